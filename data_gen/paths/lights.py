@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.camera import QUARTERS, CameraSamples
+from data_gen.scenes.load import path_depths
 from data_gen.scenes.places import Chosen, Places
 
 # Shapes that Mitsuba samples uniformly by area, besides meshes; of spheres it samples the part that is visible.
@@ -158,9 +159,9 @@ def shared_emission(scene, lights: Lights, x1, Le, p, *, x, y, y1, J) -> tuple[m
 def emission_seen(scene, integrator, medium, ray: mi.RayDifferential3f, active) -> mi.Spectrum:
     """What a camera ray meets of emitters before anything else: the layer ``direct``.
 
-    Zero where ``integrator`` hides it, and where the camera is in a ``medium``, which would dim it.
+    Zero where ``integrator`` hides it or follows no edge, and where the camera is in a ``medium``, which would dim it.
     """
-    if integrator.hide_emitters or medium is not None:
+    if not _shows(integrator) or medium is not None:
         return dr.zeros(mi.Spectrum, dr.width(ray))
     ray = mi.Ray3f(ray)
     hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
@@ -169,6 +170,14 @@ def emission_seen(scene, integrator, medium, ray: mi.RayDifferential3f, active) 
     shines = active & (lamp | ~hit.is_valid())
     si = hit.compute_surface_interaction(ray, mi.RayFlags.All, lamp)
     return si.emitter(scene, shines).eval(si, shines)
+
+
+def _shows(integrator) -> bool:
+    """Whether emission that the camera sees directly is in the image; ``max_depth`` 0 means that nothing is."""
+    depth = getattr(integrator, "max_depth", None)
+    if depth is None:  # Mitsuba's own, which only print it
+        depth = path_depths(integrator).get("max_depth")
+    return not integrator.hide_emitters and depth != 0
 
 
 def emission_in_pixel(

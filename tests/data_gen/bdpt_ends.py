@@ -201,3 +201,15 @@ def check_weights(ends):
             ends.eye, ends.lens, y, y_bsdf, scatters_smoothly(y_bsdf), lambda si, toward, active: mi.Bool(False)
         )
         compare(others, ends.densities(0, s), s + 1, dr.max(C) > 0, ends.from_light[:s])
+
+
+@np.errstate(divide="ignore", invalid="ignore")
+def close(ours, theirs, good, median=1e-3, most=0.03):
+    error = np.abs(np.array(ours, np.float64) / np.array(theirs, np.float64) - 1)
+    error = error[..., np.array(good)]
+    assert np.median(error) < median and np.quantile(error, 0.97) < most, (np.median(error), np.quantile(error, 0.97))
+
+
+def number(mi, dr, code):
+    """A random number with which an event of that code is sampled."""
+    return dr.select(code == 1, mi.Float(0), 1 - dr.epsilon(mi.Float))

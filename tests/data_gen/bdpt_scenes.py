@@ -109,6 +109,81 @@ def without_the_point():
     return scene
 
 
+def by_a_point():
+    """The same ball and mirror, lit by a point."""
+    from data_gen.scenes.builtin import _rgb
+
+    scene = caustics()
+    del scene["lamp"]
+    return scene | {"point": {"type": "point", "position": [0.2, 2.6, -0.2], "intensity": _rgb(9, 9, 9)}}
+
+
+def by_the_sun():
+    """The same ball and mirror, lit from one direction."""
+    from data_gen.scenes.builtin import _rgb
+
+    scene = caustics()
+    del scene["lamp"]
+    return scene | {"sun": {"type": "directional", "direction": [0.1, -1, 0.05], "irradiance": _rgb(9, 9, 9)}}
+
+
+def by_a_wall():
+    """The same ball and mirror, lit by what a lamp lights: the light's end is not what stays."""
+    from data_gen.scenes.builtin import _diffuse, _light, _wall
+
+    scene = caustics()
+    return scene | {
+        "lamp": _light([0.2, 1.2, -0.2], [0, 1, 0], (0.6, 0.6), (20, 20, 20)),
+        "ceiling": _wall([0, 2.4, 0], [0, -1, 0], (4, 4), _diffuse(0.8, 0.6, 0.5)),
+    }
+
+
+def under_a_sky():
+    """A ball and a mirror on a floor, lit by a sky alone: chains end where it is."""
+    from data_gen.scenes.builtin import _rgb
+
+    scene = caustics()
+    del scene["lamp"]
+    return scene | {"sky": {"type": "constant", "radiance": _rgb(1, 2, 3)}}
+
+
+def lacquered():
+    """A room with a ball of glass and a lacquered one: it mirrors, but paths may be joined at it too."""
+    scene = glass()
+    del scene["hole"]
+    scene["rough"]["bsdf"] = {"type": "plastic"}
+    return scene
+
+
+def corner():
+    """All is diffuse or glossy, and one lamp is a rectangle of area 1; some paths begin in a mirror."""
+    from data_gen.scenes.builtin import _camera, _diffuse, _light, _sphere, _wall
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 8, "rr_depth": 100},
+        "sensor": _camera([0, 0.9, 3.6], [0, 0.6, 0], 45),
+        "floor": _wall([0, 0, 0], [0, 1, 0], (6, 6), _diffuse(0.6, 0.5, 0.4)),
+        "back": _wall([0, 1, -1.2], [0, 0, 1], (6, 3), _diffuse(0.4, 0.6, 0.4)),
+        "wall": _wall([1.2, 1, 0], [-1, 0, 0], (6, 3), _diffuse(0.7, 0.2, 0.2)),
+        "ball": _sphere([0.3, 0.4, 0], 0.4, {"type": "roughconductor", "material": "Cu", "alpha": 0.3}),
+        "mirror": _sphere([-0.6, 0.4, 0.2], 0.4, {"type": "conductor", "material": "Al"}),
+        "lamp": _light([0, 2, 0.3], [0, -1, 0], (1, 1), (3, 4, 5)),
+    }
+
+
+def seen_through_glass():
+    """A floor under a pane of thick glass, lit through it by a point: no connection finds that light."""
+    floor = {
+        key: value for key, value in SCENES["points"]().items() if key in ("type", "integrator", "sensor", "floor")
+    }
+    pane = {"type": "cube", "bsdf": {"type": "dielectric"}}
+    import mitsuba as mi
+
+    pane["to_world"] = mi.ScalarTransform4f().translate([0, 0.3, 0]).scale([5, 0.1, 5])
+    return floor | {"pane": pane, "point": {"type": "point", "position": [0, 2, 0], "intensity": 5.0}}
+
+
 SCENES = {
     "points": points,
     "areas": areas,
@@ -126,3 +201,7 @@ SCENES = {
     "environment": "environment",
     "lens": "lens",
 }
+
+# Light behind mirrors and glass: where light paths of ``gbdpt`` end through them, and where camera paths do
+LIT = {"lamp": caustics, "point": by_a_point, "sun": by_the_sun, "wall": by_a_wall}
+ENDS = {"lamp": caustics, "wall": by_a_wall, "sky": under_a_sky, "room": glass, "lacquer": lacquered}

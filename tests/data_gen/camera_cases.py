@@ -5,7 +5,7 @@ The scenes have no symmetry. A card stands before some near planes, and somethin
 
 import numpy as np
 from data_gen_scenes import _scale
-from unbiased import differences, light_apart, load, render_references
+from unbiased import differences, light_apart, load
 
 from ngpt.testing import z_test
 
@@ -104,6 +104,10 @@ CAMERAS = {
 }
 
 
+# But for those that no sampler renders
+RENDERED = [view for view in CAMERAS if view not in ("batch", "radiancemeter, scaled")]
+
+
 def corner(media=False):
     """A corner with a ball and a lamp beside the view; with ``media`` the air scatters light."""
     from data_gen.scenes.builtin import _diffuse, _light, _sphere, _wall
@@ -123,14 +127,18 @@ def corner(media=False):
     return {"type": "scene", "air": {"type": "homogeneous", "id": "air", "albedo": 0.8, "sigma_t": 0.15}, **scene}
 
 
-def scene_with(mi, name, media=False):
+def described(view, media=False):
     """The scene before the camera of that name."""
-    changes = CAMERAS[name]()
+    changes = CAMERAS[view]()
     if media:
         # Of meters on shapes, too: their rays start in the air.
         sensor = changes["sensor"].get("sensor", changes["sensor"])
         sensor["medium"] = {"type": "ref", "id": "air"}
-    return load(mi, corner(media) | changes)
+    return corner(media) | changes
+
+
+def scene_with(mi, view, media=False):
+    return load(mi, described(view, media))
 
 
 def compare(stacks, references, level, slack=0.0):
@@ -160,10 +168,6 @@ def compare(stacks, references, level, slack=0.0):
 def block_means(image, edge):
     rows, columns = image.shape[0] // edge, image.shape[1] // edge
     return image[: rows * edge, : columns * edge].reshape(rows, edge, columns, edge, -1).mean(axis=(1, 3))
-
-
-def references_of(mi, name, media=False, batches=12, spp=256):
-    return render_references(mi, scene_with(mi, name, media), batches, spp)
 
 
 def stacks_of(scene, sampler, batches, spp):

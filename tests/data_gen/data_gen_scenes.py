@@ -61,21 +61,6 @@ def hidden_lamp():
     return scene
 
 
-def one_sided(side):
-    """A scene without symmetry, of which ``side`` = -1 is the mirror image of ``side`` = 1."""
-    from data_gen.scenes.builtin import _camera, _diffuse, _light, _sphere, _wall
-
-    return {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 5},
-        "sensor": _camera([0, 0.8, 4], [0, 0.6, 0], 45),
-        "floor": _wall([0, 0, 0], [0, 1, 0], (6, 6), _diffuse(0.5, 0.5, 0.5)),
-        "wall": _wall([side * 1.2, 1, 0], [-side, 0, 0], (6, 2), _diffuse(0.7, 0.2, 0.2)),
-        "ball": _sphere([-side * 0.4, 0.5, 0], 0.5, {"type": "roughconductor", "material": "Cu", "alpha": 0.1}),
-        "lamp": _light([-side * 0.6, 2.4, 0.8], [0, -1, 0], (1.2, 1.2), (5, 5, 5)),
-    }
-
-
 def furnace():
     """The inside of a ball whose wall glows and reflects half of what it gets: radiance is 1 everywhere."""
     from data_gen.scenes.builtin import _camera, _diffuse, _rgb, _sphere
@@ -191,5 +176,107 @@ def plenty():
             "type": "rectangle",
             "to_world": mi.ScalarTransform4f().translate([-0.7, 0.9, 1.0]).scale(0.35),
             "bsdf": {"type": "thindielectric"},
+        },
+    }
+
+
+def under_the_sky():
+    """The same objects under a sky, seen in a mirror, one of them lacquered and one a bubble."""
+    from data_gen.scenes.builtin import _diffuse, _rgb, _sphere, _wall
+
+    scene = caustics()
+    del scene["lamp"]
+    return scene | {
+        "sky": {"type": "constant", "radiance": _rgb(0.8, 0.9, 1.0)},
+        "wall": _wall([0, 0.8, -1.2], [0, 0, 1], (4, 2), {"type": "conductor", "material": "Al"}),
+        "bubble": _sphere([0, 0.4, 0.9], 0.2, {"type": "thindielectric"}),
+        "plastic": _sphere([-0.9, 0.25, 0.8], 0.25, {"type": "plastic", "diffuse_reflectance": _rgb(0.1, 0.3, 0.1)}),
+        "post": _sphere([0.9, 0.2, -0.5], 0.2, _diffuse(0.2, 0.2, 0.6)),
+    }
+
+
+def courtyard():
+    """Things that scatter widely, in as many ways as can be, under a sky, a bulb, a lamp and a point light.
+
+    One wall is black in red and green, so that paths go on there which carry nothing for some or all of five.
+    """
+    from data_gen.scenes.builtin import _box, _camera, _diffuse, _light, _rgb, _room, _sphere, _transform, _wall
+
+    tiles = {"type": "checkerboard", "to_uv": _transform().scale([3, 3, 1])}
+    satin = {"type": "roughplastic", "diffuse_reflectance": tiles, "alpha": 0.2}
+    black = {"type": "diffuse", "reflectance": tiles | {"color0": _rgb(0, 0, 0), "color1": _rgb(0, 0, 0.8)}}
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 7, "rr_depth": 5},
+        "sensor": _camera([0, 1.25, 3.9], [0, 1.0, 0], 50)
+        | {"type": "thinlens", "aperture_radius": 0.04, "focus_distance": 4.0},
+        **{name: wall for name, wall in _room(1.5, satin).items() if name != "ceiling"},
+        "sky": {"type": "constant", "radiance": _rgb(0.3, 0.4, 0.5)},
+        "lamp": _light([0.3, 2.3, 0], [0, -1, 0], (1.0, 1.0), (3, 3, 2.5)),
+        "bulb": _sphere([-1.1, 1.9, -0.6], 0.15, _diffuse(0, 0, 0))
+        | {"emitter": {"type": "area", "radiance": _rgb(6, 4, 2)}},
+        "point": {"type": "point", "position": [0.8, 2.0, 1.6], "intensity": _rgb(1.5, 1.5, 1.8)},
+        "brushed": _sphere([-0.9, 0.5, -0.2], 0.5, {"type": "roughconductor", "material": "Cu", "alpha": 0.3}),
+        "frosted": _sphere([0.1, 0.4, 0.4], 0.4, {"type": "roughdielectric", "alpha": 0.3}),
+        "box": _box([0.95, 0.5, -0.4], [0.6, 1.0, 0.6], 25, {"type": "twosided", "nested": _diffuse(0.3, 0.5, 0.4)}),
+        "panel": _wall([-0.3, 1.5, -0.6], [0.2, 0, 1], (0.9, 0.7), black),
+    }
+
+
+def limited(max_depth):
+    def scene():
+        description = courtyard()
+        description["integrator"]["max_depth"] = max_depth
+        return description
+
+    return scene
+
+
+def panels():
+    """Four under a sky, two of them seen from behind, two of metal; before them a floor."""
+    from data_gen.scenes.builtin import _camera, _diffuse, _path, _rgb, _wall
+
+    metal = {"type": "roughconductor", "material": "Cu", "alpha": 0.4}
+    kinds = [(bsdf, z) for bsdf in (_diffuse(0.8, 0.7, 0.6), metal) for z in (0.7, -0.7)]
+    return {
+        "type": "scene",
+        "integrator": _path(4),
+        "sensor": _camera([0, 1, 5], [0, 1, 0], 40),
+        "sky": {"type": "constant", "radiance": _rgb(0.3, 0.4, 0.5)},
+        "floor": _wall([0, 0, 0], [0, 1, 0], (8, 8), _diffuse(0.5, 0.5, 0.5)),
+        **{f"panel{i}": _wall([i - 1.5, 1, 0], [0, 0.7, z], (1, 2), bsdf) for i, (bsdf, z) in enumerate(kinds)},
+    }
+
+
+def moved(scale, shift):
+    """``polished(0.2)``, camera included, scaled about the origin and then moved along x."""
+    import mitsuba as mi
+
+    T = mi.ScalarTransform4f().translate([shift, 0, 0]) @ mi.ScalarTransform4f().scale(scale)
+    scene = polished(0.2)
+    for part in scene.values():
+        if isinstance(part, dict) and part["type"] in ("rectangle", "sphere", "perspective"):
+            part["to_world"] = T @ part.get("to_world", mi.ScalarTransform4f())
+    # A camera has no size: its matrix must not scale.
+    camera = {"origin": [shift, 0.8 * scale, 4 * scale], "target": [shift, 0.6 * scale, 0], "up": [0, 1, 0]}
+    to_world = mi.ScalarTransform4f().look_at(**camera)
+    scene["sensor"] |= {"to_world": to_world, "near_clip": 1e-2 * scale, "far_clip": 1e4 * scale}
+    return scene
+
+
+def lamp_alone():
+    """A ball that glows, and nothing else."""
+    import mitsuba as mi
+
+    film = {"type": "hdrfilm", "width": 16, "height": 16}
+    look = mi.ScalarTransform4f().look_at(origin=[0.1, 0.2, -4], target=[0, 0, 0], up=[0, 1, 0])
+    return {
+        "type": "scene",
+        "integrator": {"type": "path"},
+        "sensor": {"type": "perspective", "fov": 30, "to_world": look, "film": film},
+        "lamp": {
+            "type": "sphere",
+            "radius": 0.6,
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 2.0}},
         },
     }

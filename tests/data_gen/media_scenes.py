@@ -131,6 +131,11 @@ def before_the_sky():
     return scene
 
 
+def seen_through():
+    """The same by paths of one edge: before anything scatters."""
+    return before_the_sky() | {"integrator": {"type": "volpath", "max_depth": 1}}
+
+
 def hiding():
     """A lamp in plain view, half behind a cloud, that hides from the camera; and mist around the camera."""
     return glowing(cloudy(grid(1), mist={"albedo": 0.8, "sigma_t": 0.2}))

@@ -4,7 +4,7 @@ from itertools import count
 
 import numpy as np
 import pytest
-from unbiased import load
+from unbiased import load, same
 
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import relmse_trimmed
@@ -20,12 +20,6 @@ def render(mi, spp, seed=0, scene="glossy", sampler="gpt", error=None, method="w
 
     scene = load(mi, scene, SIZE) if isinstance(scene, str) else scene
     return render_stack(scene, spp, seed, sampler, adaptive=Adaptive(error, method), **options)
-
-
-def same(a, b):
-    assert a.names == b.names
-    for name in a.names:
-        assert np.array_equal(a[name], b[name], equal_nan=True), name
 
 
 def test_counts_are_proportional_to_what_is_needed(renderer, rng):

@@ -1,62 +1,9 @@
-"""What is particular to ``bdpt``: MIS weights, all kinds of lights, what is kept of light paths, refusals.
-
-That it is unbiased on quick scenes, repeats its bits and says how noisy it is, is among the laws of all samplers.
-"""
+"""What is particular to ``bdpt``: MIS weights by brute force, and what is kept of light paths."""
 
 import numpy as np
-import pytest
 from bdpt_ends import Ends, check_weights, plan_of, without_hole
-from bdpt_scenes import SCENES
 from data_gen_scenes import glass
-from unbiased import REFERENCES, load, render_ours, render_references
-
-from ngpt.errors import NgptError
-from ngpt.testing import z_test
-
-QUICK = ("sky",)
-
-
-def check(mi, description, **options):
-    scene = load(mi, description, (32, 32))
-    stacks = render_ours(scene, "bdpt", batches=24, spp=16, **options)
-    references = render_references(mi, scene, spp=96)
-    assert references.mean() > 0.01
-    result = z_test(np.stack([stack["primal"] for stack in stacks]), references)
-    assert result.passed, str(result)
-
-
-@pytest.mark.parametrize("name", QUICK)
-def test_unbiased(renderer, name):
-    check(renderer, SCENES[name])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in SCENES if name not in QUICK])
-def test_unbiased_on_more_scenes(renderer, name):
-    check(renderer, SCENES[name])
-
-
-@pytest.mark.parametrize("joined_depth", [1, pytest.param(3, marks=pytest.mark.slow)])
-def test_longer_paths_come_from_the_camera_alone(renderer, joined_depth):
-    check(renderer, SCENES["areas"], joined_depth=joined_depth)
-
-
-@pytest.mark.slow
-# In monochromatic variants Dr.Jit does not find a number that the kernel uses.
-@pytest.mark.recorded_anew
-def test_spectral_and_monochromatic_variants(renderer):
-    from data_gen.backend import use_variant
-
-    try:
-        for variant in ("llvm_ad_spectral", "llvm_ad_mono"):
-            use_variant(variant)
-            scene = load(renderer, "lens", (16, 16))
-            ours = np.stack([s["primal"] for s in render_ours(scene, "bdpt", batches=12, spp=32)])
-            primal = np.stack([s["primal"] for s in render_ours(scene, "primal", batches=12, spp=64, seed=REFERENCES)])
-            result = z_test(ours, primal)
-            assert result.passed, f"{variant}: {result}"
-    finally:
-        use_variant()
+from unbiased import load
 
 
 def test_weights_are_those_of_all_densities(renderer):
@@ -133,37 +80,3 @@ def test_nothing_kept_is_a_bool(renderer):
     from data_gen.samplers.bdpt import vertex
 
     assert mi.Bool not in get_type_hints(vertex.record_class(mi.variant()), {"mi": mi}).values()
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"sensor": {"type": "orthographic"}}, "light paths cannot reach a camera 'orthographic'"),
-        ({"lamp": {"type": "projector", "irradiance": 1.0}}, r"from emitter 'lamp' \(Projector\); use --sampler gpt"),
-    ],
-)
-def test_what_it_cannot_render(renderer, change, message):
-    from data_gen.render import render_stack
-
-    scene = load(renderer, lambda: SCENES["points"]() | change, (8, 8))
-    with pytest.raises(NgptError, match=message):
-        render_stack(scene, 1, 0, "bdpt")
-
-
-def test_scenes_without_lights_are_black(renderer):
-    from data_gen.render import render_stack
-
-    def dark():
-        scene = SCENES["points"]()
-        return {key: value for key, value in scene.items() if key not in ("point", "spot", "sun")}
-
-    stack = render_stack(load(renderer, dark, (8, 8)), 4, 0, "bdpt")
-    assert not stack["primal"].any() and stack["albedo"].any()
-
-
-def test_media_are_refused():
-    from data_gen.samplers import find
-    from data_gen.scenes.facts import Facts
-
-    with pytest.raises(NgptError, match=r"there are media .*, which 'bdpt' does not see"):
-        find("bdpt", Facts("path", ("air",)))

@@ -1,6 +1,6 @@
 """Cameras: every sampler before every one of Mitsuba's, right or refused; and what samplers know of a camera."""
 
-from functools import cache
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,13 +9,14 @@ from camera_cases import (
     camera,
     card,
     compare,
+    described,
     film,
     orthographic,
     perspective,
-    references_of,
     scene_with,
     stacks_of,
 )
+from references import references
 from unbiased import load
 
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
@@ -36,12 +37,6 @@ def in_media(sampler):
     return bool({**SAMPLERS, **FRAME_SAMPLERS}[sampler].refuses(Facts("path", ())))
 
 
-@cache
-def references(mi, view, media):
-    meter = view in ("radiancemeter", "distant")
-    return references_of(mi, view, media, 16, 1024 if meter else 256)
-
-
 def check(mi, sampler, view, batches, spp, media=False):
     media = media or in_media(sampler)
     scene = scene_with(mi, view, media)
@@ -57,7 +52,7 @@ def check(mi, sampler, view, batches, spp, media=False):
             stacks_of(scene, sampler, 1, 1)
         return
     stacks = stacks_of(scene, sampler, batches, spp)
-    expected = references(mi, view, media)
+    expected = references(mi, partial(described, view, media))
     assert expected.mean() > 0.01
     for layer, result in compare(stacks, expected, LEVEL, slack=0.01 if by_photons else 0.0):
         assert result.passed, f"{layer}: {result}"

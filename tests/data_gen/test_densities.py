@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from unbiased import gradient_tests, load, render_ours, render_references
 
 MATERIALS = {
     "diffuse": {"type": "diffuse"},
@@ -54,44 +53,3 @@ def test_a_sampled_direction_has_the_density_that_others_are_told(renderer, name
     assert np.array_equal(ours[kept], before[kept])
     if name in ("diffuse", "black", "metal"):
         assert np.mean((before > 0) & (told == 0)) > 0.01  # the trap is there
-
-
-def panels():
-    """Four under a sky, two of them seen from behind, two of metal; before them a floor."""
-    from data_gen.scenes.builtin import _camera, _diffuse, _path, _rgb, _wall
-
-    metal = {"type": "roughconductor", "material": "Cu", "alpha": 0.4}
-    kinds = [(bsdf, z) for bsdf in (_diffuse(0.8, 0.7, 0.6), metal) for z in (0.7, -0.7)]
-    return {
-        "type": "scene",
-        "integrator": _path(4),
-        "sensor": _camera([0, 1, 5], [0, 1, 0], 40),
-        "sky": {"type": "constant", "radiance": _rgb(0.3, 0.4, 0.5)},
-        "floor": _wall([0, 0, 0], [0, 1, 0], (8, 8), _diffuse(0.5, 0.5, 0.5)),
-        **{f"panel{i}": _wall([i - 1.5, 1, 0], [0, 0.7, z], (1, 2), bsdf) for i, (bsdf, z) in enumerate(kinds)},
-    }
-
-
-def panel_tests(mi, sampler):
-    """Over eight pixels, where another panel is."""
-    scene = load(mi, panels, (24, 24))
-    references = render_references(mi, scene, batches=12, spp=128)
-    return gradient_tests(render_ours(scene, sampler, batches=12, spp=32, pixels=8), references, pixels=8)
-
-
-@pytest.mark.parametrize("sampler", ["gpt", pytest.param("gpt-simple", marks=pytest.mark.slow)])
-def test_unbiased_where_surfaces_are_seen_from_behind(renderer, sampler):
-    for name, result in panel_tests(renderer, sampler):
-        assert result.passed, f"{name}: {result}"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sampler", ["gpt", "gpt-simple"])
-def test_a_mutant_that_takes_samples_at_their_word_fails_the_z_test(renderer, monkeypatch, sampler):
-    from data_gen.paths import media
-    from data_gen.samplers.teaching import gpt_simple
-
-    for module in (media, gpt_simple):
-        monkeypatch.setattr(module, "consistent", lambda bsdf, si, sample, *_: sample)
-    passed = {name: result.passed for name, result in panel_tests(renderer, sampler)}
-    assert passed["primal"] and not (passed["dx"] and passed["dy"]), passed

@@ -5,30 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from bdpt_ends import fresh, plan_of
-from data_gen_scenes import caustics, glass
-from test_gbdpt_glass import by_a_wall, close, number
-from unbiased import DISTANCES, REFERENCES, gradient_tests, load, render_ours
-
-
-def under_a_sky():
-    """A ball and a mirror on a floor, lit by a sky alone: chains end where it is."""
-    from data_gen.scenes.builtin import _rgb
-
-    scene = caustics()
-    del scene["lamp"]
-    return scene | {"sky": {"type": "constant", "radiance": _rgb(1, 2, 3)}}
-
-
-def lacquered():
-    """A room with a ball of glass and a lacquered one: it mirrors, but paths may be joined at it too."""
-    scene = glass()
-    del scene["hole"]
-    scene["rough"]["bsdf"] = {"type": "plastic"}
-    return scene
-
-
-ENDS = {"lamp": caustics, "wall": by_a_wall, "sky": under_a_sky, "room": glass, "lacquer": lacquered}
+from bdpt_ends import close, fresh, number, plan_of
+from bdpt_scenes import ENDS
+from data_gen_scenes import glass
+from unbiased import load, render_ours
 
 
 class Start(NamedTuple):
@@ -216,29 +196,6 @@ def test_copies_are_paths_that_the_camera_could_have_found(bent):
     there = np.array(back & ~far)
     if there.any():
         close(end2.vc, bent.step.end1.vc, there, median=1e-2, most=0.1)
-
-
-@pytest.fixture
-def long_passes(monkeypatch):
-    """A pass of 64 samples per pixel: much less of the time goes by with recording kernels."""
-    from data_gen.samplers import SAMPLERS
-
-    for name in ("bdpt", "gbdpt"):
-        monkeypatch.setitem(SAMPLERS, name, replace(SAMPLERS[name], batch=64))
-
-
-def z_tests(mi, description, pixels):
-    scene = load(mi, description, (32, 32))
-    references = np.stack([stack["primal"] for stack in render_ours(scene, "bdpt", 16, 64, seed=REFERENCES)])
-    return list(gradient_tests(render_ours(scene, "gbdpt", 16, 64, pixels), references, pixels=pixels))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("pixels", DISTANCES)
-@pytest.mark.parametrize("ends", [glass, lacquered, under_a_sky, by_a_wall, "glossy"])
-def test_unbiased(renderer, long_passes, ends, pixels):
-    for name, result in z_tests(renderer, ends, pixels):
-        assert result.passed, f"{name}: {result}"
 
 
 @pytest.mark.slow

@@ -2,41 +2,9 @@
 
 import numpy as np
 import pytest
-from bdpt_ends import plan_of
-from data_gen_scenes import caustics
-from unbiased import DISTANCES, REFERENCES, gradient_tests, load, render_ours
-
-
-def by_a_point():
-    """The same ball and mirror, lit by a point."""
-    from data_gen.scenes.builtin import _rgb
-
-    scene = caustics()
-    del scene["lamp"]
-    return scene | {"point": {"type": "point", "position": [0.2, 2.6, -0.2], "intensity": _rgb(9, 9, 9)}}
-
-
-def by_the_sun():
-    """The same ball and mirror, lit from one direction."""
-    from data_gen.scenes.builtin import _rgb
-
-    scene = caustics()
-    del scene["lamp"]
-    return scene | {"sun": {"type": "directional", "direction": [0.1, -1, 0.05], "irradiance": _rgb(9, 9, 9)}}
-
-
-def by_a_wall():
-    """The same ball and mirror, lit by what a lamp lights: the light's end is not what stays."""
-    from data_gen.scenes.builtin import _diffuse, _light, _wall
-
-    scene = caustics()
-    return scene | {
-        "lamp": _light([0.2, 1.2, -0.2], [0, 1, 0], (0.6, 0.6), (20, 20, 20)),
-        "ceiling": _wall([0, 2.4, 0], [0, -1, 0], (4, 4), _diffuse(0.8, 0.6, 0.5)),
-    }
-
-
-LIT = {"lamp": caustics, "point": by_a_point, "sun": by_the_sun, "wall": by_a_wall}
+from bdpt_ends import close, number, plan_of
+from bdpt_scenes import LIT, by_a_wall, by_the_sun
+from unbiased import load, render_ours
 
 
 class Caustics:
@@ -113,13 +81,6 @@ class Caustics:
 )
 def paths(renderer, request):
     return Caustics(renderer, LIT[request.param])
-
-
-@np.errstate(divide="ignore", invalid="ignore")
-def close(ours, theirs, good, median=1e-3, most=0.03):
-    error = np.abs(np.array(ours, np.float64) / np.array(theirs, np.float64) - 1)
-    error = error[..., np.array(good)]
-    assert np.median(error) < median and np.quantile(error, 0.97) < most, (np.median(error), np.quantile(error, 0.97))
 
 
 def test_a_path_is_its_own_copy_in_its_own_place(paths):
@@ -203,11 +164,6 @@ def moved_path(paths, uv, good):
     return moved, good
 
 
-def number(mi, dr, code):
-    """A random number with which an event of that code is sampled."""
-    return dr.select(code == 1, mi.Float(0), 1 - dr.epsilon(mi.Float))
-
-
 def test_copies_are_paths_that_light_could_have_found(paths):
     """C' / r is the contribution of the copy by its own density, traced forward; weights are those along it; and the
     copy's copy is the path, with 1 / r."""
@@ -267,52 +223,6 @@ def long_passes(monkeypatch):
         monkeypatch.setitem(SAMPLERS, name, replace(SAMPLERS[name], batch=64))
 
 
-def z_tests(mi, description, pixels):
-    """Against differences of ``bdpt``: ``path`` finds hardly any of this light, and none of a point's."""
-    scene = load(mi, description, (32, 32))
-    references = np.stack([stack["primal"] for stack in render_ours(scene, "bdpt", 16, 64, seed=REFERENCES)])
-    return list(gradient_tests(render_ours(scene, "gbdpt", 16, 64, pixels), references, pixels=pixels))
-
-
-@pytest.mark.slow
-def test_unbiased(renderer, long_passes):
-    for name, result in z_tests(renderer, caustics, 1):
-        assert result.passed, f"{name}: {result}"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("pixels", DISTANCES)
-@pytest.mark.parametrize("lit", LIT)
-def test_unbiased_by_more_lights(renderer, long_passes, lit, pixels):
-    for name, result in z_tests(renderer, LIT[lit], pixels):
-        assert result.passed, f"{name}: {result}"
-
-
-def without_jacobian(follow):
-    def mutant(*args, **more):
-        ω, shot, J, found = follow(*args, **more)
-        return ω, shot, J * 0 + 1, found
-
-    return mutant
-
-
-def halved(weights):
-    """As if a rejected path had a copy that says the rest."""
-    return lambda C, others, shifted, r, others_shifted: weights(C, others, shifted, r, others_shifted) / 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("function", "mutate"), [("follow", without_jacobian), ("difference_of_one", halved)], ids=["J is 1", "half"]
-)
-def test_mutants_fail_the_z_test(renderer, long_passes, monkeypatch, function, mutate):
-    from data_gen.samplers.gbdpt import light_shift
-
-    monkeypatch.setattr(light_shift, function, mutate(getattr(light_shift, function)))
-    passed = {name: result.passed for name, result in z_tests(renderer, caustics, 1)}
-    assert passed["primal"] and not (passed["dx"] and passed["dy"])
-
-
 @pytest.mark.slow
 def test_less_noise_than_without(renderer, long_passes, monkeypatch):
     """Light of one direction, through a ball and by a mirror, and straight onto the floor."""
@@ -332,17 +242,3 @@ def test_less_noise_than_without(renderer, long_passes, monkeypatch):
     monkeypatch.setattr(light_shift, "through_glass", lost)
     without = noise()
     assert followed < 0.5 * without, (followed, without)
-
-
-@pytest.mark.slow
-def test_the_same_bits_whatever_the_passes(renderer, monkeypatch):
-    from data_gen import passes
-    from data_gen.render import render_stack
-
-    scene = load(renderer, caustics, (24, 16))
-    whole = render_stack(scene, 32, 5, "gbdpt")
-    monkeypatch.setattr(passes, "FIRST_LANES", 1)
-    monkeypatch.setattr(passes, "PASS_SECONDS", 0.0)
-    split = render_stack(scene, 32, 5, "gbdpt")
-    for name in whole.names:
-        assert np.array_equal(whole[name], split[name]), name

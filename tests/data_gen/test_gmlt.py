@@ -149,16 +149,3 @@ def test_light_through_a_door_ajar(renderer):
     stacks = [render_stack(scene, 32, seed, "gmlt")["primal"] for seed in range(16)]
     result = z_test(np.stack(stacks), references)
     assert result.passed, result
-
-
-def test_a_scene_without_light_is_black(renderer):
-    from data_gen.render import render_stack
-    from data_gen.scenes.builtin import diffuse
-
-    def dark():
-        scene = diffuse()
-        del scene["lamp"]
-        return scene
-
-    stack = render_stack(load(renderer, dark, SIZE), 16, 0, "gmlt")
-    assert all(not stack[name].any() for name in ("primal", "dx", "dy")) and stack["albedo"].any()

@@ -1,7 +1,4 @@
-"""What is particular to ``gpm``: how photons are copied, and its differences against those of its own images.
-
-That it repeats its bits, says how noisy it is and stays within its memory is among the laws of all samplers.
-"""
+"""What is particular to ``gpm``: how photons are copied, and its differences against those of its own images."""
 
 from itertools import product
 from types import SimpleNamespace
@@ -9,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from bdpt_scenes import SCENES
-from unbiased import differences, far_shifts, light_of_gradients, load, render_ours
+from photon_laws import assert_no_bias, gain, joined, largest, maps_of, passes
+from unbiased import far_shifts, load, render_ours
 
 
 @pytest.fixture(scope="module")
@@ -37,10 +35,6 @@ def geometry(renderer):
         b=Vector(x + rng.normal(size=(3, n)) * 0.1),
         length=rng.uniform(1, 4, n),
     )
-
-
-def largest(value) -> float:
-    return np.abs(np.array(value, np.float64)).max()
 
 
 def test_places_go_to_and_fro(geometry):
@@ -99,25 +93,11 @@ def test_jacobian_by_finite_differences(geometry, far):
     assert good.sum() > 1000 and np.abs(measured / told - 1)[good].max() < 1e-5
 
 
-def joined(one, other, mi, dr):
-    """Two records as one: all arrays of the other behind those of the first."""
-    n, m = dr.width(one.p), dr.width(other["p"])
-    index = dr.arange(mi.UInt32, n + m)
-    values = {}
-    for name, old in vars(one).items():
-        new = other[name]
-        both = dr.gather(type(old), old, index, index < n), dr.gather(type(old), new, index - n, index >= n)
-        values[name] = dr.select(index < n, *both)
-    dr.eval(values)
-    return type(one)(**values)
-
-
 @pytest.mark.parametrize("name", ["areas", "sky", "points", "glossy"])
 def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(renderer, name):
     """By the densities and throughputs of the copy itself, evaluated anew: r(T(x)) r(x) = 1, and T(T(x)) = x."""
     import drjit as dr
     from scipy.spatial import cKDTree
-    from test_photons import maps_of
 
     from data_gen.paths.light_ends import LightEnds, LightRay
     from data_gen.paths.vertex import Materials
@@ -191,42 +171,6 @@ def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(rend
     assert np.median(away) < 2e-5 and np.quantile(away, 0.95) < 1e-3
 
 
-def passes(scene, n, pixels=1, sampler="gpm", **options):
-    """The layers of ``n`` first passes, each of another seed: what ``render_ours`` has, prepared once."""
-    from data_gen.film import GradientFilm
-    from data_gen.passes import recording
-    from data_gen.paths.camera import CameraSamples
-    from data_gen.samplers import find
-
-    sample, sensor = find(sampler).made(scene, **options), scene.sensors()[0]
-    stacks = []
-    with far_shifts(pixels), recording():
-        for seed in range(n):
-            film = GradientFilm(*(int(n) for n in sensor.film().crop_size()), batches=True)
-            sample(CameraSamples(sensor, seed, 1), film)
-            film.end_pass(1)
-            stacks.append(film.develop())
-    return stacks
-
-
-def paired(stacks, pixels, block):
-    """z of dx and dy minus the differences of the same image, over blocks: both have the same mean, bias included."""
-    off = []
-    for stack in stacks:
-        slopes = differences(np.asarray(light_of_gradients(stack), np.float64), pixels)
-        off.append([stack[name] - slope for name, slope in zip(("dx", "dy"), slopes, strict=True)])
-    n, two, height, width, _ = np.shape(off)
-    blocks = np.reshape(off, (n, two, height // block, block, width // block, block, 3)).mean(axis=(3, 5, 6))
-    error = blocks.std(axis=0, ddof=1) / np.sqrt(n)
-    return (blocks.mean(axis=0) / np.where(error > 0, error, np.inf)).ravel()
-
-
-def assert_no_bias(stacks, pixels):
-    """The largest z of blocks of 4x4 pixels, and the mean of all squares of 2x2."""
-    largest, squares = np.abs(paired(stacks, pixels, 4)).max(), np.mean(paired(stacks, pixels, 2) ** 2)
-    assert largest < 4.5 and squares < 1.6, (largest, squares)
-
-
 def without_glass():
     """The sky, whose sun no camera path meets by chance: that is rarer than any test has samples for."""
     scene = SCENES["sky"]()
@@ -244,16 +188,6 @@ def test_differences_are_those_of_the_image(renderer, name, pixels):
     stacks = passes(scene, 32, pixels, radius=0.7, photons=2)
     assert np.mean([stack["primal"].mean() for stack in stacks]) > 0.01
     assert_no_bias(stacks, pixels)
-
-
-def test_a_wrong_jacobian_is_found(renderer, monkeypatch):
-    """By the same test: J = 1 has even less noise. Measured with 64 passes: a mean of z² of 13, with J one of 0.95."""
-    from data_gen.samplers.photons.gradients import shift
-
-    monkeypatch.setattr(shift, "jacobian", lambda d, n, length2, d1, m, length2_1: 0 * length2_1 + 1)
-    stacks = passes(load(renderer, "diffuse", (16, 16)), 32, 4, radius=0.7, photons=2)
-    with pytest.raises(AssertionError):
-        assert_no_bias(stacks, 4)
 
 
 @pytest.mark.parametrize("name", ["glass", "hidden_sky"])
@@ -282,20 +216,6 @@ def test_shifts_by_nothing_find_no_difference(renderer):
     with far_shifts(0):
         layers = render_stack(load(renderer, SCENES["glass"], (16, 16)), 2, 0, "gpm").layers
     assert not layers["dx"].any() and not layers["dy"].any() and layers["primal"].any()
-
-
-def gain(stacks):
-    """Variance of differences of independent images over that of dx and dy: in the mean and in the median."""
-    L = np.stack([light_of_gradients(stack) for stack in stacks]).astype(np.float64)
-    variance = L.var(axis=0, ddof=1)
-    ratios, sums = [], np.zeros(2)
-    for name, axis in (("dx", 1), ("dy", 0)):
-        ours = np.stack([stack[name] for stack in stacks]).astype(np.float64).var(axis=0, ddof=1)
-        pixels = variance + np.roll(variance, -1, axis=axis)
-        inner = np.s_[:-1, :-1]
-        sums += pixels[inner].sum(), ours[inner].sum()
-        ratios.append((pixels[inner] / np.where(ours[inner] > 0, ours[inner], np.nan)).ravel())
-    return sums[0] / sums[1], np.nanmedian(ratios)
 
 
 def test_photons_have_copies_and_differences_little_noise(renderer):

@@ -1,72 +1,8 @@
 """The shift "manifold" of ``gpt`` is unbiased, the light it follows leaves the layer, and all else stays."""
 
 import numpy as np
-import pytest
-from data_gen_scenes import caustics, glass
-from unbiased import DISTANCES, gradient_tests, load, render_ours, render_references
-
-from ngpt.errors import NgptError
-
-
-def under_the_sky():
-    """The same objects under a sky, seen in a mirror, one of them lacquered and one a bubble."""
-    from data_gen.scenes.builtin import _diffuse, _rgb, _sphere, _wall
-
-    scene = caustics()
-    del scene["lamp"]
-    return scene | {
-        "sky": {"type": "constant", "radiance": _rgb(0.8, 0.9, 1.0)},
-        "wall": _wall([0, 0.8, -1.2], [0, 0, 1], (4, 2), {"type": "conductor", "material": "Al"}),
-        "bubble": _sphere([0, 0.4, 0.9], 0.2, {"type": "thindielectric"}),
-        "plastic": _sphere([-0.9, 0.25, 0.8], 0.25, {"type": "plastic", "diffuse_reflectance": _rgb(0.1, 0.3, 0.1)}),
-        "post": _sphere([0.9, 0.2, -0.5], 0.2, _diffuse(0.2, 0.2, 0.6)),
-    }
-
-
-@pytest.mark.parametrize(
-    "scene", [caustics, *(pytest.param(s, marks=pytest.mark.slow) for s in (under_the_sky, glass))]
-)
-def test_unbiased(renderer, scene):
-    scene = load(renderer, scene, (32, 32))
-    references = render_references(renderer, scene, spp=128)
-    for pixels in DISTANCES:
-        stacks = render_ours(scene, "gpt", pixels=pixels, shift="manifold")
-        for name, result in gradient_tests(stacks, references, pixels=pixels):
-            assert result.passed, f"{name} over {pixels} pixels: {result}"
-
-
-def inverted(mi, follow):
-    def mutant(*args, **more):
-        ω, shot, J, found = follow(*args, **more)
-        return ω, shot, 1 / J, found
-
-    return mutant
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("function", "mutate"),
-    [
-        ("follow", inverted),
-        ("gradient_weight", lambda mi, _: lambda r, good: mi.Float(1)),
-        ("shoot", lambda mi, shoot: lambda *args, **more: _tinted(shoot(*args, **more))),
-    ],
-    ids=["determinant inverted", "rejected walks count half", "colour of the base path alone"],
-)
-def test_mutants_fail_the_z_test(renderer, function, mutate, monkeypatch):
-    from data_gen.samplers.gpt import manifold_shift
-
-    scene = load(renderer, caustics, (32, 32))
-    references = render_references(renderer, scene, spp=128)
-    monkeypatch.setattr(manifold_shift, function, mutate(renderer, getattr(manifold_shift, function)))
-    tests = gradient_tests(render_ours(scene, "gpt", shift="manifold"), references)
-    passed = {name: result.passed for name, result in tests}
-    assert passed["primal"] and not (passed["dx"] and passed["dy"])
-
-
-def _tinted(shot):
-    shot.weight *= 2
-    return shot
+from data_gen_scenes import caustics
+from unbiased import load, render_ours
 
 
 def test_light_moves_from_the_layer_to_the_gradients(renderer):
@@ -138,19 +74,6 @@ def test_the_second_kernel_finds_what_the_first_has_recorded(renderer, monkeypat
         assert np.allclose(own[recorded], -2 * followed[recorded], rtol=1e-3, atol=1e-5)
 
 
-def test_same_seed_same_bits_whatever_the_passes(renderer, monkeypatch):
-    from data_gen import passes
-    from data_gen.render import render_stack
-
-    scene = load(renderer, caustics, (32, 32))
-    whole = render_stack(scene, 64, 5, "gpt", shift="manifold")
-    monkeypatch.setattr(passes, "FIRST_LANES", 1)
-    monkeypatch.setattr(passes, "PASS_SECONDS", 0.0)
-    split = render_stack(scene, 64, 5, "gpt", shift="manifold")
-    for name in whole.names:
-        assert np.array_equal(whole[name], split[name]), name
-
-
 def test_scenes_without_mirrors_have_the_same_kernels(renderer):
     import drjit as dr
 
@@ -165,13 +88,3 @@ def test_scenes_without_mirrors_have_the_same_kernels(renderer):
 
     scene = load(renderer, "diffuse", (8, 8))
     assert kernels() and kernels() == kernels(shift="manifold")
-
-
-def test_what_does_not_go_together(renderer):
-    """Mitsuba makes a text of what a plugin raises, of which render_stack makes our error again."""
-    from data_gen.render import render_stack
-
-    scene = load(renderer, "diffuse", (8, 8))
-    for options in ({"reuse": True}, {"caustic": False}):
-        with pytest.raises(NgptError, match=r"^gpt: shift 'manifold' needs the layer 'caustic'"):
-            render_stack(scene, 1, 0, "gpt", shift="manifold", **options)

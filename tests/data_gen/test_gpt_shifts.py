@@ -188,30 +188,6 @@ def round_trips(steps):
     return np.array(taken), np.array(undone), np.array(r)
 
 
-def mutants_of_rules(mi, dr):
-    """Rules of data_gen.paths.shift, each replaced by one that is wrong."""
-    return [
-        # The reverse shift would reconnect.
-        ("replay_inverts", lambda *_: mi.Bool(True)),
-        ("replay_inverts", lambda kind, offset, after, base: ~(offset & after & base) | (kind == 2)),
-        # The offset vertex does not matter.
-        ("reconnects", lambda kind, base, after, offset: (kind == 0) & base & after),
-    ]
-
-
-@pytest.mark.slow
-def test_round_trips_see_wrong_rules(renderer, monkeypatch):
-    import drjit as dr
-
-    from data_gen.paths import shift
-
-    for name, mutant in mutants_of_rules(renderer, dr):
-        with monkeypatch.context() as patch:
-            patch.setattr(shift, name, mutant)
-            taken, undone, _ = round_trips(Steps(renderer, "replay", caustic=False))
-        assert undone[taken].mean() < LEVEL, name
-
-
 def test_paths_whose_light_will_be_caustic_are_rejected_from_both_sides(renderer, monkeypatch):
     from data_gen.samplers.gpt import offset_path
 

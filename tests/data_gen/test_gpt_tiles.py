@@ -5,11 +5,7 @@ The laws that all samplers share are in ``test_samplers``; the budget of z-tests
 
 import numpy as np
 import pytest
-from data_gen_scenes import fog, hidden_lamp
-from unbiased import gradient_tests, load, render_ours, render_references
-
-from data_gen.adaptive import Adaptive
-from ngpt.errors import NgptError
+from unbiased import load
 
 SIZE = (8, 6)
 
@@ -101,55 +97,6 @@ def test_weights_of_a_path_add_up_to_one(renderer):
     assert tile.balanced()[:, 0].sum() == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.fixture(scope="module")
-def courtyard(renderer):
-    """Rough materials of many kinds, a sky, a bulb, a point light; and references."""
-    from test_gpt_simple import courtyard
-
-    scene = load(renderer, courtyard, (24, 24))
-    return scene, render_references(renderer, scene, batches=16, spp=128)
-
-
-@pytest.mark.slow
-def test_unbiased_where_densities_differ(courtyard):
-    scene, references = courtyard
-    for name, result in gradient_tests(render_ours(scene, "gpt-tiles", batches=12), references):
-        assert result.passed, f"{name}: {result}"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("tile", [2, 4])
-def test_unbiased_with_a_large_budget(renderer, tile):
-    """A material that denies densities of its own (test_densities) would show here."""
-    from test_gpt_simple import courtyard
-
-    scene = load(renderer, courtyard, (32, 32))
-    references = render_references(renderer, scene, batches=24, spp=512)
-    for name, result in gradient_tests(render_ours(scene, "gpt-tiles", spp=256, tile=tile), references):
-        assert result.passed, f"{name}: {result}"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("pixels", [1, 8])
-@pytest.mark.parametrize("scene", ["diffuse", "glossy", "lens"])
-def test_unbiased_with_mirrors_and_lenses(renderer, scene, pixels):
-    scene = load(renderer, scene, (32, 32))
-    references = render_references(renderer, scene, spp=256)
-    for name, result in gradient_tests(render_ours(scene, "gpt-tiles", pixels=pixels), references, pixels=pixels):
-        assert result.passed, f"{name}: {result}"
-
-
-@pytest.mark.slow
-def test_a_mutant_without_jacobian_fails_the_z_test(renderer, courtyard, monkeypatch):
-    """Over eight pixels, where Jacobians are far from 1."""
-    from data_gen.samplers.studies import gpt_tiles
-
-    monkeypatch.setattr(gpt_tiles, "reconnection_jacobian", lambda *_: renderer.Float(1))
-    scene, references = courtyard
-    stacks = render_ours(scene, "gpt-tiles", pixels=8)
-    assert not all(result.passed for _, result in gradient_tests(stacks, references, pixels=8))
-
-
 @pytest.mark.slow
 def test_variance_gain(renderer):
     """Over ``gpt`` at equal samples, median of pixels. Measured: 3.4 of the primal and 1.25 of differences."""
@@ -161,30 +108,3 @@ def test_variance_gain(renderer):
     for layer, floor in (("primal_var", 2.5), ("dx_var", 1.05), ("dy_var", 1.05)):
         gain = theirs[layer].sum(axis=-1)[unlit] / np.maximum(ours[layer].sum(axis=-1)[unlit], 1e-20)
         assert np.median(gain) > floor, layer
-
-
-@pytest.mark.slow
-def test_depth_limits(renderer):
-    from test_gpt_simple import limited
-
-    from data_gen.render import render_stack
-
-    for max_depth in (0, 1):
-        stack = render_stack(load(renderer, limited(max_depth), (16, 16)), 16, sampler="gpt-tiles")
-        assert stack["primal"].any() == stack["direct"].any() == (max_depth == 1)
-        assert not stack["dx"].any() and not stack["dy"].any()
-
-
-@pytest.mark.parametrize(
-    ("scene", "options", "reason"),
-    [
-        (fog, {}, "'gpt-tiles' knows only 'path'"),
-        (hidden_lamp, {}, "hides emitters; use --sampler gpt"),
-        ("diffuse", {"adaptive": Adaptive()}, "'gpt-tiles' depend on each other, so all pixels have as many"),
-    ],
-)
-def test_refuses_what_it_cannot_render(renderer, scene, options, reason):
-    from data_gen.render import render_stack
-
-    with pytest.raises(NgptError, match=reason):
-        render_stack(load(renderer, scene, (8, 8)), 64, sampler="gpt-tiles", **options)

@@ -1,7 +1,4 @@
-"""What is particular to ``gvcm``: weights of copies with merging, pairs that merging completes, its differences.
-
-That it repeats its bits, says how noisy it is and stays within its memory is among the laws of all samplers.
-"""
+"""What is particular to ``gvcm``: weights of copies with merging, pairs that merging completes, its differences."""
 
 from copy import copy
 from dataclasses import replace
@@ -10,12 +7,9 @@ from operator import itemgetter
 import numpy as np
 import pytest
 from bdpt_ends import Ends, fresh, plan_of, without_hole
-from bdpt_scenes import SCENES
-from test_gpm import assert_no_bias, gain, passes
-from test_vcm import seen_through_glass
+from bdpt_scenes import SCENES, seen_through_glass
+from photon_laws import assert_no_bias, gain, passes
 from unbiased import far_shifts, light_of_gradients, load, render_ours
-
-from ngpt.errors import NgptError
 
 # Of so many light paths, or of such a radius, that merging has its share
 ETA = 1000.0
@@ -238,30 +232,9 @@ def test_pairs_at_shared_vertices_have_the_weight_of_all_strategies(copies):
     check_shared_weight(copies)
 
 
-def test_weights_of_merging_alone_are_found_at_shared_vertices(copies, monkeypatch):
-    from data_gen.samplers.gbdpt.pairs import difference_of_one
-    from data_gen.samplers.vcm import differences
-
-    monkeypatch.setattr(differences, "difference", difference_of_one)
-    with pytest.raises(AssertionError):
-        check_shared_weight(copies)
-
-
 @pytest.mark.parametrize("t", [1, 2])
 def test_pairs_that_merging_completes_are_the_same_from_both_ends(copies, t):
     check_pairs(copies, t)
-
-
-@pytest.mark.parametrize(("t", "name"), [(1, "difference_of_one"), (2, "difference")])
-def test_weights_of_other_vertices_are_found(copies, monkeypatch, t, name):
-    """The weight of the base path in the place of that of the copy."""
-    from data_gen.samplers.gbdpt import pairs
-    from data_gen.samplers.vcm import differences
-
-    right = getattr(pairs, name)
-    monkeypatch.setattr(differences, name, lambda C, others, shifted, r, _: right(C, others, shifted, r, others))
-    with pytest.raises(AssertionError):
-        check_pairs(copies, t)
 
 
 # Where nothing but merging finds light, and where all strategies do. Over four pixels no photon is near to both.
@@ -324,21 +297,3 @@ def test_light_that_merging_alone_finds_has_little_noise_in_differences(renderer
     """Of photons that are near to both of two pixels; a sampler that rejects all is unbiased as well. Measured: 1.9."""
     mean, median = gain(passes(load(renderer, seen_through_glass, (32, 32)), 8, 1, "gvcm", radius=3.0))
     assert mean > 1.5 and median > 1.5, (mean, median)
-
-
-def test_maps_of_gvcm_larger_than_memory_are_refused(renderer):
-    from data_gen.render import render_stack
-
-    scene = load(renderer, "diffuse", (128, 128))
-    with pytest.raises(NgptError, match=r"pass --memory \d+, or .* or no more than -O joined_depth=\d+"):
-        render_stack(scene, 1, 0, "gvcm", memory=60, joined_depth=64)
-
-
-def test_scenes_without_lights_are_black_for_gvcm(renderer):
-    from data_gen.render import render_stack
-
-    def dark():
-        return {key: value for key, value in SCENES["points"]().items() if key not in ("point", "spot", "sun")}
-
-    stack = render_stack(load(renderer, dark, (8, 8)), 2, 0, "gvcm")
-    assert not any(stack[layer].any() for layer in ("primal", "dx", "dy")) and stack["albedo"].any()

@@ -8,54 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from unbiased import DISTANCES, gradient_tests, load, render_ours, render_references
+from lamps_scenes import GALLERIES, gallery
+from references import references
+from unbiased import DISTANCES, assert_unbiased, load, render_ours
 
 LANES = 1 << 14
-
-
-def gallery(flat=True, sky=True, fog=False, low=False):
-    """Fourteen lamps over a floor, a wall and a mirror; not all ``flat`` ones, beside a ``sky``, in ``fog``.
-
-    Lamps that hang ``low`` light up little of the floor each.
-    """
-    import mitsuba as mi
-
-    from data_gen.scenes.builtin import _camera, _diffuse, _sphere
-
-    place = mi.ScalarTransform4f
-    rng, parts = np.random.default_rng(4), {}
-    for number in range(14):
-        x, z = -1.6 + 0.8 * (number % 5), -1.5 + 1.2 * (number // 5)
-        radiance = {"type": "rgb", "value": (10 ** rng.uniform(0.2, 1.3) * rng.uniform(0.3, 1, 3)).tolist()}
-        if flat or number % 3:
-            at = place().translate([x, 0.3 if low else rng.uniform(1.2, 1.8), z]).rotate([1, 0, 0], 90).scale(0.12)
-            parts[f"lamp_{number}"] = {"type": "rectangle", "to_world": at, "emitter": {"type": "area"}}
-            parts[f"lamp_{number}"]["emitter"]["radiance"] = radiance
-        elif number % 2:
-            ball = _sphere([x, 1.5, z], 0.12, _diffuse(0.5, 0.5, 0.5))
-            parts[f"lamp_{number}"] = ball | {"emitter": {"type": "area", "radiance": radiance}}
-        else:
-            parts[f"lamp_{number}"] = {"type": "point", "position": [x, 1.5, z], "intensity": 0.1}
-    if sky:
-        parts["sky"] = {"type": "constant", "radiance": 0.2}
-    wall = place().translate([0.2, 0.6, 0]).rotate([0, 1, 0], 90).scale([1.5, 0.6, 1])
-    both = {"type": "twosided", "nested": _diffuse(0.6, 0.5, 0.4)}
-    scene = {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 5},
-        "sensor": _camera([0, 1.4, 4.5], [0, 0.6, 0], 50),
-        "floor": {"type": "rectangle", "to_world": place().rotate([1, 0, 0], -90).scale(2.5), "bsdf": both},
-        "wall": {"type": "rectangle", "to_world": wall, "bsdf": both},
-        "mirror": _sphere([-1, 0.4, 0.3], 0.4, {"type": "conductor"}),
-        "shiny": _sphere([1.1, 0.4, 0.5], 0.4, {"type": "roughconductor", "alpha": 0.2}),
-        **parts,
-    }
-    if fog:
-        scene["integrator"] = {"type": "volpath", "max_depth": 5}
-        around = {"type": "homogeneous", "albedo": 0.7, "sigma_t": 0.2}
-        box = place().translate([0, 1, 0]).scale([2.8, 1.3, 2.8])
-        scene["box"] = {"type": "cube", "to_world": box, "bsdf": {"type": "null"}, "interior": around}
-    return scene
 
 
 def any_places(scene, side=4, seed=1):
@@ -219,35 +176,12 @@ def test_the_plugin_takes_it_too(renderer):
     assert plugin.places
 
 
-SCENES = {
-    "flat": lambda: gallery(),
-    "balls and points": lambda: gallery(flat=False, sky=False),
-    "fog": lambda: gallery(fog=True),
-}
-
-
-@pytest.mark.parametrize("name", ["flat", *(pytest.param(name, marks=pytest.mark.slow) for name in list(SCENES)[1:])])
+@pytest.mark.parametrize(
+    "name", ["flat", *(pytest.param(name, marks=pytest.mark.slow) for name in list(GALLERIES)[1:])]
+)
 def test_unbiased(renderer, name, by_any_places):
     """Differences of ``gpt``, and the primal by its base paths alone."""
-    scene = load(renderer, SCENES[name], (32, 32))
-    references = render_references(renderer, scene, spp=128)
+    scene, expected = load(renderer, GALLERIES[name], (32, 32)), references(renderer, GALLERIES[name], (32, 32))
     for pixels in DISTANCES:
-        for layer, result in gradient_tests(render_ours(scene, "gpt", pixels=pixels), references, pixels=pixels):
-            assert result.passed, f"{layer} over {pixels} pixels: {result}"
-    for layer, result in gradient_tests(render_ours(scene, "primal", features=False), references):
-        assert result.passed, f"{layer} of primal: {result}"
-
-
-@pytest.mark.slow
-def test_the_z_test_sees_a_density_of_the_other_end(renderer, by_any_places, monkeypatch):
-    from data_gen.samplers.gpt import offset_path
-
-    def forgetful(*args, replayed=offset_path.replay_lamp, **more):
-        light, r = replayed(*args, **more)
-        return replace(light, p=light.p / r), r
-
-    monkeypatch.setattr(offset_path, "replay_lamp", forgetful)
-    scene = load(renderer, gallery, (32, 32))
-    references = render_references(renderer, scene, spp=128)
-    tests = dict(gradient_tests(render_ours(scene, "gpt", pixels=8), references, pixels=8))
-    assert tests["primal"].passed and not (tests["dx"].passed and tests["dy"].passed)
+        assert_unbiased(render_ours(scene, "gpt", 12, 32, pixels), expected, pixels=pixels)
+    assert_unbiased(render_ours(scene, "primal", 12, 32, features=False), expected)

@@ -2,20 +2,13 @@
 
 import subprocess
 import sys
-import time
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from unbiased import load
+from unbiased import load, same
 
 from ngpt.errors import NgptError
-
-
-def same(a, b):
-    assert a.names == b.names
-    for name in a.names:
-        assert np.array_equal(a[name], b[name], equal_nan=True), name
 
 
 def test_large_images_with_small_blocks(renderer, monkeypatch):
@@ -39,27 +32,13 @@ def test_passes_do_not_move_blocks_within_packets(renderer):
     assert blocks_within(1000, GradientFilm(33, 21), 4) == 1
 
 
-def test_samples_are_independent(renderer):
-    from data_gen.render import render_stack
-
-    scene = load(renderer, "diffuse", (24, 16))
-    stacks = [render_stack(scene, 64, seed, "primal", points="independent") for seed in range(24)]
-    # If samples, pixels or seeds shared their numbers, means would vary more than the variance of samples says.
-    images = np.stack([stack["primal"] for stack in stacks])
-    predicted = np.mean([stack["primal_var"] for stack in stacks], axis=0)
-    assert images.var(axis=0, ddof=1).mean() == pytest.approx(predicted.mean(), rel=0.1)
-    whole = images.mean(axis=(1, 2, 3))
-    assert whole.var(ddof=1) < 3 * predicted.mean() / images[0].size * 3  # colours go together
-
-
 def test_time_is_kept_and_its_samples_are_those_of_spp(renderer):
     from data_gen.render import render_stack
 
     scene = load(renderer, "diffuse", (64, 48))
     render_stack(scene, 1)
-    calls, start = [], time.perf_counter()
+    calls = []
     stack = render_stack(scene, None, 3, progress=lambda *call: calls.append(call), seconds=1.5)
-    assert 0.5 < time.perf_counter() - start < 4  # on a busy machine too
     assert calls[0] == (0, 2) and calls[-1] == (2, 2)
     spp = stack.attributes["ngpt:spp"]
     assert spp > 1
@@ -121,28 +100,6 @@ def test_what_takes_longer_than_the_time_is_rendered_once(renderer, monkeypatch)
     assert render_passes(fake, sensor, 0, None, seconds=10, batch=4).samples == 4
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("sampler", ["gpt", "primal", "bdpt", "ppm"])
-def test_time_is_kept_on_a_busy_machine(renderer, tmp_path, sampler):
-    """Beside two processes that never rest; the second time, since the first may compile kernels for longer."""
-    import ngpt
-
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
-    try:
-        out, words = tmp_path / "s.exr", ["glossy", "--size", "160x90", "--time", "10", "--sampler", sampler, "--force"]
-        for _ in range(2):
-            run = subprocess.run(
-                [sys.executable, "-m", "ngpt", "render", *words, "-o", out], capture_output=True, text=True
-            )
-            assert run.returncode == 0, run.stderr
-    finally:
-        for process in busy:
-            process.kill()
-            process.wait()
-    stack = ngpt.read(out)
-    assert 8 <= stack.attributes["ngpt:seconds"] <= 12 or "it took longer than 10 s: kernels and a least" in run.stdout
-
-
 def test_stopping_keeps_the_samples_done(renderer):
     from data_gen.render import render_stack
 
@@ -175,6 +132,9 @@ def test_sizes_that_memory_cannot_hold(renderer, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"spp": 0}, "0 samples"),
+        ({"spp": 1, "seed": -1}, "seed -1"),
+        ({"spp": 1, "sampler": "x"}, "auto, gpt, gpt-basic"),
         ({"spp": 2**31}, "from 1 to"),
         ({"spp": None}, "neither a number of samples"),
         ({"spp": None, "seconds": 0}, "cannot render for 0 s"),

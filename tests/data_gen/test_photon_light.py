@@ -1,9 +1,12 @@
 """What light photons bring: the power that lamps send, to where it is gathered, all of it as the radius goes to 0."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from lamps_scenes import lamps, lit_by
-from unbiased import differences, load, render_ours, render_references
+from references import references
+from unbiased import differences, load, render_ours
 
 KINDS = "picture", "glow", "point", "spot", "sun", "sky"
 
@@ -217,18 +220,18 @@ def test_bias_goes_to_zero_with_the_radius(renderer, sampler):
     """Of images under lamps of all kinds, and of their differences: what Mitsuba's integrators do not have goes."""
     photons, fog = SAMPLERS[sampler]
     scene = load(renderer, lambda: lit_by(fog=fog), (48, 32))
-    references = render_references(renderer, scene, batches=16, spp=256)
+    expected = references(renderer, partial(lit_by, fog=fog), (48, 32))
     options = {"spp": 16} if photons is None else {"spp": 1, "photons": photons}
     wide, narrow = (render_ours(scene, sampler, batches=16, radius=r, **options) for r in (4.0, 1.0))
     for layer in ("primal", "dx", "dy"):
         if layer in wide[0]:
-            assert_goes_to_zero(off(wide, references, layer), off(narrow, references, layer))
+            assert_goes_to_zero(off(wide, expected, layer), off(narrow, expected, layer))
 
 
 def test_photons_of_all_lamps_bring_the_light_of_paths(renderer):
     """With a small radius, where all are lit together: what is lost or counted twice of any lamp stands out."""
     scene = load(renderer, lit_by, (48, 32))
-    references = render_references(renderer, scene, batches=8, spp=128)
-    energy, error, blocks, noise = off(render_ours(scene, "ppm", 12, spp=1, radius=1.0, photons=64), references)
+    expected = references(renderer, partial(lit_by, fog=False), (48, 32))
+    energy, error, blocks, noise = off(render_ours(scene, "ppm", 12, spp=1, radius=1.0, photons=64), expected)
     assert abs(energy) < 0.005 + 4 * error and error < 0.006, (energy, error)
     assert blocks < 0.03 + noise, (blocks, noise)

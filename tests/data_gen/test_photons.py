@@ -1,14 +1,12 @@
-"""What is particular to photons: the grid, maps and their vertices, radii, and ``ppm``, which is biased and converges.
-
-That ``ppm`` repeats its bits, says how noisy it is and stays within its memory is among the laws of all samplers.
-"""
+"""What is particular to photons: the grid, maps, radii, and ``ppm``, which is biased and converges."""
 
 import numpy as np
 import pytest
 from bdpt_scenes import SCENES
+from photon_laws import assert_alike, maps_of
 from unbiased import light_of_gradients, load, render_ours
 
-from ngpt.errors import Interrupted, NgptError
+from ngpt.errors import Interrupted
 
 
 @pytest.mark.parametrize("radius", [0.3, 0.05, 0.004])
@@ -45,21 +43,6 @@ def test_an_empty_grid(renderer):
     grid = Grid(mi.Point3f(np.zeros((3, 4))), mi.Bool([False] * 4), 0.1)
     found = grid.gather(mi.Point3f(0), mi.Float(0.01), mi.Bool(True), lambda i, near: mi.Float(near), mi.Float(0))
     assert not np.array(found).any()
-
-
-def maps_of(mi, scene, paths=4096, max_depth=6):
-    """The maps of so many light paths, and the light's end of them."""
-    import drjit as dr
-
-    from data_gen.paths.light_ends import LightEnds
-    from data_gen.paths.streams import sample_streams
-    from data_gen.paths.vertex import Materials
-    from data_gen.paths.world import World
-    from data_gen.samplers.photons.map.trace import trace
-
-    random = sample_streams(0, dr.arange(mi.UInt32, paths), mi.UInt32(0))
-    start, maps = trace(World(scene, LightEnds(scene), Materials(scene, 0.05)), random, max_depth, 4)
-    return start, list(maps)
 
 
 def entries(photons, *names):
@@ -174,19 +157,6 @@ def test_radii_shrink_as_told():
     assert shrunk(10**8) ** 2 == pytest.approx(shrunk(10**5) ** 2 * 1e3 ** (ALPHA - 1), rel=1e-3)
 
 
-def assert_alike(images, references, block):
-    """Means of blocks differ by no more than 4 standard errors and 3 % of the image, which may be bias."""
-
-    def blocks(stack):
-        n, height, width, _ = stack.shape
-        x = stack.reshape(n, height // block, block, width // block, block, 3).mean(axis=(2, 4))
-        return x.mean(axis=0), x.var(axis=0, ddof=1) / n
-
-    (ours, ours_var), (theirs, theirs_var) = blocks(images), blocks(references)
-    off = np.abs(ours - theirs) - 4 * np.sqrt(ours_var + theirs_var)
-    assert off.max() < 0.03 * theirs.mean(), (off.max(), theirs.mean())
-
-
 @pytest.mark.parametrize("name", ["areas", "sky", "glass", pytest.param("points", marks=pytest.mark.slow)])
 def test_small_radii_have_the_image_of_paths(renderer, name):
     """All lights and chains; within what a radius of a third of a pixel blurs. Of points, that of ``bdpt``."""
@@ -213,15 +183,6 @@ def test_it_converges(renderer):
     counts = 2, 8, 32
     slope, _ = np.polyfit(np.log(counts), np.log([error(n) for n in counts]), 1)
     assert slope < -0.6
-
-
-def test_a_wide_radius_is_biased(renderer):
-    """Light of a pixel's neighbourhood is gathered: what the laws of other samplers call a failure."""
-    scene = load(renderer, "diffuse", (24, 24))
-    references = np.stack([light_of_gradients(s) for s in render_ours(scene, "primal", batches=12, spp=64)])
-    ours = render_ours(scene, "ppm", batches=12, spp=1, radius=4.0, photons=16)
-    with pytest.raises(AssertionError):
-        assert_alike(np.stack([light_of_gradients(s) for s in ours]), references, 6)
 
 
 @pytest.mark.parametrize("max_depth", [1, 2, 4])
@@ -253,41 +214,3 @@ def test_light_that_only_photons_find(renderer):
     scene = load(renderer, ball_on_the_floor, (16, 16))
     ours, theirs = (render_ours(scene, name, 1, 8)[0]["primal"] for name in ("ppm", "primal"))
     assert ours.mean() > 1.2 * theirs.mean()
-
-
-def test_maps_larger_than_memory_are_refused_with_what_fits(renderer):
-    from data_gen.render import render_stack
-
-    scene = load(renderer, "diffuse", (128, 128))
-    with pytest.raises(NgptError, match=r"pass --memory \d+, or .* or no more than -O photons=(\d+)") as caught:
-        render_stack(scene, 1, 0, "ppm", memory=400, photons=64)
-    words = str(caught.value)
-    fits, needed = int(words.rsplit("=", 1)[1]), int(words.split("--memory ")[1].split(",")[0])
-    assert 1 < fits < 64 and needed > 400
-    render_stack(scene, 1, 0, "ppm", memory=400, photons=fits)
-    with pytest.raises(NgptError, match=r"render a smaller image$"):
-        render_stack(scene, 1, 0, "ppm", memory=20)
-
-
-def test_variants_that_photons_refuse(renderer):
-    from data_gen.backend import use_variant
-    from data_gen.render import render_stack
-
-    try:
-        use_variant("llvm_ad_spectral")
-        with pytest.raises(NgptError, match=r"does not follow spectra, .*; use variant 'llvm_ad_rgb'"):
-            render_stack(load(renderer, "diffuse", (8, 8)), 1, 0, "ppm")
-        use_variant("llvm_ad_mono")
-        assert render_stack(load(renderer, "diffuse", (8, 8)), 2, 0, "ppm")["primal"].mean() > 0.01
-    finally:
-        use_variant()
-
-
-def test_a_scene_without_lamps_is_black_for_photons(renderer):
-    from data_gen.render import render_stack
-
-    def dark():
-        return {key: value for key, value in SCENES["points"]().items() if key not in ("point", "spot", "sun")}
-
-    stack = render_stack(load(renderer, dark, (8, 8)), 4, 0, "ppm")
-    assert not stack["primal"].any() and stack["albedo"].any()

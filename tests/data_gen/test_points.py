@@ -142,9 +142,9 @@ def test_first_rounds(streams):
 def test_points_take_noise_away_and_no_light(renderer, sampler):
     from data_gen.render import render_stack
 
-    scene, found = load(renderer, "diffuse", (32, 24)), {}
+    scene, found = load(renderer, "diffuse", (24, 16)), {}
     for points in ("sobol", "independent"):
-        stacks = [render_stack(scene, 16, seed, sampler, points=points) for seed in range(24)]
+        stacks = [render_stack(scene, 16, seed, sampler, points=points) for seed in range(16)]
         found[points] = {layer: np.array([stack[layer] for stack in stacks], np.float64) for layer in stacks[0].names}
     better, before = found["sobol"], found["independent"]
 
@@ -159,8 +159,8 @@ def test_points_take_noise_away_and_no_light(renderer, sampler):
             assert variances[0] < most * variances[1]
             blocks = [np.median(block_means(images[layer]).var(axis=0, ddof=1)) for images in (better, before)]
             assert blocks[0] < of_blocks * blocks[1]
-            means = [block_means(images[layer]).reshape(24, -1) for images in (better, before)]
-            error = np.sqrt(sum(part.var(axis=0, ddof=1) for part in means) / 24)
+            means = [block_means(images[layer]).reshape(16, -1) for images in (better, before)]
+            error = np.sqrt(sum(part.var(axis=0, ddof=1) for part in means) / 16)
             z = (means[0] - means[1]).mean(axis=0) / np.maximum(error, 1e-12)
             assert np.abs(z).max() < 5
 
@@ -240,8 +240,9 @@ def test_claims_follow_what_is_seen_between_rounds(renderer, rng, size):
     assert left / 64 * 0.8 < claimed < (left + prior) / 64 * 1.3
 
 
-@pytest.mark.parametrize(("sampler", "scene"), [("primal", "glossy"), ("gpt", "diffuse"), ("gpt", "glossy")])
-@pytest.mark.parametrize("spp", [17, 48])
+@pytest.mark.parametrize(
+    ("sampler", "scene", "spp"), [("primal", "glossy", 17), ("gpt", "diffuse", 48), ("gpt", "glossy", 17)]
+)
 def test_claims_are_those_over_seeds(renderer, sampler, scene, spp):
     from data_gen.render import render_stack
 
@@ -317,7 +318,7 @@ def check_claims(images, variances, where):
     assert 0.8 < real / np.mean(variances, axis=0, dtype=np.float64).sum() < 1.25, where
 
 
-@pytest.mark.parametrize("n", [7, 8, 9, 16, 17, 18, 24, 31, 33, 48, 63, 64, 65, 66, 100, 129])
+@pytest.mark.parametrize("n", [7, 8, 16, 17, 31, 48, 65, 129])
 @pytest.mark.parametrize("kind", ["sobol", "rounds", "cut"])
 def test_claims_hold_at_any_number_of_samples(renderer, kind, n):
     from data_gen.film import GradientFilm
@@ -507,7 +508,10 @@ def light_of_box(renderer):
     return np.array([np.array(renderer.render(scene, spp=256, seed=100 + seed)).mean() for seed in range(8)])
 
 
-@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize(
+    "sampler",
+    [n if e.standing != "study" else pytest.param(n, marks=pytest.mark.slow) for n, e in SAMPLERS.items()],
+)
 def test_light_of_a_lamp_that_is_chosen_never_is_found_or_refused(renderer, light_of_box, sampler):
     from data_gen.render import render_stack
     from data_gen.scenes.facts import scene_facts
@@ -521,7 +525,8 @@ def test_light_of_a_lamp_that_is_chosen_never_is_found_or_refused(renderer, ligh
         ):
             render_stack(scene, 1, 0, sampler)
         return
-    means = np.array([render_stack(scene, 32, seed, sampler)["primal"].mean() for seed in range(8)])
+    spp = 4 if SAMPLERS[sampler].batch == 1 else 32
+    means = np.array([render_stack(scene, spp, seed, sampler)["primal"].mean() for seed in range(8)])
     z = (means.mean() - light_of_box.mean()) / np.sqrt((means.var(ddof=1) + light_of_box.var(ddof=1)) / 8)
     assert abs(z) < 5  # about p = 0.001 of so few images
     assert abs(means.mean() / light_of_box.mean() - 1) < 0.1

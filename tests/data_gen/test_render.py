@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from unbiased import load
 
 import ngpt
 from ngpt.cli import main
@@ -127,18 +126,6 @@ def test_paths_alone_are_those_with_features(scene_file):
         render_stack(scene, 4, 0, "gpt", with_features=False)
 
 
-def test_the_primal_sampler_agrees_with_mitsuba(renderer):
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
-    from ngpt.testing import z_test
-
-    scene = load_scene("environment", (24, 24))
-    ours = np.stack([render_stack(scene, 64, seed, "primal")["primal"] for seed in range(12)])
-    theirs = np.stack([np.array(renderer.render(scene, spp=64, seed=100 + i)) for i in range(12)])
-    result = z_test(ours, theirs)
-    assert result.passed, result
-
-
 def test_attributes_tell_how_it_was_made(renderer):
     from data_gen.render import render_stack
     from data_gen.scenes.load import load_scene
@@ -206,30 +193,6 @@ def test_scene_files_that_cannot_be_loaded(scene_file, options, message):
     assert "\n" not in str(error.value)
 
 
-def test_integrators_without_camera_paths(scene_file):
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
-
-    with pytest.raises(NgptError, match=r"does not trace paths from the camera.*'path' or 'volpath'"):
-        render_stack(load_scene(scene_file(integrator="ptracer")), 1)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"spp": 0}, "0 samples"),
-        ({"spp": 1, "seed": -1}, "seed -1"),
-        ({"spp": 1, "sampler": "x"}, "auto, gpt, gpt-basic"),
-    ],
-)
-def test_bad_options(renderer, options, message):
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
-
-    with pytest.raises(NgptError, match=message):
-        render_stack(load_scene("diffuse", (4, 4)), **options)
-
-
 def test_variants_that_do_not_exist(renderer):
     from data_gen.backend import use_variant
 
@@ -254,24 +217,6 @@ def test_inspection_names_what_matters(scene_file):
         inspect_scene(scene_file(text="<scene"))
 
 
-def test_media_are_refused_by_name(renderer):
-    from data_gen_scenes import within_fog
-
-    from data_gen.render import render_stack
-    from data_gen.samplers import choose
-    from data_gen.scenes.facts import scene_facts
-    from data_gen.scenes.load import set_film_size
-
-    description = within_fog()
-    description["integrator"]["type"] = "path"
-    scene = load(renderer, description)
-    set_film_size(scene, (6, 4))
-    assert scene_facts(scene).media == ("air",) and choose(scene_facts(scene))[0] == "gpt-basic"
-    with pytest.raises(NgptError, match=r"media \(air\).*gpt-basic, or primal"):
-        render_stack(scene, 1, sampler="gpt")
-    assert render_stack(scene, 1, sampler="primal").attributes["ngpt:sampler"] == "primal"
-
-
 def test_inspection_of_media_lens_maps_and_shutter(scene_file):
     from data_gen.inspect import inspect_scene
 
@@ -290,13 +235,3 @@ def test_inspection_of_media_lens_maps_and_shutter(scene_file):
     assert "both ends" not in through_glass  # which see no media
     report = inspect_scene("lens")
     assert report["lens"] and "depth of field" in "\n".join(report["plan"])
-
-
-@pytest.mark.parametrize("size", [(1, 1), (3, 2), (1, 7), (5, 1), (2, 2)])
-def test_tiny_images(renderer, size):
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
-
-    stack = render_stack(load_scene("diffuse", size), 2)
-    assert stack["dx"].shape == (size[1], size[0], 3)
-    assert not stack["dx"][:, -1].any() and not stack["dy"][-1].any()

@@ -4,13 +4,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+from restir_shots import CHAINS, FRAMES, SIZE, layers_of, noise_left, rendered_by_gpt
 from unbiased import load
 
 from data_gen.samplers.restir.footprint import pair_motions
 from data_gen.samplers.restir.reservoir import confidence_after
 from ngpt.testing import z_test
 
-SIZE, CHAINS, FRAMES = 24, 48, 3
 STEPS = ((0, 0), (1, 0), (0, 1))
 
 
@@ -58,12 +58,7 @@ class Room:
             now = type(now)(() if before is None else before.shapes, now.film, now.place)
             motion = None if before is None else motion_vectors(self.scene, now, before)
             values, before = history.next_frame(motion), now
-            yield history, {n: images(getattr(values, n), chains) for n in ("path", "primal", "dx", "dy")}
-
-
-def images(values, chains):
-    """(chains, H, W, 3) of a value of each lane."""
-    return np.moveaxis(np.array(values, np.float64).T.reshape(SIZE, SIZE, chains, 3), 2, 0)
+            yield history, layers_of(values, chains)
 
 
 @pytest.fixture(scope="module")
@@ -74,15 +69,11 @@ def rooms(renderer):
 @pytest.fixture(scope="module")
 def references(rooms):
     """(scene, frame) -> layers of independent renders of gpt, (renders, H, W, 3)."""
-    from data_gen.render import render_stack
 
     @cache
     def rendered(name, frame):
         rooms[name].at(frame)
-        stacks = [render_stack(rooms[name].scene, 48, seed, "gpt", caustic=False).layers for seed in range(900, 908)]
-        layers = {n: np.stack([stack[n] for stack in stacks]) for n in ("primal", "direct", "dx", "dy")}
-        layers["primal"] = layers["path"] = layers["primal"] - layers.pop("direct")
-        return layers
+        return rendered_by_gpt(rooms[name].scene)
 
     return rendered
 
@@ -106,10 +97,7 @@ def test_the_third_frame_of_a_moving_camera_is_unbiased(shots, references, scene
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("name", ["primal", "dx", "dy"])
 def test_history_is_worth_it(shots, scene, name):
-    """The variance of the third frame beside that of the first, each beside that of its candidates."""
-    variances = [np.sort(frame[name].var(axis=0).mean(axis=-1).ravel())[:-10].mean() for frame in shots(scene)]
-    paths = [np.sort(frame["path"].var(axis=0).mean(axis=-1).ravel())[:-10].mean() for frame in shots(scene)]
-    assert variances[-1] / paths[-1] < 0.75 * variances[0] / paths[0]
+    assert noise_left(shots(scene), name) < 0.75
 
 
 def test_differences_end_at_the_film(shots):
@@ -285,64 +273,3 @@ def far_references(references):
 def test_differences_of_far_pixels_are_unbiased(rooms, references, monkeypatch):
     result = z_test(far_differences(rooms["diffuse"], monkeypatch), far_references(references))
     assert result.passed, result
-
-
-def without_jacobian(monkeypatch):
-    from data_gen.samplers.restir import history as module
-
-    right = module.evaluate_record
-
-    def wrong(*args):
-        shifted = right(*args)
-        shifted.J = type(shifted.J)(1)
-        return shifted
-
-    monkeypatch.setattr(module, "evaluate_record", wrong)
-
-
-def with_half_weights(monkeypatch):
-    from data_gen.samplers.restir import merging as module
-
-    monkeypatch.setattr(module, "difference", lambda first, second, side: (second - first) / 2)
-
-
-def with_wrong_side(monkeypatch):
-    from data_gen.samplers.restir import merging as module
-
-    right = module.difference
-    monkeypatch.setattr(module, "difference", lambda first, second, side: right(first, second, 1 - side))
-
-
-@pytest.mark.parametrize("mutant", [without_jacobian, with_half_weights, with_wrong_side])
-def test_a_wrong_rule_is_seen_by_that(rooms, references, monkeypatch, mutant):
-    mutant(monkeypatch)
-    assert not z_test(far_differences(rooms["diffuse"], monkeypatch), far_references(references)).passed
-
-
-def with_constant_weights(monkeypatch):
-    from data_gen.samplers.restir import reservoir as module
-
-    monkeypatch.setattr(module, "share", lambda own, others: own * 0 + 0.5)
-
-
-def without_the_other_pixel(monkeypatch):
-    """What wraps is taken for one of a kind."""
-    from data_gen.samplers.restir.layout import Layout
-
-    right = Layout.corner
-
-    def wrong(self, lane, kept):
-        it = right(self, lane, kept)
-        it.twice = it.twice & False
-        return it
-
-    monkeypatch.setattr(Layout, "corner", wrong)
-
-
-@pytest.mark.parametrize(
-    "mutant", [pytest.param(with_constant_weights, marks=pytest.mark.slow), without_the_other_pixel]
-)
-def test_a_wrong_weight_over_time_is_seen(rooms, references, monkeypatch, mutant):
-    mutant(monkeypatch)
-    *_, (_, last) = rooms["diffuse"].frames()
-    assert not z_test(last["primal"], references("diffuse", FRAMES - 1)["primal"]).passed

@@ -141,11 +141,8 @@ def test_there_and_back_is_where_it_was(paths, move):
     back, inverse, _ = paths.at(moved, [-m for m in move])
     assert close(back[:, exists], paths.f[:, exists]) > 0.999
     assert np.mean(np.abs(J[exists] * inverse[exists] - 1) < 1e-3) > 0.999
-    # A record that is moved without its geometry is seen by this, though hardly by a test of means.
-    joined = exists & (J != 1)
-    if joined.sum() > 100:
-        _, wrong, _ = paths.at(replace(moved, geometry=record.geometry), [-m for m in move])
-        assert np.mean(np.abs(J[joined] * wrong[joined] - 1) < 1e-3) < 0.9
+    # Where paths reconnect there is a Jacobian.
+    assert (np.abs(J[exists] - 1) > 1e-3).sum() > 100
 
 
 @pytest.mark.parametrize("move", [(1, 0), (5, 3)])

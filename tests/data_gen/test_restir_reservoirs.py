@@ -59,21 +59,6 @@ def test_what_is_kept_of_all_that_is_offered_is_unbiased(renderer, M, both):
     assert np.sum(probability * estimate) == pytest.approx(LIGHT[0].sum(), rel=3e-3)
 
 
-@pytest.mark.parametrize("wrong", ["share", "others", "value"])
-def test_a_wrong_weight_is_seen_by_that(renderer, monkeypatch, wrong):
-    from data_gen.samplers.restir import reservoir as module
-
-    if wrong == "share":
-        monkeypatch.setattr(module, "share", lambda own, others: renderer.Float(0.5))
-    elif wrong == "others":
-        right = module.share
-        monkeypatch.setattr(module, "share", lambda own, others: right(own, 0.5 * others))
-    else:
-        monkeypatch.setattr(module, "weight_of", lambda total, value: total)
-    estimate, _, _, probability = all_outcomes(renderer, (1, 7))
-    assert abs(np.sum(probability * estimate) / LIGHT[0].sum() - 1) > 0.02
-
-
 def test_a_path_is_kept_in_proportion_to_its_weight(renderer, rng):
     from data_gen.samplers.restir.reservoir import choose
 

@@ -5,99 +5,25 @@ The budget of z-tests is fixed: 16 stacks against 16 references, a level of 1 % 
 
 import numpy as np
 import pytest
-from data_gen_scenes import fog, hidden_lamp
-from unbiased import load, render_ours, render_references
+from references import references
+from split_scenes import coats, everything, principled, shelf, without_gloss
+from unbiased import assert_unbiased, load, render_ours
 
 import ngpt
 from ngpt.cli import main
-from ngpt.errors import NgptError
 from ngpt.layers import LAYERS
 from ngpt.testing import z_test
 
 PARTS = ("diffuse", "specular")
 
 
-def coats(specular=1.0):
-    """Materials with diffuse lobes and others; with ``specular`` 0 the others are black, the diffuse ones the same."""
-    from data_gen.scenes.builtin import _diffuse, _rgb
-
-    satin = {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": _rgb(0.6, 0.3, 0.1), "nonlinear": True}
-    satin |= {"specular_reflectance": specular}
-    gloss = {"type": "plastic", "diffuse_reflectance": _rgb(0.2, 0.5, 0.3), "specular_reflectance": specular}
-    metal = {"type": "roughconductor", "material": "Cu", "alpha": 0.3} if specular else _diffuse(0, 0, 0)
-    return {
-        "satin": satin,
-        "gloss": {"type": "twosided", "nested": gloss},
-        "hole": {"type": "mask", "opacity": 0.6, "nested": satin},
-        "blend": {"type": "blendbsdf", "weight": 0.4, "one": _diffuse(0.5, 0.4, 0.6), "two": metal},
-    }
-
-
-def shelf(materials, max_depth=5, more=None):
-    """Balls of these materials on a floor under a large lamp."""
-    from data_gen.scenes.builtin import _camera, _diffuse, _light, _sphere, _wall
-
-    def scene():
-        places = zip((-1.05, -0.35, 0.35, 1.05), materials.items(), strict=False)
-        return {
-            "type": "scene",
-            "integrator": {"type": "path", "max_depth": max_depth, "rr_depth": 3},
-            "sensor": _camera([0, 0.9, 3.2], [0, 0.35, 0], 45),
-            "floor": _wall([0, 0, 0], [0, 1, 0], (6, 6), _diffuse(0.5, 0.5, 0.5)),
-            "lamp": _light([0, 2.2, 0.8], [0, -1, 0], (2, 2), (3, 3, 3)),
-            **{name: _sphere([x, 0.33, 0], 0.33, bsdf) for x, (name, bsdf) in places},
-            **(more or {}),
-        }
-
-    return scene
-
-
-def principled(**values):
-    base = {"type": "rgb", "value": [0.7, 0.4, 0.2]}
-    return {"type": "twosided", "nested": {"type": "principled", "base_color": base, "roughness": 0.4, **values}}
-
-
-def everything():
-    """All that light may meet first: coats, mirrors, glass, metal, principled materials, bumps."""
-    import mitsuba as mi
-
-    from data_gen.scenes.builtin import _sphere
-
-    relief = mi.Bitmap(np.random.default_rng(3).random((8, 8), np.float32))
-    bump = {"type": "bitmap", "raw": True, "bitmap": relief}
-    first = {**coats(), "paint": principled(metallic=0.2, clearcoat=0.5)}
-    behind = {
-        "mirror": {"type": "conductor"},
-        "glass": {"type": "dielectric"},
-        "frosted": {"type": "roughdielectric", "alpha": 0.2},
-        "relief": {"type": "bumpmap", "texture": bump, "scale": 0.05, "nested": principled(metallic=0.5)["nested"]},
-    }
-    places = zip((-1, -0.3, 0.4, 1.1), behind.items(), strict=True)
-    more = {name: _sphere([x, 1.0, -0.4], 0.33, bsdf) for x, (name, bsdf) in places}
-    more["paint"] = _sphere([0, 0.2, 1.2], 0.2, first.pop("paint"))
-    # Without it ``path`` loses light behind holes.
-    more["sky"] = {"type": "constant", "radiance": 0.2}
-    return shelf(first, more=more)()
-
-
 def test_all_of_it_is_the_light_of_path(renderer):
-    scene = load(renderer, everything, (32, 32))
-    stacks = render_ours(scene, "split", spp=32)
-    references = render_references(renderer, scene, batches=16, spp=64)
+    stacks = render_ours(load(renderer, everything, (32, 32)), "split", batches=12, spp=32)
     for stack in stacks:
         parts = stack["direct"] + stack["diffuse"] + stack["specular"]
         np.testing.assert_allclose(stack["primal"], parts, rtol=1e-5, atol=1e-6)
         assert min(stack[name].min() for name in PARTS) >= 0
-    result = z_test(np.stack([stack["primal"] for stack in stacks]), references)
-    assert references.mean() > 0.1 and result.passed, result
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scene", ["glossy", "environment", "lens", everything])
-def test_all_of_it_is_the_light_of_path_with_a_large_budget(renderer, scene):
-    scene = load(renderer, scene, (48, 48))
-    ours = np.stack([stack["primal"] for stack in render_ours(scene, "split", spp=512)])
-    assert z_test(ours, render_references(renderer, scene, batches=16, spp=512)).passed
+    assert_unbiased(stacks, references(renderer, everything, (32, 32)))
 
 
 def test_what_is_diffuse_has_no_specular_light(renderer):
@@ -126,12 +52,11 @@ def test_what_is_not_has_no_diffuse_light(renderer):
 def test_diffuse_light_is_that_of_the_same_materials_without_gloss(renderer):
     """Of light that lamps send to what the camera sees; Mitsuba renders the materials whose gloss is black."""
     stacks = render_ours(load(renderer, shelf(coats(), 2), (32, 32)), "split", spp=32)
-    black = load(renderer, shelf(coats(0.0), 2, {"sky": {"type": "constant", "radiance": 1e-9}}), (32, 32))
-    references = render_references(renderer, black, batches=16, spp=128)
-    result = z_test(np.stack([stack["diffuse"] for stack in stacks]), references)
+    expected = references(renderer, without_gloss, (32, 32))
+    result = z_test(np.stack([stack["diffuse"] for stack in stacks]), expected)
     assert result.passed, result
     # With the gloss it is another image.
-    assert not z_test(np.stack([stack["diffuse"] + stack["specular"] for stack in stacks]), references).passed
+    assert not z_test(np.stack([stack["diffuse"] + stack["specular"] for stack in stacks]), expected).passed
 
 
 def by_lobe(mi, scene, seed, spp):
@@ -226,24 +151,6 @@ def test_the_diffuse_part_of_principled_materials_is_lamberts(renderer, metallic
         lambert = (1 - metallic) * (1 - spec_trans) * np.array([[0.7], [0.4], [0.2]]) * np.abs(out) / np.pi
         expected = np.where(out * into > 0, np.minimum(lambert, f), 0)
         np.testing.assert_allclose(share * f, expected, rtol=1e-3, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("scene", "reason"), [(fog, "'split' knows only 'path'"), (hidden_lamp, "hides emitters; use --sampler primal")]
-)
-def test_refuses_what_it_cannot_render(renderer, scene, reason):
-    from data_gen.render import render_stack
-
-    with pytest.raises(NgptError, match=reason):
-        render_stack(load(renderer, scene, (8, 8)), 1, sampler="split")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("max_depth", [0, 1])
-def test_depth_limits(renderer, max_depth):
-    (stack,) = render_ours(load(renderer, shelf(coats(), max_depth), (16, 16)), "split", batches=1, spp=2)
-    assert not stack["diffuse"].any() and not stack["specular"].any()
-    assert np.array_equal(stack["primal"], stack["direct"])
 
 
 @pytest.fixture

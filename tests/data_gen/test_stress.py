@@ -6,13 +6,13 @@ What a sampler leaves to others it refuses by name.
 """
 
 import time
-from functools import cache
 
 import numpy as np
 import pytest
+from references import references
 from reliability import record
-from stress_scenes import SCENES, facets
-from unbiased import DISTANCES, gradient_tests, light_of_gradients, load, render_ours, render_references
+from stress_scenes import SCENES
+from unbiased import DISTANCES, gradient_tests, light_of_gradients, load, render_ours
 
 from data_gen.samplers import SAMPLERS
 from ngpt.errors import NgptError
@@ -29,11 +29,6 @@ FLOOR = 1.2
 FAILURES = 0.4
 
 
-@cache
-def references(mi, scene):
-    return render_references(mi, load(mi, scene, SIZE), 2 * SEEDS, 256)
-
-
 def samples(name):
     """Few where a pass has few: those take long to start."""
     return 16 if SAMPLERS[name].batch else 128
@@ -41,7 +36,7 @@ def samples(name):
 
 def judged(mi, scene, name):
     """What is wrong in that scene, "" if nothing; the largest z and where; and the worth of the gradients, or None."""
-    theirs, failures, largest, worth = references(mi, scene), [], (0.0, ""), None
+    theirs, failures, largest, worth = references(mi, scene, SIZE), [], (0.0, ""), None
     for pixels in DISTANCES[: 1 + SAMPLERS[name].gradients]:
         stacks = render_ours(load(mi, scene, SIZE), name, SEEDS, samples(name), pixels)
         for layer, result in gradient_tests(stacks, theirs, level=LEVEL, pixels=pixels):
@@ -72,14 +67,6 @@ def failed_shifts(mi, scene, name):
 
     stack = render_stack(load(mi, scene, SIZE), 16, 0, name, diagnostics=True)
     return float(pass_through(stack)["diagnostics.shiftFailures"].mean())
-
-
-@pytest.mark.slow
-def test_a_sampler_that_never_joins_falls_through_the_floor(renderer, monkeypatch):
-    from data_gen.paths import shift
-
-    monkeypatch.setattr(shift, "reconnects", lambda kind, *_: kind != kind)
-    assert "gradients gain 1.1" in judged(renderer, facets, "gpt")[0]
 
 
 @pytest.mark.slow

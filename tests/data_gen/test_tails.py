@@ -149,24 +149,6 @@ def test_a_full_cache_says_so_and_goes_on(renderer, caplog, monkeypatch):
     assert "the cache of tails is full" in line and "--unbiased" in line
 
 
-@pytest.mark.parametrize("sampler", ["primal", "gpt"])
-@pytest.mark.parametrize("scene", ["diffuse", "glossy"])
-def test_no_bit_depends_on_passes(renderer, monkeypatch, scene, sampler):
-    from data_gen import passes
-    from data_gen.render import render_stack
-
-    scene = load(renderer, scene, (24, 16))
-    whole = render_stack(scene, 40, 3, sampler, tails="shared")
-    assert whole.attributes["ngpt:samplerOptions"] == "tails=shared"
-    monkeypatch.setattr(passes, "FIRST_LANES", 1)
-    monkeypatch.setattr(passes, "PASS_SECONDS", 1e-9)
-    calls = []
-    parts = render_stack(scene, 40, 3, sampler, lambda *call: calls.append(call), tails="shared")
-    assert [n for n, _ in calls] == [0, 8, 16, 32, 40]
-    assert all(np.array_equal(whole[layer], parts[layer], equal_nan=True) for layer in whole.names)
-    assert not np.array_equal(whole["primal"], render_stack(scene, 40, 4, sampler, tails="shared")["primal"])
-
-
 @pytest.mark.parametrize("scene", ["diffuse", "glossy", bulb, mirrors])
 def test_differences_are_those_of_the_image(renderer, scene):
     """In the mean over blocks, within four standard errors and a little for places where but one of two paths ends."""
@@ -201,18 +183,6 @@ def test_no_light_is_lost_or_counted_twice(renderer, sampler, scene):
     assert mean["shared"] == pytest.approx(mean["paths"], rel=0.02)
     assert late["shared"] == pytest.approx(late["paths"], rel=0.02)
     assert (late["paths"] > 0) == (sampler == "gpt")
-
-
-def test_fewer_rays_find_more(renderer):
-    """Variance of the image at equal samples, in a room without mirrors."""
-    from data_gen.render import render_stack
-
-    scene = load(renderer, "diffuse", (48, 32))
-    noise = {}
-    for tails in ("paths", "shared"):
-        images = np.array([render_stack(scene, 16, seed, "primal", tails=tails)["primal"] for seed in range(4)])
-        noise[tails] = np.median(images.var(axis=0, ddof=1).mean(axis=-1))
-    assert noise["shared"] < 0.8 * noise["paths"]
 
 
 def test_where_nothing_is_matt_paths_go_on(renderer):
@@ -296,3 +266,15 @@ def test_samples_that_are_shared_out(renderer, caplog):
         for memory in (6144, 64)
     )
     assert all(np.array_equal(one[layer], other[layer], equal_nan=True) for layer in one.names) and not caplog.messages
+
+
+def test_fewer_rays_find_more(renderer):
+    """Variance of the image at equal samples, in a room without mirrors."""
+    from data_gen.render import render_stack
+
+    scene = load(renderer, "diffuse", (48, 32))
+    noise = {}
+    for tails in ("paths", "shared"):
+        images = np.array([render_stack(scene, 16, seed, "primal", tails=tails)["primal"] for seed in range(4)])
+        noise[tails] = np.median(images.var(axis=0, ddof=1).mean(axis=-1))
+    assert noise["shared"] < 0.8 * noise["paths"]

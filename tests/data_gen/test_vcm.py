@@ -1,15 +1,10 @@
-"""What is particular to ``vcm``: weights with merging, the map of light paths, its image, refusals.
-
-That it repeats its bits, says how noisy it is and stays within its memory is among the laws of all samplers.
-"""
+"""What is particular to ``vcm``: weights with merging, the map of light paths, its image."""
 
 import numpy as np
 import pytest
 from bdpt_ends import Ends, check_weights, compare, plan_of, without_hole
-from bdpt_scenes import SCENES
+from bdpt_scenes import SCENES, seen_through_glass
 from unbiased import REFERENCES, light_of_gradients, load
-
-from ngpt.errors import NgptError
 
 ETA = 0.05
 
@@ -125,18 +120,6 @@ def test_small_radii_have_the_image_of_bdpt(renderer, name):
     assert_same_image(images(scene, "vcm", 64, radius=0.5), images(scene, "bdpt", 8, 32))
 
 
-def seen_through_glass():
-    """A floor under a pane of thick glass, lit through it by a point: no connection finds that light."""
-    floor = {
-        key: value for key, value in SCENES["points"]().items() if key in ("type", "integrator", "sensor", "floor")
-    }
-    pane = {"type": "cube", "bsdf": {"type": "dielectric"}}
-    import mitsuba as mi
-
-    pane["to_world"] = mi.ScalarTransform4f().translate([0, 0.3, 0]).scale([5, 0.1, 5])
-    return floor | {"pane": pane, "point": {"type": "point", "position": [0, 2, 0], "intensity": 5.0}}
-
-
 def test_light_that_merging_alone_finds(renderer):
     """As much as ``ppm`` does, where ``bdpt`` is black."""
     scene = load(renderer, seen_through_glass, (24, 24))
@@ -176,64 +159,3 @@ def test_kernels_of_vcm_are_recorded_once(renderer, recordings):
             passes(CameraSamples(scene.sensors()[0], 3, 1, i), film)
             film.end_pass(1)
     assert len(recordings.of) == 3 and recordings.total() <= 4
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            {"sensor": {"type": "orthographic"}},
-            "'vcm' cannot .* light paths cannot reach a camera .orthographic",
-        ),
-        ({"lamp": {"type": "projector", "irradiance": 1.0}}, r"'vcm' cannot .* from emitter 'lamp' \(Projector\)"),
-    ],
-)
-def test_what_vcm_cannot_render(renderer, change, message):
-    from data_gen.render import render_stack
-
-    scene = load(renderer, lambda: SCENES["points"]() | change, (8, 8))
-    with pytest.raises(NgptError, match=message):
-        render_stack(scene, 1, 0, "vcm")
-
-
-def test_maps_of_vcm_larger_than_memory_are_refused_with_what_fits(renderer):
-    from data_gen.render import render_stack
-
-    scene = load(renderer, "diffuse", (128, 128))
-    with pytest.raises(NgptError, match=r"pass --memory \d+, or .* or no more than -O joined_depth=\d+") as caught:
-        render_stack(scene, 1, 0, "vcm", memory=50, joined_depth=64)
-    fits = int(str(caught.value).rsplit("=", 1)[1])
-    assert 1 < fits < 64
-    render_stack(scene, 1, 0, "vcm", memory=50, joined_depth=fits)
-    with pytest.raises(NgptError, match=r"render a smaller image$"):
-        render_stack(scene, 1, 0, "vcm", memory=20)
-
-
-def test_spectra_are_refused_by_vcm(renderer):
-    from data_gen.backend import use_variant
-    from data_gen.render import render_stack
-
-    try:
-        use_variant("llvm_ad_spectral")
-        with pytest.raises(NgptError, match="sampler 'vcm' does not follow spectra"):
-            render_stack(load(renderer, "diffuse", (8, 8)), 1, 0, "vcm")
-    finally:
-        use_variant()
-
-
-def test_scenes_without_lights_are_black_for_vcm(renderer):
-    from data_gen.render import render_stack
-
-    def dark():
-        return {key: value for key, value in SCENES["points"]().items() if key not in ("point", "spot", "sun")}
-
-    stack = render_stack(load(renderer, dark, (8, 8)), 2, 0, "vcm")
-    assert not stack["primal"].any() and stack["albedo"].any()
-
-
-def test_media_are_refused_by_vcm():
-    from data_gen.samplers import find
-    from data_gen.scenes.facts import Facts
-
-    with pytest.raises(NgptError, match=r"there are media .*, which 'vcm' does not see"):
-        find("vcm", Facts("path", ("air",)))

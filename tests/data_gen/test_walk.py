@@ -98,11 +98,6 @@ def test_a_hidden_sky_hides_behind_holes_until_something_scatters(renderer):
 # ------------------------------ The style of data_gen ------------------------------
 
 
-def test_roulette_stands_in_one_place():
-    found = [name for name, _ in trees() if name.startswith("samplers/") and "0.95)" in source(name)]
-    assert found == []
-
-
 def test_no_function_takes_more_than_six_positional_arguments():
     found = set()
     for name, tree in trees():

@@ -1,4 +1,4 @@
-"""How the statistical tests render and compare: stacks of one of our samplers against Mitsuba's own integrator.
+"""How the statistical tests render and compare: stacks of one of our samplers against stored ``references``.
 
 Gradients are tested over one pixel, as users have them, and over ``FAR`` pixels: ``far_shifts`` moves the offset paths
 of every sampler by that many, and dx[y, x] then estimates I[y, x + 8] - I[y, x]. Base and offset vertices lie further
@@ -9,13 +9,13 @@ them stands out of the noise. Nothing of a sampler knows how far its shifts go: 
 from contextlib import contextmanager
 
 import numpy as np
+from references import REFERENCES
+from scipy.stats import chi2, norm
 
 from ngpt.testing import z_test
 
 FAR = 8
 DISTANCES = (1, FAR)
-# First seed of images to compare with: none of those of what is judged, since samplers may share their paths.
-REFERENCES = 1000
 
 
 def load(mi, scene, size=None):
@@ -57,7 +57,7 @@ def render_ours(scene, sampler, batches=16, spp=64, pixels=1, seed=0, **options)
 
 
 def render_references(mi, scene, batches=24, spp=256):
-    """Independent images, (batches, H, W, 3)."""
+    """Independent images, (batches, H, W, 3), of files, and for ``references``."""
     integrator = right_integrator(mi, scene)
     return np.stack(
         [np.array(mi.render(scene, integrator=integrator, spp=spp, seed=REFERENCES + i)) for i in range(batches)]
@@ -92,6 +92,19 @@ def gradient_tests(stacks, references, level=0.01, pixels=1):
         yield name, z_test(ours, np.stack([slope[axis] for slope in slopes]), level=level)
 
 
+def sum_of_squares(stacks, references, pixels, block=4):
+    """The probability of so large a sum of z² over blocks of grey pixels of dx and dy: it sees errors everywhere."""
+    total, count = 0.0, 0
+    slopes = [differences(reference, pixels) for reference in references]
+    for axis, name in enumerate(("dx", "dy")):
+        ours = np.stack([stack[name] + differences(light_apart(stack), pixels)[axis] for stack in stacks])
+        theirs = np.stack([slope[axis] for slope in slopes])
+        result = z_test(*(images.mean(axis=-1, keepdims=True) for images in (ours, theirs)), block=block)
+        z = norm.isf(result.p / 2)[result.z != 0]
+        total, count = total + (z**2).sum(), count + z.size
+    return chi2.sf(total, count)
+
+
 def differences(image, pixels=1):
     """I[y, x + pixels] - I[y, x] and the same along y, image-sized: 0 where the other pixel is not in the image."""
     dx, dy = np.zeros((2, *image.shape), image.dtype)
@@ -108,3 +121,17 @@ def light_apart(stack):
 def light_of_gradients(stack):
     """The image whose differences dx and dy are."""
     return stack["primal"] - light_apart(stack)
+
+
+def assert_unbiased(stacks, references, level=0.01, pixels=1, about=""):
+    """By ``gradient_tests``; black images agree all too well."""
+    assert references.mean() > 0.01
+    for layer, result in gradient_tests(stacks, references, level, pixels):
+        assert result.passed, f"{about} {layer} over {pixels} pixels: {result}"
+
+
+def same(a, b):
+    """The bits of two stacks."""
+    assert a.names == b.names
+    for name in a.names:
+        assert np.array_equal(a[name], b[name], equal_nan=True), name

@@ -1,124 +1,103 @@
-"""What is particular to ``gbre``: how photons beside rays are copied, and its differences against its own images.
-
-That it repeats its bits, says how noisy it is and stays within its memory is among the laws of all samplers; what it
-does on surfaces is that of ``gpm``.
-"""
-
-from types import SimpleNamespace
+"""What tests of photons share: passes, differences pair by pair, images beside each other, copies of photons."""
 
 import media_scenes
 import numpy as np
-import pytest
-from test_gpm import joined, largest
-from unbiased import load
-
-LONG = ("haze", "colours", "forward")
+from unbiased import differences, far_shifts, light_of_gradients, load
 
 
-@pytest.fixture(scope="module")
-def rays(renderer):
-    """Pairs of rays near each other, a distance along them, and a place beside the first; in double precision."""
-    import drjit as dr
-    from drjit.llvm import Array3f64 as Vector
-    from drjit.llvm import Float64
-
-    rng, n = np.random.default_rng(6), 2000
-
-    def around(center, spread):
-        return Vector(rng.normal(size=(3, n)) * spread + np.array(center)[:, None])
-
-    d, e = dr.normalize(around([0, 0, 1], 0.2)), dr.normalize(around([0, 0, 1], 0.2))
-    t = Float64(rng.uniform(1, 4, n))
-    o = around([0, 0, 0], 0.1)
-    v = around([0, 0, 0], 0.1)
-    b = o + d * t + (v - d * dr.dot(v, d))
-    return SimpleNamespace(
-        dr=dr, Vector=Vector, o=o, d=d, t=t, u=around([0, 0, 0], 0.1), e=e, b=b, a=b - around([0, 1, 0], 0.3)
-    )
+def largest(value) -> float:
+    return np.abs(np.array(value, np.float64)).max()
 
 
-def beside(g, b, o, d, u, e):
-    """The copy, beside the ray (u, e), of a photon beside (o, d)."""
-    from data_gen.samplers.photons.gradients.shift import moved
-
-    t = g.dr.dot(b - o, d)
-    return moved(b, o + d * t, d, u + e * t, e)
-
-
-def test_photons_keep_their_distances(rays):
-    """Along the ray and from it; and the shift back gives the photon, whatever the rays."""
-    g, dr = rays, rays.dr
-    c = beside(g, g.b, g.o, g.d, g.u, g.e)
-    assert largest(dr.dot(c - g.u, g.e) - g.t) < 1e-12
-    assert largest(dr.norm(c - g.u - g.e * g.t) - dr.norm(g.b - g.o - g.d * g.t)) < 1e-12
-    assert largest(beside(g, c, g.u, g.e, g.o, g.d) - g.b) < 1e-9
+def joined(one, other, mi, dr):
+    """Two records as one: all arrays of the other behind those of the first."""
+    n, m = dr.width(one.p), dr.width(other["p"])
+    index = dr.arange(mi.UInt32, n + m)
+    values = {}
+    for name, old in vars(one).items():
+        new = other[name]
+        both = dr.gather(type(old), old, index, index < n), dr.gather(type(old), new, index - n, index >= n)
+        values[name] = dr.select(index < n, *both)
+    dr.eval(values)
+    return type(one)(**values)
 
 
-def test_between_rays_from_one_point_what_is_beside_one_alone_goes_to_the_other(rays):
-    g, dr = rays, rays.dr
-    c = beside(g, g.b, g.o, g.d, g.o, g.e)
-    from_b = dr.norm(dr.cross(g.b - g.o, g.e))
-    assert largest(dr.norm(dr.cross(c - g.o, g.d)) - from_b) < 1e-11
+def passes(scene, n, pixels=1, sampler="gpm", **options):
+    """The layers of ``n`` first passes, each of another seed: what ``render_ours`` has, prepared once."""
+    from data_gen.film import GradientFilm
+    from data_gen.passes import recording
+    from data_gen.paths.camera import CameraSamples
+    from data_gen.samplers import find
+
+    sample, sensor = find(sampler).made(scene, **options), scene.sensors()[0]
+    stacks = []
+    with far_shifts(pixels), recording():
+        for seed in range(n):
+            film = GradientFilm(*(int(n) for n in sensor.film().crop_size()), batches=True)
+            sample(CameraSamples(sensor, seed, 1), film)
+            film.end_pass(1)
+            stacks.append(film.develop())
+    return stacks
 
 
-def test_jacobians_in_media_by_finite_differences(rays):
-    """Of volumes, which are kept; and of directions and distances from the predecessor."""
-    from data_gen.samplers.photons.gradients.shift import jacobian_in_medium
-
-    g, dr = rays, rays.dr
-    axes = [g.Vector(1, 0, 0), g.Vector(0, 1, 0), g.Vector(0, 0, 1)]
-    h = 1e-5
-
-    def volume(of):
-        x, y, z = ((of(axis * h) - of(axis * -h)) / (2 * h) for axis in axes)
-        return np.abs(np.array(dr.dot(dr.cross(x, y), z)))
-
-    volumes = volume(lambda step: beside(g, g.b + step, g.o, g.d, g.u, g.e))
-    assert np.quantile(np.abs(volumes - 1), 0.99) < 1e-6
-
-    to = g.b - g.a
-    length = dr.norm(to)
-    d = to / length
-    s = dr.normalize(dr.cross(d, g.Vector(0.3, 0.9, 0.1)))
-    t = dr.cross(d, s)
-    d1 = dr.normalize(beside(g, g.b, g.o, g.d, g.u, g.e) - g.a)
-    s1 = dr.normalize(dr.cross(d1, g.Vector(0.3, 0.9, 0.1)))
-    t1 = dr.cross(d1, s1)
-
-    def copied(step):
-        """Direction and distance, on axes of their own, of the copy of a photon so much aside and further away."""
-        b = g.a + dr.normalize(d + s * step.x + t * step.y) * (length + step.z)
-        c = beside(g, b, g.o, g.d, g.u, g.e) - g.a
-        way = dr.normalize(c)
-        return g.Vector(dr.dot(way, s1), dr.dot(way, t1), dr.norm(c))
-
-    told = np.array(jacobian_in_medium(dr.squared_norm(to), dr.squared_norm(beside(g, g.b, g.o, g.d, g.u, g.e) - g.a)))
-    assert np.quantile(np.abs(volume(copied) / told - 1), 0.99) < 1e-5
-    assert np.std(np.log(told)) > 0.1
+def paired(stacks, pixels, block):
+    """z of dx and dy minus the differences of the same image, over blocks: both have the same mean, bias included."""
+    off = []
+    for stack in stacks:
+        slopes = differences(np.asarray(light_of_gradients(stack), np.float64), pixels)
+        off.append([stack[name] - slope for name, slope in zip(("dx", "dy"), slopes, strict=True)])
+    n, two, height, width, _ = np.shape(off)
+    blocks = np.reshape(off, (n, two, height // block, block, width // block, block, 3)).mean(axis=(3, 5, 6))
+    error = blocks.std(axis=0, ddof=1) / np.sqrt(n)
+    return (blocks.mean(axis=0) / np.where(error > 0, error, np.inf)).ravel()
 
 
-@pytest.mark.parametrize("name", ["nested", *(pytest.param(n, marks=pytest.mark.slow) for n in LONG)])
-def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(renderer, name):
-    """Camera rays come by, a hundredth of their length apart."""
+def assert_no_bias(stacks, pixels):
+    """The largest z of blocks of 4x4 pixels, and the mean of all squares of 2x2."""
+    largest, squares = np.abs(paired(stacks, pixels, 4)).max(), np.mean(paired(stacks, pixels, 2) ** 2)
+    assert largest < 4.5 and squares < 1.6, (largest, squares)
+
+
+def gain(stacks):
+    """Variance of differences of independent images over that of dx and dy: in the mean and in the median."""
+    L = np.stack([light_of_gradients(stack) for stack in stacks]).astype(np.float64)
+    variance = L.var(axis=0, ddof=1)
+    ratios, sums = [], np.zeros(2)
+    for name, axis in (("dx", 1), ("dy", 0)):
+        ours = np.stack([stack[name] for stack in stacks]).astype(np.float64).var(axis=0, ddof=1)
+        pixels = variance + np.roll(variance, -1, axis=axis)
+        inner = np.s_[:-1, :-1]
+        sums += pixels[inner].sum(), ours[inner].sum()
+        ratios.append((pixels[inner] / np.where(ours[inner] > 0, ours[inner], np.nan)).ravel())
+    return sums[0] / sums[1], np.nanmedian(ratios)
+
+
+def assert_alike(images, references, block):
+    """Means of blocks differ by no more than 4 standard errors and 3 % of the image, which may be bias."""
+
+    def blocks(stack):
+        n, height, width, _ = stack.shape
+        x = stack.reshape(n, height // block, block, width // block, block, 3).mean(axis=(2, 4))
+        return x.mean(axis=0), x.var(axis=0, ddof=1) / n
+
+    (ours, ours_var), (theirs, theirs_var) = blocks(images), blocks(references)
+    off = np.abs(ours - theirs) - 4 * np.sqrt(ours_var + theirs_var)
+    assert off.max() < 0.03 * theirs.mean(), (off.max(), theirs.mean())
+
+
+def maps_of(mi, scene, paths=4096, max_depth=6):
+    """The maps of so many light paths, and the light's end of them."""
     import drjit as dr
 
-    from data_gen.samplers.photons.media.gbre import Beside
+    from data_gen.paths.light_ends import LightEnds
+    from data_gen.paths.streams import sample_streams
+    from data_gen.paths.vertex import Materials
+    from data_gen.paths.world import World
+    from data_gen.samplers.photons.map.trace import trace
 
-    mi = renderer
-
-    def rays(eye, p, medium, rng):
-        to, n = p - eye, p.shape[1]
-        length = np.linalg.norm(to, axis=0)
-
-        def ray(spread):
-            d = to + rng.normal(size=p.shape) * spread * length
-            d = mi.Vector3f(d / np.linalg.norm(d, axis=0))
-            zero, everywhere = dr.zeros(mi.Spectrum, n), dr.full(mi.Bool, True, n)
-            return Beside(mi.Point3f(eye), d, dr.full(mi.Float, 100, n), medium, zero, zero + 1, everywhere)
-
-        return ray(0.004), ray(0.012), mi.Float((0.01 * length) ** 2)
-
-    assert_copies_are_light_paths(mi, name, rays)
+    random = sample_streams(0, dr.arange(mi.UInt32, paths), mi.UInt32(0))
+    start, maps = trace(World(scene, LightEnds(scene), Materials(scene, 0.05)), random, max_depth, 4)
+    return start, list(maps)
 
 
 def assert_copies_are_light_paths(mi, name, receivers):
@@ -204,3 +183,11 @@ def assert_copies_are_light_paths(mi, name, receivers):
     assert np.median(np.abs(power - 1)) < 5e-4 and np.quantile(np.abs(power - 1), 0.95) < 2e-2
     away = np.linalg.norm(np.array(back.p) - np.array(photon.p), axis=0)[good]
     assert np.median(away) < 2e-5 and np.quantile(away, 0.95) < 1e-3
+
+
+def beside(g, b, o, d, u, e):
+    """The copy, beside the ray (u, e), of a photon beside (o, d)."""
+    from data_gen.samplers.photons.gradients.shift import moved
+
+    t = g.dr.dot(b - o, d)
+    return moved(b, o + d * t, d, u + e * t, e)

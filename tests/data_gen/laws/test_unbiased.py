@@ -1,0 +1,156 @@
+"""Every sampler has the means of Mitsuba's integrators: of the image, and of differences over one and eight pixels.
+
+Wrong densities and weights of neighbours drown in the noise; over eight pixels they stand out of it. A case as a whole
+has a level of 1 %, with fixed seeds. In media pixels are wide, and the sum of all z² is tested, too.
+"""
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import media_scenes
+import numpy as np
+import pytest
+from bdpt_scenes import SCENES as OF_ALL_LAMPS
+from reference_scenes import BENT, BUILTIN, LARGE, MEDIA, PLACES, SMALL, at_place, of
+from references import REFERENCES, references
+from registered import quick, slow
+from unbiased import DISTANCES, FAR, assert_unbiased, load, render_ours, render_references, sum_of_squares
+
+from data_gen.samplers import SAMPLERS
+from ngpt.errors import NgptError
+
+# In media images are of 16 x 16 pixels, and differences go over four.
+WIDE = 4
+
+
+@dataclass(frozen=True)
+class Case:
+    """A sampler in a scene, with options, over so many pixels; ``by`` is whose image it has, if not Mitsuba's."""
+
+    sampler: str
+    scene: str
+    pixels: tuple[int, ...] = DISTANCES
+    options: dict = field(default_factory=dict)
+    size: tuple[int, int] = LARGE
+    spp: int = 32
+    by: str | None = None
+    place: tuple | None = None
+
+    @property
+    def in_media(self):
+        return self.pixels[-1] == WIDE
+
+    def __str__(self):
+        return "-".join([self.sampler, self.scene, *(f"{name}={value}" for name, value in self.options.items())])
+
+    def description(self, mi):
+        if self.scene == "quick":
+            return quick(mi, self.sampler)
+        if self.place:
+            return at_place(*self.place)
+        if self.scene.startswith("lit: "):
+            return OF_ALL_LAMPS[self.scene.removeprefix("lit: ")]
+        if self.scene.endswith(" by mis"):
+            return media_scenes.by_mis(of(self.scene.removesuffix(" by mis")))
+        name, _, depth = self.scene.partition(" to ")
+        return of("limited")(int(depth)) if depth else of(name)
+
+
+def registered(study):
+    """Every sampler but those that say they are biased, which are held to what they converge to: alike everywhere, and
+    where there are holes and no environment, where Mitsuba's ``path`` loses light (docs/use/rendering.md)."""
+    names = [name for name, entry in SAMPLERS.items() if not entry.biased and (entry.standing == "study") == study]
+    return [*(Case(name, "quick") for name in names), *(Case(name, "leaf", (FAR,)) for name in names)]
+
+
+QUICK = [
+    *registered(study=False),
+    Case("gpt", "glass"),
+    Case("gpt", "lens", (FAR,)),
+    Case("gpt", "hidden_lamp", (FAR,)),
+    # All that is not a mirror is connectable: paths reconnect where they hardly can.
+    Case("gpt", "plenty", (1,), {"roughness_threshold": 0.0}),
+    Case("gpt", "caustics", options={"shift": "manifold"}),
+    *(Case("gpt", f"moved {place}", (1,), size=(24, 24), place=place) for place in PLACES),
+    Case("gpt", "panels", (FAR,), size=(24, 24)),
+    *(Case("gpt", scene, (WIDE,), size=SMALL, spp=48) for scene in ("haze", "colours by mis", "before_the_sky")),
+    Case("gpt-basic", "within_fog", (1,), size=SMALL, spp=48),
+    Case("gpt-simple", "courtyard"),
+    # Paths end at a step that is written out.
+    Case("gpt-simple", "courtyard to 2", (1,), size=SMALL, spp=64),
+    Case("gpt-simple", "courtyard to 3", (1,), size=SMALL, spp=64),
+    Case("bdpt", "lit: sky"),
+    Case("bdpt", "lit: areas", options={"joined_depth": 1}),
+    Case("gbdpt", "lit: sky", (FAR,)),
+]
+LONG = {"spp": 256}
+SLOW = [
+    *registered(study=True),
+    *(Case("gpt", scene, **LONG) for scene in (*BUILTIN, "glass", "hidden_lamp", "plenty")),
+    Case("gpt", "plenty", options={"roughness_threshold": 10.0}),
+    *(Case("gpt", scene, options={"shift": "manifold"}) for scene in ("under_the_sky", "glass")),
+    *(
+        Case("gpt", scene, options={"shift": "half-vector", "roughness_threshold": 0.35})
+        for scene in ("plenty", "glass", "environment")
+    ),
+    *(Case("gpt", scene, (1,), options={"reuse": True}) for scene in ("glossy", "plenty")),
+    *(Case("gpt", scene, (1, WIDE), size=SMALL, **LONG) for scene in (*MEDIA, "fog", "within_fog")),
+    Case("gpt", "coloured_smoke by mis", (1, WIDE), size=SMALL, **LONG),
+    *(Case("gpt-basic", scene, **LONG) for scene in (*BUILTIN, "glass", "fog", "within_fog", "hidden_lamp")),
+    *(Case("gpt-simple", scene, **LONG) for scene in ("diffuse", "lens", "courtyard")),
+    Case("gpt-simple", "panels", (FAR,), size=(24, 24)),
+    *(Case("gpt-tiles", scene, spp=64) for scene in ("diffuse", "glossy", "lens", "courtyard")),
+    Case("gpt-tiles", "courtyard", (1,), {"tile": 2}, **LONG),
+    Case("gpt-tiles", "courtyard", (1,), {"tile": 4}, **LONG),
+    *(Case("split", scene, **LONG) for scene in ("glossy", "environment", "lens", "everything")),
+    *(Case("bdpt", f"lit: {scene}", spp=16) for scene in OF_ALL_LAMPS),
+    Case("bdpt", "lit: areas", options={"joined_depth": 3}),
+    *(Case("gbdpt", f"lit: {scene}", (FAR,), spp=64) for scene in OF_ALL_LAMPS),
+    *(Case("gbdpt", "lit: areas", (FAR,), {"joined_depth": depth}, spp=64) for depth in (1, 3)),
+    *(Case("gbdpt", scene, by="bdpt", spp=64) for scene in BENT),
+]
+
+
+@pytest.mark.parametrize("case", [*QUICK, *(slow(case, id=f"{case}-long") for case in SLOW)], ids=str)
+def test_unbiased(renderer, case):
+    description = case.description(renderer)
+    expected, scene = references(renderer, description, case.size, case.by), load(renderer, description, case.size)
+    for pixels in case.pixels[: 1 + SAMPLERS[case.sampler].gradients]:
+        try:
+            stacks = render_ours(scene, case.sampler, 12, case.spp, pixels, **case.options)
+        except NgptError as error:
+            assert case.scene == "leaf", error
+            pytest.skip(f"it refuses holes: {error}")
+        assert ("dx" in stacks[0]) == SAMPLERS[case.sampler].gradients
+        assert_unbiased(stacks, expected, 0.01 / (3 * len(case.pixels)), pixels)
+        if case.in_media:
+            assert sum_of_squares(stacks, expected, pixels) > 1e-3
+
+
+# ------------------------- Whatever scenes are at hand -------------------------
+
+FOLDER = os.environ.get("NGPT_SCENES")
+FILES = sorted(Path(FOLDER).glob("*/*.xml")) if FOLDER else []
+# All tests of all files together find something by chance in one run of a hundred.
+LEVEL = 1 - 0.99 ** (1 / (9 * max(1, len(FILES))))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not FILES, reason="NGPT_SCENES names no folder of scenes")
+@pytest.mark.parametrize("sampler", ["auto", "bdpt", "gbdpt"])
+@pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_unbiased_in_files(renderer, path, sampler):
+    """NGPT_SCENES=folder with */*.xml in it. Gradients of ``gbdpt`` against ``bdpt``, which finds the same light."""
+    from data_gen.scenes.facts import scene_facts
+    from data_gen.scenes.load import load_scene
+
+    scene = load_scene(str(path), (32, 24))
+    if sampler != "auto" and (reason := SAMPLERS[sampler].refuses(scene_facts(scene))):
+        pytest.skip(reason)
+    if sampler == "gbdpt":
+        expected = np.stack([s["primal"] for s in render_ours(scene, "bdpt", 16, 32, seed=REFERENCES)])
+    else:
+        expected = render_references(renderer, scene, spp=192)
+    for pixels in DISTANCES if sampler != "bdpt" else (1,):
+        assert_unbiased(render_ours(scene, sampler, 20, 32, pixels), expected, LEVEL, pixels)
