@@ -17,10 +17,11 @@ from dataclasses import dataclass, replace
 import mitsuba as mi
 
 from data_gen import samplers
+from data_gen.budget import DEFAULT_MEMORY
 from data_gen.choosing.enclosed import enclosed
 from data_gen.choosing.pipelines import Pipeline, choose, measure, methods_for
 from data_gen.choosing.trials import PIXELS, Trial, at_most, candidates, try_all
-from data_gen.passes import DEFAULT_MEMORY, film_within
+from data_gen.passes import film_within
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.facts import scene_facts
 from data_gen.tails.schedule import FIRST, LEAST_PATHS

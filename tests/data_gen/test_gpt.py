@@ -391,7 +391,7 @@ def test_polarised_light_is_declined(renderer):
         scene = load(mi, "diffuse", (4, 4))
         with pytest.raises(NgptError, match="polarised"):
             render_stack(scene, 1, sampler="gpt")
-        with pytest.raises(NgptError, match="use variant 'llvm_ad_spectral', or sampler 'gpt-basic'"):
+        with pytest.raises(NgptError, match="is polarised, which 'gpt' does not follow; use --sampler gpt-basic"):
             mi.load_dict({"type": "gpt"}).render(scene, spp=1)
     finally:
         use_variant("llvm_ad_rgb")

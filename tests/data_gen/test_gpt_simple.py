@@ -11,6 +11,7 @@ import pytest
 from data_gen_scenes import fog, furnace, hidden_lamp, polished
 from unbiased import gradient_tests, load, render_ours, render_references
 
+from data_gen.samplers import find
 from ngpt.errors import NgptError
 from ngpt.testing import z_test
 
@@ -247,6 +248,4 @@ def test_refuses_what_it_cannot_render(renderer, scene, reason):
 
 
 def test_takes_what_is_rough_enough(renderer):
-    from data_gen.samplers.teaching.gpt_simple import make
-
-    assert callable(make(load(renderer, lambda: polished(0.06), (8, 8))))
+    assert callable(find("gpt-simple").made(load(renderer, lambda: polished(0.06), (8, 8))))

@@ -9,6 +9,7 @@ from data_gen_scenes import fog, hidden_lamp
 from unbiased import gradient_tests, load, render_ours, render_references
 
 from data_gen.adaptive import Adaptive
+from data_gen.samplers import find
 from ngpt.errors import NgptError
 
 SIZE = (8, 6)
@@ -24,7 +25,7 @@ class Tile:
         from data_gen.samplers.studies import gpt_tiles
 
         scene = load(mi, "diffuse", SIZE)
-        tiles = gpt_tiles.make(scene, tile=side)
+        tiles = find("gpt-tiles").made(scene, tile=side)
         camera = CameraSamples(scene.sensors()[0], 5, 4)
         gpt_tiles.keep_in_step(camera)
         _, paths = tiles.trace(camera)

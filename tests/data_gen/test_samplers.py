@@ -11,6 +11,7 @@ import pytest
 from data_gen_scenes import fog, leaf
 from unbiased import DISTANCES, gradient_tests, load, render_ours, render_references
 
+from data_gen.budget import Budget
 from data_gen.samplers import SAMPLERS, Option, Sampler, choose, find, register
 from ngpt.errors import NgptError
 from ngpt.testing import z_test
@@ -23,9 +24,8 @@ class Toy:
 
     def __init__(self, scene, share):
         from data_gen.samplers.common import radiance
-        from data_gen.samplers.teaching.gpt_basic import make
 
-        make(scene)  # refuses what it cannot render
+        find("gpt-basic").made(scene)  # refuses what it cannot render
         self.scene, self.estimate, self.share = scene, radiance(scene, scene.integrator()), share
 
     def __call__(self, camera, film):
@@ -274,7 +274,7 @@ def test_variances_are_those_over_seeds(renderer, name, full):
     spp = (6 if entry.batch == 1 else 16) if full else passes_of(name, 3, 16)
     sample, sensor, more = entry.made(scene), scene.sensors()[0], {"lane_bytes": entry.lane_bytes, "batch": entry.batch}
     more["points"] = "independent"
-    stacks = [render_passes(sample, sensor, seed, spp, **more).develop() for seed in range(64 if full else 24)]
+    stacks = [render_passes(sample, sensor, seed, Budget(spp), **more).develop() for seed in range(64 if full else 24)]
     low, high = (0.88, 1.12) if full else (0.8, 1.25)
     for layer in ("primal", "dx", "dy"):
         if layer in stacks[0]:

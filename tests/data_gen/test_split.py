@@ -229,7 +229,7 @@ def test_the_diffuse_part_of_principled_materials_is_lamberts(renderer, metallic
 
 
 @pytest.mark.parametrize(
-    ("scene", "reason"), [(fog, "'split' knows only 'path'"), (hidden_lamp, "hides emitters; use --sampler primal")]
+    ("scene", "reason"), [(fog, "'split' knows only 'path'"), (hidden_lamp, "hides emitters; use --sampler gpt")]
 )
 def test_refuses_what_it_cannot_render(renderer, scene, reason):
     from data_gen.render import render_stack

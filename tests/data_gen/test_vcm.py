@@ -215,7 +215,7 @@ def test_spectra_are_refused_by_vcm(renderer):
 
     try:
         use_variant("llvm_ad_spectral")
-        with pytest.raises(NgptError, match="sampler 'vcm' does not follow spectra"):
+        with pytest.raises(NgptError, match="'llvm_ad_spectral' each path has wavelengths of its own, and 'vcm'"):
             render_stack(load(renderer, "diffuse", (8, 8)), 1, 0, "vcm")
     finally:
         use_variant()

@@ -81,7 +81,7 @@ def test_media_and_lights_that_vpm_refuses(renderer):
         NgptError, match=r"'gbeams' .* media whose density varies.* use --sampler gpt, .*vpm \(no gradients\), or gvpm"
     ):
         render_stack(load(renderer, media_scenes.smoke, (8, 8)), 1, 0, "gbeams")
-    with pytest.raises(NgptError, match=r"'gbre' .* media whose density varies; use --sampler gpt, or gvpm, vpm, bre"):
+    with pytest.raises(NgptError, match=r"'gbre' .* media whose density varies, .*; use --sampler gpt, .* or bre"):
         renderer.load_dict({"type": "gbre"}).prepare(load(renderer, media_scenes.smoke, (8, 8)))
 
     def endless():
