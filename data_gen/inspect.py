@@ -41,7 +41,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
             raise no_scene(name, [*METHODS, *SAMPLERS])
     except RuntimeError as error:
         raise NgptError(f"{name}: not a scene Mitsuba can read: {complaint(error)}") from error
-    plugins = {kind: Counter() for kind in _KINDS}
+    plugins: dict[str, Counter] = {kind: Counter() for kind in _KINDS}
     shutter, media = 0.0, []
     sensors = [_Camera.of(nodes, node) for node in _children(nodes, nodes[0], mi.ObjectType.Sensor)]
     taken = sensors[0] if sensors else _Camera()

@@ -106,7 +106,8 @@ def render_stack(
     _LOG.info("sampler %s, options %s", sampler, options_as_attribute(entry, settings) or "as by default")
     start = time.perf_counter()
     more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
-    sensor, chosen = scene.sensors()[0], {}
+    sensor = scene.sensors()[0]
+    chosen: dict[str, Any] = {}
     whole: list[GradientFilm] = []  # the film after the last pass, if there was one
 
     def look(film: GradientFilm) -> None:
@@ -116,8 +117,8 @@ def render_stack(
     # Of samples that time may end nobody knows how many there will be, though no more than ``spp``.
     if settings.get("points") == "sobol" and (spp is None or seconds is not None or adaptive is not None):
         settings["points"] = "rounds"
-    watch, how = Watch(progress, stop, look), {"lane_bytes": entry.lane_bytes}
-    how["points"] = settings.get("points", "independent")
+    watch = Watch(progress, stop, look)
+    how: dict[str, Any] = {"lane_bytes": entry.lane_bytes, "points": settings.get("points", "independent")}
     with weighed(scene, settings["lamps"], entry.by_place) as places:
         more |= own(settings) | ({"places": places} if places else {})
         made = made or Made()

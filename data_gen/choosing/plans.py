@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mitsuba as mi
 
@@ -112,7 +113,7 @@ def explore(
     pixels = round(PIXELS * min(1.0, max((seconds / LONG) ** 2, LEAST_PIXELS)))
     with at_most(scene, pixels) as scale:
         first = math.inf if patient else SHARE * seconds
-        told = {"clock": clock, "said": said, "stop": stop, "unbiased": unbiased}
+        told: dict[str, Any] = {"clock": clock, "said": said, "stop": stop, "unbiased": unbiased}
         trials = try_all(scene, able, lambda _: SHARE * seconds, first, **told)
     if not trials or stop():
         return []
@@ -226,7 +227,7 @@ def plan_sampler(
             return min(math.inf if spp is None else trials[sampler].seconds * spp * scale, longest)
 
         share = _SHARE_OF_RENDER
-        told = {"said": said, "stop": stop, "unbiased": unbiased}
+        told: dict[str, Any] = {"said": said, "stop": stop, "unbiased": unbiased}
         trials = try_all(scene, names, lambda trials: share * whole(trials), share * longest, **told)
     found = (sampler, reason)
     if sampler in trials and not stop():

@@ -265,7 +265,8 @@ class GradientFilm:
         known = {"ngpt:spp": int(self.samples_each.mean()), "ngpt:normalSpace": "camera"}
         if (noise := self.feature_noise) is not None:
             known[FEATURE_NOISE] = noise
-        return GradientStack(self.develop(), known | dict(attributes or {}), place=place)
+        where = {} if place is None else {"place": place}
+        return GradientStack(self.develop(), known | dict(attributes or {}), **where)
 
     @property
     def feature_noise(self) -> float | None:

@@ -89,7 +89,7 @@ def test_each_renders_what_its_sampler_does(renderer):
         ("bdpt", "haze", "there are media .*, which 'bdpt' does not see"),
         ("ppm", "haze", "there are media .*, which 'ppm' does not see"),
         ("vpm", "diffuse", "there are no media"),
-        ("gbre", "smoke", "density varies, which 'gbre' does not render"),
+        ("gbre", "smoke", "there are media whose density varies, which 'gbre' does not render"),
     ],
 )
 def test_each_refuses_what_its_sampler_does(renderer, sampler, scene, reason):
