@@ -72,7 +72,7 @@ class View:
 class Surroundings:
     """What rays find in a scene, how large its inhabited part is, and the samplers that are ``made`` for it."""
 
-    def __init__(self, scene: mi.Scene, box: tuple | None = None):
+    def __init__(self, scene: mi.Scene, box: list | tuple | None = None):
         self.scene, self.box, self.made = scene, box, Made()
         sensor = mi.traverse(scene.sensors()[0])
         matrix = np.array(sensor["to_world"].matrix, float).reshape(4, 4)
