@@ -84,6 +84,7 @@ def costs(args: argparse.Namespace, scene: str, shot: str) -> dict[str, dict[str
     """Of a frame, by the clock and in processor time, in samples of gpt; and how many kernels it launches."""
     import drjit as dr
 
+    from data_gen.budget import Budget
     from data_gen.passes import render_passes
     from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
 
@@ -110,7 +111,7 @@ def costs(args: argparse.Namespace, scene: str, shot: str) -> dict[str, dict[str
             dr.kernel_history_clear()
             start, work = time.perf_counter(), time.process_time()
             if name == "gpt":
-                render_passes(gpt, loaded.sensors()[0], frame, args.chains)
+                render_passes(gpt, loaded.sensors()[0], frame, Budget(args.chains))
             else:
                 rivals[name].film(frame, motion, None, (now, shapes) if changes else None)
             dr.sync_thread()

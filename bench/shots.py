@@ -167,6 +167,8 @@ def mover(shape: str, way: tuple[float, float, float]):
     """What moves a shape so far a frame: see ``data_gen.frames.shot.Shot``."""
     import mitsuba as mi
 
+    from data_gen.scenes.geometry import put_vertices, vertices, vertices_name
+
     start: dict = {}
 
     def update(params, frame: int) -> None:
@@ -179,8 +181,8 @@ def mover(shape: str, way: tuple[float, float, float]):
             before = start.setdefault(who, mi.Transform4f(params[f"{who}.to_world"]))
             params[f"{who}.to_world"] = mi.Transform4f(mi.ScalarTransform4f().translate(far)) @ before
         else:
-            before = start.setdefault(who, np.array(params[f"{who}.vertex_positions"]).reshape(-1, 3))
-            params[f"{who}.vertex_positions"] = mi.Float((before + far).astype(np.float32).ravel())
+            name = vertices_name(params, who)
+            put_vertices(params, name, start.setdefault(who, vertices(params, name)) + far)
 
     return update
 

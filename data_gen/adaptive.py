@@ -17,19 +17,19 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
+from data_gen.budget import Budget, Watch
 from data_gen.film import GradientFilm
-from data_gen.passes import DEFAULT_MEMORY, Look, Progress, SamplePass, rounds_of
-from data_gen.samplers import LANE_BYTES, SAMPLERS, Sampler
+from data_gen.passes import SamplePass, rounds_of
+from data_gen.samplers import SAMPLERS, Sampler
 from data_gen.uneven import BLOCK, UnevenRender
 from ngpt.api.uncertainty import FACTOR, FACTORS, change, noisier
 from ngpt.errors import NgptError, WrongUse
-from ngpt.layers import FEATURE_NOISE
 from ngpt.measure.metrics import EPSILON, trimmed_mean
 from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
@@ -91,51 +91,35 @@ def render_adaptive(
     sensor: mi.Sensor,
     seed: int,
     adaptive: Adaptive,
-    spp: int | None,
-    *,
-    progress: Progress = lambda done, total: None,
-    seconds: float | None = None,
-    memory: int = DEFAULT_MEMORY,
-    stop: Callable[[], bool] = lambda: False,
-    look: Look = lambda film: None,
-    lane_bytes: int = LANE_BYTES,
-    points: str = "sobol",
+    budget: Budget,
+    watch: Watch,
+    **how: Any,
 ) -> tuple[GradientFilm, dict]:
     """The film, and attributes that say what its samples were chosen for.
 
-    For the parameters see ``data_gen.passes.render_passes()``; ``spp`` and what is reported of samples are means over
-    pixels. The first 16 samples of each pixel are always rendered. The seed, the size, the method and the number of all
-    samples decide the bits, whatever ended the render. Raises NgptError as the method does.
+    For the parameters see ``data_gen.passes.render_passes()``; samples of the ``budget``, and what is reported of them,
+    are means over pixels. The first 16 samples of each pixel are always rendered. The seed, the size, the method and
+    the number of all samples decide the bits, whatever ended the render. Raises NgptError as the method does.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     pixels = width * height
+    spp, seconds, stop = budget.spp, budget.seconds, watch.stop
     start, total = time.perf_counter(), spp or LEAST
 
     def report() -> None:
         if seconds is not None:
             limit = math.ceil(seconds)
-            progress(min(limit, int(time.perf_counter() - start)), limit)
+            watch.progress(min(limit, int(time.perf_counter() - start)), limit)
         else:
             done = int(work.film.samples_each.mean())
-            progress(min(done, total), total)
+            watch.progress(min(done, total), total)
 
     def after_pass() -> None:
-        look(work.film)
+        watch.look(work.film)
         report()
 
     most = None if spp is None else spp * pixels
-    work = UnevenRender(
-        sample,
-        sensor,
-        seed,
-        most,
-        seconds=seconds,
-        memory=memory,
-        stop=stop,
-        lane_bytes=lane_bytes,
-        report=after_pass,
-        points=points,
-    )
+    work = UnevenRender(sample, sensor, seed, most, budget=budget, stop=stop, report=after_pass, **how)
     report()
     rounds = rounds_of(sample)
     rounds.begin(sensor, seed, 0, None)
@@ -146,7 +130,7 @@ def render_adaptive(
         begin = time.perf_counter()
         if seconds is not None and begin - start > seconds:
             break
-        n, stack = work.film.samples_each, stack_of(work.film)
+        n, stack = work.film.samples_each, work.film.stack()
         method = adaptive.chosen_by(stack)
         if seconds is not None:
             took = took or seconds_to_assess(stack, method)
@@ -167,9 +151,9 @@ def render_adaptive(
         rounds.begin(sensor, seed, int(n.mean()), None)
         work.add(share_out(found.relative * np.sqrt(n), n, more * pixels))
     if seconds is not None:
-        progress(math.ceil(seconds), math.ceil(seconds))
+        watch.progress(math.ceil(seconds), math.ceil(seconds))
     elif not stop():
-        progress(total, total)
+        watch.progress(total, total)
     return work.film, attributes
 
 
@@ -180,13 +164,6 @@ class Assessment:
     relative: np.ndarray
     error: float
     method: str
-
-
-def stack_of(film: GradientFilm) -> GradientStack:
-    """What is in the film so far, as methods take it."""
-    attributes = {"ngpt:spp": int(film.samples_each.mean()), "ngpt:normalSpace": "camera"}
-    noise = film.feature_noise
-    return GradientStack(film.develop(), attributes | ({} if noise is None else {FEATURE_NOISE: noise}))
 
 
 def assess(stack: GradientStack, method: str) -> Assessment:

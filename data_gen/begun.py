@@ -173,7 +173,7 @@ class Asked:
         ):
             if theirs != asked:
                 # Names alike differ in the checksum, which says nothing to anybody.
-                alike = what == "scene" and theirs.rpartition(" ")[0] == asked.rpartition(" ")[0]
+                alike = what == "scene" and str(theirs).rpartition(" ")[0] == str(asked).rpartition(" ")[0]
                 why = " (its file, -D, --sensor, --camera, --fps or --dt was another)" if alike else ""
                 raise NgptError(
                     f"{path}: is another render: {what} {_text(theirs)}, not {_text(asked)}{why}; give another name, "

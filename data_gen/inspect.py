@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from data_gen.samplers import SAMPLERS, by_standing, choose
 from data_gen.scenes.builtin import SCENES, no_scene
-from data_gen.scenes.facts import Facts, polarised
+from data_gen.scenes.facts import Facts, polarised, spectral
 from data_gen.scenes.integrators import AROUND, lack, same_image
 from data_gen.scenes.load import complaint
 from ngpt.errors import NgptError
@@ -41,7 +41,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
             raise no_scene(name, [*METHODS, *SAMPLERS])
     except RuntimeError as error:
         raise NgptError(f"{name}: not a scene Mitsuba can read: {complaint(error)}") from error
-    plugins = {kind: Counter() for kind in _KINDS}
+    plugins: dict[str, Counter] = {kind: Counter() for kind in _KINDS}
     shutter, media = 0.0, []
     sensors = [_Camera.of(nodes, node) for node in _children(nodes, nodes[0], mi.ObjectType.Sensor)]
     taken = sensors[0] if sensors else _Camera()
@@ -53,7 +53,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
             shutter = float(props.get("shutter_close", 0.0)) - float(props.get("shutter_open", 0.0))
         if kind == "Medium":
             media.append(props.id() or props.plugin_name())
-    integrator, followed, unable = _transport(nodes)
+    integrator, followed, unable, hides = _transport(nodes)
     lens = "thinlens" in plugins["Sensor"]
     mirrors = any(name in plugins["BSDF"] for name in _MIRRORS)
     facts = Facts(
@@ -64,6 +64,8 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         grids="heterogeneous" in plugins["Medium"],
         camera=taken.plugin,
         hair="hair" in plugins["BSDF"],
+        spectral=spectral(),
+        hides=hides,
     )
     sampler, reason = choose(facts)
     return {
@@ -111,11 +113,11 @@ def _children(nodes: Sequence, node, kind: mi.ObjectType) -> list:
     return [nodes[part] for part in parts if nodes[part].type == kind]
 
 
-def _transport(nodes: Sequence) -> tuple[str, str, str]:
-    """A scene's integrator, the one whose image is rendered, and why there is none, or ""."""
+def _transport(nodes: Sequence) -> tuple[str, str, str, bool]:
+    """A scene's integrator, the one whose image is rendered, why there is none, or "", and whether lamps are hidden."""
     found = _children(nodes, nodes[0], mi.ObjectType.Integrator)
     if not found:
-        return "path", "path", ""
+        return "path", "path", "", False
     outer = inner = found[0]
     while True:
         nested, plugin = _children(nodes, inner, mi.ObjectType.Integrator), inner.props.plugin_name()
@@ -123,7 +125,7 @@ def _transport(nodes: Sequence) -> tuple[str, str, str]:
             break
         inner = nested[0]
     hides = bool(inner.props.get("hide_emitters", False))
-    return outer.props.plugin_name(), same_image(plugin, hides), lack(plugin, len(nested))
+    return outer.props.plugin_name(), same_image(plugin, hides), lack(plugin, len(nested)), hides
 
 
 def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:

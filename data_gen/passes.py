@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from data_gen.budget import Budget, Watch
 from data_gen.film import GradientFilm
 from data_gen.paths.camera import CameraSamples, bytes_of_rays
 from data_gen.paths.streams import ROUND, first_round
@@ -23,15 +24,9 @@ from ngpt.system.limits import memory as machine_memory
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
-Progress = Callable[[int, int], None]
 # What takes the samples of one pass: it puts, or splats, one for each camera sample into the film.
 SamplePass = Callable[[CameraSamples, GradientFilm], None]
 
-# What looks at the film between passes, and leaves it as it is.
-Look = Callable[[GradientFilm], None]
-
-# What a render may use, in MiB, beside the scene itself; see blocks_within().
-DEFAULT_MEMORY = 6144
 # Rays of lanes side by side are traced together, and do best where they start from one pixel.
 PACKET = 16
 _BLOCK_LANES = 1 << 21
@@ -89,27 +84,20 @@ def render_passes(
     sample: SamplePass,
     sensor: mi.Sensor,
     seed: int,
-    spp: int | None,
+    budget: Budget,
+    watch: Watch = Watch(),  # noqa: B008 - it is frozen
     *,
-    progress: Progress = lambda done, total: None,
-    seconds: float | None = None,
-    memory: int = DEFAULT_MEMORY,
-    stop: Callable[[], bool] = lambda: False,
-    look: Look = lambda film: None,
     lane_bytes: int = LANE_BYTES,
     batch: int = 0,
     points: str = "sobol",
 ) -> GradientFilm:
     """Calls ``sample`` with the camera samples of pass after pass, and returns the film it filled.
 
-    Rendered are ``spp`` samples per pixel, or as many as ``seconds`` of wall-clock time allow, compilation of kernels
-    included; with both, whichever comes first. The first pass is always rendered, and no further one that is expected
-    to take longer than the time left; of the last block there may be a part. Passes are short at first where ``points``
-    are "rounds", which is how their number is not known before. ``stop`` is asked after each pass whether to end
-    there, and ``look`` called with the film before. ``progress`` is called with (samples per pixel so far, spp) before
-    the first pass and after each, or, where there are ``seconds``, with whole (seconds gone, seconds).
+    The first pass is always rendered, and no further one that is expected to take longer than what is left of the
+    ``budget``'s time; of the last block there may be a part. Passes are short at first where ``points`` are "rounds",
+    which is how their number is not known before.
 
-    How many blocks of samples make a pass adapts to the speed of the scene and to ``memory`` (MiB), of which a lane
+    How many blocks of samples make a pass adapts to the speed of the scene and to the memory, of which a lane
     takes ``lane_bytes``, or what ``sample`` says in an attribute of that name. That changes no bit of the result, which
     depends on the seed, the size, the number of samples and ``spp`` alone: of that goes the first round of the
     ``points``, see ``data_gen.paths.streams.first_round``. With a ``batch``, the samples of a pass depend
@@ -118,24 +106,25 @@ def render_passes(
 
     A ``sample`` may come in ``Rounds``, which no pass goes beyond.
 
-    Raises NgptError where one block of samples does not fit into ``memory``.
+    Raises NgptError where one block of samples does not fit into the memory.
     """
+    spp, seconds = budget.spp, budget.seconds
     total = spp if spp is not None else 1 << 31
     rounds = rounds_of(sample)
     lane_bytes = getattr(sample, "lane_bytes", lane_bytes)
     instead = getattr(sample, "instead", _nothing)
     net = first_round(points, spp)
-    film, block, most = film_within(memory, sensor, total, lane_bytes, batch, instead, net=net)
+    film, block, most = film_within(budget.memory, sensor, total, lane_bytes, batch, instead, net=net)
     grows = points == "rounds" and not batch
     start = now = time.perf_counter()
     done: list[tuple[int, float]] = []
 
     def report(finished: bool = False) -> None:
         if seconds is None:
-            progress(film.samples, total)
+            watch.progress(film.samples, total)
         else:
             limit = math.ceil(seconds)
-            progress(limit if finished else min(limit - 1, int(now - start)), limit)
+            watch.progress(limit if finished else min(limit - 1, int(now - start)), limit)
 
     def next_pass(size: int) -> int:
         """Samples of the next pass, where ``size`` is that of its blocks; 0 for none."""
@@ -176,9 +165,9 @@ def render_passes(
         first = ", kernels compiled or loaded" if not done else ""
         _LOG.debug("pass of %d samples per pixel, %.3g s%s", n, now - begin, first)
         done.append((n, max(now - begin - sum(compiled), 1e-6)))
-        look(film)
+        watch.look(film)
         now = time.perf_counter()
-        if n % size or film.samples >= total or stop():
+        if n % size or film.samples >= total or watch.stop():
             break
         report()
     report(finished=True)

@@ -61,28 +61,22 @@ def _register() -> None:
 
     for entry in SAMPLERS.values():
         if entry.module:
-            mi.register_integrator(plugin_name(entry.name), lambda props, entry=entry: _construct(entry, props))
-
-
-def plugin_name(sampler: str) -> str:
-    """What Mitsuba calls a sampler's integrator."""
-    return sampler.replace("-", "_")
+            mi.register_integrator(entry.plugin, lambda props, entry=entry: _construct(entry, props))
 
 
 def _construct(entry: Any, props: Any) -> Any:
     """The integrator of a sampler, of the current variant. Raises NgptError where the sampler is none of Mitsuba's."""
+    from data_gen.samplers.registry import integrator_of
     from ngpt.errors import NgptError
 
     make_classes()
-    from data_gen.samplers.common import GradientIntegrator
-
-    module = importlib.import_module(entry.module)
-    for value in vars(module).values():
-        if isinstance(value, type) and issubclass(value, GradientIntegrator) and value.__module__ == entry.module:
-            return value(props)
-    raise NgptError(
-        f"sampler '{entry.name}' is no integrator of Mitsuba; use data_gen.render_scene(scene, sampler='{entry.name}')"
-    )
+    kind = integrator_of(entry.module)
+    if kind is None:
+        raise NgptError(
+            f"sampler '{entry.name}' is no integrator of Mitsuba; "
+            f"use data_gen.render_scene(scene, sampler='{entry.name}')"
+        )
+    return kind(props)
 
 
 def make_classes() -> None:

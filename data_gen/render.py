@@ -6,15 +6,17 @@ import logging
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import mitsuba as mi
 
 from data_gen.adaptive import Adaptive, check_adaptive, render_adaptive
 from data_gen.begun import Unfinished
+from data_gen.budget import DEFAULT_MEMORY, Budget, Progress, Watch
 from data_gen.film import GradientFilm
 from data_gen.made import Made
-from data_gen.passes import DEFAULT_MEMORY, Progress, render_passes, rounds_of
+from data_gen.passes import render_passes, rounds_of
 from data_gen.samplers import SAMPLERS, choose, find
 from data_gen.samplers.registry import Entry, own
 from data_gen.samplers.shared import why_not_shared
@@ -25,7 +27,6 @@ from data_gen.scenes.load import check_scene
 from data_gen.tails.schedule import FIRST, LEAST_MIB, LEAST_PATHS, MIB
 from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
 from ngpt.io.exr import with_channels
-from ngpt.layers import FEATURE_NOISE
 from ngpt.merging import UNFINISHED
 from ngpt.stack import GradientStack
 from ngpt.version import __version__
@@ -56,14 +57,13 @@ def render_stack(
 ) -> GradientStack:
     """Renders a stack from the scene's first sensor.
 
-    ``spp`` is the number of (base) paths per pixel, ``seconds`` a limit of wall-clock time (one of them may be None),
-    ``sampler`` "auto" or one of ``data_gen.samplers.SAMPLERS``, ``options`` are the sampler's own, which may be texts.
-    ``progress`` is called with (samples done, spp) before the first pass and after each; for it, ``memory`` and
-    ``stop`` see ``data_gen.passes.render_passes()``. With ``diagnostics`` the stack carries the images of
-    ``data_gen.film.GradientFilm.diagnose()`` as further channels; ``newest`` is called after each pass with a function
-    that makes the stack of the samples done by then; without ``with_features``, which sampler "primal"
-    alone can do without, it holds the primal alone. The scene's reconstruction filter is not used: the pixels of a
-    stack, and so their differences, are box-filtered.
+    ``sampler`` is "auto" or one of ``data_gen.samplers.SAMPLERS``; ``options`` are its own, which may be texts.
+    ``spp``, ``seconds`` and ``memory`` are those of ``data_gen.budget.Budget``, ``progress`` and ``stop`` those of
+    ``data_gen.budget.Watch``; ``newest`` is called after each pass with a function that makes the stack of the samples
+    done by then. With ``diagnostics`` the stack carries the images of ``data_gen.film.GradientFilm.diagnose()`` as
+    further channels; without ``with_features``, which only sampler "primal" can do without, it holds nothing but the
+    primal. The scene's reconstruction filter is not used: the pixels of a stack, and so their differences, are
+    box-filtered.
 
     With ``adaptive``, pixels get samples in different numbers, which the layer ``samples`` says: see
     ``data_gen.adaptive``. ``spp``, and ``ngpt:spp``, are means over pixels then.
@@ -80,7 +80,8 @@ def render_stack(
     Raises Unfinished, which has the stack of the samples done by then, where a later pass fails; and NgptError for
     options that do not exist or make no sense, and for a scene that the sampler cannot render.
     """
-    check_limits(spp, seed, sampler, seconds, memory, adaptive is not None and adaptive.error is not None)
+    budget = Budget(spp, seconds, memory)
+    check_limits(budget, seed, sampler, adaptive is not None and adaptive.error is not None)
     facts = scene_facts(check_scene(scene))
     if sampler == "auto":
         sampler, _ = choose(facts)
@@ -97,39 +98,40 @@ def render_stack(
             why_not = f"the integrator is '{facts.integrator}', and only paths of 'path' do"
         if why_not and settings["tails"] == "shared":
             raise WrongUse(f"sampler '{sampler}': tails=shared is not possible: {why_not}; leave it out")
-        if "tails" not in options and not unbiased and not why_not and _enough_to_share(scene, spp, memory):
+        if "tails" not in options and not unbiased and not why_not and _enough_to_share(scene, budget):
             settings["tails"] = "shared"
-            memory -= MIB
+            budget = replace(budget, memory=memory - MIB)
     if adaptive is not None:
         check_adaptive(adaptive, entry, settings, spp)
     _LOG.info("sampler %s, options %s", sampler, options_as_attribute(entry, settings) or "as by default")
     start = time.perf_counter()
     more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
-    sensor, chosen = scene.sensors()[0], {}
-    limits = {"progress": progress, "memory": memory, "stop": stop, "lane_bytes": entry.lane_bytes}
+    sensor = scene.sensors()[0]
+    chosen: dict[str, Any] = {}
     whole: list[GradientFilm] = []  # the film after the last pass, if there was one
 
     def look(film: GradientFilm) -> None:
         whole[:] = [film]
         newest(lambda: stack_of(film, sensor, seed, sampler, start, {}))
 
-    limits["look"] = look
     # Of samples that time may end nobody knows how many there will be, though no more than ``spp``.
     if settings.get("points") == "sobol" and (spp is None or seconds is not None or adaptive is not None):
         settings["points"] = "rounds"
-    limits["points"] = settings.get("points", "independent")
+    watch = Watch(progress, stop, look)
+    how: dict[str, Any] = {"lane_bytes": entry.lane_bytes, "points": settings.get("points", "independent")}
     with weighed(scene, settings["lamps"], entry.by_place) as places:
         more |= own(settings) | ({"places": places} if places else {})
         made = made or Made()
         sample = made.sampler(entry, scene, more)
         # However long it took to weigh the lamps, the render is begun.
-        limits["seconds"] = None if seconds is None else max(seconds - (time.perf_counter() - start), 1e-3)
+        if seconds is not None:
+            budget = replace(budget, seconds=max(seconds - (time.perf_counter() - start), 1e-3))
         failed = None
         try:
             if adaptive is None:
-                film = render_passes(sample, sensor, seed, spp, batch=entry.batch, **limits)
+                film = render_passes(sample, sensor, seed, budget, watch, batch=entry.batch, **how)
             else:
-                film, chosen = render_adaptive(sample, sensor, seed, adaptive, spp, **limits)
+                film, chosen = render_adaptive(sample, sensor, seed, adaptive, budget, watch, **how)
         except Exception as error:
             stop_if_interrupted(error)
             if not whole:
@@ -150,10 +152,10 @@ def render_stack(
     return stack
 
 
-def _enough_to_share(scene: mi.Scene, spp: int | None, memory: int) -> bool:
+def _enough_to_share(scene: mi.Scene, budget: Budget) -> bool:
     """Whether a render has paths and memory enough for a cache that they share."""
     pixels = math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
-    return pixels * (spp or FIRST) >= LEAST_PATHS and memory >= LEAST_MIB
+    return pixels * (budget.spp or FIRST) >= LEAST_PATHS and budget.memory >= LEAST_MIB
 
 
 def options_as_attribute(entry: Entry, settings: dict[str, Any]) -> dict[str, str]:
@@ -176,36 +178,21 @@ def stack_of(
 
     It lies where the crop window of the sensor does, in a picture of the whole size.
     """
-    layers = film.develop()
     attributes = {
-        "ngpt:spp": film.samples,
         "ngpt:seed": str(seed),
         "ngpt:sampler": sampler,
         "ngpt:seconds": time.perf_counter() - start,
-        "ngpt:normalSpace": "camera",
         "ngpt:discarded": film.discarded,
         "software": f"ngpt {__version__}, Mitsuba {mi.__version__} {mi.variant()}",
     }
-    if (noise := film.feature_noise) is not None:
-        attributes[FEATURE_NOISE] = noise
-    attributes |= more
-    stack = GradientStack(layers, attributes=attributes, place=place_of(sensor))
+    stack = film.stack(attributes | more, place_of(sensor))
     return with_channels(stack, film.diagnose()) if diagnostics else stack
 
 
-def check_limits(
-    spp: int | None, seed: int, sampler: str, seconds: float | None, memory: int, ends: bool = False
-) -> None:
+def check_limits(budget: Budget, seed: int, sampler: str, ends: bool = False) -> None:
     """Raises WrongUse for what no scene could be rendered with; ``ends``: something else ends the render."""
-    if spp is None and seconds is None and not ends:
-        raise WrongUse("neither a number of samples per pixel nor a time to render for is given")
-    if spp is not None and not 1 <= spp < 2**31:
-        raise WrongUse(f"{spp} samples per pixel: from 1 to 2^31 - 1 can be rendered")
-    if seconds is not None and not 0 < seconds < float("inf"):
-        raise WrongUse(f"cannot render for {seconds:g} s; give a positive number of seconds")
+    budget.check(ends)
     if not 0 <= seed < 2**64:
         raise WrongUse(f"seed {seed} is out of range; use 0 .. 2^64 - 1")
-    if memory < 1:
-        raise WrongUse(f"{memory} MiB of memory: give a positive number")
     if sampler != "auto":
         find(sampler)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,22 +31,24 @@ def render(scene: mi.Scene, options: Options, spp: int | None, seed: int, *, sec
     return render_stack(scene, spp, seed, seconds=seconds, **options)
 
 
-def warm_up(*args: Any) -> GradientStack:
+def warm_up(scene: mi.Scene, options: Options) -> GradientStack:
     from data_gen.choosing import costs
 
-    return costs.warm_up(*args)
+    return costs.warm_up(scene, options)
 
 
-def timed(*args: Any) -> tuple[GradientStack, float]:
+def timed(scene: mi.Scene, options: Options, spp: int, seed: int, clock: str) -> tuple[GradientStack, float]:
     from data_gen.choosing import costs
 
-    return costs.timed(*args)
+    return costs.timed(scene, options, spp, seed, clock)
 
 
-def measure(*args: Any, **options: Any) -> tuple[dict[str, list[float]], GradientStack]:
+def measure(
+    scene: mi.Scene, renders: Mapping[str, Options], spp: int, repeats: int, *, clock: str
+) -> tuple[dict[str, list[float]], GradientStack]:
     from data_gen.choosing import costs
 
-    return costs.measure(*args, **options)
+    return costs.measure(scene, renders, spp, repeats, clock=clock)
 
 
 def batch(sampler: str) -> int:

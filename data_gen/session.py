@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from data_gen.backend import DEFAULT_VARIANT, use_variant
+from data_gen.budget import DEFAULT_MEMORY, Budget
 from data_gen.frames.pattern import filled
 from data_gen.samplers import FRAME_SAMPLERS, check_options
 from ngpt.errors import NgptError, WrongUse
@@ -93,7 +94,6 @@ def render_scene(
     sense, and for scenes that cannot be loaded or that the sampler cannot render.
     """
     _start(variant)
-    from data_gen.passes import DEFAULT_MEMORY
     from data_gen.render import check_limits, render_stack
     from data_gen.scenes.cameras import sensor_names
 
@@ -103,7 +103,7 @@ def render_scene(
     by_itself = sampler == "auto" and seconds is not None and spp is None
     sharing = _sharing(adaptive, error, method, by_itself)
     # Before the scene is loaded, which may take long.
-    check_limits(spp, seed, sampler, seconds, memory, error is not None)
+    check_limits(Budget(spp, seconds, memory), seed, sampler, error is not None)
     check_options(sampler, options)
     scene = _loaded(scene, size, parameters, sensor)
     if sensor is None and len(scene.sensors()) > 1:
@@ -196,14 +196,13 @@ def render_frames(
     from data_gen.frames.camera_path import read_camera_path
     from data_gen.frames.gltf import read_gltf_camera
     from data_gen.frames.shot import Shot, render_shot
-    from data_gen.passes import DEFAULT_MEMORY
     from data_gen.render import check_limits
 
     memory = DEFAULT_MEMORY if memory is None else memory
     remembers = FRAME_SAMPLERS.get(sampler)
     if spp is None and (seconds is None or remembers):
         spp = remembers.spp if remembers else DEFAULT_SPP
-    check_limits(spp, seed, "auto" if remembers else sampler, seconds, memory)
+    check_limits(Budget(spp, seconds, memory), seed, "auto" if remembers else sampler)
     check_options(sampler, options)
     if isinstance(camera, str | Path):
         animated = Path(camera).suffix.lower() in (".glb", ".gltf")

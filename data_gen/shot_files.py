@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from concurrent.futures import as_completed
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +100,7 @@ def write_frames(
 
     def write_all(skip: Callable[[int], bool], more: Mapping[str, Any]) -> None:
         try:
-            for frame, stack in render_frames(scene, list(files), skip=skip, stop=stop, **(options | more)):
+            for frame, stack in render_frames(scene, list(files), skip=skip, stop=stop, **{**options, **more}):
                 add(frame, stack)
         except Unfinished as error:
             frame = error.stack.attributes["ngpt:frame"]
@@ -109,7 +110,7 @@ def write_frames(
             raise
 
     for rest, frames in begun.items():
-        write_all(lambda frame, these=frozenset(frames): frame not in these, rest.options(options.get("seed", 0)))
+        write_all(partial(_not_among, frozenset(frames)), rest.options(options.get("seed", 0)))
     write_all(skip, {})
     if stop():
         done = {report["frame"] for report in written.frames if "unfinished" not in report}
@@ -194,3 +195,7 @@ def write_frames_on_cluster(
             made(whole, len(files))
     whole.frames.sort(key=lambda report: order.index(report["frame"]))
     return whole
+
+
+def _not_among(frames: frozenset[int], frame: int) -> bool:
+    return frame not in frames

@@ -10,8 +10,9 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen import passes
+from data_gen.budget import Budget
 from data_gen.film import GradientFilm
-from data_gen.passes import DEFAULT_MEMORY, PACKET, SamplePass, foretold, lanes_within, recording
+from data_gen.passes import PACKET, SamplePass, foretold, lanes_within, recording
 from data_gen.paths.camera import CameraSamples, bytes_of_rays
 from data_gen.paths.streams import first_round
 from data_gen.samplers.registry import LANE_BYTES
@@ -24,11 +25,11 @@ class UnevenRender:
     """A render that is told, step by step, how many more blocks of samples each pixel gets.
 
     What it is told makes one sequence of blocks: the first of all pixels that get one, row by row, then the second of
-    all that get two, and so on. ``most`` samples, a time of ``seconds`` or ``stop`` cut the sequence
-    wherever it is: the same samples in all give the same bits, whatever the passes and whatever ended it.
+    all that get two, and so on. ``most`` samples, the time of the ``budget`` or ``stop`` cut the sequence wherever it
+    is: the same samples in all give the same bits, whatever the passes and whatever ended it.
 
-    ``sample`` must take samples that do not share anything; see ``data_gen.passes.render_passes()`` for it, for
-    ``memory`` (MiB) and for ``stop``. ``report`` is called after each pass.
+    ``sample`` must take samples that do not share anything; see ``data_gen.passes.render_passes()`` for it. ``stop`` is
+    asked before each pass, and ``report`` called after it.
     """
 
     def __init__(
@@ -38,8 +39,7 @@ class UnevenRender:
         seed: int,
         most: int | None = None,
         *,
-        seconds: float | None = None,
-        memory: int = DEFAULT_MEMORY,
+        budget: Budget = Budget(),  # noqa: B008 - it is frozen
         stop: Callable[[], bool] = lambda: False,
         lane_bytes: int = LANE_BYTES,
         report: Callable[[], None] = lambda: None,
@@ -50,9 +50,10 @@ class UnevenRender:
         self.film = GradientFilm(width, height, net=self.net)
         self.sample, self.sensor, self.seed, self.stop, self.report = sample, sensor, seed, stop, report
         self.blocks_left = (most or 1 << 62) // BLOCK
+        lane_bytes += bytes_of_rays(sensor)
         # Raises NgptError where not even one row's worth fits.
-        self.at_once = lanes_within(memory, self.film, BLOCK * width, lane_bytes + bytes_of_rays(sensor)) // BLOCK
-        self.end = None if seconds is None else time.perf_counter() + seconds
+        self.at_once = lanes_within(budget.memory, self.film, BLOCK * width, lane_bytes) // BLOCK
+        self.end = None if budget.seconds is None else time.perf_counter() + budget.seconds
         self.passes: list[tuple[int, float]] = []  # blocks and seconds of each
         self.ended = False
 

@@ -100,11 +100,12 @@ def test_the_metric_of_the_page(site, stack_file, capsys):
 def test_the_sampler_of_the_page(renderer, site, tmp_path, capsys):
     """It is random replay, to the last bit."""
     install_page(site, PAGES["sampler"])
-    for sampler in ("replay", "gpt-basic"):
+    for sampler in ("replay", "replay-path", "gpt-basic"):
         call = ["render", "diffuse", "--sampler", sampler, "--spp", "2", "--size", "12x8"]
         assert main([*call, "-o", str(tmp_path / f"{sampler}.exr")]) == 0, capsys.readouterr().err
-    ours, theirs = (ngpt.read(tmp_path / f"{name}.exr") for name in ("replay", "gpt-basic"))
-    assert ours.names == theirs.names and all((ours[n] == theirs[n]).all() for n in ("primal", "dx", "dy"))
+    *both, theirs = (ngpt.read(tmp_path / f"{name}.exr") for name in ("replay", "replay-path", "gpt-basic"))
+    for ours in both:
+        assert ours.names == theirs.names and all((ours[n] == theirs[n]).all() for n in ("primal", "dx", "dy"))
     assert main(["info", "replay"]) == 0 and "gradients by random replay" in capsys.readouterr().out
     from data_gen.code import code
 

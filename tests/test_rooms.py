@@ -40,7 +40,7 @@ ngpt.export
 ngpt.sequence.export
 ngpt.evaluation
 ngpt.cli
-data_gen.llvm data_gen.scenes.grids
+data_gen.llvm data_gen.scenes.grids data_gen.budget
 data_gen.scenes data_gen.scenes.procedural
 data_gen.film data_gen.paths data_gen.samplers.registry
 data_gen.passes data_gen.tails

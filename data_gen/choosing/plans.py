@@ -13,14 +13,16 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mitsuba as mi
 
 from data_gen import samplers
+from data_gen.budget import DEFAULT_MEMORY
 from data_gen.choosing.enclosed import enclosed
 from data_gen.choosing.pipelines import Pipeline, choose, measure, methods_for
 from data_gen.choosing.trials import PIXELS, Trial, at_most, candidates, try_all
-from data_gen.passes import DEFAULT_MEMORY, film_within
+from data_gen.passes import film_within
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.facts import scene_facts
 from data_gen.tails.schedule import FIRST, LEAST_PATHS
@@ -111,7 +113,7 @@ def explore(
     pixels = round(PIXELS * min(1.0, max((seconds / LONG) ** 2, LEAST_PIXELS)))
     with at_most(scene, pixels) as scale:
         first = math.inf if patient else SHARE * seconds
-        told = {"clock": clock, "said": said, "stop": stop, "unbiased": unbiased}
+        told: dict[str, Any] = {"clock": clock, "said": said, "stop": stop, "unbiased": unbiased}
         trials = try_all(scene, able, lambda _: SHARE * seconds, first, **told)
     if not trials or stop():
         return []
@@ -225,7 +227,7 @@ def plan_sampler(
             return min(math.inf if spp is None else trials[sampler].seconds * spp * scale, longest)
 
         share = _SHARE_OF_RENDER
-        told = {"said": said, "stop": stop, "unbiased": unbiased}
+        told: dict[str, Any] = {"said": said, "stop": stop, "unbiased": unbiased}
         trials = try_all(scene, names, lambda trials: share * whole(trials), share * longest, **told)
     found = (sampler, reason)
     if sampler in trials and not stop():

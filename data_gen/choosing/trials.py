@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
+import zlib
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -85,7 +86,8 @@ def try_all(
     The ``first`` has a budget of its own, and is compiled in any case. ``said`` is told what is tried, and ``stop``
     asked whether to end there. ``unbiased`` goes to ``data_gen.render.render_stack``.
     """
-    start, slow, trials = clock(), 1.0, {}
+    start, slow = clock(), 1.0
+    trials: dict[str, Trial] = {}
     for i, name in enumerate(samplers):
         rest = (budget(trials) if i else first) - (clock() - start)
         compiles = SAMPLERS[name].compiles
@@ -102,6 +104,11 @@ def try_all(
         if trial is not None:
             trials[name] = trial
     return by_processor(trials)
+
+
+def seed_of(sampler: str) -> int:
+    """The first of the eight seeds of a sampler's trials: by its name, so that no other sampler changes them."""
+    return SEED + 8 * zlib.crc32(sampler.encode())
 
 
 def by_processor(trials: dict[str, Trial]) -> dict[str, Trial]:
@@ -127,7 +134,7 @@ def try_out(
     """
     begins = clock()
     batch = SAMPLERS[sampler].batch
-    spp, seed = max(SPP, 2 * batch), SEED + 8 * list(SAMPLERS).index(sampler)
+    spp, seed = max(SPP, 2 * batch), seed_of(sampler)
     # What a render takes to begin is no part of what a sample takes; a render of another length tells the two apart.
     other = batch or 2 * SPP
     try:
@@ -179,9 +186,10 @@ class Witnesses:
     @classmethod
     def of(cls, trials: dict[str, Trial]) -> Witnesses:
         primals = {name: [stack["primal"].astype(np.float64) for stack in t.stacks] for name, t in trials.items()}
-        middle = sum(sum(images) / 4 for images in primals.values()) / len(primals)
-        noise = {name: max(noise_of(*images[:2], middle), 1e-12) for name, images in primals.items()}
-        return cls(primals, noise, mean_of({name: sum(images) / 4 for name, images in primals.items()}, noise))
+        means = {name: np.asarray(sum(images)) / 4 for name, images in primals.items()}
+        middle = np.asarray(sum(means.values())) / len(primals)
+        noise = {name: max(noise_of(images[0], images[1], middle), 1e-12) for name, images in primals.items()}
+        return cls(primals, noise, mean_of(means, noise))
 
     def against(self, sampler: str, half: int) -> tuple[np.ndarray, np.ndarray]:
         """Two independent images that the sampler's other half has no part in: that ``half`` of its own, and all of
@@ -204,8 +212,8 @@ class Witnesses:
             for half, images in enumerate(halves)
             for image in images
         ]
-        pairs = halves if len(halves[0]) > 1 else [[images[0] for images in halves]]
-        return max(statistics.mean(judged), statistics.mean(noise_of(*p, self.scale) for p in pairs), 1e-9)
+        pairs = [(images[0], images[1]) for images in (halves if len(halves[0]) > 1 else [[h[0] for h in halves]])]
+        return max(statistics.mean(judged), statistics.mean(noise_of(a, b, self.scale) for a, b in pairs), 1e-9)
 
     def doubt(self, sampler: str, image: np.ndarray) -> float:
         """The standard error of the error of an ``image`` of the first half."""
@@ -215,7 +223,7 @@ class Witnesses:
 def mean_of(images: dict[str, np.ndarray], noise: dict[str, float]) -> np.ndarray:
     """Of images by name, weighted by 1 / their noise."""
     weights = {name: 1 / noise[name] for name in images}
-    return sum(weights[name] * image for name, image in images.items()) / sum(weights.values())
+    return np.asarray(sum(weights[name] * image for name, image in images.items())) / sum(weights.values())
 
 
 def noise_of(a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> float:
@@ -248,12 +256,13 @@ def at_most(scene: mi.Scene, pixels: int):
     A cropped film stays as it is: its window could not be set again.
     """
     film = scene.sensors()[0].film()
-    size, window = (tuple(int(n) for n in numbers) for numbers in (film.size(), film.crop_size()))
+    (width, height), window = (tuple(int(n) for n in numbers) for numbers in (film.size(), film.crop_size()))
+    size = width, height
     shrink = math.sqrt(pixels / (size[0] * size[1]))
     if shrink >= 1 or size != window:
         yield 1.0
         return
-    small = tuple(max(1, round(n * shrink)) for n in size)
+    small = max(1, round(width * shrink)), max(1, round(height * shrink))
     set_film_size(scene, small)
     try:
         yield size[0] * size[1] / (small[0] * small[1])

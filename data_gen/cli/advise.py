@@ -95,7 +95,7 @@ def rows_of(pipelines: list[Pipeline], seconds: float | None, error: float | Non
     first. Raises NgptError where none fits."""
     found = []
     for p in pipelines:
-        spp = math.floor(p.samples(seconds)) if seconds is not None else math.ceil(p.needed(error))
+        spp = math.floor(p.samples(seconds)) if seconds is not None else math.ceil(p.needed(error or math.inf))
         if max(p.least, 2) <= spp < LARGEST_SPP:
             found.append(Row(p.sampler, p.method, p.shared, spp, p.takes(spp), p.expected(spp), *p.likely(spp)))
     if not found and seconds is not None:

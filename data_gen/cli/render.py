@@ -163,8 +163,8 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
     if failed is not None:
         raise NgptError(f"{failed}; {target} has the {done} samples per pixel done before")
     if interrupted := UNFINISHED in stack.attributes:
-        tell, how = (console.error, "interrupted") if stop() else (console.say, "enough")
-        tell(f"{how}: {target} holds the {done} samples per pixel done by then")
+        tell, why = (console.error, "interrupted") if stop() else (console.say, "enough")
+        tell(f"{why}: {target} holds the {done} samples per pixel done by then")
     by = f", {described(made)}" if made else ""
     console.say(f"{args.scene} -> {target}: {stack.place}, {done} spp, {took:.2f} s{by}")
     if args.time is not None and took > _LATE * args.time and done <= _FEW:

@@ -9,6 +9,7 @@ sees, and look at something else it sees.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -64,13 +65,14 @@ class View:
     @classmethod
     def of(cls, record: dict) -> View:
         """The view of a record."""
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in record.items()})
+        values: dict[str, Any] = {n: tuple(value) if isinstance(value, list) else value for n, value in record.items()}
+        return cls(**values)
 
 
 class Surroundings:
     """What rays find in a scene, how large its inhabited part is, and the samplers that are ``made`` for it."""
 
-    def __init__(self, scene: mi.Scene, box: tuple | None = None):
+    def __init__(self, scene: mi.Scene, box: list | tuple | None = None):
         self.scene, self.box, self.made = scene, box, Made()
         sensor = mi.traverse(scene.sensors()[0])
         matrix = np.array(sensor["to_world"].matrix, float).reshape(4, 4)
@@ -157,7 +159,8 @@ def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: f
     standard deviation of the aperture's radius relative to the distance in focus (0.005 in the paper). Raises NgptError
     when no view can be found.
     """
-    views, details = [], []
+    views: list[View] = []
+    details: list[float] = []
     for attempt in range(2 * ATTEMPTS):
         if attempt == ATTEMPTS and views:
             break
@@ -195,12 +198,17 @@ def random_view(
     side = np.cross(towards, around.up)
     up = np.cos(angle) * around.up + np.sin(angle) * side / max(np.linalg.norm(side), 1e-6)
     scale = size / VIRTUAL_SIZE[1] * MAX_ZOOM ** rng.random()
-    film = tuple(max(size, round(scale * n)) for n in VIRTUAL_SIZE)
-    window = tuple(int(rng.integers(0, n - size + 1)) for n in film)
+    film = max(size, round(scale * VIRTUAL_SIZE[0])), max(size, round(scale * VIRTUAL_SIZE[1]))
+    window = int(rng.integers(0, film[0] - size + 1)), int(rng.integers(0, film[1] - size + 1))
     fov = float(np.clip(around.fov * rng.uniform(0.7, 1.2), 15, 100))
     aperture = max(abs(rng.normal(0, lens)), 1e-5) * focus
-    origin, target, up = (tuple(float(x) for x in v) for v in (origin, origin + focus * towards, up))
-    return View(origin, target, up, fov, float(aperture), float(focus), film, window, size)
+    ways = floats(origin), floats(origin + focus * towards), floats(up)
+    return View(*ways, fov, float(aperture), float(focus), film, window, size)
+
+
+def floats(vector: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in vector)
+    return x, y, z
 
 
 def with_one_kernel(around: Surroundings, view: View) -> View:

@@ -193,9 +193,10 @@ def make_inputs(config: Config, scene, made: Any, kept: Kept, place: int, seed: 
     clock = time.perf_counter()
     View.of(told["view"]).apply(scene)
     cleaned = [finite(render_input(config, scene, *each, made)) for each in zip(counts, seeds, uneven, strict=True)]
-    new = {"spp": counts, "seeds": seeds, "repaired": [count for _, count in cleaned]}
+    new: dict[str, Any] = {"spp": counts, "seeds": seeds, "repaired": [count for _, count in cleaned]}
     new["seconds"] = {"inputs": round(time.perf_counter() - clock, 4)}
-    return [(CropData([stack for stack, _ in cleaned], counts, *kept.images(place)), told | new)]
+    images: Any = kept.images(place)
+    return [(CropData([stack for stack, _ in cleaned], counts, *images), told | new)]
 
 
 def _seeds(rng: np.random.Generator, config: Config) -> list[int]:

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from functools import partial
 from multiprocessing import active_children, get_context
 from pathlib import Path
+from typing import Any
 
 from data_gen.dataset.config import Config, Job, as_json
 from data_gen.dataset.crops import make_shard
@@ -114,7 +115,8 @@ def generate(
 
 def finished(executor: Executor, make: Callable[[Job], str], jobs: list[Job], ahead: int = 64) -> Iterator[Job]:
     """Yields jobs as they are finished, with at most ``ahead`` of them handed out; drops the others on an error."""
-    waiting, running = iter(jobs), {}
+    waiting = iter(jobs)
+    running: dict[Any, Job] = {}
     try:
         while True:
             limit = 1 if isinstance(executor, Serial) else ahead

@@ -12,8 +12,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.dataset.cameras import Surroundings, View
+from data_gen.dataset.cameras import Surroundings, View, floats
 from data_gen.frames.motion import seen
+from data_gen.scenes.geometry import VERTICES, put_vertices, vertices
 
 # Shares of shots of which the camera moves, a thing does, the light does; and of the latter, of which a lamp moves,
 # where there is one, rather than shines differently.
@@ -50,8 +51,7 @@ class Movement:
     def view_at(self, frame: int) -> View:
         origin = np.add(self.view.origin, frame * np.array(self.way))
         target = np.add(self.view.target, frame * (np.array(self.way) + self.turn))
-        origin, target = (tuple(float(x) for x in point) for point in (origin, target))
-        return replace(self.view, origin=origin, target=target)
+        return replace(self.view, origin=floats(origin), target=floats(target))
 
     def apply(self, scene: mi.Scene, frame: int) -> None:
         """Brings ``scene`` into the state of a frame; that of frame 0 is the scene's own, seen by the view."""
@@ -73,8 +73,7 @@ class Movement:
             start = self._start.setdefault(self.shape, mi.Transform4f(params[self.shape]))
             params[self.shape] = mi.Transform4f(mi.ScalarTransform4f().translate(list(map(float, far)))) @ start
             return
-        start = self._start.setdefault(self.shape, np.array(params[self.shape]).reshape(-1, 3))
-        params[self.shape] = mi.Float((start + far).astype(np.float32).ravel())
+        put_vertices(params, self.shape, self._start.setdefault(self.shape, vertices(params, self.shape)) + far)
 
     def record(self) -> dict:
         told = {"way": self.way, "turn": self.turn, "shape": self.shape, "shift": self.shift}
@@ -110,7 +109,7 @@ def random_movement(around: Surroundings, view: View, rng: np.random.Generator, 
         turn = rng.normal(size=2) * (1, 0.5) @ axes[:2]
         turn *= rng.integers(2) * speed(*SPEEDS) * width / max(np.linalg.norm(turn), 1e-9)
         turn *= np.linalg.norm(target - eye) / distance
-        made.way, made.turn = _floats(way), _floats(turn)
+        made.way, made.turn = floats(way), floats(turn)
     movable = _movable(scene)
     if rng.random() < THING:
         share = np.bincount(shapes, minlength=len(scene.shapes())) / len(what.shape)
@@ -118,14 +117,14 @@ def random_movement(around: Surroundings, view: View, rng: np.random.Generator, 
         if things:
             way = rng.normal(size=3) @ axes
             made.shape = movable[things[int(rng.integers(len(things)))]]
-            made.shift = _floats(way * speed(*SPEEDS) * width / np.linalg.norm(way))
+            made.shift = floats(way * speed(*SPEEDS) * width / np.linalg.norm(way))
     if rng.random() < LIGHT:
         lamps = [i for i in movable if scene.shapes()[i].is_emitter()]
         lights = sorted(name for name in mi.traverse(scene).keys() if name.endswith(RADIANCE))  # noqa: SIM118
         if lamps and not made.shape and rng.random() < LAMP:
             way = rng.normal(size=3)
             made.shape = movable[lamps[int(rng.integers(len(lamps)))]]
-            made.shift = _floats(way * speed(*LAMP_WAYS) * around.scale / np.linalg.norm(way))
+            made.shift = floats(way * speed(*LAMP_WAYS) * around.scale / np.linalg.norm(way))
         elif lights:
             made.light = lights[int(rng.integers(len(lights)))]
             made.gain = float(np.exp(rng.choice([-1, 1]) * speed(*GAINS)))
@@ -139,11 +138,6 @@ def _movable(scene: mi.Scene) -> dict[int, str]:
     # Not by names of shapes, which they need not have.
     for name, (_, _, node, _) in mi.traverse(scene).properties.items():
         kind = name.rpartition(".")[2]
-        if node in numbers and (kind == "to_world" or (kind == "vertex_positions" and numbers[node] not in places)):
+        if node in numbers and (kind == "to_world" or (kind in VERTICES and numbers[node] not in places)):
             places[numbers[node]] = name
     return places
-
-
-def _floats(vector: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in vector)
-    return x, y, z

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -10,7 +13,9 @@ from data_gen.film import claims
 from data_gen.film.moments import Moments, Strands, accumulate, no_moments, one_more, put_back, taken
 from data_gen.film.splats import SPLAT_BYTES, Splats
 from data_gen.film.statistics import contrast, statistics
-from ngpt.layers import DIFFERENCES
+from ngpt.layers import DIFFERENCES, FEATURE_NOISE
+from ngpt.stack import GradientStack
+from ngpt.windows import Place
 
 # What samplers shift paths by, (x, y) in pixels, y down: each difference of the contract, and back. The film keeps the
 # differences "neighbour - base" at the base pixel and combines both directions when it develops.
@@ -254,6 +259,14 @@ class GradientFilm:
         if self.counts is not None and np.ptp(self.counts):
             layers["samples"] = self._image(self.counts)
         return {name: np.ascontiguousarray(layer, np.float32) for name, layer in layers.items()}
+
+    def stack(self, attributes: Mapping[str, Any] | None = None, place: Place | None = None) -> GradientStack:
+        """The layers as a stack, with further ``attributes``, at a ``place`` in a larger picture."""
+        known = {"ngpt:spp": int(self.samples_each.mean()), "ngpt:normalSpace": "camera"}
+        if (noise := self.feature_noise) is not None:
+            known[FEATURE_NOISE] = noise
+        where = {} if place is None else {"place": place}
+        return GradientStack(self.develop(), known | dict(attributes or {}), **where)
 
     @property
     def feature_noise(self) -> float | None:

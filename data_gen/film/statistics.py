@@ -21,7 +21,8 @@ def statistics(moments: Moments, strands: int, batch: int = 0) -> tuple[np.ndarr
     counts = np.array(moments.count, np.float64).reshape(strands, -1)
     count = counts.sum(axis=0)
     values = np.ceil(count / batch) if batch else count
-    means, variances = [], []
+    means: list[np.ndarray] = []
+    variances: list[np.ndarray] = []
     with np.errstate(invalid="ignore", divide="ignore"):
         for channel in moments.mean:
             each = np.array(channel).reshape(strands, -1)

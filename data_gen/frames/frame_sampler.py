@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from data_gen.passes import DEFAULT_MEMORY
+from data_gen.budget import DEFAULT_MEMORY
 from data_gen.render import options_as_attribute, stack_of
 from data_gen.samplers import FrameSampler
 from data_gen.scenes.facts import scene_facts

@@ -63,8 +63,12 @@ def _value(node: ast.expr, frame: int):
         return _OPERATORS[type(node.op)](_value(node.left, frame), _value(node.right, frame))
     if isinstance(node, ast.UnaryOp) and type(node.op) in _OPERATORS:
         return _OPERATORS[type(node.op)](_value(node.operand, frame))
-    known = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in _FUNCTIONS
-    if known and not node.keywords:
+    if (
+        isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and not node.keywords
+        and node.func.id in _FUNCTIONS
+    ):
         return _FUNCTIONS[node.func.id](*(_value(argument, frame) for argument in node.args))
     raise WrongUse(
         f"'{ast.unparse(node)}' is not known in {{}}; known are numbers, frame, pi, + - * / // %, brackets, "

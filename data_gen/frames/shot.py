@@ -81,6 +81,7 @@ class Shot:
         return self.update is not None or any(self.describe(frame) != self.describe(frames[0]) for frame in frames)
 
     def _place_camera(self, sensor: mi.Sensor, frame: int) -> None:
+        assert self.camera is not None
         view, params = self.camera.at(frame), mi.traverse(sensor)
         params["to_world"] = type(params["to_world"])(mi.ScalarTransform4f(view.to_world).matrix)
         if view.fov is not None:
@@ -159,11 +160,11 @@ def render_shot(
                     own = frame_seed(seed, frame)
                     stack = render_stack(scene, spp, own, sampler, progress=progress(frame), **options)
                 except Unfinished as error:
-                    placed = _placed(error.stack, frame, previous, motion + np.float32(shift))
+                    placed = _placed(error.stack, frame, previous, motion + np.asarray(shift, np.float32))
                     raise Unfinished(f"frame {frame}: {error}", placed) from error
             before, last = now, frame
         done = i + 1
-        stack = _placed(stack, frame, previous, motion + np.float32(shift))
+        stack = _placed(stack, frame, previous, motion + np.asarray(shift, np.float32))
         del scene  # two scenes in memory would make kernels larger
         if dt and UNFINISHED in stack.attributes:
             return

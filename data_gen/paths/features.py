@@ -11,8 +11,7 @@ from data_gen.scenes.facts import media_of
 # A longer chain of mirrors is cut: the features of what it shows are unknown then, as for a path that escapes.
 MAX_SPECULAR_VERTICES = 32
 
-
-# Of a ray through a medium whose density varies, from where to where there is any.
+# Steps of a ray through a medium whose density varies
 MEDIUM_STEPS = 8
 
 # Materials that turn the shading frame; Mitsuba tells of the turn only through its `aov` integrator.

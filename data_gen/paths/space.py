@@ -108,8 +108,8 @@ class Filled(Space):
         return x1
 
     def sees(self, x, place: Place, target: mi.Point3f, drawn: Drawn, active) -> tuple[mi.Spectrum, mi.Bool]:
-        drawn = {"channel": drawn.channel, "key": drawn.light}
-        T = segments.transmittance(self.scene, self.media, x, place, target, **drawn, active=active)
+        numbers = {"channel": drawn.channel, "key": drawn.light}
+        T = segments.transmittance(self.scene, self.media, x, place, target, **numbers, active=active)
         return T, dr.max(T) > 0
 
     def reconnect(

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import partial
+from typing import Any, Self
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from data_gen.budget import Budget
 from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass, render_passes
 from data_gen.paths import segments
@@ -17,13 +19,13 @@ from data_gen.paths.frozen import Frozen
 from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.media import Media
 from data_gen.paths.walk import Limits
-from data_gen.samplers import SAMPLERS
+from data_gen.samplers.registry import SAMPLERS, Sampler, by_plugin, find
 from data_gen.scenes.cameras import check_camera
+from data_gen.scenes.facts import Facts, scene_facts
 from data_gen.scenes.integrators import own_estimate
 from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import path_depths, reference_integrator
 from data_gen.scenes.places import Places
-from ngpt.errors import NgptError, stop_if_interrupted
 from ngpt.layers import LAYERS
 from ngpt.options import written
 
@@ -62,19 +64,20 @@ class GradientIntegrator(mi.SamplingIntegrator):
 
     ``render()`` returns a tensor (height, width, channels) whose channels ``aov_names()`` lists, in the order of the
     layers of a stack. The film's reconstruction filter is not used, since a gradient is a difference of box-filtered
-    pixels. Derived classes implement ``prepare()`` and ``sample()``.
+    pixels. Derived classes implement ``begin()``.
 
-    ``name``     of the sampler, whose entry says which options there are
+    ``follows``  Mitsuba's integrator whose image is rendered
+    ``name``     of the sampler, whose ``entry`` in the registry says which options there are, and what it refuses
     ``options``  all of them, as given or by default
     ``nested``   whether another integrator traces the paths, so that there are no ``limits``
     """
 
-    name, nested = "", False
+    follows, nested = "path", False
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
-        entry = SAMPLERS[self.name]
-        self.options = entry.settings({name: props[name] for name in entry.options if name in props})
+        self.name = by_plugin(props.plugin_name()).name
+        self.options = self.entry.settings({name: props[name] for name in self.entry.options if name in props})
         # Whether the film counts failed shifts, where the sampler ``diagnoses`` them
         self.diagnostics = props.get("diagnostics", False)
         if not self.nested:
@@ -83,21 +86,64 @@ class GradientIntegrator(mi.SamplingIntegrator):
         # By which lamps are chosen, where the sampler does so by place and there are many
         self.places: Places | None = None
 
-    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
-        """What takes the samples of a pass of ``sensor``, or of the scene's first one."""
+    # No attribute: Dr.Jit looks at all of these where an integrator is among the variables of a loop.
+    @property
+    def entry(self) -> Sampler:
+        return SAMPLERS[self.name]
+
+    @classmethod
+    def like_path(cls, scene: mi.Scene, plugin: str, places: Places | None = None, **options) -> Self:
+        """The integrator ``plugin``, of this class, with the parameters of the scene's own ``path``, and ``options``.
+
+        Lamps are chosen by ``places``. Raises NgptError where the parameters cannot be read.
+        """
+        props = mi.Properties(plugin)
+        for name, value in (cls.parameters(scene) | options).items():
+            props[name] = value
+        integrator = cls(props)
+        integrator.places = places
+        return integrator
+
+    @classmethod
+    def parameters(cls, scene: mi.Scene) -> dict[str, Any]:
+        """What of the scene's own integrator this one has as well."""
+        return Limits.of(reference_integrator(scene)).parameters()
+
+    def reference(self) -> mi.SamplingIntegrator:
+        """Mitsuba's integrator whose image is rendered."""
+        return mi.load_dict({"type": self.follows, **self.limits.parameters()})
+
+    def facts(self, scene: mi.Scene, sensor: mi.Sensor) -> Facts:
+        """The facts about a scene that this integrator renders, whatever the scene's own is."""
+        return scene_facts(scene, sensor, self.reference())
+
+    def prepare(self, scene: mi.Scene, sensor: mi.Sensor | None = None) -> SamplePass:
+        """What takes the samples of a pass of ``sensor``, or of the scene's first one.
+
+        Raises NgptError for what the registry says that the sampler refuses.
+        """
+        sensor = sensor or scene.sensors()[0]
+        find(self.name, self.facts(scene, sensor))
+        return self.begin(scene, sensor)
+
+    def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
+        """``prepare()`` of a scene that the sampler does not refuse."""
         raise NotImplementedError
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        """The primal estimate alone, by the ``reference()``."""
+        return self.reference().sample(scene, sampler, ray, medium, active)
 
     def render_film(self, scene, sensor, seed: int, spp: int) -> GradientFilm:
         """The film of ``spp`` samples per pixel."""
         check_camera(sensor)
-        entry = SAMPLERS[self.name]
         limits = {
-            "lane_bytes": entry.lane_bytes,
-            "batch": entry.batch,
+            "lane_bytes": self.entry.lane_bytes,
+            "batch": self.entry.batch,
             "points": self.options.get("points", "independent"),
         }
-        with weighed(scene, self.options["lamps"], entry.by_place) as self.places:
-            return render_passes(self.prepare(scene, sensor), sensor, seed, spp, **limits)
+        with weighed(scene, self.options["lamps"], self.entry.by_place) as self.places:
+            return render_passes(self.prepare(scene, sensor), sensor, seed, Budget(spp), **limits)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """Renders all layers: see ``mitsuba.Integrator.render()`` for the parameters."""
@@ -168,20 +214,3 @@ class GradientIntegrator(mi.SamplingIntegrator):
         si = segment.hit.compute_surface_interaction(segment.ray)
         arrives = ~segment.place.scatters & ((segment.nulls.M > 0) | ~segment.hit.is_valid())
         return si.emitter(scene).eval(si, arrives)
-
-
-def like_path(scene: mi.Scene, plugin: str, **options) -> GradientIntegrator:
-    """The integrator ``plugin`` with the parameters of the scene's own ``path``, and ``options`` of its own.
-
-    Raises NgptError where the parameters cannot be read.
-    """
-    limits = Limits.of(reference_integrator(scene))
-    try:
-        return mi.load_dict({"type": plugin, **limits.parameters(), **options})
-    except RuntimeError as error:
-        stop_if_interrupted(error)
-        # Mitsuba makes a text of what a plugin raises, with the lines where it was raised.
-        _, ours, message = str(error).rpartition("NgptError: ")
-        if not ours:
-            raise
-        raise NgptError(message) from None

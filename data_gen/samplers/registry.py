@@ -18,6 +18,9 @@ from ngpt.system.parts import Registry
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
 
+# Why a scene of these facts cannot be rendered by the sampler of a name; "" where it can
+Rule = Callable[["Facts", str], str]
+
 # Bytes that a lane takes in a pass: the most that any path tracer was seen to take, 200, and some more
 LANE_BYTES = 256
 
@@ -34,9 +37,11 @@ def _nothing_to_note(facts: Facts) -> list[str]:
     return []
 
 
-def _from_module(module: str) -> Callable[..., Any]:
-    """The function ``make`` of a module, which is imported when it is first called."""
-    return lambda *args, **options: import_module(module).make(*args, **options)
+def integrator_of(module: str) -> Any:
+    """The class of the Mitsuba integrator that a module defines; None where it has a function ``make`` instead."""
+    found = import_module(module)
+    own = (value for value in vars(found).values() if getattr(value, "__module__", "") == module)
+    return None if hasattr(found, "make") else next(value for value in own if hasattr(value, "like_path"))
 
 
 # What every sampler of single images takes beside its own options; ``data_gen.render`` sees to it, and not ``make``.
@@ -60,11 +65,13 @@ class Entry:
 
     ``name``      as users call it
     ``summary``   one line for the user
-    ``module``    where its function ``make`` is, and its Mitsuba classes, which are made anew with each variant
+    ``module``    where its Mitsuba integrator is, a ``data_gen.samplers.common.GradientIntegrator``; or a function
+                  ``make``. It is imported when the sampler is made, since its classes belong to a variant of Mitsuba
     ``make``      what makes it, where there is no ``module``
     ``standing``  one of ``STANDINGS``: which samplers help shows first, and which laws run in `make test`
     ``options``   name -> ``Option``; ``make`` takes all of them, but for those of ``COMMON``
     ``refuses``   facts about a scene -> why the sampler cannot render it, "" if it can
+    ``refusals``  the same as rules that several samplers share; the first that gives a reason counts
     ``notes``     facts about a scene -> what the user should know about rendering it, a line each
     """
 
@@ -75,13 +82,22 @@ class Entry:
     standing: str = field(default="niche", kw_only=True)
     options: Mapping[str, Option] = field(default_factory=dict, kw_only=True)
     refuses: Callable[[Facts], str] = field(default=_anything, kw_only=True)
+    refusals: tuple[Rule, ...] = field(default=(), kw_only=True)
     notes: Callable[[Facts], list[str]] = field(default=_nothing_to_note, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.standing not in STANDINGS:
             raise NgptError(f"sampler '{self.name}': standing '{self.standing}' is none of {', '.join(STANDINGS)}")
+        if self.refusals:
+            object.__setattr__(self, "refuses", self._first_refusal)
         if self.module:
-            object.__setattr__(self, "make", _from_module(self.module))
+            object.__setattr__(self, "make", self._make)
+
+    def _make(self, *args: Any, **options: Any) -> Any:
+        return import_module(self.module).make(*args, **options)
+
+    def _first_refusal(self, facts: Facts) -> str:
+        return next(filter(None, (rule(facts, self.name) for rule in self.refusals)), "")
 
     def settings(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """All options, those ``given``, which may be texts, and the others' defaults.
@@ -145,6 +161,20 @@ class Sampler(Entry):
         object.__setattr__(self, "options", {**self.options, **common})
 
     @property
+    def plugin(self) -> str:
+        """What Mitsuba calls its integrator."""
+        return self.name.replace("-", "_")
+
+    def integrator(self, scene: Any, **options: Any) -> Any:
+        """Its integrator with the parameters of the scene's own ``path``, and ``options`` that are checked."""
+        return integrator_of(self.module).like_path(scene, self.plugin, **options)
+
+    def _make(self, scene: Any, **options: Any) -> Any:
+        if integrator_of(self.module) is None:
+            return super()._make(scene, **options)
+        return self.integrator(scene, **options).prepare(scene)
+
+    @property
     def even(self) -> bool:
         """Whether all pixels must have as many samples."""
         return bool(self.batch) or self.together
@@ -174,6 +204,11 @@ class FrameSampler(Entry):
 FRAME_SAMPLERS: dict[str, FrameSampler] = {}
 # Other packages bring theirs by entry points.
 SAMPLERS: Registry[Sampler] = Registry("ngpt.samplers", "sampler", Sampler, {}, FRAME_SAMPLERS)
+
+
+def by_plugin(plugin: str) -> Sampler:
+    """The sampler whose integrator Mitsuba calls so."""
+    return next(entry for entry in SAMPLERS.values() if entry.plugin == plugin)
 
 
 def register(entry: Sampler | FrameSampler) -> None:

@@ -1,9 +1,9 @@
-"""What entries of several families share: why they refuse a scene, and options and notes."""
+"""What entries of several families share: why they refuse a scene (``registry.Rule``), and options and notes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from data_gen.samplers.registry import Option
@@ -14,78 +14,58 @@ if TYPE_CHECKING:
 # Integrators that render media, of those that samplers of ours follow
 VOLUMETRIC = ("volpath", "volpathmis")
 
-Refusal = Callable[["Facts"], str]
 
-
-def refused_if_polarised(facts: Facts, name: str) -> str:
+def polarised(facts: Facts, name: str) -> str:
     return f"variant '{facts.polarised}' is polarised, which '{name}' does not follow" if facts.polarised else ""
 
 
-def surfaces_alone(name: str) -> Refusal:
-    """Of a sampler that sees no media."""
-
-    def refuses(facts: Facts) -> str:
-        if facts.integrator != "path":
-            reason = f"the integrator is '{facts.integrator}', and '{name}' knows only 'path'"
-        else:
-            media = ", ".join(facts.media)
-            reason = f"there are media ({media}), which '{name}' does not see" if media else ""
-        return refused_if_polarised(facts, name) or reason
-
-    return refuses
+def spectra(facts: Facts, name: str) -> str:
+    """What paths share with others must have the same wavelengths."""
+    reason = f"in variant '{facts.spectral}' each path has wavelengths of its own, and '{name}' lets paths share light"
+    return f"{reason}, as variant 'llvm_ad_rgb' allows" if facts.spectral else ""
 
 
-def surfaces_from_both_ends(name: str) -> Refusal:
-    """Of a sampler whose light paths end at the camera."""
-    alone = surfaces_alone(name)
-
-    def refuses(facts: Facts) -> str:
-        return alone(facts) or refused_by_light_paths(facts.camera) or refused_by_hair(facts)
-
-    return refuses
+def unseen_media(facts: Facts, name: str) -> str:
+    if facts.integrator != "path":
+        return f"the integrator is '{facts.integrator}', and '{name}' knows only 'path'"
+    media = ", ".join(facts.media)
+    return f"there are media ({media}), which '{name}' does not see" if media else ""
 
 
-def refused_by_light_paths(camera: str) -> str:
-    reached = camera in ("perspective", "thinlens")
-    return "" if reached else f"light paths cannot reach a camera '{camera}', but 'perspective' and 'thinlens'"
+def no_media(facts: Facts, name: str) -> str:
+    if facts.integrator not in VOLUMETRIC:
+        return f"the integrator is '{facts.integrator}', and '{name}' knows only 'volpath' and 'volpathmis'"
+    return "" if facts.media else "there are no media, and 'ppm' has the same image"
 
 
-def refused_by_hair(facts: Facts) -> str:
+def varying_media(facts: Facts, name: str) -> str:
+    return f"there are media whose density varies, which '{name}' does not render" if facts.grids else ""
+
+
+def hidden_emitters(facts: Facts, name: str) -> str:
+    return "its integrator hides emitters" if facts.hides else ""
+
+
+def unreachable_camera(facts: Facts, name: str) -> str:
+    """Light paths must be able to end there."""
+    reached = facts.camera in ("perspective", "thinlens")
+    return "" if reached else f"light paths cannot reach a camera '{facts.camera}', but 'perspective' and 'thinlens'"
+
+
+def no_pixels(facts: Facts, name: str) -> str:
+    """The radius of photons is in pixels: meters have one for all that they see, or none side by side."""
+    meter = facts.camera in ("radiancemeter", "irradiancemeter", "distant")
+    return f"photons are gathered over pixels, which a camera '{facts.camera}' has not side by side" if meter else ""
+
+
+def hair(facts: Facts, name: str) -> str:
     """Mitsuba's hair scatters otherwise from the light to the eye than back, and tells nothing of its adjoint."""
     return "light paths lose light at the material 'hair', which is not the same in both directions" * facts.hair
 
 
-def refused_by_photons(camera: str) -> str:
-    """Their radius is in pixels: meters have one for all that they see, or none side by side."""
-    meter = camera in ("radiancemeter", "irradiancemeter", "distant")
-    return f"photons are gathered over pixels, which a camera '{camera}' has not side by side" if meter else ""
-
-
-def photons_on_surfaces(name: str) -> Refusal:
-    """Of a sampler that gathers photons where there are no media."""
-    alone = surfaces_alone(name)
-
-    def refuses(facts: Facts) -> str:
-        return alone(facts) or refused_by_photons(facts.camera) or refused_by_hair(facts)
-
-    return refuses
-
-
-def photons_in_media(name: str, grids: bool = True) -> Refusal:
-    """Of a sampler that gathers photons in scenes with media; ``grids``: also ones whose density varies."""
-
-    def refuses(facts: Facts) -> str:
-        if facts.integrator not in VOLUMETRIC:
-            reason = f"the integrator is '{facts.integrator}', and '{name}' knows only 'volpath' and 'volpathmis'"
-        elif not facts.media:
-            reason = "there are no media, and 'ppm' has the same image"
-        else:
-            varies = facts.grids and not grids
-            reason = f"there are media whose density varies, which '{name}' does not render" if varies else ""
-        reason = refused_if_polarised(facts, name) or reason
-        return reason or refused_by_photons(facts.camera) or refused_by_hair(facts)
-
-    return refuses
+SURFACES = (polarised, unseen_media)
+BOTH_ENDS = (*SURFACES, unreachable_camera, hair)
+PHOTONS = (polarised, spectra, no_pixels, hair)
 
 
 # Options that several samplers have

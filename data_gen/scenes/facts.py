@@ -18,6 +18,8 @@ class Facts:
                     scene has none: see ``data_gen.scenes.integrators.followed``
     ``media``       the names of its media, sorted
     ``polarised``   the name of a variant that renders polarised light, or ""
+    ``spectral``    the name of a variant whose paths have wavelengths, or ""
+    ``hides``       whether emitters hide from the camera
     ``mirrors``     whether there are mirrors or clear glass; known of scene files that were inspected
     ``grids``       whether there are media whose density varies
     ``camera``      the plugin name of its first camera, or the name of its class
@@ -31,20 +33,32 @@ class Facts:
     grids: bool = False
     camera: str = "perspective"
     hair: bool = False
+    spectral: str = ""
+    hides: bool = False
 
 
-def scene_facts(scene: mi.Scene) -> Facts:
-    """The facts about a scene that is loaded. Raises NgptError for a camera or integrator that no sampler renders."""
-    camera = scene.sensors()[0]
+def scene_facts(scene: mi.Scene, sensor: mi.Sensor | None = None, integrator: mi.Integrator | None = None) -> Facts:
+    """The facts about a scene that is loaded, as seen by a ``sensor`` and by an ``integrator``: by its own ones, where
+    they are not given. Raises NgptError for a camera or integrator that no sampler renders."""
+    camera, integrator = sensor or scene.sensors()[0], integrator or scene.integrator()
     check_camera(camera)
-    if scene.integrator() is not None:
-        check_integrator(scene.integrator())
+    if integrator is not None:
+        check_integrator(integrator)
     media = media_of(scene)
     names = {medium.id() or medium.class_name() for medium in media}
     grids = any(not medium.is_homogeneous() for medium in media)
     hair = any(_has_hair(shape.bsdf()) for shape in scene.shapes())
-    kind = integrator_name(scene)
-    return Facts(kind, tuple(sorted(names)), polarised(), grids=grids, camera=camera_name(camera), hair=hair)
+    reference = None if integrator is None else followed(integrator)
+    return Facts(
+        "path" if reference is None else plugin_name(reference),
+        tuple(sorted(names)),
+        polarised(),
+        grids=grids,
+        camera=camera_name(camera),
+        hair=hair,
+        spectral=spectral(),
+        hides=bool(getattr(reference, "hide_emitters", False)),
+    )
 
 
 def _has_hair(bsdf: mi.BSDF | None) -> bool:
@@ -79,3 +93,8 @@ def media_of(scene: mi.Scene) -> list[mi.Medium]:
 def polarised() -> str:
     """The current variant's name if it renders polarised light, else ""."""
     return mi.variant() if mi.is_polarized else ""
+
+
+def spectral() -> str:
+    """The current variant's name if its paths have wavelengths, else ""."""
+    return mi.variant() if mi.is_spectral else ""

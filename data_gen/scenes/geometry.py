@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -16,19 +18,40 @@ class Mesh:
     faces: np.ndarray
 
 
+# Parameters of a mesh that hold its vertices: rows of three numbers since Mitsuba 3.10, and one row of all before
+VERTICES = ("positions", "vertex_positions")
+
 # A matrix (4, 4) to the world, or a mesh; None for shapes that show neither.
 Geometry = np.ndarray | Mesh | None
 
 
 def geometry(shape: mi.Shape) -> Geometry:
-    params = mi.traverse(shape)
+    return geometry_of(mi.traverse(shape))
+
+
+def geometry_of(params: Mapping[str, Any]) -> Geometry:
+    """The geometry of a shape with these parameters."""
     if "to_world" in params:
         return matrix(params["to_world"])
-    if "vertex_positions" in params and "faces" in params:
-        # Copies, for a scene that is updated keeps its buffers.
-        vertices = np.array(params["vertex_positions"], np.float64).reshape(-1, 3)
-        return Mesh(vertices, np.array(params["faces"]).reshape(-1, 3))
+    if (name := vertices_name(params)) and "faces" in params:
+        return Mesh(vertices(params, name), np.array(params["faces"]).reshape(-1, 3))
     return None
+
+
+def vertices_name(params: Mapping[str, Any], shape: str = "") -> str:
+    """The parameter that holds the vertices of a mesh, which a scene calls ``shape``; "" if there is none."""
+    names = (f"{shape}.{name}" if shape else name for name in VERTICES)
+    return next((name for name in names if name in params), "")
+
+
+def vertices(params: Mapping[str, Any], name: str) -> np.ndarray:
+    """The vertices (V, 3) that a parameter holds: a copy, for a scene that is updated keeps its buffers."""
+    return np.array(params[name], np.float64).reshape(-1, 3)
+
+
+def put_vertices(params: Any, name: str, moved: np.ndarray) -> None:
+    """Has a parameter hold other vertices (V, 3)."""
+    params[name] = type(params[name])(np.ascontiguousarray(moved, np.float32).reshape(np.shape(params[name])))
 
 
 def matrix(transform) -> np.ndarray:

@@ -46,7 +46,7 @@ def cloud(rng: np.random.Generator, shape: tuple[int, int, int] = (32, 32, 48)) 
     return _finished(np.clip(3 * field + 0.35 * noise(rng, shape, 2.2), 0, 1) * base)
 
 
-def _coordinates(shape: tuple[int, int, int]) -> list[np.ndarray]:
+def _coordinates(shape: tuple[int, int, int]) -> tuple[np.ndarray, ...]:
     """z, y and x of the middles of the cells, from -1 to 1."""
     return np.meshgrid(*[(np.arange(n) + 0.5) / n * 2 - 1 for n in shape], indexing="ij")
 
@@ -55,7 +55,7 @@ def _finished(density: np.ndarray) -> np.ndarray:
     """The largest density is 1, and that on the border 0."""
     inner = np.zeros_like(density)
     inner[1:-1, 1:-1, 1:-1] = density[1:-1, 1:-1, 1:-1]
-    return np.float32(inner / max(inner.max(), 1e-6))
+    return (inner / max(inner.max(), 1e-6)).astype(np.float32)
 
 
 def write_vol(path: Path, grid: np.ndarray) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -117,14 +118,16 @@ def own_estimate(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable
 
     That raises NgptError where the integrator fails.
     """
-    call = partial(integrator.sample, scene)
+    call: Callable[..., Any] = partial(integrator.sample, scene)
     if isinstance(integrator, mi.CppADIntegrator):
         # As ``mi.ad.integrators.common.ADIntegrator.render`` calls them
         constant = {"mode": dr.ADMode.Primal, "scene": scene, "δL": None, "δaovs": None, "state_in": None}
 
-        def call(sampler, ray, medium, active):
+        def call_as_render_does(sampler, ray, medium, active):
             with dr.suspend_grad():
                 return integrator.sample(sampler=sampler, ray=ray, depth=mi.UInt32(0), active=active, **constant)
+
+        call = call_as_render_does
 
     def estimate(sampler, ray, medium, active) -> mi.Spectrum:
         try:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 
@@ -42,7 +43,8 @@ def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int |
 
 
 def _merge(state: mi.parser.ParserState) -> None:
-    scene, groups = state.root.props, {}
+    scene = state.root.props
+    groups: dict[Any, list[str]] = {}
     for name, reference in scene.items():
         if isinstance(reference, mi.Properties.ResolvedReference) and (key := _group(state, reference.index())):
             groups.setdefault(key, []).append(name)

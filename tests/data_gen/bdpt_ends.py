@@ -19,10 +19,10 @@ def plan_of(scene, longest=8, **more):
     from data_gen.paths.light_ends import LightEnds
     from data_gen.paths.vertex import Materials
     from data_gen.paths.walk import Limits
-    from data_gen.samplers.common import like_path
+    from data_gen.samplers import SAMPLERS
     from data_gen.samplers.gbdpt.base_path import Plan
 
-    lights, materials, integrator = LightEnds(scene), Materials(scene, 0.05), like_path(scene, "gbdpt")
+    lights, materials, integrator = LightEnds(scene), Materials(scene, 0.05), SAMPLERS["gbdpt"].integrator(scene)
     ways = {"first_hit": integrator.first_hit, "hidden": integrator.hidden_from_camera}
     return Plan(scene, lights, materials, limits=Limits(longest, 100), longest=longest, **ways, **more)
 

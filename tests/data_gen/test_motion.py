@@ -91,16 +91,37 @@ def test_a_sphere_moves_in_front_of_a_wall_at_rest(renderer):
     assert (np.abs(motion).max(axis=-1) > 0).sum() > 20
 
 
+def test_vertices_have_the_names_of_this_mitsuba_and_of_the_next(renderer):
+    """Mitsuba 3.10 has "positions", a tensor (V, 3); what is installed is asked for its own."""
+    from data_gen.scenes.geometry import Mesh, geometry, geometry_of, put_vertices, vertices, vertices_name
+
+    mi = renderer
+    box = mi.load_dict({"type": "cube"})
+    installed, found = mi.traverse(box), geometry(box)
+    name = vertices_name(installed)
+    rows = vertices(installed, name)
+    assert isinstance(found, Mesh) and np.array_equal(found.vertices, rows) and rows.shape[1] == 3
+    new = {"positions": mi.TensorXf(rows.astype(np.float32)), "faces": mi.TensorXu(found.faces)}
+    for params, mesh in ((installed, ""), (new, ""), ({f"box.{key}": value for key, value in new.items()}, "box")):
+        name = vertices_name(params, mesh)
+        put_vertices(params, name, 2 * rows)
+        assert np.array_equal(vertices(params, name), 2 * rows)
+    assert np.array_equal(geometry_of(new).vertices, 2 * rows) and np.array_equal(geometry_of(new).faces, found.faces)
+    assert vertices_name(new, "ball") == "" and geometry_of({"faces": new["faces"]}) is None
+
+
 def test_any_deformation_of_a_mesh_is_followed(renderer):
+    from data_gen.scenes.geometry import put_vertices, vertices, vertices_name
+
     mi = renderer
     scene = scene_of(mi, box={"type": "cube", "to_world": mi.ScalarTransform4f().scale([1.5, 1.5, 0.1])})
     params = mi.traverse(scene)
-    key = next(filter(lambda name: name.endswith("box.vertex_positions"), params.keys()))
-    points = np.array(params[key]).reshape(-1, 3)
+    key = vertices_name(params, "box")
+    points = vertices(params, key)
 
     def change():
         # Sheared: x + 0.1 y, so that rows move by different amounts.
-        params[key] = (points + np.stack([0.1 * points[:, 1], 0 * points[:, 1], 0 * points[:, 1]], axis=-1)).ravel()
+        put_vertices(params, key, points + [0.1, 0, 0] * points[:, 1:2])
         params.update()
 
     motion = moved(mi, scene, change)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from unbiased import load, same
 
+from data_gen.budget import Budget
 from ngpt.errors import NgptError
 
 
@@ -82,11 +83,11 @@ def test_time_is_kept_whatever_a_sample_takes(renderer, monkeypatch, begin, each
 
     sensor = load(renderer, "diffuse", (128, 64)).sensors()[0]
     fake = Fake(renderer, monkeypatch, begin, each, compile_once)
-    film = render_passes(fake, sensor, 0, None, seconds=10, points="rounds")
+    film = render_passes(fake, sensor, 0, Budget(seconds=10), points="rounds")
     assert 8 <= fake.now <= 12
     # What the header says gives the same blocks again.
     again = Fake(renderer, monkeypatch, 0, 0)
-    render_passes(again, sensor, 0, film.samples, points="rounds")
+    render_passes(again, sensor, 0, Budget(film.samples), points="rounds")
     assert again.blocks == fake.blocks and sum(fake.blocks) == film.samples
 
 
@@ -95,9 +96,9 @@ def test_what_takes_longer_than_the_time_is_rendered_once(renderer, monkeypatch)
 
     sensor = load(renderer, "diffuse", (128, 64)).sensors()[0]
     fake = Fake(renderer, monkeypatch, 0, 20)
-    assert render_passes(fake, sensor, 0, None, seconds=10, points="rounds").samples == 1
+    assert render_passes(fake, sensor, 0, Budget(seconds=10), points="rounds").samples == 1
     fake = Fake(renderer, monkeypatch, 0, 3)
-    assert render_passes(fake, sensor, 0, None, seconds=10, batch=4).samples == 4
+    assert render_passes(fake, sensor, 0, Budget(seconds=10), batch=4).samples == 4
 
 
 def test_stopping_keeps_the_samples_done(renderer):

@@ -178,3 +178,14 @@ def test_the_render_is_that_of_the_sampler_by_name(tmp_path, capsys):
     auto, named = map(ngpt.read, files)
     assert auto.attributes["ngpt:sampler"] == "gpt"
     assert all(np.array_equal(auto[name], named[name]) for name in named.names)
+
+
+def test_seeds_of_trials_do_not_depend_on_other_samplers(monkeypatch):
+    from data_gen.choosing import trials
+    from data_gen.samplers import SAMPLERS, Sampler
+
+    before = {name: trials.seed_of(name) for name in SAMPLERS}
+    seeds = {seed + i for seed in before.values() for i in range(8)}
+    assert len(seeds) == 8 * len(before) and max(seeds) < 2**64
+    monkeypatch.setattr(trials, "SAMPLERS", {"first": Sampler("first", "of another package"), **SAMPLERS})
+    assert {name: trials.seed_of(name) for name in before} == before

@@ -56,7 +56,6 @@ def test_without_mitsuba_the_package_is_imported():
 
 
 def test_each_renders_what_its_sampler_does(renderer):
-    from data_gen.plugins import plugin_name
     from data_gen.render import render_stack
     from data_gen.samplers import SAMPLERS, find
     from data_gen.scenes.facts import scene_facts
@@ -69,7 +68,7 @@ def test_each_renders_what_its_sampler_does(renderer):
             continue
         own = {"integrator": scene.integrator()} if name == "gpt-basic" else {"max_depth": 8}
         try:
-            integrator = renderer.load_dict({"type": plugin_name(name), **own})
+            integrator = renderer.load_dict({"type": entry.plugin, **own})
         except RuntimeError as error:
             assert "is no integrator of Mitsuba; use data_gen.render_scene" in str(error)
             none.append(name)
@@ -82,6 +81,25 @@ def test_each_renders_what_its_sampler_does(renderer):
         expected = render_stack(scene, spp, 0, name)
         assert all(np.array_equal(stack[layer], expected[layer], equal_nan=True) for layer in stack.names), name
     assert set(none) == {"primal", "gmlt", "split"}
+
+
+@pytest.mark.parametrize(
+    ("sampler", "scene", "reason"),
+    [
+        ("bdpt", "haze", "there are media .*, which 'bdpt' does not see"),
+        ("ppm", "haze", "there are media .*, which 'ppm' does not see"),
+        ("vpm", "diffuse", "there are no media"),
+        ("gbre", "smoke", "there are media whose density varies, which 'gbre' does not render"),
+    ],
+)
+def test_each_refuses_what_its_sampler_does(renderer, sampler, scene, reason):
+    """Whatever the scene's own integrator is. They rendered the light of such scenes in part, without a word."""
+    from data_gen.scenes.load import load_scene
+
+    integrator, loaded = renderer.load_dict({"type": sampler}), load_scene(scene, (8, 8))
+    with pytest.raises(NgptError, match=f"sampler '{sampler}' cannot render this scene: {reason}.*; use --sampler gpt"):
+        integrator.prepare(loaded)
+    assert callable(renderer.load_dict({"type": "gpt"}).prepare(loaded))
 
 
 def test_all_are_made_anew_with_another_variant():

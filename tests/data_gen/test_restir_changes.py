@@ -21,7 +21,13 @@ def things(mi, params, starts, frame):
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     vertices, middle = starts["tall"], starts["tall"].mean(axis=0)
     moved = ((vertices - middle) @ turn.T) * [1 + 0.3 * frame, 1, 1] + middle
-    params["tall.vertex_positions"] = mi.Float(moved.astype(np.float32).ravel())
+    set_vertices(params, moved)
+
+
+def set_vertices(params, moved):
+    from data_gen.scenes.geometry import put_vertices, vertices_name
+
+    put_vertices(params, vertices_name(params, "tall"), moved)
 
 
 def lamp(mi, params, starts, frame):
@@ -37,7 +43,7 @@ class Room:
     """A built-in scene that changes; the camera moves too. Frames are of two scenes in turn."""
 
     def __init__(self, mi, name, change, more=None):
-        from data_gen.scenes import builtin
+        from data_gen.scenes import builtin, geometry
 
         description = getattr(builtin, name)() | (more or {})
         description["sensor"]["film"] = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
@@ -50,8 +56,8 @@ class Room:
             for key in ("ball", "lamp", "sensor")
             if f"{key}.to_world" in params
         }
-        if "tall.vertex_positions" in params:
-            self.starts["tall"] = np.array(params["tall.vertex_positions"], np.float64).reshape(-1, 3)
+        if name := geometry.vertices_name(params, "tall"):
+            self.starts["tall"] = geometry.vertices(params, name)
 
     def stage(self, frame):
         from data_gen.frames.motion import snapshot
@@ -207,7 +213,7 @@ def wider(mi, params, starts, frame):
     by = 1 + frame * np.array([1.0, 0.5, 0])
     params["ball.to_world"] = starts["ball"] @ mi.Transform4f().scale(1 + frame)
     params["lamp.to_world"] = starts["lamp"] @ mi.Transform4f().scale([float(v) for v in by])
-    params["tall.vertex_positions"] = mi.Float((starts["tall"] * by).astype(np.float32).ravel())
+    set_vertices(params, starts["tall"] * by)
 
 
 def test_rc_goes_with_its_shape_and_the_measure_with_its_area(renderer):

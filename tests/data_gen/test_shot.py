@@ -96,8 +96,10 @@ def test_a_scene_is_loaded_again_only_where_its_parameters_change(renderer, tmp_
 
 
 def test_parameters_can_be_set_in_place(renderer, tmp_path):
+    from data_gen.scenes.geometry import VERTICES
+
     def update(params, frame):
-        key = next(filter(lambda name: name.endswith("vertex_positions"), params.keys()))
+        key = next(filter(lambda name: name.endswith(VERTICES), params.keys()))
         start.setdefault(key, np.array(params[key]))
         params[key] = start[key] + 0.1 * frame
 

@@ -50,8 +50,10 @@ def config_of(**changes):
 
 def state(mi, scene):
     """All that can be moved or shine, but the camera."""
+    from data_gen.scenes.geometry import VERTICES
+
     params = mi.traverse(scene)
-    kinds = (".to_world", ".vertex_positions", ".value", ".radiance.value")
+    kinds = (".to_world", *(f".{name}" for name in VERTICES), ".value", ".radiance.value")
     names = [name for name in params.keys() if name.endswith(kinds) and "camera" not in name]  # noqa: SIM118
     return {name: np.array(getattr(params[name], "matrix", params[name])) for name in names}
 

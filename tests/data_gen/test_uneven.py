@@ -5,6 +5,7 @@ import pytest
 from references import references
 from unbiased import assert_unbiased, load
 
+from data_gen.budget import Budget
 from ngpt.stack import GradientStack
 
 SIZE = (12, 8)
@@ -16,9 +17,8 @@ def render(mi, scene, blocks, seed=0, sampler="gpt", memory=1000, **limits):
     from data_gen.samplers import find
     from data_gen.uneven import UnevenRender
 
-    work = UnevenRender(
-        find(sampler).made(scene), scene.sensors()[0], seed, memory=memory, points="independent", **limits
-    )
+    limits |= {"budget": Budget(memory=memory), "points": "independent"}
+    work = UnevenRender(find(sampler).made(scene), scene.sensors()[0], seed, **limits)
     work.add(np.ones(PIXELS, int), whole=True)
     work.add(blocks)
     return work.film.develop()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from data_gen.samplers.registry import Sampler, register
-from data_gen.samplers.shared import joined_depth, surfaces_from_both_ends
+from data_gen.samplers.shared import BOTH_ENDS, joined_depth
 
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
@@ -23,7 +23,7 @@ register(
         "bdpt",
         "paths from the camera and from the lights, without gradients (hidden lamps, caustics seen directly)",
         "data_gen.samplers.bdpt.integrator",
-        refuses=surfaces_from_both_ends("bdpt"),
+        refusals=BOTH_ENDS,
         notes=_notes,
         options={"joined_depth": joined_depth(10)},
         gradients=False,

@@ -39,10 +39,7 @@ from data_gen.paths.world import World
 from data_gen.samplers.bdpt.camera_path import camera_path
 from data_gen.samplers.bdpt.light_path import Seen, light_path
 from data_gen.samplers.bdpt.plan import Plan
-from data_gen.samplers.common import GradientIntegrator, like_path
-from data_gen.samplers.shared import refused_by_light_paths
-from data_gen.scenes.cameras import camera_name
-from ngpt.errors import NgptError
+from data_gen.samplers.common import GradientIntegrator
 
 
 @dataclass
@@ -75,7 +72,6 @@ class BDPT(GradientIntegrator):
     areas, points, spots and those infinitely far away. Rendering raises NgptError for them.
     """
 
-    name = "bdpt"
     plan_class = Plan
 
     def __init__(self, props: mi.Properties):
@@ -95,8 +91,7 @@ class BDPT(GradientIntegrator):
             **more,
         )
 
-    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
-        refuse(sensor or scene.sensors()[0], self.name)
+    def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
         plan = self.plan(World(scene, LightEnds(scene, self.name)))
         return partial(self.sample_pass, Frozen(scene, plan), plan)
 
@@ -133,22 +128,3 @@ class BDPT(GradientIntegrator):
         further = self.skip_area_emitters(scene, behind, False, lamp)
         blocked = dr.select(lamp, further.is_valid() & (further.t < behind.maxt), hit.is_valid())
         return on_lamp | blocked
-
-
-def refuse(sensor: mi.Sensor, sampler: str) -> None:
-    """Raises NgptError, in the name of the ``sampler``, for a variant or a camera that light paths cannot reach."""
-    if mi.is_polarized:
-        raise NgptError(
-            f"sampler '{sampler}' does not follow polarised light (variant '{mi.variant()}'); "
-            f"use variant '{mi.variant().removesuffix('_polarized')}', or sampler 'gpt-basic'"
-        )
-    if reason := refused_by_light_paths(camera_name(sensor)):
-        raise NgptError(f"sampler '{sampler}' cannot render this scene: {reason}; use --sampler gpt, or primal")
-
-
-def make(scene: mi.Scene, **options) -> SamplePass:
-    """The sampler ``bdpt``, with the parameters of the scene's own ``path``."""
-    return like_path(scene, "bdpt", **options).prepare(scene)
-
-
-mi.register_integrator("bdpt", lambda props: BDPT(props))

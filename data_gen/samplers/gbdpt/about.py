@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from data_gen.samplers.registry import LANE_BYTES, Sampler, register
-from data_gen.samplers.shared import CONNECTABLE, joined_depth, surfaces_from_both_ends
+from data_gen.samplers.shared import BOTH_ENDS, CONNECTABLE, joined_depth
 
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
@@ -32,7 +32,7 @@ register(
         "gradients of paths from the camera and from the lights (hidden lamps)",
         "data_gen.samplers.gbdpt.integrator",
         standing="use",
-        refuses=surfaces_from_both_ends("gbdpt"),
+        refusals=BOTH_ENDS,
         notes=_notes,
         options={"joined_depth": joined_depth(10), "roughness_threshold": CONNECTABLE},
         tried=True,

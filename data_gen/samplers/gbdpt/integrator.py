@@ -45,9 +45,8 @@ from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials
 from data_gen.paths.world import World
-from data_gen.samplers.bdpt.integrator import BDPT, refuse
+from data_gen.samplers.bdpt.integrator import BDPT
 from data_gen.samplers.bdpt.light_path import Visitor, light_path
-from data_gen.samplers.common import like_path
 from data_gen.samplers.gbdpt.base_path import Plan
 from data_gen.samplers.gbdpt.camera_path import shifted_camera_path
 from data_gen.samplers.gbdpt.chain_shift import no_chain, straight
@@ -67,11 +66,9 @@ class GBDPT(BDPT):
     Not handled: what ``bdpt`` does not handle.
     """
 
-    name = "gbdpt"
     plan_class = Plan
 
-    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
-        refuse(sensor or scene.sensors()[0], self.name)
+    def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
         materials = Materials(scene, self.options["roughness_threshold"])
         plan = self.plan(World(scene, LightEnds(scene, self.name), materials), pair=difference)
         return partial(self.gradient_pass, Frozen(scene, plan), plan)
@@ -186,11 +183,3 @@ def splatted_differences(
     sight = Sight.of(camera)
     splats = {name: Splats.on(sight.eye.pixels, 3, one) for name, one in sums.items()}
     return sums, splat_differences(plan, sight, depths, splats, bent, times)
-
-
-def make(scene: mi.Scene, **options) -> SamplePass:
-    """The sampler ``gbdpt``, with the parameters of the scene's own ``path``."""
-    return like_path(scene, "gbdpt", **options).prepare(scene)
-
-
-mi.register_integrator("gbdpt", lambda props: GBDPT(props))

@@ -5,19 +5,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from data_gen.samplers.registry import Option, Sampler, register
-from data_gen.samplers.shared import CONNECTABLE, TAILS, VOLUMETRIC, refused_if_polarised
+from data_gen.samplers.shared import CONNECTABLE, TAILS, VOLUMETRIC, polarised
 
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
 
 
-def _refuses(facts: Facts) -> str:
+def _unseen_media(facts: Facts, name: str) -> str:
     if facts.integrator not in ("path", *VOLUMETRIC):
-        reason = f"the integrator is '{facts.integrator}', and 'gpt' knows only 'path', 'volpath' and 'volpathmis'"
-    else:
-        unseen = ", ".join(facts.media) if facts.integrator == "path" else ""
-        reason = f"there are media ({unseen}), which the integrator 'path' does not render" if unseen else ""
-    return refused_if_polarised(facts, "gpt") or reason
+        return f"the integrator is '{facts.integrator}', and '{name}' knows only 'path', 'volpath' and 'volpathmis'"
+    unseen = ", ".join(facts.media) if facts.integrator == "path" else ""
+    return f"there are media ({unseen}), which the integrator 'path' does not render" if unseen else ""
 
 
 def _notes(facts: Facts) -> list[str]:
@@ -35,7 +33,7 @@ register(
         "gradients by shifted paths that join their base path (surfaces and media; the sampler to use)",
         "data_gen.samplers.gpt.integrator",
         standing="use",
-        refuses=_refuses,
+        refusals=(polarised, _unseen_media),
         notes=_notes,
         options={
             "shift": Option(

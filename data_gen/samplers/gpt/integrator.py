@@ -39,6 +39,7 @@ sections 3 and 4.1]
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -51,14 +52,13 @@ from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.frozen import Frozen
 from data_gen.paths.spectrum import to_rgb
-from data_gen.samplers.common import GradientIntegrator, like_path
+from data_gen.samplers.common import GradientIntegrator
 from data_gen.samplers.gpt.manifold_shift import add_followed
 from data_gen.samplers.gpt.plan import Plan, make_plan
 from data_gen.samplers.gpt.rounds import sharing
 from data_gen.samplers.gpt.trace import trace
 from data_gen.samplers.shared import VOLUMETRIC, why_not_shared
-from data_gen.scenes.facts import integrator_name, media_of
-from data_gen.scenes.places import Places
+from data_gen.scenes.facts import Facts, integrator_name, media_of
 from data_gen.tails.cache import Known
 from ngpt.errors import NgptError
 
@@ -90,33 +90,30 @@ class GPT(GradientIntegrator):
     limit to the collisions in grids, and each null event at a mask or a thin pane counts in ``max_depth``.
     """
 
-    name = "gpt"
-
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         self.roughness_threshold, self.shift = self.options["roughness_threshold"], self.options["shift"]
         self.reuse, self.caustic = self.options["reuse"], self.options["caustic"]
         self.volumes, self.shared = props.get("volumes", False), self.options["tails"] == "shared"
+        self.follows = "volpath" if self.volumes else "path"
         if self.shift == "manifold" and (self.reuse or not self.caustic):
             raise NgptError("gpt: shift 'manifold' needs the layer 'caustic', and goes without 'reuse'")
 
-    def sample(self, scene, sampler, ray, medium=None, active=True):
-        """The primal estimate alone, by Mitsuba's ``path`` or ``volpath``."""
-        path = mi.load_dict({"type": "volpath" if self.volumes else "path", **self.limits.parameters()})
-        return path.sample(scene, sampler, ray, medium, active)
+    @classmethod
+    def parameters(cls, scene: mi.Scene) -> dict[str, Any]:
+        return super().parameters(scene) | {"volumes": integrator_name(scene) in VOLUMETRIC}
 
-    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
+    def facts(self, scene: mi.Scene, sensor: mi.Sensor) -> Facts:
+        found = super().facts(scene, sensor)
+        return found if self.volumes else replace(found, media=())
+
+    def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
         plan = self.plan(scene)
         frozen = Frozen(scene, plan)
         return sharing(self, plan, frozen, partial(self.sample_pass, frozen, plan))
 
     def plan(self, scene) -> Plan:
-        """What the kernel contains for a scene. Raises NgptError for polarised variants."""
-        if mi.is_polarized:
-            raise NgptError(
-                f"sampler 'gpt' does not follow polarised light (variant '{mi.variant()}'); "
-                f"use variant '{mi.variant().removesuffix('_polarized')}', or sampler 'gpt-basic'"
-            )
+        """What the kernel contains for a scene. Raises NgptError where its paths cannot share their tails."""
         volumes = self.volumes and bool(media_of(scene))
         if self.shared and (reason := why_not_shared(volumes, self.options, mi.variant())):
             raise NgptError(f"gpt: tails=shared is not possible: {reason}; use tails=paths")
@@ -175,19 +172,3 @@ def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f
 
 def count(flags: list[mi.Bool]) -> mi.Float:
     return sum(dr.select(flag, mi.Float(1), 0) for flag in flags)
-
-
-def make(scene: mi.Scene, places: Places | None = None, **options) -> SamplePass:
-    """The sampler ``gpt``: our integrator with the parameters of the scene's own ``path``, and options of the class."""
-    return stand_in(scene, places, **options).prepare(scene)
-
-
-def stand_in(scene: mi.Scene, places: Places | None = None, **options) -> GPT:
-    """The plugin with the parameters of the scene's own ``path``, see ``like_path()``; lamps chosen by ``places``."""
-    volumes = integrator_name(scene) in VOLUMETRIC
-    integrator = like_path(scene, "gpt", volumes=volumes, **options)
-    integrator.places = places
-    return integrator
-
-
-mi.register_integrator("gpt", lambda props: GPT(props))

@@ -21,10 +21,7 @@ from data_gen.samplers.common import GradientIntegrator
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.radius import pixel_width, shrunk
 from data_gen.samplers.photons.map.trace import MAP_BYTES, VERTICES_PER_PATH, trace
-from data_gen.samplers.photons.passes import Passes, refuse_variants
-from data_gen.samplers.shared import refused_by_photons
-from data_gen.scenes.cameras import camera_name
-from data_gen.scenes.facts import media_of
+from data_gen.samplers.photons.passes import Passes
 from ngpt.errors import NgptError
 
 # Of a camera sample and its features, beside the maps
@@ -54,18 +51,15 @@ class Traced:
 class PhotonIntegrator(GradientIntegrator):
     """Derived classes have ``sample_pass(passes, camera, film)``, and say what they need:
 
-    ``sees_media``    whether they render media, or surfaces alone
-    ``grids``         of media, also those whose density varies
-    ``edges``         photon maps have the edges of light paths, too, where there are media
+    ``follows``       "volpath" where they render media, or "path" for surfaces
+    ``edges``         photon maps have the edges of light paths, too
     ``camera_bytes``  that a camera sample takes
     ``map_bytes``     that a map takes for each light path
-    ``instead_of_media``  the sampler to take where there are none, if those are not rendered
     ``walk``          class of how camera paths go with those of the neighbours: ``gradients.camera.CameraPaths``
     """
 
-    sees_media, grids, edges = False, False, False
+    edges = False
     camera_bytes, map_bytes = CAMERA_BYTES, MAP_BYTES
-    instead_of_media = ""
     walk: type | None = None
 
     def __init__(self, props: mi.Properties):
@@ -82,19 +76,10 @@ class PhotonIntegrator(GradientIntegrator):
         fits = (lane_bytes - self.camera_bytes) // self.map_bytes
         return f", or no more than -O photons={fits}" if fits > 0 else ""
 
-    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
-        sensor = sensor or scene.sensors()[0]
-        refuse_variants(self.name)
-        if reason := refused_by_photons(camera_name(sensor)):
-            raise NgptError(f"sampler '{self.name}' cannot render this scene: {reason}; use --sampler gpt, or primal")
+    def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
         lights = LightEnds(scene, self.name)
         _refuse_lamps_never_chosen(scene, self.name)
-        fog = Fog(scene, sensor, lights, self.name, self.grids) if self.sees_media and media_of(scene) else None
-        if fog is None and self.instead_of_media:
-            raise NgptError(
-                f"sampler '{self.name}' cannot render this scene: there are no media; "
-                f"use --sampler {self.instead_of_media}"
-            )
+        fog = Fog(scene, sensor, lights, self.name) if self.follows == "volpath" else None
         if fog and fog.media.grids:
             self.map_bytes = type(self).map_bytes + GRID_BYTES
         passed = {"passed": media.index_matched, "media": True} if fog else {}
@@ -109,8 +94,8 @@ class PhotonIntegrator(GradientIntegrator):
             return
         n = dr.width(camera.pixel) * self.photons
         random = light_streams(camera.seed, dr.arange(mi.UInt32, n), camera.first, independent=not camera.net)
-        edges = self.edges and world.fog is not None
-        starts, maps = trace(world, random, limits.max_depth - 1, limits.rr_depth, frozen=passes.frozen, edges=edges)
+        depths = limits.max_depth - 1, limits.rr_depth
+        starts, maps = trace(world, random, *depths, frozen=passes.frozen, edges=self.edges)
         for photons in maps:
             yield Traced(photons, starts, n, camera.first, camera.seed, self.options["radius"] * passes.width)
 

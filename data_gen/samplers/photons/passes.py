@@ -13,7 +13,6 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.frozen import Frozen
 from data_gen.paths.world import World
-from ngpt.errors import NgptError
 
 
 @dataclass
@@ -67,16 +66,3 @@ class Begun:
         dr.eval(ray, importance)
         layers = passes.frozen(features, passes.world.scene, camera.sensor, camera.random, ray)
         return cls(Start(ray, importance, random), layers)
-
-
-def refuse_variants(sampler: str) -> None:
-    """Raises NgptError, in the name of the ``sampler``, for variants in which photons cannot be shared."""
-    for refused, what in (
-        (mi.is_polarized, "polarised light"),
-        (mi.is_spectral, "spectra, since wavelengths of photons and camera paths differ"),
-    ):
-        if refused:
-            raise NgptError(
-                f"sampler '{sampler}' does not follow {what} (variant '{mi.variant()}'); "
-                f"use variant '{mi.variant().split('_')[0]}_ad_rgb', or sampler 'gpt-basic'"
-            )

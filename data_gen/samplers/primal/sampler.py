@@ -14,10 +14,10 @@ from data_gen.paths.frozen import Frozen
 from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import loses_light, radiance, recorded
-from data_gen.samplers.gpt.integrator import stand_in
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.gpt.rounds import sharing
 from data_gen.samplers.gpt.trace import trace
+from data_gen.samplers.registry import SAMPLERS
 from data_gen.samplers.shared import VOLUMETRIC
 from data_gen.scenes.facts import integrator_name
 from data_gen.scenes.load import reference_integrator
@@ -35,7 +35,7 @@ def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places |
     if not (tails == "shared" or (followed and (places or loses_light(scene, integrator)))):
         return recorded(scene, partial(samples, scene, integrator, radiance(scene, integrator), features))
     # Others choose a lamp alike everywhere. Behind holes these paths trace a quarter fewer rays than ``prb``.
-    view = stand_in(scene, places, caustic=False, tails=tails)
+    view = SAMPLERS["gpt"].integrator(scene, places=places, caustic=False, tails=tails)
     plan = view.plan(scene)
     frozen = Frozen(scene, plan)
     of_camera = partial(samples, scene, integrator, partial(our_radiance, view, plan), features)

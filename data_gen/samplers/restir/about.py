@@ -3,14 +3,14 @@
 import math
 
 from data_gen.samplers.registry import FrameSampler, Option, register
-from data_gen.samplers.shared import CONNECTABLE, surfaces_alone
+from data_gen.samplers.shared import CONNECTABLE, SURFACES
 
 register(
     FrameSampler(
         "restir",
         "gradients of paths that are reused from frame to frame (shots)",
         "data_gen.samplers.restir.sampler",
-        refuses=surfaces_alone("restir"),
+        refusals=SURFACES,
         options={
             "history": Option(32.0, "frames that a reservoir can count for", range=(1, math.inf)),
             "gradients": Option(

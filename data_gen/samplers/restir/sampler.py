@@ -99,5 +99,4 @@ class Restir:
         film.put_all(features(self.stage.scene, self.stage.sensor, camera.random.clone(), ray))
 
 
-def make(scene: mi.Scene, seed: int, spp: int, memory: int, **options) -> Restir:
-    return Restir(scene, seed, spp, memory, **options)
+make = Restir

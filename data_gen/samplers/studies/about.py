@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from data_gen.samplers.gbdpt.about import SPLATTING_BYTES
 from data_gen.samplers.registry import Option, Sampler, register
-from data_gen.samplers.shared import CONNECTABLE, surfaces_alone
+from data_gen.samplers.shared import CONNECTABLE, SURFACES, hidden_emitters, spectra
 
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
@@ -35,7 +35,7 @@ register(
         "gradients of paths that the pixels of a tile share (matte rooms, images that are not denoised)",
         "data_gen.samplers.studies.gpt_tiles",
         standing="study",
-        refuses=surfaces_alone("gpt-tiles"),
+        refusals=(*SURFACES, spectra, hidden_emitters),
         notes=_notes_on_tiles,
         options={
             "tile": Option(2, "pixels along a side of a tile", choices=(2, 4)),
@@ -50,7 +50,7 @@ register(
         "gradients of chains of paths that stay where light was found (rooms lit through a slit)",
         "data_gen.samplers.studies.gmlt.integrator",
         standing="study",
-        refuses=surfaces_alone("gmlt"),
+        refusals=SURFACES,
         notes=_notes_on_chains,
         batch=8,
         counts=True,
@@ -63,7 +63,7 @@ register(
         "paths whose light is in two layers, diffuse and specular, without gradients (kernel-predicting networks)",
         "data_gen.samplers.studies.split",
         standing="study",
-        refuses=surfaces_alone("split"),
+        refusals=(*SURFACES, hidden_emitters),
         notes=lambda facts: [
             f"transport: Mitsuba's '{facts.integrator}', split by the lobe of the first scattering event",
         ],

@@ -45,10 +45,8 @@ from data_gen.paths.lights import LightSample, emission, sample_light
 from data_gen.paths.shift import mis_weight, reconnection_jacobian
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials, evaluate, seen_from
-from data_gen.paths.walk import Limits
-from data_gen.samplers.common import GradientIntegrator, like_path
+from data_gen.samplers.common import GradientIntegrator
 from data_gen.samplers.teaching.gpt_simple import base_step, reflected, trace, walk
-from ngpt.errors import NgptError
 
 # Of a lane: its suffix, its camera sample and sums; and what is kept of one connection.
 _LANE_BYTES, _CONNECTION_BYTES = 272, 32
@@ -69,8 +67,6 @@ class GPTTiles(GradientIntegrator):
     variants; for the last three rendering raises NgptError, as for other sides of a tile.
     """
 
-    name = "gpt-tiles"
-
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         self.tile, self.roughness_threshold = self.options["tile"], self.options["roughness_threshold"]
@@ -80,8 +76,7 @@ class GPTTiles(GradientIntegrator):
         L, Le, _ = trace(scene, self.limits, sampler, ray, mi.Spectrum(1), [])
         return L + Le, mi.Bool(True), []
 
-    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
-        refuse(self.limits)
+    def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
         return Tiles(self, scene)
 
 
@@ -359,24 +354,3 @@ def balanced(members: list[tuple[Link | None, Connection]]) -> mi.Color3f:
 
 def rgb(value: mi.Spectrum) -> mi.Color3f:
     return to_rgb(value, mi.Color0f())
-
-
-def refuse(limits: Limits) -> None:
-    """Raises NgptError for what tiles cannot render."""
-    if mi.is_polarized:
-        reason, other = f"variant '{mi.variant()}' is polarised", "gpt-basic"
-    elif mi.is_spectral:
-        reason, other = f"in variant '{mi.variant()}' pixels of a tile have wavelengths of their own", "gpt"
-    elif limits.hide_emitters:
-        reason, other = "its integrator hides emitters", "gpt"
-    else:
-        return
-    raise NgptError(f"sampler 'gpt-tiles' cannot render this scene: {reason}; use --sampler {other}")
-
-
-def make(scene: mi.Scene, **options) -> SamplePass:
-    """The sampler ``gpt-tiles``, with the parameters of the scene's own ``path``, and options of the class."""
-    return like_path(scene, "gpt_tiles", **options).prepare(scene)
-
-
-mi.register_integrator("gpt_tiles", lambda props: GPTTiles(props))

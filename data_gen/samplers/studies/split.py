@@ -30,14 +30,11 @@ from data_gen.paths.walk import Limits, roulette
 from data_gen.samplers.common import recorded
 from data_gen.samplers.teaching.gpt_simple import base_step
 from data_gen.scenes.load import reference_integrator
-from ngpt.errors import NgptError
 
 
 def make(scene: mi.Scene) -> SamplePass:
-    """The sampler ``split``, with the parameters of the scene's own ``path``. Raises NgptError for hidden emitters."""
+    """The sampler ``split``, with the parameters of the scene's own ``path``."""
     limits = Limits.of(reference_integrator(scene))
-    if limits.hide_emitters:
-        raise NgptError("sampler 'split' cannot render this scene: its integrator hides emitters; use --sampler primal")
     lobes = Lobes(scene)
     return recorded(scene, partial(samples, scene, limits, lobes), lobes)
 

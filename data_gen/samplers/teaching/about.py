@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from data_gen.samplers.registry import Sampler, register
-from data_gen.samplers.shared import surfaces_alone
+from data_gen.samplers.shared import SURFACES, hidden_emitters
 
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
@@ -18,9 +18,8 @@ def _notes_on_replay(facts: Facts) -> list[str]:
     return lines
 
 
-def _refused_by_simple(facts: Facts) -> str:
-    mirrors = "there are mirrors or clear glass, at which paths cannot be reconnected" if facts.mirrors else ""
-    return surfaces_alone("gpt-simple")(facts) or mirrors
+def _mirrors(facts: Facts, name: str) -> str:
+    return "there are mirrors or clear glass, at which paths cannot be reconnected" if facts.mirrors else ""
 
 
 register(
@@ -38,7 +37,7 @@ register(
         "gpt-simple",
         "gradients by reconnection alone (surfaces that scatter widely; the code to read before that of gpt)",
         "data_gen.samplers.teaching.gpt_simple",
-        refuses=_refused_by_simple,
+        refusals=(*SURFACES, hidden_emitters, _mirrors),
         notes=lambda facts: [
             f"transport: Mitsuba's '{facts.integrator}', offset paths join it at the second vertex",
         ],

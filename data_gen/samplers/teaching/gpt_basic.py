@@ -17,6 +17,7 @@ q to p, are sampled and weighted 1/2 each.
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -42,7 +43,7 @@ class GPTBasic(GradientIntegrator):
     noisier than those of a shift that reconnects.
     """
 
-    name, nested = "gpt-basic", True
+    nested = True
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
@@ -51,11 +52,14 @@ class GPTBasic(GradientIntegrator):
         check_integrator(integrator)
         self.integrator = followed(integrator)
 
-    def sample(self, scene, sampler, ray, medium=None, active=True):
-        """The primal estimate alone: see the nested integrator."""
-        return self.integrator.sample(scene, sampler, ray, medium, active)
+    @classmethod
+    def parameters(cls, scene: mi.Scene) -> dict[str, Any]:
+        return {"integrator": reference_integrator(scene)}
 
-    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
+    def reference(self) -> mi.SamplingIntegrator:
+        return self.integrator
+
+    def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
         estimate = radiance(scene, self.integrator)
         return recorded(scene, partial(self.samples, scene, estimate), shifts=SHIFTS.values())
 
@@ -83,11 +87,3 @@ class GPTBasic(GradientIntegrator):
         L, Le = to_rgb((L - Le) * importance, ray.wavelengths), to_rgb(Le * importance, ray.wavelengths)
         dr.eval(L, Le, inside)
         return L, Le, inside
-
-
-def make(scene: mi.Scene) -> SamplePass:
-    """The sampler ``gpt-basic``: around the scene's own integrator."""
-    return mi.load_dict({"type": "gpt_basic", "integrator": reference_integrator(scene)}).prepare(scene)
-
-
-mi.register_integrator("gpt_basic", lambda props: GPTBasic(props))

@@ -42,7 +42,7 @@ from data_gen.paths.shift import gradient_weight, mis_weight, reconnection_jacob
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials, consistent, evaluate, seen_from
 from data_gen.paths.walk import Limits, roulette
-from data_gen.samplers.common import GradientIntegrator, like_path, recorded
+from data_gen.samplers.common import GradientIntegrator, recorded
 from data_gen.samplers.shared import CONNECTABLE
 from ngpt.errors import NgptError
 
@@ -57,15 +57,13 @@ class GPTSimple(GradientIntegrator):
     for the others rendering raises NgptError.
     """
 
-    name = "gpt-simple"
-
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """The primal estimate alone."""
         L, Le, _ = trace(scene, self.limits, sampler, ray, mi.Spectrum(1), [])
         return L + Le, mi.Bool(True), []
 
-    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
-        refuse(scene, self.limits)
+    def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
+        refuse(scene)
         return recorded(scene, partial(self.samples, scene), shifts=SHIFTS.values())
 
     def samples(self, scene, camera: CameraSamples) -> dict:
@@ -232,23 +230,9 @@ def step_joined(step: Step, path: Offset) -> tuple[mi.Spectrum, mi.Spectrum]:
     return Δ, w2 * (β - step.β1)
 
 
-def refuse(scene, limits: Limits) -> None:
-    """Raises NgptError for a scene that reconnection alone cannot render."""
-    if mi.is_polarized:
-        reason, other = f"variant '{mi.variant()}' is polarised", "gpt-basic"
-    elif limits.hide_emitters:
-        reason, other = "its integrator hides emitters", "gpt"
-    elif materials := Materials(scene, CONNECTABLE.default).unconnectable:
+def refuse(scene) -> None:
+    """Raises NgptError for materials that paths cannot be reconnected at: polish, too, which no description tells."""
+    if materials := Materials(scene, CONNECTABLE.default).unconnectable:
         more = f" and {len(materials) - 3} more" if len(materials) > 3 else ""
-        reason, other = f"paths cannot be reconnected at {', '.join(materials[:3])}{more}", "gpt"
-    else:
-        return
-    raise NgptError(f"sampler 'gpt-simple' cannot render this scene: {reason}; use --sampler {other}")
-
-
-def make(scene: mi.Scene) -> SamplePass:
-    """The sampler ``gpt-simple``, with the parameters of the scene's own ``path``."""
-    return like_path(scene, "gpt_simple").prepare(scene)
-
-
-mi.register_integrator("gpt_simple", lambda props: GPTSimple(props))
+        reason = f"paths cannot be reconnected at {', '.join(materials[:3])}{more}"
+        raise NgptError(f"sampler 'gpt-simple' cannot render this scene: {reason}; use --sampler gpt")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from data_gen.samplers.registry import Sampler, register
-from data_gen.samplers.shared import GATHERING, first_radius, joined_depth, notes_on_mirrors, surfaces_from_both_ends
+from data_gen.samplers.shared import BOTH_ENDS, GATHERING, first_radius, joined_depth, notes_on_mirrors, spectra
 
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
@@ -26,7 +26,7 @@ register(
         "paths from both ends, joined and merged with photons, without gradients (hidden lamps and all caustics)",
         "data_gen.samplers.vcm.integrator",
         standing="use",
-        refuses=surfaces_from_both_ends("vcm"),
+        refusals=(*BOTH_ENDS, spectra),
         notes=_notes,
         options=_OPTIONS,
         gradients=False,
@@ -40,7 +40,7 @@ register(
         "gvcm",
         "gradients of paths from both ends, joined and merged with photons (hidden lamps and all caustics)",
         "data_gen.samplers.vcm.gvcm",
-        refuses=surfaces_from_both_ends("gvcm"),
+        refusals=(*BOTH_ENDS, spectra),
         notes=_notes,
         options=_OPTIONS,
         finds=("caustics", "hidden lamps"),

@@ -29,7 +29,6 @@ from data_gen.paths.eye import Sight
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.world import World
-from data_gen.samplers.common import like_path
 from data_gen.samplers.gbdpt.base_path import Plan
 from data_gen.samplers.gbdpt.camera_path import shifted_camera_path
 from data_gen.samplers.gbdpt.light_again import Marker, marked
@@ -51,7 +50,6 @@ class GVCM(VCM):
     Not handled: what ``vcm`` does not handle.
     """
 
-    name = "gvcm"
     splatter, plan_class = Marker, Plan
     sample_bytes = VCM.sample_bytes + OFFSETS_BYTES
 
@@ -111,11 +109,3 @@ class GVCM(VCM):
         plan = self.plan(world, η=photons.η)
         merging = ShiftedMerging(photons, plan)
         return shifted_camera_path(plan, sight, shifted, photons.kept.paths(), merging)[:3]
-
-
-def make(scene: mi.Scene, **options):
-    """The sampler ``gvcm``, with the parameters of the scene's own ``path``."""
-    return like_path(scene, "gvcm", **options).prepare(scene)
-
-
-mi.register_integrator("gvcm", lambda props: GVCM(props))

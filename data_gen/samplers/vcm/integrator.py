@@ -42,12 +42,10 @@ from data_gen.paths.vertex import Materials
 from data_gen.paths.world import World
 from data_gen.samplers.bdpt.camera_path import camera_path
 from data_gen.samplers.bdpt.integrator import BDPT, Splatter
-from data_gen.samplers.bdpt.integrator import refuse as refuse_camera
 from data_gen.samplers.bdpt.light_path import light_path
-from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.map.edges import number_of
 from data_gen.samplers.photons.map.radius import pixel_width, shrunk
-from data_gen.samplers.photons.passes import Passes, refuse_variants
+from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.vcm.merging import VERTEX_BYTES, Keeper, Map, Merging, Photons, eta
 
 # Of a camera sample, its features and its light path, beside the map: what was seen, and some more
@@ -74,7 +72,7 @@ class VCM(BDPT):
 
     # What becomes of light paths that end at the camera
     splatter = Splatter
-    name, sample_bytes = "vcm", SAMPLE_BYTES
+    sample_bytes = SAMPLE_BYTES
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
@@ -98,10 +96,7 @@ class VCM(BDPT):
         fits = 1 + (1 << (places.bit_length() - 1)) if places > 0 else 0
         return f", or no more than -O joined_depth={fits}" if fits else ""
 
-    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
-        sensor = sensor or scene.sensors()[0]
-        refuse_variants(self.name)
-        refuse_camera(sensor, self.name)
+    def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
         world = World(scene, LightEnds(scene, self.name), Materials(scene, self.threshold))
         return Passes(self, world, pixel_width(scene, sensor))
 
@@ -147,11 +142,3 @@ class VCM(BDPT):
             return camera_path(self.plan(world), sight, None)
         plan = self.plan(world, η=photons.η)
         return camera_path(plan, sight, photons.kept.paths(), Merging(photons, plan))
-
-
-def make(scene: mi.Scene, **options) -> SamplePass:
-    """The sampler ``vcm``, with the parameters of the scene's own ``path``."""
-    return like_path(scene, "vcm", **options).prepare(scene)
-
-
-mi.register_integrator("vcm", lambda props: VCM(props))

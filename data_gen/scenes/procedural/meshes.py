@@ -38,7 +38,9 @@ def merge(meshes: list[Mesh]) -> Mesh:
     """One mesh of all of them."""
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     return Mesh(
-        *(np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in ("vertices", "normals", "uvs")),
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.normals for mesh in meshes]),
+        np.concatenate([mesh.uvs for mesh in meshes]),
         np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]),
     )
 

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as xml
 
 import numpy as np
@@ -47,7 +48,7 @@ def room(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
     stage.add([("wall", quads([[[-x, height, -z], [x, height, -z], [x, height, z], [-x, height, z]]]))])
     daylight = rng.random() < 0.55
     corners = np.array([[-x, -z], [x, -z], [x, z], [-x, z]])[::-1]
-    with_windows = rng.permutation(4)[: rng.integers(1, 3)] if daylight else []
+    with_windows: Any = rng.permutation(4)[: rng.integers(1, 3)] if daylight else []
     for side in range(4):
         start, end = corners[side], corners[(side + 1) % 4]
         _side(stage, start, end, height, side in with_windows)
@@ -75,8 +76,8 @@ def _side(stage: Stage, start, end, height: float, windows: bool) -> None:
         stage.add([("wall", wall(origin, u, [0, height, 0]))])
         stage.add([("wood", box([length, 0.1, 0.02]).placed(origin + u / 2 + [0, 0.05, 0] + 0.01 * inward, angle))])
         for place in rng.uniform(0.15, 0.85, rng.integers(0, 3)):
-            parts = things.picture(rng, *rng.uniform(0.3, 1.2, 2))
-            stage.add(things.placed(parts, origin + place * u + [0, 1.5, 0] + 0.01 * inward, angle))
+            picture = things.picture(rng, *rng.uniform(0.3, 1.2, 2))
+            stage.add(things.placed(picture, origin + place * u + [0, 1.5, 0] + 0.01 * inward, angle))
         return
     count = int(rng.integers(1, 1 + max(1, int(length / 1.8))))
     low, high = rng.uniform(0.02, 0.35), rng.uniform(0.75, 0.95)

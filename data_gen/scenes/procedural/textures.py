@@ -94,7 +94,7 @@ def text(rng: np.random.Generator) -> np.ndarray:
 
 def blots(rng: np.random.Generator) -> np.ndarray:
     """Flat regions with sharp, winding edges."""
-    levels = rng.integers(2, 5)
+    levels = int(rng.integers(2, 5))
     return np.floor(noise(rng, 1.8) * 0.999 * levels * 2) % levels / max(levels - 1, 1)
 
 

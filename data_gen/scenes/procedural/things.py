@@ -120,7 +120,7 @@ def table(rng: np.random.Generator) -> list[Part]:
     else:
         legs = [cylinder(0.05, height - thick, 24), cylinder(0.25, 0.03, 32)]
     parts.append((str(rng.choice(["wood", "metal"])), merge(legs)))
-    return parts + placed(clutter(rng, width, depth, rng.integers(2, 9)), [0, height, 0])
+    return parts + placed(clutter(rng, width, depth, int(rng.integers(2, 9))), [0, height, 0])
 
 
 def chair(rng: np.random.Generator) -> list[Part]:

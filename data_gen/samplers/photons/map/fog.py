@@ -15,17 +15,12 @@ from ngpt.errors import NgptError
 class Fog:
     """The media of a scene, one of which may be around the camera ``sensor``: ``within``.
 
-    Raises NgptError, in the name of the ``sampler``, for media whose density varies unless it renders ``grids``, and
-    where light from infinitely far away comes through a medium without end.
+    Raises NgptError, in the name of the ``sampler``, where light from infinitely far away comes through a medium
+    without end.
     """
 
-    def __init__(self, scene: mi.Scene, sensor: mi.Sensor, lights: LightEnds, sampler: str, grids: bool = False):
+    def __init__(self, scene: mi.Scene, sensor: mi.Sensor, lights: LightEnds, sampler: str):
         self.media = Media(scene)
-        if self.media.grids and not grids:
-            raise NgptError(
-                f"sampler '{sampler}' cannot render this scene: there are media whose density varies; "
-                "use --sampler gpt, or gvpm, vpm, bre or beams for photons"
-            )
         self.within = mi.MediumPtr(sensor.get_medium())
         # Where a ray begins: of a meter on a shape, or one infinitely far away, to_world says nothing of that.
         middle = mi.Point2f(0.5)

@@ -31,17 +31,13 @@ from typing import Any, get_type_hints
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.film import GradientFilm
-from data_gen.passes import SamplePass
 from data_gen.paths import collisions, media
-from data_gen.paths.camera import CameraSamples
 from data_gen.paths.world import World
-from data_gen.samplers.common import like_path
-from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, PhotonIntegrator, Traced
+from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.trace import EDGE_BYTES, VERTICES_PER_PATH
 from data_gen.samplers.photons.map.vertices import put
-from data_gen.samplers.photons.media.bre import BALL, Along, by_pieces, media_pass, scattering_along, seen_along
+from data_gen.samplers.photons.media.bre import BALL, BRE, Along, scattering_along, seen_along
 from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.photons.surfaces.ppm import Gathering
 
@@ -230,31 +226,22 @@ def nearest(o, d, p, e) -> tuple:
     return (cos * along - back) / sin2, (along - cos * back) / sin2, dr.abs(dr.dot(to, n)) / sin, sin
 
 
-class BEAMS(PhotonIntegrator):
+class BEAMS(BRE):
     """Progressive photon beams in media, and photons on surfaces; no gradients.
 
     Plugin ``beams``. Parameters and what is not handled are those of ``vpm``. Biased, and consistent; in media the
     ``radius`` shrinks faster.
     """
 
-    name = "beams"
-    sees_media, grids, edges = True, True, True
-    map_bytes = BEAM_BYTES + PARTS * PART_BYTES
+    edges, map_bytes = True, BEAM_BYTES + PARTS * PART_BYTES
 
-    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        media_pass(self, passes, camera, film, among_beams)
-
-    def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
-        return by_pieces(self, *path)
-
-
-def among_beams(passes: Passes, traced: Traced) -> Iterator[Along]:
-    """What is near in a photon map: photons on surfaces, and beams, some parts of them at a time."""
-    max_depth, fog = passes.integrator.limits.max_depth, passes.world.fog
-    on_surfaces: Gathering | None = Gathering(passes.world, traced, max_depth)
-    for parts in parts_of(passes, traced, PARTS * traced.paths):
-        yield Along(on_surfaces, AlongBeams(parts, traced, max_depth, fog.media.grids))
-        on_surfaces = None
+    def near(self, passes: Passes, traced: Traced) -> Iterator[Along]:
+        """Photons on surfaces, and beams, some parts of them at a time."""
+        max_depth, fog = self.limits.max_depth, passes.world.fog
+        on_surfaces: Gathering | None = Gathering(passes.world, traced, max_depth)
+        for parts in parts_of(passes, traced, PARTS * traced.paths):
+            yield Along(on_surfaces, AlongBeams(parts, traced, max_depth, fog.media.grids))
+            on_surfaces = None
 
 
 def parts_of(passes: Passes, traced: Traced, most: int) -> Iterator[Any]:
@@ -285,11 +272,3 @@ def entered(world: World, photons, rate, first: mi.UInt32, window: tuple, parts)
     """The ``parts`` of these numbers."""
     cut(world, photons, rate, first, window, parts)
     return parts
-
-
-def make(scene: mi.Scene, **options) -> SamplePass:
-    """The sampler ``beams``, with the parameters of the scene's own ``volpath`` or ``path``."""
-    return like_path(scene, "beams", **options).prepare(scene)
-
-
-mi.register_integrator("beams", lambda props: BEAMS(props))

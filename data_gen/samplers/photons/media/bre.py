@@ -25,21 +25,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.film import GradientFilm
-from data_gen.passes import SamplePass
 from data_gen.paths import collisions, media
-from data_gen.paths.camera import CameraSamples
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.paths.walk import Sky, roulette
 from data_gen.paths.world import World
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
-from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, PhotonIntegrator, Traced
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.vertices import in_media
-from data_gen.samplers.photons.passes import Begun, Passes, Start
-from data_gen.samplers.photons.surfaces.ppm import Gathering, by_vertices, image_pass
+from data_gen.samplers.photons.passes import Passes, Start
+from data_gen.samplers.photons.surfaces.ppm import PPM, Gathering
 
 # Of the grid, what is gathered within one radius of a ray: in parts 3 radii long, each in a ball of this many radii.
 BALL = np.sqrt(1 + 1.5**2)
@@ -118,46 +114,25 @@ class Along:
     in_media: Any  # photons, beams or planes, with ``light`` (piece of a ray, length, medium, σ, depth, where)
 
 
-class BRE(PhotonIntegrator):
+class BRE(PPM):
     """Progressive photon mapping by the beam radiance estimate in media, and on surfaces; no gradients.
 
     Plugin ``bre``. Parameters, bias and what is not handled are those of ``vpm``.
     """
 
-    name = "bre"
-    sees_media, grids, map_bytes = True, True, MEDIA_MAP_BYTES
+    follows, map_bytes = "volpath", MEDIA_MAP_BYTES
 
-    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        media_pass(self, passes, camera, film, beside_rays)
+    def near(self, passes: Passes, traced: Traced) -> Iterator[Along]:
+        world, max_depth = passes.world, self.limits.max_depth
+        yield Along(Gathering(world, traced, max_depth), AlongRays(world.fog, traced, max_depth))
 
     def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
         return by_pieces(self, *path)
 
 
-def beside_rays(passes: Passes, traced: Traced) -> Iterator[Along]:
-    """What is near in a photon map: photons on surfaces, and beside rays."""
-    max_depth = passes.integrator.limits.max_depth
-    yield Along(Gathering(passes.world, traced, max_depth), AlongRays(passes.world.fog, traced, max_depth))
-
-
-def media_pass(integrator, passes: Passes, camera: CameraSamples, film: GradientFilm, near: Callable) -> None:
-    """``image_pass()`` of what is ``near`` (passes, map), where there are media; else of photons on surfaces."""
-    begun = Begun.of(passes, camera)
-    maps = integrator.maps(passes, camera)
-    if passes.world.fog is None:
-        gathered = (Gathering(passes.world, traced, integrator.limits.max_depth) for traced in maps)
-    else:
-        gathered = (one for traced in maps for one in near(passes, traced))
-    image_pass(passes, begun, gathered, integrator.light, film)
-
-
-def by_pieces(integrator: PhotonIntegrator, world: World, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
-    """``by_vertices()``; through media piece by piece from boundary to boundary."""
-    return (by_vertices if world.fog is None else _by_pieces)(integrator, world, *path)
-
-
 @dr.syntax
-def _by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, emission: bool) -> tuple:
+def by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, emission: bool) -> tuple:
+    """``by_vertices()``; through media piece by piece from boundary to boundary."""
     scene, fog, limits, random = world.scene, world.fog, integrator.limits, start.random.clone()
     connectable = world.materials.connectable
     parts = (near.on_surfaces, near.in_media) if near is not None else (None, None)
@@ -237,11 +212,3 @@ def _by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, e
             onward = dr.select(skips, mi.Ray3f(ray(length), ray.d, ray.time, ray.wavelengths), onward)
         ray, active = onward, active | passes | skips
     return L, Le
-
-
-def make(scene: mi.Scene, **options) -> SamplePass:
-    """The sampler ``bre``, with the parameters of the scene's own ``volpath`` or ``path``."""
-    return like_path(scene, "bre", **options).prepare(scene)
-
-
-mi.register_integrator("bre", lambda props: BRE(props))

@@ -22,28 +22,23 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.film import GradientFilm
-from data_gen.passes import SamplePass
-from data_gen.paths.camera import CameraSamples
 from data_gen.paths.world import World
-from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera_in_media import PathsByPieces, Piece
 from data_gen.samplers.photons.gradients.copies import LightPaths, let_through, redirected
-from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, Gathered, gradient_pass
-from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
+from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, Gathered
+from data_gen.samplers.photons.integrator import Traced
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.photon import Photon
 from data_gen.samplers.photons.map.vertices import at
 from data_gen.samplers.photons.media.beams import BEAM_BYTES, PART_BYTES, AlongBeams, nearest, parts_of
 from data_gen.samplers.photons.media.gbre import PATHS_BYTES, Beside, beside_of, inside_of
 from data_gen.samplers.photons.passes import Passes
-from data_gen.samplers.photons.surfaces.gpm import OnSurfaces
+from data_gen.samplers.photons.surfaces.gpm import GPM, OnSurfaces
 
 # Parts of beams, for each light path, and pairs of a ray and a beam, for each camera sample, in memory together
 PARTS = 16
 PAIRS = 8
-MAP_BYTES, CAMERA_BYTES = BEAM_BYTES + PARTS * PART_BYTES, PATHS_BYTES + PAIRS * PAIR_BYTES
 
 
 @dataclass
@@ -178,33 +173,20 @@ def turned(world: World, paths: LightPaths, beam: Beam, A: Beside, B: Beside, ra
     return Photon(target, mi.Normal3f(0), way.ray.d, Φ), other.t, r * passage.T_c, good
 
 
-class GBEAMS(PhotonIntegrator):
+class GBEAMS(GPM):
     """Gradients of photon beams in homogeneous media, and of photons on surfaces.
 
     Plugin ``gbeams``. Parameters are those of ``gpm``; bias and what is not handled are those of ``beams``.
     """
 
-    name, walk = "gbeams", PathsByPieces
-    sees_media, instead_of_media, edges = True, "gpm", True
-    map_bytes, camera_bytes = MAP_BYTES, CAMERA_BYTES
+    follows, walk, edges, pairs = "volpath", PathsByPieces, True, PAIRS
+    map_bytes, camera_bytes = BEAM_BYTES + PARTS * PART_BYTES, PATHS_BYTES + PAIRS * PAIR_BYTES
 
-    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        gradient_pass(passes, camera, film, near_beams, PAIRS)
-
-
-def near_beams(passes: Passes, traced: Traced) -> Iterator[Gathered]:
-    """Photons on surfaces, and beams, some parts of them at a time."""
-    on_surfaces: OnSurfaces | None = OnSurfaces(traced)
-    radius2 = dr.opaque(mi.Float, traced.radius(1) ** 2)
-    for parts in parts_of(passes, traced, PARTS * traced.paths):
-        beams = AlongBeams(parts, traced, passes.integrator.limits.max_depth)
-        yield Gathered(on_surfaces, NearBeams(LightPaths(traced.starts, traced.photons), beams, beams.grid, radius2))
-        on_surfaces = None
-
-
-def make(scene: mi.Scene, **options) -> SamplePass:
-    """The sampler ``gbeams``, with the parameters of the scene's own ``volpath`` or ``path``."""
-    return like_path(scene, "gbeams", **options).prepare(scene)
-
-
-mi.register_integrator("gbeams", lambda props: GBEAMS(props))
+    def near(self, passes: Passes, traced: Traced) -> Iterator[Gathered]:
+        """Photons on surfaces, and beams, some parts of them at a time."""
+        on_surfaces: OnSurfaces | None = OnSurfaces(traced)
+        radius2 = dr.opaque(mi.Float, traced.radius(1) ** 2)
+        for parts in parts_of(passes, traced, PARTS * traced.paths):
+            beams, paths = AlongBeams(parts, traced, self.limits.max_depth), LightPaths(traced.starts, traced.photons)
+            yield Gathered(on_surfaces, NearBeams(paths, beams, beams.grid, radius2))
+            on_surfaces = None

@@ -26,23 +26,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.film import GradientFilm
-from data_gen.passes import SamplePass
-from data_gen.paths.camera import CameraSamples
 from data_gen.paths.world import World
-from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera_in_media import PathsByPieces, Piece
 from data_gen.samplers.photons.gradients.copies import LightPaths, copy_in_medium
-from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen, gradient_pass
+from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen
 from data_gen.samplers.photons.gradients.pairs import Rays
-from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, PhotonIntegrator, Traced
+from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.photon import Photon, photon_of
 from data_gen.samplers.photons.map.vertices import in_media
 from data_gen.samplers.photons.media.bre import BALL, seen_along
 from data_gen.samplers.photons.passes import Passes
-from data_gen.samplers.photons.surfaces.gpm import OnSurfaces
+from data_gen.samplers.photons.surfaces.gpm import GPM, OnSurfaces
 
 # Of a camera sample beside pairs: levels of five pieces of paths, what they end at, and as many sums
 PATHS_BYTES = 4096
@@ -162,27 +158,14 @@ class AlongPieces(InMedia):
         return beside_of(paths, which, index)
 
 
-class GBRE(PhotonIntegrator):
+class GBRE(GPM):
     """Gradients of the beam radiance estimate in homogeneous media, and of photons on surfaces.
 
     Plugin ``gbre``. Parameters are those of ``gpm``; bias and what is not handled are those of ``bre``.
     """
 
-    name, walk = "gbre", PathsByPieces
-    sees_media, instead_of_media, map_bytes = True, "gpm", MEDIA_MAP_BYTES
+    follows, walk, map_bytes = "volpath", PathsByPieces, MEDIA_MAP_BYTES
     camera_bytes = PATHS_BYTES + PAIRS * PAIR_BYTES
 
-    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        gradient_pass(passes, camera, film, near_pieces, PAIRS)
-
-
-def near_pieces(passes: Passes, traced: Traced) -> Iterator[Gathered]:
-    yield Gathered(OnSurfaces(traced), AlongPieces(traced))
-
-
-def make(scene: mi.Scene, **options) -> SamplePass:
-    """The sampler ``gbre``, with the parameters of the scene's own ``volpath`` or ``path``."""
-    return like_path(scene, "gbre", **options).prepare(scene)
-
-
-mi.register_integrator("gbre", lambda props: GBRE(props))
+    def near(self, passes: Passes, traced: Traced) -> Iterator[Gathered]:
+        yield Gathered(OnSurfaces(traced), AlongPieces(traced))

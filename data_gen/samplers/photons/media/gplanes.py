@@ -25,20 +25,16 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.film import GradientFilm
-from data_gen.passes import SamplePass
-from data_gen.paths.camera import CameraSamples
 from data_gen.paths.world import World
-from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients import shift
-from data_gen.samplers.photons.gradients.camera_in_media import PathsByPieces, Piece
-from data_gen.samplers.photons.gradients.differences import Gathered, gradient_pass
-from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
+from data_gen.samplers.photons.gradients.camera_in_media import Piece
+from data_gen.samplers.photons.gradients.differences import Gathered
+from data_gen.samplers.photons.integrator import Traced
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.photon import Photon
 from data_gen.samplers.photons.map.trace import VERTICES_PER_PATH
 from data_gen.samplers.photons.media.bre import seen_along
-from data_gen.samplers.photons.media.gbeams import CAMERA_BYTES, MAP_BYTES, PAIRS, near_beams
+from data_gen.samplers.photons.media.gbeams import GBEAMS
 from data_gen.samplers.photons.media.gbre import Beside, beside_of, inside_of
 from data_gen.samplers.photons.media.planes import (
     PLANE_BYTES,
@@ -122,28 +118,15 @@ def copied(plane, at: Crossing, B: Beside) -> tuple:
     return replace(plane, e=e, Φ=plane.Φ * (f1 / f)), there, J / dr.abs(there.volume), J * p1 / p, good
 
 
-class GPLANES(PhotonIntegrator):
+class GPLANES(GBEAMS):
     """Gradients of photon planes in homogeneous media, and of beams and photons on surfaces.
 
     Plugin ``gplanes``. Parameters are those of ``gpm``, and ``planes``; see there for bias and what is not handled.
     """
 
-    name, walk = "gplanes", PathsByPieces
-    sees_media, instead_of_media, edges = True, "gpm", True
-    map_bytes, camera_bytes = MAP_BYTES + VERTICES_PER_PATH * PLANE_BYTES, CAMERA_BYTES
+    map_bytes = GBEAMS.map_bytes + VERTICES_PER_PATH * PLANE_BYTES
 
-    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        gradient_pass(passes, camera, film, near_planes, PAIRS)
-
-
-def near_planes(passes: Passes, traced: Traced) -> Iterator[Gathered]:
-    yield from near_beams(passes, only_beams(traced))
-    yield Gathered(None, NearPlanes(planes_of(passes, traced)))
-
-
-def make(scene: mi.Scene, **options) -> SamplePass:
-    """The sampler ``gplanes``, with the parameters of the scene's own ``volpath`` or ``path``."""
-    return like_path(scene, "gplanes", **options).prepare(scene)
-
-
-mi.register_integrator("gplanes", lambda props: GPLANES(props))
+    def near(self, passes: Passes, traced: Traced) -> Iterator[Gathered]:
+        """What ``gbeams`` has of other edges, and planes."""
+        yield from super().near(passes, only_beams(traced))
+        yield Gathered(None, NearPlanes(planes_of(passes, traced)))

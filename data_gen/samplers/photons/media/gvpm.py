@@ -25,17 +25,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.film import GradientFilm
-from data_gen.passes import SamplePass
-from data_gen.paths.camera import CameraSamples
 from data_gen.paths.world import World
-from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera_segments import Flight, PathsBySegments
 from data_gen.samplers.photons.gradients.copies import LightPaths
-from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen, gradient_pass
+from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen
 from data_gen.samplers.photons.gradients.pairs import Points
-from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, PhotonIntegrator, Traced
+from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.photon import Photon
@@ -43,7 +39,7 @@ from data_gen.samplers.photons.map.vertices import in_media
 from data_gen.samplers.photons.media.bre import seen_along
 from data_gen.samplers.photons.media.gbre import PATHS_BYTES, InMedia
 from data_gen.samplers.photons.passes import Passes
-from data_gen.samplers.photons.surfaces.gpm import OnSurfaces
+from data_gen.samplers.photons.surfaces.gpm import GPM, OnSurfaces
 
 
 @dataclass
@@ -105,27 +101,14 @@ class InBalls(InMedia):
         return ball_of(paths, which, index)
 
 
-class GVPM(PhotonIntegrator):
+class GVPM(GPM):
     """Gradients of photons in media and on surfaces.
 
     Plugin ``gvpm``. Parameters are those of ``gpm``; bias and what is not handled are those of ``vpm``.
     """
 
-    name, walk = "gvpm", PathsBySegments
-    sees_media, grids, instead_of_media, map_bytes = True, True, "gpm", MEDIA_MAP_BYTES
+    follows, walk, map_bytes = "volpath", PathsBySegments, MEDIA_MAP_BYTES
     camera_bytes = PATHS_BYTES + PAIRS * PAIR_BYTES
 
-    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        gradient_pass(passes, camera, film, near_points, PAIRS)
-
-
-def near_points(passes: Passes, traced: Traced) -> Iterator[Gathered]:
-    yield Gathered(OnSurfaces(traced), InBalls(passes.world.fog, traced))
-
-
-def make(scene: mi.Scene, **options) -> SamplePass:
-    """The sampler ``gvpm``, with the parameters of the scene's own ``volpath`` or ``path``."""
-    return like_path(scene, "gvpm", **options).prepare(scene)
-
-
-mi.register_integrator("gvpm", lambda props: GVPM(props))
+    def near(self, passes: Passes, traced: Traced) -> Iterator[Gathered]:
+        yield Gathered(OnSurfaces(traced), InBalls(passes.world.fog, traced))

@@ -32,16 +32,12 @@ from typing import Any, get_type_hints
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.film import GradientFilm
-from data_gen.passes import SamplePass
 from data_gen.paths import media, segments
-from data_gen.paths.camera import CameraSamples
 from data_gen.paths.world import World
-from data_gen.samplers.common import like_path
-from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
+from data_gen.samplers.photons.integrator import Traced
 from data_gen.samplers.photons.map.trace import VERTICES_PER_PATH
-from data_gen.samplers.photons.media.beams import BEAMS, among_beams
-from data_gen.samplers.photons.media.bre import Along, by_pieces, media_pass, seen_along
+from data_gen.samplers.photons.media.beams import BEAMS
+from data_gen.samplers.photons.media.bre import Along, seen_along
 from data_gen.samplers.photons.passes import Passes
 
 # Of a plane, and of the edge of a map that it may be swept from
@@ -213,7 +209,7 @@ def swept(scene, photons, edges: mi.UInt32, weight: mi.Float):
     )
 
 
-class PLANES(PhotonIntegrator):
+class PLANES(BEAMS):
     """Photon planes for light scattered in homogeneous media twice or more, beams and photons for the rest.
 
     Plugin ``planes``, without gradients. Parameters, and what is not handled, are those of ``beams``, and
@@ -223,26 +219,9 @@ class PLANES(PhotonIntegrator):
     Unbiased in what is scattered twice in media, apart from Monte Carlo noise; biased and consistent in all else.
     """
 
-    name = "planes"
-    sees_media, edges = True, True
     map_bytes = BEAMS.map_bytes + VERTICES_PER_PATH * PLANE_BYTES
 
-    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        media_pass(self, passes, camera, film, among_planes)
-
-    def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
-        return by_pieces(self, *path)
-
-
-def among_planes(passes: Passes, traced: Traced) -> Iterator[Along]:
-    """What is near in a photon map: what ``among_beams`` has of other edges, and planes."""
-    yield from among_beams(passes, only_beams(traced))
-    yield Along(None, planes_of(passes, traced))
-
-
-def make(scene: mi.Scene, **options) -> SamplePass:
-    """The sampler ``planes``, with the parameters of the scene's own ``volpath`` or ``path``."""
-    return like_path(scene, "planes", **options).prepare(scene)
-
-
-mi.register_integrator("planes", lambda props: PLANES(props))
+    def near(self, passes: Passes, traced: Traced) -> Iterator[Along]:
+        """What ``beams`` has of other edges, and planes."""
+        yield from super().near(passes, only_beams(traced))
+        yield Along(None, planes_of(passes, traced))

@@ -17,6 +17,7 @@ Maps"; Knaus and Zwicker 2011, section 5]
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,18 +25,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.film import GradientFilm
-from data_gen.passes import SamplePass
 from data_gen.paths import media
-from data_gen.paths.camera import CameraSamples
-from data_gen.paths.world import World
-from data_gen.samplers.common import like_path
-from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, PhotonIntegrator, Traced
+from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.vertices import in_media
-from data_gen.samplers.photons.passes import Begun, Passes
-from data_gen.samplers.photons.surfaces.ppm import Gathering, by_vertices, image_pass
+from data_gen.samplers.photons.passes import Passes
+from data_gen.samplers.photons.surfaces.ppm import PPM, Gathering
 
 
 @dataclass(init=False)
@@ -88,7 +84,7 @@ class InBoth:
         return L + self.on_surfaces.light(x, place, bsdf, depth, active & ~place.scatters)
 
 
-class VPM(PhotonIntegrator):
+class VPM(PPM):
     """Progressive photon mapping in media and on surfaces; no gradients.
 
     Plugin ``vpm``. Parameters are those of ``ppm``; the ``radius`` of the first pass is that of photons in media, too.
@@ -98,27 +94,8 @@ class VPM(PhotonIntegrator):
     Not handled: light from infinitely far away through a medium without end, and what ``ppm`` does not handle.
     """
 
-    name = "vpm"
-    sees_media, grids, map_bytes = True, True, MEDIA_MAP_BYTES
+    follows, map_bytes = "volpath", MEDIA_MAP_BYTES
 
-    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        begun = Begun.of(passes, camera)
-        maps = self.maps(passes, camera)
-        image_pass(passes, begun, (self.near(passes.world, traced) for traced in maps), self.light, film)
-
-    def near(self, world: World, traced: Traced) -> Gathering | InBoth:
-        on_surfaces = Gathering(world, traced, self.limits.max_depth)
-        if world.fog is None:
-            return on_surfaces
-        return InBoth(on_surfaces, GatheringInMedia(world.fog, traced, self.limits.max_depth))
-
-    def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
-        return by_vertices(self, *path)
-
-
-def make(scene: mi.Scene, **options) -> SamplePass:
-    """The sampler ``vpm``, with the parameters of the scene's own ``volpath`` or ``path``."""
-    return like_path(scene, "vpm", **options).prepare(scene)
-
-
-mi.register_integrator("vpm", lambda props: VPM(props))
+    def near(self, passes: Passes, traced: Traced) -> Iterator[InBoth]:
+        world, max_depth = passes.world, self.limits.max_depth
+        yield InBoth(Gathering(world, traced, max_depth), GatheringInMedia(world.fog, traced, max_depth))

@@ -27,10 +27,8 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.film import GradientFilm
-from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.world import World
-from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients.camera import CameraPaths, Path
 from data_gen.samplers.photons.gradients.copies import LightPaths, copy
 from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen, gradient_pass
@@ -127,20 +125,12 @@ class GPM(PhotonIntegrator):
     Not handled: what ``ppm`` does not handle. Photons that come through glass have no copies but themselves.
     """
 
-    name, walk = "gpm", CameraPaths
+    walk, pairs = CameraPaths, PAIRS
     camera_bytes = PATHS_BYTES + PAIRS * PAIR_BYTES
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        gradient_pass(passes, camera, film, near_surfaces, PAIRS)
+        gradient_pass(passes, camera, film, self.near, self.pairs)
 
-
-def near_surfaces(passes: Passes, traced: Traced) -> Iterator[Gathered]:
-    yield Gathered(OnSurfaces(traced))
-
-
-def make(scene: mi.Scene, **options) -> SamplePass:
-    """The sampler ``gpm``, with the parameters of the scene's own ``path``."""
-    return like_path(scene, "gpm", **options).prepare(scene)
-
-
-mi.register_integrator("gpm", lambda props: GPM(props))
+    def near(self, passes: Passes, traced: Traced) -> Iterator[Gathered]:
+        """What is near to camera paths in a photon map, one part after another."""
+        yield Gathered(OnSurfaces(traced))

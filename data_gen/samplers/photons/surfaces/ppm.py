@@ -19,6 +19,7 @@ emission that the camera path meets on its way counts as it is. So each path of 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -28,7 +29,6 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.film import GradientFilm
-from data_gen.passes import SamplePass
 from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.segments import next_surface
@@ -37,7 +37,6 @@ from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.paths.walk import Sky, roulette
 from data_gen.paths.world import World
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
-from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
 from data_gen.samplers.photons.map.edges import number_of, spread
 from data_gen.samplers.photons.map.grid import Grid
@@ -97,33 +96,29 @@ class PPM(PhotonIntegrator):
     far away. Rendering raises NgptError for them.
     """
 
-    name = "ppm"
-
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
+        """One photon map, and one camera path for each camera sample."""
         begun = Begun.of(passes, camera)
-        near = (Gathering(passes.world, traced, self.limits.max_depth) for traced in self.maps(passes, camera))
-        image_pass(passes, begun, near, self.light, film)
+        near = (one for traced in self.maps(passes, camera) for one in self.near(passes, traced))
+        values, wavelengths = begun.features, begun.start.ray.wavelengths
+        # Emission that camera paths meet is counted with the first map, or without any.
+        L, Le = passes.frozen(self.light, passes.world, begun.start, next(near, None), True)
+        values |= {"primal": to_rgb(L + Le, wavelengths), "direct": to_rgb(Le, wavelengths)}
+        dr.eval(values)
+        for more in near:
+            L, _ = passes.frozen(self.light, passes.world, begun.start, more, False)
+            values["primal"] += to_rgb(L, wavelengths)
+            dr.eval(values["primal"])
+        film.put_all(values)
+
+    def near(self, passes: Passes, traced: Traced) -> Iterator[Any]:
+        """What is gathered of a photon map, one part after another."""
+        yield Gathering(passes.world, traced, self.limits.max_depth)
 
     def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
+        """L and Le of camera paths (world, start, near, emission), with what is gathered from ``near``, and with the
+        ``emission`` that they meet or without."""
         return by_vertices(self, *path)
-
-
-def image_pass(passes: Passes, begun: Begun, near, light, film: GradientFilm) -> None:
-    """One photon map, of which ``near`` has what is gathered from, and one camera path for each camera sample.
-
-    ``light`` (world, start, near, emission) is L and Le of camera paths, with what is gathered from
-    ``near``, and with the emission that they meet or without.
-    """
-    near, values, wavelengths = iter(near), begun.features, begun.start.ray.wavelengths
-    # Emission that camera paths meet is counted with the first map, or without any.
-    L, Le = passes.frozen(light, passes.world, begun.start, next(near, None), True)
-    values |= {"primal": to_rgb(L + Le, wavelengths), "direct": to_rgb(Le, wavelengths)}
-    dr.eval(values)
-    for more in near:
-        L, _ = passes.frozen(light, passes.world, begun.start, more, False)
-        values["primal"] += to_rgb(L, wavelengths)
-        dr.eval(values["primal"])
-    film.put_all(values)
 
 
 @dr.syntax
@@ -185,11 +180,3 @@ def by_vertices(integrator: PhotonIntegrator, world: World, start: Start, near, 
             L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)
         active &= si.is_valid() & (depth < limits.max_depth)
     return L, Le
-
-
-def make(scene: mi.Scene, **options) -> SamplePass:
-    """The sampler ``ppm``, with the parameters of the scene's own ``path``."""
-    return like_path(scene, "ppm", **options).prepare(scene)
-
-
-mi.register_integrator("ppm", lambda props: PPM(props))

@@ -32,6 +32,7 @@ from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
+from data_gen.samplers.registry import SAMPLERS
 from data_gen.samplers.studies.gmlt.chains import Paths, run, value_of
 
 # Mutations for each candidate, and candidates for each chain
@@ -88,7 +89,5 @@ def chosen(sums: np.ndarray, n: int, camera: CameraSamples) -> np.ndarray:
 
 def make(scene: mi.Scene) -> SamplePass:
     """The sampler ``gmlt``: chains of the paths of ``gpt``."""
-    from data_gen.samplers.gpt.integrator import stand_in
-
-    gpt = stand_in(scene)
+    gpt = SAMPLERS["gpt"].integrator(scene)
     return GMLT(Paths(gpt, scene, gpt.plan(scene)))

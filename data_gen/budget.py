@@ -1,0 +1,54 @@
+"""What a render may spend, and who watches it: two small records that go from ``render_stack`` to each pass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from ngpt.errors import WrongUse
+
+# What a render may use, in MiB, beside the scene itself
+DEFAULT_MEMORY = 6144
+
+# Called with (samples per pixel so far, spp), or, where there are seconds, with whole (seconds gone, seconds)
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a render may spend. Of ``spp`` and ``seconds`` whichever is reached first ends it.
+
+    ``spp``      base paths per pixel; None: as many as time allows
+    ``seconds``  of wall-clock time, compilation of kernels included; None: no limit
+    ``memory``   MiB for paths and film
+    """
+
+    spp: int | None = None
+    seconds: float | None = None
+    memory: int = DEFAULT_MEMORY
+
+    def check(self, ends: bool = False) -> None:
+        """Raises WrongUse for what no scene could be rendered with; ``ends``: something else ends the render."""
+        if self.spp is None and self.seconds is None and not ends:
+            raise WrongUse("neither a number of samples per pixel nor a time to render for is given")
+        if self.spp is not None and not 1 <= self.spp < 2**31:
+            raise WrongUse(f"{self.spp} samples per pixel: from 1 to 2^31 - 1 can be rendered")
+        if self.seconds is not None and not 0 < self.seconds < float("inf"):
+            raise WrongUse(f"cannot render for {self.seconds:g} s; give a positive number of seconds")
+        if self.memory < 1:
+            raise WrongUse(f"{self.memory} MiB of memory: give a positive number")
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Who is told of a render as it goes on.
+
+    ``progress``  called before the first pass and after each
+    ``stop``      asked after each pass whether to end there
+    ``look``      called with the ``GradientFilm`` after each pass, before ``stop``; it leaves the film as it is
+    """
+
+    progress: Progress = lambda done, total: None
+    stop: Callable[[], bool] = lambda: False
+    look: Callable[[Any], None] = lambda film: None
