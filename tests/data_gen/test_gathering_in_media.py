@@ -212,9 +212,9 @@ def black_room(max_depth=6):
 
 def light_of_planes(renderer, monkeypatch, spp=4, batches=8, **options):
     """(light by planes alone, that of all paths but those of two edges), images of the same shape."""
-    from data_gen.samplers.photons.media import planes
+    from data_gen.samplers.photons.media.beams import BEAMS
 
-    monkeypatch.setattr(planes, "among_beams", lambda *_: iter(()))
+    monkeypatch.setattr(BEAMS, "near", lambda *_: iter(()))
     ours = render_ours(load(renderer, black_room, (16, 16)), "planes", batches=batches, spp=spp, photons=2, **options)
     long, short = (
         render_ours(
@@ -238,9 +238,9 @@ def test_light_by_planes_has_no_bias(renderer, monkeypatch):
 def test_paths_of_planes_are_no_longer_than_the_scene_says(renderer, monkeypatch):
     """A plane and the way to the camera are three edges."""
     from data_gen.render import render_stack
-    from data_gen.samplers.photons.media import planes
+    from data_gen.samplers.photons.media.beams import BEAMS
 
-    monkeypatch.setattr(planes, "among_beams", lambda *_: iter(()))
+    monkeypatch.setattr(BEAMS, "near", lambda *_: iter(()))
     scenes = [load(renderer, partial(black_room, depth), (8, 8)) for depth in (2, 3)]
     light = [render_stack(scene, 1, 0, "planes")["primal"].sum() for scene in scenes]
     assert light[0] == 0 < light[1]

@@ -17,9 +17,9 @@ def make_plan(scene, *args, hide_emitters=False, **options):
 
 def render(scene, spp=16, size=None, **options):
     """Layers of our integrator with these parameters, and the rate of failed shifts if that is asked for."""
-    from data_gen.samplers.gpt.integrator import stand_in
+    from data_gen.samplers import SAMPLERS
 
-    integrator = stand_in(scene)
+    integrator = SAMPLERS["gpt"].integrator(scene)
     for name, value in options.items():
         setattr(integrator, name, value)
     film = integrator.render_film(scene, scene.sensors()[0], 0, spp)
@@ -139,10 +139,10 @@ def mostly(condition):
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["glossy", plenty])
 def test_the_primal_of_base_and_offset_paths_has_less_noise(renderer, scene):
-    from data_gen.samplers.gpt.integrator import stand_in
+    from data_gen.samplers import SAMPLERS
 
     scene = load(renderer, scene, (32, 32))
-    integrator = stand_in(scene)
+    integrator = SAMPLERS["gpt"].integrator(scene)
     integrator.reuse = True
     stacks = [integrator.render_film(scene, scene.sensors()[0], 0, 64).develop()]
     base = render(scene, spp=64)
@@ -185,9 +185,9 @@ def test_shift_modes_agree(renderer):
     scene = load(renderer, lambda: polished(0.2), (24, 24))
 
     def batches(shift):
-        from data_gen.samplers.gpt.integrator import stand_in
+        from data_gen.samplers import SAMPLERS
 
-        integrator = stand_in(scene)
+        integrator = SAMPLERS["gpt"].integrator(scene)
         integrator.shift, integrator.roughness_threshold = shift, 10.0
         return [integrator.render_film(scene, scene.sensors()[0], seed, 64).develop()["dx"] for seed in range(16)]
 

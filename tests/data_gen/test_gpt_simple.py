@@ -5,6 +5,8 @@ import pytest
 from data_gen_scenes import courtyard, polished
 from unbiased import load
 
+from data_gen.samplers import find
+
 
 def test_random_replay_of_it_is_random_replay(renderer):
     """As a plugin that samples radiance, in place of Mitsuba's ``path``."""
@@ -87,6 +89,4 @@ def test_most_shifts_succeed(pairs):
 
 
 def test_takes_what_is_rough_enough(renderer):
-    from data_gen.samplers.teaching.gpt_simple import make
-
-    assert callable(make(load(renderer, lambda: polished(0.06), (8, 8))))
+    assert callable(find("gpt-simple").made(load(renderer, lambda: polished(0.06), (8, 8))))

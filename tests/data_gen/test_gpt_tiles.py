@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from unbiased import load
 
+from data_gen.samplers import find
+
 SIZE = (8, 6)
 
 
@@ -20,7 +22,7 @@ class Tile:
         from data_gen.samplers.studies import gpt_tiles
 
         scene = load(mi, "diffuse", SIZE)
-        tiles = gpt_tiles.make(scene, tile=side)
+        tiles = find("gpt-tiles").made(scene, tile=side)
         camera = CameraSamples(scene.sensors()[0], 5, 4)
         gpt_tiles.keep_in_step(camera)
         _, paths = tiles.trace(camera)

@@ -305,8 +305,8 @@ def test_copies_of_planes_are_planes_and_their_copies_are_the_planes(renderer, n
     assert np.allclose(np.array(back.Φ)[:, good], np.array(planes.Φ)[:, good], rtol=1e-2)
 
 
-def by_planes_alone(passes, traced):
-    """For ``near_planes``."""
+def by_planes_alone(integrator, passes, traced):
+    """For ``GPLANES.near``."""
     from data_gen.samplers.photons.gradients.differences import Gathered
     from data_gen.samplers.photons.media.gplanes import NearPlanes
     from data_gen.samplers.photons.media.planes import planes_of
@@ -316,9 +316,9 @@ def by_planes_alone(passes, traced):
 
 @pytest.mark.slow
 def test_differences_by_planes_alone_are_those_of_their_image(renderer, monkeypatch):
-    from data_gen.samplers.photons.media import gplanes
+    from data_gen.samplers.photons.media.gplanes import GPLANES
 
-    monkeypatch.setattr(gplanes, "near_planes", by_planes_alone)
+    monkeypatch.setattr(GPLANES, "near", by_planes_alone)
     stacks = passes(load(renderer, media_scenes.colours, (12, 12)), 32, 4, "gplanes", planes=144)
     assert np.mean([stack["primal"].mean() for stack in stacks]) > 0.01
     assert_no_bias(stacks, 4)
@@ -328,10 +328,10 @@ def test_differences_by_planes_alone_are_those_of_their_image(renderer, monkeypa
 def test_planes_have_copies_and_differences_little_noise(renderer, monkeypatch):
     """No z-test asks for that: a sampler that rejects every shift is unbiased. Measured, 48x48: 0.02, 66 and 106."""
     from data_gen.render import render_stack
-    from data_gen.samplers.photons.media import gplanes
+    from data_gen.samplers.photons.media.gplanes import GPLANES
     from ngpt.io.exr import pass_through
 
-    monkeypatch.setattr(gplanes, "near_planes", by_planes_alone)
+    monkeypatch.setattr(GPLANES, "near", by_planes_alone)
     scene = load(renderer, media_scenes.haze, (32, 32))
     failed = pass_through(render_stack(scene, 2, 0, "gplanes", diagnostics=True))["diagnostics.shiftFailures"]
     mean, median = gain(passes(scene, 8, 1, "gplanes"))

@@ -12,9 +12,8 @@ class Toy:
 
     def __init__(self, scene, share):
         from data_gen.samplers.common import radiance
-        from data_gen.samplers.teaching.gpt_basic import make
 
-        make(scene)  # refuses what it cannot render
+        find("gpt-basic").made(scene)  # refuses what it cannot render
         self.scene, self.estimate, self.share = scene, radiance(scene, scene.integrator()), share
 
     def __call__(self, camera, film):

@@ -10,6 +10,7 @@ from media_scenes import haze
 from registered import cases, quick, scene_for
 from unbiased import load, render_ours
 
+from data_gen.budget import Budget
 from data_gen.samplers import SAMPLERS
 from ngpt.testing import z_test
 
@@ -29,7 +30,7 @@ def test_variances_are_those_over_seeds(renderer, name, full):
     spp = (6 if entry.batch == 1 else 16) if full else 3 * entry.batch or 16
     sample, sensor, more = entry.made(scene), scene.sensors()[0], {"lane_bytes": entry.lane_bytes, "batch": entry.batch}
     more["points"] = "independent"
-    stacks = [render_passes(sample, sensor, seed, spp, **more).develop() for seed in range(64 if full else 24)]
+    stacks = [render_passes(sample, sensor, seed, Budget(spp), **more).develop() for seed in range(64 if full else 24)]
     low, high = (0.88, 1.12) if full else (0.8, 1.25)
     for layer in ("primal", "dx", "dy"):
         if layer in stacks[0]:

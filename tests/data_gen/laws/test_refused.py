@@ -48,7 +48,7 @@ TABLE = [
     ("gpt-tiles", hidden_lamp, {}, "hides emitters; use --sampler gpt"),
     ("gpt-tiles", "diffuse", {"adaptive": Adaptive()}, "'gpt-tiles' depend on each other, so all pixels have as many"),
     ("split", fog, {}, "'split' knows only 'path'"),
-    ("split", hidden_lamp, {}, "hides emitters; use --sampler primal"),
+    ("split", hidden_lamp, {}, "hides emitters; use --sampler gpt"),
     ("gbeams", media_scenes.smoke, {}, r"density varies.* use --sampler gpt, .*vpm \(no gradients\), or gvpm"),
     ("vpm", endless, {}, "infinitely far away comes through a medium without end"),
     ("gpt", media_scenes.haze, {"shift": "half-vector"}, "gpt: shift 'half-vector' does not go through media"),
