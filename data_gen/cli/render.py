@@ -93,6 +93,9 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
         args.time,
         args.error,
         (args.method or "auto") if args.adaptive else "",
+        unbiased=args.unbiased,
+        variant=args.variant,
+        diagnostics=args.diagnostics,
     )
     if args.skip_existing:
         output.check_skipping()
@@ -101,7 +104,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
         if rest is None and output.done(whole):
             console.say(f"{target}: skipped: the {'stack' if denoising is None else 'image'} is there")
             return 0
-        begun = begun_stack(output.stack, args.diagnostics)
+        begun = begun_stack(output.stack)
         if rest is None:
             made = output.image(begun, overwrite=True)
             console.say(f"{output.stack} -> {target}: {described(made)}; the stack was there")
