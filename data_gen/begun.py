@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from data_gen.backend import DEFAULT_VARIANT
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
 from ngpt.errors import NgptError
 from ngpt.io.exr import MADE_BY, pass_through, read, with_channels, write
@@ -111,7 +110,7 @@ class Asked:
     adaptive: str = ""  # the method that samples are shared out for
     frame: int | None = None
     unbiased: bool = False  # paths must not share what they find
-    variant: str | None = None
+    variant: str = ""  # of Mitsuba; "": its colours are not compared
     diagnostics: bool = False
 
     def left(self, path: Path) -> Rest | None:
@@ -187,7 +186,7 @@ class Asked:
             ("options", options, wanted),
             ("tails", "shared", "of each path (--unbiased)" if unbiased and "tails=shared" in named else "shared"),
             ("samples", theirs_shared, ours_shared),
-            ("colours", colours, _colours(self.variant or DEFAULT_VARIANT) if colours else colours),
+            ("colours", colours, _colours(self.variant) if colours and self.variant else colours),
         ):
             if theirs != asked:
                 # Names alike differ in the checksum, which says nothing to anybody.

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from data_gen.backend import DEFAULT_VARIANT
 from data_gen.begun import Asked, Rest, Unfinished, begun_stack, scene_name
 from data_gen.frames.pattern import filled
 from data_gen.outputs import Denoising, Output
@@ -148,7 +149,7 @@ def asked_of(
     }
     given |= {} if sensor is None else {"--sensor": str(sensor)}
     name = scene_name(filled(scene, frame), given, str(camera) if camera is not None else None)
-    more = {"unbiased": unbiased, "variant": variant, "diagnostics": diagnostics}
+    more = {"unbiased": unbiased, "variant": variant or DEFAULT_VARIANT, "diagnostics": diagnostics}
     return Asked(name, seed, sampler, options, size, spp, seconds, frame=frame, **more)
 
 

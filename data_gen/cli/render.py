@@ -6,6 +6,7 @@ from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
+from data_gen.backend import DEFAULT_VARIANT
 from data_gen.begun import Asked, Unfinished, begun_stack, scene_name
 from data_gen.cli import KERNELS
 from data_gen.cli.frames import targets
@@ -94,7 +95,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
         args.error,
         (args.method or "auto") if args.adaptive else "",
         unbiased=args.unbiased,
-        variant=args.variant,
+        variant=args.variant or DEFAULT_VARIANT,
         diagnostics=args.diagnostics,
     )
     if args.skip_existing:

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
+from campaigns.fuzz.exr_structure import Attribute, parse
 from exr_files import comparable, same_bits, window, write_raw
-from fuzz.exr_structure import Attribute, parse
 
 import ngpt
 import ngpt.cli
