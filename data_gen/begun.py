@@ -17,20 +17,22 @@ from typing import Any
 
 import numpy as np
 
-from data_gen.samplers import FRAME_SAMPLERS, find
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
 from ngpt.errors import NgptError
 from ngpt.io.exr import MADE_BY, pass_through, read, with_channels, write
 from ngpt.io.openexr import read_header
 from ngpt.io.whole import finished
-from ngpt.merging import DIAGNOSTICS, UNFINISHED, merge
+from ngpt.merging import DIAGNOSTICS, OPTIONS, UNFINISHED, merge
 from ngpt.stack import GradientStack
 from ngpt.system.files import save
 from ngpt.windows import Window
 
 # Attributes: which scene a stack is of, and for how many seconds it was to be rendered
 SCENE, TIME = "ngpt:scene", "ngpt:time"
-# Points that the number of samples decides between are no other way to render.
-_EITHER = {"points=rounds", "points=sobol"}
+# Options that a render decides on, where nobody else does: points by the number of samples, tails by what pays
+_EITHER = {"points=rounds", "points=sobol", "tails=shared", "tails=paths"}
+# Parts of a variant's name that say where and how precisely it computes, and nothing of the light
+_MACHINES = {"scalar", "llvm", "cuda", "metal", "ad", "double"}
 # The fraction of the time asked for that is too little to go on for
 _NOTHING = 0.02
 # Samples per pixel that are too few to be shared out: what is left is rendered evenly then.
@@ -107,11 +109,16 @@ class Asked:
     error: float | None = None
     adaptive: str = ""  # the method that samples are shared out for
     frame: int | None = None
+    unbiased: bool = False  # paths must not share what they find
+    variant: str = ""  # of Mitsuba; "": its colours are not compared
+    diagnostics: bool = False
 
     def left(self, path: Path) -> Rest | None:
         """What is left to render of the stack in a file, None where nothing is.
 
-        Raises NgptError where the stack is another render: scene, frame, seed, size, sampler or its options differ.
+        Raises NgptError where the stack is another render: scene, frame, seed, size, sampler or its options, colours
+        of the variant, or how samples are shared out differ; where it is biased, and what is asked for is not; and
+        where it has not the channels that are asked for.
         """
         attributes, _ = read_header(path)
         # With a crop window, the film that was asked for is the display window.
@@ -160,16 +167,26 @@ class Asked:
         ours = [part_seed(self.seed, part) for part in range(max(len(seeds), 1))]
         if self.frame is not None and self.sampler not in FRAME_SAMPLERS:
             ours = [frame_seed(seed, self.frame) for seed in ours]
-        options = _options(str(attributes.get("ngpt:samplerOptions", "")))
-        entry = FRAME_SAMPLERS.get(self.sampler) or (None if self.sampler == "auto" else find(self.sampler))
-        wanted = _options(entry.unusual(entry.settings(self.options))) if entry else set()
+        named = _options(str(attributes.get(OPTIONS, "")))
+        options = named - _EITHER
+        # What the file's sampler is called with if any will do; one from another package may be missing here.
+        entry = FRAME_SAMPLERS.get(self.sampler) or (
+            SAMPLERS.get(sampler) if self.sampler in ("auto", sampler) else None
+        )
+        wanted = _options(entry.unusual(entry.settings(self.options))) - _EITHER if entry else options
+        unbiased = self.unbiased or self.options.get("tails") == "paths"
+        theirs_shared, ours_shared = self._sharing(attributes, len(seeds))
+        colours = _colours(str(attributes.get("software", "")).rpartition(" ")[2])
         for what, theirs, asked in (
             ("scene", attributes.get(SCENE, self.scene), self.scene),
             ("frame", attributes.get("ngpt:frame"), self.frame),
             ("size", "{}x{}".format(*size), "{}x{}".format(*(self.size or size))),
             ("seed", " ".join(seeds), " ".join(map(str, ours))),
             ("sampler", sampler, sampler if self.sampler == "auto" else self.sampler),
-            ("options", options, wanted if entry else options),
+            ("options", options, wanted),
+            ("tails", "shared", "of each path (--unbiased)" if unbiased and "tails=shared" in named else "shared"),
+            ("samples", theirs_shared, ours_shared),
+            ("colours", colours, _colours(self.variant) if colours and self.variant else colours),
         ):
             if theirs != asked:
                 # Names alike differ in the checksum, which says nothing to anybody.
@@ -179,15 +196,28 @@ class Asked:
                     f"{path}: is another render: {what} {_text(theirs)}, not {_text(asked)}{why}; give another name, "
                     "or --force in place of --skip-existing to replace it"
                 )
+        if self.diagnostics != any(channel.name.startswith(DIAGNOSTICS) for channel in attributes["channels"]):
+            has, remedy = ("none", "leave --diagnostics out") if self.diagnostics else ("some", "pass --diagnostics")
+            raise NgptError(
+                f"{path}: has {has} of the channels that --diagnostics writes; {remedy}, or give another name"
+            )
+
+    def _sharing(self, attributes: Mapping, parts: int) -> tuple[str, str]:
+        """How the samples of a file are shared out, and how they should be; the same where it does not matter."""
+        theirs = str(attributes.get("ngpt:adaptive", ""))
+        by_itself = self.sampler == "auto" and self.seconds is not None and self.spp is None
+        if not theirs and self.adaptive and parts == 1 and UNFINISHED not in attributes:
+            return "alike for all pixels", f"for '{self.adaptive}' (--adaptive)"
+        if theirs and not self.adaptive and self.error is None and not by_itself:
+            return f"for '{theirs}' (--adaptive)", "alike for all pixels"
+        if theirs and self.adaptive not in ("", "auto", theirs):
+            return f"for '{theirs}'", f"for '{self.adaptive}'"
+        return theirs, theirs
 
 
-def begun_stack(path: Path, diagnostics: bool) -> GradientStack:
-    """What a file has of a render; raises NgptError where the rest of it would have other channels."""
-    stack = rendered(read(path))
-    if diagnostics != bool(pass_through(stack)):
-        has, remedy = ("none", "leave --diagnostics out") if diagnostics else ("some", "pass --diagnostics")
-        raise NgptError(f"{path}: has {has} of the channels that --diagnostics writes; {remedy}, or give another name")
-    return stack
+def begun_stack(path: Path) -> GradientStack:
+    """What a file has of a render."""
+    return rendered(read(path))
 
 
 def rendered(read: GradientStack) -> GradientStack:
@@ -246,7 +276,13 @@ def _text(value: Any) -> str:
 
 
 def _options(text: str) -> set[str]:
-    return {option for option in text.split(", ") if option} - _EITHER
+    return {option for option in text.split(", ") if option}
+
+
+def _colours(variant: str) -> str:
+    """What a variant of Mitsuba knows of light: "rgb", "spectral", "mono", "rgb polarized"; "" of no variant."""
+    machine, *parts = variant.split("_")
+    return " ".join(part for part in parts if part not in _MACHINES) if machine in _MACHINES else ""
 
 
 def _number(attributes: Mapping[str, Any], name: str) -> float:

@@ -109,14 +109,23 @@ class Output:
             )
 
     def done(self, asked: Asked) -> bool:
-        """Whether all is there that is asked for. Raises NgptError where a stack is there in place of its image."""
+        """Whether all is there that is asked for.
+
+        Raises NgptError where a stack is there in place of its image, or the image of another method.
+        """
         if not asked.done(self.stack):
             return False
+        by = read_header(self.file)[0].get("ngpt:method") if _readable(self.file) else None
+        if self.denoising is not None and by and self.denoising.method not in ("auto", by):
+            raise NgptError(
+                f"{self.file}: is the image of method '{by}', not '{self.denoising.method}'; `ngpt denoise` makes "
+                "another of the stack, or give another name, or --force in place of --skip-existing to replace it"
+            )
         if self.kept is not None:
-            there = finished(self.file) if self.file.suffix.lower() == ".exr" else self.file.exists()
+            there = self.file.exists() and (self.file.suffix.lower() != ".exr" or _readable(self.file))
             # A stack that has grown since then has another image.
             return there and self.file.stat().st_mtime_ns >= self.kept.stat().st_mtime_ns
-        if self.denoising is not None and "ngpt:method" not in read_header(self.file)[0]:
+        if self.denoising is not None and not by:
             raise NgptError(
                 f"{self.file}: has all samples, and no image: it is a stack; `ngpt denoise` makes one of it, or give "
                 "another name"
@@ -144,3 +153,8 @@ class Output:
 
         dr.flush_malloc_cache()
         return self.denoising.write(self.file, stack, overwrite, keeps=self.kept is not None)
+
+
+def _readable(file: Path) -> bool:
+    """Whether a file is there that has a header, and is whole."""
+    return file.suffix.lower() == ".exr" and file.is_file() and finished(file)

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from data_gen.backend import DEFAULT_VARIANT
 from data_gen.begun import Asked, Rest, Unfinished, begun_stack, scene_name
 from data_gen.frames.pattern import filled
 from data_gen.outputs import Denoising, Output
@@ -72,7 +73,6 @@ def write_frames(
     begun: dict[Rest, list[int]] = {}
     for frame in ours:
         if skip_existing and finished(files[frame]) and (rest := asked[frame].left(files[frame])):
-            begun_stack(files[frame], bool(options.get("diagnostics")))
             begun.setdefault(rest, []).append(frame)
     gone_on = {frame for frames in begun.values() for frame in frames}
     made(written, len(ours))
@@ -92,7 +92,7 @@ def write_frames(
         # Another machine may have been faster.
         by: dict[str, Any] = {}
         if not (skip_existing and outputs[frame].done(asked[frame])):
-            before = begun_stack(files[frame], bool(options.get("diagnostics"))) if frame in gone_on else None
+            before = begun_stack(files[frame]) if frame in gone_on else None
             stack, by = outputs[frame].write(stack, overwrite or cut, before)
         said = {"in place of": "a file that was not whole"} if cut else {}
         written.frames.append(report_of(stack, files[frame], by) | said)
@@ -150,7 +150,8 @@ def asked_of(
     }
     given |= {} if sensor is None else {"--sensor": str(sensor)}
     name = scene_name(filled(scene, frame), given, str(camera) if camera is not None else None)
-    return Asked(name, seed, sampler, options, size, spp, seconds, frame=frame)
+    more = {"unbiased": unbiased, "variant": variant or DEFAULT_VARIANT, "diagnostics": diagnostics}
+    return Asked(name, seed, sampler, options, size, spp, seconds, frame=frame, **more)
 
 
 def report_of(stack: GradientStack, file: Path, made: Mapping[str, Any]) -> dict[str, Any]:

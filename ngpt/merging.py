@@ -32,6 +32,8 @@ VARIANCES = {name: f"{name}_var" for name in ("primal", "dx", "dy", "caustic", "
 DIAGNOSTICS = "diagnostics."
 # Attribute: what broke a render off before all that was asked for was done, "interrupted" or "failed"
 UNFINISHED = "ngpt:unfinished"
+# Attribute: the sampler's options that are not defaults, with commas between
+OPTIONS = "ngpt:samplerOptions"
 # Samples of a pixel, of which headers count as many in 32 bits
 _MOST = 2.0**31
 
@@ -57,12 +59,13 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     are known of tiles that overlap by a pixel.
 
     The result's ``ngpt:seed`` lists all seeds, ``ngpt:spp`` is the mean over pixels of the samples that they have,
-    ``ngpt:seconds`` and ``ngpt:discarded`` are sums, ``ngpt:featureNoise`` is the noise of the merged features where
-    all stacks have it, ``ngpt:unfinished`` is left out, and all other attributes come from the first stack. Raises
-    NgptError for fewer than two stacks, stacks that differ in layers or sampler, or are of pictures of different size,
-    tiles that leave pixels out, a seed that occurs twice in one place, missing ``ngpt:spp`` or ``ngpt:seed``,
-    ``samples`` that are negative or not finite, ``ngpt:seconds``, ``ngpt:discarded`` or ``ngpt:featureNoise`` that are
-    no numbers, results of a reconstruction, and channels of unknown meaning.
+    ``ngpt:seconds`` and ``ngpt:discarded`` are sums, ``ngpt:samplerOptions`` has the options of all stacks,
+    ``ngpt:featureNoise`` is the noise of the merged features where all stacks have it, ``ngpt:unfinished`` is left out,
+    and all other attributes come from the first stack. Raises NgptError for fewer than two stacks, stacks that differ
+    in layers or sampler, or are of pictures of different size, tiles that leave pixels out, a seed that occurs twice in
+    one place, missing ``ngpt:spp`` or ``ngpt:seed``, ``samples`` that are negative or not finite, ``ngpt:seconds``,
+    ``ngpt:discarded`` or ``ngpt:featureNoise`` that are no numbers, results of a reconstruction, and channels of
+    unknown meaning.
     """
     if len(stacks) < 2:
         raise NgptError(f"merging needs at least two stacks, and got {len(stacks)}")
@@ -89,6 +92,10 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
         "ngpt:seed": " ".join(seeds),
     }
     attributes.pop(UNFINISHED, None)
+    # What holds of a part holds of the whole, such as that paths share their tails, which biases it.
+    each = (str(stack.attributes.get(OPTIONS, "")).split(", ") for stack in stacks)
+    if options := dict.fromkeys(option for part in each for option in part if option):
+        attributes[OPTIONS] = ", ".join(options)
     for name in ("ngpt:seconds", "ngpt:discarded"):
         if all(name in stack.attributes for stack in stacks):
             attributes[name] = sum(_number(stack, name) for stack in stacks)

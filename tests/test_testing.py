@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import ttest_ind
 
 from ngpt.testing import z_test
 
@@ -33,6 +34,13 @@ def test_blocks_without_variance_must_agree():
     assert z_test(0 * flat, 0 * flat).passed
     rounded = flat * np.linspace(1e-8, 2e-8, 8)[:, None, None, None]
     assert not z_test(rounded, 0 * flat).passed and z_test(rounded, 0 * flat, scale=1.0).passed
+
+
+def test_is_the_test_of_welch(rng):
+    a, b = rng.normal(size=(8, 8, 8, 1)), rng.normal(0.5, 2, size=(12, 8, 8, 1))
+    welch = ttest_ind(a.mean(axis=(1, 2, 3)), b.mean(axis=(1, 2, 3)), equal_var=False)
+    assert z_test(a, b).z.item() == pytest.approx(welch.statistic, rel=1e-6)
+    assert z_test(a, b).p.item() == pytest.approx(welch.pvalue, rel=1e-6)
 
 
 def test_needs_enough_batches(rng):

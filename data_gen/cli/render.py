@@ -6,6 +6,7 @@ from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
+from data_gen.backend import DEFAULT_VARIANT
 from data_gen.begun import Asked, Unfinished, begun_stack, scene_name
 from data_gen.cli import KERNELS
 from data_gen.cli.frames import targets
@@ -93,6 +94,9 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
         args.time,
         args.error,
         (args.method or "auto") if args.adaptive else "",
+        unbiased=args.unbiased,
+        variant=args.variant or DEFAULT_VARIANT,
+        diagnostics=args.diagnostics,
     )
     if args.skip_existing:
         output.check_skipping()
@@ -101,7 +105,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
         if rest is None and output.done(whole):
             console.say(f"{target}: skipped: the {'stack' if denoising is None else 'image'} is there")
             return 0
-        begun = begun_stack(output.stack, args.diagnostics)
+        begun = begun_stack(output.stack)
         if rest is None:
             made = output.image(begun, overwrite=True)
             console.say(f"{output.stack} -> {target}: {described(made)}; the stack was there")

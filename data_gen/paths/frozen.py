@@ -8,6 +8,7 @@ arrays happen to be of one width, or of width 1, and where scenes come into the 
 from __future__ import annotations
 
 import logging
+import weakref
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -28,13 +29,10 @@ class Frozen:
     """
 
     def __init__(self, scene: mi.Scene, *owners: Any):
-        # Not bound to ``self``: what is in no circle goes when the render does.
-        self.scene, state = scene, [scene, *map(arrays, owners), *_of_each_kind()]
-        # Maps of as many vertices as there are pixels, and the like, are recorded once more: no reason to warn.
-        self.options = {"state_fn": lambda *_: state, "warn_after": 1 << 30, "auto_opaque": False}
+        self.scene, self.state = scene, [scene, *map(arrays, owners), *_of_each_kind()]
         self.functions: dict[Callable, Callable] = {}
         _wake_lamps(scene)
-        self.settle = dr.freeze(lambda *_: None, **self.options)
+        self.settle = _Recorded(_nothing, self.state)
 
     def __call__(self, f: Callable, *args: Any, sums: Callable | None = None) -> Any:
         """``sums`` makes the last argument, which f adds to.
@@ -50,7 +48,7 @@ class Frozen:
             return tried(evaluated(f))
         try:
             if f not in self.functions:
-                self.functions[f] = dr.freeze(as_wide_as_arguments(f), **self.options)
+                self.functions[f] = _Recorded(as_wide_as_arguments(f), self.state)
                 # Dr.Jit makes an array of each number that it meets, and one that belongs to several objects becomes
                 # several arrays, which are one again from the next call on. What does nothing is recorded for that.
                 tried(self.settle)
@@ -68,6 +66,27 @@ class Frozen:
             result = tried(self.functions[f])
             _say(f, " ".join(str(error.__cause__ or error).split()))
             return result
+
+
+class _Recorded:
+    """A function that ``dr.freeze`` records, with arrays that it uses beside its arguments.
+
+    ``dr.freeze`` makes a class, which only Python's collector of circles frees. Until then all would live that the
+    class knows: scenes of earlier renders, which make kernels larger, and whose end has them recorded anew.
+    """
+
+    def __init__(self, f: Callable, state: list):
+        self.f, self.state, this = f, state, weakref.ref(self)
+        # Maps of as many vertices as there are pixels, and the like, are recorded once more: no reason to warn.
+        options = {"warn_after": 1 << 30, "auto_opaque": False, "state_fn": lambda *_: this().state}
+        self.launch = dr.freeze(lambda *args: this().f(*args), **options)
+
+    def __call__(self, *args: Any) -> Any:
+        return self.launch(*args)
+
+
+def _nothing(*args: Any) -> None:
+    pass
 
 
 def _of_each_kind() -> list:

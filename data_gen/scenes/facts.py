@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 
 from data_gen.scenes.cameras import camera_name, check_camera
-from data_gen.scenes.integrators import check_integrator, followed, plugin_name
+from data_gen.scenes.integrators import check_integrator, followed, objects_in, plugin_name
 
 
 @dataclass(frozen=True)
@@ -65,15 +65,7 @@ def _has_hair(bsdf: mi.BSDF | None) -> bool:
     """Whether a material is hair, or one within it: of a mask, a blend, a two-sided one."""
     if bsdf is None:
         return False
-    nested: list[mi.BSDF] = []
-
-    class Inside(mi.TraversalCallback):
-        def put(self, name, value, *_):
-            if isinstance(value, mi.BSDF):
-                nested.append(value)
-
-    bsdf.traverse(Inside())
-    return bsdf.class_name() == "Hair" or any(map(_has_hair, nested))
+    return bsdf.class_name() == "Hair" or any(map(_has_hair, objects_in(bsdf, mi.BSDF)))
 
 
 def integrator_name(scene: mi.Scene) -> str:

@@ -68,7 +68,7 @@ def followed(integrator: mi.Integrator) -> mi.Integrator:
     """The integrator whose image is rendered in place of this one: one of the same image with the same depths, the one
     within an ``aov``, ``moment`` or ``stokes``, or itself."""
     name = plugin_name(integrator)
-    if name in AROUND and len(nested := _nested(integrator)) == 1:
+    if name in AROUND and len(nested := objects_in(integrator, mi.Integrator)) == 1:
         return followed(nested[0])
     hides = bool(getattr(integrator, "hide_emitters", False))
     same = same_image(name, hides)
@@ -79,16 +79,22 @@ def followed(integrator: mi.Integrator) -> mi.Integrator:
     return mi.load_dict({"type": same, "hide_emitters": hides, **depths})
 
 
-def _nested(integrator: mi.Integrator) -> list[mi.Integrator]:
-    found: list[mi.Integrator] = []
+def objects_in(thing: mi.Object, kind: type) -> list:
+    """The objects of a ``kind`` right within another: integrators of an integrator, materials of a mask."""
 
+    # What the class knew would live on in circles, and with it its scene: it knows its arguments alone.
     class Inside(mi.TraversalCallback):
-        def put(self, name, value, *_):
-            if isinstance(value, mi.Integrator):
-                found.append(value)
+        def __init__(self, kind: type):
+            super().__init__()
+            self.kind, self.found = kind, []
 
-    integrator.traverse(Inside())
-    return found
+        def put(self, name, value, *_):
+            if isinstance(value, self.kind):
+                self.found.append(value)
+
+    inside = Inside(kind)
+    thing.traverse(inside)
+    return inside.found
 
 
 def lack(plugin: str, nested: int, from_camera: bool = True) -> str:
@@ -109,7 +115,7 @@ def lack(plugin: str, nested: int, from_camera: bool = True) -> str:
 def check_integrator(integrator: mi.Integrator) -> None:
     """Raises NgptError for an integrator that does not tell radiance along a camera ray."""
     from_camera = isinstance(integrator, mi.SamplingIntegrator)
-    if reason := lack(plugin_name(integrator), len(_nested(integrator)), from_camera):
+    if reason := lack(plugin_name(integrator), len(objects_in(integrator, mi.Integrator)), from_camera):
         raise NgptError(reason)
 
 

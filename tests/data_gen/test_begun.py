@@ -15,13 +15,15 @@ from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 
 SIZE = ["--size", "16x12"]
+UNIFORM, TAILS = {"lamps": "uniform"}, {"tails": "paths"}
 
 
-def there(path, **attributes):
+def there(path, software="", **attributes):
     """A file of a render of 16x12 pixels by `gpt`."""
     names = {"spp": 336, "seed": "3", "sampler": "gpt", "seconds": 14.0, "scene": "box 1"} | attributes
     stack = GradientStack({"primal": np.ones((12, 16, 3), np.float32)})
     stack.attributes.update({f"ngpt:{name}": value for name, value in names.items()})
+    stack.attributes |= {"software": software} if software else {}
     return ngpt.write(path, stack, overwrite=True)
 
 
@@ -50,7 +52,7 @@ def test_a_file_is_finished_where_it_has_what_is_asked_for(tmp_path):
 
 
 def test_a_file_of_another_render_is_neither_taken_nor_replaced(tmp_path):
-    path = there(tmp_path / "a.exr", samplerOptions="lamps=uniform")
+    path = there(tmp_path / "a.exr", samplerOptions="lamps=uniform", software="ngpt 1, Mitsuba 3 cuda_ad_rgb")
     for what, asked in {
         "scene box 1, not ball 1": Asked("ball 1", 3, spp=9),
         r"scene box 1, not box 2 \(its file, -D, --sensor, .* was another\)": Asked("box 2", 3, spp=9),
@@ -58,13 +60,49 @@ def test_a_file_of_another_render_is_neither_taken_nor_replaced(tmp_path):
         "seed 3, not 4": Asked("box 1", 4, spp=9),
         "sampler gpt, not primal": Asked("box 1", 3, "primal", spp=9),
         "options lamps=uniform, not none": Asked("box 1", 3, "gpt", spp=9),
+        "options lamps=uniform, not lamps=uniform, reuse=true": Asked(
+            "box 1", 3, "gpt", {"lamps": "uniform", "reuse": True}, spp=9
+        ),
+        r"colours rgb, not spectral": Asked("box 1", 3, "gpt", UNIFORM, spp=9, variant="llvm_ad_spectral"),
+        r"samples alike for all pixels, not for 'wcv' \(--adaptive\)": Asked(
+            "box 1", 3, "gpt", UNIFORM, spp=9, adaptive="wcv"
+        ),
         "frame unknown, not 7": Asked("box 1", 3, frame=7, spp=9),
     }.items():
         with pytest.raises(NgptError, match=rf"a.exr: is another render: {what};"):
             asked.left(path)
+    # By any sampler, but with the options of none
+    with pytest.raises(NgptError, match="options lamps=uniform, not none"):
+        Asked("box 1", 3, spp=9).left(path)
+    there(path, adaptive="wcv")
+    for what, asked in {
+        r"samples for 'wcv' \(--adaptive\), not alike for all pixels": Asked("box 1", 3, "gpt", spp=9),
+        "samples for 'wcv', not for 'l2'": Asked("box 1", 3, "gpt", spp=9, adaptive="l2"),
+    }.items():
+        with pytest.raises(NgptError, match=what):
+            asked.left(path)
+    assert Asked("box 1", 3, spp=9, adaptive="auto").left(path) is None
+    with pytest.raises(NgptError, match="has none of the channels that --diagnostics writes"):
+        Asked("box 1", 3, spp=9, adaptive="auto", diagnostics=True).left(path)
     ngpt.write(path, np.ones((2, 2, 3), np.float32), overwrite=True)
     with pytest.raises(NgptError, match="seed unknown, not 3"):
         Asked("box 1", 3, spp=1).left(path)
+
+
+def test_shared_tails_are_as_asked_for_unless_unbiased(tmp_path):
+    """Whether they pay is known after the render: the same command must take both, and go on with both."""
+    path, whole = tmp_path / "a.exr", there(tmp_path / "b.exr", seed="4")
+    for given in ({}, {"sampler": "gpt"}, {"sampler": "gpt", "options": {"tails": "shared"}}):
+        for options in ({}, {"samplerOptions": "tails=shared"}):
+            there(path, **options)
+            assert Asked("box 1", 3, spp=336, **given).left(path) is None
+            assert Asked("box 1", 3, spp=400, **given).left(path).spp == 64
+    for given in ({"unbiased": True}, {"sampler": "gpt", "unbiased": True}, {"sampler": "gpt", "options": TAILS}):
+        with pytest.raises(NgptError, match=r"tails shared, not of each path \(--unbiased\)"):
+            Asked("box 1", 3, spp=336, **given).left(path)
+        assert Asked("box 1", 4, spp=336, **given).left(whole) is None
+    # Whole paths and then shared ones are biased too.
+    assert ngpt.merge([ngpt.read(whole), ngpt.read(path)]).attributes["ngpt:samplerOptions"] == "tails=shared"
 
 
 def test_parts_and_frames_have_seeds_of_their_own(tmp_path):

@@ -1,5 +1,6 @@
 """Kernels that are recorded once: how often the Python that makes them runs, and that no bit depends on it."""
 
+import gc
 import logging
 
 import numpy as np
@@ -150,6 +151,50 @@ def test_scenes_that_come_meanwhile_change_no_bit(renderer, recordings, caplog):
     assert recordings.total() <= 3 and not caplog.records
     for name in alone:
         assert np.array_equal(alone[name], among[name], equal_nan=True), name
+
+
+def loaded_and_gone(mi, sampler, size):
+    """A scene is rendered, and nobody has it any more."""
+    from data_gen.samplers import FRAME_SAMPLERS
+    from data_gen.session import render_frames, render_scene
+
+    spp = 16 if size[0] > 9 else 2
+    if sampler in FRAME_SAMPLERS:
+        list(render_frames("glossy", range(2), 1, sampler=sampler, size=size))
+    else:
+        render_scene("glossy", spp, sampler=sampler, size=size)
+
+
+@pytest.mark.parametrize("sampler", ["gpt", "primal", "gpm", "vcm", "gbdpt", "restir"])
+def test_a_scene_goes_with_its_last_render(renderer, sampler):
+    """Python's collector of circles comes late: until then its objects would be in the kernels of other scenes."""
+    import drjit as dr
+
+    from data_gen.paths.frozen import _of_each_kind
+
+    class Calls:
+        count = 0
+
+    def counted(x, calls=Calls):
+        calls.count += 1
+        return x + 1
+
+    # Recorded again where other objects are in the process.
+    kinds, x = _of_each_kind(), dr.opaque(renderer.Float, 1, 4)
+    probe = dr.freeze(lambda x: counted(x), state_fn=lambda *_: kinds, limit=1, auto_opaque=False)
+    gc.collect()
+    gc.disable()
+    try:
+        probe(x), probe(x)
+        before = Calls.count
+        loaded_and_gone(renderer, sampler, (64, 64) if sampler in ("gpt", "primal") else (9, 7))
+        probe(x)
+        assert Calls.count == before
+        scene = load(renderer, "glossy", (4, 4))
+        probe(x)
+        assert Calls.count > before and scene
+    finally:
+        gc.enable()
 
 
 @pytest.mark.recorded_anew

@@ -101,12 +101,12 @@ def test_weights_of_a_path_add_up_to_one(renderer):
 
 @pytest.mark.slow
 def test_variance_gain(renderer):
-    """Over ``gpt`` at equal samples, median of pixels. Measured: 3.4 of the primal and 1.25 of differences."""
+    """Over ``gpt`` at equal samples, median of pixels. Measured: 2.3 of the primal, 1.15 and 1.2 of differences."""
     from data_gen.render import render_stack
 
     scene = load(renderer, "diffuse", (32, 32))
-    ours, theirs = (render_stack(scene, 64, sampler=name) for name in ("gpt-tiles", "gpt"))
+    ours, theirs = (render_stack(scene, 64, sampler=name, unbiased=True) for name in ("gpt-tiles", "gpt"))
     unlit = theirs["direct"].sum(axis=-1) == 0
-    for layer, floor in (("primal_var", 2.5), ("dx_var", 1.05), ("dy_var", 1.05)):
+    for layer, floor in (("primal_var", 2.0), ("dx_var", 1.05), ("dy_var", 1.05)):
         gain = theirs[layer].sum(axis=-1)[unlit] / np.maximum(ours[layer].sum(axis=-1)[unlit], 1e-20)
         assert np.median(gain) > floor, layer

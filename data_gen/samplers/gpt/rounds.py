@@ -45,7 +45,9 @@ class SharedTails:
     """
 
     def __init__(self, view, plan: Plan, frozen: Frozen, take: Take):
-        self.view, self.plan, self.frozen, self.take = view, plan, frozen, take
+        self.frozen, self.take = frozen, take
+        # No method of this object, which has ``frozen``: there must be no circle.
+        self.plan, self.paths = plan, partial(paths, view, plan)
         self.cache: Cache | None = None
         self.fed = 0
 
@@ -105,11 +107,11 @@ class SharedTails:
             self.cache.add(Place(mi.Point3f(x, y, z), code, level), values)
         return dr.width(lanes[0]) / n
 
-    def paths(self, known: Known, camera: CameraSamples) -> tuple[mi.UInt32, list[list]]:
-        """How many records each path has, and these: place, and light of each sort over reflectance, RGB."""
-        ray, importance, _ = camera.rays()
-        count, records = feed(self.view, self.plan, known, camera.random.clone(), (ray, importance))
-        return count, [
-            [*r.place.p, r.place.code, r.place.level, *(each for L in r.L for each in mi.Color3f(L) / r.ρ)]
-            for r in records
-        ]
+
+def paths(view, plan: Plan, known: Known, camera: CameraSamples) -> tuple[mi.UInt32, list[list]]:
+    """How many records each path has, and these: place, and light of each sort over reflectance, RGB."""
+    ray, importance, _ = camera.rays()
+    count, records = feed(view, plan, known, camera.random.clone(), (ray, importance))
+    return count, [
+        [*r.place.p, r.place.code, r.place.level, *(each for L in r.L for each in mi.Color3f(L) / r.ρ)] for r in records
+    ]

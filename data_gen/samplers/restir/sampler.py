@@ -45,8 +45,11 @@ class Restir:
         self.stage = self._stage(scene, ())
         film = self._film()
         lanes_within(memory, film, film.pixels * spp, LANE_BYTES)
-        self._new = lambda: History(self.stage, seed, spp, history, gradients == "pairs")
+        self._remembers = seed, spp, history, gradients == "pairs"
         self._history = self._new()
+
+    def _new(self) -> History:
+        return History(self.stage, *self._remembers)
 
     def _stage(self, scene: mi.Scene, shapes: Sequence[Geometry]) -> Stage:
         plan = make_plan(scene, Limits.of(reference_integrator(scene)), self._roughness, caustic=False)
