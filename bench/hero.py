@@ -1,4 +1,4 @@
-"""The first picture of README.md: path tracing, OIDN at equal rendering time, ngpt, reference; and two crops of each.
+"""The first picture of docs/index.md: path tracing, OIDN at equal rendering time, ngpt, reference; two crops of each.
 
     python -m bench.hero SCENE.xml --cache out/hero --references 8
 

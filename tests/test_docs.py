@@ -138,6 +138,22 @@ def test_tables_of_evaluations_are_those_of_their_files():
         assert f"{start}\n\n{table(of)}\n\n{end}" in (ROOT / page).read_text(), of
 
 
+def test_the_table_of_the_gallery_is_that_of_its_file():
+    """`python -m bench.gallery` writes it; each scene has a picture and a heading."""
+    from bench.gallery import MARKS, PAGE, RESULT, SCENES_SHOWN, name_of, table
+
+    page = PAGE.read_text()
+    assert f"{MARKS[0]}\n\n{table(json.loads(RESULT.read_text()))}\n\n{MARKS[1]}" in page
+    assert re.findall(r"^## (\S+)$", page, re.M) == [name_of(row) for row in SCENES_SHOWN]
+    assert re.findall(r"gallery/(\S+)\.webp", page) == [name_of(row) for row in SCENES_SHOWN]
+
+
+def test_the_readme_is_short():
+    """What is read is counted: no pipes and rules of tables."""
+    words = [word for word in (ROOT / "README.md").read_text().split() if re.search(r"\w", word)]
+    assert len(words) <= 900, len(words)
+
+
 def test_the_numbers_of_the_readme_are_in_the_results():
     readme, results = ((ROOT / page).read_text() for page in ("README.md", "docs/lab/RESULTS.md"))
     hero = json.loads((ROOT / "bench" / "results" / "hero.json").read_text())["results"]

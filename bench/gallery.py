@@ -1,0 +1,183 @@
+"""The pictures of docs/gallery.md: twelve scenes, each noisy, denoised and converged, side by side.
+
+    python -m bench.gallery --folder SCENES --cache out/gallery
+
+SCENES has the scenes that are files. Each row of SCENES_SHOWN is rendered with the command that the page gives, at
+320x180 pixels, and denoised by the method that `ngpt denoise` takes. The reference is rendered without shared paths, in
+two halves of other seeds. Renders are kept in the cache, so a run that was broken off goes on. Written are
+docs/images/gallery, bench/results/gallery.json, and the table between the marks of the page.
+
+    python -m bench.gallery --wipe glossy --size 640 360 --cache out/gallery
+
+writes docs/images/wipe.webp: the noisy image, and a line that moves over it and leaves the result.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+import ngpt
+from bench import panels
+from bench.common import metadata, save, write_page
+from ngpt.measure.metrics import relmse_trimmed
+from ngpt.report.display import auto_exposure, to_srgb8
+from ngpt.stack import GradientStack
+from ngpt.system.files import atomic_output
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "gallery.md"
+RESULT = ROOT / "bench" / "results" / "gallery.json"
+MARKS = ("<!-- python -m bench.gallery: rows -->", "<!-- rows ends -->")
+REFERENCE_SEED = 1 << 20
+NO_GRADIENTS = ("primal", "bdpt", "vcm")
+WIPE_FRAMES, WIPE_MS, REST_MS = 24, 60, 1400  # of the moving line; milliseconds of a frame, and at each end
+
+
+class Shown(NamedTuple):
+    """A row: a scene, its command's options, and how its reference is rendered."""
+
+    scene: str
+    spp: int = 16
+    sampler: str = "auto"
+    reference: str = "primal"
+    reference_spp: int = 64  # of each half
+
+
+SCENES_SHOWN = (
+    Shown("diffuse"),
+    Shown("glossy"),
+    Shown("environment"),
+    Shown("lens"),
+    Shown("living-room/scene.xml"),
+    Shown("kitchen/scene.xml"),
+    Shown("haze", reference_spp=32),
+    Shown("lamp/scene.xml"),
+    Shown("veach-bidir/scene.xml", 64, "gbdpt", "bdpt"),
+    Shown("coffee/scene.xml"),
+    Shown("bedroom/scene.xml"),
+    Shown("classroom/scene.xml", 4),
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--folder", type=Path, default=Path(), help="of the scenes that are files")
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="scenes to make anew")
+    parser.add_argument("--wipe", metavar="NAME", help="writes the moving picture of one scene instead")
+    parser.add_argument("--size", type=int, nargs=2, default=(320, 180), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--cache", type=Path, required=True, help="folder for what is rendered")
+    args = parser.parse_args()
+    args.cache.mkdir(parents=True, exist_ok=True)
+    if args.wipe:
+        row = next(row for row in SCENES_SHOWN if name_of(row) == args.wipe)
+        stack = rendered(args, row, row.sampler, row.spp, 0, unbiased=False)
+        result = ngpt.denoise(stack)
+        shown = [to_srgb8(image, auto_exposure(result)) for image in (stack["primal"], result)]
+        write_wipe(ROOT / "docs" / "images" / "wipe.webp", *shown)
+        return
+    before = json.loads(RESULT.read_text()) if args.only else {"rows": {}}
+    rows = {}
+    for row in SCENES_SHOWN:
+        name = name_of(row)
+        if args.only and name not in args.only:
+            rows[name] = before["rows"][name]
+            continue
+        shown, rows[name] = images(args, row)
+        exposure = auto_exposure(shown[-1])
+        tiles = [[to_srgb8(image, exposure)] for image in shown]
+        lines = [["Noisy"], ["Denoised"], ["Reference"]]
+        panels.save(ROOT / "docs" / "images" / "gallery" / f"{name}.webp", panels.columns(lines, tiles))
+    found = {"benchmark": "gallery", "size": list(args.size), "rows": rows}
+    save(RESULT, found | {"metadata": metadata("mitsuba", "mitsuba-oidn")})
+    write_page(PAGE, table(found), MARKS)
+
+
+def name_of(row: Shown) -> str:
+    return Path(row.scene).parent.name or row.scene
+
+
+def command(row: Shown) -> str:
+    sampler = "" if row.sampler == "auto" else f" --sampler {row.sampler}"
+    return f"ngpt render {row.scene} -o image.png --spp {row.spp}{sampler}"
+
+
+def images(args: argparse.Namespace, row: Shown) -> tuple[list[np.ndarray], dict[str, Any]]:
+    """Noisy image, result and reference, (H, W, 3) scene-linear, and what the table says of them."""
+    stack = rendered(args, row, row.sampler, row.spp, 0, unbiased=False)
+    ngpt.reconstruct(stack)  # loads what the method needs
+    start = time.process_time()
+    result = ngpt.reconstruct(stack)
+    seconds = float(stack.attributes["gallery:seconds"]) + time.process_time() - start
+    halves = [
+        rendered(args, row, row.reference, row.reference_spp, REFERENCE_SEED + i, unbiased=True)["primal"]
+        for i in (0, 1)
+    ]
+    facts = {
+        "command": command(row),
+        "sampler": stack.attributes["ngpt:sampler"],
+        "method": result.method,
+        "CPU seconds": seconds,
+        "noisy": relmse_trimmed(stack["primal"], *halves),
+        "result": relmse_trimmed(result.image, *halves),
+        "oidn": relmse_trimmed(ngpt.denoise(stack, "oidn"), *halves),
+        "light": float(result.image.mean() / np.mean(halves)),
+    }
+    return [stack["primal"], result.image, np.mean(halves, axis=0)], facts
+
+
+def rendered(args: argparse.Namespace, row: Shown, sampler: str, spp: int, seed: int, unbiased: bool) -> GradientStack:
+    """A stack, from the cache if it is there; the attribute gallery:seconds is processor time, kernels included."""
+    file = args.cache / f"{name_of(row)}-{sampler}-{spp}-{seed}-{args.size[0]}x{args.size[1]}.exr"
+    if not file.exists():
+        import data_gen
+
+        print(f"rendering {file.name}", flush=True)
+        path = args.folder / row.scene if (args.folder / row.scene).exists() else row.scene
+        start = time.process_time()
+        stack, _ = data_gen.render_scene(path, spp, seed, sampler, size=tuple(args.size), unbiased=unbiased)
+        stack.attributes["gallery:seconds"] = time.process_time() - start
+        ngpt.write(file, stack)
+    # Without gradients beside it the reader takes the name "direct" for direct light.
+    stack = ngpt.read(file)
+    return ngpt.read(file, {"direct": "direct"}) if stack.attributes.get("ngpt:sampler") in NO_GRADIENTS else stack
+
+
+def table(found: dict[str, Any]) -> str:
+    lines = [
+        "| scene | command | sampler, method | seconds | error, noisy | result | by `oidn` | light |",
+        "|---|---|---|--:|--:|--:|--:|--:|",
+    ]
+    for name, row in found["rows"].items():
+        how = f"`{row['sampler']}`, `{row['method']}` | {row['CPU seconds']:.0f}"
+        errors = " | ".join(f"{row[key]:.4f}" for key in ("noisy", "result", "oidn"))
+        lines.append(f"| [{name}](#{name}) | `{row['command']}` | {how} | {errors} | {row['light']:.2f} |")
+    return "\n".join(lines)
+
+
+def write_wipe(path: Path, before: np.ndarray, after: np.ndarray) -> None:
+    """An animated WebP, (H, W, 3) uint8 images: a white line leaves ``after`` to its left and goes back."""
+    height, width = before.shape[:2]
+    places = [round(width * (1 - np.cos(np.pi * i / WIPE_FRAMES)) / 2) for i in range(WIPE_FRAMES + 1)]
+    frames = []
+    for x in [*places, *places[-2:0:-1]]:
+        frame = Image.fromarray(np.concatenate([after[:, :x], before[:, x:]], axis=1))
+        draw = ImageDraw.Draw(frame)
+        draw.rectangle((x - 1, 0, x, height), fill=panels.PAPER)
+        font, edge = ImageFont.load_default(15), {"stroke_width": 2, "stroke_fill": panels.INK}
+        for text, place, shown in (("denoised", 6, x > width / 4), ("noisy", width - 52, x < width * 3 / 4)):
+            if shown:
+                draw.text((place, height - 22), text, panels.PAPER, font, **edge)
+        frames.append(frame)
+    waits = [REST_MS if i in (0, WIPE_FRAMES) else WIPE_MS for i in range(len(frames))]
+    with atomic_output(path, overwrite=True) as temporary:
+        frames[0].save(temporary, "WEBP", save_all=True, append_images=frames[1:], duration=waits, loop=0, quality=70)
+    print(f"{path}: {width}x{height}, {path.stat().st_size / 1000:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()
