@@ -150,8 +150,19 @@ def asked_of(
     }
     given |= {} if sensor is None else {"--sensor": str(sensor)}
     name = scene_name(filled(scene, frame), given, str(camera) if camera is not None else None)
-    more = {"unbiased": unbiased, "variant": variant or DEFAULT_VARIANT, "diagnostics": diagnostics}
-    return Asked(name, seed, sampler, options, size, spp, seconds, frame=frame, **more)
+    return Asked(
+        name,
+        seed,
+        sampler,
+        options,
+        size,
+        spp,
+        seconds,
+        frame=frame,
+        unbiased=unbiased,
+        variant=variant or DEFAULT_VARIANT,
+        diagnostics=diagnostics,
+    )
 
 
 def report_of(stack: GradientStack, file: Path, made: Mapping[str, Any]) -> dict[str, Any]:

@@ -86,7 +86,8 @@ def objects_in(thing: mi.Object, kind: type) -> list:
     class Inside(mi.TraversalCallback):
         def __init__(self, kind: type):
             super().__init__()
-            self.kind, self.found = kind, []
+            self.kind = kind
+            self.found: list = []
 
         def put(self, name, value, *_):
             if isinstance(value, self.kind):
