@@ -31,8 +31,8 @@ import ngpt
 from bench.common import measure, metadata, save, summary
 from bench.reconstruction import synthetic
 from ngpt.methods import METHODS, reconstruct
-from ngpt.network.run import WEIGHTS
 from ngpt.network.run_onnx import Network, planes
+from ngpt.network.shipped import WEIGHTS
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 

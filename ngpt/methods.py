@@ -20,7 +20,7 @@ from ngpt.io.primaries import converted, inside_rec709
 from ngpt.magnitude import enlarged, magnitude, scaled
 from ngpt.network.identity import Identity, identify
 from ngpt.network.inputs import ESTIMATED
-from ngpt.network.run import OPTIONS, Shipped
+from ngpt.network.shipped import OPTIONS, Shipped
 from ngpt.options import Option, as_text, settings, unusual
 from ngpt.repair import Repaired, finite_pixels, repair
 from ngpt.stack import GradientStack

@@ -11,7 +11,7 @@ from ngpt.io.resolution import resolve
 from ngpt.layers import FEATURE_NOISE
 from ngpt.merging import merge
 from ngpt.methods import METHODS, reconstruct
-from ngpt.network.run import WEIGHTS
+from ngpt.network.shipped import WEIGHTS
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 

@@ -105,18 +105,3 @@ def copy_half_vector(
     # What is no refraction about h to begin with has no inverse.
     exists &= (~bends | ((cos2 > 0) & (dr.dot(wi, h) * dr.dot(wo, h) < 0))) & dr.isfinite(J) & (J > 0)
     return dr.select(exists, wo_offset, mi.Vector3f(0, 0, 1)), dr.select(exists, J, 0), exists
-
-
-def mis_weight(chosen: mi.Float, other: mi.Float) -> mi.Float:
-    """Power heuristic of two techniques' densities by their ratio: squares of densities would leave float32."""
-    return dr.select(chosen > 0, dr.rcp(1 + dr.square(other / chosen)), 0)
-
-
-def gradient_weight(r: mi.Float, good: mi.Bool) -> mi.Float:
-    """2 w, twice the weight with which base path x is responsible for the pair (x, T(x)).
-
-    ``r`` = p(T(x)) |J| / p(x). Either path of a pair may be the one that was sampled, so the balance heuristic gives it
-    w = 1 / (1 + r), and its mirror image the rest (survey, eq. 16-17). A rejected shift has no mirror image: w = 1. The
-    film averages the two directions of a difference, hence twice.
-    """
-    return dr.select(good, 2 / (1 + r), 2)

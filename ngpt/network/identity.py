@@ -8,7 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from ngpt.errors import NgptError
-from ngpt.network.run import WEIGHTS
+from ngpt.network.shipped import WEIGHTS
 from ngpt.system.reading import regular_file
 
 

@@ -22,9 +22,10 @@ from pathlib import Path
 import numpy as np
 
 from ngpt.errors import NgptError
-from ngpt.network import run, run_onnx, tiles
+from ngpt.network import run_onnx, tiles
 from ngpt.network.describe import FRAMES
 from ngpt.network.exposure import statistics
+from ngpt.network.shipped import WEIGHTS as FOLDER
 from ngpt.sequence.evidence import Evidence
 from ngpt.system.late import ndimage
 
@@ -43,7 +44,7 @@ INPUTS = (
     *(f"band {s} over noise" for s in range(BANDS)),
     *("share", "first", "trust", "best", "weight", "speed", "albedo", "facing"),
 )
-WEIGHTS = run.WEIGHTS / "temporal.onnx"
+WEIGHTS = FOLDER / "temporal.onnx"
 # Pixels of a strip of the image that the network sees at a time, at about 1 KB each.
 STRIP = 1 << 20
 

@@ -146,7 +146,7 @@ def networks(recipe: Recipe) -> dict[str, Any]:
 
 def onnx(recipe: Recipe) -> dict[str, Any]:
     """The shipped networks in ONNX Runtime, by its provider for the device and by that for processors."""
-    from ngpt.network import run
+    from ngpt.network import shipped
     from ngpt.network.inputs import gather
     from ngpt.network.run_onnx import DEVICES, Network, runtime
     from ngpt.repair import repair
@@ -156,7 +156,7 @@ def onnx(recipe: Recipe) -> dict[str, Any]:
         raise Unavailable(f"this build of ONNX Runtime has only {have}: onnxruntime-gpu has the other")
     stack, told = made_stack(64, seed=3), {}
     for name in ("ngpt-fast",):
-        networks = [Network(run.WEIGHTS / f"{name}.onnx", device) for device in ("cpu", recipe.device)]
+        networks = [Network(shipped.WEIGHTS / f"{name}.onnx", device) for device in ("cpu", recipe.device)]
         first = networks[0]
         inputs = (*first.inputs, "base") if first.base else first.inputs
         layers = gather(repair(stack, "dx" in first.inputs or bool(first.base)), inputs, first.base)

@@ -11,7 +11,7 @@ from full_stack import full_stack
 import ngpt
 from ngpt.cli import main
 from ngpt.io.exr import MADE_BY
-from ngpt.network.run import WEIGHTS
+from ngpt.network.shipped import WEIGHTS
 
 FAST = WEIGHTS / "ngpt-fast.onnx"
 

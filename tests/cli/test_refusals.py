@@ -17,7 +17,7 @@ from full_stack import full_stack
 import ngpt
 from ngpt.cli import main
 from ngpt.denoisers import oidn
-from ngpt.network.run import WEIGHTS
+from ngpt.network.shipped import WEIGHTS
 from ngpt.stack import GradientStack
 from ngpt.windows import Place, Window
 

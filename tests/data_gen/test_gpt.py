@@ -95,7 +95,7 @@ def test_jacobian_is_that_of_the_shift(renderer):
 def test_weights_of_a_pair_sum_to_one(renderer):
     import drjit as dr
 
-    from data_gen.paths.shift import gradient_weight, mis_weight
+    from data_gen.paths.mis import gradient_weight, mis_weight
 
     r = renderer.Float([1e-30, 1e-3, 1, 7, 1e30])
     assert dr.allclose(gradient_weight(r, True) + gradient_weight(1 / r, True), 2)

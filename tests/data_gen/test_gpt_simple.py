@@ -51,7 +51,7 @@ class Pairs:
         import drjit as dr
 
         from data_gen.paths.lights import emission, sample_light
-        from data_gen.paths.shift import mis_weight
+        from data_gen.paths.mis import mis_weight
         from data_gen.paths.vertex import evaluate
         from data_gen.samplers.teaching.gpt_simple import Step, reflected
 

@@ -25,7 +25,7 @@ from ngpt.network import padding as torch_padding
 from ngpt.network import transfer as torch_transfer
 from ngpt.network.heads import Direct, Kernels, Mixture, Pyramid, Residual
 from ngpt.network.poisson import GRADIENTS, Poisson
-from ngpt.network.run import WEIGHTS
+from ngpt.network.shipped import WEIGHTS
 from ngpt.repair import repair as numpy_repair
 from ngpt.stack import GradientStack
 

@@ -25,7 +25,7 @@ from ngpt.network import inputs
 from ngpt.network.exposure import statistics
 from ngpt.network.features import exposure
 from ngpt.network.model import ModelConfig, Reconstructor
-from ngpt.network.run import WEIGHTS
+from ngpt.network.shipped import WEIGHTS
 from ngpt.network.weights import save_weights
 from ngpt.repair import repair
 from ngpt.stack import GradientStack

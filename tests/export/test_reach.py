@@ -10,8 +10,8 @@ from full_stack import full_layers
 from ngpt.export import reach as module
 from ngpt.export.reach import reach
 from ngpt.network.model import ModelConfig, Reconstructor
-from ngpt.network.run import WEIGHTS
 from ngpt.network.run_onnx import Network
+from ngpt.network.shipped import WEIGHTS
 from ngpt.network.weights import load_weights
 
 TWINS = Path(__file__).parents[2] / "export" / "weights"

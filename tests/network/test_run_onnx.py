@@ -11,8 +11,8 @@ from full_stack import full_layers, full_stack
 
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS, reconstruct
-from ngpt.network.run import WEIGHTS
 from ngpt.network.run_onnx import Cancelled, Network
+from ngpt.network.shipped import WEIGHTS
 from ngpt.stack import GradientStack
 
 FAST = WEIGHTS / "ngpt-fast.onnx"

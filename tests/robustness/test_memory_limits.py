@@ -6,8 +6,8 @@ from full_stack import full_layers
 
 from ngpt.errors import NgptError
 from ngpt.network import run_onnx
-from ngpt.network.run import WEIGHTS
 from ngpt.network.run_onnx import Network
+from ngpt.network.shipped import WEIGHTS
 
 FAST = WEIGHTS / "ngpt-fast.onnx"
 

@@ -15,7 +15,7 @@ from full_stack import full_stack
 
 import ngpt
 from ngpt.errors import NgptError
-from ngpt.network.run import WEIGHTS
+from ngpt.network.shipped import WEIGHTS
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = sorted(

@@ -18,7 +18,7 @@ from ngpt.errors import NgptError
 from ngpt.measure.metrics import METRICS, scores
 from ngpt.methods import METHODS
 from ngpt.network import run_onnx
-from ngpt.network.run import WEIGHTS
+from ngpt.network.shipped import WEIGHTS
 from ngpt.system import limits
 from ngpt.system.forks import until_fork
 from ngpt.system.limits import processors

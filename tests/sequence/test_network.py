@@ -69,7 +69,7 @@ def test_strips_agree_with_the_whole(rng, monkeypatch):
 
 def test_other_files_are_refused(tmp_path):
     pytest.importorskip("onnxruntime")
-    from ngpt.network.run import WEIGHTS
+    from ngpt.network.shipped import WEIGHTS
 
     with pytest.raises(NgptError, match="is no network that blends frames"):
         Network(WEIGHTS / "ngpt-fast.onnx")

@@ -9,8 +9,8 @@ import mitsuba as mi
 
 from data_gen.paths import caustic, media
 from data_gen.paths.lights import emission
+from data_gen.paths.mis import mis_weight
 from data_gen.paths.segments import Segment
-from data_gen.paths.shift import mis_weight
 from data_gen.paths.space import Drawn
 from data_gen.paths.vertex import DELTA, SMOOTH, event_kind
 from data_gen.paths.walk import Sky, roulette

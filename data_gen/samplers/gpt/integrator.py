@@ -12,7 +12,7 @@ four offsets cost about as much as the base path and not four times that.
     J                 |dT/dx|, the Jacobian of the shift
     p, p'             densities of BSDF sampling, in solid angle
     r                 p(y) |J| / p(x), the product of the ratios of each step (survey, eq. 17); 1 while replaying
-    w                 1 / (1 + r), or 1 where the shift is rejected: see data_gen.paths.shift.gradient_weight()
+    w                 1 / (1 + r), or 1 where the shift is rejected: see data_gen.paths.mis.gradient_weight()
     m                 MIS weight of emitter against BSDF sampling, each path's own
     Δ                 gradient sample 2 w (C(y) |J| - C(x)) / p(x), the sum over all lengths of paths and over the two
                       techniques, which are shifted separately: C is the contribution f m of one

@@ -28,7 +28,7 @@ import numpy as np
 
 from data_gen.paths.camera import CameraSamples, in_packets
 from data_gen.paths.manifold import MAX_EVENTS, Target, add_event, event, follow, shoot
-from data_gen.paths.shift import gradient_weight
+from data_gen.paths.mis import gradient_weight
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import SMOOTH, evaluate, event_kind, seen_from
 from data_gen.samplers.gpt.plan import Plan

@@ -9,8 +9,8 @@ import mitsuba as mi
 
 from data_gen.paths import caustic, media, shift
 from data_gen.paths.lights import emission, replay_lamp, replay_light, shared_emission
+from data_gen.paths.mis import gradient_weight, mis_weight
 from data_gen.paths.segments import Segment
-from data_gen.paths.shift import mis_weight
 from data_gen.paths.vertex import DELTA, SMOOTH, event_kind, seen_from
 from data_gen.paths.walk import Sky
 from data_gen.samplers.gpt.base_path import Path, Step, light_mis
@@ -152,7 +152,7 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     # ----------------- Emitter sampling: replay ------------------
     L_light, r_light = replayed_light(scene, plan, step, path, own)
     # Survey, eq. 16, with the weights of eq. 17; β' holds the |J| of all steps before.
-    w2_light = shift.gradient_weight(path.r * r_light, True)
+    w2_light = gradient_weight(path.r * r_light, True)
     Δ = path.Δ + w2_light * (path.β * L_light - step.β * step.L_light)
 
     # ------------- BSDF sampling: reconnect, or part -------------
@@ -170,7 +170,7 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     β1, r1 = dr.select(good, β1, 0), dr.select(good, r1, 0)
     apart, joined = good & parts & move.reaches, good & joins & move.reaches
     # This step has changed r, and with it the weight: emission found at its end is weighted by that of the new pair.
-    w2 = shift.gradient_weight(r1, good)
+    w2 = gradient_weight(r1, good)
     return Offset(
         ray=move.ray,
         hit=move.hit,
@@ -329,7 +329,7 @@ def step_joined(step: Step, path: Offset) -> Offset:
     f, p = media.evaluate_vertex(bsdf, y, step.place, y.to_local(step.light.d), step.lit)
     L_light = dr.select(step.lit, f * step.light_weight * light_mis(step.light.delta, step.light.pdf, p), 0)
     L_light *= step.T_light
-    w2_light = shift.gradient_weight(path.r, True)
+    w2_light = gradient_weight(path.r, True)
     Δ = path.Δ + w2_light * (path.β * L_light - step.β * step.L_light)
 
     # -------------- BSDF sampling: the same direction ------------
@@ -341,7 +341,7 @@ def step_joined(step: Step, path: Offset) -> Offset:
     good = shift.keeps_joined(step.kind) & dr.isfinite(r1) & dr.isfinite(dr.sum(β1))
     β1 = dr.select(good, β1, 0)
     L_bsdf = step.Le * mis_weight(p, step.p_light)
-    w2 = shift.gradient_weight(r1, good)
+    w2 = gradient_weight(r1, good)
     # All later factors of both paths are the same: r and w stay, and a is all that is left to know of y.
     a, Δ = w2 * (β1 - step.β1), Δ + w2 * (β1 * L_bsdf - step.β1 * step.L_bsdf)
     A = path.A + w2_light * step.β * step.L_light + w2 * step.β1 * step.L_bsdf

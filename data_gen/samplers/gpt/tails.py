@@ -24,7 +24,8 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths import caustic, media, shift
+from data_gen.paths import caustic, media
+from data_gen.paths.mis import gradient_weight
 from data_gen.paths.walk import UNLIMITED
 from data_gen.samplers.gpt.base_path import Path, base_step, begin
 from data_gen.samplers.gpt.plan import Plan
@@ -64,7 +65,7 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
     caustic_found = sum(late, caustic_found)
     for y in offsets:
         # Of a joined path, what it would settle with at this vertex, which scatters alike in all directions
-        joined = shift.gradient_weight(y.r, True) * (y.β - path.β)
+        joined = gradient_weight(y.r, True) * (y.β - path.β)
         y.Δ = y.Δ + dr.select(y.joined, joined, y.a) * found
     path.walks = path.walks & ~ends
     return path, path.β * found, path.β * caustic_found

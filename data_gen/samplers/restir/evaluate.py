@@ -21,7 +21,7 @@ import mitsuba as mi
 
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.lights import emission, sample_light, shadowed
-from data_gen.paths.shift import mis_weight
+from data_gen.paths.mis import mis_weight
 from data_gen.paths.vertex import SMOOTH, evaluate, seen_from
 from data_gen.samplers.gpt.base_path import light_mis
 from data_gen.samplers.gpt.plan import Plan

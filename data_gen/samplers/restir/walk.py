@@ -24,7 +24,7 @@ import numpy as np
 
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.lights import emission
-from data_gen.paths.shift import mis_weight
+from data_gen.paths.mis import mis_weight
 from data_gen.paths.streams import sample_streams
 from data_gen.paths.vertex import SMOOTH, evaluate, seen_from
 from data_gen.paths.walk import roulette

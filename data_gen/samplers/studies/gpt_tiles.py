@@ -42,7 +42,8 @@ from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.lights import LightSample, emission, sample_light
-from data_gen.paths.shift import mis_weight, reconnection_jacobian
+from data_gen.paths.mis import mis_weight
+from data_gen.paths.shift import reconnection_jacobian
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials, evaluate, seen_from
 from data_gen.samplers.common import GradientIntegrator

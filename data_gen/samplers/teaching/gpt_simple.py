@@ -11,7 +11,7 @@ and symbols are those of ``data_gen.samplers.gpt``, to be read side by side:
     J                 |dT/dx|, the Jacobian of the shift
     p, p'             densities of BSDF sampling, in solid angle
     r                 p(y) |J| / p(x), the product of the ratios of each step (survey, eq. 17); 0 once rejected
-    w                 1 / (1 + r): see data_gen.paths.shift.gradient_weight()
+    w                 1 / (1 + r): see data_gen.paths.mis.gradient_weight()
     m                 MIS weight of emitter against BSDF sampling, each path's own
     Δ                 gradient sample 2 w (C(y) |J| - C(x)) / p(x) (survey, eq. 4 and 16), the sum over all lengths of
                       paths and over the two techniques, which are shifted separately: C is the contribution f m of one
@@ -38,7 +38,8 @@ from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.lights import LightSample, emission, sample_light
-from data_gen.paths.shift import gradient_weight, mis_weight, reconnection_jacobian
+from data_gen.paths.mis import gradient_weight, mis_weight
+from data_gen.paths.shift import reconnection_jacobian
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials, consistent, evaluate, seen_from
 from data_gen.paths.walk import Limits, roulette

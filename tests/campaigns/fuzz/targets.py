@@ -24,7 +24,7 @@ import ngpt
 from ngpt.errors import NgptError
 from ngpt.io.exr import read, write
 from ngpt.methods import reconstruct
-from ngpt.network.run import WEIGHTS
+from ngpt.network.shipped import WEIGHTS
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 

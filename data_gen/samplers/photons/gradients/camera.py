@@ -17,7 +17,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths.shift import gradient_weight
+from data_gen.paths.mis import gradient_weight
 from data_gen.paths.vertex import SMOOTH, Materials, event_kind
 from data_gen.paths.walk import Sky, brightest, roulette
 from data_gen.paths.world import World

@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.shift import gradient_weight
+from data_gen.paths.mis import gradient_weight
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.world import World
 from data_gen.samplers.photons.gradients.camera import Level

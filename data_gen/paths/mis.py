@@ -1,0 +1,21 @@
+"""Weights of techniques that could all have made a path, and of the two paths of a pair."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+
+def mis_weight(chosen: mi.Float, other: mi.Float) -> mi.Float:
+    """Power heuristic of two techniques' densities by their ratio: squares of densities would leave float32."""
+    return dr.select(chosen > 0, dr.rcp(1 + dr.square(other / chosen)), 0)
+
+
+def gradient_weight(r: mi.Float, good: mi.Bool) -> mi.Float:
+    """2 w, twice the weight with which base path x is responsible for the pair (x, T(x)).
+
+    ``r`` = p(T(x)) |J| / p(x). Either path of a pair may be the one that was sampled, so the balance heuristic gives it
+    w = 1 / (1 + r), and its mirror image the rest (survey, eq. 16-17). A rejected shift has no mirror image: w = 1. The
+    film averages the two directions of a difference, hence twice.
+    """
+    return dr.select(good, 2 / (1 + r), 2)
