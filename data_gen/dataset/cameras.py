@@ -202,8 +202,8 @@ def random_view(
     window = int(rng.integers(0, film[0] - size + 1)), int(rng.integers(0, film[1] - size + 1))
     fov = float(np.clip(around.fov * rng.uniform(0.7, 1.2), 15, 100))
     aperture = max(abs(rng.normal(0, lens)), 1e-5) * focus
-    ways = floats(origin), floats(origin + focus * towards), floats(up)
-    return View(*ways, fov, float(aperture), float(focus), film, window, size)
+    target = floats(origin + focus * towards)
+    return View(floats(origin), target, floats(up), fov, float(aperture), float(focus), film, window, size)
 
 
 def floats(vector: np.ndarray) -> tuple[float, float, float]:

@@ -69,7 +69,7 @@ class ModelConfig:
     pooling: str = "convolution"
 
     def __post_init__(self) -> None:
-        if self.network not in KINDS:
+        if not isinstance(self.network, str) or self.network not in KINDS:
             raise NgptError(f"network '{self.network}': choose one of: {', '.join(KINDS)}")
         if self.pooling not in POOLING:
             raise NgptError(f"pooling '{self.pooling}': choose one of: {', '.join(POOLING)}")

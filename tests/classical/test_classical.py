@@ -232,7 +232,7 @@ def peak_bytes(function):
 
 @pytest.mark.parametrize(("name", "bound"), [("l2", 35), ("l1", 175), ("cv", 100), ("wcv", 100), ("wl2", 180)])
 def test_memory_per_pixel_is_as_stated(name, bound):
-    height, width = 500, 600
+    height, width = 1000, 1100
     _, *data, variances = noisy_stack(height, width)
     assert peak_bytes(lambda: METHODS[name](*data, variances)) < bound * height * width
 

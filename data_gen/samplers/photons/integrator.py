@@ -94,8 +94,8 @@ class PhotonIntegrator(GradientIntegrator):
             return
         n = dr.width(camera.pixel) * self.photons
         random = light_streams(camera.seed, dr.arange(mi.UInt32, n), camera.first, independent=not camera.net)
-        depths = limits.max_depth - 1, limits.rr_depth
-        starts, maps = trace(world, random, *depths, frozen=passes.frozen, edges=self.edges)
+        longest = limits.max_depth - 1
+        starts, maps = trace(world, random, longest, limits.rr_depth, frozen=passes.frozen, edges=self.edges)
         for photons in maps:
             yield Traced(photons, starts, n, camera.first, camera.seed, self.options["radius"] * passes.width)
 
