@@ -37,14 +37,18 @@ class Denoising:
     def needs_gradients(self) -> bool:
         return self.method != "auto" and "dx" in runnable(self.method).needs
 
-    def check(self, sampler: str, spp: int | None) -> None:
-        """Raises an error for a method that does not run here, or that needs what such a render lacks."""
+    def check(self, sampler: str, spp: int | None, begun: str = "") -> None:
+        """Raises an error for a method that does not run here, or that needs what such a render lacks.
+
+        ``begun`` is the file of a render that is gone on with, whose sampler it is.
+        """
         if self.method == "auto":
             return
         needs, entry = runnable(self.method).needs, SAMPLERS.get(sampler)
         if self.needs_gradients and (sampler in FRAME_SAMPLERS or (entry and not entry.gradients)):
             raise WrongUse(
-                f"method '{self.method}' needs gradients, and sampler '{sampler}' renders none; name another"
+                f"method '{self.method}' needs gradients, and sampler '{sampler}'{f' of {begun}' if begun else ''} "
+                "renders none; name another"
             )
         if spp == 1 and any(name.endswith("_var") for name in needs):
             raise WrongUse(

@@ -247,9 +247,6 @@ def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
                 f"{stack.path} is {stack.place} but {first.path} is {first.place}; only stacks of one image can be "
                 "merged: its tiles, or its seeds"
             )
-        for name in _means(stack) ^ _means(first):
-            has, lacks = (stack, first) if name in _means(stack) else (first, stack)
-            raise NgptError(f"{has.path} has '{name}' and {lacks.path} has not; merge stacks with the same layers")
         # As texts, for files of elsewhere may hold anything under our names.
         ours, theirs = (str(s.attributes.get("ngpt:sampler")) for s in (stack, first))
         if ours != theirs:
@@ -257,14 +254,17 @@ def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
                 f"{stack.path} was made by sampler '{ours}' and {first.path} by '{theirs}'; their variances cannot be "
                 "merged: name one with --sampler"
             )
+        for name in _means(stack) ^ _means(first):
+            has, lacks = (stack, first) if name in _means(stack) else (first, stack)
+            raise NgptError(f"{has.path} has '{name}' and {lacks.path} has not; merge stacks with the same layers")
         ours, theirs = (str(s.attributes.get("ngpt:frame")) for s in (stack, first))
         if ours != theirs:
             raise NgptError(
                 f"{stack.path} is frame {ours} and {first.path} is frame {theirs}; only stacks of one frame can be "
                 "merged"
             )
-        for name in VARIANCES.values():
-            if n > 1 and name not in stack and any(name in other for other in stacks):
+        for mean, name in VARIANCES.items():
+            if n > 1 and mean in stack and name not in stack and any(name in other for other in stacks):
                 raise NgptError(f"{stack.path} has no '{name}' though it has {n} samples per pixel; render it again")
         for seed in _seeds(stack):
             for other in seen.setdefault(seed, []):

@@ -176,6 +176,8 @@ def error_cases(rng):
         ([stack(), changed(stack(2), spp=None)], "2.exr: has no attribute 'ngpt:spp'"),
         ([stack(), changed(stack(2), seed=None)], "2.exr: has no attribute 'ngpt:seed'"),
         ([stack(), changed(stack(2), sampler="primal")], "made by sampler 'primal'"),
+        ([changed(stack(gradients=False), sampler="primal"), stack(2)], "2.exr was made by sampler 'gpt' and 1.exr by"),
+        ([stack(gradients=False), stack(2)], "2.exr has 'd[xy]' and 1.exr has not"),
         ([stack(), unknown], "2.exr has no 'primal_var' though it has 4 samples"),
         ([with_channels(stack(i), {"id": np.zeros(SHAPE[:2])}) for i in range(2)], "channel 'id' is no layer"),
         *(

@@ -22,6 +22,7 @@ from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.whole import finished
 from ngpt.merging import UNFINISHED
+from ngpt.methods import choose
 from ngpt.system.console import Console
 from ngpt.system.interrupts import Interrupt
 from ngpt.system.limits import limit_threads
@@ -106,6 +107,8 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
             console.say(f"{target}: skipped: the {'stack' if denoising is None else 'image'} is there")
             return 0
         begun = begun_stack(output.stack)
+        if denoising is not None:
+            denoising.check(str(begun.attributes.get("ngpt:sampler", "")), wanted, str(output.stack))
         if rest is None:
             made = output.image(begun, overwrite=True)
             console.say(f"{output.stack} -> {target}: {described(made)}; the stack was there")
@@ -176,8 +179,9 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
             f"{args.scene}: it took longer than {args.time:g} s: kernels and a least pass ({done} spp) are not quicker "
             "on this machine now; a smaller --size is"
         )
-    if denoising is None and (method := stack.attributes.get("ngpt:for")):
-        console.say(f"then: ngpt denoise {shlex.quote(str(target))}, which takes method '{method}'")
+    if denoising is None and "ngpt:for" in stack.attributes:
+        # Another than it is for where that needs variances, which one sample per pixel has not.
+        console.say(f"then: ngpt denoise {shlex.quote(str(target))}, which takes method '{choose(stack)}'")
     if args.json:
         kept = {"stack": str(output.kept)} if output.kept else {}
         print_json(report_of(stack, target, made) | {"layers": stack.names} | kept)

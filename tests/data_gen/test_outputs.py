@@ -84,6 +84,35 @@ def test_the_method_of_a_pilot_is_run(renderer, tmp_path, monkeypatch, capsys):
     assert " s, nfor " in said and "then: ngpt denoise" not in said
 
 
+def test_the_line_on_what_comes_next_names_the_method_that_it_takes(renderer, tmp_path, monkeypatch, capsys):
+    """One sample per pixel has no variances, so not every method that a render is for can clean it."""
+    from data_gen.choosing import plans
+
+    monkeypatch.setattr(plans, "plan_sampler", lambda *_, **__: plans.Plan("gpt", "wcv", False, None, "for a test"))
+    for spp, taken in (("1", None), ("2", "wcv")):
+        out = str(tmp_path / f"{spp}.exr")
+        assert main(["render", "diffuse", "--size", "16x12", "--spp", spp, "-o", out]) == 0
+        said = capsys.readouterr().err
+        assert main(["denoise", out, "-o", str(tmp_path / "image.exr"), "-q"]) == 0
+        method = read_exr(tmp_path / "image.exr").parts[0].header["ngpt:method"]
+        assert f"which takes method '{method}'" in said and (method == taken if taken else method != "wcv")
+        (tmp_path / "image.exr").unlink()
+
+
+@pytest.mark.parametrize("frames", [False, True])
+def test_a_method_that_cannot_use_what_was_begun_is_refused(renderer, tmp_path, monkeypatch, capsys, frames):
+    from data_gen import render
+    from data_gen.frames import shot
+
+    out = str(tmp_path / ("{frame}.exr" if frames else "0.exr"))
+    words = ["render", "diffuse", "--size", "16x12", "-o", out, *(["--frames", "0:1"] if frames else [])]
+    assert main([*words, "--spp", "2", "--sampler", "primal"]) == 0
+    monkeypatch.setattr(render, "render_stack", lambda *_, **__: pytest.fail("rendered"))
+    monkeypatch.setattr(shot, "render_shot", lambda *_, **__: pytest.fail("rendered"))
+    assert main([*words, "--spp", "4", "--skip-existing", "--denoise", "wcv"]) == 2
+    assert "0.exr renders none" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("kept", [False, True])
 def test_a_render_goes_on_and_its_image_is_made_anew(renderer, tmp_path, capsys, kept):
     """From the result, which has the stack in it, or from the stack that is kept beside a picture."""
