@@ -105,6 +105,11 @@ class Output:
         if self.kept is not None and self.kept.resolve() == self.file.resolve():
             raise WrongUse(f"--keep {self.kept}: is the file of the image; give another name, or leave --keep out")
 
+    def check_begun(self, sampler: str) -> None:
+        """Raises WrongUse for an image that cannot be made of what ``sampler`` has begun."""
+        if self.denoising is not None:
+            self.denoising.check(sampler, None, str(self.stack))
+
     def check_skipping(self) -> None:
         """Raises WrongUse where nothing could tell what is there of a render."""
         if self.stack.suffix.lower() != ".exr":

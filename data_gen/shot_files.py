@@ -73,8 +73,7 @@ def write_frames(
     begun: dict[Rest, list[int]] = {}
     for frame in ours:
         if skip_existing and finished(files[frame]) and (rest := asked[frame].left(files[frame])):
-            if denoising is not None:
-                denoising.check(rest.sampler, None, str(files[frame]))
+            outputs[frame].check_begun(rest.sampler)
             begun.setdefault(rest, []).append(frame)
     gone_on = {frame for frames in begun.values() for frame in frames}
     made(written, len(ours))

@@ -134,7 +134,7 @@ class GradientStack:
             what = f"layer{'s' if len(missing) > 1 else ''} {' and '.join(repr(name) for name in missing)}"
             remedy = " ".join(f"--layer {name}=NAME" for name in missing)
             if "dx" in missing and "ngpt:sampler" in self.attributes:
-                remedy += f"; sampler '{self.attributes['ngpt:sampler']}' renders none: `ngpt render --sampler gpt` does"
+                remedy += "; sampler 'gpt' renders gradients: `ngpt render --sampler gpt`"
             if "primal_var" in missing:
                 remedy += "; if its renderer writes none, several seeds do: 'With variances' in from-your-renderer.md"
             raise NgptError(

@@ -136,7 +136,7 @@ def test_missing_layers_are_named_with_the_remedy():
     assert "a.exr: method 'l1' needs layers 'dx' and 'dy'; the stack holds primal, albedo" in str(caught.value)
     assert "--layer dx=NAME --layer dy=NAME" in str(caught.value) and "sampler" not in str(caught.value)
     stack.attributes["ngpt:sampler"] = "primal"
-    with pytest.raises(NgptError, match="sampler 'primal' renders none: `ngpt render --sampler gpt` does"):
+    with pytest.raises(NgptError, match="`ngpt render --sampler gpt`"):
         stack.require("dx", "dy", why="method 'l1'")
     with pytest.raises(NgptError, match="no layer is called 'gradient'"):
         stack["gradient"]

@@ -19,7 +19,7 @@ def enclosed(scene: mi.Scene) -> bool:
     """
     random = mi.PCG32(_RAYS)
     sensor = scene.sensors()[0]
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, *(mi.Point2f(_two(random)) for _ in range(2)))
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, *(mi.Point2f(_two(random)) for _ in range(2)))
     seen = scene.ray_intersect(ray)
     normal = dr.select(dr.dot(seen.n, ray.d) > 0, -seen.n, seen.n)
     away = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(_two(random))))

@@ -107,8 +107,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
             console.say(f"{target}: skipped: the {'stack' if denoising is None else 'image'} is there")
             return 0
         begun = begun_stack(output.stack)
-        if denoising is not None:
-            denoising.check(str(begun.attributes.get("ngpt:sampler", "")), wanted, str(output.stack))
+        output.check_begun(str(begun.attributes.get("ngpt:sampler", "")))
         if rest is None:
             made = output.image(begun, overwrite=True)
             console.say(f"{output.stack} -> {target}: {described(made)}; the stack was there")

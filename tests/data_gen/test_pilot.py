@@ -143,6 +143,15 @@ def test_rooms_are_rendered_without_gradients(renderer, monkeypatch):
     assert chosen("glossy", (128, 64), 8) == ("gpt", "")
 
 
+def test_every_camera_is_asked_whether_it_is_in_a_room(renderer):
+    """Those that fill a surface have ray differentials only."""
+    from camera_cases import RENDERED, scene_with
+
+    from data_gen.choosing.enclosed import enclosed
+
+    assert [view for view in (*RENDERED, "batch") if enclosed(scene_with(renderer, view)) not in (True, False)] == []
+
+
 def test_a_pilot_leaves_the_scene_as_it_was(renderer, monkeypatch):
     from data_gen.choosing import plans, trials
     from data_gen.render import render_stack
