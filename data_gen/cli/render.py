@@ -3,6 +3,7 @@
 import argparse
 import shlex
 from contextlib import closing, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,8 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
             console.say(f"{target}: skipped: the {'stack' if denoising is None else 'image'} is there")
             return 0
         begun = begun_stack(output.stack)
-        output.check_begun(str(begun.attributes.get("ngpt:sampler", "")))
+        for_whom = denoising or Denoising(args.method or "auto")
+        replace(output, denoising=for_whom).check_begun(str(begun.attributes.get("ngpt:sampler", "")))
         if rest is None:
             made = output.image(begun, overwrite=True)
             console.say(f"{output.stack} -> {target}: {described(made)}; the stack was there")

@@ -99,17 +99,24 @@ def test_the_line_on_what_comes_next_names_the_method_that_it_takes(renderer, tm
         (tmp_path / "image.exr").unlink()
 
 
-@pytest.mark.parametrize("frames", [False, True])
-def test_a_method_that_cannot_use_what_was_begun_is_refused(renderer, tmp_path, monkeypatch, capsys, frames):
+@pytest.mark.parametrize(
+    ("frames", "more"),
+    [
+        ([], ["--spp", "4", "--denoise", "wcv"]),
+        (["--frames", "0:1"], ["--spp", "4", "--denoise", "wcv"]),
+        ([], ["--time", "60", "--for", "wcv"]),
+    ],
+)
+def test_a_method_that_cannot_use_what_was_begun_is_refused(renderer, tmp_path, monkeypatch, capsys, frames, more):
     from data_gen import render
     from data_gen.frames import shot
 
     out = str(tmp_path / ("{frame}.exr" if frames else "0.exr"))
-    words = ["render", "diffuse", "--size", "16x12", "-o", out, *(["--frames", "0:1"] if frames else [])]
+    words = ["render", "diffuse", "--size", "16x12", "-o", out, *frames]
     assert main([*words, "--spp", "2", "--sampler", "primal"]) == 0
     monkeypatch.setattr(render, "render_stack", lambda *_, **__: pytest.fail("rendered"))
     monkeypatch.setattr(shot, "render_shot", lambda *_, **__: pytest.fail("rendered"))
-    assert main([*words, "--spp", "4", "--skip-existing", "--denoise", "wcv"]) == 2
+    assert main([*words, "--skip-existing", *more]) == 2
     assert "0.exr renders none" in capsys.readouterr().err
 
 

@@ -136,7 +136,9 @@ def test_attributes_tell_how_it_was_made(renderer):
     assert attributes["ngpt:seconds"] > 0 and attributes["ngpt:discarded"] == 0
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_spectral_polarized"])
+@pytest.mark.parametrize(
+    "variant", ["llvm_ad_mono", "llvm_ad_mono_polarized", "llvm_ad_spectral", "llvm_ad_spectral_polarized"]
+)
 def test_every_kind_of_variant_renders_the_same_image(renderer, variant):
     from data_gen.backend import use_variant
 
