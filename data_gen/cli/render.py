@@ -115,7 +115,8 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
             console.say(f"{output.stack} -> {target}: {described(made)}; the stack was there")
             return 0
         given |= rest.options(args.seed)
-        how = {"adaptive": bool(rest.adaptive), "error": rest.error, "method": rest.method(args.method)}
+        goal = args.method or (choose(begun) if "ngpt:for" in begun.attributes else None)
+        how = {"adaptive": bool(rest.adaptive), "error": rest.error, "method": rest.method(goal)}
         console.say(f"{output.stack}: has {begun.attributes['ngpt:spp']} samples per pixel; going on with it")
 
     def chosen(plan) -> None:

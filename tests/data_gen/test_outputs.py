@@ -84,6 +84,17 @@ def test_the_method_of_a_pilot_is_run(renderer, tmp_path, monkeypatch, capsys):
     assert " s, nfor " in said and "then: ngpt denoise" not in said
 
 
+def test_the_error_of_what_goes_on_is_that_of_its_method(renderer, tmp_path, monkeypatch, capsys):
+    from data_gen.choosing import plans
+
+    monkeypatch.setattr(plans, "plan_sampler", lambda *_, **__: plans.Plan("primal", "nfor", False, None, "for a test"))
+    words = ["render", "diffuse", "--size", "16x12", "-o", str(tmp_path / "it.exr")]
+    assert main([*words, "--spp", "4"]) == 0
+    assert main([*words, "--error", "0.5", "--skip-existing"]) == 0
+    said = capsys.readouterr().err
+    assert "'nfor' is expected to have an error" in said and "which takes method 'nfor'" in said
+
+
 def test_the_line_on_what_comes_next_names_the_method_that_it_takes(renderer, tmp_path, monkeypatch, capsys):
     """One sample per pixel has no variances, so not every method that a render is for can clean it."""
     from data_gen.choosing import plans
