@@ -209,7 +209,9 @@ def plan_sampler(
     sampler, reason = samplers.choose(scene_facts(scene))
     described = Plan(sampler, "", False, seconds, reason)
     if not gradients and in_a_room(scene, spp):
-        return replace(described, sampler="primal", method=_ROOM_METHOD, reason=_ROOM_REASON)
+        # One sample has no variance, which the method needs.
+        method = _ROOM_METHOD if spp != 1 else ""
+        return replace(described, sampler="primal", method=method, reason=_ROOM_REASON)
     names = candidates(scene, biased=True)
     if len(names) == 1:
         return described
