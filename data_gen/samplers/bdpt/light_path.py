@@ -67,8 +67,7 @@ class LightPath:
 
 
 def begin(world: World, random, camera_ray: mi.Ray3f) -> tuple[LightRay, End, mi.Bool]:
-    """A path from a light up to its first vertex, and whether there is one; time and wavelengths are those of
-    ``camera_ray``."""
+    """A path from a light up to its first vertex, and whether it exists; ``camera_ray`` gives time and wavelengths."""
     scene, lights = world.scene, world.lights
     start = lights.sample(scene, random, camera_ray.time, camera_ray.wavelengths)
     active = dr.max(start.β) > 0
