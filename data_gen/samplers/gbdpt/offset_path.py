@@ -1,7 +1,7 @@
-"""The four camera paths beside that of a sample: how each is shifted, and completed by every strategy.
+"""The four offset paths of a camera sample: how each is shifted, and completed by every strategy.
 
 An offset path is *apart* while it has vertices of its own, *joined* at the vertex that it shares but has come to from
-elsewhere, and *settled* from there on: it differs from its base path by β, r and the partial sums of its weights alone.
+elsewhere, and *settled* from there on: it differs from its base path only by β, r and the partial sums of its weights.
 It has ended where β is 0. Symbols as in ``gbdpt``.
 """
 
@@ -75,7 +75,7 @@ def brightest(offsets: list[Offset]) -> mi.Float:
 
 
 def with_differences(offsets: list[Offset], Δ: list[mi.Spectrum]) -> list[Offset]:
-    """The same offset paths, with these sums of Δ."""
+    """The offset paths with ``Δ`` as their sums."""
     return [replace(offset, Δ=total) for offset, total in zip(offsets, Δ, strict=True)]
 
 
@@ -121,7 +121,7 @@ def take_step(
 ) -> list[Offset]:
     """Takes all offset paths along a step of their base path; connections to the light path are not in it.
 
-    Where there is a ``chain``, that behind the step, bent paths alone are shifted; ``course`` is the one before it.
+    With a ``chain``, the one behind the step, only bent paths are shifted; ``course`` is the one before the step.
     """
     busy = mi.Bool(False)
     for offset in offsets:
