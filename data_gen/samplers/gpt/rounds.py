@@ -23,7 +23,7 @@ from data_gen.tails.cells import Place
 _SEED = 0x5441494C53
 # Paths that feed the cache together, lest their new cells be more than there is room for
 _AT_ONCE = 1 << 18
-# The first round comes in two parts, since paths of the second may end in what those of the first have found.
+# The first round comes in two parts, since paths of the second may end in what paths of the first have found.
 _FIRST_PART = 1 / 4
 # Where fewer of the first paths come by a place to end than this share of them, none end: it would cost more than it
 # gains.
