@@ -111,7 +111,7 @@ class CameraPaths:
         return replace(level, paths=paths, depth=level.depth + 1, η=η, numbers=random.state, behind=[])
 
     def further(self, level: Level, random, lanes: mi.UInt32) -> Level:
-        """Those of these ``lanes``, up to what their rays hit."""
+        """The paths of these ``lanes``, up to what their rays hit."""
         paths = [at_lanes(path, lanes) for path in level.paths]
         for path in paths:
             path.hit = self.world.scene.ray_intersect_preliminary(path.ray, active=path.alive)
@@ -175,7 +175,7 @@ def taken(value: Any, lanes: mi.UInt32) -> Any:
 
 
 def at_lanes(path: Path, lanes: mi.UInt32) -> Path:
-    """What belongs to these ``lanes`` alone; the hit stays."""
+    """The part of a path that belongs to these ``lanes``; the hit stays."""
     old = path.ray
     time = taken(old.time, lanes) if dr.width(old.time) > 1 else old.time
     wavelengths = taken(old.wavelengths, lanes) if dr.width(old.wavelengths) > 1 else old.wavelengths

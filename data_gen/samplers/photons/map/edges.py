@@ -8,8 +8,8 @@ Light that is the same everywhere on a surface would be lost along the edges, in
 π r². Counted over A nothing of it is lost. π r² / A is the sum of the products (1 - w₁) ... (1 - wₖ) over k from 0 on,
 whose mean is right, and which has one term on a plane: one probe for each point.
 
-The probes' numbers are those of the place and the pass. So π r² / A is a property of x in each pass, by whatever path
-it is reached.
+The place and the pass determine the probes' random numbers. So π r² / A is a property of x in each pass, by whatever
+path it is reached.
 
 [the sum: Booth 2007, "Unbiased Monte Carlo Estimation of the Reciprocal of an Integral"]
 """
@@ -33,13 +33,13 @@ ROUNDS = 8
 
 
 def number_of(seed: int, number: int) -> mi.UInt32:
-    """Of pass ``number`` of a render with that ``seed``: another one for each."""
+    """A number for pass ``number`` of a render with that ``seed``: another one for each."""
     return dr.opaque(mi.UInt32, (seed * 0x9E3779B1 + number * 0x85EBCA77) % (1 << 32))
 
 
 @dr.syntax
 def spread(world: World, x: mi.SurfaceInteraction3f, radius2: mi.Float, number: mi.UInt32, active: mi.Bool) -> mi.Float:
-    """π r² / A at vertices ``x`` where light is gathered; ``number`` is that of the pass, see ``number_of()``."""
+    """π r² / A at vertices ``x`` where light is gathered; ``number`` is the pass's, see ``number_of()``."""
     scene, receives = world.scene, world.materials.connectable
     frame, n = mi.Frame3f(x.n), mi.Vector3f(x.n)
     radius = dr.sqrt(radius2)
