@@ -44,7 +44,7 @@ class Traced:
     first_radius: float  # that photons are gathered within in pass 0
 
     def radius(self, dimension: int = 2) -> float:
-        """Of this pass, where photons are counted in so many dimensions."""
+        """The radius of this pass, where photons are counted in so many dimensions."""
         return self.first_radius * shrunk(self.number, dimension)
 
 
@@ -55,7 +55,7 @@ class PhotonIntegrator(GradientIntegrator):
     ``edges``         photon maps have the edges of light paths, too
     ``camera_bytes``  that a camera sample takes
     ``map_bytes``     that a map takes for each light path
-    ``walk``          class of how camera paths go with those of the neighbours: ``gradients.camera.CameraPaths``
+    ``walk``          class of how camera paths go with the neighbours' paths: ``gradients.camera.CameraPaths``
     """
 
     edges = False
@@ -68,7 +68,7 @@ class PhotonIntegrator(GradientIntegrator):
 
     @property
     def lane_bytes(self) -> int:
-        """Of a camera sample, with all that its light paths may leave in a map."""
+        """Bytes for a camera sample, with all that its light paths may leave in a map."""
         return self.camera_bytes + self.photons * self.map_bytes
 
     def instead(self, lane_bytes: int) -> str:
