@@ -1,6 +1,6 @@
 r"""Gradients of photon planes: ``planes``, and each plane that a camera ray meets shifted to four neighbours.
 
-    A, B        pieces of rays through a medium, of a camera path, along w, and of the neighbouring pixel's path
+    A, B        pieces of rays through a medium: A of a camera path, along w; B of the neighbouring pixel's path
     a, d, e     a plane: where the edge enters the medium, its direction, and the direction of the scattered light
     s, t, u     distances on the edge, from there to the point of the plane that is on A, and along A
     e', s', t'  of the copy, whose point on B is as far along B: u' = u

@@ -39,7 +39,7 @@ def acceptance(f: mi.Float, proposed: mi.Float) -> mi.Float:
 class Proposal:
     """The numbers of a mutation, one after the other; instead of a sampler.
 
-    ``vector``  those of the chain's state, a ``dr.Local``
+    ``vector``  the numbers of the chain's state, a ``dr.Local``
     ``random``  one number for each of them
     ``large``   all numbers are new, independent of the state's
     """

@@ -39,7 +39,7 @@ def _glass_class(variant: str) -> type:
 
         A ray goes the way of its first wavelength. So images are right where all wavelengths of a ray are one, as
         ``data_gen.samplers.studies.spectral.render`` has them; elsewhere the others lose their way, but no light. In
-        variants without wavelengths the index is that of sodium light.
+        variants without wavelengths the index is for sodium light.
         """
 
         def __init__(self, props):
