@@ -85,7 +85,7 @@ def go_on(plan: Plan, random, start: LightRay, y: Vertex, bsdf, active) -> tuple
     sample, f_p = bsdf.sample(context(IMPORTANCE), y.si, u_lobe, u_direction, active)
     d, f_p, end = light_leaves(y, bsdf, sample, f_p, active & (sample.pdf > 0))
     β = y.β * dr.select(sample.pdf > 0, f_p, 0)
-    # By what is left of the light that the path began with
+    # Russian roulette by what is left of the light that the path began with
     survives = roulette(dr.max(β) * dr.rcp(dr.max(start.β)), y.depth >= plan.limits.rr_depth)
     active = active & (sample.pdf > 0) & (dr.max(β) > 0) & (u_survival < survives)
     ray = y.si.spawn_ray(d)

@@ -40,7 +40,7 @@ class Partial:
 
     vcm: mi.Float
     vc: mi.Float
-    # Of a camera path: what is added to ``vc`` if the next event is a delta
+    # For a camera path: what is added to ``vc`` if the next event is a delta
     waiting: mi.Float = field(default_factory=lambda: mi.Float(0))
 
 

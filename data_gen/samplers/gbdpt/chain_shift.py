@@ -108,7 +108,7 @@ class Chain:
 
 
 def no_chain(lanes: int) -> Chain:
-    """A chain for each of so many base paths, none of which has one yet."""
+    """The chains of base paths that have none yet, one for each of so many ``lanes``."""
     return Chain(
         x1=dr.zeros(mi.SurfaceInteraction3f, lanes),
         ω=mi.Vector3f(0),

@@ -150,7 +150,7 @@ def shift_splats(
     """Splats the differences of light paths that end at ``marked`` vertices, of those that survive ``roulette``, which
     goes by the ``threshold`` of each pixel.
 
-    Those behind mirrors or glass are few, and their walks long: in the kernel of all most lanes would wait.
+    Paths behind mirrors or glass are few, and their walks long: in one kernel for all paths most lanes would wait.
     """
     lanes, depths = marked(marks, plan.longest)
     if not dr.width(lanes):

@@ -94,7 +94,7 @@ def connect(plan: Plan, step: Step, y: Vertex, times, offsets: list[Offset], Δ:
         others1 = mis.others_connected(offset.end, y.end, edge)
         sums.append(Δ_before + dr.select(~own, times * plan.pair(C, others, offset.β * g, offset.r, others1), 0))
     # --------- Others: from the copy's own vertex, one by one ---------
-    # What a shift to y needs of the materials, but for the offset path's own
+    # What a shift to y needs of the materials, except for the offset path's own
     both = step.connectable & plan.materials.connectable(y.si.bsdf())
 
     def one(i, *Δ):
@@ -184,7 +184,7 @@ def step_own(plan: Plan, step: Step, y: Offset, course: Course | None = None, ch
     smooth = step.kind == SMOOTH
     joins = step.goes_on & smooth & step.connectable & connectable
     replays = step.goes_on & ~smooth & y.apart
-    # What neither does is rejected: β = 0.
+    # Rejected if it does neither: β = 0.
     none = Offset(y.ray, y.hit, mi.Spectrum(0), y.r, y.end, mi.Bool(False), mi.Bool(False), Δ)
     state = (none, mi.Spectrum(0), mi.Float(0))
     if chain is not None:
@@ -238,7 +238,7 @@ def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tupl
 
 
 def replay(plan: Plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
-    """By the mirror, glass or hole that the base path's random numbers find here; and emission at its next vertex.
+    """The step by the mirror, glass or hole that the base path's random numbers find here; emission at the next vertex.
 
     Only camera paths find such events in front of the first one that is smooth, so that their random numbers belong to
     the path for every strategy that finds it: r = 1, and the shift is a function of the path.

@@ -81,7 +81,7 @@ def thresholds(camera: CameraSamples, light: mi.Color3f, splats: Splats) -> mi.F
     """√(I I0) for each pixel, from the ``light`` of camera paths and the light of ``splats``."""
     seen = np.array(dr.mean(light)).reshape(camera.pixels, -1)
     total = seen.mean(axis=1) + np.mean(splats.totals(), axis=0) / seen.shape[1]
-    # What is not finite is lost on the film, and a spectral sum may be negative.
+    # The film loses what is not finite, and a spectral sum may be negative.
     root = np.sqrt(np.maximum(np.nan_to_num(total, nan=0.0, posinf=0.0, neginf=0.0), 0.0))
     return mi.Float((root * root.mean()).astype(np.float32))
 

@@ -195,8 +195,8 @@ def replayed_light(scene, plan: Plan, step: Step, path: Offset, own: Own) -> tup
 
     Densities of the same numbers cancel (survey, eq. 6 and 7), so r stays what it was, and the numbers lead to, or
     near, the same point of an emitter. It is never rejected: an emitter that y does not see is a sample of value 0, and
-    the reverse shift knows it as such. Of an emitter that is chosen by place, the same one is taken from y, where it
-    has another probability: the ratio of the two does not cancel.
+    the reverse shift knows it as such. Where an emitter is chosen by place, y takes the same one, where it has another
+    probability: the ratio of the two does not cancel.
     """
     y, bsdf = own.y, own.bsdf
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) | media.scatters(own.place)
@@ -274,7 +274,7 @@ def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
 
 
 def part(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
-    """In a direction of its own, with the half-vector of the base path or along its random numbers."""
+    """A move in a direction of its own, with the half-vector of the base path or along its random numbers."""
     # -------------------- Random sequence replay -----------------
     # |J| = p / p' (survey, eq. 6), hence f |J| / p = f / p', which is what sampling returns (eq. 7), and r = 1.
     y = own.y

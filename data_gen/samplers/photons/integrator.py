@@ -1,4 +1,4 @@
-"""What all plugins by photons are: parameters, the world of a scene, and the photon maps of a pass."""
+"""What all photon plugins share: parameters, the world of a scene, and the photon maps of a pass."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from data_gen.samplers.photons.map.trace import MAP_BYTES, VERTICES_PER_PATH, tr
 from data_gen.samplers.photons.passes import Passes
 from ngpt.errors import NgptError
 
-# Of a camera sample and its features, beside the maps
+# Bytes of a camera sample and its features, beside the maps
 CAMERA_BYTES = 256
-# Of a map in media: two words more for each vertex, and two for each light path
+# Bytes of a map in media: two words more for each vertex, and two for each light path
 MEDIA_MAP_BYTES = MAP_BYTES + VERTICES_PER_PATH * 2 * 8 + 2 * 8
-# More of it with grids: null collisions of each vertex, twice; and Φ / σs
+# Further bytes of it with grids: null collisions of each vertex, twice; and Φ / σs
 GRID_BYTES = VERTICES_PER_PATH * (3 + 3 + 3) * 4
 
 

@@ -68,7 +68,7 @@ class CameraPaths:
     def levels(self, rays: list, random: mi.Sampler, frozen: Callable) -> Iterator[Level]:
         """Level after level of the paths that begin with ``rays``, each evaluated.
 
-        Of each ray there is (ray, importance, whether it is on the film); the first is the base path's. ``frozen``
+        Each ray is given as (ray, importance, whether it is on the film); the first is the base path's. ``frozen``
         calls the functions that make kernels.
         """
         n, stream = dr.width(rays[0][0].o), type(random)
@@ -137,7 +137,7 @@ class CameraPaths:
         """A path before its first ray is traced."""
         ray, n = mi.Ray3f(ray), dr.width(ray)
         β = mi.Spectrum(importance) + dr.zeros(mi.Spectrum, n)
-        # Of the width of the ray, and no constant
+        # As wide as the ray, and not a constant
         alive = inside & (mi.UInt32(0) == dr.zeros(mi.UInt32, n))
         return Path(ray, None, β, alive, Sky.from_camera(self.limits.hide_emitters, n))
 

@@ -28,7 +28,7 @@ RAYS = 24
 LEAST = 0.01
 # In a radius: what lies so near together has the same numbers, whatever has rounded it.
 PLACES = 8
-# Of the hash: with Mitsuba's 4, one probe after another misses.
+# Rounds of the hash: with Mitsuba's 4, one probe after another misses.
 ROUNDS = 8
 
 
@@ -47,7 +47,7 @@ def spread(world: World, x: mi.SurfaceInteraction3f, radius2: mi.Float, number: 
     other, _ = mi.sample_tea_32(place[1], place[2], ROUNDS)
     place, _ = mi.sample_tea_32(place[0] ^ number, other, ROUNDS)
     total, term, rays = mi.Float(0), mi.Float(1), mi.UInt32(0)
-    # Of a probe what is left of it
+    # What is left of a probe
     ray, begins = mi.Ray3f(x.p, -n, dr.zeros(mi.Float), x.time, x.wavelengths), mi.Bool(True)
     going = mi.Bool(active)
     while dr.hint(going, label="probes of edges"):

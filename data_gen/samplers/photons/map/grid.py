@@ -72,7 +72,7 @@ class Grid:
         return x + self.n.x * (y + self.n.y * z)
 
     def row(self, p: mi.Point3f, k: mi.UInt32, active) -> tuple[mi.UInt32, mi.UInt32]:
-        """From where to where in the list is row ``k`` of 4 of the cells near ``p``; nothing if ``p`` is far off."""
+        """The start and end in the list of row ``k`` of 4 of the cells near ``p``; nothing if ``p`` is far off."""
         near = [(q - o) * self.rate - 0.5 for q, o in zip(p, self.low, strict=True)]
         for f, n in zip(near, self.n, strict=True):
             active = active & (f >= 0) & (f < n - 1)
