@@ -59,7 +59,7 @@ def no_pixels(facts: Facts, name: str) -> str:
 
 
 def hair(facts: Facts, name: str) -> str:
-    """Mitsuba's hair scatters otherwise from the light to the eye than back, and tells nothing of its adjoint."""
+    """Mitsuba's hair scatters differently from the light to the eye than back, and does not provide its adjoint."""
     return "light paths lose light at the material 'hair', which is not the same in both directions" * facts.hair
 
 

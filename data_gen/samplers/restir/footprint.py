@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-# Of a pixel's area that was moved by a fraction: the pixels it lies on, from the one of its own corner on.
+# The pixels that a pixel's area lies on when it is moved by a fraction, starting at the one of its own corner.
 CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 
 

@@ -117,7 +117,7 @@ class Layout:
 
 
 def step(domain: mi.UInt32) -> mi.Point2i:
-    """From the first pixel of a pair to the second."""
+    """The step from the first pixel of a pair to the second."""
     return mi.Point2i(dr.select(domain == 1, mi.Int32(1), 0), dr.select(domain == 2, mi.Int32(1), 0))
 
 
@@ -131,5 +131,5 @@ def fraction(place: mi.Point2f) -> mi.Vector2f:
 
 
 def across(domain: mi.UInt32, side: mi.UInt32) -> mi.Vector2f:
-    """From the pixel of a pair that a path is in to the other one."""
+    """The step from the pixel of a pair that a path is in to the other one."""
     return mi.Vector2f(step(domain)) * dr.select(side == 0, mi.Float(1), -1)

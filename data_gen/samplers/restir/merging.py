@@ -136,6 +136,6 @@ def _pair(own: mi.Spectrum, other: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
 
 
 def _value(r: mi.UInt32, own: mi.Spectrum, other: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
-    """What reservoir number ``r`` is of, light or one sign of a difference: of a path in its pixel and in the other."""
+    """The value of reservoir ``r``, light or one sign of a difference, for a path in its pixel and in the other."""
     sign = dr.select(r % 2 == 1, mi.Float(1), -1)
     return dr.select(r == 0, own, part(_pair(own, other, side), sign))

@@ -36,7 +36,7 @@ import mitsuba as mi
 
 LIGHT, HIT, RC_LIGHT, SUFFIX, REPLAY, STUCK = range(6)
 
-# Of a word, from its lowest bits on: kind, whether the lamp was sampled, vertices behind rc, those that are replayed
+# Parts of a word, from its lowest bits on: kind, whether the lamp was sampled, vertices behind rc, replayed vertices
 _KIND_BITS, _COUNT_BITS = 3, 14
 _BEHIND, _REPLAYED = _KIND_BITS + 1, _KIND_BITS + 1 + _COUNT_BITS
 # Vertices that a record can count. Russian roulette ends paths by then, for none survives a step for certain.

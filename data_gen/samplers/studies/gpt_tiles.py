@@ -49,7 +49,7 @@ from data_gen.paths.vertex import Materials, evaluate, seen_from
 from data_gen.samplers.common import GradientIntegrator
 from data_gen.samplers.teaching.gpt_simple import base_step, reflected, trace, walk
 
-# Of a lane: its suffix, its camera sample and sums; and what is kept of one connection.
+# Bytes of a lane: its suffix, its camera sample and sums; and what is kept of one connection.
 _LANE_BYTES, _CONNECTION_BYTES = 272, 32
 
 
@@ -269,7 +269,7 @@ class Paths:
 
 @dataclass
 class Link:
-    """To the same sample of another pixel, by lanes; where it is ``active``, its own link leads back."""
+    """A link to the same sample of another pixel, by lanes; where it is ``active``, its own link leads back."""
 
     lane: mi.UInt32
     active: mi.Bool
@@ -284,14 +284,14 @@ class Grid:
         width, height = camera.size
         self.place = camera.pixel % dr.opaque(mi.UInt32, width), camera.pixel // dr.opaque(mi.UInt32, width)
         self.size = width, height
-        # Of pixels that far apart; tests move them.
+        # Tiles consist of pixels that far apart; tests move them.
         self.stride = SHIFTS["dx+"][0]
         offsets = camera.sample % side, camera.sample // side % side
         #: the place of a pixel in its tile
         self.slot = tuple((p // self.stride + o) % side for p, o in zip(self.place, offsets, strict=True))
 
     def others(self) -> list[Link]:
-        """To all other pixels of the tile. Places are paired by an exclusive or, so that links lead back."""
+        """Links to all other pixels of the tile. Places are paired by an exclusive or, so that links lead back."""
         # Opaque: all connections are one kernel.
         all_bits = [dr.opaque(mi.UInt32, bits) for bits in range(self.side)]
         pairs = [(x, y) for y in all_bits for x in all_bits][1:]
@@ -301,7 +301,7 @@ class Grid:
         ]
 
     def across(self, axis: int) -> Link:
-        """To the neighbour along ``axis`` that is in another tile, of pixels at such a border."""
+        """The link to the neighbour along ``axis`` that is in another tile, for pixels at such a border."""
         slot = self.slot[axis]
         step = dr.select(slot == self.side - 1, mi.Int32(self.stride), 0)
         step = dr.select(slot == 0, -mi.Int32(self.stride), step)
@@ -309,7 +309,7 @@ class Grid:
         return Link(link.lane, link.active & (step != 0))
 
     def neighbour(self, x: mi.Int32 | int, y: mi.Int32 | int) -> Link:
-        """To the pixel at (x, y) from here; not active where that is outside the image."""
+        """The link to the pixel at (x, y) from here; not active where that is outside the image."""
         (width, height), (here_x, here_y) = self.size, self.place
         there_x, there_y = mi.Int32(here_x) + x, mi.Int32(here_y) + y
         width, height = (dr.opaque(mi.Int32, n) for n in (width, height))

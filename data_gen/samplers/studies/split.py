@@ -57,7 +57,7 @@ def trace(scene, limits: Limits, lobes: Lobes, random, ray, β) -> tuple[mi.Spec
     """Diffuse and specular light of paths that begin with ``ray``, of importance ``β``."""
     diffuse, specular = mi.Spectrum(0), mi.Spectrum(0)
     x = scene.ray_intersect(mi.Ray3f(ray))
-    # Of the light that comes to x from beyond: what share is diffuse, once that is settled.
+    # The diffuse share of the light that comes to x from beyond, once that is settled
     share, settled = mi.Spectrum(0), mi.Bool(False)
     depth = mi.UInt32(1)
     active = x.is_valid() & (depth < limits.max_depth)

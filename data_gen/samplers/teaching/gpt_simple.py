@@ -232,7 +232,8 @@ def step_joined(step: Step, path: Offset) -> tuple[mi.Spectrum, mi.Spectrum]:
 
 
 def refuse(scene) -> None:
-    """Raises NgptError for materials that paths cannot be reconnected at: polish, too, which no description tells."""
+    """Raises NgptError for materials that paths cannot be reconnected at; also for polish, which no description
+    shows."""
     if materials := Materials(scene, CONNECTABLE.default).unconnectable:
         more = f" and {len(materials) - 3} more" if len(materials) > 3 else ""
         reason = f"paths cannot be reconnected at {', '.join(materials[:3])}{more}"

@@ -48,7 +48,7 @@ from data_gen.samplers.photons.map.radius import pixel_width, shrunk
 from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.vcm.merging import VERTEX_BYTES, Keeper, Map, Merging, Photons, eta
 
-# Of a camera sample, its features and its light path, beside the map: what was seen, and some more
+# Bytes of a camera sample, its features and its light path, beside the map: what was seen, and some more
 SAMPLE_BYTES = 1536
 
 

@@ -141,13 +141,13 @@ class Merging:
         return found, Partial(its("vcm"), its("vc")), gathered
 
     def merged(self, z: Vertex, bsdf: mi.BSDFPtr, photon: Photon, end: Partial, active) -> tuple[mi.Spectrum, mi.Float]:
-        """What a ``photon`` brings to the camera by ``z``, but for the kernel; ``end`` is its light path's."""
+        """What a ``photon`` brings to the camera by ``z``, without the kernel; ``end`` is its light path's."""
         g, p, q = brought(photon, z.si, bsdf, active)
         return z.β * g, mis.others_merged(z.end, q, end, p, self.photons.η)
 
 
 def brought(photon: Photon, si, bsdf: mi.BSDFPtr, active) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
-    """What a ``photon`` adds to radiance at ``si``, but for the kernel; p of the direction to the light, q swapped."""
+    """What a ``photon`` adds to radiance at ``si``, without the kernel; p of the direction to the light, q swapped."""
     f, p, q = evaluate(RADIANCE, si, bsdf, si.to_local(-photon.d), active)
     # f has a cosine; the photons lie as densely as the geometric one is large.
     return f * photon.Φ / dr.abs(dr.dot(photon.n, photon.d)), p, q

@@ -155,7 +155,7 @@ def _walk(world: World, paths: Paths, random, depths: tuple, photons, places: tu
             if dr.hint(nulls is not None, mode="scalar"):
                 around |= {"key": nulls.key, "nulls": nulls.n, "N_c": nulls.N_c}
             if dr.hint(nulls is not None and keeps_edges, mode="scalar"):
-                # Of edges that lead to nothing as well
+                # Also for edges that lead to nothing
                 _enter(photons, {"key": nulls.key, "nulls": nulls.n}, place, alive)
         else:
             hit = scene.ray_intersect_preliminary(ray, active=alive)
@@ -196,7 +196,7 @@ def _walk(world: World, paths: Paths, random, depths: tuple, photons, places: tu
             medium = where.toward(si, ray.d)
 
         # ------------------ Whether the path goes on ----------------------
-        # By what is left of the light that the path began with
+        # Russian roulette by what is left of the light that the path began with
         survival = roulette(dr.max(β) * brightest, bounce >= rr_depth)
         alive = exists & (sample.pdf > 0) & (dr.max(β) > 0) & dr.isfinite(dr.sum(β)) & (u_survival < survival)
         β = β / survival

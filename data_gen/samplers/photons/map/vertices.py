@@ -122,6 +122,6 @@ def put(photons, vertex, place: mi.UInt32, active) -> None:
 
 
 def at(some: Any, index: mi.UInt32) -> Any:
-    """The entries of a record of arrays, some of which may be None, at these places."""
+    """The entries at these places of a record of arrays; some arrays may be None."""
     values = (getattr(some, f.name) for f in fields(some))
     return type(some)(*(None if value is None else dr.gather(type(value), value, index) for value in values))

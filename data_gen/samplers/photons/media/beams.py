@@ -79,8 +79,8 @@ def parts_class(variant: str) -> type:
 def cut(world: World, edges, rate: mi.Float, first: mi.UInt32, window: tuple, parts: Any) -> mi.UInt32:
     """How many parts the ``edges`` of light paths have, ``rate`` of them in a unit of length.
 
-    Those of an edge are numbered from ``first`` on. The parts in the ``window`` (low, size) are entered into the arrays
-    ``parts``, unless these are None.
+    The parts of an edge are numbered from ``first`` on. The parts in the ``window`` (low, size) are entered into the
+    arrays ``parts``, unless these are None.
     """
     scene, fog, (low, size) = world.scene, world.fog, window
     ray, medium = mi.Ray3f(edges.o, edges.e), mi.MediumPtr(edges.begins)  # a piece, and what it goes through
@@ -217,7 +217,7 @@ def nearest(o, d, p, e) -> tuple:
     """Where two lines are nearest: through ``o`` along ``d``, and through ``p`` along ``e``, unit vectors.
 
     Returns the distances from p, and from o, how far the lines are apart, and the sine of their angle. Where they are
-    parallel nothing of it is finite.
+    parallel no value is finite.
     """
     n, to, cos = dr.cross(d, e), p - o, dr.dot(d, e)
     sin2 = dr.squared_norm(n)

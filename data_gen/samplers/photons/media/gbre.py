@@ -40,7 +40,7 @@ from data_gen.samplers.photons.media.bre import BALL, seen_along
 from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.photons.surfaces.gpm import GPM, OnSurfaces
 
-# Of a camera sample beside pairs: levels of five pieces of paths, what they end at, and as many sums
+# Bytes of a camera sample beside pairs: levels of five pieces of paths, what they end at, and as many sums
 PATHS_BYTES = 4096
 
 

@@ -40,7 +40,7 @@ from data_gen.samplers.photons.media.beams import BEAMS
 from data_gen.samplers.photons.media.bre import Along, seen_along
 from data_gen.samplers.photons.passes import Passes
 
-# Of a plane, and of the edge of a map that it may be swept from
+# Bytes of a plane, and of the edge of a map that it may be swept from
 PLANE_BYTES = (18 + 3) * 4
 
 

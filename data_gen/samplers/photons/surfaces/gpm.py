@@ -40,7 +40,7 @@ from data_gen.samplers.photons.map.photon import Photon, is_near, light, photon_
 from data_gen.samplers.photons.map.vertices import on_surfaces
 from data_gen.samplers.photons.passes import Passes
 
-# Of a camera sample beside that: levels of five paths with their rays, hits and throughputs, and as many sums
+# Bytes of a camera sample beside that: levels of five paths with their rays, hits and throughputs, and as many sums
 PATHS_BYTES = 3072
 
 

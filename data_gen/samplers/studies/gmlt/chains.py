@@ -106,7 +106,7 @@ def run(
         f = value_of(layers)
         a = acceptance(old.f, f)
         accepted = u < a
-        # Of the two states one is left for good: what it has to splat is known.
+        # One of the two states is left for good: what it has to splat is known.
         new = State(None, pixel, layers, f, a, old.accepted + 1)
         stays = State(None, old.pixel, old.layers, old.f, old.weight + 1 - a, old.accepted)
         splat(dr.select(accepted, stays, new))

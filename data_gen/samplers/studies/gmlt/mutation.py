@@ -12,7 +12,7 @@ import mitsuba as mi
 
 # Small steps are from the one to the other, of the range of a number; their logarithms are uniform.
 SMALLEST, LARGEST = 1 / 1024, 1 / 64
-# Numbers that a chain remembers: 6 of the camera, then 6 for each vertex. Those beyond are new in each mutation.
+# Numbers that a chain remembers: 6 of the camera, then 6 for each vertex. Further numbers are new in each mutation.
 REMEMBERED = 6 + 8 * 6
 
 
@@ -26,7 +26,7 @@ def small_step(x: mi.Float, u: mi.Float) -> mi.Float:
     step = LARGEST * dr.exp(u * dr.log(SMALLEST / LARGEST))
     x = x + dr.select(left, -step, step)
     x -= dr.floor(x)
-    # Of a number just below 0, rounded.
+    # 1 results from a number just below 0, rounded.
     return dr.select(x < 1, x, 0)
 
 

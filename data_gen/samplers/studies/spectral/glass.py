@@ -14,7 +14,7 @@ SELLMEIER = {
     "n-bk7": ((1.03961212, 0.231792344, 1.01046945), (0.00600069867, 0.0200179144, 103.560653)),
     "n-sf11": ((1.73759695, 0.313747346, 1.89878101), (0.013188707, 0.0623068142, 155.23629)),
 }
-# Of sodium, in nm: what a single index stands for
+# The wavelength of sodium light, in nm: what a single index stands for
 SODIUM = 589.3
 
 
