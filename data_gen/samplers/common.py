@@ -33,8 +33,8 @@ from ngpt.options import written
 def loses_light(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> bool:
     """Whether the integrator is ``path`` in a scene where that is biased.
 
-    ``path`` returns 0 for a path that has escaped after holes alone, were it lit by emitter sampling where the material
-    of a mask is there in part; but for scenes with an environment.
+    ``path`` returns 0 for a path that escapes after passing only holes, even if emitter sampling has lit it where the
+    material of a mask is partly there. Scenes with an environment are not affected.
     """
     if integrator.class_name() != "PathIntegrator" or scene.environment() or integrator.hide_emitters:
         return False
@@ -131,7 +131,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
         raise NotImplementedError
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        """The primal estimate alone, by the ``reference()``."""
+        """Only the primal estimate, by the ``reference()``."""
         return self.reference().sample(scene, sampler, ray, medium, active)
 
     def render_film(self, scene, sensor, seed: int, spp: int) -> GradientFilm:
@@ -154,7 +154,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return mi.TensorXf(np.concatenate(list(layers.values()), axis=-1))
 
     def aov_names(self):
-        """Of the last render; `ngpt.GradientStack.from_aovs` makes a stack of its tensor by them."""
+        """The channels of the last render; `ngpt.GradientStack.from_aovs` makes a stack of its tensor by them."""
         return self.channels
 
     def to_string(self):
@@ -173,8 +173,8 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return hit
 
     def first_surface(self, scene, media: Media, ray, medium, active) -> mi.PreliminaryIntersection3f:
-        """The same of a piece of such a ray; as in ``volpath``, lamps in a medium are dark there, but seen."""
-        # Where a boundary lies in a surface, coherent rays meet the boundary half as often as others; those of
+        """``first_hit()`` for a piece of such a ray; as in ``volpath``, lamps in a medium are dark there, but seen."""
+        # Where a boundary lies in a surface, coherent rays meet the boundary half as often as others; rays of
         # ``volpath`` are never coherent.
         coherent = not media.boundaries
         hit = self.first_hit(scene, ray, active, coherent=coherent)

@@ -69,7 +69,7 @@ class Entry:
                   ``make``. It is imported when the sampler is made, since its classes belong to a variant of Mitsuba
     ``make``      what makes it, where there is no ``module``
     ``standing``  one of ``STANDINGS``: which samplers help shows first, and which laws run in `make test`
-    ``options``   name -> ``Option``; ``make`` takes all of them, but for those of ``COMMON``
+    ``options``   name -> ``Option``; ``make`` takes all of them, except the options in ``COMMON``
     ``refuses``   facts about a scene -> why the sampler cannot render it, "" if it can
     ``refusals``  the same as rules that several samplers share; the first that gives a reason counts
     ``notes``     facts about a scene -> what the user should know about rendering it, a line each
@@ -107,7 +107,7 @@ class Entry:
         return settings(f"sampler '{self.name}'", self.options, given)
 
     def unusual(self, settings: Mapping[str, Any]) -> str:
-        """Those of the ``settings`` that are not defaults, as ``-O`` takes them, with commas between."""
+        """The ``settings`` that are not defaults, as ``-O`` takes them, separated by commas."""
         return as_text(unusual(self.options, settings))
 
     def made(self, *args: Any, **options: Any) -> Any:
@@ -122,15 +122,15 @@ def own(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Sampler(Entry):
-    """What renders the layers of a gradient stack. Its options are its own, and those of ``COMMON``.
+    """What renders the layers of a gradient stack. It has its own options, and the options in ``COMMON``.
 
     ``make``        (scene, options) -> what takes the samples of a pass (``data_gen.passes.SamplePass``); raises
                     NgptError for a scene it cannot render
     ``gradients``   whether it renders dx and dy
     ``rank``        "auto" takes the sampler of least rank that can render the scene; 0: never
-    ``tried``       whether the pilot of "auto" compares it with others, where it can render the scene: those that were
-                    seen to be chosen where they are best (``data_gen.choosing.plans``)
-    ``compiles``    seconds that a core takes to compile its kernels, of most scenes; told for those that are ``tried``
+    ``tried``       whether the pilot of "auto" compares it with others, where it can render the scene. True for
+                    samplers that were seen to be chosen where they are best (``data_gen.choosing.plans``)
+    ``compiles``    seconds that a core takes to compile its kernels, of most scenes; given where ``tried`` is true
     ``finds``       what light it finds that paths from the camera hardly find: of ``FINDS``
     ``diagnoses``   whether it counts failed shifts, which ``--diagnostics`` writes: ``make`` takes ``diagnostics=True``
     ``batch``       0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass
@@ -139,7 +139,7 @@ class Sampler(Entry):
     ``lane_bytes``  memory that a lane, one sample of one pixel, takes in a pass
     ``counts``      whether it replays numbers one by one, so that they must be independent: it takes no ``points``
     ``by_place``    whether it can choose lamps by place: ``make`` takes ``places``
-    ``biased``      whether its mean is that of Mitsuba's integrator only as the number of samples grows
+    ``biased``      whether its mean approaches the mean of Mitsuba's integrator only as the number of samples grows
     """
 
     gradients: bool = field(default=True, kw_only=True)
@@ -238,7 +238,7 @@ def find(name: str, facts: Facts | None = None) -> Sampler:
 
 
 def choose(facts: Facts) -> tuple[str, str]:
-    """The sampler that "auto" stands for by the description alone, and why."""
+    """The sampler that "auto" stands for, from the description only, and why."""
     reasons: list[str] = []
     for sampler in sorted(SAMPLERS.values(), key=lambda sampler: sampler.rank):
         if not sampler.rank:

@@ -59,7 +59,7 @@ def no_pixels(facts: Facts, name: str) -> str:
 
 
 def hair(facts: Facts, name: str) -> str:
-    """Mitsuba's hair scatters otherwise from the light to the eye than back, and tells nothing of its adjoint."""
+    """Mitsuba's hair scatters differently from the light to the eye than back, and does not provide its adjoint."""
     return "light paths lose light at the material 'hair', which is not the same in both directions" * facts.hair
 
 
@@ -96,13 +96,13 @@ def why_not_shared(media: bool, settings: Mapping[str, Any], variant: str) -> st
 
 
 def joined_depth(default: int) -> Option:
-    """Of samplers by paths from both ends."""
+    """The option of samplers that trace paths from both ends."""
     meaning = "edges of a path, up to which it is found from both ends; longer ones from the camera"
     return Option(default, meaning, range=(1, 64))
 
 
 def first_radius(default: float) -> Option:
-    """Of samplers by photons."""
+    """The option of photon samplers."""
     meaning = "how far photons are gathered from in the first pass, in pixels where most is seen"
     return Option(default, meaning, range=(1e-6, 1e6))
 
@@ -113,6 +113,6 @@ def notes_on_photons(facts: Facts) -> list[str]:
 
 
 def notes_on_mirrors(facts: Facts) -> list[str]:
-    """Of samplers by photons."""
+    """The note of photon samplers."""
     line = "mirrors or clear glass: followed from the camera and from the lights, caustics seen in them too"
     return [line] if facts.mirrors else []

@@ -31,7 +31,7 @@ class Merges(Protocol):
     """What gathers photons at the vertices of camera paths, see ``vcm.merging``."""
 
     def light(self, z: Vertex, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Spectrum:
-        """That of the photons near to the vertex ``z``, weighted."""
+        """The weighted light of the photons near the vertex ``z``."""
 
 
 @dr.syntax

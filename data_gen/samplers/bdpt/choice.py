@@ -30,7 +30,7 @@ def choose(z: Vertex, active, light: LightPath, longest: int, u: mi.Float):
     come_from = cosine(z.si, z.si.to_world(z.si.wi))
     i = mi.UInt32(0)  # the vertex that is looked at
     chosen = mi.UInt32(0)  # one of those before it, each with a probability in proportion to its worth
-    total, own = mi.Float(0), mi.Float(0)  # their worth, and that of the chosen one
+    total, own = mi.Float(0), mi.Float(0)  # their worth, and the worth of the chosen one
     while dr.hint(active & (i < end), label="choice"):
         w = worth(z, come_from, kept.read(i))
         total += w

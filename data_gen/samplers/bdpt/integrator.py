@@ -1,8 +1,9 @@
 r"""Bidirectional path tracing: for each camera sample a path from the camera and one from a light, joined every way.
 
-Light that a camera path finds by accident alone, from lamps behind shades or through glass onto a wall, a light path
-finds at once. Every way to find a path is a strategy; all are weighted against each other (``mis``). A vertex of the
-camera path is connected to a lamp and to one vertex of the light path, for all of them (``choice``).
+A light path finds at once what a camera path finds only by accident: light from lamps behind shades, or light that goes
+through glass onto a wall. Every way to find a path is a strategy; all are weighted against each other (``mis``). A
+vertex of the camera path is connected to a lamp and to one vertex of the light path, which stands for all of them
+(``choice``).
 
     z                 vertices of the camera path
     y                 vertices of the light path, kept while the camera path is traced
@@ -12,8 +13,8 @@ camera path is connected to a lamp and to one vertex of the light path, for all 
     L, Le             radiance of the camera path without, and of only, the emission that the camera sees directly
 
 Both paths are made in one kernel. Light paths that reach the camera end on pixels of their own: they are splatted, so
-samples are independent from pass to pass only. Paths of more than ``joined_depth`` edges are found from the camera
-alone, by s = 0 and s = 1: that bounds what is kept of a light path, and paths may be as long as they like.
+samples are independent from pass to pass only. Paths of more than ``joined_depth`` edges are found only from the
+camera, by s = 0 and s = 1. That bounds what is kept of a light path, and paths may be as long as they like.
 
 [Veach 1997, "Robust Monte Carlo Methods for Light Transport Simulation", chapter 10]
 """

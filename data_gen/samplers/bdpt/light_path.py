@@ -67,8 +67,7 @@ class LightPath:
 
 
 def begin(world: World, random, camera_ray: mi.Ray3f) -> tuple[LightRay, End, mi.Bool]:
-    """A path from a light up to its first vertex, and whether there is one; time and wavelengths are those of
-    ``camera_ray``."""
+    """A path from a light up to its first vertex, and whether it exists; ``camera_ray`` gives time and wavelengths."""
     scene, lights = world.scene, world.lights
     start = lights.sample(scene, random, camera_ray.time, camera_ray.wavelengths)
     active = dr.max(start.β) > 0
@@ -86,7 +85,7 @@ def go_on(plan: Plan, random, start: LightRay, y: Vertex, bsdf, active) -> tuple
     sample, f_p = bsdf.sample(context(IMPORTANCE), y.si, u_lobe, u_direction, active)
     d, f_p, end = light_leaves(y, bsdf, sample, f_p, active & (sample.pdf > 0))
     β = y.β * dr.select(sample.pdf > 0, f_p, 0)
-    # By what is left of the light that the path began with
+    # Russian roulette by what is left of the light that the path began with
     survives = roulette(dr.max(β) * dr.rcp(dr.max(start.β)), y.depth >= plan.limits.rr_depth)
     active = active & (sample.pdf > 0) & (dr.max(β) > 0) & (u_survival < survives)
     ray = y.si.spawn_ray(d)

@@ -11,9 +11,9 @@ Either sum is a number that its end carries from vertex to vertex, without the d
     vcm   1 / the density of the last vertex, the first summand without what is still unknown of it
     vc    the sum of all further summands, likewise
 
-Densities are those before Russian roulette: weights are then a function of the path alone. Camera and light begin
-alike. ``e`` stands for both: p_emit / (p_connect cos), the density of sampling the first edge outward, over that of
-choosing the end to connect to, per unit area facing the end. Delta events cannot be met by a connection: their
+Densities do not include Russian roulette, so weights depend only on the path. Camera and light begin alike, and ``e``
+stands for both: p_emit / (p_connect cos). It is the density of sampling the first edge outward, divided by the density
+of choosing the end to connect to, per unit area facing the end. Delta events cannot be met by a connection: their
 summands are 0, and the densities of both directions cancel in what is behind them.
 
 Both ends may also come to one vertex, and merge: η = π r² N times as many such pairs of N light paths lie within the
@@ -40,7 +40,7 @@ class Partial:
 
     vcm: mi.Float
     vc: mi.Float
-    # Of a camera path: what is added to ``vc`` if the next event is a delta
+    # For a camera path: what is added to ``vc`` if the next event is a delta
     waiting: mi.Float = field(default_factory=lambda: mi.Float(0))
 
 
@@ -71,31 +71,35 @@ def gathered(y: Partial, η: mi.Float) -> Partial:
 
 
 def others_merged(z: Partial, q_z: mi.Float, y: Partial, q_y: mi.Float, η: mi.Float) -> mi.Float:
-    """Of a camera path and a light path that merge: ``z`` and ``y`` are their last vertices, with η in that of y.
+    """``others`` for a camera path and a light path that merge at ``z`` and ``y``, their last vertices.
 
-    ``q_y`` is the density of the direction to the light, ``q_z`` of that to the camera.
+    ``q_y`` is the density of the direction to the light, ``q_z`` the density of the direction to the camera.
+    ``y`` includes η.
     """
     return dr.maximum((z.vcm + z.vc * q_z + y.vcm + y.vc * q_y) / η - 1, 0)
 
 
 def others_emitted(end: Partial, e: mi.Float, p: mi.Float) -> mi.Float:
-    """Of a camera path that has met an emitter; ``end`` is on the way there, ``p`` the density of connecting to it."""
+    """``others`` for a camera path that met an emitter; ``end``: on the way, ``p``: density of connecting to it."""
     return p * (end.vcm + e * end.vc)
 
 
 def others_to_light(end: Partial, e: mi.Float, p_light: mi.Float, cos: mi.Float, p, q) -> mi.Float:
-    """Of a camera path whose last vertex is connected to a light, found with density ``p_light``; 0: a delta light."""
+    """``others`` for a camera path whose last vertex is connected to a light.
+
+    ``p_light`` is the density of sampling that light; it is 0 for a delta light.
+    """
     return dr.select(p_light > 0, p / p_light, 0) + others_to_camera(end, e, cos, q)
 
 
 def others_to_camera(end: Partial, e: mi.Float, cos: mi.Float, q: mi.Float) -> mi.Float:
-    """Of a light path whose last vertex is connected to the camera."""
+    """``others`` for a light path whose last vertex is connected to the camera."""
     return e * cos * (end.vcm + end.vc * q)
 
 
 @dataclass
 class Side:
-    """Of a vertex at which two paths are connected."""
+    """One of two vertices at which paths are connected."""
 
     cos: mi.Float  # of the edge
     p: mi.Float  # density of sampling the edge
@@ -112,7 +116,7 @@ class Edge:
 
 
 def others_connected(z: Partial, y: Partial, edge: Edge) -> mi.Float:
-    """Of a camera path connected to a light path: ``z`` and ``y`` are their last vertices."""
+    """``others`` for a camera path connected to a light path; ``z`` and ``y`` are their last vertices."""
     from_camera = edge.z.p * edge.y.cos / edge.distance2 * (y.vcm + y.vc * edge.y.q)
     from_light = edge.y.p * edge.z.cos / edge.distance2 * (z.vcm + z.vc * edge.z.q)
     return from_camera + from_light

@@ -30,7 +30,7 @@ def emission_at(scene, lights: LightEnds, si, ref, active) -> tuple[mi.Spectrum,
 
 
 def to_light(lights: LightEnds, z: Vertex, light, weight, f, *, p, q) -> tuple[mi.Spectrum, mi.Float]:
-    """s = 1: ``light`` and its ``weight`` Le / p are Mitsuba's; f, p, q those of ``evaluate`` toward it."""
+    """s = 1: ``light`` and its ``weight`` Le / p are Mitsuba's; f, p and q are from ``evaluate`` toward it."""
     cos = dr.abs(dr.dot(light.n, light.d))
     e = lights.emission(lights.index_of(light.emitter), light.pdf, cos, dr.square(light.dist))
     p_light = dr.select(light.delta, 0, light.pdf)
@@ -44,7 +44,7 @@ def connected(scene, z: Vertex, z_bsdf, y: Vertex, active) -> tuple[mi.Spectrum,
 
 
 def connection(scene, z: Vertex, z_bsdf, y: Vertex, active, seen: mi.Bool | bool = False) -> tuple[mi.Spectrum, Edge]:
-    """The same without the camera path's throughput, and what else its MIS weight is made of.
+    """As ``connected()``, without the camera path's throughput; and the edge, which its MIS weight depends on.
 
     Where it is known that the vertices see each other, ``seen``, no ray is traced.
     """

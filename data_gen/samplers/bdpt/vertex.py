@@ -1,4 +1,4 @@
-"""Vertices of paths from either end, how light scatters there, and what is kept of those of light paths."""
+"""Vertices of paths from either end, how light scatters there, and the records that are kept of light paths."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Vertex:
 
 @cache
 def record_class(variant: str) -> type:
-    """Of what is kept; Dr.Jit reads the types of its fields once, and Mitsuba's belong to a variant."""
+    """The class of a kept vertex; Dr.Jit reads its fields' types once, and Mitsuba's types belong to a variant."""
 
     @dataclass
     class Record:
@@ -78,11 +78,11 @@ def record(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, vertex: Vertex, smo
 
 
 def recall(kept, time: mi.Float, wavelengths: mi.Wavelength) -> Vertex:
-    """The vertex of which a record was kept."""
+    """The vertex of a kept record."""
     hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(kept.t))
     hit.t, hit.prim_uv, hit.prim_index = kept.t, kept.prim_uv, kept.prim_index
     hit.shape, hit.instance = kept.shape, kept.instance
-    # Not told by any other field: without it the vertex would be void.
+    # No other field says so: without this the vertex would be void.
     hit.valid = mi.Bool(True)
     si = hit.compute_surface_interaction(mi.Ray3f(kept.o, kept.d, time, wavelengths))
     return Vertex(si, kept.β, Partial(kept.vcm, kept.vc), kept.depth)
@@ -114,8 +114,9 @@ def reverse_density(si, bsdf, wo: mi.Vector3f, active) -> mi.Float:
 def light_scattered(si, bsdf, wo: mi.Vector3f, active) -> tuple[mi.Spectrum, mi.Float]:
     """f cos of light that leaves along ``wo``, and the density with both directions swapped.
 
-    It is f of radiance the other way, times cos_g(wo) / cos_g(wi): so both ends agree on f of a path, whatever normals
-    a material has. Those of bump and normal maps are in f alone, and f for light has the cosine to the wrong side.
+    It is f of radiance in the opposite direction, times cos_g(wo) / cos_g(wi), so both ends agree on f of a path,
+    whatever normals a material has. Normals of bump and normal maps affect only f, and f for light has the cosine to
+    the wrong side.
     [Veach 1997, "Robust Monte Carlo Methods for Light Transport Simulation", section 5.3.2]
     """
     f, q = bsdf.eval_pdf(context(RADIANCE), _come_along(si, wo), si.wi, active)
@@ -127,8 +128,8 @@ def light_scattered(si, bsdf, wo: mi.Vector3f, active) -> tuple[mi.Spectrum, mi.
 def light_sampled(si, bsdf, sample: mi.BSDFSample3f, f_p: mi.Spectrum, active) -> tuple[mi.Spectrum, mi.Float]:
     """f cos / p of light that leaves by a sampled event, and the density with both directions swapped.
 
-    ``f_p`` is Mitsuba's for IMPORTANCE. Of mirrors and glass it has no cosines; those are to the half-vector, which is
-    their normal, whatever the shape's is.
+    ``f_p`` is Mitsuba's for IMPORTANCE. For mirrors and glass it has no cosines. Their cosines are to the half-vector,
+    which is their normal, whatever the shape's normal is.
     """
     smooth = event_kind(sample.sampled_type) == SMOOTH
     f, q = light_scattered(si, bsdf, sample.wo, active & smooth)
@@ -143,7 +144,7 @@ def light_sampled(si, bsdf, sample: mi.BSDFSample3f, f_p: mi.Spectrum, active) -
 def leave(
     vertex: Vertex, bsdf, sample: mi.BSDFSample3f, active, η: mi.Float | float = 0.0
 ) -> tuple[mi.Vector3f, Partial]:
-    """The direction of a sampled event, and what the path's end knows behind it; ``η`` is that of ``mis.leave``."""
+    """The direction of a sampled event, and what the path's end knows behind it; ``η`` as in ``mis.leave``."""
     si, d = vertex.si, vertex.si.to_world(sample.wo)
     smooth = event_kind(sample.sampled_type) == SMOOTH
     q = reverse_density(si, bsdf, sample.wo, active & smooth)
@@ -153,7 +154,7 @@ def leave(
 def light_leaves(
     vertex: Vertex, bsdf, sample: mi.BSDFSample3f, f_p: mi.Spectrum, active
 ) -> tuple[mi.Vector3f, mi.Spectrum, Partial]:
-    """The same of a light path, with f cos / p between; ``f_p`` is Mitsuba's."""
+    """As ``leave()``, for a light path, with f cos / p as the second value; ``f_p`` is Mitsuba's."""
     si, d = vertex.si, vertex.si.to_world(sample.wo)
     f_p, q = light_sampled(si, bsdf, sample, f_p, active)
     return d, f_p, mis.leave(vertex.end, cosine(si, d), sample.pdf, q, event_kind(sample.sampled_type) != SMOOTH)

@@ -1,4 +1,4 @@
-"""The camera path of ``gbdpt``, vertex by vertex: that of ``bdpt``, and what offset paths need to know of it."""
+"""The camera path of ``gbdpt``, vertex by vertex: as in ``bdpt``, with what offset paths need to know of it."""
 
 from __future__ import annotations
 
@@ -172,5 +172,5 @@ def known_end(end: Partial, joins: mi.Bool) -> Partial:
 
 
 def known_met(end: Partial, counted: mi.Bool) -> Partial:
-    """The same on the way to emission that is met by chance, which a sampled emitter finds all the same."""
+    """As ``known_end()``, on the way to emission that is met by chance: a sampled emitter finds it all the same."""
     return Partial(end.vcm, dr.select(counted, end.vc, 0))

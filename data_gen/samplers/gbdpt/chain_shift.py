@@ -47,18 +47,18 @@ class Course:
 
     ahead: mi.Bool  # no smooth event so far
     second: mi.Bool  # right behind the first one, which was at a connectable vertex
-    bent: mi.Bool  # all that it brings from here on is that of bent paths
+    bent: mi.Bool  # all light that it brings from here on belongs to bent paths
 
 
 def straight(exists: mi.Bool | bool = True) -> Course:
-    """That of a path at the first vertex that the camera sees."""
+    """The course of a path at the first vertex that the camera sees."""
     return Course(mi.Bool(exists), mi.Bool(False), mi.Bool(False))
 
 
 def next_course(course: Course, step: Step) -> Course:
-    """That of the next vertex; what is met by chance there already belongs to it."""
+    """The course at the next vertex; what is met by chance there already belongs to it."""
     smooth = step.kind == SMOOTH
-    # By the sampled event alone, whether or not the path survives it: both kernels then agree on it.
+    # This depends on the sampled event, not on whether the path survives it, so that both kernels agree.
     bends = course.second & ~smooth & (step.p > 0)
     return Course(course.ahead & ~smooth, course.ahead & smooth & step.connectable, course.bent | bends)
 
@@ -66,8 +66,10 @@ def next_course(course: Course, step: Step) -> Course:
 def along(
     plan: Plan, step: Step, course: Course | None, chain: Chain | None
 ) -> tuple[Step, Course | None, Chain | None]:
-    """The step that leads from ``course`` and ``chain`` to the next ones, with such light as Δ has a share in: that of
-    bent paths where there is a ``chain``, else of all others; of all where there is no ``course``."""
+    """``step`` with only the light that counts in Δ, and the next ``course`` and ``chain``.
+
+    With a ``chain`` only the light of bent paths counts, without one all other light; without a ``course`` all light.
+    """
     if course is None or plan.materials.all_connectable:
         return step, course, chain
     behind = next_course(course, step)
@@ -106,7 +108,7 @@ class Chain:
 
 
 def no_chain(lanes: int) -> Chain:
-    """That of so many base paths which have none yet."""
+    """The chains of base paths that have none yet, one for each of so many ``lanes``."""
     return Chain(
         x1=dr.zeros(mi.SurfaceInteraction3f, lanes),
         ω=mi.Vector3f(0),

@@ -59,7 +59,7 @@ from data_gen.samplers.gbdpt.roulette import Rater, Worth, survivors, thresholds
 class GBDPT(BDPT):
     """Gradient-domain bidirectional path tracing, for surfaces.
 
-    Plugin ``gbdpt``. Parameters are those of ``bdpt``, and
+    Plugin ``gbdpt``. Parameters: as for ``bdpt``, and
 
     ``roughness_threshold``  0.05, the microfacet roughness above which materials are connectable
 
@@ -107,7 +107,7 @@ def both_paths(plan: Plan, camera: CameraSamples, visitor: Visitor | None, alone
     """L, Le, and for each of SHIFTS Δ, as colours, of the path from the camera, joined to one from a light; the state
     of the light path's ``visitor``, and whether the camera path is bent.
 
-    In Δ are all paths but bent ones, or, with ``alone``, bent ones alone, of the lanes where that is true.
+    Δ contains all paths except bent ones. With ``alone`` it contains only bent ones, in the lanes where that is true.
     """
     sight, light, state = Sight.of(camera), None, mi.UInt64(0)
     shifted = [camera.rays(shift) for shift in SHIFTS.values()]
@@ -150,7 +150,7 @@ def shift_splats(
     """Splats the differences of light paths that end at ``marked`` vertices, of those that survive ``roulette``, which
     goes by the ``threshold`` of each pixel.
 
-    Those behind mirrors or glass are few, and their walks long: in the kernel of all most lanes would wait.
+    Paths behind mirrors or glass are few, and their walks long: in one kernel for all paths most lanes would wait.
     """
     lanes, depths = marked(marks, plan.longest)
     if not dr.width(lanes):

@@ -77,12 +77,12 @@ class Link:
 
 
 def first_link() -> Link:
-    """That of the vertex that a light's end lights."""
+    """The link of the vertex that a light's end lights."""
     return Link(mi.UInt32(0), mi.Float(1), mi.Float(1), mi.UInt32(0), mi.Bool(True))
 
 
 def next_link(link: Link, depth: mi.UInt32, sample: mi.BSDFSample3f, survival: mi.Float) -> Link:
-    """That of the next vertex, where the one at ``depth`` is left by a sampled event."""
+    """The link of the next vertex, where a sampled event leaves the vertex at ``depth``."""
     smooth = event_kind(sample.sampled_type) == SMOOTH
     code = event(sample.sampled_type)
     events, fits = prepend_event(link.events, code)

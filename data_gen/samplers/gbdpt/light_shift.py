@@ -1,6 +1,6 @@
 """Light paths that end at the camera, shifted: the last vertex moves to where a neighbouring pixel looks.
 
-The vertex before it stays. So it is the same shift as that of camera paths, seen from the other end. Where mirrors and
+The vertex before it stays. So camera paths are shifted in the same way, seen from the other end. Where mirrors and
 glass lie between the two, the vertex before them stays, and the copy goes through the same ones: see ``through_glass``.
 """
 
@@ -55,8 +55,9 @@ def splat_differences(
 ) -> mi.Bool:
     """Splats the differences of light paths that end at vertices that the camera sees, one for each of its samples.
 
-    Those at ``depth`` edges from the light, each so many ``times``. Bent is what ends behind mirrors or glass: with
-    ``bent`` its differences alone are splatted, else all others. Returns which are bent.
+    These vertices are at ``depth`` edges from the light, and each counts so many ``times``. A path is bent if it ends
+    behind mirrors or glass. With ``bent`` only the differences of bent paths are splatted, else only all others.
+    Returns which are bent.
     """
     eye, ray, connectable = sight.eye, sight.ray, plan.materials.connectable
     again = light_again(plan, sight, depth)
@@ -95,9 +96,9 @@ def splat_differences(
 def differences(
     plan: Plan, eye: Eye, path: Splatted, lit: mi.Bool, bent: bool = False
 ) -> dict[str, tuple[mi.Spectrum, mi.Bool]]:
-    """For each of SHIFTS Δ of the path, and whether there is one: light arrives, and that pixel is on the film.
+    """Δ of the path for each of SHIFTS, and whether it exists: light arrives, and that pixel is on the film.
 
-    Paths are those that are ``lit``: with ``bent`` the ones with events in between, else the others.
+    Only paths that are ``lit`` count: with ``bent`` the ones with events in between, else the others.
     """
     shifts = list(SHIFTS.values())
     state = (mi.UInt32(0), *(mi.Spectrum(0) for _ in shifts))

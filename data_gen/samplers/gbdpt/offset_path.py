@@ -1,7 +1,7 @@
-"""The four camera paths beside that of a sample: how each is shifted, and completed by every strategy.
+"""The four offset paths of a camera sample: how each is shifted, and completed by every strategy.
 
 An offset path is *apart* while it has vertices of its own, *joined* at the vertex that it shares but has come to from
-elsewhere, and *settled* from there on: it differs from its base path by β, r and the partial sums of its weights alone.
+elsewhere, and *settled* from there on: it differs from its base path only by β, r and the partial sums of its weights.
 It has ended where β is 0. Symbols as in ``gbdpt``.
 """
 
@@ -75,7 +75,7 @@ def brightest(offsets: list[Offset]) -> mi.Float:
 
 
 def with_differences(offsets: list[Offset], Δ: list[mi.Spectrum]) -> list[Offset]:
-    """The same offset paths, with these sums of Δ."""
+    """The offset paths with ``Δ`` as their sums."""
     return [replace(offset, Δ=total) for offset, total in zip(offsets, Δ, strict=True)]
 
 
@@ -94,7 +94,7 @@ def connect(plan: Plan, step: Step, y: Vertex, times, offsets: list[Offset], Δ:
         others1 = mis.others_connected(offset.end, y.end, edge)
         sums.append(Δ_before + dr.select(~own, times * plan.pair(C, others, offset.β * g, offset.r, others1), 0))
     # --------- Others: from the copy's own vertex, one by one ---------
-    # What a shift to y needs of the materials, but for the offset path's own
+    # What a shift to y needs of the materials, except for the offset path's own
     both = step.connectable & plan.materials.connectable(y.si.bsdf())
 
     def one(i, *Δ):
@@ -121,7 +121,7 @@ def take_step(
 ) -> list[Offset]:
     """Takes all offset paths along a step of their base path; connections to the light path are not in it.
 
-    Where there is a ``chain``, that behind the step, bent paths alone are shifted; ``course`` is the one before it.
+    With a ``chain``, the one behind the step, only bent paths are shifted; ``course`` is the one before the step.
     """
     busy = mi.Bool(False)
     for offset in offsets:
@@ -184,7 +184,7 @@ def step_own(plan: Plan, step: Step, y: Offset, course: Course | None = None, ch
     smooth = step.kind == SMOOTH
     joins = step.goes_on & smooth & step.connectable & connectable
     replays = step.goes_on & ~smooth & y.apart
-    # What neither does is rejected: β = 0.
+    # Rejected if it does neither: β = 0.
     none = Offset(y.ray, y.hit, mi.Spectrum(0), y.r, y.end, mi.Bool(False), mi.Bool(False), Δ)
     state = (none, mi.Spectrum(0), mi.Float(0))
     if chain is not None:
@@ -238,7 +238,7 @@ def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tupl
 
 
 def replay(plan: Plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
-    """By the mirror, glass or hole that the base path's random numbers find here; and emission at its next vertex.
+    """The step by the mirror, glass or hole that the base path's random numbers find here; emission at the next vertex.
 
     Only camera paths find such events in front of the first one that is smooth, so that their random numbers belong to
     the path for every strategy that finds it: r = 1, and the shift is a function of the path.

@@ -5,15 +5,15 @@ their densities, J the Jacobian of T, b = f(x) / p_s(x), b' = f(y) J / p_s(x), a
 
     Δ = 2 (b' - b) / (W(x) + r W(y))        W = Σ p_j / p_s = 1 + others (see ``bdpt.mis``), r = p_s(y) J / p_s(x)
 
-The 2 is there since the film averages both directions of a difference. That holds if T is a function of the path
-alone, the same for whichever strategy has found it. A path whose copy does not exist or carries no light is no pair:
+The 2 is there since the film averages both directions of a difference. That holds if T depends only on the path,
+whichever strategy has found it. A path whose copy does not exist or carries no light is no pair:
 
     Δ = -2 b / W(x)
 
 and from its dark copy there is nothing to say.
 
-A class of paths may be shifted by one strategy alone, by any map that does not leave the class, if all others reject
-its paths. Each has weights of its own then, and the strategy that shifts has
+A single strategy may shift a class of paths, by any map that does not leave the class, if all others reject its paths.
+Each has weights of its own then, and the strategy that shifts has
 
     Δ = 2 (b' / W(y) - b / W(x)) / (1 + r)
 
@@ -39,7 +39,7 @@ def difference(C: mi.Spectrum, others: mi.Float, shifted: mi.Spectrum, r: mi.Flo
 def difference_of_one(
     C: mi.Spectrum, others: mi.Float, shifted: mi.Spectrum, r: mi.Float, others_shifted
 ) -> mi.Spectrum:
-    """Δ of a path that this strategy alone shifts, while all others reject it: 2 (b' / W(y) - b / W(x)) / (1 + r)."""
+    """Δ of a path that only this strategy shifts, while all others reject it: 2 (b' / W(y) - b / W(x)) / (1 + r)."""
     whole = (dr.max(shifted) > 0) & dr.isfinite(dr.sum(shifted)) & dr.isfinite(r) & dr.isfinite(others_shifted)
     b, b1 = C / (1 + others), shifted / (1 + others_shifted)
     Δ = dr.select(whole, (b1 - b) * (2 / (1 + r)), -2 * b)

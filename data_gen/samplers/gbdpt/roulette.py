@@ -4,12 +4,13 @@ A shift is eight rays, and half of the vertices that the camera sees bring littl
 anything of a shift is traced, the light of all paths of the pass is known, and with it
 
     w      the light that the path has splatted
-    I, I0  the light of its pixel in this pass, but for lamps seen directly, and that of the image: (mean of √I)²
+    I      the light of its pixel in this pass, without lamps seen directly
+    I0     the light of the image: (mean of √I)²
     p      = min(1, 2 w / √(I I0)), and at least 0.1
 
 Where noise is seen, relative to the pixel, is between w / I and w / I0. A path is shifted with probability p, and its Δ
-counts 1 / p times. Δ is that of a path and its copy (``pairs``), by whichever of the two was sampled; the roulette
-stands on top of it and may differ for both, and its expectation is Δ whatever p is: random numbers of their own decide.
+counts 1 / p times. Δ belongs to a path and its copy (``pairs``), whichever of the two was sampled. The roulette stands
+on top of it and may differ for both: it has random numbers of its own. Its expectation is Δ whatever p is.
 
 [Arvo and Kirk 1990, "Particle Transport and Image Synthesis", section 4]
 """
@@ -27,11 +28,11 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.samplers.bdpt.light_path import Seen
 from data_gen.samplers.gbdpt.light_again import Marker
 
-# Of 1, 2, 3, 4 and 6 that with the least variance x time on four scenes
+# Among 1, 2, 3, 4 and 6, the one with the least variance x time on four scenes
 SHARE = 2.0
 # Copies may be brighter than their paths.
 LEAST = 0.1
-# Vertices of a light path of which the worth is kept, 8 bytes each; all behind them are shifted.
+# Vertices of a light path whose worth is kept, 8 bytes each; all behind them are shifted.
 RATED = 9
 
 
@@ -77,10 +78,10 @@ class Rater(Marker):
 
 
 def thresholds(camera: CameraSamples, light: mi.Color3f, splats: Splats) -> mi.Float:
-    """√(I I0) for each pixel, of the ``light`` of camera paths and that of ``splats``."""
+    """√(I I0) for each pixel, from the ``light`` of camera paths and the light of ``splats``."""
     seen = np.array(dr.mean(light)).reshape(camera.pixels, -1)
     total = seen.mean(axis=1) + np.mean(splats.totals(), axis=0) / seen.shape[1]
-    # What is not finite is lost on the film, and a spectral sum may be negative.
+    # The film loses what is not finite, and a spectral sum may be negative.
     root = np.sqrt(np.maximum(np.nan_to_num(total, nan=0.0, posinf=0.0, neginf=0.0), 0.0))
     return mi.Float((root * root.mean()).astype(np.float32))
 
@@ -88,7 +89,7 @@ def thresholds(camera: CameraSamples, light: mi.Color3f, splats: Splats) -> mi.F
 def survivors(
     camera: CameraSamples, worth: Worth, lane: mi.UInt32, depth: mi.UInt32, threshold: mi.Float
 ) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
-    """Of the vertices at ``depth`` of the light paths of ``lane`` those that are shifted, and 1 / p of each."""
+    """The vertices at ``depth`` of the light paths of ``lane`` that are shifted, and 1 / p for each."""
     light, pixel, kept = worth.of(lane, depth)
     share = SHARE * light / dr.gather(mi.Float, threshold, pixel)
     p = dr.select(kept & (share < 1), dr.fmax(share, LEAST), 1)

@@ -123,7 +123,7 @@ def base_step(scene, plan: Plan, random, path: Path, offsets: list) -> tuple[Ste
     lit &= light.pdf != 0
     # Toward the emitter and along a new direction at once
     f, p, sample, f_p = media.evaluate_and_sample(bsdf, x, place, x.to_local(light.d), u_lobe, u_direction)
-    # No shadow ray toward what lies behind the surface, but for those who arrive from elsewhere.
+    # No shadow ray toward what lies behind the surface, except for paths that arrive from elsewhere.
     asked = lit & ((dr.max(f) > 0) | dr.any([y.joined for y in offsets]))
     T_light, visible = space.sees(x, place, light.p, drawn, asked)
     lit &= visible

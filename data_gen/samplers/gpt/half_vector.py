@@ -30,7 +30,7 @@ class Departure:
 
 
 def copy_where_smooth(step: Step, y: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, replayed: Departure) -> Departure:
-    """From vertex ``y`` with the base path's half-vector where that has one, else as ``replayed``."""
+    """The departure from ``y`` with the base path's half-vector where the base path has one, else as ``replayed``."""
     # A Dirac event has no density to be divided by: it is replayed, as its own half-vector would have it.
     copies = step.goes_on & (step.kind == SMOOTH)
     same = y.bsdf() == step.x.bsdf()

@@ -18,7 +18,7 @@ four offsets cost about as much as the base path and not four times that.
                       techniques, which are shifted separately: C is the contribution f m of one
     a                 once a path is settled, all that follows in Δ is a times the radiance that reaches the base path
     A                 the base path's part of Δ, the sum of 2 w C(x) / p(x)
-    rough, late       whether light belongs to the layer ``caustic``, of which L and Δ hold nothing: see
+    rough, late       whether light belongs to the layer ``caustic``, which is in neither L nor Δ: see
                       data_gen.paths.caustic
 
 An offset path is *apart* from its base path, then *joined* to it for one step (it shares the vertex, but arrives there
@@ -72,10 +72,10 @@ class GPT(GradientIntegrator):
     ``rr_depth``             5
     ``hide_emitters``        false
     ``roughness_threshold``  0.05, the microfacet roughness above which materials are connectable
-    ``shift``                "replay" before paths join, or "half-vector": that of smooth events is copied, others are
-                             replayed, which is rarely better; "manifold": light that comes to the first rough vertex
-                             through mirrors and glass is not in the layer ``caustic``, but followed to its lamp by
-                             walks: see ``manifold_shift``
+    ``shift``                "replay" before paths join; or "half-vector", which copies the half vectors of smooth
+                             events and replays other events, and is rarely better; or "manifold": light that comes to
+                             the first rough vertex through mirrors and glass is not in the layer ``caustic``, but
+                             followed to its lamp by walks: see ``manifold_shift``
     ``reuse``                false; true makes the primal the mean over base paths and the offset paths of neighbours.
                              Its variance is 2.6 times lower, but the noise of neighbouring pixels is then correlated.
     ``caustic``              true: light that has come over a rough surface and then mirrors, glass or sharp gloss is in

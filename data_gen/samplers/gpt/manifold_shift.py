@@ -5,15 +5,15 @@ goes through the same events to the same point x_c of the lamp, by the walks of 
 
     z_b, z_b'   the first vertices that are left by a smooth event, after as many specular ones from the camera
     ω, ω'       directions there; k specular events further on, k = 1 .. 6, both paths meet the lamp at x_c
-    F           product of the reflectances of the k events, P that of the probabilities to take them
+    F           product of the reflectances of the k events; P: product of the probabilities to take them
     b, b'       f(x) / p(x) and f(y) |J| / p(x); p, p' densities of ω at z_b, ω' at z_b'
     r           p' P' J / (p P)
     Δ           2 (b' - b) / (1 + r), or -2 b where no walk leads there and back
 
-Up to z_b' the offset path replays the base path's random numbers, with r = 1. As the light is that of one technique
-(no emitter sampling finds a lamp behind glass), and a class of paths by itself, it is shifted apart from all other
-light, of which the kernel of ``gpt`` knows nothing here. That kernel leaves one record for each lane; such paths are
-rare, so this one runs on the few lanes that have one, four times as wide, one for each direction.
+Up to z_b' the offset path replays the base path's random numbers, with r = 1. A single technique finds this light,
+since no emitter sampling finds a lamp behind glass, and it is a class of paths by itself. So it is shifted apart from
+all other light, and the kernel of ``gpt`` knows nothing of it. That kernel leaves one record for each lane. Such paths
+are rare, so this kernel runs only on the few lanes that have a record, four times as wide, one for each direction.
 
 [Hua et al. 2019, sections 3.4 and 3.5]
 """
@@ -54,7 +54,7 @@ class Chain:
     def end(self, depth, survival, late, x1, Le) -> tuple[Chain, mi.Bool]:
         """Behind the ``depth``-th vertex: whether the chain ends at ``x1``, where it finds ``Le``, and then its record.
 
-        Only ``late`` light is followed: a lamp behind panes alone is no worse off with replay.
+        Only ``late`` light is followed: for a lamp behind panes only, replay is no worse.
         """
         # A lamp that is a mirror too could be met again further on: a lane has one record.
         sharp = mi.has_flag(x1.bsdf().flags(), mi.BSDFFlags.Delta) | mi.has_flag(x1.bsdf().flags(), mi.BSDFFlags.Null)
@@ -99,7 +99,7 @@ def add_followed(plan: Plan, first_hit, camera: CameraSamples, shifts, chain: Ch
     lanes, exists = in_packets(np.array(dr.compress(chain.record != 0)), camera)
     if not len(lanes):
         return Δ
-    # One lane for each offset path, so that those of a base path are in one packet
+    # One lane for each offset path, so that all offset paths of a base path are in one packet
     n = len(shifts)
     wide, found = mi.UInt32(np.repeat(lanes, n)), mi.Bool(np.repeat(exists, n))
     number = dr.arange(mi.UInt32, n * len(lanes)) % n

@@ -144,7 +144,7 @@ def settle(step: Step, offsets: list[Offset]) -> None:
 def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     """A step from the offset path's own vertex y."""
     # ----------------------- The vertex --------------------------
-    # The state carries the preliminary hit alone: whole interactions of four paths would swell every loop.
+    # The state carries only the preliminary hit: whole interactions of four paths would swell every loop.
     y = media.vertex(path.ray, path.hit, path.place)
     bsdf, scatters = y.bsdf(), media.scatters(path.place)
     own = Own(y, path.place, bsdf, plan.materials.connectable(bsdf) | scatters)
@@ -169,7 +169,7 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     good = move.good & dr.isfinite(r1) & dr.isfinite(dr.sum(β1))
     β1, r1 = dr.select(good, β1, 0), dr.select(good, r1, 0)
     apart, joined = good & parts & move.reaches, good & joins & move.reaches
-    # This step has changed r, and with it the weight: emission found at its end is weighted by that of the new pair.
+    # This step has changed r, and with it the weight: emission found at its end has the weight of the new pair.
     w2 = gradient_weight(r1, good)
     return Offset(
         ray=move.ray,
@@ -195,8 +195,8 @@ def replayed_light(scene, plan: Plan, step: Step, path: Offset, own: Own) -> tup
 
     Densities of the same numbers cancel (survey, eq. 6 and 7), so r stays what it was, and the numbers lead to, or
     near, the same point of an emitter. It is never rejected: an emitter that y does not see is a sample of value 0, and
-    the reverse shift knows it as such. Of an emitter that is chosen by place, the same one is taken from y, where it
-    has another probability: the ratio of the two does not cancel.
+    the reverse shift knows it as such. Where an emitter is chosen by place, y takes the same one, where it has another
+    probability: the ratio of the two does not cancel.
     """
     y, bsdf = own.y, own.bsdf
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) | media.scatters(own.place)
@@ -217,7 +217,7 @@ def replayed_light(scene, plan: Plan, step: Step, path: Offset, own: Own) -> tup
 
 
 def no_move(path: Offset) -> Move:
-    """Of a path that neither reconnects nor parts: rejected, with β' = 0 and r = 0."""
+    """The move of a path that neither reconnects nor parts: rejected, with β' = 0 and r = 0."""
     none = mi.Bool(False)
     return Move(
         ray=path.ray,
@@ -254,7 +254,7 @@ def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
     T, T_c, occluded = plan.space.reconnect(y, own.place, ray, x1, step.segment, step.drawn, active=p > 0)
 
     # ---------------------- Emission at x1 -----------------------
-    # Le may depend on the direction of arrival, and p_light does on the distance: m is not that of the base path.
+    # Le may depend on the direction of arrival, and p_light depends on the distance, so m differs from the base path's.
     y1 = seen_from(x1, direction)
     ratio = dr.squared_norm(x1.p - y.p) / dr.square(x1.t)
     Le, p_light = shared_emission(scene, plan.lights, x1, step.Le, step.p_light, x=step.x, y=y, y1=y1, J=ratio)
@@ -262,7 +262,7 @@ def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
         ray=mi.Ray3f(y.p, direction, y.time, y.wavelengths),
         hit=move.hit,
         place=own.place,
-        # f |J| over the density of the *base* path (survey, eq. 4): p' enters by the weight alone.
+        # f |J| over the density of the *base* path (survey, eq. 4): p' enters only by the weight.
         f_p=dr.select(p > 0, f * (J / step.p * step.survival), 0) * T,
         r=J * p / step.p * T_c,
         sky=Sky(mi.Bool(True)),
@@ -274,7 +274,7 @@ def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
 
 
 def part(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
-    """In a direction of its own, with the half-vector of the base path or along its random numbers."""
+    """A move in a direction of its own, with the half-vector of the base path or along its random numbers."""
     # -------------------- Random sequence replay -----------------
     # |J| = p / p' (survey, eq. 6), hence f |J| / p = f / p', which is what sampling returns (eq. 7), and r = 1.
     y = own.y

@@ -54,7 +54,7 @@ def make_plan(
     places: Places | None = None,
     shared: bool = False,
 ) -> Plan:
-    """Inspects the scene; the parameters are those of ``gpt``. Without ``volumes`` its media are not seen.
+    """Inspects the scene; the parameters are as for ``gpt``. Without ``volumes`` its media are not seen.
 
     With ``places``, lamps are chosen by them.
 

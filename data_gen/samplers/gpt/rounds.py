@@ -21,9 +21,9 @@ from data_gen.tails.cells import Place
 
 # Paths that feed the cache have random numbers of their own: "TAILS".
 _SEED = 0x5441494C53
-# Paths that feed the cache together, lest their new cells be more than there is room for
+# Paths that feed the cache together, so that there is room for their new cells
 _AT_ONCE = 1 << 18
-# The first round comes in two parts, since paths of the second may end in what those of the first have found.
+# The first round comes in two parts, since paths of the second may end in what paths of the first have found.
 _FIRST_PART = 1 / 4
 # Where fewer of the first paths come by a place to end than this share of them, none end: it would cost more than it
 # gains.

@@ -64,7 +64,7 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
     found, caustic_found = caustic.split(path.late, found)
     caustic_found = sum(late, caustic_found)
     for y in offsets:
-        # Of a joined path, what it would settle with at this vertex, which scatters alike in all directions
+        # For a joined path: what it would settle with at this vertex, which scatters alike in all directions
         joined = gradient_weight(y.r, True) * (y.β - path.β)
         y.Δ = y.Δ + dr.select(y.joined, joined, y.a) * found
     path.walks = path.walks & ~ends

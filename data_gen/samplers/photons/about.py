@@ -1,4 +1,4 @@
-"""The entries of all samplers by photons alone."""
+"""The entries of all samplers that use only photons."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,4 +1,4 @@
-"""What all plugins by photons are: parameters, the world of a scene, and the photon maps of a pass."""
+"""What all photon plugins share: parameters, the world of a scene, and the photon maps of a pass."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from data_gen.samplers.photons.map.trace import MAP_BYTES, VERTICES_PER_PATH, tr
 from data_gen.samplers.photons.passes import Passes
 from ngpt.errors import NgptError
 
-# Of a camera sample and its features, beside the maps
+# Bytes of a camera sample and its features, beside the maps
 CAMERA_BYTES = 256
-# Of a map in media: two words more for each vertex, and two for each light path
+# Bytes of a map in media: two words more for each vertex, and two for each light path
 MEDIA_MAP_BYTES = MAP_BYTES + VERTICES_PER_PATH * 2 * 8 + 2 * 8
-# More of it with grids: null collisions of each vertex, twice; and Φ / σs
+# Further bytes of it with grids: null collisions of each vertex, twice; and Φ / σs
 GRID_BYTES = VERTICES_PER_PATH * (3 + 3 + 3) * 4
 
 
@@ -44,7 +44,7 @@ class Traced:
     first_radius: float  # that photons are gathered within in pass 0
 
     def radius(self, dimension: int = 2) -> float:
-        """Of this pass, where photons are counted in so many dimensions."""
+        """The radius of this pass, where photons are counted in so many dimensions."""
         return self.first_radius * shrunk(self.number, dimension)
 
 
@@ -55,7 +55,7 @@ class PhotonIntegrator(GradientIntegrator):
     ``edges``         photon maps have the edges of light paths, too
     ``camera_bytes``  that a camera sample takes
     ``map_bytes``     that a map takes for each light path
-    ``walk``          class of how camera paths go with those of the neighbours: ``gradients.camera.CameraPaths``
+    ``walk``          class of how camera paths go with the neighbours' paths: ``gradients.camera.CameraPaths``
     """
 
     edges = False
@@ -68,7 +68,7 @@ class PhotonIntegrator(GradientIntegrator):
 
     @property
     def lane_bytes(self) -> int:
-        """Of a camera sample, with all that its light paths may leave in a map."""
+        """Bytes for a camera sample, with all that its light paths may leave in a map."""
         return self.camera_bytes + self.photons * self.map_bytes
 
     def instead(self, lane_bytes: int) -> str:

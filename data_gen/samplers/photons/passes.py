@@ -26,7 +26,7 @@ class Passes:
     integrator: Any
     world: World
     width: float  # of a pixel
-    walk: Any = None  # how camera paths go with those of the neighbours: ``photons.gradients.camera.CameraPaths``
+    walk: Any = None  # how camera paths go with the neighbours' paths: ``photons.gradients.camera.CameraPaths``
     frozen: Frozen = field(init=False)
 
     def __post_init__(self) -> None:

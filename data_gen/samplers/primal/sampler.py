@@ -26,7 +26,7 @@ from data_gen.tails.cache import Known
 
 
 def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places | None = None) -> SamplePass:
-    """The sampler ``primal``; without ``features`` it holds the primal alone. Lamps may be chosen by ``places``.
+    """The sampler ``primal``; without ``features`` it holds only the primal. Lamps may be chosen by ``places``.
 
     With ``tails`` "shared" the tails of paths are found in a cache, see ``data_gen.tails``.
     """

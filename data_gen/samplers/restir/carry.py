@@ -11,7 +11,7 @@ A path is the same path in both scenes if its random numbers are, and rc is the 
 
 Nothing of that depends on the pixel that a path is in. So a record is carried once, and everything else is E in either
 scene. The way back is the same, and what it cannot undo is never carried: rc on a shape that was not there, or that has
-other triangles. [Lin et al. 2022: shifts between domains of any kind, here those of two times]
+other triangles. [Lin et al. 2022: shifts between domains of any kind, here between two times]
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class Carry:
         face = dr.gather(mi.Bool, self.stretched, at)
         place = dr.gather(mi.UInt32, self.first, at) + dr.select(face, record.primitive, 0)
         stretch = dr.gather(mi.Float, self.stretches, place)
-        # The normal of a plane that is moved by A is that of before, by the inverse transpose.
+        # The normal of a plane that A moves is the previous normal times the inverse transpose.
         n = mi.Vector3f(x.n)
         stretch *= dr.abs(dr.det(A)) / dr.norm(
             sum((mi.Vector3f(*rows[i][:3]) * n[i] for i in range(3)), mi.Vector3f(0))
@@ -99,7 +99,7 @@ class Carry:
 
         behind = known & ~lost & ((kind == RC_LIGHT) | (kind == SUFFIX))
         camera = CameraSamples.replayed(target.sensor, seed, record.pixel, record.sample, record.place)
-        # rc's own numbers come behind those of the vertices that are replayed and of the one before it.
+        # rc's own numbers come after the numbers of the replayed vertices and of the vertex before it.
         random = camera.random
         random.skip(mi.UInt32(DRAWN) * (record.replayed + 1))
         w, L, p_light, delta = _behind(target.scene, target.plan, random, x, record, behind)

@@ -7,8 +7,8 @@ vertices that are replayed may be joined, and the one before rc must be connecta
 
 At its own place, by its own camera, E gives back the f that was recorded, to float32.
 
-Occlusion is tested by a shadow ray, whose ends are kept off surfaces by epsilons, and a walk by what its ray meets. Of
-90,000 paths in three scenes none differed. ``P`` and ``shape`` of a record are those of this scene: what was found in
+A shadow ray tests occlusion, with its ends kept off surfaces by epsilons; a walk tests it by what its ray meets. Of
+90,000 paths in three scenes none differed. ``P`` and ``shape`` of a record belong to this scene: what was found in
 another is carried here first, see ``data_gen.samplers.restir.carry``.
 """
 
@@ -40,7 +40,7 @@ class Shifted:
 
 
 def evaluate_record(stage: Stage, seed: int, record: Record, place: mi.Point2f, active: mi.Bool) -> Shifted:
-    """E(record, place): the paths of the records, as those of the ``place`` on the film; J is that of the way there."""
+    """E(record, place): the records' paths as paths of the ``place`` on the film; J: Jacobian of the way there."""
     scene, plan = stage.scene, stage.plan
     camera = CameraSamples.replayed(stage.sensor, seed, record.pixel, record.sample, place)
     ray, importance, inside = camera.rays()

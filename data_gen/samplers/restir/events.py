@@ -10,7 +10,7 @@ import mitsuba as mi
 from data_gen.paths.vertex import DELTA, SMOOTH, event_kind
 from data_gen.samplers.gpt.plan import Plan
 
-# Random numbers of a vertex, all told
+# Random numbers of a vertex, in total
 DRAWN = 6
 
 

@@ -1,4 +1,4 @@
-"""Where a pixel's area was one frame before: on up to four pixels. NumPy, and of motion alone."""
+"""Where a pixel's area was one frame before: on up to four pixels. NumPy; depends on motion only."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
-# Of a pixel's area that was moved by a fraction: the pixels it lies on, from the one of its own corner on.
+# The pixels that a pixel's area lies on when it is moved by a fraction, starting at the one of its own corner.
 CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 
 
 def pair_motions(motion: np.ndarray, depth: np.ndarray | None, steps: Iterable[tuple[int, int]]) -> np.ndarray:
-    """(steps, H, W, 2): the motion of the pixel, or of the pair of it and the one a step on: that of the nearer one.
+    """(steps, H, W, 2): the motion of a pixel, or of a pair of it and the pixel one step on: the nearer one's motion.
 
     NaN where that is not known, and for pairs that reach over the edge of the film.
     """

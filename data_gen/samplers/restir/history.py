@@ -10,13 +10,14 @@ r"""Reservoirs of all pixels, and of all pairs of neighbours, kept from frame to
 There are five reservoirs for each pixel: of its own light, and of the difference to its right and to its lower
 neighbour, one for each sign. Values that change sign have no density to choose by.
 
-A pixel's paths are those of its whole area, and a path keeps its place on the film to a fraction of a pixel. With the
+A pixel's paths come from its whole area, and a path keeps its place on the film to a fraction of a pixel. With the
 motion m of a pixel, paths that were at p in the frame before are now at p - m. So the pixel's area, moved by m, lies on
-up to four pixels of the frame before, and what they have kept there is taken over. Were that all, a fifth of the
+up to four pixels of the frame before, and what they have kept there is taken over. With that only, a fifth of the
 pixels would find nothing of what they could: the nearest of the four has kept one path, and it may lie beside the area.
-So of the nearest pixel all is taken over, what lies beside it moved by a whole pixel: it *wraps*. A path may have been
-found by this frame's candidate, then, straight, and wrapped: their MIS weights sum to 1, whatever m is. Confidence is
-handed on in proportion to the areas. [Zhang et al. 2024, "Area ReSTIR"; gradient-domain ReSTIR 2025, section 4.3.1]
+So everything is taken over from the nearest pixel. What lies beside the area is moved by a whole pixel: it *wraps*. A
+path may then have been found in three ways: by this frame's candidate, straight, and wrapped. The MIS weights of the
+three sum to 1, whatever m is. Confidence is handed on in proportion to the areas. [Zhang et al. 2024, "Area ReSTIR";
+gradient-domain ReSTIR 2025, section 4.3.1]
 
 That is unbiased as long as motion depends on no random numbers. Where more than the camera changes there are two
 scenes, and records are carried into the one that E is of: see ``data_gen.samplers.restir.carry``. Lanes of ``chains``
@@ -98,11 +99,11 @@ class History:
     ) -> Frame:
         """Renders a frame.
 
-        ``stage`` is the scene as it is now, where more than the camera has changed: another scene than that of the
-        frame before, which is still as it was then. None: the same scene.
+        ``stage`` is the scene as it is now, where more than the camera has changed. It is another scene than the one of
+        the frame before, which is still as it was then. None: the same scene.
 
-        ``motion`` (H, W, 2) is that of ``data_gen.frames.motion``, NaN where there is no history; None: nothing moves.
-        ``depth`` (H, W) tells which pixel of a pair is the nearer one, whose motion is that of both.
+        ``motion`` (H, W, 2) comes from ``data_gen.frames.motion``, NaN where there is no history; None: nothing moves.
+        ``depth`` (H, W) determines which pixel of a pair is the nearer one; its motion applies to both.
         """
         width, height = self.size
         self.before, self.stage = self.stage, stage or self.stage

@@ -37,9 +37,9 @@ class Kept:
 class Layout:
     """A frame of ``size`` = (width, height) with ``chains`` of each pixel, and ``reservoirs`` of each of these lanes.
 
-    ``motions`` (3, H, W, 2), NaN where there are none, and ``confidence`` (3, H, W) of the frame before are those of
-    the pixels themselves and of pairs, in the order of ``STEPS``. What kernels read is opaque: literals would be
-    compiled into them, each anew.
+    ``motions`` (3, H, W, 2), NaN where there are none, and ``confidence`` (3, H, W) of the frame before are given for
+    pixels and for pairs, in the order of ``STEPS``. What kernels read is opaque: literals would be compiled into them,
+    each anew.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class Layout:
         return dr.gather(mi.Vector2f, self.motions, self._at(domain, pixel, active), active)
 
     def confidence(self, domain: mi.UInt32, pixel: mi.Point2i) -> mi.Float:
-        """Of the frame before; 0 off the film, and of pairs that are not there."""
+        """The confidence in the frame before; 0 off the film, and for pairs that do not exist."""
         there = self.on_film(pixel)
         return dr.gather(mi.Float, self.confidences, self._at(domain, pixel, there), there)
 
@@ -117,7 +117,7 @@ class Layout:
 
 
 def step(domain: mi.UInt32) -> mi.Point2i:
-    """From the first pixel of a pair to the second."""
+    """The step from the first pixel of a pair to the second."""
     return mi.Point2i(dr.select(domain == 1, mi.Int32(1), 0), dr.select(domain == 2, mi.Int32(1), 0))
 
 
@@ -126,10 +126,10 @@ def same(a: mi.Point2i, b: mi.Point2i) -> mi.Bool:
 
 
 def fraction(place: mi.Point2f) -> mi.Vector2f:
-    """Of a place on the film, that within its pixel."""
+    """The position within its pixel of a place on the film."""
     return mi.Vector2f(place - dr.floor(place))
 
 
 def across(domain: mi.UInt32, side: mi.UInt32) -> mi.Vector2f:
-    """From the pixel of a pair that a path is in to the other one."""
+    """The step from the pixel of a pair that a path is in to the other one."""
     return mi.Vector2f(step(domain)) * dr.select(side == 0, mi.Float(1), -1)

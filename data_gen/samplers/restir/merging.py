@@ -1,4 +1,4 @@
-"""Of each reservoir one path of all that it is offered; and differences of the paths that pixels have kept."""
+"""Each reservoir keeps one path of all that it is offered; and differences of the paths that pixels have kept."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Merging:
     e: Evaluated
 
     def merged(self, u: mi.Float) -> Reservoir:
-        """Of each reservoir the path that is kept, of this frame or of the one before, by random numbers ``u``."""
+        """Chooses, by random numbers ``u``, the path that each reservoir keeps, of this frame or of the one before."""
         lane = dr.arange(mi.UInt32, self.at.total)
         r, i = lane // self.at.n, lane % self.at.n
         domain, pixel = (r + 1) // 2, self.at.pixel(i)
@@ -69,7 +69,7 @@ class Merging:
         return Reservoir(record, best.side, best.value, weight_of(total, best.value))
 
     def _candidate(self, r: mi.UInt32, i: mi.UInt32, side: mi.UInt32) -> _Offer:
-        """What a pixel's candidate offers: of a pair that of either side."""
+        """What a pixel's candidate offers; for a pair, what the candidate of either side offers."""
         found, e = self.found, self.e
         domain, pixel = (r + 1) // 2, self.at.pixel(i)
         at = pixel + step(domain) * mi.Int32(side)
@@ -136,6 +136,6 @@ def _pair(own: mi.Spectrum, other: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
 
 
 def _value(r: mi.UInt32, own: mi.Spectrum, other: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
-    """What reservoir number ``r`` is of, light or one sign of a difference: of a path in its pixel and in the other."""
+    """The value of reservoir ``r``, light or one sign of a difference, for a path in its pixel and in the other."""
     sign = dr.select(r % 2 == 1, mi.Float(1), -1)
     return dr.select(r == 0, own, part(_pair(own, other, side), sign))

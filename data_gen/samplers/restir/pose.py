@@ -11,7 +11,7 @@ import numpy as np
 
 
 class Pose:
-    """The parameters of a sensor, but for those of its film and of its sampler."""
+    """The parameters of a sensor, except for its film and its sampler."""
 
     def __init__(self, sensor: mi.Sensor):
         params = mi.traverse(sensor)

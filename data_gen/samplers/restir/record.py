@@ -8,7 +8,7 @@ measure of its own, so that a shift has one Jacobian and not one at each vertex:
 | part | measure | Jacobian of a shift |
 |---|---|---|
 | camera sample, prefix, choice of an emitter | the random numbers; f there is f / p | 1 |
-| the step to rc | solid angle | that of the reconnection |
+| the step to rc | solid angle | the reconnection's Jacobian |
 | the direction from rc on | solid angle at rc | 1 |
 | behind it | the random numbers; f, and Russian roulette, are in ``L`` | 1 |
 
@@ -36,7 +36,7 @@ import mitsuba as mi
 
 LIGHT, HIT, RC_LIGHT, SUFFIX, REPLAY, STUCK = range(6)
 
-# Of a word, from its lowest bits on: kind, whether the lamp was sampled, vertices behind rc, those that are replayed
+# Parts of a word, from its lowest bits on: kind, whether the lamp was sampled, vertices behind rc, replayed vertices
 _KIND_BITS, _COUNT_BITS = 3, 14
 _BEHIND, _REPLAYED = _KIND_BITS + 1, _KIND_BITS + 1 + _COUNT_BITS
 # Vertices that a record can count. Russian roulette ends paths by then, for none survives a step for certain.
@@ -95,7 +95,7 @@ class Record:
         return self.shape == None  # noqa: E711 - a comparison of arrays of pointers
 
     def moved(self, place: mi.Point2f, geometry: mi.Float) -> Record:
-        """The same path elsewhere on the film, where ``evaluate`` has found its ``geometry``."""
+        """The record's path elsewhere on the film, where ``evaluate`` has found its ``geometry``."""
         return replace(self, place=place, geometry=geometry)
 
 

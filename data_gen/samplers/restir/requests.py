@@ -11,7 +11,7 @@ import mitsuba as mi
 from data_gen.samplers.restir.evaluate import Shifted
 from data_gen.samplers.restir.record import Record, gather
 
-# Of lanes and of the number of the end, 0 or 1: which record, at what place on the film, and whether there is one
+# From lanes and the number of the end, 0 or 1: which record, at what place on the film, and whether there is one
 Request = Callable[["mi.UInt32", "mi.UInt32"], "tuple[mi.UInt32, mi.Point2f, mi.Bool]"]
 _NONE = 0xFFFFFFFF
 

@@ -18,7 +18,7 @@ from data_gen.samplers.restir.stage import Stage
 from data_gen.scenes.geometry import Geometry
 from data_gen.scenes.load import reference_integrator
 
-# What a lane takes: five reservoirs of 100 bytes, those of the frame before, and E of what they ask for.
+# What a lane takes: five reservoirs of 100 bytes, five of the frame before, and E of what they ask for.
 LANE_BYTES = 3072
 
 
@@ -64,8 +64,8 @@ class Restir:
     ) -> GradientFilm:
         """Frame number ``index`` of the shot; where it is not the one after the last, history begins anew.
 
-        ``motion`` and ``depth`` are those of ``History.next_frame``. ``changed`` is the scene as it is now, and where
-        its shapes are; None where the camera alone has moved. Two frames in turn must be of two scenes, then.
+        ``motion`` and ``depth`` are as for ``History.next_frame``. ``changed`` is the scene as it is now, and where its
+        shapes are; None where only the camera has moved. With ``changed``, two frames in turn must be of two scenes.
         """
         stage = None if changed is None else self._stage(*changed)
         self.stage = stage or self.stage

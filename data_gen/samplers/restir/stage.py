@@ -14,7 +14,7 @@ from ngpt.errors import NgptError
 
 @dataclass
 class Stage:
-    """A scene in the state of one frame; ``shapes`` are those of its shapes, in their order."""
+    """A scene in the state of one frame; ``shapes`` are its shapes, in their order."""
 
     scene: mi.Scene
     plan: Plan

@@ -1,4 +1,4 @@
-r"""Candidates: one random walk, and of all its paths the one that a reservoir keeps.
+r"""Candidates: one random walk, and the one of its paths that a reservoir keeps.
 
 A walk is Mitsuba's ``path``: emitter sampling and BSDF sampling at each vertex. Each emitter found is a path. One of
 them is chosen as the walk goes on, with probability in proportion to the luminance of its contribution C = f W, and
@@ -10,8 +10,8 @@ radiance. [Lin et al. 2022; Chao 1982 for the choice in one go]
     B       radiance behind rc, as part of ``L``: f / p of all vertices since
     phase   BEFORE rc; AT rc; BEHIND it
 
-At joined events f and p are those of the material as a whole, not of the lobe that was sampled: ``evaluate`` knows no
-other, and the mixture of both is unbiased for ``blendbsdf`` too, whose samples tell the density of one part alone.
+At joined events f and p belong to the material as a whole, not to the lobe that was sampled: ``evaluate`` knows no
+other. Their mixture is unbiased for ``blendbsdf`` too, whose samples give the density of only one part.
 """
 
 from __future__ import annotations
@@ -222,7 +222,7 @@ def _onward(scene, plan: Plan, at: _State, numbers: Numbers, active: mi.Bool) ->
     η = dr.select(event.found, at.η * event.η, at.η)
 
     # ---------------------- Russian roulette ---------------------
-    # Behind rc it goes by what is behind rc alone, so that it can be played again from there.
+    # Behind rc it depends only on what is behind rc, so that it can be played again from there.
     throughput = dr.max(dr.select(behind, at.B, at.F * at.W) * f_p)
     q = roulette(throughput, at.depth >= plan.limits.rr_depth, η)
     # Where a join has no density, after that correction, there is no such path.

@@ -12,18 +12,18 @@ the other pixels of the tile as well. So each of N pixels has N suffixes for its
     I_i               Σ_j C_i(s_j) / D(s_j), the estimate of pixel i; m and a second pair q, C: see below
     dx, dy            I_k - I_i within a tile: the suffixes and the denominators are the same
 
-What ends at s_j, or at a lamp that was sampled there, needs s_j alone (C1, q1, D1). What goes on from there needs the
-direction that was sampled at s_j too, whose density depends on where the path has come from (C2, q2, D2). Each path
+What ends at s_j, or at a lamp that was sampled there, needs only s_j (C1, q1, D1). What goes on from there needs also
+the direction that was sampled at s_j, whose density depends on where the path has come from (C2, q2, D2). Each path
 keeps its own MIS weights m of emitter against BSDF sampling: C is the contribution f m of one technique. Emitters are
-sampled at x_i by the numbers of all pixels of the tile, which has the same density everywhere: D is the number of
-pixels there are.
+sampled at x_i by the numbers of all pixels of the tile. The density is the same everywhere, so D is the number of
+pixels.
 
-A difference across the border of two tiles has the suffixes of its two pixels alone, which is what ``gpt`` does. The
-grid of tiles moves by a pixel from sample to sample, so that each pair of pixels is in one tile in its turn. Both are
-unbiased, wherever the grid is.
+A difference across the border of two tiles has only the suffixes of its two pixels, as in ``gpt``. The grid of tiles
+moves by a pixel from sample to sample, so that each pair of pixels is in one tile in its turn. Both are unbiased,
+wherever the grid is.
 
-A suffix is shared where all three vertices are connectable and the event at x_j is smooth, or else belongs to its own
-pixel alone, in primal and differences alike: the pixels of a pair agree on that, since the rule names neither first.
+A suffix is shared where all three vertices are connectable and the event at x_j is smooth. Otherwise only its own pixel
+uses it, in primal and differences alike: the pixels of a pair agree on that, since the rule names neither first.
 
 [Bauszat, Petitjean, Eisemann 2017, "Gradient-domain path reusing"; Bekaert, Sbert, Halton 2002, "Accelerating path
 tracing by reusing paths"; Hua et al. 2019, "A Survey on Gradient-Domain Rendering", section 6.1]
@@ -49,7 +49,7 @@ from data_gen.paths.vertex import Materials, evaluate, seen_from
 from data_gen.samplers.common import GradientIntegrator
 from data_gen.samplers.teaching.gpt_simple import base_step, reflected, trace, walk
 
-# Of a lane: its suffix, its camera sample and sums; and what is kept of one connection.
+# Bytes of a lane: its suffix, its camera sample and sums; and what is kept of one connection.
 _LANE_BYTES, _CONNECTION_BYTES = 272, 32
 
 
@@ -73,7 +73,7 @@ class GPTTiles(GradientIntegrator):
         self.tile, self.roughness_threshold = self.options["tile"], self.options["roughness_threshold"]
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        """The primal estimate alone."""
+        """Only the primal estimate."""
         L, Le, _ = trace(scene, self.limits, sampler, ray, mi.Spectrum(1), [])
         return L + Le, mi.Bool(True), []
 
@@ -111,7 +111,7 @@ class Tiles:
         film.put_all(features(self.scene, camera.sensor, camera.random.clone(), camera.rays()[0]))
 
     def shared(self, camera: CameraSamples, paths: Paths, links: list[Link]) -> mi.Color3f:
-        """I of each pixel, of its own path and those of the pixels that ``links`` lead to."""
+        """I of each pixel, from its own path and from the paths of the pixels that ``links`` lead to."""
         members, direct, count = [(None, paths.own)], paths.direct, dr.select(paths.lives, mi.Float(1), 0)
         for link in links:
             connection, light = self.connect(camera, paths, link)
@@ -234,7 +234,7 @@ class Suffix:
     R: mi.Spectrum  # all other radiance that comes from there
 
     def at(self, lanes: mi.UInt32, active: mi.Bool) -> Suffix:
-        """Those of other lanes."""
+        """The suffixes of other lanes."""
 
         def taken(value: Any) -> Any:
             return dr.gather(type(value), value, lanes, active) if dr.width(value) > 1 else value
@@ -269,7 +269,7 @@ class Paths:
 
 @dataclass
 class Link:
-    """To the same sample of another pixel, by lanes; where it is ``active``, its own link leads back."""
+    """A link to the same sample of another pixel, by lanes; where it is ``active``, its own link leads back."""
 
     lane: mi.UInt32
     active: mi.Bool
@@ -284,14 +284,14 @@ class Grid:
         width, height = camera.size
         self.place = camera.pixel % dr.opaque(mi.UInt32, width), camera.pixel // dr.opaque(mi.UInt32, width)
         self.size = width, height
-        # Of pixels that far apart; tests move them.
+        # Tiles consist of pixels that far apart; tests move them.
         self.stride = SHIFTS["dx+"][0]
         offsets = camera.sample % side, camera.sample // side % side
         #: the place of a pixel in its tile
         self.slot = tuple((p // self.stride + o) % side for p, o in zip(self.place, offsets, strict=True))
 
     def others(self) -> list[Link]:
-        """To all other pixels of the tile. Places are paired by an exclusive or, so that links lead back."""
+        """Links to all other pixels of the tile. Places are paired by an exclusive or, so that links lead back."""
         # Opaque: all connections are one kernel.
         all_bits = [dr.opaque(mi.UInt32, bits) for bits in range(self.side)]
         pairs = [(x, y) for y in all_bits for x in all_bits][1:]
@@ -301,7 +301,7 @@ class Grid:
         ]
 
     def across(self, axis: int) -> Link:
-        """To the neighbour along ``axis`` that is in another tile, of pixels at such a border."""
+        """The link to the neighbour along ``axis`` that is in another tile, for pixels at such a border."""
         slot = self.slot[axis]
         step = dr.select(slot == self.side - 1, mi.Int32(self.stride), 0)
         step = dr.select(slot == 0, -mi.Int32(self.stride), step)
@@ -309,7 +309,7 @@ class Grid:
         return Link(link.lane, link.active & (step != 0))
 
     def neighbour(self, x: mi.Int32 | int, y: mi.Int32 | int) -> Link:
-        """To the pixel at (x, y) from here; not active where that is outside the image."""
+        """The link to the pixel at (x, y) from here; not active where that is outside the image."""
         (width, height), (here_x, here_y) = self.size, self.place
         there_x, there_y = mi.Int32(here_x) + x, mi.Int32(here_y) + y
         width, height = (dr.opaque(mi.Int32, n) for n in (width, height))
@@ -334,7 +334,7 @@ def keep_in_step(camera: CameraSamples) -> None:
 def balanced(members: list[tuple[Link | None, Connection]]) -> mi.Color3f:
     """Σ_j C_i(s_j) / D(s_j) of each pixel i, by the balance heuristic over the ``members`` of its tile.
 
-    A link leads to the pixel that made the suffix; that of a pixel to itself is None.
+    A link leads to the pixel that made the suffix; the link of a pixel to itself is None.
     """
 
     def of(link: Link | None, values: mi.Float) -> mi.Float:

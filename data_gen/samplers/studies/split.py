@@ -5,12 +5,12 @@ Denoising Monte Carlo Renderings", section 5.1]: what diffuse lobes scatter is s
 by which it is divided, and the rest has a large range. Light that reaches the camera in several lobes of one vertex is
 shared between the layers in proportion to them, f_diffuse / f (``data_gen.paths.lobes``), by whichever technique it was
 found: that has less noise than to go by the lobe which was sampled, and the same mean. The rest, mirrors, glass, gloss,
-and emission seen through holes, is specular. Of the emission that the camera sees directly neither holds anything:
+and emission seen through holes, is specular. Neither layer holds emission that the camera sees directly:
 
     primal = direct + diffuse + specular
 
-Holes (null events) are no scattering. Paths are those of Mitsuba's ``path``: emitter and BSDF sampling combined by the
-power heuristic, roulette by throughput. Steps are taken as in ``gpt_simple``.
+Holes (null events) are no scattering. Paths are sampled as by Mitsuba's ``path``: emitter and BSDF sampling combined by
+the power heuristic, roulette by throughput. Steps are taken as in ``gpt_simple``.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def trace(scene, limits: Limits, lobes: Lobes, random, ray, β) -> tuple[mi.Spec
     """Diffuse and specular light of paths that begin with ``ray``, of importance ``β``."""
     diffuse, specular = mi.Spectrum(0), mi.Spectrum(0)
     x = scene.ray_intersect(mi.Ray3f(ray))
-    # Of the light that comes to x from beyond: what share is diffuse, once that is settled.
+    # The diffuse share of the light that comes to x from beyond, once that is settled
     share, settled = mi.Spectrum(0), mi.Bool(False)
     depth = mi.UInt32(1)
     active = x.is_valid() & (depth < limits.max_depth)

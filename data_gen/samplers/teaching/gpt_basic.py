@@ -39,8 +39,8 @@ class GPTBasic(GradientIntegrator):
     Plugin ``gpt_basic``. Its only parameter is a nested integrator (default: ``path``), which decides what transport
     is rendered; ``path`` and ``volpath`` are the usual ones.
 
-    Not meant for production: shifted paths part for good at the first reflection that differs, which makes gradients
-    noisier than those of a shift that reconnects.
+    Not meant for production: shifted paths part for good at the first reflection that differs. This makes gradients
+    noisier than with a shift that reconnects.
     """
 
     nested = True

@@ -3,7 +3,7 @@ r"""The gradient-domain path tracer to be read: ``gpt`` where every shift is a r
 It renders scenes whose materials all scatter widely. There an offset path always goes straight from its own first
 vertex to the second vertex of its base path, so that the first two steps can be written down one after the other. What
 ``gpt`` does beyond that (replay, half-vectors, ghosts, shared emitters, kernels cut to a scene) is left out. Functions
-and symbols are those of ``data_gen.samplers.gpt``, to be read side by side:
+and symbols are as in ``data_gen.samplers.gpt``, to be read side by side:
 
     x, y              base path, offset path y = T(x); x1 is the base path's next vertex
     L, Le             radiance of the base path without, and of only, the emission that the camera sees directly
@@ -49,7 +49,7 @@ from ngpt.errors import NgptError
 
 
 class GPTSimple(GradientIntegrator):
-    """Gradient-domain path tracing by reconnection alone, for surfaces that scatter widely.
+    """Gradient-domain path tracing with reconnection only, for surfaces that scatter widely.
 
     Plugin ``gpt_simple``. Parameters, as for Mitsuba's ``path``: ``max_depth`` (default -1: no limit) and ``rr_depth``
     (5, and from the third vertex on at the earliest).
@@ -59,7 +59,7 @@ class GPTSimple(GradientIntegrator):
     """
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        """The primal estimate alone."""
+        """Only the primal estimate."""
         L, Le, _ = trace(scene, self.limits, sampler, ray, mi.Spectrum(1), [])
         return L + Le, mi.Bool(True), []
 
@@ -107,7 +107,7 @@ def walk(scene, limits: Limits, random, x):
     while dr.hint(active, label="gpt_simple"):
         step = base_step(scene, random, x, β, active)
         R += β * step.L_light + step.β1 * step.L_bsdf
-        # Roulette by the throughput since the second vertex, which is that of all five paths: none is starved.
+        # Roulette by the throughput since the second vertex, which all five paths share: none is starved.
         q = roulette(dr.max(step.β1), depth >= limits.rr_depth)
         survives = random.next_1d() < q
         x, β = step.x1, step.β1 / q
@@ -232,7 +232,8 @@ def step_joined(step: Step, path: Offset) -> tuple[mi.Spectrum, mi.Spectrum]:
 
 
 def refuse(scene) -> None:
-    """Raises NgptError for materials that paths cannot be reconnected at: polish, too, which no description tells."""
+    """Raises NgptError for materials that paths cannot be reconnected at; also for polish, which no description
+    shows."""
     if materials := Materials(scene, CONNECTABLE.default).unconnectable:
         more = f" and {len(materials) - 3} more" if len(materials) > 3 else ""
         reason = f"paths cannot be reconnected at {', '.join(materials[:3])}{more}"

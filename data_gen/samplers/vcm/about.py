@@ -10,8 +10,8 @@ from data_gen.samplers.shared import BOTH_ENDS, GATHERING, first_radius, joined_
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
 
-# Light through glass and back has long paths, which the camera finds by rare and bright ones alone. Of a light path 16
-# vertices are kept.
+# Light through glass and back has long paths, which the camera finds only by rare and bright ones. 16 vertices of a
+# light path are kept.
 _OPTIONS = {"radius": first_radius(2.0), "joined_depth": joined_depth(17), "roughness_threshold": GATHERING}
 
 

@@ -7,7 +7,7 @@ other strategies, at the first vertices, and shares their weight.
 
 At an offset path's own vertex it is gathered if it is near to that one, too. All light here comes from mirrors or
 glass, so the map of the others rejects these paths; merging shifts them by a map of its own, which keeps the light path
-and replays the camera path. r is 1, and weights are those of merging alone (``pairs.difference_of_one``).
+and replays the camera path. r is 1, and weights are for merging only (``pairs.difference_of_one``).
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
 r"""Gradient-domain vertex connection and merging: ``vcm``, and each of its paths shifted to four neighbouring pixels.
 
 Paths that connections, lamps and cameras complete are shifted as ``gbdpt`` shifts them: by one map, under one weight
-over all strategies of both ends of a pair, of which merging is one wherever photons are gathered. Paths that merging
-completes are shifted without a ray: see ``differences``.
+over all strategies of both ends of a pair. Merging is one of these strategies wherever photons are gathered. Paths that
+merging completes are shifted without a ray: see ``differences``.
 
     a pair of x and y       Δ = 2 (b' - b) / (W(x) + r W(y)), W = Σ p_j / p_s over connections and mergings
     merging at z_b          Δ = b' / W(y) - b / W(x), for photons near to both vertices; else -2 b / W(x)
 
 z_b is the camera path's first vertex that scatters widely. The copy of a light path knows η of its own vertices, and
-the copy of a camera path those of its own: ``mis`` carries them along.
+the copy of a camera path knows η of its own: ``mis`` carries them along.
 
 [Sun et al. 2017, "Gradient-Domain Vertex Connection and Merging", eq. 18-23: there photons are gathered everywhere, and
 the edge in front of a photon is shifted, too; here that edge is one of mirrors or glass, and stays]
@@ -38,14 +38,14 @@ from data_gen.samplers.vcm.differences import ShiftedMerging
 from data_gen.samplers.vcm.integrator import VCM
 from data_gen.samplers.vcm.merging import Photons
 
-# Of a camera sample beside that of ``vcm``: the rays of five paths, four Δ, and what of its light path is shifted
+# What a camera sample takes beyond ``vcm``: the rays of five paths, four Δ, and what of its light path is shifted
 OFFSETS_BYTES = 1024
 
 
 class GVCM(VCM):
     """Gradient-domain vertex connection and merging, for surfaces.
 
-    Plugin ``gvcm``. Parameters are those of ``vcm``; where photons are gathered, paths are connectable as well.
+    Plugin ``gvcm``. Parameters: as for ``vcm``; where photons are gathered, paths are connectable as well.
 
     Not handled: what ``vcm`` does not handle.
     """
@@ -54,7 +54,7 @@ class GVCM(VCM):
     sample_bytes = VCM.sample_bytes + OFFSETS_BYTES
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        """One light path, one camera path, and all their shifts for each camera sample, of which a pixel has one."""
+        """Traces one light path, one camera path, and all their shifts for each sample; a pixel has one sample."""
         world, frozen, sight, photons = passes.world, passes.frozen, Sight.of(camera), None
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         dr.eval(sight.ray, sight.importance, shifted)

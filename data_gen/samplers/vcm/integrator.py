@@ -1,8 +1,8 @@
 r"""Vertex connection and merging: ``bdpt`` and ``ppm`` in one, and every path of light under one weight.
 
 Connections find light from lamps and over rough surfaces; photons find what comes through glass and is seen in a mirror
-or through glass. Each fails where the other does well, and neither is told apart by the scene. Here both render it all,
-and each path counts for each of them by the balance heuristic: by how likely it is found so.
+or through glass. Each fails where the other does well, and a scene does not show which one it needs. Here both render
+all light, and each path counts for each of them by the balance heuristic: by how likely it is found so.
 
     s, t        vertices of a path that come from the light, and from the camera
     z, y        vertices of the camera path and of light paths
@@ -11,12 +11,12 @@ and each path counts for each of them by the balance heuristic: by how likely it
 A pass has one camera sample and one light path for each pixel. Light paths are traced once: their vertices are
 connected to the camera (splats), kept in a map, connected to the camera path of the same sample (one of them,
 ``bdpt.choice``), and gathered at all camera paths, within the radius, where materials scatter widely. The radius
-shrinks from pass to pass as that of ``ppm``.
+shrinks from pass to pass as in ``ppm``.
 
 Photons are gathered only where light comes from mirrors, clear glass or holes. The papers gather all; but where it
 comes from a surface that scatters, a connection to that one finds the path without any blur.
 
-Merging finds paths of up to ``joined_depth`` edges, like connections; longer ones come from the camera alone.
+Merging finds paths of up to ``joined_depth`` edges, like connections; longer ones come only from the camera.
 
 [Georgiev et al. 2012, "Light Transport Simulation with Vertex Connection and Merging"; Hachisuka et al. 2012, "A Path
 Space Extension for Robust Light Transport Simulation"]
@@ -48,7 +48,7 @@ from data_gen.samplers.photons.map.radius import pixel_width, shrunk
 from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.vcm.merging import VERTEX_BYTES, Keeper, Map, Merging, Photons, eta
 
-# Of a camera sample, its features and its light path, beside the map: what was seen, and some more
+# Bytes of a camera sample, its features and its light path, beside the map: what was seen, and some more
 SAMPLE_BYTES = 1536
 
 
@@ -85,7 +85,7 @@ class VCM(BDPT):
 
     @property
     def lane_bytes(self) -> int:
-        """Of a camera sample, with all that its light path may leave in the map."""
+        """Bytes for a camera sample, with all that its light path may leave in the map."""
         # Dr.Jit gives each array the next power of two of bytes.
         places = 1 << (self.vertices - 1).bit_length() if self.vertices else 0
         return self.sample_bytes + places * VERTEX_BYTES
@@ -101,7 +101,7 @@ class VCM(BDPT):
         return Passes(self, world, pixel_width(scene, sensor))
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        """One light path and one camera path for each camera sample, of which a pixel has one."""
+        """Traces one light path and one camera path for each camera sample; a pixel has one sample."""
         world, frozen, sight, photons = passes.world, passes.frozen, Sight.of(camera), None
         dr.eval(sight.ray, sight.importance)
         values = frozen(features, world.scene, camera.sensor, camera.random.clone(), sight.ray)

@@ -1,8 +1,8 @@
 """What is kept of the light paths of a pass, as a map; and merging: photons of it that are gathered at a camera path.
 
 The photons that are gathered at z, the last vertex of a camera path, are all that lie within the radius r, of whatever
-light path. Each ends a path of its own there, that of density η times as large as if z were connected to its light path
-at a given place; η = π r² N. So ``mis`` has a weight for it beside all connections of that path.
+light path. Each ends a path of its own there. The density of that path is η times the density of connecting z to its
+light path at a given place; η = π r² N. So ``mis`` has a weight for it beside all connections of that path.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ VERTEX_BYTES = (23 + 1 + 12) * 4
 
 @dataclass
 class Map:
-    """The vertices of light paths: that of depth d of path i has the place i ``size`` + d - 1."""
+    """The vertices of light paths: the vertex at depth d of path i has the place i ``size`` + d - 1."""
 
     vertices: Any  # ``record_class``
     photon: mi.UInt32  # 1 where photons are gathered
@@ -38,7 +38,7 @@ class Map:
 
     @classmethod
     def empty(cls, paths: int, size: int) -> Map:
-        """Of so many light paths of at most ``size`` vertices."""
+        """An empty map for so many light paths of at most ``size`` vertices."""
         n, kind = paths * size, record_class(mi.variant())
         vertices = kind(*(dr.empty(t, n) for t in get_type_hints(kind, {"mi": mi}).values()))
         # Where nothing was kept
@@ -86,7 +86,7 @@ class Keeper:
 
 @dataclass(init=False)
 class Photons:
-    """Those of a map where they are gathered within ``radius``; ``paths`` light paths have brought them."""
+    """The photons of a map, gathered within ``radius``; ``paths`` light paths have brought them."""
 
     kept: Map
     grid: Grid
@@ -110,7 +110,7 @@ class Merging:
         self.photons, self.plan, self.materials, self.longest = photons, plan, plan.materials, plan.longest
 
     def light(self, z: Vertex, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Spectrum:
-        """That of the photons near to the vertex ``z``, weighted."""
+        """The weighted light of the photons near the vertex ``z``."""
         photons, active = self.photons, active & self.materials.connectable(bsdf)
 
         def one(i, near):
@@ -141,13 +141,13 @@ class Merging:
         return found, Partial(its("vcm"), its("vc")), gathered
 
     def merged(self, z: Vertex, bsdf: mi.BSDFPtr, photon: Photon, end: Partial, active) -> tuple[mi.Spectrum, mi.Float]:
-        """What a ``photon`` brings to the camera by ``z``, but for the kernel; ``end`` is its light path's."""
+        """What a ``photon`` brings to the camera by ``z``, without the kernel; ``end`` is its light path's."""
         g, p, q = brought(photon, z.si, bsdf, active)
         return z.β * g, mis.others_merged(z.end, q, end, p, self.photons.η)
 
 
 def brought(photon: Photon, si, bsdf: mi.BSDFPtr, active) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
-    """What a ``photon`` adds to radiance at ``si``, but for the kernel; p of the direction to the light, q swapped."""
+    """What a ``photon`` adds to radiance at ``si``, without the kernel; p of the direction to the light, q swapped."""
     f, p, q = evaluate(RADIANCE, si, bsdf, si.to_local(-photon.d), active)
     # f has a cosine; the photons lie as densely as the geometric one is large.
     return f * photon.Φ / dr.abs(dr.dot(photon.n, photon.d)), p, q

@@ -68,7 +68,7 @@ class CameraPaths:
     def levels(self, rays: list, random: mi.Sampler, frozen: Callable) -> Iterator[Level]:
         """Level after level of the paths that begin with ``rays``, each evaluated.
 
-        Of each ray there is (ray, importance, whether it is on the film); the first is the base path's. ``frozen``
+        Each ray is given as (ray, importance, whether it is on the film); the first is the base path's. ``frozen``
         calls the functions that make kernels.
         """
         n, stream = dr.width(rays[0][0].o), type(random)
@@ -111,7 +111,7 @@ class CameraPaths:
         return replace(level, paths=paths, depth=level.depth + 1, η=η, numbers=random.state, behind=[])
 
     def further(self, level: Level, random, lanes: mi.UInt32) -> Level:
-        """Those of these ``lanes``, up to what their rays hit."""
+        """The paths of these ``lanes``, up to what their rays hit."""
         paths = [at_lanes(path, lanes) for path in level.paths]
         for path in paths:
             path.hit = self.world.scene.ray_intersect_preliminary(path.ray, active=path.alive)
@@ -137,7 +137,7 @@ class CameraPaths:
         """A path before its first ray is traced."""
         ray, n = mi.Ray3f(ray), dr.width(ray)
         β = mi.Spectrum(importance) + dr.zeros(mi.Spectrum, n)
-        # Of the width of the ray, and no constant
+        # As wide as the ray, and not a constant
         alive = inside & (mi.UInt32(0) == dr.zeros(mi.UInt32, n))
         return Path(ray, None, β, alive, Sky.from_camera(self.limits.hide_emitters, n))
 
@@ -175,7 +175,7 @@ def taken(value: Any, lanes: mi.UInt32) -> Any:
 
 
 def at_lanes(path: Path, lanes: mi.UInt32) -> Path:
-    """What belongs to these ``lanes`` alone; the hit stays."""
+    """The part of a path that belongs to these ``lanes``; the hit stays."""
     old = path.ray
     time = taken(old.time, lanes) if dr.width(old.time) > 1 else old.time
     wavelengths = taken(old.wavelengths, lanes) if dr.width(old.wavelengths) > 1 else old.wavelengths

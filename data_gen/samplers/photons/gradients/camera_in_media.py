@@ -1,8 +1,8 @@
 """Camera paths of a pixel and its neighbours through media, side by side from piece to piece: for ``gbre``.
 
 As ``camera``, but a level is a piece of a ray through one medium, up to a vertex or to a boundary that bends nothing.
-Where the base path goes through a boundary, those of the neighbours must do so, too, or end. ``depth`` numbers
-segments, of which each piece is a level.
+Where the base path goes through a boundary, the neighbours' paths must do so, too, or end. ``depth`` numbers segments,
+and each piece of a segment is a level.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def ended(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.PreliminaryInt
 
 
 class PathsByPieces(CameraPaths):
-    """Those of ``gbre``, ``gbeams`` and ``gplanes``."""
+    """The paths of ``gbre``, ``gbeams`` and ``gplanes``."""
 
     def is_last(self, number: int) -> bool:
         return False

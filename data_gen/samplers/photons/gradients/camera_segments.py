@@ -29,7 +29,7 @@ from data_gen.samplers.photons.passes import Start
 
 @dataclass
 class Flight(Path):
-    """A camera path behind a segment, of which ``ray`` is the last piece; β is that of what is gathered at its end."""
+    """A camera path behind a segment, whose last piece is ``ray``; β is for what is gathered at its end."""
 
     medium: mi.MediumPtr  # of the last piece
     scatters: mi.Bool  # in the medium, not on a surface
@@ -46,7 +46,7 @@ class Flight(Path):
 
 
 class PathsBySegments(CameraPaths):
-    """Those of ``gvpm``."""
+    """The paths of ``gvpm``."""
 
     def begun(self, start: Level, random, rays: list) -> Level:
         random, flights, behind, fog = random.clone(), [], [], self.world.fog

@@ -62,7 +62,7 @@ class Way:
 
 @dataclass
 class Through:
-    """Media along the way from a, and along that of the photon itself."""
+    """Media along the way from a, and along the way of the photon itself."""
 
     medium: mi.MediumPtr  # at a
     τ_c: mi.Float  # of the photon's way, in colour c
@@ -204,7 +204,7 @@ def redirected(world: World, paths: LightPaths, photon: Photon, foot, target, ac
     if world.fog is None:
         through, base_length = None, dr.gather(mi.Float, photons.t, j, active) + dr.dot(foot - photon.p, photon.d)
     else:
-        # The record knows the last piece alone.
+        # The record knows only the last piece.
         origin_of_photon = dr.select(first, start.ray.o, origin)
         base_length = dr.dot(foot - origin_of_photon, photon.d)
         through = known_of_media(world, photons, photon, origin_of_photon)
@@ -229,7 +229,7 @@ def known_of_media(world: World, photons, photon: Photon, origin) -> Through:
     back, medium, nulls = b.spawn_ray(-photon.d), photon.medium, None
     reach = dr.dot(back.o - origin, photon.d)
     if fog.media.grids:
-        # Of the way back the majorant's optical depth M alone: with no collision to place
+        # Only the majorant's optical depth M of the way back: with no collision to place
         back, none = media.shortened(back, reach), mi.UInt32(0)
         steps = {"channel": photon.channel, "key": none, "scale": mi.Float(1), "most": none, "target": None}
         τ, _, _, medium, M, _ = collisions.cross(fog.media.passes, trace, back, medium, reach, **steps, active=True)

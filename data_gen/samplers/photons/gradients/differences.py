@@ -35,7 +35,7 @@ class Gathered:
 
 
 def gradient_pass(passes: Passes, camera: CameraSamples, film: GradientFilm, near: Callable, pairs: int) -> None:
-    """One photon map, and one camera path and its four shifts for each camera sample, of which a pixel has one.
+    """One photon map, and one camera path and its four shifts for each camera sample; a pixel has one sample.
 
     ``near`` (passes, photon map) yields what is ``Gathered`` of a map; ``pairs`` are in memory together for each camera
     sample.
@@ -117,7 +117,7 @@ def joined(passes: Passes, levels: list[Level]) -> Level:
 
 
 def entered(all_of_it: list, values: list, low: mi.UInt32) -> list:
-    """``all_of_it``, a tree of arrays, with that of ``values`` from place ``low`` on."""
+    """``all_of_it``, a tree of arrays, where ``values`` replace the entries from place ``low`` on."""
     dr.scatter(all_of_it, values, low + dr.arange(mi.UInt32, dr.width(values[0])))
     return all_of_it
 
@@ -133,7 +133,7 @@ def add_to(sums: list, lanes: mi.UInt32, parts: list) -> None:
 
 
 def parts(passes: Passes, near: Gathered, level: Level, longest: mi.UInt32, most: int) -> Iterator[list]:
-    """Of what is ``near`` to a level's paths, the differences."""
+    """The differences from what is ``near`` to a level's paths."""
     at_surfaces = passes.walk.at_surfaces(level, passes.frozen)
     if near.on_surfaces is not None:
         receivers = passes.frozen(spread_out, near.on_surfaces, passes.world, at_surfaces)
@@ -205,7 +205,7 @@ def of_copies(near: Near, world: World, pairs: Pairs, paths: list, C: mi.Spectru
 
 
 def summed(pairs: Pairs, found: Found) -> list:
-    """Of each point the sums of all over its pairs; pairs without a copy are counted."""
+    """For each point, the sums of all values over its pairs; pairs without a copy are counted."""
     failures = mi.Float(0)
     for one in found.Δ:
         failures += dr.select((found.shifts > 0) & dr.all(one == -2 * found.C), 1, 0)
@@ -228,6 +228,6 @@ def difference(C: mi.Spectrum, C1: mi.Spectrum, r: mi.Float) -> mi.Spectrum:
 
 
 def differences_behind(behind: list, paths: list) -> list:
-    """Of what paths have seen behind grids, that of base paths and its four Δ."""
+    """What paths have seen behind grids: the light of base paths and its four Δ."""
     C, *others = behind
     return [C, *(gradient_weight(mi.Float(1), y.alive) * (C1 - C) for y, C1 in zip(paths[1:], others, strict=True))]

@@ -1,8 +1,8 @@
 """What is near to camera paths: the protocol by which photons, beams and planes give their differences.
 
 A *thing* (a photon, a beam, a plane) is paired with what it is near to on a base path (a vertex, a piece of a ray), the
-*receiver* A. The same of the neighbour's path is B. A thing near to both is its own copy; of one near to A alone a copy
-is made near to B.
+*receiver* A. The neighbour's path has the corresponding receiver B. A thing near to both is its own copy. If a thing is
+near only to A, a copy is made near to B.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from data_gen.samplers.photons.map.grid import Grid
 
 @dataclass
 class Pairs:
-    """A piece of the list of all pairs: ``point`` and ``place``, that of the photon in the list of the grid."""
+    """A piece of the list of all pairs: ``point``, and ``place``, where the photon is in the list of the grid."""
 
     point: mi.UInt32
     place: mi.UInt32

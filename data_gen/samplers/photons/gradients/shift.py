@@ -1,8 +1,8 @@
 r"""How a photon moves with the point that gathers it: pure functions.
 
 A photon b is gathered at x, and its copy b' at y, the vertex of the neighbouring pixel's path. The copy's place round y
-is the mirror image of that of b round x: whatever is nearer to x than the radius, and not to y, goes to what is nearer
-to y and not to x. Surfaces are curved, and photons lie on them, not on a plane; so it is the photon's line that moves.
+mirrors the place of b round x: whatever is nearer to x than the radius, and not to y, goes to what is nearer to y and
+not to x. Surfaces are curved, and photons lie on them, not on a plane; so it is the photon's line that moves.
 
     a, d        the predecessor of the photon on its light path, and the direction from there
     b̂           where that line meets the tangent plane at x
@@ -66,7 +66,7 @@ def rotate(v, n, m):
 def past(a, e, x, d, u, far):
     """Where a line from ``a`` passes the ray through ``x`` along ``d``, there, at the signed distance ``u``.
 
-    ``e`` is a direction near to that of the line, or, where it comes from infinitely ``far`` away, its own.
+    ``e`` is a direction near to the line's; where the line comes from infinitely ``far`` away, ``e`` is its direction.
     """
     target = x
     # The line's direction turns the place by a little: each step is better by u over the length.
@@ -99,8 +99,8 @@ def jacobian_of_planes(t, volume, t1, volume1):
 def jacobian(d, n, length2, d1, m, length2_1):
     """J of the way from a, along ``d``, to b̂ (normal ``n``), which becomes that along ``d1`` to ĉ (normal ``m``).
 
-    ``length2``, ``length2_1``: squared distances of b̂ and ĉ from a. Of light from infinitely far away, whose origins
-    move and not the directions, they are 1.
+    ``length2``, ``length2_1``: squared distances of b̂ and ĉ from a. They are 1 for light from infinitely far away,
+    whose origins move and not the directions.
     """
     return dr.abs(dr.dot(m, d1) / dr.dot(n, d)) * jacobian_in_medium(length2, length2_1)
 

@@ -8,8 +8,8 @@ Light that is the same everywhere on a surface would be lost along the edges, in
 π r². Counted over A nothing of it is lost. π r² / A is the sum of the products (1 - w₁) ... (1 - wₖ) over k from 0 on,
 whose mean is right, and which has one term on a plane: one probe for each point.
 
-The probes' numbers are those of the place and the pass. So π r² / A is a property of x in each pass, by whatever path
-it is reached.
+The place and the pass determine the probes' random numbers. So π r² / A is a property of x in each pass, by whatever
+path it is reached.
 
 [the sum: Booth 2007, "Unbiased Monte Carlo Estimation of the Reciprocal of an Integral"]
 """
@@ -28,18 +28,18 @@ RAYS = 24
 LEAST = 0.01
 # In a radius: what lies so near together has the same numbers, whatever has rounded it.
 PLACES = 8
-# Of the hash: with Mitsuba's 4, one probe after another misses.
+# Rounds of the hash: with Mitsuba's 4, one probe after another misses.
 ROUNDS = 8
 
 
 def number_of(seed: int, number: int) -> mi.UInt32:
-    """Of pass ``number`` of a render with that ``seed``: another one for each."""
+    """A number for pass ``number`` of a render with that ``seed``: another one for each."""
     return dr.opaque(mi.UInt32, (seed * 0x9E3779B1 + number * 0x85EBCA77) % (1 << 32))
 
 
 @dr.syntax
 def spread(world: World, x: mi.SurfaceInteraction3f, radius2: mi.Float, number: mi.UInt32, active: mi.Bool) -> mi.Float:
-    """π r² / A at vertices ``x`` where light is gathered; ``number`` is that of the pass, see ``number_of()``."""
+    """π r² / A at vertices ``x`` where light is gathered; ``number`` is the pass's, see ``number_of()``."""
     scene, receives = world.scene, world.materials.connectable
     frame, n = mi.Frame3f(x.n), mi.Vector3f(x.n)
     radius = dr.sqrt(radius2)
@@ -47,7 +47,7 @@ def spread(world: World, x: mi.SurfaceInteraction3f, radius2: mi.Float, number: 
     other, _ = mi.sample_tea_32(place[1], place[2], ROUNDS)
     place, _ = mi.sample_tea_32(place[0] ^ number, other, ROUNDS)
     total, term, rays = mi.Float(0), mi.Float(1), mi.UInt32(0)
-    # Of a probe what is left of it
+    # What is left of a probe
     ray, begins = mi.Ray3f(x.p, -n, dr.zeros(mi.Float), x.time, x.wavelengths), mi.Bool(True)
     going = mi.Bool(active)
     while dr.hint(going, label="probes of edges"):

@@ -13,7 +13,7 @@ from ngpt.errors import NgptError
 
 
 class Fog:
-    """The media of a scene, one of which may be around the camera ``sensor``: ``within``.
+    """The media of a scene. One of them may be around the camera ``sensor``: ``within``.
 
     Raises NgptError, in the name of the ``sampler``, where light from infinitely far away comes through a medium
     without end.
@@ -56,7 +56,7 @@ class Fog:
         return medium
 
     def fly(self, trace, ray, medium, channel, random, active):
-        """The segment along ``ray``, and the vertex at its end; ``trace`` is that of ``segments.fly()``."""
+        """The segment along ``ray``, and the vertex at its end; ``trace`` as in ``segments.fly()``."""
         numbers = segments.draw(random, self.media)
         segment = segments.fly(self.media, trace, ray, medium, channel, numbers, active=active)
         return segment, vertex(segment.ray, segment.hit, segment.place)

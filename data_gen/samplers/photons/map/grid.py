@@ -22,7 +22,7 @@ _LEAST_CELLS = 1 << 12
 class Grid:
     """Points of index ``index[i]`` at ``p[i]``, sorted by cell; cell c has those from ``start[c]`` to ``start[c + 1]``.
 
-    ``points`` are all points, of which those that ``exist`` are entered; ``radius`` is the largest that is asked for.
+    ``points`` are all points, and those that ``exist`` are entered; ``radius`` is the largest that is asked for.
     """
 
     low: mi.Point3f
@@ -72,7 +72,7 @@ class Grid:
         return x + self.n.x * (y + self.n.y * z)
 
     def row(self, p: mi.Point3f, k: mi.UInt32, active) -> tuple[mi.UInt32, mi.UInt32]:
-        """From where to where in the list is row ``k`` of 4 of the cells near ``p``; nothing if ``p`` is far off."""
+        """The start and end in the list of row ``k`` of 4 of the cells near ``p``; nothing if ``p`` is far off."""
         near = [(q - o) * self.rate - 0.5 for q, o in zip(p, self.low, strict=True)]
         for f, n in zip(near, self.n, strict=True):
             active = active & (f >= 0) & (f < n - 1)
@@ -93,10 +93,10 @@ class Grid:
         return self.rows((none, none + 4), lambda k: p, nearer, active, visit, state)
 
     def along(self, ray: mi.Ray3f, length: mi.Float, radius2: mi.Float, active: mi.Bool, visit, state: tuple) -> tuple:
-        """The same for the points nearer than that to a piece of a ray, each where it is beside the ray, not its ends.
+        """As ``each()``, for points nearer than the radius to a piece of a ray, beside it and not past its ends.
 
         The piece is cut into parts so short that two cells along each axis hold what is near to one. Each point is
-        beside one part alone.
+        beside only one part.
         """
         # What is near to the part is in the ball about its middle with half an edge for a radius; half of that length:
         half = dr.sqrt(dr.maximum(0.25 * dr.square(self.edge) - radius2, 0))

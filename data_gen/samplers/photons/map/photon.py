@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 
-# Photons on surfaces that face another way, by more than about 45 degrees, are those of another surface.
+# Photons on surfaces that face another way, by more than about 45 degrees, belong to another surface.
 NORMAL_COSINE = 0.7
 
 
@@ -33,7 +33,7 @@ def is_near(photon: Photon, x: mi.SurfaceInteraction3f, radius2: mi.Float) -> mi
 
 
 def faces(photon: Photon, x: mi.SurfaceInteraction3f) -> mi.Bool:
-    """Whether a photon lies on a surface that faces the same way as that of ``x``."""
+    """Whether a photon lies on a surface that faces the same way as the surface at ``x``."""
     return dr.dot(photon.n, x.n) > NORMAL_COSINE
 
 

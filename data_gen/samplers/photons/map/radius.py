@@ -35,7 +35,7 @@ def pixel_width(scene: mi.Scene, sensor: mi.Sensor) -> float:
     camera = CameraSamples(sensor, 0, 1)
     ray, _, _ = camera.rays()
     depth = features(scene, camera.sensor, camera.random.clone(), ray)["depth"]
-    # Of a perspective camera Mitsuba 3.9 begins the neighbour's ray where this one begins, on the near plane.
+    # With a perspective camera Mitsuba 3.9 begins the neighbour's ray where this one begins, on the near plane.
     fans = dr.squared_norm(ray.d_x - ray.d) > 0
     aside = dr.select(fans, dr.norm(ray.d_x - ray.d) * depth, dr.norm(ray.o_x - ray.o))
     dr.eval(depth, aside)

@@ -3,8 +3,8 @@
 So vertices lie in the map by path, then by bounce: the same seed gives the same map. (Places handed out by a counter
 would come in the order of threads.) Places that a path does not need stay empty, their edges have the length 0.
 
-In media, vertices are where light scatters, too. Their normal is 0, and their power that which is scattered there: the
-sum of it over a volume is σs times the light that goes through, so a camera path brings its transmittance alone.
+In media, vertices are also where light scatters. Their normal is 0, and their power is the power scattered there. Its
+sum over a volume is σs times the light that goes through, so a camera path contributes only its transmittance.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from data_gen.samplers.photons.map.vertices import at, put, vertices_class
 VERTICES_PER_PATH = 8
 # Bytes of a vertex: 22 words of a record, as much again in the map before, and 9 words of a grid that is made.
 VERTEX_BYTES = (22 + 22 + 9) * 4
-# And those of an edge, twice
+# And bytes of an edge, twice
 EDGE_BYTES = 12 * 4 * 2
 # Bytes of a light path beside that: rays, throughput and random numbers, twice, and its start.
 PATH_BYTES = 512
@@ -60,7 +60,7 @@ def trace(
     """One light path for each lane of ``random``, of at most ``max_depth`` edges, as maps of vertices.
 
     Light is gathered at materials that are connectable, and within the media of the world's fog. A map has
-    VERTICES_PER_PATH places for each path; further maps are of those paths alone that go on, and begin with their last
+    VERTICES_PER_PATH places for each path. Further maps hold only the paths that go on, and begin with their last
     vertex, as parent. ``frozen`` calls the functions that make kernels; with ``edges`` maps have those, too. Returns
     the light's end of all paths, and the maps.
     """
@@ -155,7 +155,7 @@ def _walk(world: World, paths: Paths, random, depths: tuple, photons, places: tu
             if dr.hint(nulls is not None, mode="scalar"):
                 around |= {"key": nulls.key, "nulls": nulls.n, "N_c": nulls.N_c}
             if dr.hint(nulls is not None and keeps_edges, mode="scalar"):
-                # Of edges that lead to nothing as well
+                # Also for edges that lead to nothing
                 _enter(photons, {"key": nulls.key, "nulls": nulls.n}, place, alive)
         else:
             hit = scene.ray_intersect_preliminary(ray, active=alive)
@@ -196,7 +196,7 @@ def _walk(world: World, paths: Paths, random, depths: tuple, photons, places: tu
             medium = where.toward(si, ray.d)
 
         # ------------------ Whether the path goes on ----------------------
-        # By what is left of the light that the path began with
+        # Russian roulette by what is left of the light that the path began with
         survival = roulette(dr.max(β) * brightest, bounce >= rr_depth)
         alive = exists & (sample.pdf > 0) & (dr.max(β) > 0) & dr.isfinite(dr.sum(β)) & (u_survival < survival)
         β = β / survival

@@ -14,7 +14,10 @@ from data_gen.paths import media
 
 @cache
 def vertices_class(variant: str, in_media: bool = False, grids: bool = False, edges: bool = False) -> type:
-    """Of a map: Mitsuba's types belong to a variant. Of a scene with media, with grids among them; with ``edges``."""
+    """The class of a map's vertices, for a scene ``in_media``, with ``grids`` among them, and with ``edges``.
+
+    Mitsuba's types belong to a variant.
+    """
 
     @dataclass
     class Vertices:
@@ -26,7 +29,7 @@ def vertices_class(variant: str, in_media: bool = False, grids: bool = False, ed
         β: mi.Spectrum  # its power, times the number of light paths
         density: mi.Float  # with which d was sampled at the parent: infinite by a mirror or alike; 0 at a first vertex
         survival: mi.Float  # the probability to survive Russian roulette at the parent
-        depth: mi.UInt32  # edges from the light; 0 where nothing is gathered: the vertex is a parent alone
+        depth: mi.UInt32  # edges from the light; 0 where nothing is gathered: the vertex is only a parent
         parent: mi.UInt32  # its place in the map; of a first vertex, the number of its light path
         t: mi.Float  # the length of the edge from there
         prim_uv: mi.Point2f
@@ -96,7 +99,7 @@ def _met(photons, index: mi.UInt32, active) -> tuple[mi.Ray3f, mi.PreliminaryInt
     for name in ("t", "prim_uv", "prim_index", "shape", "instance"):
         value = getattr(photons, name)
         setattr(hit, name, dr.gather(type(value), value, index, active))
-    # Not told by any other field: without it the vertex would be void.
+    # No other field says so: without this the vertex would be void.
     hit.valid = mi.Bool(active)
     p, d = dr.gather(mi.Point3f, photons.p, index, active), dr.gather(mi.Vector3f, photons.d, index, active)
     return mi.Ray3f(p - d * hit.t, d), hit
@@ -119,6 +122,6 @@ def put(photons, vertex, place: mi.UInt32, active) -> None:
 
 
 def at(some: Any, index: mi.UInt32) -> Any:
-    """Of a record of arrays, some of which may be None, what is in these places."""
+    """The entries at these places of a record of arrays; some arrays may be None."""
     values = (getattr(some, f.name) for f in fields(some))
     return type(some)(*(None if value is None else dr.gather(type(value), value, index) for value in values))

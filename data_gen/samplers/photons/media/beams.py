@@ -14,8 +14,8 @@ T_c(s).
 In media whose density varies a beam goes by the null collisions of its edge up to where the light path scatters: it
 comes so far with the probability T. There Φ is without σs, which is taken where the ray is nearest.
 
-Beams are cut into parts, which lie in the ``Grid`` by their middles. Where a beam and a ray are nearest to each other,
-there is one part alone.
+Beams are cut into parts, which lie in the ``Grid`` by their middles. Only one part contains the point where a beam and
+a ray are nearest to each other.
 
 [Jarosz et al. 2011, "A Comprehensive Theory of Volumetric Radiance Estimation Using Photon Points and Beams", the beam
 x beam estimate with a one-dimensional blur; the radius: radius.py]
@@ -43,16 +43,16 @@ from data_gen.samplers.photons.surfaces.ppm import Gathering
 
 # Radii in the length of a part: shorter ones are more to enter, longer ones more that is near to no ray.
 PART = 6
-# Parts that are in memory together, for each light path; and the bytes of one, with those of the grid.
+# Parts that are in memory together, for each light path; and the bytes of one, including the grid's.
 PARTS = 32
 PART_BYTES = (18 + 9) * 4
-# Of a light path with its edges
+# Bytes of a light path with its edges
 BEAM_BYTES = MEDIA_MAP_BYTES + VERTICES_PER_PATH * EDGE_BYTES
 
 
 @cache
 def parts_class(variant: str) -> type:
-    """Of beams; Mitsuba's types belong to a variant."""
+    """The class of beams' parts; Mitsuba's types belong to a variant."""
 
     @dataclass
     class Parts:
@@ -66,7 +66,7 @@ def parts_class(variant: str) -> type:
         Φ: mi.Spectrum  # at the middle, times σs but in scenes with grids
         σ: mi.Spectrum  # by which it falls along the beam
         medium: mi.MediumPtr
-        depth: mi.UInt32  # edges from the light, that of the beam included
+        depth: mi.UInt32  # edges from the light, including the beam's edge
         edge: mi.UInt32  # its place in the map
 
         def __len__(self) -> int:
@@ -79,8 +79,8 @@ def parts_class(variant: str) -> type:
 def cut(world: World, edges, rate: mi.Float, first: mi.UInt32, window: tuple, parts: Any) -> mi.UInt32:
     """How many parts the ``edges`` of light paths have, ``rate`` of them in a unit of length.
 
-    Those of an edge are numbered from ``first`` on. The parts in the ``window`` (low, size) are entered into the arrays
-    ``parts``, unless these are None.
+    The parts of an edge are numbered from ``first`` on. The parts in the ``window`` (low, size) are entered into the
+    arrays ``parts``, unless these are None.
     """
     scene, fog, (low, size) = world.scene, world.fog, window
     ray, medium = mi.Ray3f(edges.o, edges.e), mi.MediumPtr(edges.begins)  # a piece, and what it goes through
@@ -191,7 +191,7 @@ class AlongBeams:
     def light(self, ray, length, medium: mi.MediumPtr, σ: mi.Spectrum, depth: mi.UInt32, active) -> mi.Spectrum:
         """Σ of the beams beside a piece of a ray through one ``medium``, of paths that are not too long.
 
-        ``depth`` is the number of the segment, T(t) that of the piece alone.
+        ``depth`` is the number of the segment; T(t) is of the piece only.
         """
         parts, longest = self.parts, self.max_depth - depth
         phase, seen = medium.phase_function(), seen_along(ray, medium)
@@ -214,10 +214,10 @@ class AlongBeams:
 
 
 def nearest(o, d, p, e) -> tuple:
-    """Of the lines through ``o`` along ``d`` and through ``p`` along ``e``, unit vectors, where they are nearest.
+    """Where two lines are nearest: through ``o`` along ``d``, and through ``p`` along ``e``, unit vectors.
 
     Returns the distances from p, and from o, how far the lines are apart, and the sine of their angle. Where they are
-    parallel nothing of it is finite.
+    parallel no value is finite.
     """
     n, to, cos = dr.cross(d, e), p - o, dr.dot(d, e)
     sin2 = dr.squared_norm(n)
@@ -229,7 +229,7 @@ def nearest(o, d, p, e) -> tuple:
 class BEAMS(BRE):
     """Progressive photon beams in media, and photons on surfaces; no gradients.
 
-    Plugin ``beams``. Parameters and what is not handled are those of ``vpm``. Biased, and consistent; in media the
+    Plugin ``beams``. Parameters and what is not handled: as for ``vpm``. Biased, and consistent; in media the
     ``radius`` shrinks faster.
     """
 

@@ -37,7 +37,7 @@ from data_gen.samplers.photons.map.vertices import in_media
 from data_gen.samplers.photons.passes import Passes, Start
 from data_gen.samplers.photons.surfaces.ppm import PPM, Gathering
 
-# Of the grid, what is gathered within one radius of a ray: in parts 3 radii long, each in a ball of this many radii.
+# Points of the grid within one radius of a ray are gathered in parts 3 radii long, each in a ball of this many radii.
 BALL = np.sqrt(1 + 1.5**2)
 
 
@@ -65,7 +65,7 @@ class AlongRays:
     def light(self, ray, length, medium: mi.MediumPtr, σ: mi.Spectrum, depth: mi.UInt32, active) -> mi.Spectrum:
         """Σ of the photons beside a piece of a ray through one ``medium``, of paths that are not too long.
 
-        ``depth`` is the number of the segment, T that of the piece alone.
+        ``depth`` is the number of the segment; T is of the piece only.
         """
         photons, longest = self.photons, self.max_depth - depth
         phase = medium.phase_function()
@@ -117,7 +117,7 @@ class Along:
 class BRE(PPM):
     """Progressive photon mapping by the beam radiance estimate in media, and on surfaces; no gradients.
 
-    Plugin ``bre``. Parameters, bias and what is not handled are those of ``vpm``.
+    Plugin ``bre``. Parameters, bias and what is not handled: as for ``vpm``.
     """
 
     follows, map_bytes = "volpath", MEDIA_MAP_BYTES
@@ -144,7 +144,7 @@ def by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, em
     β, η = mi.Spectrum(importance), mi.Float(1)  # throughput, and the relative index of refraction, of the piece
     depth = mi.UInt32(1)  # the number of the segment that it is of
     sky, active = Sky.from_camera(limits.hide_emitters), mi.Bool(True)
-    # Of scenes with grids: whether the path has come through one, and goes on behind a null collision
+    # In scenes with grids: whether the path has come through one, and goes on behind a null collision
     grids, behind, skips = fog.media.grids, mi.Bool(False), mi.Bool(False)
     if dr.hint(grids, mode="scalar"):
         channel = media.choose_channel(random.next_1d())

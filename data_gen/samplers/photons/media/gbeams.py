@@ -1,13 +1,13 @@
 r"""Gradients of photon beams: ``beams``, and each beam that is gathered shifted to four neighbours.
 
-    A, B        a piece of a camera path's ray through a medium, and that of the neighbouring pixel's path
+    A, B        pieces of rays through a medium, of a camera path and of the neighbouring pixel's path
     s, t, u     distances along a beam and along A to where both are nearest, and how far they are apart there, signed
     a           where the beam begins, a vertex of its light path or the point of a lamp
     C, C'       of a beam and its copy, both with the density of the beam's path: see ``beams``
     J           dω'/dω = (sin θ' / sin θ) (s / s')² of the directions at a, θ: between beam and ray
     r           p' J / p of the copy, T_c among the densities
 
-A beam that is near to both rays is its own copy. One that is near to A alone turns about a: it passes B at the same
+A beam that is near to both rays is its own copy. One that is near only to A turns about a: it passes B at the same
 distance t, on the other side, at -u. So A, which it passes about as far off as the beam passes B, is not near.
 
 [Gruson et al. 2018, "Gradient-Domain Volumetric Photon Density Estimation", section 5.2]
@@ -67,7 +67,7 @@ class Meeting:
 
 @dataclass
 class Beam:
-    """A beam, of which a ``part`` is near to a ray; p of its line is the middle of that."""
+    """A beam whose ``part`` is near to a ray; p of its line is the middle of the part."""
 
     line: Line
     part: Any  # ``beams.parts_class``
@@ -176,7 +176,7 @@ def turned(world: World, paths: LightPaths, beam: Beam, A: Beside, B: Beside, ra
 class GBEAMS(GPM):
     """Gradients of photon beams in homogeneous media, and of photons on surfaces.
 
-    Plugin ``gbeams``. Parameters are those of ``gpm``; bias and what is not handled are those of ``beams``.
+    Plugin ``gbeams``. Parameters: as for ``gpm``. Bias and what is not handled: as for ``beams``.
     """
 
     follows, walk, edges, pairs = "volpath", PathsByPieces, True, PAIRS

@@ -1,18 +1,18 @@
 r"""Gradients of the beam radiance estimate: ``bre``, and each photon that is gathered shifted to four neighbours.
 
-    A, B        a piece of a camera path's ray through a medium, and that of the neighbouring pixel's path
+    A, B        pieces of rays through a medium, of a camera path and of the neighbouring pixel's path
     b, b'       a photon beside A and its copy beside B: light path and camera path together make the path and its copy
     t, t'       the distances along A and B to where they are
     C, C'       β T(t) f Φ / (π r² N) of either, both with the density of the photon's path
     r           p' J / p of the copy
     Δ           gradient sample, the sum of 2 w (C' - C) over all photons, w = 1 / (1 + r)
 
-A photon that is beside both is its own copy: r = 1, and no ray is traced. One that is beside A alone keeps its distance
+A photon that is beside both is its own copy: r = 1, and no ray is traced. One that is beside only A keeps its distance
 along the ray, and goes to its mirror image beside B: there A is further away than the radius. Between two rays from one
-point that is a reflection, which maps what is beside A alone to what is beside B alone. The photon's predecessor stays,
+point this is a reflection, which maps what is beside only A to what is beside only B. The photon's predecessor stays,
 and a new edge is made from there: see ``shift`` and ``copies``.
 
-Camera paths are shifted by replay, see ``camera_in_media``. Photons on surfaces are those of ``gpm``.
+Camera paths are shifted by replay, see ``camera_in_media``. Photons on surfaces are as in ``gpm``.
 
 [Gruson et al. 2018, "Gradient-Domain Volumetric Photon Density Estimation", section 5.1]
 """
@@ -40,7 +40,7 @@ from data_gen.samplers.photons.media.bre import BALL, seen_along
 from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.photons.surfaces.gpm import GPM, OnSurfaces
 
-# Of a camera sample beside pairs: levels of five pieces of paths, what they end at, and as many sums
+# Bytes of a camera sample beside pairs: levels of five pieces of paths, what they end at, and as many sums
 PATHS_BYTES = 4096
 
 
@@ -69,7 +69,7 @@ class Beside:
         return t < self.length
 
     def image(self, p: mi.Point3f, other: Beside) -> mi.Point3f:
-        """The place of the copy beside the ``other`` of a photon that is near to this ray alone."""
+        """Where a photon that is near only to this ray has its copy, beside the ``other`` ray."""
         t = dr.dot(p - self.o, self.d)
         return shift.moved(p, self.at(t), self.d, other.at(t), other.d)
 
@@ -161,7 +161,7 @@ class AlongPieces(InMedia):
 class GBRE(GPM):
     """Gradients of the beam radiance estimate in homogeneous media, and of photons on surfaces.
 
-    Plugin ``gbre``. Parameters are those of ``gpm``; bias and what is not handled are those of ``bre``.
+    Plugin ``gbre``. Parameters: as for ``gpm``. Bias and what is not handled: as for ``bre``.
     """
 
     follows, walk, map_bytes = "volpath", PathsByPieces, MEDIA_MAP_BYTES

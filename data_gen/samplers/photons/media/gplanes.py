@@ -1,7 +1,7 @@
 r"""Gradients of photon planes: ``planes``, and each plane that a camera ray meets shifted to four neighbours.
 
-    A, B        a piece of a camera path's ray through a medium, along w, and that of the neighbouring pixel's path
-    a, d, e     a plane: where the edge enters the medium, its direction, and that of the scattered light
+    A, B        pieces of rays through a medium: A of a camera path, along w; B of the neighbouring pixel's path
+    a, d, e     a plane: where the edge enters the medium, its direction, and the direction of the scattered light
     s, t, u     distances on the edge, from there to the point of the plane that is on A, and along A
     e', s', t'  of the copy, whose point on B is as far along B: u' = u
     C, C'       of the plane and its copy, both with the density of the plane's path: see ``planes``
@@ -65,7 +65,7 @@ class RaysAcrossPlanes:
 
 @dataclass
 class NearPlanes:
-    """``Near``: the planes of a map, each of which may be met by each ray: no grid, no radius."""
+    """``Near``: the planes of a map. Each ray may meet each plane: there is no grid and no radius."""
 
     planes: AcrossPlanes
     grid: None = None
@@ -121,7 +121,7 @@ def copied(plane, at: Crossing, B: Beside) -> tuple:
 class GPLANES(GBEAMS):
     """Gradients of photon planes in homogeneous media, and of beams and photons on surfaces.
 
-    Plugin ``gplanes``. Parameters are those of ``gpm``, and ``planes``; see there for bias and what is not handled.
+    Plugin ``gplanes``. Parameters: as for ``gpm``, and ``planes``; see there for bias and what is not handled.
     """
 
     map_bytes = GBEAMS.map_bytes + VERTICES_PER_PATH * PLANE_BYTES

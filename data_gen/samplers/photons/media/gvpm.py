@@ -6,12 +6,12 @@ r"""Gradients of photons in media: ``vpm``, and each photon that is gathered shi
     r           p' J / p of the copy
     Δ           gradient sample, the sum of 2 w (C' - C) over all photons, w = 1 / (1 + r)
 
-A photon in both balls is its own copy: r = 1, and no ray is traced. One in that around x alone goes to its mirror image
-in the plane between x and y, which is in the ball around y alone. (Gruson et al. call both together the mixed shift.)
-The photon's predecessor stays, and a new edge is made from there: see ``shift`` and ``copies``.
+A photon in both balls is its own copy: r = 1, and no ray is traced. A photon only in the ball around x goes to its
+mirror image in the plane between x and y, which is only in the ball around y. (Gruson et al. call both together the
+mixed shift.) The photon's predecessor stays, and a new edge is made from there: see ``shift`` and ``copies``.
 
-Camera paths are shifted by replay, distances included, see ``camera_segments``. Where one path scatters in a medium
-and the other meets a surface, no photon has a copy. Photons on surfaces are those of ``gpm``.
+Camera paths are shifted by replay, distances included, see ``camera_segments``. Where one path scatters in a medium and
+the other meets a surface, no photon has a copy. Photons on surfaces are as in ``gpm``.
 
 [Gruson et al. 2018, "Gradient-Domain Volumetric Photon Density Estimation", section 4]
 """
@@ -62,7 +62,7 @@ class InBall:
         return self.alive
 
     def image(self, p: mi.Point3f, other: InBall) -> mi.Point3f:
-        """The place of the copy near to the ``other`` of a photon that is near to this one alone."""
+        """Where a photon that is near only to this vertex has its copy, near to the ``other``."""
         return shift.image(p, self.p, other.p)
 
     def light(self, photon: Photon, distance2: mi.Float, active: mi.Bool) -> mi.Spectrum:
@@ -104,7 +104,7 @@ class InBalls(InMedia):
 class GVPM(GPM):
     """Gradients of photons in media and on surfaces.
 
-    Plugin ``gvpm``. Parameters are those of ``gpm``; bias and what is not handled are those of ``vpm``.
+    Plugin ``gvpm``. Parameters: as for ``gpm``. Bias and what is not handled: as for ``vpm``.
     """
 
     follows, walk, map_bytes = "volpath", PathsBySegments, MEDIA_MAP_BYTES

@@ -12,8 +12,8 @@ ray: of three integrals over a point in space nothing is left to blur. So this p
 paths that scatter in the medium, as 1 - T_c(S) of them do, stand for all distances at which they might have done so. A
 shadow ray says whether anything is between the edge and x.
 
-The light that comes to x straight from a lamp or a surface is swept by one edge alone: it is that of ``beams``, blurred
-in one dimension. Each path of light is found in one way.
+Only one edge sweeps the light that comes to x straight from a lamp or a surface: this light is left to ``beams``,
+blurred in one dimension. Each path of light is found in one way.
 
 Each ray is crossed with each plane, since a plane is as large as its medium. So few light paths are swept: ``planes``
 of a map, however many pixels there are.
@@ -40,13 +40,13 @@ from data_gen.samplers.photons.media.beams import BEAMS
 from data_gen.samplers.photons.media.bre import Along, seen_along
 from data_gen.samplers.photons.passes import Passes
 
-# Of a plane, and of the edge of a map that it may be swept from
+# Bytes of a plane, and of the edge of a map that it may be swept from
 PLANE_BYTES = (18 + 3) * 4
 
 
 @cache
 def planes_class(variant: str) -> type:
-    """Of a map; Mitsuba's types belong to a variant."""
+    """The class of a map's planes; Mitsuba's types belong to a variant."""
 
     @dataclass
     class Planes:
@@ -59,7 +59,7 @@ def planes_class(variant: str) -> type:
         Φ: mi.Spectrum  # over (1 - T_c(S)) N
         σ: mi.Spectrum
         medium: mi.MediumPtr
-        depth: mi.UInt32  # edges from the light, those of the plane included
+        depth: mi.UInt32  # edges from the light, including the plane's edges
 
         def __len__(self) -> int:
             return dr.width(self.length)
@@ -78,7 +78,7 @@ class Crossing:
 
 
 def crossing(a, d, e, o, w) -> Crossing:
-    """That of the line from ``o``; nothing of it is finite where the line is parallel to the plane."""
+    """Where the line from ``o`` crosses the plane; no value is finite where the line is parallel to the plane."""
     to, across = o - a, dr.cross(e, w)
     volume = dr.dot(d, across)
     n = dr.cross(d, e)
@@ -97,7 +97,7 @@ class AcrossPlanes:
     def light(self, ray, length, medium: mi.MediumPtr, σ: mi.Spectrum, depth: mi.UInt32, active) -> mi.Spectrum:
         """Σ of the planes that a piece of a ray through one ``medium`` meets, of paths that are not too long.
 
-        ``depth`` is the number of the segment, T(u) that of the piece alone.
+        ``depth`` is the number of the segment; T(u) is of the piece only.
         """
         longest = self.max_depth - depth
         seen, scattering = seen_along(ray, medium), scattered_of(medium, ray, active)
@@ -159,7 +159,7 @@ def after_scattering(photons) -> mi.Bool:
 
 
 def only_beams(traced: Traced) -> Traced:
-    """The map, whose edges are those alone that no plane ends with."""
+    """The map with only the edges that no plane ends with."""
     photons = traced.photons
     others = replace(photons, bounce=dr.select(after_scattering(photons), 0, photons.bounce))
     dr.eval(others.bounce)
@@ -167,7 +167,7 @@ def only_beams(traced: Traced) -> Traced:
 
 
 def planes_of(passes: Passes, traced: Traced) -> AcrossPlanes:
-    """Those of some light paths of a map; and one that nothing meets if there is none.
+    """The planes of some light paths of a map; if there is none, one that nothing meets.
 
     Paths are as good as each other, so every k-th stands for k. Further maps are of fewer paths.
     """
@@ -212,7 +212,7 @@ def swept(scene, photons, edges: mi.UInt32, weight: mi.Float):
 class PLANES(BEAMS):
     """Photon planes for light scattered in homogeneous media twice or more, beams and photons for the rest.
 
-    Plugin ``planes``, without gradients. Parameters, and what is not handled, are those of ``beams``, and
+    Plugin ``planes``, without gradients. Parameters, and what is not handled: as for ``beams``, and
 
     ``planes``  64, light paths of a map that are swept, whatever the number of pixels
 

@@ -87,7 +87,7 @@ class InBoth:
 class VPM(PPM):
     """Progressive photon mapping in media and on surfaces; no gradients.
 
-    Plugin ``vpm``. Parameters are those of ``ppm``; the ``radius`` of the first pass is that of photons in media, too.
+    Plugin ``vpm``. Parameters: as for ``ppm``; the ``radius`` of the first pass is also used for photons in media.
 
     Biased, and consistent: the mean over passes converges to the image of ``volpath``.
 

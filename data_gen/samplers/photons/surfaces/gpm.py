@@ -1,6 +1,6 @@
 r"""Gradient-domain photon mapping on surfaces: ``ppm``, and each photon that is gathered shifted to four neighbours.
 
-    x, y        the vertex of a camera path where photons are gathered, and that of the neighbouring pixel's path
+    x, y        where photons are gathered: the vertices of a camera path and of the neighbouring pixel's path
     b, b'       a photon and its copy: light path and camera path together make the path, and its copy
     C, C'       f β Φ / (π r² N) of either, both with the density of the photon's path
     r           p' J / p of the copy
@@ -40,7 +40,7 @@ from data_gen.samplers.photons.map.photon import Photon, is_near, light, photon_
 from data_gen.samplers.photons.map.vertices import on_surfaces
 from data_gen.samplers.photons.passes import Passes
 
-# Of a camera sample beside that: levels of five paths with their rays, hits and throughputs, and as many sums
+# Bytes of a camera sample beside that: levels of five paths with their rays, hits and throughputs, and as many sums
 PATHS_BYTES = 3072
 
 
@@ -117,7 +117,7 @@ def fields_of(path: Path, index: mi.UInt32) -> tuple:
 class GPM(PhotonIntegrator):
     """Gradient-domain photon mapping on surfaces.
 
-    Plugin ``gpm``. Parameters are those of ``ppm``, and
+    Plugin ``gpm``. Parameters: as for ``ppm``, and
 
     ``diagnostics``  false; true adds the layer ``shift_failures``, the share in [0, 1] of the photons gathered at a
                      pixel that have no copy

@@ -11,8 +11,8 @@ a radius of the point that the camera path meets. That blurs the light over the 
     β           throughput of the camera path
 
 A camera path goes on by mirrors, glass, sharp gloss and holes. It ends where light is scattered smoothly by a material
-that scatters widely. All light that is scattered there comes from photons, that of lamps seen from there included;
-emission that the camera path meets on its way counts as it is. So each path of light is found in one way alone.
+that scatters widely. All light that is scattered there comes from photons, including light of lamps seen from there.
+Emission that the camera path meets on its way counts as it is. So each path of light is found in only one way.
 
 [Hachisuka et al. 2008, "Progressive Photon Mapping"; Knaus and Zwicker 2011, radius.py]
 """

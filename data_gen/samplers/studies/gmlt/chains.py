@@ -84,10 +84,10 @@ def run(
 ) -> mi.Float:
     """Runs chains of so many ``steps``; returns the share of mutations that each has accepted.
 
-    They begin with the paths of the lanes ``start``, of all those of the ``camera``, whose ``layers`` and values ``f``
-    are known. A state of value f counts ``scale(f)`` for each step that a chain is expected to be there: the state it
-    is at and the one proposed are both splatted, whatever is accepted. [Veach and Guibas 1997, "Metropolis Light
-    Transport", section 5.1]
+    They begin with the paths of the lanes ``start``, among all paths of the ``camera``, whose ``layers`` and values
+    ``f`` are known. A state of value f counts ``scale(f)`` for each step that a chain is expected to be there: the
+    current state and the proposed one are both splatted, whatever is accepted. [Veach and Guibas 1997, "Metropolis
+    Light Transport", section 5.1]
     """
     splats = {name: film.splats(name) for name in layers}
 
@@ -97,7 +97,7 @@ def run(
             splats[name].add(state.pixel, list(light * counts), dr.max(dr.abs(light)) * counts > 0)
 
     def step(i: mi.UInt32, old: State):
-        # Drawn before the numbers of the path, of which there are more for some paths than for others.
+        # Drawn before the numbers of the path, since some paths draw more of them than others.
         random = stream(keys, i)
         large, u = random.next_float32() < LARGE_STEPS, random.next_float32()
         proposal = Proposal(old.vector, mi.PCG32(random), large, mi.UInt32(0))
@@ -106,7 +106,7 @@ def run(
         f = value_of(layers)
         a = acceptance(old.f, f)
         accepted = u < a
-        # Of the two states one is left for good: what it has to splat is known.
+        # One of the two states is left for good: what it has to splat is known.
         new = State(None, pixel, layers, f, a, old.accepted + 1)
         stays = State(None, old.pixel, old.layers, old.f, old.weight + 1 - a, old.accepted)
         splat(dr.select(accepted, stays, new))

@@ -16,7 +16,7 @@ is dim comes from candidates, evenly, and what is bright from chains. No path co
 are no fireflies. b0 is the same in all passes, whatever they find, so that both weights of a path sum to one.
 
 Chains begin at candidates chosen in proportion to f, and count b̂: that is unbiased, however short they are. Passes are
-independent of each other: variances over passes are those of the noise.
+independent of each other, so variances over passes are variances of the noise.
 
 [Lehtinen et al. 2013, "Gradient-Domain Metropolis Light Transport"; Kelemen et al. 2002; Veach and Guibas 1997,
 "Metropolis Light Transport", section 5.1; survey, section 6.2]

@@ -12,7 +12,7 @@ import mitsuba as mi
 
 # Small steps are from the one to the other, of the range of a number; their logarithms are uniform.
 SMALLEST, LARGEST = 1 / 1024, 1 / 64
-# Numbers that a chain remembers: 6 of the camera, then 6 for each vertex. Those beyond are new in each mutation.
+# Numbers that a chain remembers: 6 of the camera, then 6 for each vertex. Further numbers are new in each mutation.
 REMEMBERED = 6 + 8 * 6
 
 
@@ -26,7 +26,7 @@ def small_step(x: mi.Float, u: mi.Float) -> mi.Float:
     step = LARGEST * dr.exp(u * dr.log(SMALLEST / LARGEST))
     x = x + dr.select(left, -step, step)
     x -= dr.floor(x)
-    # Of a number just below 0, rounded.
+    # 1 results from a number just below 0, rounded.
     return dr.select(x < 1, x, 0)
 
 
@@ -39,7 +39,7 @@ def acceptance(f: mi.Float, proposed: mi.Float) -> mi.Float:
 class Proposal:
     """The numbers of a mutation, one after the other; instead of a sampler.
 
-    ``vector``  those of the chain's state, a ``dr.Local``
+    ``vector``  the numbers of the chain's state, a ``dr.Local``
     ``random``  one number for each of them
     ``large``   all numbers are new, independent of the state's
     """

@@ -14,7 +14,7 @@ SELLMEIER = {
     "n-bk7": ((1.03961212, 0.231792344, 1.01046945), (0.00600069867, 0.0200179144, 103.560653)),
     "n-sf11": ((1.73759695, 0.313747346, 1.89878101), (0.013188707, 0.0623068142, 155.23629)),
 }
-# Of sodium, in nm: what a single index stands for
+# The wavelength of sodium light, in nm: what a single index stands for
 SODIUM = 589.3
 
 
@@ -39,7 +39,7 @@ def _glass_class(variant: str) -> type:
 
         A ray goes the way of its first wavelength. So images are right where all wavelengths of a ray are one, as
         ``data_gen.samplers.studies.spectral.render`` has them; elsewhere the others lose their way, but no light. In
-        variants without wavelengths the index is that of sodium light.
+        variants without wavelengths the index is for sodium light.
         """
 
         def __init__(self, props):

@@ -1,10 +1,10 @@
 """Images by bins of wavelengths, and differences between neighbouring bins.
 
 A base path has one wavelength. Its offset path has the same random numbers and the wavelength one bin further, so both
-differ where glass disperses, and in colours. The difference of their light is that of the two bins, without bias: the
-replay of random numbers has no Jacobian. As in ``gpt-basic``, for any integrator of Mitsuba that knows no wavelengths
-of its own. [Petitjean, Bauszat and Eisemann 2018, "Spectral gradient sampling for path tracing"; survey, section 7.3.
-They copy half vectors instead.]
+differ where glass disperses, and in colours. Their difference estimates the difference of the two bins, without bias:
+the replay of random numbers has no Jacobian. As in ``gpt-basic``, for any integrator of Mitsuba that knows no
+wavelengths of its own. [Petitjean, Bauszat and Eisemann 2018, "Spectral gradient sampling for path tracing"; survey,
+section 7.3. They copy half vectors instead.]
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Spectra:
 def render_spectra(scene: mi.Scene, bins: int, samples: int, seed: int = 0, steps: bool = True) -> Spectra:
     """``samples`` base paths for each bin of each pixel, at least 2; with ``steps`` an offset path each.
 
-    Radiance is that of the scene's own integrator, in its spectral units. Raises NgptError without a spectral variant.
+    Radiance is from the scene's own integrator, in its spectral units. Raises NgptError without a spectral variant.
     """
     if not mi.is_spectral or mi.is_polarized:
         raise NgptError(f"variant '{mi.variant()}' has no spectra to render; use 'llvm_ad_spectral'")
