@@ -12,8 +12,8 @@ ray: of three integrals over a point in space nothing is left to blur. So this p
 paths that scatter in the medium, as 1 - T_c(S) of them do, stand for all distances at which they might have done so. A
 shadow ray says whether anything is between the edge and x.
 
-Only one edge sweeps the light that comes to x straight from a lamp or a surface: this light is left to ``beams``,
-blurred in one dimension. Each path of light is found in one way.
+Only one edge sweeps the light that comes to x straight from a lamp or a surface. This light is gathered as in
+``beams``, blurred in one dimension. Each path of light is found in one way.
 
 Each ray is crossed with each plane, since a plane is as large as its medium. So few light paths are swept: ``planes``
 of a map, however many pixels there are.
