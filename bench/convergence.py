@@ -85,7 +85,7 @@ def slope(counts: list[int], errors: list[float]) -> float:
 
 
 def picture(rows: list[dict], counts: list[int]) -> str:
-    """Errors of `primal` over those of pixels with independent points at one sample, geometric means over scenes."""
+    """Errors of `primal` relative to independent points at one sample per pixel, geometric means over scenes."""
     found = {}
     for area in AREAS:
         # Rounds would lie on top of one net; the table has them

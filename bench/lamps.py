@@ -23,7 +23,7 @@ WAYS = {"whole": (0.0, "power"), "place": (np.inf, "power"), "alike": (0.0, "uni
 
 
 def variances(stacks: list) -> dict[str, np.ndarray]:
-    """Of pixels and blocks over seeds, the colours together."""
+    """Variances of pixels and of blocks over seeds, summed over the colour channels."""
     found = {}
     for layer in ("primal", "dx"):
         if layer not in stacks[0].names:

@@ -166,7 +166,7 @@ def written(
 
 
 def measured(files: Sequence[tuple[GradientStack, np.ndarray]], oidn: bool) -> tuple[str, float, float | None, float]:
-    """The method that `auto` took, its error, that of `oidn` if it is there, and that of the input."""
+    """The method that `auto` chose, its error, the error of `oidn` if it is installed, and the error of the input."""
 
     def error(method: str) -> float:
         images = (reconstruct(stack, method).image for stack, _ in files)

@@ -96,7 +96,7 @@ def judge(stacks: list, references: list, method: str) -> list[dict]:
 
 
 def measured(stacks: list, references: list, images: dict[str, list[np.ndarray]]) -> list[dict]:
-    """A row for each list of images; ``references`` are stacks, one alone for a shot at rest."""
+    """A row for each list of images; ``references`` are stacks, a single one for a static shot."""
     truth = [reference["primal"] for reference in references]
     rng = np.random.default_rng(0)
     noise = [np.sqrt(reference["primal_var"]) * rng.standard_normal(truth[0].shape) for reference in references]
