@@ -14,8 +14,9 @@ _IN_ROOMS = 0.9
 def enclosed(scene: mi.Scene) -> bool:
     """Whether nearly all light that reaches what the camera sees comes from other surfaces.
 
-    Rays go through random pixels, and on from where they hit, in proportion to the cosine. Windows without glass count
-    as open. The answer depends on the scene alone: the rays are always the same. It takes .15 processor seconds.
+    Rays go through random pixels, and continue from where they hit in directions sampled by the cosine. Windows without
+    glass count as open. The answer depends only on the scene: the rays are always the same. It takes 0.15 processor
+    seconds.
     """
     random = mi.PCG32(_RAYS)
     sensor = scene.sensors()[0]

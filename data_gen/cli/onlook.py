@@ -21,9 +21,9 @@ _LOAD, _PIXEL = 0.1, 3e-6
 
 
 class Onlookers:
-    """The page and the viewer of a render, those of them that are there; none costs nothing.
+    """The page and the viewer of a render, if there are any; without them it costs nothing.
 
-    ``newest`` is what ``data_gen.render_scene`` calls after each pass, ``progress`` what it tells of it.
+    ``data_gen.render_scene`` calls ``newest`` after each pass, and ``progress`` with the progress.
     """
 
     def __init__(self, page: LivePage | None, viewer: Tev | None, say: Callable[[str], None], unit: str):
@@ -115,7 +115,7 @@ class Onlookers:
 
 
 def onlookers(live: bool, view: str | None, scene: str, command: str, console: Console, unit: str) -> Onlookers:
-    """Those that were asked for, as far as they are there: who is not is told of in a line, and the render goes on."""
+    """The page and viewer that were asked for; a line names each one that is not available, and the render goes on."""
     page = viewer = None
     try:
         viewer = Tev(view, scene) if view else None

@@ -28,7 +28,7 @@ from ngpt.system.console import Console
 from ngpt.system.interrupts import Interrupt
 from ngpt.system.limits import limit_threads
 
-# How many times its time a render takes whose user is told why, where it made no more than so many samples per pixel.
+# A render explains why it was late if it took this many times its time for at most this many samples per pixel.
 _LATE, _FEW = 1.2, 16
 
 
