@@ -133,7 +133,7 @@ class Surroundings:
 
 
 def is_boundary(bsdf: mi.BSDF | mi.BSDFPtr):
-    """Whether the material is that of a boundary of media, which lets all light through."""
+    """Whether the material only bounds media and lets all light through."""
     return bsdf.flags() & int(mi.BSDFFlags.All) == int(mi.BSDFFlags.Null)
 
 
@@ -153,9 +153,9 @@ def grid_rays(sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float) -> View:
-    """A random view that shows something, the more it shows the more likely.
+    """A random view that shows something; views that show more are more likely.
 
-    ``size`` is that of the crop in pixels, ``roll`` the largest angle about the view direction in degrees, ``lens`` the
+    ``size`` is the crop size in pixels, ``roll`` the largest angle about the view direction in degrees, ``lens`` the
     standard deviation of the aperture's radius relative to the distance in focus (0.005 in the paper). Raises NgptError
     when no view can be found.
     """
