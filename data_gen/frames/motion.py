@@ -44,7 +44,7 @@ class Snapshot:
 
 
 def snapshot(scene: mi.Scene, shapes: tuple[Geometry, ...] | None = None) -> Snapshot:
-    """The state of a scene; ``shapes`` where they are known to be those of an earlier snapshot."""
+    """The state of a scene; ``shapes`` of an earlier snapshot, if they are known to be the same."""
     if shapes is None:
         shapes = tuple(geometry(shape) for shape in scene.shapes())
     sensor = scene.sensors()[0]
