@@ -89,10 +89,10 @@ def replay_light(
 def replay_lamp(
     lights: Lights, base, base_weight, chosen: Chosen, x, y: mi.SurfaceInteraction3f, *, lit: mi.Bool
 ) -> tuple[LightSample, mi.Float]:
-    """The same of a lamp ``chosen`` by place at vertex ``x``: the same point on the same lamp, seen from ``y``.
+    """Replays a lamp sample ``chosen`` by place at vertex ``x``: the same point on the same lamp, seen from ``y``.
 
-    Its ``p`` counts the probability P to choose the lamp at ``y``, its ``weight`` that at ``x``. P(y) / P(x), a factor
-    of r, is returned as well.
+    Its ``p`` includes the probability P of choosing the lamp at ``y``, its ``weight`` the probability at ``x``. The
+    ratio P(y) / P(x), a factor of r, is returned as well.
     """
     places = lights.places
 
@@ -140,7 +140,7 @@ def emission(
 def shared_emission(scene, lights: Lights, x1, Le, p, *, x, y, y1, J) -> tuple[mi.Spectrum, mi.Float]:
     """``emission(scene, y1, y, True, True)`` by way of ``Le`` and ``p`` of the same vertex ``x1``, as seen from ``x``.
 
-    ``y1`` is ``x1`` with another incident direction, of which ``J`` is the ratio d'²/d² of squared distances.
+    ``y1`` is ``x1`` with another incident direction; ``J`` is the ratio d'²/d² of the squared distances.
     """
     places = lights.places
     if not lights.shared:
