@@ -50,12 +50,12 @@ def write_frames(
     stop: Callable[[], bool] = lambda: False,
     **options: Any,
 ) -> Written:
-    """Writes the stack of each frame to its file, ``files``: frame -> file, all of the shot in order.
+    """Writes the stack of each frame to its file; ``files`` maps all frames of the shot, in order, to their files.
 
-    With ``denoising`` its image instead, see ``data_gen.outputs``. Only those of the part i of n where ``shard`` is
-    (i, n). ``made`` is called with what is written so far and the number of frames, at first and after each.
-    ``options`` are those of ``render_frames``. Raises NgptError as that does, and for files that exist unless one of
-    ``overwrite`` and ``skip_existing`` says what to do with them.
+    With ``denoising`` it writes images instead of stacks, see ``data_gen.outputs``. With ``shard`` (i, n) it writes
+    only part i of n. ``made`` is called with what is written so far and the number of frames, first and after each
+    frame. ``options`` are as in ``render_frames``. Raises NgptError as ``render_frames`` does, and for files that exist
+    unless ``overwrite`` or ``skip_existing`` says what to do with them.
     """
     number, parts = shard
     # Of frames side by side, each needs the scene of the one before.

@@ -31,8 +31,8 @@ LEAST = 16
 # A record may be so many times as bright as the mean of all so far, or have such a part of their light. What is
 # brighter is cut: one path would make a spot that no denoiser removes.
 MOST, PARTS = 3000, 200
-# The light of the brightest record of the first round, and the brightest that is told from others, in units of sums,
-# both as powers of two
+# The light of the brightest record of the first round, and the brightest light that can be represented, in units of
+# sums, both as powers of two
 _BITS, _MOST_BITS = 30, 40
 
 
@@ -61,11 +61,11 @@ class Known:
 
 
 class Cache:
-    """Sums by cell of so many ``sorts`` of light, which grow, and what is known of them.
+    """Growing sums by cell of so many ``sorts`` of light, and what is known of them.
 
-    The number of a cell's records decides whether it is trusted, and not the light in them. Where light is rare, a cell
-    that has found some looks doubtful, and one that has missed it looks sure. To believe the sure ones alone would lose
-    the light: see docs/samplers/tails.md.
+    The number of a cell's records decides whether the cell is trusted, not the light in them. Where light is rare, a
+    cell that has found some looks uncertain, and a cell that has missed it looks certain. Trusting only the certain
+    cells would lose light: see docs/samplers/tails.md.
     """
 
     def __init__(self, fineness: float, sorts: int = 1):

@@ -103,7 +103,7 @@ def solvers(recipe: Recipe) -> dict[str, Any]:
 
 
 def arrays(recipe: Recipe) -> dict[str, Any]:
-    """``ngpt.denoise`` of tensors that lie there: the result lies there too, and is that of NumPy's arrays."""
+    """``ngpt.denoise`` of tensors on the device: the result is there too, and equals the result of NumPy arrays."""
     import ngpt
 
     torch = _torch(recipe)
@@ -350,7 +350,7 @@ def _largest(difference: np.ndarray, values: np.ndarray) -> float:
 
 
 def _writable(value: Any) -> Any:
-    """The same for JSON, which knows neither NaN nor infinity."""
+    """The value for JSON, which has neither NaN nor infinity."""
     if isinstance(value, dict):
         return {name: _writable(item) for name, item in value.items()}
     if isinstance(value, list):
