@@ -1,4 +1,4 @@
-"""Whether ``ngpt render --time T --for auto`` keeps its word: its time, and its error beside that of plain ``--time``.
+"""Whether ``ngpt render --time T --for auto`` keeps its word: its time, and its error compared to plain ``--time``.
 
     python -m bench.auto diffuse glossy SCENE.xml ... --times 10 30 60 [--cold] [--beside 1]
 

@@ -30,7 +30,7 @@ from ngpt.system.writing import write_json
 
 TABLE = Path(__file__).parents[1] / "ngpt" / "measure" / "layers.json"
 SPP, SIZE, REFERENCE_SPP = (4, 16, 64), (192, 108), 2048
-# Of the table of renderers.
+# Samples per pixel for the table of renderers
 RENDERER_SPP = 16
 
 # Renderer -> layer -> what its channels are called: the prefix, and what follows its dot.

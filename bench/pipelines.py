@@ -215,7 +215,7 @@ def _cost(stacks: list[GradientStack]) -> float:
 
 
 def true_error(errors: dict[str, float], spp: float) -> float:
-    """At a number of samples, between those that were measured; beyond them the last line goes on."""
+    """The error at a number of samples, interpolated between the measured ones, or extrapolated beyond them."""
     known = sorted((int(n), e) for n, e in errors.items())
     i = next((i for i in range(1, len(known) - 1) if spp < known[i][0]), len(known) - 1)
     (n0, e0), (n1, e1) = known[i - 1], known[i]

@@ -125,9 +125,9 @@ def line(row: dict) -> str:
 
 
 def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path) -> tuple[str, str, str]:
-    """Renders stacks, those with pairs (the same without ``--pairs``) and references; returns the names of the folders.
+    """Renders stacks, stacks with pairs (without ``--pairs``: the same) and references; returns the names of the folders.
 
-    What is there already is kept.
+    Existing files are kept.
     """
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 

@@ -39,7 +39,7 @@ def by_scene(result: dict[str, Any]) -> str:
     for method in methods:
         ratios = [cells[*column, method] / least[column] if (*column, method) in cells else None for column in columns]
         shown = ["" if r is None else "**1**" if r == 1 else short(r) for r in ratios]
-        # Of all scenes or of none: means over other scenes could not be compared.
+        # A mean needs all scenes: means over different scenes could not be compared.
         shown.append("" if None in ratios else short(mean(ratios)))
         lines.append(f"| `{method}` | {' | '.join(shown)} |")
     lines.append(f"| *least error* | {' | '.join(f'{error:.2g}' for error in least.values())} | |")

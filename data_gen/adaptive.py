@@ -37,7 +37,7 @@ from ngpt.system.late import ndimage
 
 # Least mean number of samples per pixel: the first step everywhere, and as many again to distribute
 LEAST = 2 * BLOCK
-# Of an even share, what a pixel gets at least and at most
+# The least and the most that a pixel gets, relative to an even share
 _FLOOR, _CAP = 0.25, 16.0
 # A step to a given error goes a bit further than is thought to be needed, and is no smaller than this of what there is.
 _MARGIN, _SMALLEST = 1.05, 0.125

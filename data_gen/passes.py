@@ -34,8 +34,8 @@ _BLOCK_LANES = 1 << 21
 _MOST_LANES = 1 << 30
 # Lanes of the first pass of a render that time may end: fewer leave cores idle.
 _FEWEST_LANES = 1 << 13
-# Of the time that is left, what a pass that ends the render is expected to take; and how many times as long as the
-# longest before it a pass may be where there is a time.
+# The share of the remaining time that the last pass is planned to take; and, in a render with a time limit, how many
+# times as long as the longest pass before it a pass may be
 _CAUTION, _GROWTH = 0.9, 8
 # Lanes of the first pass of others: enough to render small images at one go, and to judge how long the next may be.
 FIRST_LANES = 1 << 20

@@ -113,7 +113,7 @@ def render_stack(
         whole[:] = [film]
         newest(lambda: stack_of(film, sensor, seed, sampler, start, {}))
 
-    # Of samples that time may end nobody knows how many there will be, though no more than ``spp``.
+    # If time may end the render, the number of samples is not known, except that it is at most ``spp``.
     if settings.get("points") == "sobol" and (spp is None or seconds is not None or adaptive is not None):
         settings["points"] = "rounds"
     watch = Watch(progress, stop, look)

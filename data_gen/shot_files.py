@@ -1,4 +1,4 @@
-"""The frames of a shot as files: all, those that are missing, the part of one machine, or by all of a Dask cluster."""
+"""The frames of a shot as files: all frames, missing frames, the part of one machine, or all on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ngpt.io.whole import finished
 from ngpt.stack import GradientStack
 from ngpt.system.files import check_output
 
-# Of a cluster: frames that a worker renders with one scene in memory, and kernels compiled once.
+# On a cluster: the frames that a worker renders with one scene in memory, and with kernels compiled once
 FRAMES_OF_A_PART = 8
 
 
@@ -58,7 +58,7 @@ def write_frames(
     unless ``overwrite`` or ``skip_existing`` says what to do with them.
     """
     number, parts = shard
-    # Of frames side by side, each needs the scene of the one before.
+    # Each part is a run of consecutive frames, since a frame needs the scene of the previous one.
     part_of = {frame: i * parts // len(files) for i, frame in enumerate(files)}
     ours = [frame for frame in files if part_of[frame] == number]
     outputs = {frame: Output(files[frame], denoising) for frame in ours}

@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 
 _RAYS = 1 << 12
-# Of the rays that leave what the camera sees, the share that meets another surface: in five rooms .96 to 1, around
-# objects and in open boxes .14 to .82 (docs/lab/worth.md).
+# The share of the rays leaving visible surfaces that meet another surface: 0.96 to 1 in five rooms, 0.14 to 0.82 around
+# objects and in open boxes (docs/lab/worth.md)
 _IN_ROOMS = 0.9
 
 

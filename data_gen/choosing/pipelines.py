@@ -33,7 +33,7 @@ from ngpt.methods import METHODS, reconstruct, runnable
 from ngpt.stack import GradientStack
 
 # The best of each kind of stack at some number of samples; what is not here is behind one of them, or far slower.
-# Those that are best most often come first: where time is short, the others are not measured.
+# The most frequent winners come first: where time is short, the others are not measured.
 WITH_GRADIENTS = ("ngpt-combine", "ngpt-fast", "wcv", "l1")
 WITHOUT = ("ngpt-primal", "oidn", "primal")
 # These numbers come from python -m bench.pipelines on scenes that are not ``--apart``.
@@ -45,10 +45,10 @@ SEEN, STEEPEST, FLATTEST = 0.3, -1.2, -0.2
 # samples of the pilot: of networks that use gradients and of others, on all scenes of that file.
 SPREADS = {True: ((0.4, 2.3), (0.5, 3.2), (0.6, 5.1)), False: ((0.5, 1.8), (0.5, 2.4), (0.5, 2.6))}
 _SPREAD_AT = (1, 4, 16)
-# The same power of photons' images, by theory; and how much of the standard error of their errors is added to these
+# The exponent for images by photons, from theory; and how many standard errors are added to their error
 _BY_PHOTONS, _DOUBT = -2 / 3, 2.0
-# The power by which shared out samples with gradients are better than the pilot says, whose need is smoother than it
-# is; and the samples from which on they are thought of
+# The power of the pilot's gain that adaptive samples with gradients achieve: the pilot's need is smoother than the true
+# one; and the number of samples from which on they are considered
 REALISED, FROM = 2.0, 2 * LEAST
 
 
@@ -118,7 +118,7 @@ class Pipeline:
         if self.shared:
             return FROM
         batch = SAMPLERS[self.sampler].batch
-        # Of one batch there are no variances.
+        # A single batch has no variances.
         return max(1, 2 * batch if self.method == "wcv" else batch)
 
     def expected(self, spp: float) -> float:
@@ -184,7 +184,7 @@ def measure(
             if SAMPLERS[name].biased:
                 doubt = witnesses.doubt(name, double[0][0])
             else:
-                # Of both: at twice the samples, the one that was measured there and the one that falls to it.
+                # The geometric mean of the error measured at twice the samples, and the error extrapolated to there
                 two = math.sqrt(two * one * 2 ** usual_fall(name, method))
             pipeline = Pipeline(name, method, spp, two, math.log2(two / one), trial.seconds, min(after), doubt=doubt)
             found.append(pipeline)

@@ -30,8 +30,8 @@ from ngpt.errors import NgptError
 from ngpt.methods import METHODS
 from ngpt.system.console import brief
 
-# Of the time that there is, what trials of samplers may take together, and those and the methods: of an image, and
-# of a render, where no method is measured but the quickest
+# The shares of the time that all trials of samplers may take, and that trials and methods may take, for an image; and
+# the share for a render, where only the quickest method is measured
 SHARE, SHARE_WITH_METHODS = 0.2, 0.3
 _SHARE_OF_RENDER = 0.15
 # Seconds for an image below which a pilot costs more than it could gain. The trials of gpt and primal on the smallest
@@ -45,7 +45,7 @@ _BEGINS, _FILES = 0.8, 3.7
 # The power of the pixels by which the seconds of methods grow: from 4,080 to 230,400 pixels 0.84 (ngpt-combine), 0.86
 # (oidn, ngpt-primal) to 0.96 (ngpt-fast), from 57,600 on 0.89 to 1.1. A call takes some time whatever the size.
 _GROWS = 0.9
-# Seconds for a million pixels, on two cores, of methods that no pilot has measured; of those that are not listed
+# Seconds for a million pixels, on two cores, of methods that no pilot has measured; of methods that are not listed
 _METHOD_SECONDS, _OTHERS = {"auto": 18.0, "ngpt-combine": 18.0, "ngpt-primal": 7.0, "oidn": 8.0}, 3.0
 # Seconds from which on the pilot's images are as large as they ever are, and the least share of that
 LONG, LEAST_PIXELS = 200.0, 1 / 16
@@ -283,7 +283,7 @@ def best_of(pipelines: Sequence[Pipeline], seconds: float) -> tuple[str, str]:
 def times_to_the_end(pipelines: Sequence[Pipeline], seconds: float) -> dict[str, float]:
     """Seconds that each sampler takes to the error that the first has after so many of them."""
     first = pipelines[0]
-    # Of methods as quick as these, what they take is no part.
+    # These methods are so quick that their time is not counted.
     error = first.expected(max(first.least, seconds / first.seconds))
     return {p.sampler: p.needed(error) * p.seconds for p in pipelines}
 

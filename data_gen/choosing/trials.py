@@ -39,7 +39,7 @@ SPP = 8
 PIXELS, _LEAST_PIXELS = 1 << 16, 1 << 10
 # The worst pixels are left out, as ngpt.measure.metrics.relmse_trimmed does.
 _TRIM = 0.001
-# Seeds far from those that users take
+# Seeds far from the ones that users take
 SEED = 0x9E3779B9
 
 
@@ -56,9 +56,9 @@ class Trial:
 
 
 def candidates(scene: mi.Scene, biased: bool = False) -> list[str]:
-    """What could render the scene: the sampler that its description stands for, and then those to be compared with.
+    """Samplers that could render the scene: the one that its description stands for, then the ones to compare it with.
 
-    Those of them that are ``biased`` come last, if at all.
+    With ``biased``, biased samplers are included and come last.
     """
     facts = scene_facts(scene)
     first, _ = choose(facts)
@@ -172,11 +172,11 @@ def try_out(
 
 @dataclass(frozen=True)
 class Witnesses:
-    """The primals of trials, by which images of each of the samplers are judged.
+    """The primals of trials, which judge the images of each sampler.
 
     ``primals``  four of each sampler, by name
-    ``noise``    of one of them
-    ``scale``    what errors are relative to: of all samplers, those with little noise count most
+    ``noise``    noise of a single primal, by name of sampler
+    ``scale``    what errors are relative to: an image from all samplers, where samplers with little noise count most
     """
 
     primals: dict[str, list[np.ndarray]]
@@ -192,8 +192,8 @@ class Witnesses:
         return cls(primals, noise, mean_of(means, noise))
 
     def against(self, sampler: str, half: int) -> tuple[np.ndarray, np.ndarray]:
-        """Two independent images that the sampler's other half has no part in: that ``half`` of its own, and all of
-        the others that are unbiased. Nothing but its own judges it where there are none."""
+        """Two independent images without the sampler's other half: made of its own ``half`` and all other unbiased
+        samplers. If there are none, only its own images judge it."""
         a, b = (self._side(sampler, half, i) for i in range(2))
         return a, b
 

@@ -13,7 +13,7 @@ from ngpt.report.tev import Tev
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 
-# Of the render's time, what making and sending images may take; the first may take half of what all may.
+# The share of the render's time that making and sending images may take; the first image may take half of all this.
 SHARE, _AHEAD = 0.02, 0.5
 _CAUTION = 1.5
 # Seconds that the first image is expected to take: to load the method, and for a pixel.
@@ -96,7 +96,7 @@ class Onlookers:
 
     def _affordable(self, gone: float) -> bool:
         if not self.shown:
-            # Of what the whole render may cost: how long it takes is not known well yet.
+            # Relative to the whole render, but cautiously: how long it takes is not known well yet.
             gone = max(gone, _AHEAD * (gone + self.left))
         return self.spent + self.expected <= SHARE * gone
 

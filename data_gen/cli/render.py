@@ -52,7 +52,7 @@ def denoising_of(args: argparse.Namespace) -> Denoising | None:
         return None
     method = args.denoise if args.denoise not in (None, "auto") else args.method or "auto"
     if args.error is not None and args.method is None and method != "auto":
-        args.method = method  # the error is that of the image
+        args.method = method  # the error is measured on the image
     denoising = Denoising(method, args.transform, args.exposure)
     denoising.check(args.sampler, args.spp)
     return denoising

@@ -219,7 +219,7 @@ def with_one_kernel(around: Surroundings, view: View) -> View:
     """
     params = mi.traverse(around.scene.sensors()[0])
     crop, corner = mi.ScalarVector2i(view.size, view.size), mi.ScalarVector2i(*view.window)
-    # Some sizes have equal factors whatever the field of view: all those that are as high as the crop.
+    # Some sizes have equal factors whatever the field of view: all sizes that are as high as the crop.
     for larger in range(16):
         width, height = view.film[0] + larger, view.film[1] + larger
         for steps in range(8):

@@ -23,9 +23,9 @@ CAMERA, THING, LIGHT, LAMP = 0.8, 0.35, 0.35, 0.5
 SPEEDS = 0.001, 0.1
 # A thing that is moved fills this share of the pixels: smaller ones are not seen, larger ones are walls.
 SIZES = 0.01, 0.3
-# Of the lamp's way in the median distance, and of the logarithm of its radiance, a frame.
+# Changes per frame: of the lamp's position, relative to the median distance, and of the logarithm of its radiance
 LAMP_WAYS, GAINS = (0.005, 0.08), (0.01, 0.3)
-# Of the way to what is in the way that a camera may go, all frames together.
+# The share of the way to the next obstacle that a camera may go, in all frames together
 CLEAR = 0.6
 RADIANCE = (".radiance.value", ".intensity.value", ".irradiance.value")
 

@@ -217,7 +217,7 @@ class GradientFilm:
 
     @property
     def samples_each(self) -> np.ndarray:
-        """Samples of each pixel, (pixels) int64, those that were not finite included."""
+        """Samples of each pixel, (pixels) int64, including samples that were not finite."""
         return np.full(self.pixels, self.samples, np.int64) if self.counts is None else self.counts.copy()
 
     def _moments(self, name: str, channels: int) -> Moments:

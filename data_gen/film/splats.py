@@ -62,7 +62,7 @@ class Splats:
             range_ = dr.maximum(exponent - _LOWEST, 0) // _BITS
             digits = Int64(Float64(component) / _unit(range_))
             place = (pixel * BINS + mi.UInt32(range_)) * self.channels + channel
-            # Side by side, lanes hardly ever meet at a pixel: to look for those that do costs more than it saves.
+            # Neighbouring lanes hardly ever meet at a pixel: looking for such lanes costs more than it saves.
             dr.scatter_add(self.sums, digits, place, active & good, mode=dr.ReduceMode.Direct)
 
     def totals(self) -> list:

@@ -115,7 +115,7 @@ def _mirrored(matrix: np.ndarray) -> bool:
 
 
 def _between(one: np.ndarray, other: np.ndarray, t: float) -> np.ndarray:
-    # Of mirrored cameras their images turn.
+    # Mirrored cameras are mirrored back, since only rotations can be interpolated.
     side = np.array([-1.0 if _mirrored(one) else 1.0, 1, 1])
     turns = Rotation.from_matrix([m[:3, :3] * side for m in (one, other)])
     matrix = np.eye(4)

@@ -25,7 +25,7 @@ _DEFAULTS = {"translation": [0.0, 0, 0], "rotation": [0.0, 0, 0, 1], "scale": [1
 _MOST = 1_000_000
 _MOST_BYTES = 2**30  # of a file or a buffer beside it
 
-# Of one property of one node: times (K,), values (K, C) or (3K, C), and how to go from one to the next.
+# A property of a node: times (K,), values (K, C) or (3K, C), and how to interpolate
 Channel = tuple[np.ndarray, np.ndarray, str]
 
 

@@ -30,7 +30,7 @@ class Shot:
     ``describe``  frame -> the scene's file or name, and its ``<default>`` values. The scene is loaded again only where
                   they change; kernels are compiled once, as long as frames consist of the same kinds of things.
     ``camera``    moves the first sensor
-    ``sensor``    number or id of the one that is rendered; None: the first
+    ``sensor``    number or id of the sensor to render; None: the first
     ``update``    changes ``mi.traverse(scene)`` for a frame; what it sets once it must set in every frame
     """
 

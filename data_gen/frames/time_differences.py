@@ -24,14 +24,14 @@ from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import radiance
 from data_gen.scenes.load import reference_integrator
 
-# Of them, means over samples are kept for all pixels at once: enough to tell how much they vary.
+# For each batch, means over its samples are kept for all pixels: enough batches to estimate the variance.
 BATCHES = 16
 
 
 def light(scene: mi.Scene, seed: int, spp: int, motion: np.ndarray | None = None) -> list[tuple[int, np.ndarray]]:
     """All light but what the camera sees directly, in batches: how many samples a pixel, and their mean (H, W, 3).
 
-    With the ``motion`` (H, W, 2) of a later frame, samples are the partners of those that have the same ``seed`` there.
+    With the ``motion`` (H, W, 2) of a later frame, samples are partners of the samples with the same ``seed`` there.
     NaN where a partner is not on the film, where the motion is not known, and where a sample is not finite.
     """
     integrator, sensor = reference_integrator(scene), scene.sensors()[0]

@@ -4,7 +4,7 @@ In a grid the transmittance can only be estimated. So a path holds not only its 
 on its way, which happen at the density of the majorant μ and change nothing. In this larger path space all densities
 are known. A list of n null collisions with a vertex at the end has the density
 
-    exp(-M) ∏ σn(x_i) / μ · σ,        M the majorant's optical depth of the segment, in grids alone
+    exp(-M) ∏ σn(x_i) / μ · σ,        M the majorant's optical depth of the segment, only in grids
 
 and the integrand has σs in place of σ, and has colours. Collisions are exponential steps along the optical depth m of
 the majorant, which uses the same units in all grids and gaps that the segment crosses.

@@ -42,7 +42,7 @@ def features(scene, sensor, sampler, ray: mi.RayDifferential3f) -> dict[str, mi.
     # A Mitsuba camera looks along its +z with +x to the left of the image.
     right, up, back = (sign * axis for sign, axis in zip((-1, 1, -1), axes(sensor), strict=True))
     normal = mi.Color3f(dr.dot(normal, right), dr.dot(normal, up), dr.dot(normal, back))
-    # Of polarised variants the one is a matrix, and the other is not.
+    # In polarised variants the reflectance is a Mueller matrix, but the albedo of media is not.
     reflectance = mi.unpolarized_spectrum(dr.select(found, reflectance, 0))
     albedo = reflectance_to_rgb(reflectance + scattered, ray.wavelengths)
     return {

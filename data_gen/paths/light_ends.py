@@ -162,7 +162,7 @@ class LightEnds:
         d = dr.select(far, start.ray.d, dr.normalize(to))
         β, ratio = mi.Spectrum(start.β), mi.Float(1)
         if _AREA in self.kinds:
-            # Of a cosine distribution; behind the emitter there is no light.
+            # The ratio for a cosine distribution; behind the emitter there is no light.
             cosines = dr.dot(start.end.n, d) / dr.dot(start.end.n, start.ray.d)
             ratio = dr.select(kind == _AREA, dr.select(cosines > 0, cosines, 0), ratio)
             β *= ratio

@@ -12,15 +12,15 @@ from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.scenes.load import path_depths
 from data_gen.scenes.places import Chosen, Places
 
-# Shapes that Mitsuba samples uniformly by area, besides meshes; of spheres it samples the part that is visible.
+# Shapes that Mitsuba samples uniformly by area, besides meshes; for spheres it samples the visible part.
 _UNIFORM_SHAPES = ("Rectangle", "Disk", "Cylinder")
 
 
 class Lights:
     """Whether the emitters of a scene answer the same random numbers with the same point, or direction, everywhere.
 
-    Those that do are all that are infinitely far away, and area lights on shapes that are sampled uniformly. To replay
-    their sampling at another vertex changes no more than the solid angle, which saves choosing them anew: they are
+    This holds for all emitters that are infinitely far away, and for area lights on shapes that are sampled uniformly.
+    Replaying their sampling at another vertex changes only the solid angle, so they need not be sampled again: they are
     ``shared``, if there are no others in the scene (a kernel with both kinds of code gained nothing).
 
     ``near``, ``far``: whether there are emitters of finite and of infinite distance.

@@ -25,7 +25,7 @@ import numpy as np
 
 # Samples of a pixel in the first round, where it is not known how many there will be
 ROUND = 16
-# Of a round at most, as a power of two: with the pixels of a tile, 32 bits number its points.
+# The largest number of samples per pixel in a round, as a power of two: with the pixels of a tile, 32 bits number them.
 _LARGEST = 20
 # Side of a tile of pixels, as a power of two
 _TILE = 6

@@ -101,7 +101,7 @@ def objects_in(thing: mi.Object, kind: type) -> list:
 def lack(plugin: str, nested: int, from_camera: bool = True) -> str:
     """Why an integrator around so many others renders no image for a stack, "" if it does.
 
-    ``from_camera``: it is one of those that trace paths from the camera, unless its name says otherwise.
+    ``from_camera``: it traces paths from the camera, unless its name says otherwise.
     """
     if not from_camera or plugin in _FROM_LAMPS:
         return (

@@ -24,9 +24,9 @@ _PATHS_BY_PLACE, MANY = 1 << 17, 8
 # Lamps are chosen by place if this is expected to lower the variance of direct light to less than this share. In matt
 # scenes the expectation holds; glossy materials, which the pilot does not consider, were seen to cost a factor of two.
 PROMISE = 0.45
-# Of all lamps alike: those that the pilot did not see may bring light elsewhere, and light paths begin there, too.
+# The share given to all lamps alike: lamps that the pilot did not see may light other places and start light paths.
 _FLOOR = 0.2
-# Mean squares are over all but so many of a lamp's largest, lest a single vertex close to it decide.
+# Mean squares leave out this share of a lamp's largest values, so that a single vertex close to it does not decide.
 _TRIM = 0.002
 
 
@@ -127,7 +127,7 @@ def _pilot(scene: mi.Scene, paths: int) -> tuple[np.ndarray, np.ndarray, np.ndar
         emitter = dr.gather(mi.EmitterPtr, emitters, index)
         light, radiance = emitter.sample_direction(si, pair(), active)
         cos = dr.maximum(dr.dot(side.n, light.d), 0)
-        # Of all colours: a red lamp has as much noise in one of them as a white one in each.
+        # Over all colours: a red lamp has as much noise in one channel as a white lamp has in each.
         L = dr.sqrt(dr.mean(dr.square(mi.unpolarized_spectrum(radiance)))) * cos
         L *= dr.select(light.delta, 1, dr.rcp(1 + dr.square(cos * dr.inv_pi * n / light.pdf)))
         lit = active & (light.pdf > 0) & (L > 0)

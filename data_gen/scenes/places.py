@@ -21,7 +21,7 @@ import numpy as np
 _SIDE = 16
 # Samples that the mean of the larger cell stands for
 _OF_PARENT = 16
-# Of what is chosen as in the whole scene: no pilot sees all light.
+# The share chosen as in the whole scene: no pilot sees all light.
 _FLOOR = 0.2
 # Numbers in a table: with more lamps, cells are larger.
 _LARGEST = 1 << 21
@@ -75,7 +75,7 @@ class Places:
         index = np.zeros(max(numbers) + 1, np.uint32)
         index[numbers] = np.arange(len(numbers))
         self.indices = mi.UInt32(index)
-        # Of scenes alike the kernel is the same.
+        # Similar scenes can then share the kernel.
         dr.make_opaque(self.low, self.per_size, self.p, self.upto, self.indices)
 
     def row(self, x: mi.SurfaceInteraction3f) -> mi.UInt32:

@@ -72,7 +72,7 @@ class Cache:
         self.keys, self.count = dr.zeros(mi.UInt32, CELLS), dr.zeros(mi.UInt32, CELLS)
         self.sums = [dr.zeros(mi.Int64, CELLS) for _ in range(3 * sorts)]
         self.unit, self.full, self.fineness = 0.0, False, fineness
-        # Of all records so far: how many, and the light of the brightest colour of each, in units
+        # For all records so far: their number, and the sum of the light of the brightest colour of each, in units
         self.records = self.light = 0
         blank = [dr.zeros(mi.Float, 4 * CELLS) for _ in range(sorts)]
         self.known = Known(self.keys, blank, dr.opaque(mi.Float, fineness))
