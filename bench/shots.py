@@ -125,7 +125,7 @@ def line(row: dict) -> str:
 
 
 def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path) -> tuple[str, str, str]:
-    """Renders stacks, stacks with pairs (without ``--pairs``: the same) and references; returns the names of the folders.
+    """Renders stacks, stacks with pairs (without ``--pairs``: the same) and references; returns the folder names.
 
     Existing files are kept.
     """

@@ -78,7 +78,7 @@ class Pipeline:
 
     @property
     def shared(self) -> bool:
-        """Whether samples are shared out."""
+        """Whether samples are adaptive."""
         return self.choosing > 0
 
     @property
@@ -109,7 +109,7 @@ class Pipeline:
         return spp * self.seconds + self._choices(spp) + self.after
 
     def _choices(self, spp: float) -> float:
-        """Seconds in which samples are shared out: each time, their number doubles."""
+        """Seconds spent on distributing samples: each time, their number doubles."""
         return self.choosing * math.ceil(math.log2(spp / LEAST) + 1) if self.shared and spp > LEAST else 0.0
 
     @property

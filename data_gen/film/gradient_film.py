@@ -371,5 +371,5 @@ def _components(value) -> list:
 
 
 def opaque(n: int) -> mi.UInt32:
-    """A number that is not compiled into kernels, each anew."""
+    """A number that is not compiled into kernels, as a new variable for each call."""
     return dr.opaque(mi.UInt32, n)

@@ -5,8 +5,8 @@ points, the default, come from Owen-scrambled Sobol sequences, with a new pair o
 Samples of a pixel and of neighbouring pixels are then well spread, which lowers the errors of pixels and of blocks of
 pixels. Each single point is uniform, so all estimates stay unbiased; but samples are no longer independent.
 
-- A pair of dimensions is the first two of Sobol's sequence, with the order of the points and both coordinates scrambled
-  anew. [Burley 2020, "Practical Hash-based Owen Scrambling"]
+- A pair of dimensions is the first two of Sobol's sequence, with a new scrambling of the order of the points and of
+  both coordinates. [Burley 2020, "Practical Hash-based Owen Scrambling"]
 - Pixels are numbered in Z order, and a pixel's points are side by side, so that the points of aligned blocks of pixels
   are well spread together, too. [Ahmed and Wonka 2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error
   via hierarchical ordering of pixels"] This holds within tiles of 64x64 pixels, which are independent of each other.
@@ -96,7 +96,7 @@ def _stream_class(variant: str) -> type:
     """The sampler's class; Mitsuba's own classes, and so those derived from them, belong to a variant."""
 
     class Stream(mi.Sampler):
-        """Independent random numbers. Cloning replays them. From ``state`` a stream can be made anew."""
+        """Independent random numbers. Cloning replays them. A stream can be recreated from ``state``."""
 
         def __init__(self, state):
             super().__init__(mi.Properties())

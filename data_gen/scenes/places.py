@@ -68,7 +68,7 @@ class Places:
         self.low, self.per_size = mi.Point3f(*table.low.tolist()), mi.Vector3f(*(1 / table.size).tolist())
         self.p = mi.Float(table.p.ravel().astype(np.float32))
         upto = np.cumsum(table.p, axis=1).astype(np.float32)
-        # More than any random number, lest rounding leave one beyond
+        # More than any random number, so that rounding leaves none beyond
         upto[:, -1] = 2
         self.upto = mi.Float(upto.ravel())
         numbers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]) for emitter in scene.emitters()]

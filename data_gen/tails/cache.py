@@ -111,7 +111,7 @@ class Cache:
         dr.eval(self.keys, self.count, self.sums)
 
     def settle(self, fineness: float) -> None:
-        """Makes what is known anew, of all records so far; from here on cells have this ``fineness``."""
+        """Rebuilds what is known from all records so far; from here on cells have this ``fineness``."""
         self.fineness = fineness
         cells = int(dr.count(self.keys != 0)[0])
         if cells > _FULL * CELLS and not self.full:

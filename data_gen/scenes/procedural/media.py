@@ -18,7 +18,7 @@ from data_gen.scenes.procedural.meshes import box, cylinder, sphere, write_ply
 from data_gen.scenes.procedural.stage import Stage
 from data_gen.scenes.procedural.textures import colour
 
-# Phase functions: few, since each is compiled anew.
+# Phase functions: few, since each is compiled separately.
 FORWARD = (0.0, 0.3, 0.7)
 
 
