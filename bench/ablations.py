@@ -58,7 +58,7 @@ def train(settings: Settings, crops: Sequence[Any], held_out: Sequence[Any], out
 
 @torch.no_grad()
 def judged(model: Reconstructor, crops: Sequence[Any]) -> list[dict[str, float]]:
-    """Of each input of each crop: its samples per pixel, and the metrics of the network's image and of the primal."""
+    """A row for each input of each crop: samples per pixel, metrics of the network's image and of the primal."""
     found = []
     for crop in crops:
         halves = judges_of(crop, model.config)

@@ -125,9 +125,12 @@ def bench_costs(path: str, args: argparse.Namespace) -> dict:
 
 
 def table(result: dict) -> str:
-    """Markdown, for each method that shared out: errors of adaptive samples over those of even ones, their means, and
-    what adaptive samples cost over even ones; then errors that were expected over the true ones, of the pilot, even and
-    adaptive."""
+    """Markdown tables for each method that distributed the samples.
+
+    The first has the ratios of the error with adaptive samples to the error with even ones, their means, and the ratio
+    of the costs. The second has the ratios of the expected error to the true one, for the pilot, even and adaptive
+    samples.
+    """
     parts = []
     for by, scenes in result["by"].items():
         methods = list(dict.fromkeys(m for entry in scenes.values() for m in entry["methods"]))
@@ -153,7 +156,7 @@ def table(result: dict) -> str:
 
 
 def price(costs: dict, method: str) -> str:
-    """Seconds of adaptive samples over those of as many even ones, the median of scenes; "" if not measured."""
+    """Render time of adaptive samples relative to as many even ones, the median over scenes; "" if not measured."""
     name = f"adaptive {method}"
     each = [row[name]["median"] / row["gpt"]["median"] for row in costs.values() if name in row and "gpt" in row]
     return f"{statistics.median(each):.2f}" if each else ""

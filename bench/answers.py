@@ -53,7 +53,7 @@ def features(_: Path) -> dict[str, Any]:
 
 
 def cost(scene: Any) -> dict[str, Any]:
-    """Of our sampler `primal` with features, and of Mitsuba's integrator `aov` around its `path`; and the seconds."""
+    """Cost of our sampler `primal` with features and of Mitsuba's integrator `aov` around its `path`, with seconds."""
     import mitsuba as mi
 
     from data_gen.render import render_stack
@@ -157,7 +157,7 @@ def alpha(pictures: Path) -> dict[str, Any]:
 
 
 def infinite(pictures: Path) -> dict[str, Any]:
-    """One pixel of 21,240 is Inf: how much OIDN alone changes by that, and `ngpt denoise` with OIDN."""
+    """Sets one pixel of 21,240 to Inf, and measures how much this changes the output of OIDN and of `ngpt denoise`."""
     import mitsuba_oidn
 
     from data_gen.render import render_stack

@@ -1,11 +1,11 @@
-"""Whether ``ngpt render --time T --for auto`` keeps its word: its time, and its error beside that of plain ``--time``.
+"""Whether ``ngpt render --time T --for auto`` keeps its word: its time, and its error compared to plain ``--time``.
 
     python -m bench.auto diffuse glossy SCENE.xml ... --times 10 30 60 [--cold] [--beside 1]
 
-Each command runs in a process of its own, and so does the denoising, by what the stack says (``ngpt:for``), or by
-``auto``. Seconds are of the wall, from the start of `ngpt render` to the end of `ngpt denoise`, over the time that was
-asked for. Errors are trimmed relMSE against two halves of a reference. ``--cold``: no kernel is kept from another run.
-``--beside``: so many other processes are busy at the same time.
+Each render runs in a process of its own. So does each denoising, by the method that the stack names (``ngpt:for``) or
+by ``auto``. Seconds are wall-clock time from the start of `ngpt render` to the end of `ngpt denoise`, relative to the
+requested time. Errors are trimmed relMSE against two halves of a reference. ``--cold``: no kernel is kept from another
+run. ``--beside``: the number of other processes that are busy at the same time.
 """
 
 import argparse
@@ -100,7 +100,7 @@ def line(row: dict) -> str:
 
 
 def summary(rows: list[dict]) -> str:
-    """A line for each time and state of the machine: the longest, and the error over that of plain --time."""
+    """A line for each time and state of the machine: the longest run, and the error relative to plain --time."""
     lines = ["| seconds | kernels | other jobs | longest | error, mean | worst |", "|--:|---|--:|--:|--:|--:|"]
     for key in sorted({(row["time"], row["cold"], row["beside"]) for row in rows}):
         these = [row for row in rows if (row["time"], row["cold"], row["beside"]) == key]

@@ -4,8 +4,8 @@
 
 renders each scene with `primal` and `gpt`, and takes the root of the mean squared error of the image against a
 reference of many samples: of pixels, and of means over 8x8 pixels. The 2 % that are noisiest in the reference are left
-out, lest single fireflies decide. It writes the errors and their slopes, fitted to logarithms, as JSON, a picture of
-the geometric means over scenes, and the table of slopes into the page.
+out, so that single fireflies do not decide. It writes the errors and their slopes, fitted to logarithms, as JSON, a
+picture of the geometric means over scenes, and the table of slopes into the page.
 """
 
 import argparse
@@ -85,7 +85,7 @@ def slope(counts: list[int], errors: list[float]) -> float:
 
 
 def picture(rows: list[dict], counts: list[int]) -> str:
-    """Errors of `primal` over those of pixels with independent points at one sample, geometric means over scenes."""
+    """Errors of `primal` relative to independent points at one sample per pixel, geometric means over scenes."""
     found = {}
     for area in AREAS:
         # Rounds would lie on top of one net; the table has them

@@ -80,7 +80,7 @@ def hall(lamps: int = 100) -> str:
         parts.append(cube((x - 0.4, 0, z - 0.3), (x + 0.4, high, z + 0.3)))
     for number in range(lamps):
         at = rng.uniform(-HALF + 0.3, HALF - 0.3), rng.uniform(1.7, 2.7), rng.uniform(0.3, LENGTH - 0.3)
-        # Powers over three decades, those of most lamps small
+        # Powers span three decades; most lamps are weak.
         parts.append(lamp(number, at, rng.uniform(0.08, 0.3), 10 ** rng.uniform(0, 2.5)))
     return "".join(parts) + "</scene>\n"
 

@@ -2,22 +2,22 @@
 
     python -m bench.hero SCENE.xml --cache out/hero --references 8
 
-The gradient stack has --spp samples per pixel. What a sample costs is measured on the same scene and size, in turn,
-and path tracing with features gets as many samples as the same time buys. Time is processor time of all threads
-together, so that other work on the machine does not change the comparison. The time to denoise is stated apart.
-Nothing is chosen by hand: the camera is the scene's own, the crops are the place where ngpt gains most over OIDN and
-the place where it loses most (or gains least).
+The gradient stack has --spp samples per pixel. The cost of a sample is measured on the same scene and size, in turn,
+and path tracing with features gets as many samples as fit into the same time. Time is processor time of all threads
+together, so that other work on the machine does not change the comparison. The time to denoise is stated separately.
+Nothing is chosen by hand: the camera is the scene's own, and the crops are the place where ngpt gains most over OIDN
+and the place where it loses most (or gains least).
 
 The reference is path traced in --references parts of --reference-spp samples, each with its own seed. Even and odd
 parts make two independent halves A and B. relMSE is the mean of (x - A)(x - B) / (m² + 0.001) with m = (A + B) / 2, so
 that the noise of the reference drops out in expectation; the 0.1 % of the pixels that are farthest from m are left out,
 as in the tables. Pixels within SPREAD of a light that the camera sees are left out too, in numbers and crops: ngpt
-keeps such light apart, OIDN is given it, and the comparison is of what is left. The numbers of the whole image are
-recorded beside them, and those of OIDN with such light kept apart and of ngpt without gradients. FLIP is computed
-against m and recorded beside its floor, the FLIP of A and B. For the eye, and for no number, the two crops of the
-reference are rendered again with --crop-spp samples, and pixels of the reference whose own standard error is over
-UNSETTLED are shown as the median of 3x3: fireflies, which path tracing does not lose in any time. All renders are
-kept in the cache, so a run that was broken off goes on. Written are the picture and bench/results/hero.json.
+keeps such light separate and OIDN does not, so only the other pixels are compared. Also recorded are the numbers of the
+whole image, of OIDN with such light kept separate, and of ngpt without gradients. FLIP is computed against m and
+recorded with its floor, the FLIP of A and B. For display only, not for any number, the two crops of the reference are
+rendered again with --crop-spp samples. For display, too, pixels of the reference whose own standard error exceeds
+UNSETTLED are replaced by the median of 3x3: these are fireflies, which path tracing never loses. All renders are kept
+in the cache, so an interrupted run can continue. The script writes the picture and bench/results/hero.json.
 """
 
 import argparse

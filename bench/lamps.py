@@ -1,12 +1,12 @@
-"""What the choice of lamps is worth: variance and time by place, and alike, over those by weights of the whole scene.
+"""What the choice of lamps is worth: variance and time by place, and uniform, relative to weights of the whole scene.
 
     python -m bench.hall out/hall.xml
     python -m bench.lamps out/hall.xml bistro-chalice/scene.xml
 
-prints, scene by scene, variance over seeds: of pixels of the primal (without the layer `caustic`), of means over 8x8
-pixels, the same of `dx`; then the processor time of a sample, the pilot not included. The noisiest 1 % of pixels and
-3 % of blocks are left out, of all ways together, since few seeds say nothing of them. The promise is what the pilot
-says of direct light: lamps are chosen by place where it is below `data_gen.scenes.lamps.PROMISE`.
+prints, scene by scene, the variance over seeds of pixels of the primal (without the layer `caustic`) and of means over
+8x8 pixels, and both for `dx`; then the processor time of a sample, without the pilot. The noisiest 1 % of pixels and
+3 % of blocks, over all ways together, are left out, since few seeds cannot measure them. The promise is the pilot's
+estimate for direct light: lamps are chosen by place where it is below `data_gen.scenes.lamps.PROMISE`.
 """
 
 import argparse
@@ -23,7 +23,7 @@ WAYS = {"whole": (0.0, "power"), "place": (np.inf, "power"), "alike": (0.0, "uni
 
 
 def variances(stacks: list) -> dict[str, np.ndarray]:
-    """Of pixels and blocks over seeds, the colours together."""
+    """Variances of pixels and of blocks over seeds, summed over the colour channels."""
     found = {}
     for layer in ("primal", "dx"):
         if layer not in stacks[0].names:

@@ -30,7 +30,7 @@ from ngpt.system.writing import write_json
 
 TABLE = Path(__file__).parents[1] / "ngpt" / "measure" / "layers.json"
 SPP, SIZE, REFERENCE_SPP = (4, 16, 64), (192, 108), 2048
-# Of the table of renderers.
+# Samples per pixel for the table of renderers
 RENDERER_SPP = 16
 
 # Renderer -> layer -> what its channels are called: the prefix, and what follows its dot.
@@ -166,7 +166,7 @@ def written(
 
 
 def measured(files: Sequence[tuple[GradientStack, np.ndarray]], oidn: bool) -> tuple[str, float, float | None, float]:
-    """The method that `auto` took, its error, that of `oidn` if it is there, and that of the input."""
+    """The method that `auto` chose, its error, the error of `oidn` if it is installed, and the error of the input."""
 
     def error(method: str) -> float:
         images = (reconstruct(stack, method).image for stack, _ in files)

@@ -1,4 +1,4 @@
-"""The same noise before and after: independent points and uniform lamps beside better samples, and both denoised.
+"""The noise of independent points and uniform lamps, compared to the noise of better samples, and both denoised.
 
     python -m bench.noise diffuse
 

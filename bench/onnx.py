@@ -5,17 +5,17 @@
 Per size, on synthetic stacks with features and variances, all in this process and in turn, warm:
 
     ngpt-fast       as ngpt.reconstruct() runs it: repair, base (NumPy), network (ONNX Runtime)
-    repair, base    the first two alone
-    network         the network alone, its base given, in ONNX Runtime
-    float16         the same with half precision, which this provider computes in float32
-    graph alone     the network with its base made inside the graph, as a host without ngpt has it
-    torch, torch bf16   the network by PyTorch, in float32 and under autocast
-    oidn high, oidn fast   Open Image Denoise with albedo and normal, for what people use today
-    oidn prefiltered    the first, with its features denoised before: `--method oidn`
+    repair, base    only these first two steps
+    network         only the network in ONNX Runtime, with the base as input
+    float16         the network in half precision, which this provider computes in float32
+    graph alone     the network with the base computed inside the graph, as a host without ngpt runs it
+    torch, torch bf16   the network in PyTorch, in float32 and under autocast
+    oidn high, oidn fast   Open Image Denoise with albedo and normal, which people use today
+    oidn prefiltered    oidn high with denoised features: `--method oidn`
     ngpt-combine    as ngpt.reconstruct() runs it: base, OIDN of the primal and of the base, network
 
-Beside them, each in a process of its own: the largest memory, and the seconds from the command to the end of `ngpt
-denoise` for a stack of 64x64 pixels. Rows whose package is not installed are left out, and the results say so.
+Two more values are measured in separate processes: the peak memory, and the seconds from the command to the end of
+`ngpt denoise` for a stack of 64x64 pixels. Rows whose package is not installed are left out, and the results say so.
 """
 
 import argparse

@@ -1,21 +1,21 @@
-"""Is the sampler and method that a pilot chooses as good as the best of all: scene by scene, at equal time.
+"""Is the sampler and method that a pilot chooses as good as the best of all, scene by scene, at equal time?
 
     python -m bench.pipelines --scenes diffuse glossy SCENE.xml ... [--apart SCENE.xml ...] [--size 64 36]
     python -m bench.pipelines --table        print what the file says, with the rules as they are now
 
-All samplers take turns: each renders four parts of fixed numbers of samples, chosen so that a part takes about the time
-of 64 samples of the first sampler. What a sample costs over one of the first is the median of the ratios of the parts,
-in seconds of the processor on all cores together. So a busy machine counts little. Errors (trimmed relMSE against two
-halves of a reference) are those of each method on a few samples, on one part and on all four, with samples even or
-shared out. Seconds of the methods are measured in the same turns. Stacks are kept in --cache, so that a benchmark that
-was broken off goes on, and rules can be judged anew without a render.
+All samplers take turns: each renders four parts with fixed numbers of samples, chosen so that a part takes about as
+long as 64 samples of the first sampler. The cost of a sample relative to the first sampler is the median of the ratios
+of the parts, in processor seconds on all cores together, so other work on the machine has little effect. Errors
+(trimmed relMSE against two halves of a reference) are measured for each method on a few samples, on one part and on all
+four, with even and with adaptive samples. The methods are timed in the same turns. Stacks are kept in --cache, so an
+interrupted benchmark can continue, and rules can be evaluated again without a render.
 
-The pilot (data_gen/choosing/pipelines.py) is not told any of it. Times are those of 16, 64 and 256 samples of the first
-sampler and of the slowest method, so that every pipeline fits into each of them. Of the samples that a pipeline has
-time for, the error is on the straight line of logarithms between the measured ones. Regret is the error of what the
-pilot chose over the least of all.
+The pilot (data_gen/choosing/pipelines.py) gets none of these measurements. The equal times are the time of 16, 64 and
+256 samples of the first sampler plus the time of the slowest method, so that every pipeline fits into each of them. The
+error at the number of samples that a pipeline has time for is interpolated between the measured ones, linearly in the
+logarithms. Regret is the error of the pilot's choice over the least error of all.
 
-Nothing may be chosen by scenes ``--apart``.
+Scenes ``--apart`` must not influence any choice.
 """
 
 import argparse
@@ -174,7 +174,7 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
                 after.append(time.process_time() - start)
                 each.append(relmse_trimmed(image, *halves))
             errors[str(n)] = max(statistics.mean(each), 1e-9)
-        # In units of the first sampler's, whose seconds are those of the same turns.
+        # Relative to the first sampler, whose seconds were measured in the same turns
         rows.append(
             {"pilot": vars(p), "errors": errors}
             | {"seconds": relative[p.sampler] * cost[first], "after": statistics.median(after)}
@@ -215,7 +215,7 @@ def _cost(stacks: list[GradientStack]) -> float:
 
 
 def true_error(errors: dict[str, float], spp: float) -> float:
-    """At a number of samples, between those that were measured; beyond them the last line goes on."""
+    """The error at a number of samples, interpolated between the measured ones, or extrapolated beyond them."""
     known = sorted((int(n), e) for n, e in errors.items())
     i = next((i for i in range(1, len(known) - 1) if spp < known[i][0]), len(known) - 1)
     (n0, e0), (n1, e1) = known[i - 1], known[i]

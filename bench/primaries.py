@@ -1,9 +1,9 @@
-"""What it costs to reconstruct in other primaries than those of Rec. 709, or to convert to those.
+"""What it costs to reconstruct in other primaries than Rec. 709, or to convert to Rec. 709.
 
     python -m bench.primaries demo --scenes glossy diffuse       # after make demo
 
-within   the same light told in other primaries, and reconstructed in those: the cost of not converting
-beyond   the numbers of the stack taken for those of other primaries, and converted: the cost of converting
+within   the light is converted to other primaries and reconstructed in these: the cost of not converting
+beyond   the numbers of the stack are read as other primaries and converted to Rec. 709: the cost of converting
 
 Trimmed relMSE in the primaries of the demo's references.
 """
@@ -42,7 +42,10 @@ def main() -> None:
 
 
 def error(stack: GradientStack, reference: np.ndarray, method: str, matrix: np.ndarray) -> float:
-    """Of a reconstruction of light that a matrix was applied to, without variances, of which no matrix gives others."""
+    """The error of a reconstruction after the ``matrix`` was applied to the light.
+
+    The stack has no variances, since no matrix converts these.
+    """
     layers = {name: converted(stack[name], matrix) for name in LIGHT if name in stack}
     layers |= {name: stack[name] for name in FEATURES if name in stack}
     image = reconstruct(GradientStack(layers), method).image

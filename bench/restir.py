@@ -1,19 +1,19 @@
-"""Paths reused from frame to frame beside new ones: cost, noise, and what reconstructions make of it at equal time.
+"""Paths reused from frame to frame compared to new ones: cost, noise, and reconstructions at equal time.
 
     python -m bench.restir --folder SCENES --scenes diffuse glossy cornell-box --out OUT
 
 The camera goes sideways, or a shape or a lamp moves, as in ``bench.shots``. Rivals:
 
     restir       reservoirs of pixels and of pairs
-    after        reservoirs of pixels, differences taken of what they have kept: the paper's baseline
-    gpt          samples of their own in each frame
+    after        reservoirs of pixels; differences are computed from the paths they keep: the paper's baseline
+    gpt          new samples in each frame
 
-``cost`` is what a frame takes, by the clock and in processor time, over that of a sample of ``gpt``: the median of
-``--repeats`` frames of all rivals in turn, at ``--cost-size``, chains as many as samples. ``noise`` is the variance of
-primal, dx and dy (without the worst 1 % of the pixels) in the last frame, for one chain or sample, and times the cost
-in processor time over that of ``gpt``: below 1 where a frame is worth more than it costs. Then all rivals render with
-the time of ``--chains`` chains of ``restir``, and their frames after ``--skip`` are reconstructed; + temporal: as
-`ngpt denoise --temporal`, from the first frame on. relMSE and flicker as in ``bench.shots``.
+``cost`` is the wall-clock and processor time of a frame relative to a sample of ``gpt``. It is the median of
+``--repeats`` frames of all rivals in turn, at ``--cost-size``, with as many chains as samples. ``noise`` is the
+variance of primal, dx and dy (without the worst 1 % of the pixels) in the last frame, for one chain or sample. It is
+also given times the cost in processor time, relative to ``gpt``: below 1, a frame is worth more than it costs. Then all
+rivals render for the time of ``--chains`` chains of ``restir``, and their frames after ``--skip`` are reconstructed;
++ temporal: as `ngpt denoise --temporal` does, from the first frame on. relMSE and flicker are as in ``bench.shots``.
 """
 
 import argparse
@@ -81,7 +81,7 @@ def shot_of(args: argparse.Namespace, scene: str, shot: str, size: str):
 
 
 def costs(args: argparse.Namespace, scene: str, shot: str) -> dict[str, dict[str, float]]:
-    """Of a frame, by the clock and in processor time, in samples of gpt; and how many kernels it launches."""
+    """Wall-clock and processor time of a frame in units of a gpt sample, and how many kernels it launches."""
     import drjit as dr
 
     from data_gen.budget import Budget

@@ -1,10 +1,11 @@
-"""Weights beside those that ship, in rooms that nobody trains on, at equal samples:
+"""Weights compared to the weights that ship, in rooms that nobody trains on, at equal samples:
 
     python -m bench.rooms SCENE.xml ... --weights ARM=FILE ARM=FILE ... [--start FILE] --cache FOLDER
 
-Files of one ARM are its seeds. Error is the trimmed relMSE against two halves of a reference by path tracing, FLIP that
-to their mean, brightness the mean over the reference's. Error and FLIP are over those of ``--start``, geometric means
-over the rooms; what follows a number is the standard error over seeds and rooms. Stacks are `gpt`'s, of one seed.
+The files of one ARM are its seeds. Error is the trimmed relMSE against two halves of a path-traced reference. FLIP is
+measured against the mean of the halves. Brightness is the mean of the image over the mean of the reference. Error and
+FLIP are ratios to ``--start``, geometric means over the rooms, each followed by its standard error over seeds and
+rooms. Stacks are rendered by `gpt` with one seed.
 """
 
 import argparse
@@ -88,7 +89,7 @@ def table(rows: list[dict], counts: list[int]) -> str:
 
 
 def _cells(these: list[dict], rows: list[dict]) -> list[str]:
-    """Error and FLIP over those of the start, each with its standard error, and the brightness."""
+    """Error and FLIP relative to the start, each with its standard error, and the brightness."""
     cells = []
     for name in ("error", "flip"):
         logs = [np.log(row[name] / _start(row, rows)[name]) for row in these]

@@ -2,19 +2,20 @@
 
     python -m bench.sampler --folder SCENES [--maps NAME ...]
 
-Rendered are the built-in scenes and each FOLDER/*/scene.xml that `gpt` can render (the others are named and left out):
+It renders the built-in scenes and each FOLDER/*/scene.xml that `gpt` can render (the others are named and left out):
 
-    cost       time of `gpt`, whole stacks with features, variances and film, over that of Mitsuba's C++ `path` at the
-               same samples per pixel, --timing-spp of them; alternating, kernels compiled before
-    compile    seconds to compile the kernels of either, from an empty cache
-    variance   of independent differences of neighbouring pixels over that of `dx` and of `dy`, summed over the image.
-               Pixels where the camera sees a light are left out: its emission is in the primal, not in the gradients
-    relMSE     (without the worst 0.1 % of the pixels) of reconstructions from `gpt`, over that of `path` with as many
-               more samples as it has time for; time to reconstruct is not counted, and listed in the results
+    cost       time of `gpt` (whole stacks with features, variances and film) relative to Mitsuba's C++ `path` at the
+               same samples per pixel, --timing-spp; alternating, with kernels compiled beforehand
+    compile    seconds to compile the kernels of each, from an empty cache
+    variance   variance of independent differences of neighbouring pixels relative to the variance of `dx` and `dy`,
+               each summed over the image. Pixels where the camera sees a light are left out: its emission is in the
+               primal, not in the gradients
+    relMSE     (without the worst 0.1 % of the pixels) of reconstructions from `gpt`, relative to `path` with as many
+               samples as fit into the same time; the time to reconstruct is not counted, but listed in the results
 
-References are rendered for a fixed time, kept in CACHE, and taken from there the next time. A run that was broken off
-goes on where it ended if it is started with the same arguments. Written are the results, and for each scene
-named by --maps docs/images/NAME-gradients.png, see ngpt/evaluation/gradientmap.py.
+References are rendered for a fixed time and kept in CACHE for the next run. An interrupted run continues where it ended
+if it is started with the same arguments. The script writes the results and, for each scene named by --maps,
+docs/images/NAME-gradients.png, see ngpt/evaluation/gradientmap.py.
 """
 
 import argparse
@@ -180,7 +181,7 @@ def cached_reference(scene, name: str, size: tuple[int, int], args: argparse.Nam
 
 
 def variance_ratios(stack: GradientStack) -> dict[str, float]:
-    """Sum over the image of the variance of independent differences of neighbours, over that of the gradients."""
+    """Variance of independent differences of neighbours over variance of the gradients, each summed over the image."""
     ratios = {}
     for name, independent in zip(("dx", "dy"), variances_of_differences(stack), strict=True):
         used = np.isfinite(independent) & np.isfinite(stack[f"{name}_var"])

@@ -1,10 +1,10 @@
 """A contact sheet for the eye, in blind order: python -m bench.sheet EVALUATION --methods oidn ngpt-combine -o out/
 
 Each row is one crop of one scene and number of samples of an evaluation whose images were kept (``images = "first"``):
-the reference, then the methods in an order of its own, named A, B, C. Scene, samples and place are drawn by --seed
-alone; nobody chooses them. Write down which one you prefer, then open key.json: what A, B and C are, and the errors
-(FLIP and trimmed relMSE) of the very crop. ``python -m bench.sheet EVALUATION --answers "BCA A..." -o out/`` counts:
-one letter a row, - for none, against the key that is there.
+the reference, then the methods in a random order, named A, B, C. Scene, samples and place depend only on --seed;
+nobody chooses them. Write down which one you prefer, then open key.json: it says what A, B and C are, and gives the
+errors (FLIP and trimmed relMSE) of each crop. ``python -m bench.sheet EVALUATION --answers "BCA A..." -o out/`` counts
+the answers by the key in that folder: one letter per row, - for none.
 """
 
 import argparse

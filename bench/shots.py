@@ -96,7 +96,7 @@ def judge(stacks: list, references: list, method: str) -> list[dict]:
 
 
 def measured(stacks: list, references: list, images: dict[str, list[np.ndarray]]) -> list[dict]:
-    """A row for each list of images; ``references`` are stacks, one alone for a shot at rest."""
+    """A row for each list of images; ``references`` are stacks, a single one for a static shot."""
     truth = [reference["primal"] for reference in references]
     rng = np.random.default_rng(0)
     noise = [np.sqrt(reference["primal_var"]) * rng.standard_normal(truth[0].shape) for reference in references]
@@ -125,9 +125,9 @@ def line(row: dict) -> str:
 
 
 def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path) -> tuple[str, str, str]:
-    """Renders stacks, those with pairs (the same without ``--pairs``) and references; returns the names of the folders.
+    """Renders stacks, stacks with pairs (without ``--pairs``: the same) and references; returns the folder names.
 
-    What is there already is kept.
+    Existing files are kept.
     """
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 

@@ -2,18 +2,18 @@
 
     python -m bench.speed --before f72936e
 
-On synthetic stacks with features and variances. Each row runs once in a turn, so that a busy moment hits all alike;
-those of the commit run in a process of their own, which takes its turn like the others.
+Stacks are synthetic, with features and variances. Each row runs once per turn, so that other work on the machine
+affects all rows alike. The rows of the commit run in a separate process, which takes its turn like the others.
 
-    oidn            Open Image Denoise with albedo and normal as they are, its largest quality: the rival of all rows
-    wcv, ngpt-fast, ngpt-primal, ngpt-combine   as ``ngpt denoise`` runs them, by features that are known to be clean
-    ..., caustic    with a layer of that name, as rooms with a mirror or a glass have it
-    ..., noisy      by features whose noise is not known, or large
-    oidn-small, oidn-default   networks of that shape, weights at random, on wcv: ``ngpt denoise --weights NET.tza``
-    before: ...     the same at the commit
+    oidn            Open Image Denoise with unfiltered albedo and normal, at its highest quality: compared to all rows
+    wcv, ngpt-fast, ngpt-primal, ngpt-combine   as ``ngpt denoise`` runs them, with features that are known to be clean
+    ..., caustic    with the layer ``caustic``, which rooms with a mirror or glass have
+    ..., noisy      with features whose noise is unknown or large
+    oidn-small, oidn-default   networks of that shape, random weights, on wcv: ``ngpt denoise --weights NET.tza``
+    before: ...     the row at the commit
 
-Seconds by the clock and of processors, and the latter over those of "oidn" in the same turn: medians and quartiles. On
-a busy machine only processor time means anything.
+Results are medians and quartiles of wall-clock seconds, of processor seconds, and of processor seconds relative to
+"oidn" in the same turn. On a busy machine only processor time is meaningful.
 """
 
 import argparse

@@ -2,15 +2,15 @@
 
     python eval.py --config configs/eval-bidirectional.toml --out out/bidirectional --scenes 'scenes/*/scene.xml'
     python -m bench.tables bidirectional out/bidirectional   # keeps its numbers, puts the table into its page
-    python -m bench.tables                                   # all tables anew, from the numbers that are kept
+    python -m bench.tables                                   # all tables again, from the numbers that are kept
 
 Numbers are kept in bench/results/NAME.json: medians over seeds of the primary metric and of FLIP, cell by cell, and
-what a sample of each sampler costs. ``PAGES`` says which page a table is in, and which of three kinds it is of:
+the cost of a sample of each sampler. ``PAGES`` gives the page of each table, and its kind, one of three:
 
-    by_scene   errors over the least of the scene, bold where it is the least; below, what that is, and the costs of a
-               sample over those of `primal`
+    by_scene   errors over the least error of the scene, which is bold; below, the least error itself, and the cost of a
+               sample relative to `primal`
     means      geometric means over the scenes at each number of samples; the least is bold
-    rivals     errors over those of OIDN on our samples and on Mitsuba's, means over all cells
+    rivals     errors relative to OIDN on our samples and on Mitsuba's, means over all cells
 """
 
 import argparse
@@ -39,7 +39,7 @@ def by_scene(result: dict[str, Any]) -> str:
     for method in methods:
         ratios = [cells[*column, method] / least[column] if (*column, method) in cells else None for column in columns]
         shown = ["" if r is None else "**1**" if r == 1 else short(r) for r in ratios]
-        # Of all scenes or of none: means over other scenes could not be compared.
+        # A mean needs all scenes: means over different scenes could not be compared.
         shown.append("" if None in ratios else short(mean(ratios)))
         lines.append(f"| `{method}` | {' | '.join(shown)} |")
     lines.append(f"| *least error* | {' | '.join(f'{error:.2g}' for error in least.values())} | |")
@@ -121,7 +121,7 @@ def marks(name: str) -> tuple[str, str]:
 
 
 def kept(results: dict[str, Any]) -> dict[str, Any]:
-    """Of an evaluation's results.json what tables are made of."""
+    """The part of an evaluation's results.json that the tables use."""
     facts = {name: results[name] for name in ("title", "command", "date", "metadata", "settings")}
     costs = {
         scene: {cost["sampler"]: cost["median"] for cost in entry["cost"].values()}

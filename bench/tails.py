@@ -1,4 +1,4 @@
-"""What shared tails are worth: seconds and errors with tails=shared over those with tails=paths.
+"""What shared tails are worth: seconds and errors with tails=shared relative to tails=paths.
 
     python -m bench.tails kitchen/scene.xml bedroom/scene.xml --references FOLDER --groups rooms=kitchen,bedroom
 
@@ -53,7 +53,7 @@ RIVAL = {"points": "independent", "lamps": "uniform"}
 TAILS = ("paths", "shared")
 VALUES = ("error", "steady", "FLIP", "blocks", "energy")
 ERRORS = VALUES[:-1]
-# Far from those that images have
+# Far from the seeds of images
 REFERENCE_SEED = 1 << 20
 # With these a render comes to its second round of samples: all kernels are compiled.
 WARM_SPP = 9

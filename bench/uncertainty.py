@@ -95,7 +95,7 @@ def images(scene: str, spp: int, args: argparse.Namespace) -> list[GradientStack
 
 
 def case(method: str, reference: GradientStack, stack: GradientStack, *halves: GradientStack) -> tuple[np.ndarray, ...]:
-    """Of all values that show no lamp: difference to the reference, change by more noise, variance of the reference."""
+    """Difference to the reference, change by more noise, variance of the reference, for values that show no lamp."""
     result = reconstruct_with_error(stack, method, halves=halves or None)
     image, changed = result.image, result.error / FACTORS.get(method, FACTOR)
     shown = ~stack["direct"].any(axis=-1) if "direct" in stack else np.ones(image.shape[:2], bool)

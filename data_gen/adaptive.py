@@ -1,16 +1,16 @@
 """Samples where they pay: after a few samples everywhere, more of them where the result's error is large.
 
-The error is that of the image by the method that will run on the stack, not that of the stack: the standard errors of
-``ngpt.api.uncertainty``. A render goes on in steps, each of which may double the samples. Before each step the method
-runs twice on what there is. With error q of a pixel, relative to its light, and n samples of it, s = q sqrt(n) is what
-one sample would leave. The mean of s² / n for a given sum of n is least where n is proportional to s: the step brings
-the counts as near to that as it can. All pixels get at least a quarter of their even share, lest light that the first
-samples missed were never found.
+The error is measured on the image that the chosen method reconstructs, not on the stack: it is the standard error of
+``ngpt.api.uncertainty``. A render proceeds in steps, and each step may double the samples. Before each step the method
+runs twice on the samples so far. If a pixel has the error q, relative to its light, after n samples, one sample would
+leave the error s = q sqrt(n). For a given sum of n, the mean of s² / n is least where n is proportional to s. Each step
+brings the counts as near to this as it can. Every pixel gets at least a quarter of its even share, so that light which
+the first samples missed can still be found.
 
-The samples that a choice was made by stay in the means. So a pixel whose first samples were too dark by chance might
-get fewer of those that would show it, and be too dark in the mean. Two things keep that small: errors are means over
-about 9x9 pixels, in which a pixel's own samples are few; and they are relative to the light there, so that noise which
-darkens lowers both. docs/use/adaptive.md has what was measured.
+The samples that decide the counts stay in the means. So a pixel whose first samples were too dark by chance might get
+too few further samples, and its expected value would be too dark. Two things keep this bias small: errors are means
+over about 9x9 pixels, where a pixel's own samples have little weight; and they are relative to the light there, so
+noise that darkens a pixel lowers both. docs/use/adaptive.md has measurements.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
 from ngpt.system.late import ndimage
 
-# Least number of samples per pixel in the mean: that of the first step, everywhere, and as many to be shared out
+# Least mean number of samples per pixel: the first step everywhere, and as many again to distribute
 LEAST = 2 * BLOCK
-# Of an even share, what a pixel gets at least and at most
+# The least and the most that a pixel gets, relative to an even share
 _FLOOR, _CAP = 0.25, 16.0
 # A step to a given error goes a bit further than is thought to be needed, and is no smaller than this of what there is.
 _MARGIN, _SMALLEST = 1.05, 0.125
@@ -172,12 +172,12 @@ def assess(stack: GradientStack, method: str) -> Assessment:
     again = reconstruct(noisier(stack), method)
     light = ndimage.uniform_filter(np.nan_to_num(result.image).astype(np.float64), (3, 3, 1))
     unit = np.sqrt(np.square(light) + EPSILON)
-    # Relative before it is averaged over neighbours: that of a lamp's edge is no error of the dark beside it.
+    # Made relative before averaging over neighbours: the error of a lamp's edge must not count for the dark beside it.
     once, twice = (np.nan_to_num(r.image) / unit for r in (result, again))
     factor = FACTORS.get(result.method, FACTOR)
     squares = np.square(factor * (twice - once))
     error = _TAILS.get(result.method, _TAIL) * math.sqrt(trimmed_mean(squares, squares, _TRIM))
-    # Nor is that of a firefly an error of all pixels around it.
+    # Nor must the error of a firefly count for all pixels around it.
     most = np.quantile(np.abs(twice - once), 1 - _CUT)
     around = factor * change(once, once + np.clip(twice - once, -most, most))
     return Assessment(np.sqrt(np.square(around).mean(axis=-1)).ravel(), error, result.method)
@@ -213,7 +213,7 @@ def share_out(need: np.ndarray, n: np.ndarray, samples: float) -> np.ndarray:
 
 
 def gain(need: np.ndarray) -> float:
-    """Squared error over that of even samples of the same number, where ``need`` (pixels) is right and counts exact."""
+    """Squared error relative to as many even samples, if ``need`` (per pixel) is right and the counts are exact."""
     shares = np.clip(need / max(need.mean(), 1e-300), _FLOOR, _CAP)
     squares = np.square(need)
     return float((squares / (shares / shares.mean())).mean() / max(squares.mean(), 1e-300))

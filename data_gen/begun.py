@@ -1,8 +1,8 @@
 """Renders that were begun: whether a file has all that is asked for, and what is left to render of it.
 
-What is left gets a seed of its own, made of the one that is asked for and the number of parts that are there. So its
-samples are none of those in the file, and independent of them: means and variances of both are merged exactly as those
-of stacks with different seeds are (``ngpt.merging``). Whatever ends a part says nothing of its samples.
+The rest gets its own seed, made from the requested seed and the number of existing parts. So its samples differ from
+the samples in the file and are independent of them: means and variances are merged exactly as for stacks with different
+seeds (``ngpt.merging``). What ends a part does not depend on its samples.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Watch:
-    """Who is told of a render as it goes on.
+    """Callbacks during a render.
 
     ``progress``  called before the first pass and after each
     ``stop``      asked after each pass whether to end there

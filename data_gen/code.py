@@ -74,7 +74,7 @@ def _imports(file: Path) -> set[str]:
     return found
 
 
-# Of files as they were when last changed
+# Cached by the time of the last change of the file
 @lru_cache(maxsize=1024)
 def _tree(file: Path, changed: int) -> ast.Module:
     return ast.parse(file.read_bytes())

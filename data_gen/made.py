@@ -18,7 +18,7 @@ _IN_ARRAYS = ("film.size", "film.crop_offset")
 
 
 class Made:
-    """The newest sampler of each name. The camera may move between renders; after all else a sampler is made anew."""
+    """The newest sampler of each name. The camera may move between renders; any other change needs a new one."""
 
     def __init__(self) -> None:
         self._kept: dict[str, tuple[Any, SamplePass]] = {}
@@ -38,7 +38,7 @@ class Made:
 
 
 def _key(scene: mi.Scene, options: dict[str, Any]) -> tuple:
-    """What a recorded kernel depends on, but for arrays of the camera: numbers by value, arrays by identity."""
+    """What a recorded kernel depends on, except arrays of the camera: numbers by value, arrays by identity."""
     camera = scene.sensors()[0]
     of_scene, of_camera = ({key: params[key] for key in params.keys()} for params in map(mi.traverse, (scene, camera)))  # noqa: SIM118
     numbers = {key: value for key, value in of_camera.items() if not leaves(value) and key not in _IN_ARRAYS}

@@ -34,8 +34,8 @@ _BLOCK_LANES = 1 << 21
 _MOST_LANES = 1 << 30
 # Lanes of the first pass of a render that time may end: fewer leave cores idle.
 _FEWEST_LANES = 1 << 13
-# Of the time that is left, what a pass that ends the render is expected to take; and how many times as long as the
-# longest before it a pass may be where there is a time.
+# The share of the remaining time that the last pass is planned to take; and, in a render with a time limit, how many
+# times as long as the longest pass before it a pass may be
 _CAUTION, _GROWTH = 0.9, 8
 # Lanes of the first pass of others: enough to render small images at one go, and to judge how long the next may be.
 FIRST_LANES = 1 << 20
@@ -76,7 +76,7 @@ def rounds_of(sample: SamplePass) -> Rounds:
 
 
 def _nothing(left: int) -> str:
-    """Of what would fit into so many bytes for a lane."""
+    """Suggests nothing that would fit into so many bytes per lane."""
     return ""
 
 
@@ -93,18 +93,18 @@ def render_passes(
 ) -> GradientFilm:
     """Calls ``sample`` with the camera samples of pass after pass, and returns the film it filled.
 
-    The first pass is always rendered, and no further one that is expected to take longer than what is left of the
-    ``budget``'s time; of the last block there may be a part. Passes are short at first where ``points`` are "rounds",
-    which is how their number is not known before.
+    The first pass is always rendered. A further pass is rendered only if it is expected to fit into the rest of the
+    ``budget``'s time. The last block may be a partial one. Passes are short at first if ``points`` are "rounds", which
+    means that the number of samples is not known beforehand.
 
-    How many blocks of samples make a pass adapts to the speed of the scene and to the memory, of which a lane
-    takes ``lane_bytes``, or what ``sample`` says in an attribute of that name. That changes no bit of the result, which
-    depends on the seed, the size, the number of samples and ``spp`` alone: of that goes the first round of the
-    ``points``, see ``data_gen.paths.streams.first_round``. With a ``batch``, the samples of a pass depend
-    on each other: each pass is one block of so many samples per pixel, and the film's variances are over passes. Such a
-    ``sample`` may keep a state from pass to pass; ``CameraSamples.first`` tells it where it is.
+    The number of blocks of samples in a pass adapts to the speed of the scene and to the memory. A lane takes
+    ``lane_bytes``, or what an attribute of this name of ``sample`` says. This changes no bit of the result, which
+    depends only on the seed, the size, the number of samples and ``spp``: the latter determines the first round of the
+    ``points``, see ``data_gen.paths.streams.first_round``. With a ``batch``, the samples of a pass depend on each
+    other: each pass is one block of so many samples per pixel, and the film's variances are computed over passes. Such
+    a ``sample`` may keep a state from pass to pass; ``CameraSamples.first`` gives its position.
 
-    A ``sample`` may come in ``Rounds``, which no pass goes beyond.
+    A ``sample`` may come in ``Rounds``; no pass crosses the end of a round.
 
     Raises NgptError where one block of samples does not fit into the memory.
     """
@@ -127,7 +127,7 @@ def render_passes(
             watch.progress(limit if finished else min(limit - 1, int(now - start)), limit)
 
     def next_pass(size: int) -> int:
-        """Samples of the next pass, where ``size`` is that of its blocks; 0 for none."""
+        """Samples of the next pass, with blocks of ``size`` samples; 0 for none."""
         left, time_left = total - film.samples, math.inf if seconds is None else seconds - (now - start)
         # What is left over at the end is a block of its own.
         if left < size and seconds is None:
@@ -184,9 +184,9 @@ def growing_block(pixels: int, done: int, block: int) -> int:
 
 
 def foretold(done: list[tuple[int, float]]) -> tuple[float, float]:
-    """Seconds to begin a pass and seconds of a block of it, from those of passes: a line, by least squares.
+    """Seconds to begin a pass and seconds per block, from the times of passes: a line, fitted by least squares.
 
-    Of the last eight, without the first of all, which compiles kernels.
+    It uses the last eight passes, without the very first, which compiles kernels.
     """
     blocks, seconds = np.array(done[1:][-8:] or done).T
     fastest = float((seconds / blocks).min())
@@ -221,7 +221,7 @@ def film_within(
 ) -> tuple[GradientFilm, int, int]:
     """An empty film for ``spp`` samples per pixel, samples of a block, and how many blocks may make a pass.
 
-    ``instead`` is that of ``blocks_within``, ``net`` that of ``CameraSamples``.
+    ``instead`` is as in ``blocks_within``, ``net`` as in ``CameraSamples``.
     Raises NgptError where one block of samples does not fit into ``memory``.
     """
     width, height = (int(n) for n in sensor.film().crop_size())

@@ -31,7 +31,7 @@ from ngpt.merging import UNFINISHED
 from ngpt.stack import GradientStack
 from ngpt.version import __version__
 
-# What is told of a render after each pass: a function that makes the stack of the samples done by then.
+# Called after each pass of a render with a function that makes the stack of the samples done by then
 Newest = Callable[[Callable[[], GradientStack]], None]
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
@@ -57,25 +57,24 @@ def render_stack(
 ) -> GradientStack:
     """Renders a stack from the scene's first sensor.
 
-    ``sampler`` is "auto" or one of ``data_gen.samplers.SAMPLERS``; ``options`` are its own, which may be texts.
-    ``spp``, ``seconds`` and ``memory`` are those of ``data_gen.budget.Budget``, ``progress`` and ``stop`` those of
+    ``sampler`` is "auto" or one of ``data_gen.samplers.SAMPLERS``; ``options`` are its options, which may be strings.
+    ``spp``, ``seconds`` and ``memory`` are as in ``data_gen.budget.Budget``, ``progress`` and ``stop`` as in
     ``data_gen.budget.Watch``; ``newest`` is called after each pass with a function that makes the stack of the samples
-    done by then. With ``diagnostics`` the stack carries the images of ``data_gen.film.GradientFilm.diagnose()`` as
-    further channels; without ``with_features``, which only sampler "primal" can do without, it holds nothing but the
-    primal. The scene's reconstruction filter is not used: the pixels of a stack, and so their differences, are
-    box-filtered.
+    done by then. With ``diagnostics`` the stack has the images of ``data_gen.film.GradientFilm.diagnose()`` as
+    further channels. Without ``with_features`` it holds only the primal; only sampler "primal" can do without features.
+    The scene's reconstruction filter is not used: the pixels of a stack, and so their differences, are box-filtered.
 
-    With ``adaptive``, pixels get samples in different numbers, which the layer ``samples`` says: see
-    ``data_gen.adaptive``. ``spp``, and ``ngpt:spp``, are means over pixels then.
+    With ``adaptive``, pixels get different numbers of samples, which the layer ``samples`` contains: see
+    ``data_gen.adaptive``. ``spp`` and ``ngpt:spp`` are then means over pixels.
 
     Without ``unbiased``, samplers with the option ``tails`` let paths share what they find, where that works and pays
     (``data_gen.tails``). The attribute ``ngpt:samplerOptions`` then contains ``tails=shared``.
 
     Renders of one scene that are given the same object ``made`` share their samplers, where that is possible.
 
-    The same seed, options and number of samples give the same bits, however they came about. Where it is not known
-    before, the option points=rounds is taken, which ``ngpt:samplerOptions`` then says. A render that was ended by
-    ``stop`` before it had all says so in ``ngpt:unfinished``.
+    The same seed, options and number of samples give the same bits, however the render was ended. If the number of
+    samples is not known beforehand, the option points=rounds is used and recorded in ``ngpt:samplerOptions``. A render
+    that ``stop`` ended before it had all samples is marked by ``ngpt:unfinished``.
 
     Raises Unfinished, which has the stack of the samples done by then, where a later pass fails; and NgptError for
     options that do not exist or make no sense, and for a scene that the sampler cannot render.
@@ -114,7 +113,7 @@ def render_stack(
         whole[:] = [film]
         newest(lambda: stack_of(film, sensor, seed, sampler, start, {}))
 
-    # Of samples that time may end nobody knows how many there will be, though no more than ``spp``.
+    # If time may end the render, the number of samples is not known, except that it is at most ``spp``.
     if settings.get("points") == "sobol" and (spp is None or seconds is not None or adaptive is not None):
         settings["points"] = "rounds"
     watch = Watch(progress, stop, look)

@@ -68,21 +68,21 @@ def render_scene(
 ) -> Rendered:
     """Renders the stack of a scene: a Mitsuba scene, a scene file, or a built-in scene by name.
 
-    ``size``        (width, height) in pixels, and ``parameters``, the ``<default>`` values: of a file or built-in scene
-    ``sensor``      number or id of the one that is rendered, of a file; None: the first
-    ``spp``         base paths per pixel (32 where nothing else ends the render); with ``adaptive`` their mean
-    ``seconds``     of wall-clock time, compilation included; with ``method`` those of pilot, render and method
+    ``size``        (width, height) in pixels, and ``parameters``, the ``<default>`` values: of files or built-in scenes
+    ``sensor``      number or id of the sensor to render, for a file; None: the first
+    ``spp``         base paths per pixel (32 if nothing else ends the render); with ``adaptive`` their mean
+    ``seconds``     wall-clock time, compilation included; with ``method`` the time of pilot, render and method together
     ``adaptive``    more samples where the error of the result is large
-    ``error``       the same, until the result is expected to have this relative error (0.05: 5 %)
-    ``method``      that will denoise the stack: samples go by its error. With ``seconds`` alone, a pilot chooses the
-                    sampler for it; "auto": the method too
-    ``sampler``     "auto" or one of ``data_gen.samplers.SAMPLERS``; ``options`` are its own
+    ``error``       as ``adaptive``, until the result is expected to have this relative error (0.05: 5 %)
+    ``method``      the method that will denoise the stack: samples go by its error. With only ``seconds``, a pilot
+                    chooses the sampler for it; "auto": the method too
+    ``sampler``     "auto" or one of ``data_gen.samplers.SAMPLERS``; ``options`` are its options
     ``memory``      MiB for paths and film, beside the scene (6144)
     ``diagnostics`` adds rates of failed shifts and discarded values as channels
-    ``unbiased``    turns the cache off that paths share. The cache lowers the noise of most renders and adds a small
+    ``unbiased``    turns off the cache that paths share. The cache lowers the noise of most renders and adds a small
                     bias: see docs/samplers/tails.md
     ``gradients``   whether the stack must have dx and dy, also where a sampler without them leaves less error ("auto")
-    ``variant``     of Mitsuba; by default the current one, or llvm_ad_rgb where none is set
+    ``variant``     variant of Mitsuba; by default the current one, or llvm_ad_rgb if none is set
     ``progress``    called with (samples done, spp), or whole (seconds gone, seconds)
     ``stop``        asked after each pass whether to end there: the stack holds the samples done by then. See
                     ``stop_on_ctrl_c``

@@ -1,4 +1,4 @@
-"""The frames of a shot as files: all, those that are missing, the part of one machine, or by all of a Dask cluster."""
+"""The frames of a shot as files: all frames, missing frames, the part of one machine, or all on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ngpt.io.whole import finished
 from ngpt.stack import GradientStack
 from ngpt.system.files import check_output
 
-# Of a cluster: frames that a worker renders with one scene in memory, and kernels compiled once.
+# On a cluster: the frames that a worker renders with one scene in memory, and with kernels compiled once
 FRAMES_OF_A_PART = 8
 
 
@@ -50,15 +50,15 @@ def write_frames(
     stop: Callable[[], bool] = lambda: False,
     **options: Any,
 ) -> Written:
-    """Writes the stack of each frame to its file, ``files``: frame -> file, all of the shot in order.
+    """Writes the stack of each frame to its file; ``files`` maps all frames of the shot, in order, to their files.
 
-    With ``denoising`` its image instead, see ``data_gen.outputs``. Only those of the part i of n where ``shard`` is
-    (i, n). ``made`` is called with what is written so far and the number of frames, at first and after each.
-    ``options`` are those of ``render_frames``. Raises NgptError as that does, and for files that exist unless one of
-    ``overwrite`` and ``skip_existing`` says what to do with them.
+    With ``denoising`` it writes images instead of stacks, see ``data_gen.outputs``. With ``shard`` (i, n) it writes
+    only part i of n. ``made`` is called with what is written so far and the number of frames, first and after each
+    frame. ``options`` are as in ``render_frames``. Raises NgptError as ``render_frames`` does, and for files that exist
+    unless ``overwrite`` or ``skip_existing`` says what to do with them.
     """
     number, parts = shard
-    # Of frames side by side, each needs the scene of the one before.
+    # Each part is a run of consecutive frames, since a frame needs the scene of the previous one.
     part_of = {frame: i * parts // len(files) for i, frame in enumerate(files)}
     ours = [frame for frame in files if part_of[frame] == number]
     outputs = {frame: Output(files[frame], denoising) for frame in ours}

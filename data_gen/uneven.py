@@ -22,11 +22,11 @@ BLOCK = PACKET
 
 
 class UnevenRender:
-    """A render that is told, step by step, how many more blocks of samples each pixel gets.
+    """A render that receives, step by step, how many more blocks of samples each pixel gets.
 
-    What it is told makes one sequence of blocks: the first of all pixels that get one, row by row, then the second of
-    all that get two, and so on. ``most`` samples, the time of the ``budget`` or ``stop`` cut the sequence wherever it
-    is: the same samples in all give the same bits, whatever the passes and whatever ended it.
+    The steps make one sequence of blocks: the first block of all pixels that get one, row by row, then the second block
+    of all pixels that get two, and so on. ``most`` samples, the time of the ``budget`` or ``stop`` can end the sequence
+    anywhere. The same total of samples gives the same bits, whatever the passes and whatever ended the render.
 
     ``sample`` must take samples that do not share anything; see ``data_gen.passes.render_passes()`` for it. ``stop`` is
     asked before each pass, and ``report`` called after it.

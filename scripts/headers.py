@@ -1,8 +1,8 @@
 """Fetches ONNX Runtime's C++ headers, which libngpt is built with: python3 scripts/headers.py [FOLDER]
 
-They are those of Debian 13's package libonnxruntime-dev, checked against its SHA-256, and go to FOLDER/include. FOLDER
-is build/onnxruntime if none is named, where the tests look. The library is not among them: `pip install onnxruntime`
-has one.
+The headers come from Debian 13's package libonnxruntime-dev, which is checked against its SHA-256, and go to
+FOLDER/include. The default FOLDER is build/onnxruntime, where the tests look. The library is not included:
+`pip install onnxruntime` has one.
 """
 
 import hashlib

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-# Of a run that starts from finished weights: a small rate, which the average makes up for.
+# For a run that starts from finished weights: a small rate, which the average makes up for
 SETTINGS = {
     "run.steps": "60000",
     "run.save": "100",

@@ -16,9 +16,9 @@ CLOCKS: dict[str, Callable[[], float]] = {"wall": time.perf_counter, "processor"
 
 
 def warm_up(scene: mi.Scene, options: Mapping[str, Any]) -> GradientStack:
-    """Has the kernels of a render compiled, of which the number of samples is no part; its stack of one sample.
+    """Compiles the kernels of a render, which do not depend on the number of samples; returns a stack of one sample.
 
-    ``options`` are those of ``render_stack``. Raises NgptError for a sampler that cannot render this scene.
+    ``options`` go to ``render_stack``. Raises NgptError for a sampler that cannot render this scene.
     """
     return render_stack(scene, 1, 0, **options)
 

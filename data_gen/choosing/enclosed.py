@@ -6,16 +6,17 @@ import drjit as dr
 import mitsuba as mi
 
 _RAYS = 1 << 12
-# Of the rays that leave what the camera sees, the share that meets another surface: in five rooms .96 to 1, around
-# objects and in open boxes .14 to .82 (docs/lab/worth.md).
+# The share of the rays leaving visible surfaces that meet another surface: 0.96 to 1 in five rooms, 0.14 to 0.82 around
+# objects and in open boxes (docs/lab/worth.md)
 _IN_ROOMS = 0.9
 
 
 def enclosed(scene: mi.Scene) -> bool:
     """Whether nearly all light that reaches what the camera sees comes from other surfaces.
 
-    Rays go through random pixels, and on from where they hit, in proportion to the cosine. Windows without glass count
-    as open. The answer depends on the scene alone: the rays are always the same. It takes .15 processor seconds.
+    Rays go through random pixels, and continue from where they hit in directions sampled by the cosine. Windows without
+    glass count as open. The answer depends only on the scene: the rays are always the same. It takes 0.15 processor
+    seconds.
     """
     random = mi.PCG32(_RAYS)
     sensor = scene.sensors()[0]

@@ -1,16 +1,17 @@
-"""The whole way to an image: a sampler and a method, and the error that they are expected to leave in the end.
+"""Pipelines from scene to image: a sampler and a method, and the error that they are expected to leave.
 
-Each sampler that could render the scene renders four small stacks. Every method that can use them reconstructs each of
-the four, and both halves of them merged. The error of such an image is that against primals of the other half and of
-the other samplers, whose noise has no mean (``data_gen.choosing.trials``): so what a method blurs or loses counts. From
-the pilot's samples to those that fit into the time errors fall by a power of the samples. Part of that power is what
-the pilot saw from one stack to two, the rest what is usual for methods of its kind.
+Each sampler that can render the scene renders four small stacks. Every method that can use them reconstructs each of
+the four, and each half merged. The error of such an image is measured against primals of the other half and of the
+other samplers, whose noise has zero mean (``data_gen.choosing.trials``), so blur and lost light count as error. The
+error at the number of samples that fit into the time is extrapolated by a power law. Its exponent comes partly from the
+pilot, which compares one stack to two, and partly from what is usual for this kind of method.
 
-The image of a biased sampler (photons) is judged as a reconstruction is, and no biased sampler judges others. Where it
-finds most of the light, those that judge it have much noise: twice the standard error is added to what they say.
+The image of a biased sampler (photons) is judged like a reconstruction, and no biased sampler judges others. Where the
+biased sampler finds most of the light, the samplers that judge it are noisy: twice the standard error is added to the
+error they give.
 
-Samples are even, or shared out (``data_gen.adaptive``) where that is expected to pay for itself: the gain is that of
-the pilot's expected errors, pixel by pixel, were they known.
+Samples are even, or adaptive (``data_gen.adaptive``) where this is expected to pay for itself. The gain is computed
+from the pilot's expected errors, pixel by pixel, as if these were exact.
 
 Not handled: light that no sampler has found in the pilot.
 """
@@ -32,22 +33,22 @@ from ngpt.methods import METHODS, reconstruct, runnable
 from ngpt.stack import GradientStack
 
 # The best of each kind of stack at some number of samples; what is not here is behind one of them, or far slower.
-# Those that are best most often come first: where time is short, the others are not measured.
+# The most frequent winners come first: where time is short, the others are not measured.
 WITH_GRADIENTS = ("ngpt-combine", "ngpt-fast", "wcv", "l1")
 WITHOUT = ("ngpt-primal", "oidn", "primal")
-# These numbers are those of python -m bench.pipelines on scenes not apart.
-# The powers of the samples by which errors usually fall, of methods that use gradients and of denoisers; the share that
-# the pilot has in such a power, and the steepest and flattest that it may be
+# These numbers come from python -m bench.pipelines on scenes that are not ``--apart``.
+# The usual exponents of the error as a power of the samples, for methods that use gradients and for denoisers; the
+# weight of the pilot in an exponent, and the steepest and flattest exponents allowed
 BY_GRADIENTS, BY_DENOISERS = -0.95, -0.55
 SEEN, STEEPEST, FLATTEST = 0.3, -1.2, -0.2
 # By how many times errors turned out as expected, at least and at most in eight of ten cases, at 1, 4 and 16 times the
 # samples of the pilot: of networks that use gradients and of others, on all scenes of that file.
 SPREADS = {True: ((0.4, 2.3), (0.5, 3.2), (0.6, 5.1)), False: ((0.5, 1.8), (0.5, 2.4), (0.5, 2.6))}
 _SPREAD_AT = (1, 4, 16)
-# The same power of photons' images, by theory; and how much of the standard error of their errors is added to these
+# The exponent for images by photons, from theory; and how many standard errors are added to their error
 _BY_PHOTONS, _DOUBT = -2 / 3, 2.0
-# The power by which shared out samples with gradients are better than the pilot says, whose need is smoother than it
-# is; and the samples from which on they are thought of
+# The power of the pilot's gain that adaptive samples with gradients achieve: the pilot's need is smoother than the true
+# one; and the number of samples from which on they are considered
 REALISED, FROM = 2.0, 2 * LEAST
 
 
@@ -56,12 +57,12 @@ class Pipeline:
     """A sampler and a method, as a pilot saw them.
 
     ``spp``       samples per pixel at which the ``error`` (trimmed relMSE) was measured
-    ``step``      the power of the samples by which it falls, as the pilot saw it
-    ``seconds``   of one sample of the whole image
-    ``after``     those of the method
-    ``adaptive``  error of shared out samples over that of even ones, as the need for them says; 1: samples are even
-    ``choosing``  seconds of the method that shares them out, each time
-    ``doubt``     standard error of the error of a biased sampler, by which it is taken for larger; else 0
+    ``step``      the exponent of the error as a power of the samples, as the pilot measured it
+    ``seconds``   seconds for one sample per pixel of the whole image
+    ``after``     seconds of the method
+    ``adaptive``  expected error of adaptive samples relative to even ones; 1: samples are even
+    ``choosing``  seconds of the method each time that samples are distributed
+    ``doubt``     standard error of a biased sampler's error, by which the error is raised; otherwise 0
     """
 
     sampler: str
@@ -77,7 +78,7 @@ class Pipeline:
 
     @property
     def shared(self) -> bool:
-        """Whether samples are shared out."""
+        """Whether samples are adaptive."""
         return self.choosing > 0
 
     @property
@@ -95,7 +96,7 @@ class Pipeline:
 
     @property
     def gain(self) -> float:
-        """The error over that of as many even samples."""
+        """The error relative to as many even samples."""
         return self.adaptive ** (REALISED if SAMPLERS[self.sampler].gradients else 1)
 
     def samples(self, seconds: float) -> float:
@@ -108,7 +109,7 @@ class Pipeline:
         return spp * self.seconds + self._choices(spp) + self.after
 
     def _choices(self, spp: float) -> float:
-        """Seconds in which samples are shared out: each time, their number doubles."""
+        """Seconds spent on distributing samples: each time, their number doubles."""
         return self.choosing * math.ceil(math.log2(spp / LEAST) + 1) if self.shared and spp > LEAST else 0.0
 
     @property
@@ -117,7 +118,7 @@ class Pipeline:
         if self.shared:
             return FROM
         batch = SAMPLERS[self.sampler].batch
-        # Of one batch there are no variances.
+        # A single batch has no variances.
         return max(1, 2 * batch if self.method == "wcv" else batch)
 
     def expected(self, spp: float) -> float:
@@ -161,8 +162,8 @@ def measure(
 ) -> list[Pipeline]:
     """The pipelines of trials by name of sampler: every method that runs here on every stack that it can use.
 
-    Or those of the ``methods`` that are given for a sampler; samples are ``shared`` out too, or only even. Each sampler
-    has one method at least, and further ones as long as it ``goes_on``.
+    ``methods`` restricts the methods of each sampler. With ``shared``, samples are also distributed adaptively, else
+    only evenly. Each sampler gets at least one method, and further ones as long as it ``goes_on``.
     """
     witnesses = Witnesses.of(trials)
     found = []
@@ -183,7 +184,7 @@ def measure(
             if SAMPLERS[name].biased:
                 doubt = witnesses.doubt(name, double[0][0])
             else:
-                # Of both: at twice the samples, the one that was measured there and the one that falls to it.
+                # The geometric mean of the error measured at twice the samples, and the error extrapolated to there
                 two = math.sqrt(two * one * 2 ** usual_fall(name, method))
             pipeline = Pipeline(name, method, spp, two, math.log2(two / one), trial.seconds, min(after), doubt=doubt)
             found.append(pipeline)
@@ -214,6 +215,6 @@ def methods_for(sampler: str, only: str = "auto") -> list[str]:
 
 
 def choose(pipelines: Sequence[Pipeline], seconds: float) -> list[Pipeline]:
-    """Those of which at least a sample fits into the time, the one to take first."""
+    """The pipelines for which at least one sample fits into the time, the best first."""
     fit = [p for p in pipelines if p.samples(seconds) >= 1 and math.isfinite(p.expected(p.samples(seconds)))]
     return sorted(fit, key=lambda p: p.expected(p.samples(seconds)))

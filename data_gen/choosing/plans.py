@@ -1,10 +1,10 @@
 """Which sampler, how many samples and which method: chosen by a pilot, small renders by each sampler that could do it.
 
-``plan`` is for a time and an image that a method makes: the least error wins. ``plan_sampler`` is for ``--sampler
-auto`` where nothing says which method will run: a case of the same with one simple method for each sampler, ``wcv``
-where there are gradients, else none, and even samples. What it compares is the time to the error that the scene's own
-sampler is expected to have at the end. It chooses photons where they are better beyond doubt, and not in scenes whose
-light they alone can find. What no pilot can see is light that none of the samplers has found.
+``plan`` is for a given time and a method that makes the image: the least error wins. ``plan_sampler`` is for
+``--sampler auto`` where the method is not known. It does the same with even samples and one simple method for each
+sampler: ``wcv`` where there are gradients, else none. It compares the times to reach the error that the scene's own
+sampler is expected to have at the end. It chooses photons where they are clearly better, but not in scenes whose light
+only photons can find. No pilot can see light that none of the samplers has found.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from ngpt.errors import NgptError
 from ngpt.methods import METHODS
 from ngpt.system.console import brief
 
-# Of the time that there is, what trials of samplers may take together, and those and the methods: of an image, and
-# of a render, where no method is measured but the quickest
+# The shares of the time that all trials of samplers may take, and that trials and methods may take, for an image; and
+# the share for a render, where only the quickest method is measured
 SHARE, SHARE_WITH_METHODS = 0.2, 0.3
 _SHARE_OF_RENDER = 0.15
 # Seconds for an image below which a pilot costs more than it could gain. The trials of gpt and primal on the smallest
@@ -45,12 +45,12 @@ _BEGINS, _FILES = 0.8, 3.7
 # The power of the pixels by which the seconds of methods grow: from 4,080 to 230,400 pixels 0.84 (ngpt-combine), 0.86
 # (oidn, ngpt-primal) to 0.96 (ngpt-fast), from 57,600 on 0.89 to 1.1. A call takes some time whatever the size.
 _GROWS = 0.9
-# Seconds for a million pixels, on two cores, of methods that no pilot has measured; of those that are not listed
+# Seconds for a million pixels, on two cores, of methods that no pilot has measured; of methods that are not listed
 _METHOD_SECONDS, _OTHERS = {"auto": 18.0, "ngpt-combine": 18.0, "ngpt-primal": 7.0, "oidn": 8.0}, 3.0
 # Seconds from which on the pilot's images are as large as they ever are, and the least share of that
 LONG, LEAST_PIXELS = 200.0, 1 / 16
-# Renders for which a twentieth is enough to compile the kernels of other samplers and to try them: by seconds, and by
-# paths, of which a core or two make a million a second
+# In renders from this size on, a twentieth is enough to compile the kernels of other samplers and to try them: in
+# seconds, and in paths. One or two cores trace a million paths per second.
 _LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
 # What cleans the image of a room, and why
 _ROOM_METHOD = "ngpt-primal"
@@ -64,7 +64,7 @@ Stop = Callable[[], bool]
 
 
 def silent(line: str) -> None:
-    """Nobody is told."""
+    """Discards the line."""
 
 
 def never() -> bool:
@@ -76,10 +76,10 @@ def never() -> bool:
 class Plan:
     """How a scene is rendered, and why.
 
-    ``sampler``  its name
-    ``method``   for whose result it was chosen; "" where nothing says which one will run
-    ``shared``   whether samples are shared out
-    ``render``   seconds for the render, those of the pilot and of the method taken off; None: as long as it takes
+    ``sampler``  name of the sampler
+    ``method``   the method whose result it was chosen for; "" if the method is not known
+    ``shared``   whether samples are adaptive
+    ``render``   seconds for the render, without pilot and method; None: as long as it takes
     ``reason``   a line for the user
     """
 
@@ -159,14 +159,15 @@ def plan(
     stop: Stop = never,
     unbiased: bool = False,
 ) -> Plan:
-    """How to use so many ``seconds`` of the ``clock``, those of the pilot and of the method included.
+    """How to use so many ``seconds`` of the ``clock``, which include the pilot and the method.
 
-    Of the ``method`` alone if it is not "auto". The pilot tries the sampler that the scene's description stands for,
-    then ``primal``, then all unbiased others that ``--sampler auto`` compares, as far as they fit into a fifth of the
-    time, compilation included. The less time, the smaller are its images. Where there is no time for a pilot, and where
-    it finds that nothing fits, the description decides, and what is left of the time is rendered. ``said`` is told what
-    is tried; ``stop`` ends the pilot; ``unbiased`` goes to ``data_gen.render.render_stack``. The measurements
-    change from run to run. Raises NgptError for a method that does not run here or cannot use any of the stacks.
+    Only the given ``method`` is considered, unless it is "auto". The pilot tries the sampler that the scene's
+    description stands for, then ``primal``, then all other unbiased samplers that ``--sampler auto`` compares, as far
+    as they fit into a fifth of the time, compilation included. The less time, the smaller are its images. If there is
+    no time for a pilot, or if the pilot finds that nothing fits, the description decides, and the render takes the
+    remaining time. ``said`` is called with what is tried; ``stop`` ends the pilot; ``unbiased`` goes to
+    ``data_gen.render.render_stack``. The measurements change from run to run. Raises NgptError for
+    a method that does not run here or cannot use any of the stacks.
     """
     start = clock()
     able = _able(scene, method)
@@ -282,7 +283,7 @@ def best_of(pipelines: Sequence[Pipeline], seconds: float) -> tuple[str, str]:
 def times_to_the_end(pipelines: Sequence[Pipeline], seconds: float) -> dict[str, float]:
     """Seconds that each sampler takes to the error that the first has after so many of them."""
     first = pipelines[0]
-    # Of methods as quick as these, what they take is no part.
+    # These methods are so quick that their time is not counted.
     error = first.expected(max(first.least, seconds / first.seconds))
     return {p.sampler: p.needed(error) * p.seconds for p in pipelines}
 

@@ -39,7 +39,7 @@ SPP = 8
 PIXELS, _LEAST_PIXELS = 1 << 16, 1 << 10
 # The worst pixels are left out, as ngpt.measure.metrics.relmse_trimmed does.
 _TRIM = 0.001
-# Seeds far from those that users take
+# Seeds far from the ones that users take
 SEED = 0x9E3779B9
 
 
@@ -56,9 +56,9 @@ class Trial:
 
 
 def candidates(scene: mi.Scene, biased: bool = False) -> list[str]:
-    """What could render the scene: the sampler that its description stands for, and then those to be compared with.
+    """Samplers that could render the scene: the one that its description stands for, then the ones to compare it with.
 
-    Those of them that are ``biased`` come last, if at all.
+    With ``biased``, biased samplers are included and come last.
     """
     facts = scene_facts(scene)
     first, _ = choose(facts)
@@ -79,12 +79,12 @@ def try_all(
     stop: Callable[[], bool] = lambda: False,
     unbiased: bool = False,
 ) -> dict[str, Trial]:
-    """Trials of those that can render the scene, by name.
+    """Trials of the samplers that can render the scene, by name.
 
-    All of them together may take as many seconds of the ``clock`` as the ``budget`` says, which is asked with the
-    trials that there are: one that would not fit into the rest is left out, by what it takes to compile and to render.
-    The ``first`` has a budget of its own, and is compiled in any case. ``said`` is told what is tried, and ``stop``
-    asked whether to end there. ``unbiased`` goes to ``data_gen.render.render_stack``.
+    Together they may take as many seconds of the ``clock`` as the ``budget`` returns when called with the trials so
+    far. A trial that would not fit into the remaining time, by its time to compile and to render, is left out. The
+    ``first`` has a budget of its own, and is always compiled. ``said`` is called with what is tried; ``stop`` says
+    whether to end there. ``unbiased`` goes to ``data_gen.render.render_stack``.
     """
     start, slow = clock(), 1.0
     trials: dict[str, Trial] = {}
@@ -149,7 +149,7 @@ def try_out(
     def timed(n: int, seed: int) -> tuple[GradientStack, tuple[float, float]]:
         start, busy = clock(), time.process_time()
         stack = render_stack(scene, n, seed, sampler, unbiased=unbiased)
-        # Of a graphics card, the seconds of the processor are not those of the samples.
+        # On a graphics card, processor seconds do not measure the cost of the samples.
         return stack, (clock() - start, time.process_time() - busy if mi.variant().startswith("llvm") else 0.0)
 
     made: list[tuple[GradientStack, tuple[float, float]]] = []
@@ -172,11 +172,11 @@ def try_out(
 
 @dataclass(frozen=True)
 class Witnesses:
-    """The primals of trials, by which images of each of the samplers are judged.
+    """The primals of trials, which judge the images of each sampler.
 
     ``primals``  four of each sampler, by name
-    ``noise``    of one of them
-    ``scale``    what errors are relative to: of all samplers, those with little noise count most
+    ``noise``    noise of a single primal, by name of sampler
+    ``scale``    what errors are relative to: an image from all samplers, where samplers with little noise count most
     """
 
     primals: dict[str, list[np.ndarray]]
@@ -192,8 +192,8 @@ class Witnesses:
         return cls(primals, noise, mean_of(means, noise))
 
     def against(self, sampler: str, half: int) -> tuple[np.ndarray, np.ndarray]:
-        """Two independent images that the sampler's other half has no part in: that ``half`` of its own, and all of
-        the others that are unbiased. Nothing but its own judges it where there are none."""
+        """Two independent images without the sampler's other half: made of its own ``half`` and all other unbiased
+        samplers. If there are none, only its own images judge it."""
         a, b = (self._side(sampler, half, i) for i in range(2))
         return a, b
 
@@ -205,8 +205,11 @@ class Witnesses:
         return mean_of({n: images[n] for n in fair}, weights)
 
     def error(self, sampler: str, halves: Sequence[Sequence[np.ndarray]]) -> float:
-        """The error of independent images by ``sampler``, some of either of its halves: at least what those of one
-        differ by, which is sure, where noise of the witnesses hides the rest."""
+        """The error of independent images by ``sampler``, some from each of its halves.
+
+        It is at least the noise by which the images of one half differ from each other. This bound is certain even
+        where noise in the other samplers hides the rest.
+        """
         judged = [
             error_of(image, *self.against(sampler, 1 - half), self.scale)
             for half, images in enumerate(halves)
@@ -221,7 +224,7 @@ class Witnesses:
 
 
 def mean_of(images: dict[str, np.ndarray], noise: dict[str, float]) -> np.ndarray:
-    """Of images by name, weighted by 1 / their noise."""
+    """The mean of images by name, weighted by 1 / noise."""
     weights = {name: 1 / noise[name] for name in images}
     return np.asarray(sum(weights[name] * image for name, image in images.items())) / sum(weights.values())
 

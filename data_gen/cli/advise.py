@@ -120,7 +120,7 @@ def commands_of(row: Row, args: argparse.Namespace) -> list[str]:
 
 
 def of_the_scene(args: argparse.Namespace) -> list[str]:
-    """The options of this call that are those of a render too."""
+    """The options of this call that a render has too."""
     words = ["--size", "{}x{}".format(*args.size)] if args.size else []
     words += ["--sensor", args.sensor] if args.sensor is not None else []
     words += ["--variant", args.variant] if args.variant else []

@@ -13,7 +13,7 @@ from ngpt.report.tev import Tev
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 
-# Of the render's time, what making and sending images may take; the first may take half of what all may.
+# The share of the render's time that making and sending images may take; the first image may take half of all this.
 SHARE, _AHEAD = 0.02, 0.5
 _CAUTION = 1.5
 # Seconds that the first image is expected to take: to load the method, and for a pixel.
@@ -21,9 +21,9 @@ _LOAD, _PIXEL = 0.1, 3e-6
 
 
 class Onlookers:
-    """The page and the viewer of a render, those of them that are there; none costs nothing.
+    """The page and the viewer of a render, if there are any; without them it costs nothing.
 
-    ``newest`` is what ``data_gen.render_scene`` calls after each pass, ``progress`` what it tells of it.
+    ``data_gen.render_scene`` calls ``newest`` after each pass, and ``progress`` with the progress.
     """
 
     def __init__(self, page: LivePage | None, viewer: Tev | None, say: Callable[[str], None], unit: str):
@@ -96,7 +96,7 @@ class Onlookers:
 
     def _affordable(self, gone: float) -> bool:
         if not self.shown:
-            # Of what the whole render may cost: how long it takes is not known well yet.
+            # Relative to the whole render, but cautiously: how long it takes is not known well yet.
             gone = max(gone, _AHEAD * (gone + self.left))
         return self.spent + self.expected <= SHARE * gone
 
@@ -115,7 +115,7 @@ class Onlookers:
 
 
 def onlookers(live: bool, view: str | None, scene: str, command: str, console: Console, unit: str) -> Onlookers:
-    """Those that were asked for, as far as they are there: who is not is told of in a line, and the render goes on."""
+    """The page and viewer that were asked for; a line names each one that is not available, and the render goes on."""
     page = viewer = None
     try:
         viewer = Tev(view, scene) if view else None

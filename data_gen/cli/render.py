@@ -28,7 +28,7 @@ from ngpt.system.console import Console
 from ngpt.system.interrupts import Interrupt
 from ngpt.system.limits import limit_threads
 
-# How many times its time a render takes whose user is told why, where it made no more than so many samples per pixel.
+# A render explains why it was late if it took this many times its time for at most this many samples per pixel.
 _LATE, _FEW = 1.2, 16
 
 
@@ -52,7 +52,7 @@ def denoising_of(args: argparse.Namespace) -> Denoising | None:
         return None
     method = args.denoise if args.denoise not in (None, "auto") else args.method or "auto"
     if args.error is not None and args.method is None and method != "auto":
-        args.method = method  # the error is that of the image
+        args.method = method  # the error is measured on the image
     denoising = Denoising(method, args.transform, args.exposure)
     denoising.check(args.sampler, args.spp)
     return denoising

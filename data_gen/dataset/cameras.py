@@ -133,7 +133,7 @@ class Surroundings:
 
 
 def is_boundary(bsdf: mi.BSDF | mi.BSDFPtr):
-    """Whether the material is that of a boundary of media, which lets all light through."""
+    """Whether the material only bounds media and lets all light through."""
     return bsdf.flags() & int(mi.BSDFFlags.All) == int(mi.BSDFFlags.Null)
 
 
@@ -153,9 +153,9 @@ def grid_rays(sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float) -> View:
-    """A random view that shows something, the more it shows the more likely.
+    """A random view that shows something; views that show more are more likely.
 
-    ``size`` is that of the crop in pixels, ``roll`` the largest angle about the view direction in degrees, ``lens`` the
+    ``size`` is the crop size in pixels, ``roll`` the largest angle about the view direction in degrees, ``lens`` the
     standard deviation of the aperture's radius relative to the distance in focus (0.005 in the paper). Raises NgptError
     when no view can be found.
     """
@@ -219,7 +219,7 @@ def with_one_kernel(around: Surroundings, view: View) -> View:
     """
     params = mi.traverse(around.scene.sensors()[0])
     crop, corner = mi.ScalarVector2i(view.size, view.size), mi.ScalarVector2i(*view.window)
-    # Some sizes have equal factors whatever the field of view: all those that are as high as the crop.
+    # Some sizes have equal factors whatever the field of view: all sizes that are as high as the crop.
     for larger in range(16):
         width, height = view.film[0] + larger, view.film[1] + larger
         for steps in range(8):

@@ -112,7 +112,7 @@ class Config:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Those of the sampler."""
+        """Options of the sampler."""
         return self.samplers.get(self.sampler, {})
 
     @property
@@ -152,9 +152,9 @@ class Config:
                 raise NgptError(f"data configuration: adaptive = {self.adaptive:g}: {text}")
 
     def plan(self, turn: int = 0) -> list[Job]:
-        """The shards to make. It depends on the configuration alone, so that n machines agree on who makes which.
+        """The shards to make. It depends only on the configuration, so that n machines agree on who makes which.
 
-        ``turn``  of those who never end: from 1 on further procedural scenes, and further views of scene files
+        ``turn``  number of the turn for endless use: from 1 on, further procedural scenes and views of scene files
         """
         sources: list[tuple] = [(made_name(turn * self.scenes + i), self.crops) for i in range(self.scenes)]
         for source in self.files:

@@ -34,7 +34,7 @@ def make_shard(config: Config, job: Job, folder: str, variant: str, again: Again
     """Renders the crops of ``job`` and writes its shard into ``folder``; returns its name there.
 
     Runs in any process. The same config and job give the same bits. A crop that fails is recorded and left out.
-    ``again``  references that are there already, of which only inputs are rendered, with new noise
+    ``again``  existing references, for which only inputs are rendered, with new noise
     """
     if (Path(folder) / job.file).exists():  # made by a worker that was lost before it said so
         return job.file
@@ -75,7 +75,7 @@ def make_shard(config: Config, job: Job, folder: str, variant: str, again: Again
                 crops += [data for data, _ in made]
                 record["crops"] += [told for _, told in made]
     write_shard(Path(folder) / job.file, crops, record)
-    # Kernels are those of the scene: a process that makes thousands of scenes would keep them all.
+    # Kernels belong to the scene: a process that makes thousands of scenes would keep them all.
     import drjit as dr
 
     dr.flush_kernel_cache()
@@ -94,7 +94,7 @@ def made_scene(config: Config, name: str, folder: Path) -> Path:
 
 
 def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:
-    """K samples per pixel, log-uniform between the bounds, stratified, smallest first; those of a pair are equal."""
+    """K samples per pixel, log-uniform between the bounds, stratified, smallest first; counts of a pair are equal."""
     low, high = np.log(config.spp[0]), np.log(config.spp[1] + 1)
     if config.pairs:
         return 2 * [int(np.exp(low + rng.random() * (high - low)))]
@@ -103,9 +103,9 @@ def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:
 
 
 def uneven_inputs(config: Config, name: str, crop: int, counts: list[int]) -> list[bool]:
-    """Which inputs of the crop get uneven samples: ``config.adaptive`` of those with enough samples to share out.
+    """Which inputs of the crop get adaptive samples: the share ``config.adaptive`` of inputs with enough samples.
 
-    By random numbers of their own, so that views, seeds and references are those of even samples.
+    It uses separate random numbers, so that views, seeds and references are the same as with even samples.
     """
     if not config.adaptive:
         return [False] * len(counts)
@@ -266,8 +266,8 @@ def references(converged: GradientStack, method: str) -> tuple[np.ndarray, np.nd
 def finite(stack: GradientStack) -> tuple[GradientStack, int]:
     """The stack without values that are not finite, and how many pixels or differences had some.
 
-    Pixels come from their neighbours and gradients become 0; what is not known of a variance is that of an estimate
-    that is all noise: its own square.
+    Pixels are filled from their neighbours, and gradients become 0. An unknown variance becomes the square of the
+    value, as if the value were only noise.
     """
     whole = repair(stack)
     layers = {"primal": whole.image + whole.direct, "direct": whole.direct}

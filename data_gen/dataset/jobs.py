@@ -59,13 +59,13 @@ class Pool(ProcessPoolExecutor):
 
 
 def processes(count: int) -> Executor:
-    """``count`` processes, or this one alone."""
+    """``count`` processes, or only this one."""
     return Serial() if count == 1 else Pool(count)
 
 
 @contextmanager
 def cluster(address: str) -> Iterator[Executor]:
-    """The workers of a Dask cluster; ``address`` is that of its scheduler, such as tcp://host:8786."""
+    """The workers of a Dask cluster; ``address`` is the address of its scheduler, such as tcp://host:8786."""
     try:
         from distributed import Client
     except ModuleNotFoundError as error:
@@ -133,7 +133,7 @@ def finished(executor: Executor, make: Callable[[Job], str], jobs: list[Job], ah
 
 
 def start(config: Config, folder: Path, planned: int) -> None:
-    """Makes ``folder`` the home of this configuration's training set; raises NgptError if it is that of another."""
+    """Makes ``folder`` the home of this configuration's training set; raises NgptError if it belongs to another."""
     (folder / "shards").mkdir(parents=True, exist_ok=True)
     with exclusive(folder, wait=True):
         if not (folder / MANIFEST).exists():

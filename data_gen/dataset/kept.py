@@ -1,9 +1,9 @@
-"""References kept small, without inputs: these are rendered anew, with new noise, each time a reference is met.
+"""Compressed references without inputs: inputs are rendered again, with new noise, each time a reference is used.
 
-A file of them has the name and the record of the shard that they were made in (scene, views, seeds, versions), and for
-each crop its images as bytes of lzma. A number x is kept as the nearest of the steps log2 |x| = n / 64 and its sign, so
-it errs by 0.54 % at most. Of the numbers n, the differences from pixel to pixel are packed, those of green and those of
-what red and blue are apart from green, high and low bytes apart.
+A file of references has the name and the record of the shard that they were made in (scene, views, seeds, versions),
+and for each crop its images as bytes of lzma. A number x is stored as its sign and the nearest step log2 |x| = n / 64,
+with an error of at most 0.54 %. The numbers n of green, and the differences of red and of blue from green, are stored
+as differences from pixel to pixel, with high and low bytes separated.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Again:
 
 
 def home(config: Config, folder: Path) -> Path:
-    """Where the references of ``config`` lie in ``folder``: those of another with other inputs alone are the same."""
+    """Where the references of ``config`` lie in ``folder``; configurations that differ only in inputs share them."""
     told = {name: value for name, value in as_json(config).items() if name not in ("inputs", "spp", "adaptive")}
     return folder / f"{zlib.crc32(json.dumps(told, sort_keys=True).encode()):08x}"
 
@@ -62,7 +62,7 @@ class Kept:
 
     @property
     def places(self) -> dict[int, int]:
-        """Of the number of each crop in its scene, its place in the file."""
+        """The place of each crop in the file, by the number of the crop in its scene."""
         return {told["crop"]: place for place, told in enumerate(self.record["crops"])}
 
     def images(self, place: int) -> tuple[np.ndarray, ...]:

@@ -1,7 +1,7 @@
 """How a shot of a training set moves: its camera, one thing in it, its light. All of it comes from random numbers.
 
-Each of the three moves or rests for itself, at a speed that is even over the frames and, from shot to shot, uniform in
-its logarithm. So there are slow shots and fast ones, and shots of which only the light changes.
+Each of the three moves or rests independently. Its speed is constant over the frames and log-uniform from shot to shot.
+So there are slow shots and fast ones, and shots in which only the light changes.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from data_gen.dataset.cameras import Surroundings, View, floats
 from data_gen.frames.motion import seen
 from data_gen.scenes.geometry import VERTICES, put_vertices, vertices
 
-# Shares of shots of which the camera moves, a thing does, the light does; and of the latter, of which a lamp moves,
-# where there is one, rather than shines differently.
+# Shares of the shots in which the camera moves, a thing moves, and the light changes; of the last, the share in which a
+# lamp moves, if there is one, rather than changes its radiance.
 CAMERA, THING, LIGHT, LAMP = 0.8, 0.35, 0.35, 0.5
 # Pixels a frame of what is seen at the median distance, of the image's width: 0.1 to 9.6 of 96 pixels.
 SPEEDS = 0.001, 0.1
 # A thing that is moved fills this share of the pixels: smaller ones are not seen, larger ones are walls.
 SIZES = 0.01, 0.3
-# Of the lamp's way in the median distance, and of the logarithm of its radiance, a frame.
+# Changes per frame: of the lamp's position, relative to the median distance, and of the logarithm of its radiance
 LAMP_WAYS, GAINS = (0.005, 0.08), (0.01, 0.3)
-# Of the way to what is in the way that a camera may go, all frames together.
+# The share of the way to the next obstacle that a camera may go, in all frames together
 CLEAR = 0.6
 RADIANCE = (".radiance.value", ".intensity.value", ".irradiance.value")
 
@@ -54,7 +54,7 @@ class Movement:
         return replace(self.view, origin=floats(origin), target=floats(target))
 
     def apply(self, scene: mi.Scene, frame: int) -> None:
-        """Brings ``scene`` into the state of a frame; that of frame 0 is the scene's own, seen by the view."""
+        """Brings ``scene`` into the state of a frame; frame 0 is the original scene, seen by the view."""
         self.view_at(frame).apply(scene)
         if not self.shape and not self.light:
             return

@@ -25,8 +25,9 @@ VALIDATION = 10
 
 
 def write_layout(data: Dataset, folder: Path, progress: Callable[[int, int], None] = lambda done, total: None) -> int:
-    """Writes the crops of ``data`` into ``folder``, but for files that are there, and returns how many inputs were left
-    out: those with as many samples as another of their crop, which would have its name.
+    """Writes the crops of ``data`` into ``folder``, except existing files, and returns how many inputs were left out.
+
+    An input is left out if another input of its crop has as many samples, since both would have the same name.
 
     Raises NgptError for sets of shots or without references, and where a file cannot be written.
     """

@@ -4,10 +4,10 @@
         for step in ...:
             crop = data[rng.integers(len(data))]
 
-Scenes never run out: after those of the configuration come others of their kind, and further views of scene files.
+Scenes never run out: after the scenes of the configuration come others of their kind, and further views of scene files.
 
-With ``kept``, a folder, the references of the configuration are made once and kept there, small. Again and again they
-are met with new inputs, which take a third of the time, so that no noise is ever seen twice.
+With ``kept``, a folder, the references of the configuration are made once and stored there in compressed form. They are
+used repeatedly with new inputs, so no noise is ever seen twice. New inputs take a third of the time.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from data_gen.film.nets import law
 _GROUPS, _LEAST = 64, 64
 # Side of the square of pixels that tells how much noise there is around the one in its middle
 _AROUND = 5
-# So many pixels of a group are taken for those of independent samples, lest few pixels say it by chance.
+# As many pixels with independent samples are added to each group, so that few pixels do not decide by chance.
 _PRIOR = 4.0
 
 
@@ -47,7 +47,7 @@ def factors(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net
 
 
 def factor(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net: int) -> np.ndarray:
-    """The same of pixels (N, C) that are one group, however much noise each of them has, (N, 1)."""
+    """As ``factors``, (N, 1), for pixels (N, C) that form one group, however much noise each of them has."""
     squares, variances = np.square(contrast).sum(axis=-1), variance.sum(axis=-1)
     good = np.flatnonzero(np.isfinite(squares) & np.isfinite(variances))
     return _found(squares, variances, samples, net, good, 1)[:, None]

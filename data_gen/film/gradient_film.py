@@ -51,27 +51,27 @@ _STRANDS = 1 << 15
 class GradientFilm:
     """Collects samples, in the order of ``CameraSamples``, and develops them into the layers of a gradient stack.
 
-    Samples that are not finite get zero weight: they are left out of the mean and counted. Which sample is added to
-    which sum, and in what order, depends on its number alone: the same samples give the same bits, whatever the passes.
+    Samples that are not finite get zero weight: they are left out of the mean and counted. The number of a
+    sample determines which sum it is added to, and in what order: the same samples give the same bits in any passes.
 
-    A pass may hold samples of ``some`` pixels alone. Then pixels have samples in different numbers, and so have the two
-    ends of a pair of pixels: each direction of a difference is a mean over the base paths of its own end.
+    A pass may hold samples of only ``some`` pixels. Then the number of samples differs between pixels, also between the
+    two ends of a pair of pixels. Each direction of a difference is a mean over the base paths of its own end.
 
-    Variances are over samples, which are taken for independent. If they are points of rounds, the first of which is a
-    ``net`` of so many for each pixel, variances are brought to the noise that is seen: ``data_gen.film.claims``. Where
-    samples of a pass share photons, reservoirs or the state of a chain, or lanes splat onto pixels of others, the film
-    is made with ``batches``: each pass is one batch, a pixel's value is its mean over the batch, and variances are over
-    batches. A batch counts by its samples: the last one may have fewer than those before it.
+    Variances are computed over samples, as if these were independent. If samples are points of rounds, and the first
+    round is a ``net`` of so many points per pixel, the variances are scaled to the noise that is observed, see
+    ``data_gen.film.claims``. If samples of a pass share photons, reservoirs or the state of a chain, or lanes splat
+    onto other pixels, the film is made with ``batches``: each pass is one batch, a pixel's value is its mean over the
+    batch, and variances are computed over batches. Batches are weighted by their samples: the last one may have fewer.
     """
 
     def __init__(self, width: int, height: int, batches: bool = False, net: int = 0):
         self.width, self.height, self.batches, self.net = width, height, batches, net
         self.pixels = width * height
         self.strands = 1 if batches else max(1, _STRANDS // self.pixels)
-        self.samples = 0  # per pixel; of those that were in all passes alone
-        self.blocks = 0  # of samples, each of which goes to one strand
+        self.samples = 0  # per pixel; only for pixels that were in all passes
+        self.blocks = 0  # blocks of samples; each block goes to one strand
         self.batch = 0  # samples per pixel of all batches but the last, which may have fewer
-        # The same of each pixel, where they may differ
+        # Samples of each pixel, where these may differ
         self.counts: np.ndarray | None = None
         self._blocks_each = np.zeros(0, np.int64)
         # Dr.Jit gives each array the next power of two of bytes.
@@ -115,11 +115,12 @@ class GradientFilm:
         return self._splats[name]
 
     def end_pass(self, block: int | None = None, some: np.ndarray | None = None) -> None:
-        """Adds what was put to the statistics: all of it, so that a pass broken off before leaves no trace.
+        """Adds the values of the pass to the statistics, all at once: an interrupted pass leaves no trace.
 
-        ``block`` is that of ``CameraSamples``: the number of samples of a pixel that are side by side. Of a film with
-        ``batches`` it is all samples of the pass, and must be given where there are splats alone. ``some`` is the pixel
-        of each block, ascending, where the pass has not all pixels alike; all later passes then say theirs too.
+        ``block`` is the ``block`` of ``CameraSamples``: the number of samples of a pixel that are side by side. In a
+        film with ``batches`` it is the number of all samples of the pass, and must be given if there are only splats.
+        ``some`` is the pixel of each block, ascending, if the pass does not treat all pixels alike; all later passes
+        must then give it too.
         """
         if not self._pass and not self._splats:
             return
@@ -160,7 +161,7 @@ class GradientFilm:
         self._pass, self._splats = {}, {}
 
     def _add_some(self, values: dict, block: int | None, some: np.ndarray) -> None:
-        """The samples of a pass whose blocks are those of ``some`` pixels."""
+        """Adds the samples of a pass whose blocks belong to ``some`` pixels."""
         if self.batches or not block:
             raise ValueError("passes of some pixels have blocks of independent samples")
         if self.counts is None:
@@ -216,7 +217,7 @@ class GradientFilm:
 
     @property
     def samples_each(self) -> np.ndarray:
-        """Samples of each pixel, (pixels) int64, those that were not finite included."""
+        """Samples of each pixel, (pixels) int64, including samples that were not finite."""
         return np.full(self.pixels, self.samples, np.int64) if self.counts is None else self.counts.copy()
 
     def _moments(self, name: str, channels: int) -> Moments:
@@ -313,12 +314,12 @@ class GradientFilm:
         return contrast(self.moments[name], self.strands, self._numbers)
 
     def _gradient(self, layer: str) -> tuple[np.ndarray, np.ndarray]:
-        """Both directions of one difference, each with weight 1/2 (survey, Algorithm 1), and the variance of that.
+        """Both directions of one difference, each with weight 1/2 (survey, Algorithm 1), and its variance.
 
         The difference between pixel p and its successor is sampled from p by the forward shift and, independently,
-        from the successor by the backward shift. Either is a part of the difference, and not an estimate of all of it:
-        where one end has more samples, its part has less variance, and not more weight. What is put for the forward
-        shift alone is the whole difference.
+        from the successor by the backward shift. Each direction estimates a part of the difference, not all of it. So
+        where one end has more samples, its part has less variance, but not more weight. If only the forward shift has
+        values, these are the whole difference.
         """
         x, y = SHIFTS[f"{layer}+"]
         behind, ahead = np.s_[: self.height - y, : self.width - x], np.s_[y:, x:]
@@ -370,5 +371,5 @@ def _components(value) -> list:
 
 
 def opaque(n: int) -> mi.UInt32:
-    """A number that is not compiled into kernels, each anew."""
+    """A number that is not compiled into kernels, as a new variable for each call."""
     return dr.opaque(mi.UInt32, n)

@@ -29,14 +29,14 @@ class Splats:
     def __init__(self, pixels: int, channels: int):
         self.pixels = pixels
         self.channels = channels
-        # Pixel after pixel, within a pixel the ranges from the smallest up, within a range the channels, which then lie
-        # side by side in memory: most of the time of a splat is that of reaching it.
+        # Ordered by pixel, then by range from the smallest up, then by channel. So channels lie side by side in memory:
+        # most of the time of a splat is memory access.
         self.sums = dr.zeros(dr.int64_array_t(mi.Float), pixels * BINS * channels)
         self.lost = dr.zeros(mi.UInt32, pixels)
 
     @classmethod
     def on(cls, pixels: int, channels: int, sums: tuple) -> Self:
-        """Those that go on with ``sums``, which are changed: ``sums`` and ``lost`` of others."""
+        """Splats that continue ``sums``, the pair ``sums`` and ``lost`` of other splats, and change them in place."""
         splats = cls.__new__(cls)
         splats.pixels, splats.channels, (splats.sums, splats.lost) = pixels, channels, sums
         return splats
@@ -62,7 +62,7 @@ class Splats:
             range_ = dr.maximum(exponent - _LOWEST, 0) // _BITS
             digits = Int64(Float64(component) / _unit(range_))
             place = (pixel * BINS + mi.UInt32(range_)) * self.channels + channel
-            # Side by side, lanes hardly ever meet at a pixel: to look for those that do costs more than it saves.
+            # Neighbouring lanes hardly ever meet at a pixel: looking for such lanes costs more than it saves.
             dr.scatter_add(self.sums, digits, place, active & good, mode=dr.ReduceMode.Direct)
 
     def totals(self) -> list:

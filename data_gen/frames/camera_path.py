@@ -25,8 +25,8 @@ class Key:
 
     ``to_world``  (4, 4), Mitsuba's camera to the world: columns left, up, forward, position; in a path without scale
     ``look``      (3, 3), rows origin, target and up, where the key was given by them
-    ``fov``       degrees, None: that of the scene
-    ``fov_axis``  "x" (width) or "y" (height): what ``fov`` is of
+    ``fov``       degrees; None: the scene's own
+    ``fov_axis``  "x" (width) or "y" (height): the axis of ``fov``
     """
 
     frame: float
@@ -115,7 +115,7 @@ def _mirrored(matrix: np.ndarray) -> bool:
 
 
 def _between(one: np.ndarray, other: np.ndarray, t: float) -> np.ndarray:
-    # Of mirrored cameras their images turn.
+    # Mirrored cameras are mirrored back, since only rotations can be interpolated.
     side = np.array([-1.0 if _mirrored(one) else 1.0, 1, 1])
     turns = Rotation.from_matrix([m[:3, :3] * side for m in (one, other)])
     matrix = np.eye(4)
@@ -125,10 +125,10 @@ def _between(one: np.ndarray, other: np.ndarray, t: float) -> np.ndarray:
 
 
 def read_camera_path(path: str | Path) -> CameraPath:
-    """Reads ``{"keys": [{"frame": 0, ...}, ...]}``, or the list alone.
+    """Reads ``{"keys": [{"frame": 0, ...}, ...]}``, or only the list.
 
     A key has ``to_world`` (4 rows of 4 numbers, Mitsuba's) or ``origin``, ``target`` and, if not +y, ``up``; and may
-    have ``fov`` in degrees with ``fov_axis`` "x" (default) or "y". Raises NgptError for files and keys that are not so.
+    have ``fov`` in degrees with ``fov_axis`` "x" (default) or "y". Raises NgptError for other files and keys.
     """
     content = read_json(path)
     entries = content.get("keys") if isinstance(content, dict) else content

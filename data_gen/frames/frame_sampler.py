@@ -19,10 +19,10 @@ from ngpt.stack import GradientStack
 
 
 class Remembering:
-    """The frames of one shot; ``options`` are those of ``render_stack``.
+    """The frames of one shot; ``options`` are as in ``render_stack``.
 
     ``changes``: whether more than the camera may change from frame to frame. Raises NgptError for options that the
-    sampler has not.
+    sampler does not have.
     """
 
     def __init__(

@@ -25,15 +25,15 @@ _DEFAULTS = {"translation": [0.0, 0, 0], "rotation": [0.0, 0, 0, 1], "scale": [1
 _MOST = 1_000_000
 _MOST_BYTES = 2**30  # of a file or a buffer beside it
 
-# Of one property of one node: times (K,), values (K, C) or (3K, C), and how to go from one to the next.
+# A property of a node: times (K,), values (K, C) or (3K, C), and how to interpolate
 Channel = tuple[np.ndarray, np.ndarray, str]
 
 
 def read_gltf_camera(path: str | Path, fps: float) -> CameraPath:
     """The path of a file's first camera, a key for each frame; frame 0 is second 0.
 
-    Its coordinates are those of the file, in which +y is up. Buffers are read that are in the file, or beside it or
-    below. Raises NgptError for files that cannot be read, and where no node has a perspective camera.
+    Coordinates are as in the file, where +y is up. Buffers may be in the file, in its folder or in folders below.
+    Raises NgptError for files that cannot be read, and where no node has a perspective camera.
     """
     if not 0 < fps < math.inf:
         raise WrongUse(f"{path}: {fps:g} frames a second; give a positive number")

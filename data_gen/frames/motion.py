@@ -25,7 +25,7 @@ from data_gen.scenes.geometry import Geometry, Mesh, geometry, matrix
 from ngpt.errors import NgptError
 from ngpt.windows import Place
 
-# Of the path's length: where a hit lies off the straight ray by more, there was a mirror or a lens on the way.
+# A hit that is farther off the straight ray than this, relative to the path's length, was seen by a mirror or a lens.
 _OFF_RAY = 1e-3
 
 
@@ -44,7 +44,7 @@ class Snapshot:
 
 
 def snapshot(scene: mi.Scene, shapes: tuple[Geometry, ...] | None = None) -> Snapshot:
-    """The state of a scene; ``shapes`` where they are known to be those of an earlier snapshot."""
+    """The state of a scene; ``shapes`` of an earlier snapshot, if they are known to be the same."""
     if shapes is None:
         shapes = tuple(geometry(shape) for shape in scene.shapes())
     sensor = scene.sensors()[0]
@@ -65,7 +65,7 @@ def _film(sensor: mi.Sensor) -> np.ndarray:
     pixels = np.diag([*(float(n) for n in film.crop_size()), 1, 1])
     for axis, name in enumerate(("principal_point_offset_x", "principal_point_offset_y")):
         if name in params:
-            # Of the whole film, whatever its crop window
+            # The offset refers to the whole film, whatever its crop window.
             pixels[axis, 3] = -float(np.array(params[name]).ravel()[0]) * film.size()[axis]
     return pixels @ matrix(projection) @ np.linalg.inv(matrix(params["to_world"]))
 

@@ -30,7 +30,7 @@ class Shot:
     ``describe``  frame -> the scene's file or name, and its ``<default>`` values. The scene is loaded again only where
                   they change; kernels are compiled once, as long as frames consist of the same kinds of things.
     ``camera``    moves the first sensor
-    ``sensor``    number or id of the one that is rendered; None: the first
+    ``sensor``    number or id of the sensor to render; None: the first
     ``update``    changes ``mi.traverse(scene)`` for a frame; what it sets once it must set in every frame
     """
 
@@ -73,7 +73,7 @@ class Shot:
         return taken
 
     def twin(self) -> Shot:
-        """The same shot, with a scene of its own."""
+        """A copy of this shot, with a scene of its own."""
         return Shot(self.describe, self.size, self.camera, self.update, self.sensor)
 
     def changes(self, frames: Sequence[int]) -> bool:
@@ -104,22 +104,22 @@ def render_shot(
     sampler: str = "auto",
     **options: Any,
 ) -> Iterator[tuple[int, GradientStack]]:
-    """(frame, its stack) of each of ``frames`` that ``skip``, asked when its turn has come, does not leave out.
+    """Yields (frame, stack) for each of ``frames``, except where ``skip`` returns true when the frame's turn comes.
 
-    Stacks have the layer ``motion`` to the frame before in ``frames``; of the first, to the one that a shot of the same
-    step would have before it, all NaN where there is none. It is motion in the whole picture, and crop windows may
-    show another part of it in each frame. Attributes: ``ngpt:frame``, ``ngpt:previousFrame``. A
-    frame's seed is its own, so a frame is the same bits whatever others are rendered. ``options`` are those of
-    ``render_stack``. Raises NgptError as that does, and for cameras without a projection.
+    Stacks have the layer ``motion`` to the previous frame in ``frames``. For the first frame, it is the motion to the
+    frame that a shot of the same step would have before it, or all NaN if there is none. Motion refers to the whole
+    picture; crop windows may show another part of it in each frame. Attributes: ``ngpt:frame``, ``ngpt:previousFrame``.
+    Each frame has its own seed, so its bits do not depend on which other frames are rendered. ``options`` are as in
+    ``render_stack``. Raises NgptError as ``render_stack`` does, and for cameras without a projection.
 
-    A ``sampler`` of ``data_gen.samplers.FRAME_SAMPLERS`` reuses the frames before. Where frames are left out, up to its
-    ``warm_up`` of them are rendered nevertheless, and not given. Such a sampler has ``seed`` for all frames. Where more
-    than the camera changes, it needs the scene of the frame before: two scenes are in memory, in turn.
+    A ``sampler`` of ``data_gen.samplers.FRAME_SAMPLERS`` reuses the previous frames. If frames are skipped, up to
+    ``warm_up`` of them are rendered nevertheless, but not yielded. Such a sampler uses ``seed`` for all frames. If more
+    than the camera changes, it needs the scene of the previous frame: two scenes are in memory, in turn.
 
-    With ``dt`` pairs of samples a pixel, 2 or more, stacks have ``dt`` and ``dt_var``, of samples of their own
-    (``data_gen.frames.time_differences``), by Mitsuba's integrator, without features. Each pair is two paths, one in
-    the scene of the frame before: where parameters change, scenes are loaded twice a frame. Their seconds are in
-    ``ngpt:seconds``.
+    With ``dt`` pairs of samples per pixel, 2 or more, stacks have ``dt`` and ``dt_var``. These use separate samples
+    (``data_gen.frames.time_differences``) by Mitsuba's integrator, without features. Each pair is two paths, one of
+    them in the scene of the previous frame: where parameters change, scenes are loaded twice per frame. The time for
+    this is included in ``ngpt:seconds``.
     """
     before: Snapshot | None = None
     last = None
@@ -134,7 +134,7 @@ def render_shot(
     for i, wanted in enumerate(frames):
         if skip(wanted):
             continue
-        # Frames before it, for their history alone
+        # Previous frames, only for their history
         for j in range(max(done, i - remembers.warm_up if remembers else i), i + 1):
             frame, previous = frames[j], frames[j - 1] if j else frames[0] - step
             shot, other = turns[j % len(turns)], turns[(j - 1) % len(turns)]

@@ -1,12 +1,12 @@
-"""Differences in time: the same random numbers in the scene of this frame and in that of the frame before.
+"""Differences in time: the same random numbers in the scene of this frame and in the scene of the previous frame.
 
-A camera sample at x in this frame has its partner in the frame before, where what the pixel shows was: at x + m, with
-the pixel's motion m. From there on, both paths have the same random numbers. So where nothing but the motion has
-changed the two find the same light, and their difference has no noise to speak of. Its mean over a pixel p is
+A camera sample at x in this frame has a partner in the previous frame at x + m, with the pixel's motion m: this is
+where the visible point was. From there on, both paths use the same random numbers. So where nothing but the motion has
+changed, both paths find the same light, and their difference has almost no noise. Its mean over a pixel p is
 
     I_t(p) - I_{t-1}(p + m)
 
-with the pixel at p + m that lies between those of the film, box-filtered as they are: nothing is interpolated.
+where p + m is a pixel between the pixels of the film, box-filtered like them: nothing is interpolated.
 
 [Random sequence replay between frames: Manzi et al. 2016, "Temporal gradient-domain path tracing", section 4]
 """
@@ -24,14 +24,14 @@ from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import radiance
 from data_gen.scenes.load import reference_integrator
 
-# Of them, means over samples are kept for all pixels at once: enough to tell how much they vary.
+# For each batch, means over its samples are kept for all pixels: enough batches to estimate the variance.
 BATCHES = 16
 
 
 def light(scene: mi.Scene, seed: int, spp: int, motion: np.ndarray | None = None) -> list[tuple[int, np.ndarray]]:
     """All light but what the camera sees directly, in batches: how many samples a pixel, and their mean (H, W, 3).
 
-    With the ``motion`` (H, W, 2) of a later frame, samples are the partners of those that have the same ``seed`` there.
+    With the ``motion`` (H, W, 2) of a later frame, samples are partners of the samples with the same ``seed`` there.
     NaN where a partner is not on the film, where the motion is not known, and where a sample is not finite.
     """
     integrator, sensor = reference_integrator(scene), scene.sensors()[0]

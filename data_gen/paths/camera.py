@@ -25,16 +25,16 @@ class CameraSamples:
 
     Lanes are ordered by blocks of ``block`` samples (default: one block of them all), within a block pixel by pixel,
     within a pixel by sample; ``spp`` is a multiple of ``block``. Sample i of a pixel is the same for a given seed,
-    whatever else is rendered with it. ``pixel`` is the number of each lane's pixel, row by row, and ``sample`` that of
-    its sample. ``random`` holds the random numbers of the paths to come. Cloning it replays them, which is what
+    whatever else is rendered with it. ``pixel`` is the number of each lane's pixel, row by row, and ``sample`` the
+    number of its sample. ``random`` holds the random numbers of the paths to come. Cloning it replays them: this
     correlates a path with its shifted copies.
 
     ``net`` is the size of the first round of points (``data_gen.paths.streams``), or 0: independent samples.
 
     ``some``, UInt32, are the pixels to sample, which may repeat; ``first`` is then a UInt32 with a number for each.
 
-    Of an argument of functions that are recorded once (``data_gen.paths.frozen``), the fields of ``DRJIT_STRUCT`` are
-    all that they may use.
+    Functions that are recorded once (``data_gen.paths.frozen``) may use only the fields of ``DRJIT_STRUCT`` of an
+    argument.
     """
 
     DRJIT_STRUCT = dict.fromkeys(
@@ -106,7 +106,7 @@ class CameraSamples:
         self.wavelength = self.random.next_1d()
 
     def at(self, lanes: mi.UInt32) -> CameraSamples:
-        """The samples of these ``lanes`` alone, as far as rays and random numbers go."""
+        """The samples of only these ``lanes``, as far as rays and random numbers go."""
 
         def gather(value):
             return dr.gather(type(value), value, lanes) if dr.width(value) > 1 else value

@@ -1,19 +1,19 @@
-"""Segments through media whose density varies: null collisions, and how their list goes with a shift.
+"""Segments through media whose density varies: null collisions, and how a shift maps their list.
 
-In a grid the transmittance is known only by estimates. So a path holds more than its vertices: the null collisions on
-its way, which happen at the density of the majorant μ and change nothing. In this larger space all densities are known.
-A list of n null collisions and a vertex at the end have the density
+In a grid the transmittance can only be estimated. So a path holds not only its vertices, but also the null collisions
+on its way, which happen at the density of the majorant μ and change nothing. In this larger path space all densities
+are known. A list of n null collisions with a vertex at the end has the density
 
-    exp(-M) ∏ σn(x_i) / μ · σ,        M the majorant's optical depth of the segment, in grids alone
+    exp(-M) ∏ σn(x_i) / μ · σ,        M the majorant's optical depth of the segment, only in grids
 
-and the integrand differs from that by σs in place of σ, and by its colours. Collisions are exponential steps along the
-optical depth m of the majorant, which is the same number of units whatever grids and gaps the segment crosses.
+and the integrand has σs in place of σ, and has colours. Collisions are exponential steps along the optical depth m of
+the majorant, which uses the same units in all grids and gaps that the segment crosses.
 
-    replay      the same steps, and the same numbers to tell real collisions from null ones: r = 1
-    reconnect   the list of the base path, m_i' = m_i M' / M, with the Jacobian (M' / M)^n; its steps are made anew from
-                the base path's key, so nothing has to be kept but n
+    replay      the same steps, and the same random numbers to choose between real and null collisions: r = 1
+    reconnect   the list of the base path, m_i' = m_i M' / M, with the Jacobian (M' / M)^n; its steps are generated
+                again from the base path's key, so only n has to be kept
 
-Homogeneous media have a clock of their own: their one exponential number of a segment, and no list.
+Homogeneous media are handled separately: they use one exponential number for each segment, and no list.
 
 [Miller et al. 2019, "A null-scattering path integral formulation of light transport"; docs/samplers/media.md]
 """
@@ -77,7 +77,7 @@ class Stop:
 
 
 def next_stop(ray, length: mi.Float, medium, channel, ahead: mi.Float, active) -> Stop:
-    """Of a piece of that ``length``, with the optical depth ``ahead`` to the next collision."""
+    """The next stop on a piece of a ray of that ``length``; ``ahead`` is the optical depth to the next collision."""
     μ, grid, near, far = extent(medium, ray)
     grid, μ_c = active & grid, pick(μ, channel)
     end = dr.minimum(length, far)
@@ -146,7 +146,7 @@ def fly_on(passes, trace, ray, medium, *, channel, u, key, active):
 def cross(passes, trace, ray, medium, reach, *, channel, key, scale, most, target, active):
     """As ``segments.cross()``, where there are grids, with ``most`` collisions at most, their steps ``scale`` long.
 
-    Returns the same, τ being that of homogeneous media, and M and ∏ σn / μ_c.
+    Returns the same, where τ is the optical depth of homogeneous media, and also M and ∏ σn / μ_c.
     """
     lanes = dr.width(ray.o)
     ray, medium, reach = mi.Ray3f(ray), mi.MediumPtr(medium), mi.Float(reach)
@@ -184,11 +184,10 @@ def cross(passes, trace, ray, medium, reach, *, channel, key, scale, most, targe
 def rescale(
     passes, trace, ray, medium, reach, base: Collisions, *, channel, active, target=None, to_surface: bool = False
 ) -> tuple:
-    """The null collisions of a ``base`` segment on another way, to its end or ``to_surface``: m_i' = m_i M' / M.
+    """Maps the null collisions of a ``base`` segment to another one, to its end or ``to_surface``: m_i' = m_i M' / M.
 
-    Returns τ of homogeneous media, what is met, the last piece of the ray, the medium there, the integrand of the list
-    with its Jacobian over the density of that of the base path, and of that the colour c, which is the ratio of the
-    densities.
+    Returns τ of homogeneous media, the hit, the last piece of the ray, the medium there, and the integrand of the list
+    times the Jacobian, over the density of the base path's list. Its colour c, the ratio of the densities, comes last.
     """
     way = {"channel": channel, "key": base.key, "target": target}
     # First without collisions, for M'
@@ -206,5 +205,5 @@ def rescale(
 
 
 def list_jacobian(scale: mi.Float, n: mi.UInt32) -> mi.Float:
-    """Of stretching the places of ``n`` collisions."""
+    """The Jacobian of scaling the positions of ``n`` collisions by ``scale``."""
     return dr.select(n > 0, dr.power(scale, mi.Float(n)), 1)

@@ -26,7 +26,7 @@ class Eye:
 
     @classmethod
     def of(cls, camera: CameraSamples) -> Eye:
-        """That of these camera samples, of a perspective camera or a thin lens."""
+        """The eye of these camera samples, for a perspective camera or a thin lens."""
         sensor = camera.sensor
         numbers = (sensor.near_clip(), sensor.far_clip(), film_area(sensor))
         planes_and_area = (dr.opaque(mi.Float, number) for number in numbers)
@@ -42,7 +42,7 @@ class Eye:
         return int(dr.prod(self.size))
 
     def place_on_lens(self, random: Any) -> mi.Point2f:
-        """Another one, drawn from ``random``, if there is a lens: that of a path that comes from elsewhere."""
+        """A point on the lens for a path that comes from elsewhere, drawn from ``random`` if there is a lens."""
         return random.next_2d() if self.sensor.needs_aperture_sample() else mi.Point2f(0.5)
 
     def ray(self, uv: mi.Point2f, lens: mi.Point2f) -> mi.Ray3f:
@@ -56,8 +56,8 @@ class Eye:
         ``pdf`` is 0 where the camera does not see ``si``, whatever is in between: off the film, before the near plane
         or beyond the far one; else 1. W = 1 / (A cos³), with A the film's area at distance 1.
 
-        Of Mitsuba 3.9 are the direction and the place alone. Its importance is 0 in the part of the film that an offset
-        of the principal point adds, and a thin lens sees what is before its near plane.
+        Only the direction and the place come from Mitsuba 3.9. Its importance is 0 in the part of the film that an
+        offset of the principal point adds, and its thin lens sees what is before the near plane.
         """
         to, _ = self.sensor.sample_direction(si, lens, active)
         cos = -dr.dot(to.n, to.d)
@@ -84,12 +84,12 @@ class Sight:
 
     eye: Eye
     random: Any  # the stream of random numbers of the paths to come
-    ray: mi.Ray3f  # whose time and wavelengths are those of the path from the light, too
+    ray: mi.Ray3f  # the path from the light has the same time and wavelengths
     importance: mi.Spectrum
 
     @classmethod
     def of(cls, camera: CameraSamples) -> Sight:
-        """That of these camera samples."""
+        """The sight of these camera samples."""
         ray, importance, _ = camera.rays()
         return cls(Eye.of(camera), camera.random.clone(), ray, importance)
 

@@ -25,9 +25,9 @@ def features(scene, sensor, sampler, ray: mi.RayDifferential3f) -> dict[str, mi.
                 their own albedo by as much as they dim
     ``normal``  unit shading normal in camera space, +x right, +y up, +z toward the viewer, on the side seen
     ``depth``   path length from the camera, not from its near plane, in world units
-    All are zero where the path escapes, but for the albedo of media. Normal and depth are those of the surfaces behind
-    media. Bump and normal maps count where they are a shape's outermost material; Mitsuba keeps those inside others
-    (``twosided``, ``mask``) to itself.
+    All are zero where the path escapes, except the albedo of media. Normal and depth describe the surface behind media.
+    Bump and normal maps count if they are a shape's outermost material; Mitsuba does not expose maps inside other
+    materials (``twosided``, ``mask``).
     """
     si, last, depth, reflectance, scattered = first_nonspecular_vertex(
         scene, sampler, ray, *in_media(scene, sensor.get_medium())
@@ -37,12 +37,12 @@ def features(scene, sensor, sampler, ray: mi.RayDifferential3f) -> dict[str, mi.
     if any(shape.bsdf() is not None and shape.bsdf().class_name() in _TURNS_NORMALS for shape in scene.shapes()):
         aov = mi.load_dict({"type": "aov", "aovs": "normal:sh_normal"})
         normal = mi.Normal3f(aov.sample(scene, sampler.clone(), mi.RayDifferential3f(last), active=found)[2])
-    # The shading frame knows no side; the normal is meant on that of the incoming ray.
+    # The shading frame has no side; the layer has the normal on the side of the incoming ray.
     normal = dr.mulsign(normal, si.wi.z)
     # A Mitsuba camera looks along its +z with +x to the left of the image.
     right, up, back = (sign * axis for sign, axis in zip((-1, 1, -1), axes(sensor), strict=True))
     normal = mi.Color3f(dr.dot(normal, right), dr.dot(normal, up), dr.dot(normal, back))
-    # Of polarised variants the one is a matrix, and the other is not.
+    # In polarised variants the reflectance is a Mueller matrix, but the albedo of media is not.
     reflectance = mi.unpolarized_spectrum(dr.select(found, reflectance, 0))
     albedo = reflectance_to_rgb(reflectance + scattered, ray.wavelengths)
     return {
@@ -80,7 +80,7 @@ def in_media(scene, medium) -> tuple[mi.MediumPtr | None, int]:
 def through_medium(medium, ray, length, sampler, steps: int):
     """The transmittance of a ``medium`` (none: 1) along ``ray`` up to ``length``, and the albedo it scatters there.
 
-    The albedo is that of single scattering, weighted by what the medium takes of the light on each of the ``steps``.
+    The albedo is the single-scattering albedo, weighted by the light that the medium takes on each of the ``steps``.
     """
     transmittance = mi.unpolarized_spectrum(mi.Spectrum(1))
     albedo = mi.unpolarized_spectrum(mi.Spectrum(0))
@@ -113,8 +113,8 @@ def first_nonspecular_vertex(scene, sampler, ray, medium=None, steps=0):
     """Follows ``ray`` through mirrors, clear glass and the holes of masks to the first vertex that scatters smoothly.
 
     Returns the surface interaction there (invalid where the path escapes or the chain is too long), the ray that led
-    there from the vertex before, the path length up to it, a sample of its reflectance times that of the chain, and the
-    albedo of the media on the way. ``medium`` and ``steps`` are those of ``in_media``.
+    there from the vertex before, the path length up to it, a sample of its reflectance times the reflectance of the
+    chain, and the albedo of the media on the way. ``medium`` and ``steps`` are as in ``in_media``.
     """
     ray = mi.Ray3f(ray)
     last = mi.Ray3f(ray)

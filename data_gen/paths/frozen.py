@@ -185,7 +185,7 @@ def fields(value: Any) -> Iterable[str]:
 
 
 def call(f: Callable, *args: Any) -> Any:
-    """The same, recorded each time."""
+    """Calls ``f``, which is recorded each time."""
     return f(*args)
 
 

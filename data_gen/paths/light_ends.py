@@ -54,7 +54,7 @@ class LightEnds:
         tables = [_table(scene, emitter, kind) for emitter, kind in zip(emitters, kinds, strict=True)] or [[0] * 8]
         x, y, z, u, v, w, self.cutoff, of_ball = map(mi.Float, np.array(tables, np.float32).T)
         self.position, self.axis = mi.Point3f(x, y, z), mi.Vector3f(u, v, w)
-        # Of spheres, of which connections find the visible part alone: density of emission per area; else 0
+        # Density of emission per area for spheres, where connections find only the visible part; else 0
         self.of_ball = of_ball
         self.balls = bool(np.any(np.array(of_ball) > 0))
         numbers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]) for emitter in emitters]
@@ -162,7 +162,7 @@ class LightEnds:
         d = dr.select(far, start.ray.d, dr.normalize(to))
         β, ratio = mi.Spectrum(start.β), mi.Float(1)
         if _AREA in self.kinds:
-            # Of a cosine distribution; behind the emitter there is no light.
+            # The ratio for a cosine distribution; behind the emitter there is no light.
             cosines = dr.dot(start.end.n, d) / dr.dot(start.end.n, start.ray.d)
             ratio = dr.select(kind == _AREA, dr.select(cosines > 0, cosines, 0), ratio)
             β *= ratio
@@ -236,7 +236,7 @@ def _table(scene: mi.Scene, emitter: mi.Emitter, kind: int) -> list[float]:
 
 
 def _cone_density(cutoff: mi.Float) -> mi.Float:
-    """Of directions within a cone, or a whole sphere where the cosine of its angle is -1."""
+    """Density of directions within a cone; the cosine -1 of its angle gives the whole sphere."""
     return dr.rcp(dr.two_pi * (1 - cutoff))
 
 

@@ -12,15 +12,15 @@ from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.scenes.load import path_depths
 from data_gen.scenes.places import Chosen, Places
 
-# Shapes that Mitsuba samples uniformly by area, besides meshes; of spheres it samples the part that is visible.
+# Shapes that Mitsuba samples uniformly by area, besides meshes; for spheres it samples the visible part.
 _UNIFORM_SHAPES = ("Rectangle", "Disk", "Cylinder")
 
 
 class Lights:
     """Whether the emitters of a scene answer the same random numbers with the same point, or direction, everywhere.
 
-    Those that do are all that are infinitely far away, and area lights on shapes that are sampled uniformly. To replay
-    their sampling at another vertex changes no more than the solid angle, which saves choosing them anew: they are
+    This holds for all emitters that are infinitely far away, and for area lights on shapes that are sampled uniformly.
+    Replaying their sampling at another vertex changes only the solid angle, so they need not be sampled again: they are
     ``shared``, if there are no others in the scene (a kernel with both kinds of code gained nothing).
 
     ``near``, ``far``: whether there are emitters of finite and of infinite distance.
@@ -89,10 +89,10 @@ def replay_light(
 def replay_lamp(
     lights: Lights, base, base_weight, chosen: Chosen, x, y: mi.SurfaceInteraction3f, *, lit: mi.Bool
 ) -> tuple[LightSample, mi.Float]:
-    """The same of a lamp ``chosen`` by place at vertex ``x``: the same point on the same lamp, seen from ``y``.
+    """Replays a lamp sample ``chosen`` by place at vertex ``x``: the same point on the same lamp, seen from ``y``.
 
-    Its ``p`` counts the probability P to choose the lamp at ``y``, its ``weight`` that at ``x``. P(y) / P(x), a factor
-    of r, is returned as well.
+    Its ``p`` includes the probability P of choosing the lamp at ``y``, its ``weight`` the probability at ``x``. The
+    ratio P(y) / P(x), a factor of r, is returned as well.
     """
     places = lights.places
 
@@ -140,7 +140,7 @@ def emission(
 def shared_emission(scene, lights: Lights, x1, Le, p, *, x, y, y1, J) -> tuple[mi.Spectrum, mi.Float]:
     """``emission(scene, y1, y, True, True)`` by way of ``Le`` and ``p`` of the same vertex ``x1``, as seen from ``x``.
 
-    ``y1`` is ``x1`` with another incident direction, of which ``J`` is the ratio d'²/d² of squared distances.
+    ``y1`` is ``x1`` with another incident direction; ``J`` is the ratio d'²/d² of the squared distances.
     """
     places = lights.places
     if not lights.shared:

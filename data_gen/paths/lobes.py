@@ -21,15 +21,15 @@ _HEARS = -1.0
 class Lobes:
     """The share of diffuse lobes (``BSDFFlags.Diffuse``, reflection and transmission) in what a material scatters.
 
-    Materials evaluate some of their lobes alone where ``BSDFContext.type_mask`` asks for it, and those that hold others
-    (``twosided``, ``mask``, ``bumpmap``, ``normalmap``, ``blendbsdf``) hand the mask on. Principled materials do not
-    hear it. Of them, and of what holds one, the diffuse part is taken for Lambert's,
+    Materials evaluate only some of their lobes if ``BSDFContext.type_mask`` asks for it, and materials that hold others
+    (``twosided``, ``mask``, ``bumpmap``, ``normalmap``, ``blendbsdf``) pass the mask on. Principled materials ignore
+    it. For these, and for materials that hold one, the diffuse part is approximated by Lambert's law,
 
         s ρ |cos θ| / π,   s = (1 - metallic) (1 - spec_trans)
 
-    with ρ their reflectance, ``eval_diffuse_reflectance()``, and never for more than all that they scatter. Textured
-    parameters count with their mean, and several such materials in one with the mean of their s. Those inside shape
-    groups are not listed by Mitsuba: all that principled ones scatter there counts as diffuse.
+    where ρ is the reflectance, ``eval_diffuse_reflectance()``; it is clamped to all that the material scatters.
+    Textured parameters count with their mean, and several such materials in one with the mean of their s. Mitsuba does
+    not list materials inside shape groups: all that principled materials scatter there counts as diffuse.
     """
 
     def __init__(self, scene: mi.Scene):
@@ -40,9 +40,10 @@ class Lobes:
         self.lambert = ByMaterial(mi.Float(table))
 
     def diffuse(self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
-        """The share, in [0, 1] for each wavelength, of what goes from ``wo`` (local) into ``si.wi``; 0 of nothing.
+        """The share, in [0, 1] for each wavelength, in the light that goes from ``wo`` (local) into ``si.wi``.
 
-        For directions that were sampled or chosen otherwise, not for those of a Dirac delta, which are never diffuse.
+        It is 0 where there is no such light. It holds for directions that were sampled or chosen otherwise, but not for
+        Dirac deltas, which are never diffuse.
         """
         bsdf = si.bsdf()
         flags = bsdf.flags()

@@ -185,7 +185,7 @@ def arrive(target: Target, shot: Shot, dp: tuple, dd: tuple) -> Shot:
 
 
 def on_surface(si: mi.SurfaceInteraction3f, d: mi.Vector3f, dp: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """The differential of a ray's point as it moves on the surface, and with it that of the shading normal."""
+    """The differentials of a ray's point as it moves on the surface, and of the shading normal there."""
     dp = dp - d * (dr.dot(dp, si.n) / dr.dot(d, si.n))
     # Its coordinates (u, v), by the normal equations
     uu, uv, vv = dr.squared_norm(si.dp_du), dr.dot(si.dp_du, si.dp_dv), dr.squared_norm(si.dp_dv)

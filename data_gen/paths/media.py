@@ -75,7 +75,7 @@ def scatters(place: Place | None) -> mi.Bool:
 
 
 def vertex(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, place: Place | None) -> mi.SurfaceInteraction3f:
-    """The vertex at the end of a segment, of which ``ray`` and ``hit`` are the last piece."""
+    """The vertex at the end of a segment whose last piece is ``ray`` and ``hit``."""
     if place is None:
         return hit.compute_surface_interaction(ray)
     on_surface = hit.compute_surface_interaction(ray, mi.RayFlags.All, ~place.scatters)
@@ -146,7 +146,7 @@ def evaluate_and_sample(
 
 
 def scattered(x, place: Place, u_lobe, u_direction, sample, f_p) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
-    """``sample`` and ``f_p`` of a material, or in a medium those of its phase function."""
+    """``sample`` and ``f_p`` of a material, or of the phase function in a medium."""
     phase = place.medium.phase_function()
     wo, weight, p = phase.sample(mi.PhaseFunctionContext(), in_medium(x, place), u_lobe, u_direction, place.scatters)
     own = dr.zeros(mi.BSDFSample3f, dr.width(x.t))
@@ -186,7 +186,7 @@ def depth(σ: mi.Spectrum, distance: mi.Float) -> mi.Spectrum:
 
 
 def end_of(ray: mi.Ray3f) -> mi.Float:
-    """How far a ray goes: that of a camera up to its far plane, others infinitely far, if nothing is in the way."""
+    """How far a ray goes if nothing is in the way: a camera ray to the far plane, other rays infinitely far."""
     return dr.select(ray.maxt < dr.largest(mi.Float), ray.maxt, dr.inf)
 
 

@@ -1,8 +1,8 @@
-"""The ways between the vertices of a path through media: how far it goes, how much light comes through, and shifts.
+"""Segments of a path through media: how far they go, how much light they transmit, and how they are shifted.
 
-A *segment* leads from vertex to vertex. It goes straight through index-matched boundaries, which bend nothing and
-reflect nothing. These are no vertices: they do not count in the length of a path, and emitters are sampled and found
-through them.
+A *segment* leads from vertex to vertex. It goes straight through index-matched boundaries, which neither bend nor
+reflect light. These boundaries are no vertices: they do not count in the length of a path, and emitters are sampled and
+found through them.
 
     σ, σs       extinction and scattering coefficients, one for each colour
     c           the colour by which the distances of a path are sampled, the same for all five paths
@@ -10,8 +10,8 @@ through them.
     T           exp(-τ)
 
 An optical depth in colour c is sampled, not a distance: one number decides where a path scatters, through whatever
-homogeneous media it goes. The density of a vertex in a medium is T_c σ_c, and that of one on a surface T_c. A shifted
-copy that reconnects to the vertex has T_c' for T_c, and the same σ_c. One that replays the number has r = 1. For media
+homogeneous media it goes. The density of a vertex in a medium is T_c σ_c, and T_c on a surface. A shifted copy that
+reconnects to the vertex has T_c' instead of T_c, and the same σ_c. A copy that replays the number has r = 1. For media
 whose density varies see ``data_gen.paths.collisions``.
 
 [Hua et al. 2019, section 7.1; docs/samplers/media.md]
@@ -42,7 +42,7 @@ class Segment:
     """What is met along a ray: a vertex in a medium, one on a surface, or nothing."""
 
     ray: mi.Ray3f  # its last piece, behind the last boundary
-    hit: mi.PreliminaryIntersection3f  # of that piece; its distance is that of the vertex, in a medium too
+    hit: mi.PreliminaryIntersection3f  # of this piece; its distance is the distance to the vertex, also in a medium
     place: Place
     weight: mi.Spectrum  # integrand over density in colour c: T / T_c, times σs / σ_c in a medium
     albedo: mi.Spectrum  # σs / σ_c in a medium, else 1

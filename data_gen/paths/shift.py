@@ -88,7 +88,7 @@ def copy_half_vector(
     length2 = dr.squared_norm(h)
     h = h * dr.rsqrt(length2)
 
-    # Reflection about h, of which either sign will do
+    # Reflection about h; either sign of h will do
     c = dr.dot(wi_offset, h)
     mirrored = 2 * c * h - wi_offset
     # Refraction: wi' + η wo' is to be parallel to h (Walter et al., eq. 40).

@@ -103,7 +103,7 @@ class Filled(Space):
 
     def end(self, x, segment: Segment) -> mi.SurfaceInteraction3f:
         x1 = super().end(x, segment)
-        # Of the whole segment, not of its last piece
+        # The length of the whole segment, not of its last piece
         x1.t = dr.select(x1.is_valid(), dr.norm(x1.p - x.p), x1.t)
         return x1
 

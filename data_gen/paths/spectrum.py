@@ -9,7 +9,7 @@ import mitsuba as mi
 def to_rgb(value: mi.Spectrum, wavelengths: mi.Wavelength) -> mi.Color3f:
     """Linear RGB (Rec. 709 primaries) of a spectrum sample, for RGB, monochrome and spectral variants.
 
-    Polarised variants carry Mueller matrices, of which the intensity is kept.
+    Polarised variants carry Mueller matrices; only the intensity is kept.
     """
     if mi.is_polarized:
         value = mi.unpolarized_spectrum(value)
@@ -21,7 +21,7 @@ def to_rgb(value: mi.Spectrum, wavelengths: mi.Wavelength) -> mi.Color3f:
 
 
 def reflectance_to_rgb(value: mi.Spectrum, wavelengths: mi.Wavelength) -> mi.Color3f:
-    """The same for a reflectance, in [0, 1]: white is (1, 1, 1), whatever light the variant assumes."""
+    """Linear RGB of a reflectance, in [0, 1]: white is (1, 1, 1), whatever light the variant assumes."""
     rgb = to_rgb(value, wavelengths)
     if mi.is_spectral:
         rgb = rgb / to_rgb(mi.Spectrum(1), wavelengths)

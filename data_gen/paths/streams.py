@@ -1,17 +1,17 @@
 """Random numbers that belong to a sample of a pixel, or to a light path, whatever pass renders it.
 
-Two kinds of ``points``. "independent" are those of a random number generator for each sample. "sobol", the default, are
-points of Owen-scrambled Sobol sequences, a new pair of dimensions for each pair of numbers: samples of a pixel, and of
-pixels side by side, keep apart from each other, and errors of pixels and of blocks of pixels fall. Each point alone is
-uniform, so that all estimates stay unbiased; but samples are independent no more.
+There are two kinds of ``points``. "independent" points come from a random number generator for each sample. "sobol"
+points, the default, come from Owen-scrambled Sobol sequences, with a new pair of dimensions for each pair of numbers.
+Samples of a pixel and of neighbouring pixels are then well spread, which lowers the errors of pixels and of blocks of
+pixels. Each single point is uniform, so all estimates stay unbiased; but samples are no longer independent.
 
-- A pair of dimensions is the first two of Sobol's sequence, with the order of the points and both coordinates scrambled
-  anew. [Burley 2020, "Practical Hash-based Owen Scrambling"]
+- A pair of dimensions is the first two of Sobol's sequence, with a new scrambling of the order of the points and of
+  both coordinates. [Burley 2020, "Practical Hash-based Owen Scrambling"]
 - Pixels are numbered in Z order, and a pixel's points are side by side, so that the points of aligned blocks of pixels
   are well spread together, too. [Ahmed and Wonka 2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error
   via hierarchical ordering of pixels"] This holds within tiles of 64x64 pixels, which are independent of each other.
-- Samples come in *rounds*: the first has as many as are asked for, or 16 where that is not known, and each further one
-  as many as there are before it. Rounds are independent of each other.
+- Samples come in *rounds*. The first has the requested number of samples, or 16 if this is not known. Each further
+  round has as many as all rounds before it. Rounds are independent of each other.
 - Light paths that are no pixel's own are numbered as they come in a pass; passes are independent of each other.
 """
 
@@ -25,7 +25,7 @@ import numpy as np
 
 # Samples of a pixel in the first round, where it is not known how many there will be
 ROUND = 16
-# Of a round at most, as a power of two: with the pixels of a tile, 32 bits number its points.
+# The largest number of samples per pixel in a round, as a power of two: with the pixels of a tile, 32 bits number them.
 _LARGEST = 20
 # Side of a tile of pixels, as a power of two
 _TILE = 6
@@ -66,7 +66,7 @@ def sample_streams(seed: int, pixel: mi.UInt32, sample: mi.UInt32, width: int = 
 
 
 def light_streams(seed: int, number: mi.UInt32, turn: int, independent: bool = False) -> mi.Sampler:
-    """The streams of the light paths ``number`` of a pass, which has number ``turn``; none are those of pixels."""
+    """The streams of the light paths ``number`` of pass number ``turn``; none coincides with a stream of a pixel."""
     turn = dr.opaque(mi.UInt32, turn)
     if independent:
         return _independent(seed, number, turn, of_lights=True)
@@ -78,7 +78,7 @@ def _independent(seed: int, a: mi.UInt32, b: mi.UInt32, of_lights: bool = False)
     """Generators for each (a, b)."""
     entropy = [seed, 2] if of_lights else seed
     keys = (int(key) for key in np.random.SeedSequence(entropy).generate_state(2))
-    # Enciphered twice, so that the streams of two seeds are not those of one, shifted by some pixels or samples.
+    # Encrypted twice, so that the streams of two seeds do not differ only by a shift of some pixels or samples.
     a, b = mi.sample_tea_32(a, b)
     a, b = mi.sample_tea_32(*(half ^ dr.opaque(mi.UInt32, key) for half, key in zip((a, b), keys, strict=True)))
     random = mi.PCG32()
@@ -96,7 +96,7 @@ def _stream_class(variant: str) -> type:
     """The sampler's class; Mitsuba's own classes, and so those derived from them, belong to a variant."""
 
     class Stream(mi.Sampler):
-        """Independent random numbers. Cloning replays them. From ``state`` a stream can be made anew."""
+        """Independent random numbers. Cloning replays them. A stream can be recreated from ``state``."""
 
         def __init__(self, state):
             super().__init__(mi.Properties())
@@ -125,7 +125,7 @@ def _stream_class(variant: str) -> type:
             return Stream(self.random)
 
         def at(self, lanes):
-            """The streams of these lanes alone."""
+            """The streams of only these lanes."""
             random = mi.PCG32()
             random.state = dr.gather(mi.UInt64, self.random.state, lanes)
             random.inc = dr.gather(mi.UInt64, self.random.inc, lanes)
@@ -139,12 +139,12 @@ def _stream_class(variant: str) -> type:
 
 @cache
 def _sobol_class(variant: str) -> type:
-    """The same of Sobol points."""
+    """The class of streams for Sobol points."""
 
     class Points(mi.Sampler):
         """Point ``index`` of each dimension from ``dimension`` on, scrambled by ``key``. Cloning replays them.
 
-        A pair of numbers takes two dimensions, of which the second is skipped: so pairs and single numbers can be
+        A pair of numbers takes two dimensions, and the second is skipped, so that pairs and single numbers can be
         counted alike. Lanes that draw while others do not are ahead of them.
         """
 
@@ -184,7 +184,7 @@ def _sobol_class(variant: str) -> type:
             return Points(self.state)
 
         def at(self, lanes):
-            """The streams of these lanes alone."""
+            """The streams of only these lanes."""
             return Points([dr.gather(mi.UInt32, each, lanes) for each in self.state])
 
         def schedule_state(self):
@@ -204,10 +204,10 @@ def mixed(x: mi.UInt32) -> mi.UInt32:
 
 
 def _reversed_owen(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
-    """Nested uniform scrambling of the digits of ``x``, the first of which is its lowest bit; bits in usual order.
+    """Nested uniform scrambling of the binary digits of ``x``; its first digit is the lowest bit; bits in usual order.
 
-    Each bit is flipped by those below it. [Laine and Karras 2011, "Stratified sampling for stochastic transparency";
-    constants of Vegdahl 2021, "Building a better LK hash"]
+    The bits below a bit decide whether it is flipped. [Laine and Karras 2011, "Stratified sampling for stochastic
+    transparency"; constants of Vegdahl 2021, "Building a better LK hash"]
     """
     # Not in place: that would change what the caller has.
     x = x ^ (x * 0x3D20ADEA)

@@ -21,11 +21,12 @@ class Materials:
     """Which materials of a scene scatter so widely that any two directions may be joined at them.
 
     A vertex is *connectable* if its material has a component without a Dirac delta, and the smallest roughness of all
-    such components exceeds ``threshold``. That includes materials that mirror as well (``plastic``), though the shift
-    is rejected when the mirror is sampled at the shared vertex: to replay them instead costs more than it gains.
+    such components exceeds ``threshold``. This includes materials that also have a mirror component (``plastic``),
+    although the shift is rejected when the mirror is sampled at the shared vertex: replaying them instead would cost
+    more than it gains.
 
-    It is a property of the material alone, of neither the direction nor the lobe that was sampled: a path and its
-    shifted copy then agree on it, which keeps the shift invertible. Textured roughness counts with its smallest texel.
+    Connectability depends only on the material, not on the sampled direction or lobe. So a path and its shifted copy
+    agree on it, which keeps the shift invertible. Textured roughness counts with its smallest texel.
     Materials with no parameter for their roughness (``diffuse``, ``measured``) count as rough.
 
     Shapes that are ``passed`` have no vertices, and do not count. With ``media`` in the scene rough glass is not
@@ -68,7 +69,7 @@ class Materials:
         return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (~listed | rough)
 
     def sharp(self, si: mi.SurfaceInteraction3f, scene: mi.Scene) -> mi.Bool:
-        """Whether a path can leave vertex ``si`` by mirror, glass or sharp gloss alone, and no emitter is there."""
+        """Whether a path can leave vertex ``si`` only by mirror, glass or sharp gloss, and no emitter is there."""
         bsdf = si.bsdf()
         dark = si.emitter(scene) == None  # noqa: E711 - a comparison of arrays of pointers
         return si.is_valid() & dark & ~self.connectable(bsdf) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
@@ -123,7 +124,7 @@ def event_kind(sampled_type: mi.UInt32) -> mi.UInt32:
 
 
 def seen_from(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.SurfaceInteraction3f:
-    """The same vertex, reached along ``direction`` (world space) instead. Escaped paths keep theirs."""
+    """Vertex ``si``, but reached along ``direction`` (world space). Escaped paths keep their direction."""
     other = mi.SurfaceInteraction3f(si)
     other.wi = dr.select(si.is_valid(), si.to_local(-direction), si.wi)
     return other
@@ -136,11 +137,11 @@ def consistent(
     f_p: mi.Spectrum,
     active: bool | mi.Bool = True,
 ) -> mi.BSDFSample3f:
-    """A BSDF sample, with density 0 where the material says so of the direction that it sampled.
+    """A BSDF sample, with density 0 where the material evaluates the density of the sampled direction to 0.
 
     Diffuse materials seen from behind, and rough metal below its horizon, sample directions with a density above 0 and
-    f / p = 0, of which ``evaluate`` says 0. A shift has that 0 for the path it leads to, and the density of the sample
-    for the path it comes from: the weights of the pair then add up to more than 1.
+    f / p = 0, while ``evaluate`` gives the density 0. A shift would use this 0 for the path it leads to, and the
+    density of the sample for the path it comes from: the weights of the pair would add up to more than 1.
     """
     asked = active & (event_kind(sample.sampled_type) == SMOOTH) & (sample.pdf > 0) & (dr.max(f_p) == 0)
     _, p = evaluate(bsdf, si, sample.wo, asked)

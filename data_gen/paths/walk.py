@@ -32,7 +32,7 @@ class Limits:
 
     @classmethod
     def read(cls, props: mi.Properties) -> Limits:
-        """Those of a plugin. Raises NgptError for values that ``path`` refuses too."""
+        """Reads the limits of a plugin. Raises NgptError for values that ``path`` refuses too."""
         depth, rr_depth = props.get("max_depth", -1), props.get("rr_depth", cls.rr_depth)
         for name, value, least, meaning in (
             ("max_depth", depth, -1, "0 or more, or -1 for no limit"),
@@ -44,7 +44,7 @@ class Limits:
 
     @classmethod
     def of(cls, path: mi.SamplingIntegrator) -> Limits:
-        """Those of Mitsuba's ``path``, or one like it. Raises NgptError where they cannot be read."""
+        """The limits of Mitsuba's ``path``, or of an integrator like it. Raises NgptError where they cannot be read."""
         depths = path_depths(path)
         if not depths:
             raise NgptError(
@@ -55,7 +55,7 @@ class Limits:
         return cls(UNLIMITED if depth < 0 else depth, depths["rr_depth"], path.hide_emitters)
 
     def parameters(self) -> dict[str, int | bool]:
-        """As those of a plugin."""
+        """The limits as parameters of a plugin."""
         depth = self.max_depth if self.max_depth < UNLIMITED else -1
         return {"max_depth": depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
 

@@ -82,7 +82,7 @@ def followed(integrator: mi.Integrator) -> mi.Integrator:
 def objects_in(thing: mi.Object, kind: type) -> list:
     """The objects of a ``kind`` right within another: integrators of an integrator, materials of a mask."""
 
-    # What the class knew would live on in circles, and with it its scene: it knows its arguments alone.
+    # The class must refer only to its arguments: reference cycles would keep other objects, and their scene, alive.
     class Inside(mi.TraversalCallback):
         def __init__(self, kind: type):
             super().__init__()
@@ -101,7 +101,7 @@ def objects_in(thing: mi.Object, kind: type) -> list:
 def lack(plugin: str, nested: int, from_camera: bool = True) -> str:
     """Why an integrator around so many others renders no image for a stack, "" if it does.
 
-    ``from_camera``: it is one of those that trace paths from the camera, unless its name says otherwise.
+    ``from_camera``: it traces paths from the camera, unless its name says otherwise.
     """
     if not from_camera or plugin in _FROM_LAMPS:
         return (

@@ -2,8 +2,8 @@
 
 Mitsuba chooses all lamps alike, unless a scene gives them ``sampling_weight``. The best weights are in proportion to
 the root of the mean square of what a lamp brings to a vertex, which a short pilot measures: at the first vertices of
-camera paths, each lamp is sampled in turn. So all kinds of lamps, the sun and an environment are told by the same
-measure, and what is behind walls counts for little.
+camera paths, each lamp is sampled in turn. So all kinds of lamps, the sun and an environment are measured in the same
+way, and lamps behind walls count for little.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from data_gen.scenes.places import Places, Table, learn
 _PATHS, _VERTICES = 1 << 14, 3
 # Paths of a pilot that tells lamps by place, and from how many lamps on there is one
 _PATHS_BY_PLACE, MANY = 1 << 17, 8
-# Lamps are chosen by place if that promises less than so much of the variance of direct light. Where all is matt the
-# promise is kept; glossy materials, of which the pilot knows nothing, were seen to cost a factor of two.
+# Lamps are chosen by place if this is expected to lower the variance of direct light to less than this share. In matt
+# scenes the expectation holds; glossy materials, which the pilot does not consider, were seen to cost a factor of two.
 PROMISE = 0.45
-# Of all lamps alike: those that the pilot did not see may bring light elsewhere, and light paths begin there, too.
+# The share given to all lamps alike: lamps that the pilot did not see may light other places and start light paths.
 _FLOOR = 0.2
-# Mean squares are over all but so many of a lamp's largest, lest a single vertex close to it decide.
+# Mean squares leave out this share of a lamp's largest values, so that a single vertex close to it does not decide.
 _TRIM = 0.002
 
 
@@ -127,7 +127,7 @@ def _pilot(scene: mi.Scene, paths: int) -> tuple[np.ndarray, np.ndarray, np.ndar
         emitter = dr.gather(mi.EmitterPtr, emitters, index)
         light, radiance = emitter.sample_direction(si, pair(), active)
         cos = dr.maximum(dr.dot(side.n, light.d), 0)
-        # Of all colours: a red lamp has as much noise in one of them as a white one in each.
+        # Over all colours: a red lamp has as much noise in one channel as a white lamp has in each.
         L = dr.sqrt(dr.mean(dr.square(mi.unpolarized_spectrum(radiance)))) * cos
         L *= dr.select(light.delta, 1, dr.rcp(1 + dr.square(cos * dr.inv_pi * n / light.pdf)))
         lit = active & (light.pdf > 0) & (L > 0)

@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from data_gen.scenes.cameras import sensor_number
 
-# The plugins that read meshes, and those of their settings by which normals differ.
+# The plugins that read meshes, and their settings that change normals
 _MESHES = ("obj", "ply", "serialized")
 _NORMALS = ("face_normals", "flip_normals")
 

@@ -1,12 +1,12 @@
 """How often each lamp of a scene is chosen, by place: with many lamps, most light up little of the scene.
 
-The scene is cut into cells. In each of them lamps are chosen by the mean square of what they bring to vertices there,
-as a pilot has found it (``data_gen.scenes.lamps``). A cell that the pilot knows little of goes by the larger cells
-around it: each has the mean of its samples, and of some more that its parent stands for.
+The scene is cut into cells. In each cell, lamps are chosen by the mean square of their light at vertices there, which
+a pilot measures (``data_gen.scenes.lamps``). A cell with few samples of the pilot relies on the larger cells around it:
+the mean of each cell also includes some virtual samples with the mean of its parent.
 
-Any probabilities make right images, so long as none is 0 where a lamp has light. That of a sample depends on the vertex
-alone that it is taken at: a path that is shifted keeps its lamp, and knows with what probability it is chosen where it
-comes from and where it goes to.
+Any probabilities give correct images, as long as none is 0 where a lamp has light. The probability of a sample depends
+only on its vertex. A shifted path keeps its lamp, and knows the probability of choosing it both where the path comes
+from and where it goes to.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 _SIDE = 16
 # Samples that the mean of the larger cell stands for
 _OF_PARENT = 16
-# Of what is chosen as in the whole scene: no pilot sees all light.
+# The share chosen as in the whole scene: no pilot sees all light.
 _FLOOR = 0.2
 # Numbers in a table: with more lamps, cells are larger.
 _LARGEST = 1 << 21
@@ -68,14 +68,14 @@ class Places:
         self.low, self.per_size = mi.Point3f(*table.low.tolist()), mi.Vector3f(*(1 / table.size).tolist())
         self.p = mi.Float(table.p.ravel().astype(np.float32))
         upto = np.cumsum(table.p, axis=1).astype(np.float32)
-        # More than any random number, lest rounding leave one beyond
+        # More than any random number, so that rounding leaves none beyond
         upto[:, -1] = 2
         self.upto = mi.Float(upto.ravel())
         numbers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]) for emitter in scene.emitters()]
         index = np.zeros(max(numbers) + 1, np.uint32)
         index[numbers] = np.arange(len(numbers))
         self.indices = mi.UInt32(index)
-        # Of scenes alike the kernel is the same.
+        # Similar scenes can then share the kernel.
         dr.make_opaque(self.low, self.per_size, self.p, self.upto, self.indices)
 
     def row(self, x: mi.SurfaceInteraction3f) -> mi.UInt32:
@@ -126,8 +126,9 @@ def learn(lamp: np.ndarray, squares: np.ndarray, at: np.ndarray, whole: np.ndarr
     lamps, side = len(whole), _SIDE
     while side > 1 and side**3 * lamps > _LARGEST:
         side //= 2
-    # Where all but a few vertices are: one far away would leave the others a single cell. By odd margins, since a wall
-    # between two cells would be in either by rounding alone, and a path and its shifted copy may not agree in which.
+    # The extent of all but a few vertices: a single distant vertex would leave only one cell for the others. Uneven
+    # margins make sure that no wall lies exactly between two cells: rounding would then decide which cell it is in, and
+    # a path and its shifted copy might disagree.
     low, high = np.quantile(at, 0.005, axis=0), np.quantile(at, 0.995, axis=0)
     extent = np.maximum(high - low, 1e-3 * (high - low).max() + 1e-30)
     low, size = low - 0.0137 * extent, 1.0411 * extent / side

@@ -31,8 +31,8 @@ LEAST = 16
 # A record may be so many times as bright as the mean of all so far, or have such a part of their light. What is
 # brighter is cut: one path would make a spot that no denoiser removes.
 MOST, PARTS = 3000, 200
-# The light of the brightest record of the first round, and the brightest that is told from others, in units of sums,
-# both as powers of two
+# The light of the brightest record of the first round, and the brightest light that can be represented, in units of
+# sums, both as powers of two
 _BITS, _MOST_BITS = 30, 40
 
 
@@ -61,18 +61,18 @@ class Known:
 
 
 class Cache:
-    """Sums by cell of so many ``sorts`` of light, which grow, and what is known of them.
+    """Growing sums by cell of so many ``sorts`` of light, and what is known of them.
 
-    The number of a cell's records decides whether it is trusted, and not the light in them. Where light is rare, a cell
-    that has found some looks doubtful, and one that has missed it looks sure. To believe the sure ones alone would lose
-    the light: see docs/samplers/tails.md.
+    The number of a cell's records decides whether the cell is trusted, not the light in them. Where light is rare, a
+    cell that has found some looks uncertain, and a cell that has missed it looks certain. Trusting only the certain
+    cells would lose light: see docs/samplers/tails.md.
     """
 
     def __init__(self, fineness: float, sorts: int = 1):
         self.keys, self.count = dr.zeros(mi.UInt32, CELLS), dr.zeros(mi.UInt32, CELLS)
         self.sums = [dr.zeros(mi.Int64, CELLS) for _ in range(3 * sorts)]
         self.unit, self.full, self.fineness = 0.0, False, fineness
-        # Of all records so far: how many, and the light of the brightest colour of each, in units
+        # For all records so far: their number, and the sum of the light of the brightest colour of each, in units
         self.records = self.light = 0
         blank = [dr.zeros(mi.Float, 4 * CELLS) for _ in range(sorts)]
         self.known = Known(self.keys, blank, dr.opaque(mi.Float, fineness))
@@ -111,7 +111,7 @@ class Cache:
         dr.eval(self.keys, self.count, self.sums)
 
     def settle(self, fineness: float) -> None:
-        """Makes what is known anew, of all records so far; from here on cells have this ``fineness``."""
+        """Rebuilds what is known from all records so far; from here on cells have this ``fineness``."""
         self.fineness = fineness
         cells = int(dr.count(self.keys != 0)[0])
         if cells > _FULL * CELLS and not self.full:

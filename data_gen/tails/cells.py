@@ -44,7 +44,7 @@ class Trail:
 
     @classmethod
     def to(cls, x: mi.SurfaceInteraction3f) -> Trail:
-        """Of a path at its first vertex."""
+        """The trail of a path at its first vertex."""
         return cls(mi.Float(x.t), dr.zeros(mi.Float, dr.width(x.t)))
 
     def on(self, x: mi.SurfaceInteraction3f, smooth: mi.Bool, p: mi.Float, active: mi.Bool) -> Trail:
@@ -82,7 +82,7 @@ def octahedral(n: mi.Vector3f, fineness: mi.Float) -> mi.UInt32:
 
 
 def coarser(place: Place) -> Place:
-    """The same vertex among cells of twice the side."""
+    """The place of the same vertex among cells of twice the side."""
     return Place(place.p, place.code, place.level + 1)
 
 

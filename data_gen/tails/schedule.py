@@ -1,4 +1,4 @@
-"""When the cache is fed, and how fine its cells are: by the number of samples alone, never by passes or time."""
+"""When the cache is fed, and how fine its cells are: only the number of samples decides, never passes or time."""
 
 from __future__ import annotations
 

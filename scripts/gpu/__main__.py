@@ -64,7 +64,7 @@ class Window:
         print(f"{self.clock.spent:6.0f} s  {part}: {told}", flush=True)
 
     def checks(self) -> None:
-        """Those that have not been made yet, several at a time; those that ran out of time before come last."""
+        """Runs the checks that are not done yet, several at a time; checks that ran out of time before come last."""
         before = self.clock.spent
         records = {name: self.record(name) for name in names()}
         todo = [name for name, record in records.items() if not record]

@@ -28,7 +28,7 @@ PACKAGES = (
     *("torch", "numpy", "scipy", "safetensors", "onnxruntime", "onnxruntime-gpu", "OpenEXR", "filelock", "rich"),
     *("mitsuba", "drjit", "mitsuba-oidn"),
 )
-# Of renders: image size, samples of each, renders on either side (`z_test` asks for eight).
+# For renders: image size, samples per pixel, renders on each side (`z_test` asks for eight)
 SIZE, SPP, RENDERS = (32, 24), 16, 8
 # Paths share their tails where there are this many.
 SHARING = (80, 60)
@@ -103,7 +103,7 @@ def solvers(recipe: Recipe) -> dict[str, Any]:
 
 
 def arrays(recipe: Recipe) -> dict[str, Any]:
-    """``ngpt.denoise`` of tensors that lie there: the result lies there too, and is that of NumPy's arrays."""
+    """``ngpt.denoise`` of tensors on the device: the result is there too, and equals the result of NumPy arrays."""
     import ngpt
 
     torch = _torch(recipe)
@@ -310,7 +310,7 @@ def _clean(size: int, seed: int) -> np.ndarray:
 
 
 def made_stack(size: int, seed: int, k: int = 0, spp: int = 16):
-    """That image with noise whose differences are less noisy, and features: all layers of a gradient stack."""
+    """The image of ``_clean`` with noise, less noisy differences, and features: all layers of a gradient stack."""
     from ngpt.classical.gradients import forward_differences
     from ngpt.stack import GradientStack
 
@@ -350,7 +350,7 @@ def _largest(difference: np.ndarray, values: np.ndarray) -> float:
 
 
 def _writable(value: Any) -> Any:
-    """The same for JSON, which knows neither NaN nor infinity."""
+    """The value for JSON, which has neither NaN nor infinity."""
     if isinstance(value, dict):
         return {name: _writable(item) for name, item in value.items()}
     if isinstance(value, list):

@@ -57,7 +57,7 @@ def read_recipe(path: str | Path) -> Recipe:
 
 
 class Clock:
-    """The seconds of one window, of which ``closing`` are kept for what has to be written at its end."""
+    """The seconds of one window; ``closing`` seconds are reserved for what has to be written at its end."""
 
     def __init__(self, minutes: float, closing: float = 0.0, now=time.monotonic):
         self._now, self.start = now, now()

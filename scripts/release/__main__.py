@@ -17,8 +17,8 @@ from pathlib import Path
 
 from scripts.release.rules import ROOT, version
 
-# An extra -> what has to be importable, and a command of ngpt that uses it. "render" comes before those that take its
-# stack.
+# An extra -> what has to be importable, and a command of ngpt that uses it. "render" comes before the extras
+# that use its stack.
 TRIALS: dict[str, tuple[str, list[str]]] = {
     "": ("ngpt, data_gen, onnxruntime", ["denoise", "noisy.exr", "-o", "clean.exr"]),
     "render": (

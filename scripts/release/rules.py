@@ -12,7 +12,7 @@ UNRELEASED = "unreleased"
 
 
 def version() -> str:
-    """Of ngpt/version.py, which everything else reads."""
+    """The version in ngpt/version.py, which everything else reads."""
     found = re.search(r'^__version__ = "(.+)"$', (ROOT / "ngpt" / "version.py").read_text(), re.M)
     assert found, "ngpt/version.py names no version"
     return found[1]

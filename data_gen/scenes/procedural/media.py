@@ -18,7 +18,7 @@ from data_gen.scenes.procedural.meshes import box, cylinder, sphere, write_ply
 from data_gen.scenes.procedural.stage import Stage
 from data_gen.scenes.procedural.textures import colour
 
-# Phase functions: few, since each is compiled anew.
+# Phase functions: few, since each is compiled separately.
 FORWARD = (0.0, 0.3, 0.7)
 
 
@@ -45,7 +45,7 @@ def fog(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
 
 
 def beams(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
-    """The same, with two spots that draw their beams in it."""
+    """Fog as in ``fog``, with two spotlights whose beams are visible in it."""
     media = fog(stage, rng, folder)
     for _ in range(2):
         at = rng.uniform(-0.45, 0.45, 2) * stage.area

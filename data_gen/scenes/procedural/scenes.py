@@ -214,7 +214,7 @@ def make_scene(seed: int | tuple[int, ...], folder: Path, shares: Mapping[str, f
         lamps = merge(stage.meshes["lamp"])
         power = np.exp(rng.uniform(np.log(10), np.log(250)))
         light = power / max(_surface(lamps), 0.01) / np.pi
-        # Two emitters always: one alone has a kernel of its own.
+        # Always two emitters: a single one would need a different kernel.
         middle = len(stage.meshes["lamp"][0].faces) if len(stage.meshes["lamp"]) > 1 else len(lamps.faces) // 2
         for name, part in (("lamp0", np.s_[:middle]), ("lamp1", np.s_[middle:])):
             black = plugin("bsdf", "diffuse", reflectance=(0.0, 0.0, 0.0))
