@@ -37,15 +37,16 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 class Interrupted(KeyboardInterrupt):
     """What Ctrl-C and SIGTERM raise in a command.
 
-    Python 3.11 ends itself by SIGINT, whatever status it is told, once a plain KeyboardInterrupt has passed code that
-    was compiled from a text, as that of dataclasses and named tuples is.
+    Python 3.11 ends itself by SIGINT, whatever exit status it is given, once a plain KeyboardInterrupt has passed
+    through code that was compiled from a string, such as the code of dataclasses and named tuples.
     """
 
 
 def stop_if_interrupted(error: BaseException) -> None:
-    """Raises KeyboardInterrupt if that is what ``error`` comes from: Ctrl-C within a library that wraps what it meets.
+    """Raises KeyboardInterrupt if ``error`` comes from one: from Ctrl-C within a library that wraps exceptions.
 
-    Dr.Jit's loops and recordings make a RuntimeError of it, with the cause; Mitsuba's plugins one with a text alone.
+    Dr.Jit's loops and recordings turn it into a RuntimeError with the cause; Mitsuba's plugins into one with only a
+    text.
     """
     cause: BaseException | None = error
     while cause is not None:

@@ -96,11 +96,11 @@ def denoise(
 
     ``image``    (H, W, 3) or (H, W, 4), floats: an array of NumPy, PyTorch (any device), Dr.Jit, or a Mitsuba bitmap.
                  The same kind comes back, of the same type and shape; alpha comes back as it is. A bitmap of many
-                 channels is read by their names, as files are, and gives its colour and alpha alone. A
+                 channels is read by their names, as files are, and gives only its colour and alpha. A
                  ``GradientStack`` gives (H, W, 3) float32.
     ``method``   "auto", the best for the layers given and the packages installed, or one of those below
     ``albedo``, ``normal``, ``depth``  features of the same size, in the units of ``GradientStack``: normals in camera
-                 space, +x right, +y up, +z toward the viewer (``Denoiser`` turns those of Mitsuba)
+                 space, +x right, +y up, +z toward the viewer (``Denoiser`` converts Mitsuba's normals)
     ``dx``, ``dy``, ``direct``, ``caustic``, ``primal_var``, ``dx_var``, ``dy_var``, ``caustic_var``  further layers of
                  a gradient stack
     ``options``  of the method, see below

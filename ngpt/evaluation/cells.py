@@ -26,7 +26,7 @@ from ngpt.system.writing import write_json
 # That numbers depend on, or whose absence makes rows absent.
 PACKAGES = ("numpy", "scipy", "mitsuba", "torch", "mitsuba-oidn", "scikit-image", "flip-evaluator")
 
-# Of a cell in the cache: its time by both clocks
+# The format of a cell in the cache: its time by both clocks
 _FORMAT = 2
 
 

@@ -50,7 +50,7 @@ def log_ratio(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
 
 
 def share_that_pays(ratio: np.ndarray) -> float | None:
-    """Of the blocks whose ratio is known; None where there is none."""
+    """The share of blocks where gradients pay, among blocks whose ratio is known; None if there are none."""
     known = ratio[~np.isnan(ratio)]
     return float(np.mean(known > 0)) if known.size else None
 

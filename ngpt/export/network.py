@@ -28,8 +28,8 @@ PRECISIONS = ("float32", "float16")
 def network_model(weights: str | Path, name: str, precision: str = "float32") -> onnx.ModelProto:
     """The graph of the weights in that file; ``name`` is what its metadata call it.
 
-    ``precision`` is that of the convolutions but the last; what surrounds them is float32 always. float16 is for GPUs:
-    ONNX Runtime's CPU provider computes it in float32, with conversions, which hides overflows and takes longer.
+    ``precision`` is the precision of all convolutions but the last; everything else is always float32. float16 is for
+    GPUs: ONNX Runtime's CPU provider computes it in float32, with conversions, which hides overflows and takes longer.
 
     Raises NgptError for weights that cannot be read, and for those that start from a base that has no graph.
     """
@@ -48,7 +48,7 @@ def statistics_model(weights: str | Path, name: str) -> onnx.ModelProto:
 def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
     """What a host may want to know, by key; CONTRACT.md explains them."""
     seen, light = reach(model), REACH if model.config.reads_gradients else 0
-    # Of every second pixel another denoiser's image of ``caustic`` is made: tiles begin at even ones.
+    # Another denoiser's image of ``caustic`` is made from blocks of 2x2 pixels, so tiles begin at even pixels.
     step = max(model.alignment, 2)
 
     def overlap(*pixels: int) -> str:

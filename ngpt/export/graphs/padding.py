@@ -62,7 +62,7 @@ def _pixels(layer: Value, side: Side) -> Value:
 
 
 def _differences(layer: Value, side: Side, signed: bool) -> Value:
-    """The same for differences along that side. The last of them leads out of the image, and belongs to the border."""
+    """``_pixels`` for differences along that side. The last difference leads out of the image; it is in the border."""
     steps = [
         op.Reshape(step if signed else abs(step), [-1, 1] if side.axis == 2 else [-1])
         for step in side.borders(side.step, 1)
