@@ -5,9 +5,10 @@ precision, which ends at 2^±127: squares of light above 2^63 are infinite, and 
 whose typical light is beyond 2^±``ORDINARY`` is multiplied by a power of two before a method sees it, and the result is
 multiplied back. Both are exact. Any other stack stays as it is, bit for bit.
 
-Variances may have left single precision before: those of light of 1e-30 are 1e-60. ``GradientStack`` keeps what it is
-given in double precision. In files, and in arrays of single precision, they are 0 or infinite. Infinite ones count as
-not known, as everywhere. Those of 0 do so where light is so dim that a variance of its own size could be 0.
+Variances may have left the range of single precision before: light of 1e-30 has variances of 1e-60. ``GradientStack``
+keeps double precision if it is given double precision. In files, and in arrays of single precision, such variances are
+0 or infinite. Infinite variances count as unknown, as everywhere. Variances of 0 count as unknown where the light is so
+dim that its square could underflow to 0.
 """
 
 import math
@@ -63,7 +64,7 @@ def bound(image: np.ndarray) -> float:
 
 
 def _median(values: np.ndarray) -> float:
-    """Of the absolute values that are finite and not 0; 0 for none."""
+    """The median of the absolute values that are finite and not 0; 0 if there are none."""
     sizes = np.abs(values[np.isfinite(values) & (values != 0)])
     # In double precision: the mean of two in the middle may be beyond the largest of single precision.
     return float(np.median(sizes.astype(np.float64))) if sizes.size else 0.0

@@ -160,8 +160,7 @@ def _numbered(file: BinaryIO) -> str:
 
 @contextlib.contextmanager
 def _name_to_write(path: Path) -> Iterator[str]:
-    """``_numbered`` for a file to be written; without a numbered name the file is closed, or it would count as in use.
-    """
+    """``_numbered`` for a file to write. With only its own name, it is closed, since it may count as in use."""
     if _NUMBERS.is_dir():
         with open(path, "r+b") as file:
             yield _numbered(file)

@@ -33,8 +33,8 @@ class Gain:
     """What an addition to a stack, or to the machine, would buy.
 
     ``add``     layers, and "OIDN" for the package
-    ``method``  that ``auto`` would take then
-    ``error``   by samples per pixel: the error over that of what ``auto`` takes now
+    ``method``  the method that ``auto`` would take then
+    ``error``   by samples per pixel: the error divided by the error of the method that ``auto`` takes now
     """
 
     add: tuple[str, ...]

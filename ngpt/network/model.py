@@ -41,7 +41,7 @@ class Reconstructor(nn.Module):
     def radius(self) -> int:
         """How far, in pixels, an input's influence on the image reaches, beside exposure, depth scale and bounds."""
         head = self.config.head
-        # Kernels alone move pixels; pyramids and sweeps move what the network says of them, too.
+        # Plain kernels only move pixels; pyramids and sweeps also move the network's predictions.
         moves = self.config.scales > 1 or self.config.sweeps
         own = self.network.radius + head.reach if moves else max(self.network.radius, head.reach)
         return max(own, WINDOW // 2 if self.config.quiet else 0)

@@ -99,7 +99,7 @@ def fill(module: torch.nn.Module, tensors: dict[str, Tensor], path: str) -> None
 
 
 def check_fit(own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], path: str) -> None:
-    """Raises NgptError unless ``tensors`` are those of ``own`` by name and shape, of floats, and finite."""
+    """Raises NgptError unless ``tensors`` have the names and shapes of ``own``, hold floats, and are finite."""
     missing, extra = own.keys() - tensors.keys(), tensors.keys() - own.keys()
     if missing or extra:
         what = "lacks" if missing else "has an unexpected"

@@ -23,8 +23,8 @@ from ngpt.system.text import printable
 SECONDS_BETWEEN_LINES = 5.0
 LINES = 50
 
-# Columns that a bar takes beside its label: with all of its parts, with a rate too, and with numbers and time left
-# alone. The first has to leave so many for the label.
+# Columns that a bar takes beside its label: with all of its parts, for a rate in addition, and with only numbers and
+# time left. The last number is what the first form has to leave for the label.
 WIDE, RATE, NARROW, LABEL = 58, 14, 22, 12
 
 # MiB of address space.
@@ -32,7 +32,7 @@ FEWEST_MIB = 512
 
 
 def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "interrupted") -> int:
-    """The exit status of a command: what ``run`` returns, or that of whatever stopped it, which is told in one line.
+    """The exit status of a command: what ``run`` returns, or the status for what stopped it, with a one-line message.
 
     1 for an error, and where nobody reads standard output any more; 2 for ``WrongUse``; 130 after Ctrl-C and 143 after
     SIGTERM. ``interrupted`` says what an interrupt means for the work.
@@ -115,7 +115,7 @@ def _open_standard_streams() -> None:
             os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", closefd=False))
-    # Files may have letters in them that standard output has not: on Windows a pipe has those of one language.
+    # Text from files may have letters that standard output cannot encode: on Windows a pipe has only one language's.
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")
 
@@ -288,7 +288,7 @@ def _shortened(text: str, most: int) -> str:
 
 
 def _last(words: list[str]) -> str:
-    """Of the pace, the time that is left."""
+    """The time left: the last word on the pace."""
     return words[-1].removeprefix("about ") if words else ""
 
 

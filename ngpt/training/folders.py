@@ -60,7 +60,7 @@ class StackCrop:
 
     @property
     def reference_caustic(self) -> np.ndarray:
-        """Of the reference, or that of all stacks together, spread; zeros if they have no such layer.
+        """The layer ``caustic`` of the reference, or else the mean of all stacks, denoised; zeros if they have none.
 
         Raises NgptError if only some of the stacks have it.
         """

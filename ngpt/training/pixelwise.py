@@ -43,9 +43,9 @@ def relative(prediction: Tensor, target: Tensor, epsilon: float = 1e-2) -> Tenso
 def huber(prediction: Tensor, target: Tensor, epsilon: float = 1e-2, knee: float = 0.5) -> Tensor:
     """Mean of Huber's function of e = (p - t) / √(p² + ε): e² / 2 up to the knee, straight beyond it.
 
-    In its gradient √(p² + ε) counts as a constant. Where the target is noisy by less than the knee, the least of it is
-    at the mean of what the target may be, so that noise of mean 0 does no harm [Lehtinen et al. 2018, "Noise2Noise",
-    section 3.3]; fireflies of the target, which squares alone would chase, count by their number.
+    In its gradient √(p² + ε) counts as a constant. Where the noise of the target is below the knee, the minimum is at
+    the expectation of the target, so noise of mean 0 does no harm [Lehtinen et al. 2018, "Noise2Noise", section 3.3].
+    Fireflies of the target count only by their number; a plain squared error would chase them.
     """
     error = ((prediction - target) / (prediction.detach().square() + epsilon).sqrt()).abs()
     return torch.where(error < knee, error.square() / 2, knee * (error - knee / 2)).mean()
@@ -59,9 +59,9 @@ def logarithmic(prediction: Tensor, target: Tensor) -> Tensor:
 def pyramid(prediction: Tensor, target: Tensor) -> Tensor:
     """Mean |p - t| of display-encoded images at 4 resolutions and 3 exposures, in [0, 1].
 
-    What a viewer sees of an error depends on how wide it is: eyes average fine noise away, above all that of colours,
-    and not what a patch is off by [Andersson et al. 2020, "FLIP", section 4.1, with boxes for their filters]. SSIM of
-    the structural distance takes patches' means off. Each resolution has half the pixels of the last, rounded up.
+    How visible an error is depends on its width: eyes average out fine noise, above all noise of colours, but not an
+    offset of a whole patch [Andersson et al. 2020, "FLIP", section 4.1, here with box filters]. The SSIM in the
+    structural distance subtracts the means of patches. Each resolution has half the pixels of the last, rounded up.
     """
     total = prediction.new_zeros(())
     for exposure in _EXPOSURES:

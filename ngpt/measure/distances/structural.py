@@ -38,7 +38,7 @@ def ms_ssim(a: Tensor, b: Tensor) -> Tensor:
 
         L_S^w_S  Π_s CS_s^w_s
 
-    L and CS are means over the image. Those below 1e-4 count as that, so that the product has a slope.
+    L and CS are means over the image. Means below 1e-4 count as 1e-4, so that the product has a slope.
     """
     a, b = a.float(), b.float()
     weights = _weights(a)
@@ -54,7 +54,7 @@ def ms_ssim(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _weights(image: Tensor) -> Tensor:
-    """Of the scales that the image has room for; their sum is 1."""
+    """The weights of the scales that the image has room for; their sum is 1."""
     scales = 1
     while scales < len(_WEIGHTS) and min(image.shape[-2:]) >> scales >= _WINDOW:
         scales += 1
