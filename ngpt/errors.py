@@ -20,14 +20,14 @@ class NgptError(ValueError):
 
 
 class WrongUse(NgptError):
-    """What is asked for makes no sense whatever the files hold: an option, a value, or two that exclude each other.
+    """The request makes no sense whatever the files hold: an option, a value, or two that exclude each other.
 
     The command line ends with status 2 for it, and with 1 for any other ``NgptError``.
     """
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """What to put before a list of the known names where a word is none of them: a question, or nothing."""
+    """The text before a list of the known names if a word is none of them: a question, or nothing."""
     from difflib import get_close_matches  # only for those who mistype
 
     near = get_close_matches(word.lower(), names := {name.lower(): name for name in known}, 1)

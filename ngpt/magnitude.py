@@ -22,9 +22,9 @@ from ngpt.stack import GradientStack
 ORDINARY = 20
 # The largest light has at most so many binary digits before the point: its square is a float.
 _LARGEST = 62
-# Typical light below 2^-_DIM has variances whose zeros say nothing: a millionth of its square is below 2^-148.
+# For typical light below 2^-_DIM, variances of 0 say nothing: a millionth of its square is below 2^-148.
 _DIM = 64
-# Numbers that are looked at for what is typical; no multiple of 3 apart, so that they are of all colours.
+# How many numbers are sampled for the typical light; their distance is no multiple of 3, so all colours occur.
 _LOOKED_AT = 1 << 16
 
 # Sums of squares of light beyond this leave single precision.
@@ -56,8 +56,8 @@ def magnitude(stack: GradientStack) -> int:
 
 
 def bound(image: np.ndarray) -> float:
-    """What light in an image is beyond all measure: infinity for ordinary images, and where some of it is above
-    ``WIDE``, single fireflies of typical images, 2^``ORDINARY`` times what is typical."""
+    """The limit above which light counts as an outlier. It is infinity for ordinary images. If some light is above
+    ``WIDE``, as in single fireflies, it is 2^``ORDINARY`` times the typical light, but at most ``WIDE``."""
     if np.abs(image).max(initial=0) <= WIDE:
         return math.inf
     return min(max(_median(image.reshape(-1)), 2.0**-_LARGEST) * 2.0**ORDINARY, WIDE)

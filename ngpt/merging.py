@@ -28,7 +28,7 @@ from ngpt.windows import Place, Window
 
 # Layers with a variance, and the layers that hold it.
 VARIANCES = {name: f"{name}_var" for name in ("primal", "dx", "dy", "caustic", "diffuse", "specular", "dt")}
-# Channels beside the layers that are means over samples too.
+# The prefix of further channels that are means over samples.
 DIAGNOSTICS = "diagnostics."
 # Attribute: what broke a render off before all that was asked for was done, "interrupted" or "failed"
 UNFINISHED = "ngpt:unfinished"
@@ -131,8 +131,8 @@ class _Tile:
         return _counts(self.stack, self.spp)
 
     def weights(self, name: str) -> np.ndarray:
-        """What the mean of a layer is weighted by, (H, W, 1): of a difference the harmonic mean of both its pixels'
-        counts, and 0 where the other pixel is beyond the tile, and not beyond the canvas."""
+        """The weights of the mean of a layer, (H, W, 1). For a difference, the harmonic mean of the counts of both its
+        pixels, and 0 where the other pixel is beyond the tile but not beyond the canvas."""
         if name not in DIFFERENCES:
             return self.counts
         x, y, _ = DIFFERENCES[name]
@@ -200,7 +200,7 @@ def _feature_noise(tiles: Sequence[_Tile], total: np.ndarray) -> float:
 
 
 def _varies(stack: GradientStack, name: str) -> np.ndarray:
-    """What the variance of a layer is of: of the primal what is not in ``caustic``; in double precision."""
+    """The values that a layer's variance describes (double precision); for the primal, the part not in ``caustic``."""
     values = stack[name].astype(np.float64)
     if name == "primal" and "caustic" in stack:
         with np.errstate(invalid="ignore"):

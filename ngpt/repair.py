@@ -23,7 +23,7 @@ class Repaired:
     ``dx, dy``   (H, W, 3) gradients, finite (0 where they are not trusted), None where the stack has none
     ``trusted``  for dx and dy, (H, W) booleans, None if all of them are
     ``variances``  of image, dx and dy, (H, W, 3), NaN where not known; None where the stack lacks a layer of them
-    ``noise``    the variance of only image, (H, W, 3), NaN where not known; None where the stack lacks it
+    ``noise``    the variance of image by itself, (H, W, 3), NaN where not known; None where the stack lacks it
     ``pixels``   number of pixels whose primal was replaced
     ``gradients``  number of differences left out
     ``features``  albedo, normal and depth, those the stack holds, with 0 where they are not finite

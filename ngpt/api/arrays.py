@@ -22,10 +22,10 @@ from ngpt.stack import GradientStack
 
 T = TypeVar("T")
 
-# What Mitsuba's denoiser does not know: further layers that methods take beside the image.
+# Further layers that methods take beside the image; Mitsuba's denoiser does not have them.
 _FURTHER = ("depth", "dx", "dy", "direct", "caustic", "primal_var", "dx_var", "dy_var", "caustic_var")
 _BESIDE = ("albedo", "normal", *_FURTHER)
-# What a denoiser is given only if it was announced -> the keyword that announces it.
+# Inputs that a denoiser takes only if they were announced -> the keyword that announces them.
 _ANNOUNCED = {"albedo": "albedo", "normals": "normals", "flow": "temporal", "previous_denoised": "temporal"}
 # From Mitsuba's sensor (+x left, +y up, +z forward) to the camera of the contract (+x right, +y up, +z backward).
 _TO_CAMERA = np.array([-1, 1, -1], np.float32)

@@ -25,7 +25,7 @@ from ngpt.stack import GradientStack
 PATTERNS = {"Cycles": "Combined_*", "Arnold": "RGBA_*"}
 # The header's list of groups of a result.
 ATTRIBUTE = "ngpt:groups"
-# Light in no group, as a share of all of it, that is no more than rounding.
+# Light in no group, as a share of all light, that may be due to rounding.
 NEGLIGIBLE = 2e-3
 
 

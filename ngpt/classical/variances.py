@@ -27,8 +27,8 @@ from ngpt.classical.leastsquares import robust_mean, sum_of
 # What is added to every variance, as a share of the mean over primal and differences.
 FLOOR = 3e-3
 
-# How many times the typical variance around it a difference has at least: the mean of fourth roots lies below the mean.
-# Of 2, 3 and 4 wcv has the least error with 2, by 1 %, and wl2 with 3.
+# A difference has at least this many times the typical variance around it: the mean of fourth roots is below the mean.
+# Among 2, 3 and 4, wcv has the least error with 2, by 1 %, and wl2 with 3.
 TYPICAL = 3
 
 # The factor on the variance of differences relative to the primal's. Neighbouring pixels share paths, so errors of

@@ -21,8 +21,8 @@ from ngpt.version import __version__
 
 
 class Verb(NamedTuple):
-    """What a verb does, the package whose module of the verb's name does it, which extra of ngpt-recon brings what it
-    needs, what an interrupt means for its work, and under which of ``HEADINGS`` help has it."""
+    """A verb: its summary, the package that holds its module (named after the verb), the extra of ngpt-recon that
+    installs what it needs, what an interrupt means for its work, and its heading in help, one of ``HEADINGS``."""
 
     summary: str
     room: str = "ngpt.cli"

@@ -49,7 +49,7 @@ def motion_hint(pairs: Sequence[tuple[Path, Path]], reports: Sequence[dict], arg
 
 
 def one_view_only(target: Path, args: argparse.Namespace, files: Mapping[str, str]) -> str:
-    """What there is of one view only, by the options; "" if nothing."""
+    """The part of the options that allows only one view; "" if there is none."""
     if target.suffix.lower() != ".exr":
         return f"{target} is of one"
     if args.ref:

@@ -22,9 +22,9 @@ SIGNIFICANT = 3.0
 NEIGHBOURS = ((0, 1, 1 / 8), (1, 0, 1 / 8), (1, 1, 1 / 16), (1, -1, 1 / 16))
 # Pixels that are worked on at a time: fewer make more calls, more leave the cache.
 _PIXELS = 16384
-# What gaps hold for a surface.
+# The value of surfaces in gaps.
 _FAR = float(np.finfo(np.float32).max)
-# The largest negative logarithm of a share, and the share beside it.
+# The largest negative logarithm of a share, and that share itself.
 SMALLEST = np.float32(20)
 _LEAST = np.exp(np.full(1, -SMALLEST))
 

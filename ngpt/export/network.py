@@ -74,12 +74,13 @@ def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
 
 
 def _base_reach(model: Reconstructor) -> int:
-    """What the control variates, and the smoothing of their weights before them, see; a multiple of the alignment."""
+    """How far the control variates and the smoothing of their weights see, in pixels, rounded up to the alignment."""
     return -(-(SWEEPS + 2) // model.alignment) * model.alignment if model.config.base else 0
 
 
 def bytes_per_pixel(model: Reconstructor) -> int:
-    """What a run takes at most for each pixel, beside the image's layers; measured in tests/network/test_run_onnx.py.
+    """The most memory that a run takes for each pixel, beside the image's layers; measured in
+    tests/network/test_run_onnx.py.
 
     The last convolution reads the longest list of tensors there is; it exists as the list, as one tensor, and about
     once more in units that are at work. The channels exist raw, cleaned, scaled, encoded, padded, and as one tensor.

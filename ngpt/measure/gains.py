@@ -51,7 +51,7 @@ def gains(layers: Container[str]) -> list[Gain]:
     found: list[Gain] = []
     if before is None:
         return found
-    # OIDN by itself: once it is there, this answers anew. The networks beside it need a runtime that has to be there.
+    # OIDN only by itself: once it is installed, this gives a new answer. Networks with it need an installed runtime.
     package = [(OIDN,)] if METHODS["oidn"].missing() and not METHODS["ngpt-fast"].missing() else []
     for added in [*package, *_subsets(groups)]:
         more = {name for group in added for name in group}

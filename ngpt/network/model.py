@@ -11,8 +11,8 @@ from ngpt.network import features, padding
 from ngpt.network.config import ModelConfig
 from ngpt.network.transfer import signed_exp, signed_log
 
-# Of ``quiet``: the side of the window, in pixels, over which noise is averaged, since the variance of one pixel knows
-# too little; what is added to radiance before noise is divided by it; the largest number whose square is no overflow.
+# For ``quiet``: the side of the window, in pixels, over which noise is averaged, since the variance of one pixel is too
+# noisy; what is added to radiance before noise is divided by it; a large number whose square does not overflow.
 WINDOW, DARK, HUGE = 15, 0.01, 1e15
 
 

@@ -19,7 +19,7 @@ SHAPES: dict[tuple[int, ...], tuple[int, ...]] = {
     (32, 32, 32, 32, 32): (64, 64, 64, 32, 32, 32),
     (32, 48, 64, 80, 96): (112, 96, 64, 64, 64, 32),
 }
-# What it reads beside the colour.
+# The layers that it reads beside the colour.
 FEATURES = ("albedo", "normal")
 
 # Exposure: what the geometric mean of the luminances of bins of about so many pixels is brought to. Darker ones than

@@ -257,10 +257,10 @@ def _made(path: str, _modified: int, device: str, threads: int):
     # Planning the reuse of buffers takes most of the start, six times as long as all else. It saves neither time nor
     # memory: the arena reuses the same buffers anyway.
     options.enable_mem_reuse = False
-    # Threads that wait for each other would keep their cores busy: a fifth of the processor time of ngpt-fast, which
-    # whatever works beside it lacks.
+    # Spinning threads would keep their cores busy while they wait: a fifth of the processor time of ngpt-fast, which
+    # other work on the machine would lack.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # What goes wrong comes as an exception; in the log it would stand a second time.
+    # Errors come as exceptions; the log would repeat them.
     options.log_severity_level = 4
     try:
         session = onnxruntime.InferenceSession(path, options, providers=[provider])

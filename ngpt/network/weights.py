@@ -17,7 +17,8 @@ from ngpt.network.model import Reconstructor
 from ngpt.system.files import atomic_output
 from ngpt.system.records import parse_json
 
-# The shipped networks in PyTorch's form: beside their .onnx in an installed package, apart from them in the repository
+# The shipped networks in PyTorch's form: beside the .onnx files in an installed package, in another folder in the
+# repository
 _PACKAGE = Path(__file__).parents[1]
 FOLDERS = (_PACKAGE / "weights", _PACKAGE.parent / "export" / "weights")
 FORMAT = 1

@@ -50,8 +50,8 @@ NO_MOTION = "no layer 'motion'"
 
 @dataclass(frozen=True)
 class _History:
-    """What a frame hands on to the next: result without direct emission, that, relative variance, features, where it
-    lies, frame."""
+    """What a frame passes on to the next: the result without direct emission, the direct emission, the relative
+    variance, the features, its place, and the frame."""
 
     light: np.ndarray
     direct: np.ndarray

@@ -40,7 +40,7 @@ DOUBT = 4
 
 @dataclass(frozen=True)
 class Link:
-    """What is known of a frame beside the one before: ``motion`` (H, W, 2), ``dt``, ``dt_var`` (H, W, 3), or NaN.
+    """The relation of a frame to the one before: ``motion`` (H, W, 2), ``dt``, ``dt_var`` (H, W, 3); NaN: not known.
 
     ``shift`` is the place (x, y) in the frame before at which the first pixel of this one lies.
     """
@@ -132,7 +132,7 @@ class _Still:
             self.y[~self.trusted[1][:-1]] = np.inf
 
     def swept(self, u: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
-        """What the neighbours in the image say beyond u, times weight, and the sum of weights, with u's own of 1."""
+        """The weighted sum of changes to u from its neighbours in the image, and the sum of weights; u's own is 1."""
         own = factor * self.primal
         change, weight = np.zeros_like(u), np.ones_like(own)
         for here, there, r, v in (

@@ -212,7 +212,7 @@ class _Pace:
         self.past: deque[tuple[float, int]] = deque()
 
     def __call__(self, done: int, total: int) -> list[str]:
-        """What there is to tell of the pace, in a few words each."""
+        """Phrases about the pace, of a few words each."""
         if not self.past:
             self.start = time.monotonic()
             self.past.append((0.0, done))
@@ -268,7 +268,7 @@ def _bar(label: str, unit: str, pace: _Pace) -> Iterator[Callable[[int, int], No
     phrase: Callable[[list[str]], str] = ", ".join
     taken = WIDE + (RATE if pace.rate else 0)
     if terminal.width < taken + LABEL:
-        # What counts is how far it is and how long it takes.
+        # A narrow terminal shows only the progress and the time left.
         columns, phrase, taken = [columns[0], columns[2], columns[5]], _last, NARROW
     label = _shortened(label, terminal.width - taken)
     # Lines on standard output go above the bar, unless they go into a file.

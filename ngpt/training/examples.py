@@ -24,7 +24,7 @@ JITTER = 7
 
 
 class Crop(Protocol):
-    """One view with a reference and several inputs; what ``ngpt.training.dataset`` gives, and ``StackFolder``.
+    """One view with a reference and several inputs, from ``ngpt.training.dataset`` or ``StackFolder``.
 
     Of a crop without a reference, only ``paired`` and its two stacks are used.
     """

@@ -1,4 +1,4 @@
-"""What training is given: training sets, and folders of stacks with references."""
+"""The data for training: training sets, and folders of stacks with references."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path

@@ -63,7 +63,7 @@ class LossSettings:
     weights: str = ""
 
 
-# Weights of other packages' terms stand beside these in [loss], by the terms' names.
+# Weights of terms from other packages also go into [loss], by the terms' names.
 _TAKEN = (*KINDS, *(field.name for field in fields(LossSettings)))
 TERMS: Registry[Term] = Registry("ngpt.losses", "loss", Callable, _OURS, _TAKEN)
 

@@ -12,7 +12,8 @@ from ngpt.network.transfer import signed_log, srgb
 
 # Resolutions of ``pyramid``, and the exposures at which a viewer may look at them.
 _SCALES, _EXPOSURES = 4, (0.25, 1.0, 4.0)
-# Of ``flip``: the typical radiance over the exposure is 4, white at the first; at the last 32 times as much is.
+# For ``flip``: typical radiance over the exposure is 4. The first exposure makes it white; the last makes 32 times as
+# much white.
 _WHITES = (0.25, 0.0078)
 # The parts of ``pu``.
 _PU_L1, _PU_STRUCTURE = 0.16, 0.84

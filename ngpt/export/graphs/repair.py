@@ -115,6 +115,6 @@ def _mean(sums: Value, otherwise: Value | float) -> Value:
 
 
 def _spread(blocks: Value, like: Value) -> Value:
-    """What each block holds, at all of its pixels."""
+    """The value of each block, at all of its pixels."""
     rows, columns = (op.Range(0, op.Squeeze(op.Shape(like, start=a, end=a + 1)), 1) / BLOCK for a in (2, 3))
     return op.Gather(op.Gather(blocks, rows, axis=2), columns, axis=3)
