@@ -20,14 +20,14 @@ class NgptError(ValueError):
 
 
 class WrongUse(NgptError):
-    """What is asked for makes no sense whatever the files hold: an option, a value, or two that exclude each other.
+    """The request makes no sense whatever the files hold: an option, a value, or two that exclude each other.
 
     The command line ends with status 2 for it, and with 1 for any other ``NgptError``.
     """
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """What to put before a list of the known names where a word is none of them: a question, or nothing."""
+    """The text before a list of the known names if a word is none of them: a question, or nothing."""
     from difflib import get_close_matches  # only for those who mistype
 
     near = get_close_matches(word.lower(), names := {name.lower(): name for name in known}, 1)
@@ -37,15 +37,16 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 class Interrupted(KeyboardInterrupt):
     """What Ctrl-C and SIGTERM raise in a command.
 
-    Python 3.11 ends itself by SIGINT, whatever status it is told, once a plain KeyboardInterrupt has passed code that
-    was compiled from a text, as that of dataclasses and named tuples is.
+    Python 3.11 ends itself by SIGINT, whatever exit status it is given, once a plain KeyboardInterrupt has passed
+    through code that was compiled from a string, such as the code of dataclasses and named tuples.
     """
 
 
 def stop_if_interrupted(error: BaseException) -> None:
-    """Raises KeyboardInterrupt if that is what ``error`` comes from: Ctrl-C within a library that wraps what it meets.
+    """Raises KeyboardInterrupt if ``error`` comes from one: from Ctrl-C within a library that wraps exceptions.
 
-    Dr.Jit's loops and recordings make a RuntimeError of it, with the cause; Mitsuba's plugins one with a text alone.
+    Dr.Jit's loops and recordings turn it into a RuntimeError with the cause; Mitsuba's plugins into one with only a
+    text.
     """
     cause: BaseException | None = error
     while cause is not None:

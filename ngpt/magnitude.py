@@ -5,9 +5,10 @@ precision, which ends at 2^±127: squares of light above 2^63 are infinite, and 
 whose typical light is beyond 2^±``ORDINARY`` is multiplied by a power of two before a method sees it, and the result is
 multiplied back. Both are exact. Any other stack stays as it is, bit for bit.
 
-Variances may have left single precision before: those of light of 1e-30 are 1e-60. ``GradientStack`` keeps what it is
-given in double precision. In files, and in arrays of single precision, they are 0 or infinite. Infinite ones count as
-not known, as everywhere. Those of 0 do so where light is so dim that a variance of its own size could be 0.
+Variances may have left the range of single precision before: light of 1e-30 has variances of 1e-60. ``GradientStack``
+keeps double precision if it is given double precision. In files, and in arrays of single precision, such variances are
+0 or infinite. Infinite variances count as unknown, as everywhere. Variances of 0 count as unknown where the light is so
+dim that its square could underflow to 0.
 """
 
 import math
@@ -21,9 +22,9 @@ from ngpt.stack import GradientStack
 ORDINARY = 20
 # The largest light has at most so many binary digits before the point: its square is a float.
 _LARGEST = 62
-# Typical light below 2^-_DIM has variances whose zeros say nothing: a millionth of its square is below 2^-148.
+# For typical light below 2^-_DIM, variances of 0 say nothing: a millionth of its square is below 2^-148.
 _DIM = 64
-# Numbers that are looked at for what is typical; no multiple of 3 apart, so that they are of all colours.
+# How many numbers are sampled for the typical light; their distance is no multiple of 3, so all colours occur.
 _LOOKED_AT = 1 << 16
 
 # Sums of squares of light beyond this leave single precision.
@@ -55,15 +56,15 @@ def magnitude(stack: GradientStack) -> int:
 
 
 def bound(image: np.ndarray) -> float:
-    """What light in an image is beyond all measure: infinity for ordinary images, and where some of it is above
-    ``WIDE``, single fireflies of typical images, 2^``ORDINARY`` times what is typical."""
+    """The limit above which light counts as an outlier. It is infinity for ordinary images. If some light is above
+    ``WIDE``, as in single fireflies, it is 2^``ORDINARY`` times the typical light, but at most ``WIDE``."""
     if np.abs(image).max(initial=0) <= WIDE:
         return math.inf
     return min(max(_median(image.reshape(-1)), 2.0**-_LARGEST) * 2.0**ORDINARY, WIDE)
 
 
 def _median(values: np.ndarray) -> float:
-    """Of the absolute values that are finite and not 0; 0 for none."""
+    """The median of the absolute values that are finite and not 0; 0 if there are none."""
     sizes = np.abs(values[np.isfinite(values) & (values != 0)])
     # In double precision: the mean of two in the middle may be beyond the largest of single precision.
     return float(np.median(sizes.astype(np.float64))) if sizes.size else 0.0

@@ -28,35 +28,35 @@ from ngpt.windows import Place, Window
 
 # Layers with a variance, and the layers that hold it.
 VARIANCES = {name: f"{name}_var" for name in ("primal", "dx", "dy", "caustic", "diffuse", "specular", "dt")}
-# Channels beside the layers that are means over samples too.
+# The prefix of further channels that are means over samples.
 DIAGNOSTICS = "diagnostics."
 # Attribute: what broke a render off before all that was asked for was done, "interrupted" or "failed"
 UNFINISHED = "ngpt:unfinished"
 # Attribute: the sampler's options that are not defaults, with commas between
 OPTIONS = "ngpt:samplerOptions"
-# Samples of a pixel, of which headers count as many in 32 bits
+# The most samples of a pixel: headers count them in 32 bits.
 _MOST = 2.0**31
 
 
 def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     """The stack of all samples of ``stacks``: same scene, camera and sampler, different seeds or different places.
 
-    Means are weighted by ``ngpt:spp``, or by the layer ``samples`` where a stack has it: one of differences by the
-    harmonic mean of the samples of both its pixels, as their variances would be. The merged ``samples`` are sums, and
-    are left out where all pixels have the same number. Variances of the mean come from the pooled sums, so merged
+    Means are weighted by ``ngpt:spp``, or by the layer ``samples`` if a stack has it. A mean of differences is weighted
+    by the harmonic mean of the samples of both its pixels, as its variance would be. The merged ``samples`` are sums,
+    and are left out if all pixels have the same number. Variances of the mean come from the pooled sums, so merged
     stacks of n1 and n2 samples equal the stack of n1 + n2 up to the rounding of float32. There are two exceptions.
-    Variances of dx and dy are those of two independent directions, which a stack no longer tells apart: their merged
-    value has the same expectation, and differs by about 1 / N of itself. And samples that were not finite are missing
-    in their pixel alone, which then counts with the full weight of its stack; a pixel that lost all of them is NaN and
-    counts nothing.
+    First, variances of dx and dy combine two independent directions, which a stack no longer separates: their merged
+    value has the same expectation, and differs by about 1 / N of itself. Second, a non-finite sample is missing only in
+    its own pixel, which still counts with the full weight of its stack; a pixel that lost all samples is NaN and counts
+    nothing.
 
     A stack with one sample per pixel has no variances and needs none, since its sum of squared deviations is zero: two
     of them merged have variances. ``diagnostics.*`` channels are averaged as layers are.
 
-    Tiles (``GradientStack.place``) give the smallest rectangle that holds them all, and must fill it. They may overlap,
-    and have the same seed where they do not. The difference from a tile's last column or row to the pixel beyond it
-    was not sampled: it is NaN where no other tile knows it, and counts nothing in a reconstruction. All differences
-    are known of tiles that overlap by a pixel.
+    Tiles (``GradientStack.place``) give the smallest rectangle that holds them all, and must fill it. They may overlap.
+    Tiles that do not overlap may have the same seed. The difference from a tile's last column or row to the pixel
+    beyond it was not sampled: it is NaN if no other tile has it, and counts nothing in a reconstruction. If tiles
+    overlap by a pixel, all differences are known.
 
     The result's ``ngpt:seed`` lists all seeds, ``ngpt:spp`` is the mean over pixels of the samples that they have,
     ``ngpt:seconds`` and ``ngpt:discarded`` are sums, ``ngpt:samplerOptions`` has the options of all stacks,
@@ -131,8 +131,8 @@ class _Tile:
         return _counts(self.stack, self.spp)
 
     def weights(self, name: str) -> np.ndarray:
-        """What the mean of a layer is weighted by, (H, W, 1): of a difference the harmonic mean of both its pixels'
-        counts, and 0 where the other pixel is beyond the tile, and not beyond the canvas."""
+        """The weights of the mean of a layer, (H, W, 1). For a difference, the harmonic mean of the counts of both its
+        pixels, and 0 where the other pixel is beyond the tile but not beyond the canvas."""
         if name not in DIFFERENCES:
             return self.counts
         x, y, _ = DIFFERENCES[name]
@@ -200,7 +200,7 @@ def _feature_noise(tiles: Sequence[_Tile], total: np.ndarray) -> float:
 
 
 def _varies(stack: GradientStack, name: str) -> np.ndarray:
-    """What the variance of a layer is of: of the primal what is not in ``caustic``; in double precision."""
+    """The values that a layer's variance describes (double precision); for the primal, the part not in ``caustic``."""
     values = stack[name].astype(np.float64)
     if name == "primal" and "caustic" in stack:
         with np.errstate(invalid="ignore"):

@@ -154,7 +154,7 @@ _OURS = {
         also_missing=oidn.missing,
     ),
     "ngpt": _network("ngpt", "neural network of the paper's size", (*_GRADIENTS, *_FEATURES), "niche"),
-    # Those below see no gradients.
+    # The methods below do not use gradients.
     "nlm": Method(
         "peer: joint non-local means of scikit-image",
         ("primal", "albedo", "normal", "primal_var"),
@@ -263,7 +263,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     try:
         values = settings(f"method '{name}'", entry.options, options)
     except WrongUse as error:
-        # Of another stack `auto` may take a method that has the option.
+        # `auto` may choose a method that has the option for another stack, so this is no wrong use.
         raise error if method == name else NgptError(str(error)) from None
     if entry.missing() and not own:
         raise NgptError(f"method '{name}': {entry.missing()}")
@@ -311,7 +311,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
 
 
 def _known(stack: GradientStack, estimates: tuple[str, ...]) -> GradientStack:
-    """The stack without those layers of which nothing is known, and which are ``estimates`` of the method then."""
+    """The stack without the layers of ``estimates`` that have no finite value; the method then estimates them."""
     unknown = [name for name in estimates if name in stack and not np.isfinite(stack[name]).any()]
     layers = {name: stack[name] for name in stack.names if name not in unknown}
     return replace(stack, layers=layers) if unknown else stack

@@ -104,7 +104,7 @@ def settings(owner: str, options: Mapping[str, Option], given: Mapping[str, Any]
 
 
 def unusual(options: Mapping[str, Option], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of the ``values`` that are not defaults."""
+    """The ``values`` that are not defaults."""
     return {name: value for name, value in values.items() if value != options[name].default}
 
 

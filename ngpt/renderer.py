@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from ngpt.stack import GradientStack
 
-# Of a render: its sampler's name, the sampler's own options, and whether features are rendered
+# The options of a render: its sampler's name, the sampler's own options, and whether features are rendered
 Options = Mapping[str, Any]
 
 
@@ -45,7 +45,7 @@ class Renderer(Protocol):
         """Whether it renders them; of an unknown one nobody knows better."""
 
     def unusual(self, sampler: str, options: Options) -> str:
-        """Those of its options that are not defaults: "radius=1, photons=2". Raises NgptError for wrong ones."""
+        """The sampler's options that are not defaults: "radius=1, photons=2". Raises NgptError for wrong ones."""
 
     def code(self, sampler: str) -> str:
         """A hash of the code that a render by the sampler runs; "auto" is a sampler too."""

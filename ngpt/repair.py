@@ -23,7 +23,7 @@ class Repaired:
     ``dx, dy``   (H, W, 3) gradients, finite (0 where they are not trusted), None where the stack has none
     ``trusted``  for dx and dy, (H, W) booleans, None if all of them are
     ``variances``  of image, dx and dy, (H, W, 3), NaN where not known; None where the stack lacks a layer of them
-    ``noise``    the variance of image alone, (H, W, 3), NaN where not known; None where the stack lacks it
+    ``noise``    the variance of image by itself, (H, W, 3), NaN where not known; None where the stack lacks it
     ``pixels``   number of pixels whose primal was replaced
     ``gradients``  number of differences left out
     ``features``  albedo, normal and depth, those the stack holds, with 0 where they are not finite
@@ -32,7 +32,7 @@ class Repaired:
     ``caustic_var``  its variance, (H, W, 3), NaN where not known; None where the stack lacks it
     ``feature_noise``  the variance of albedo or normal, whichever is larger, mean over the image; None: not known
     ``parts``    diffuse and specular light, finite, and their variances as ``diffuse_var`` and ``specular_var``, NaN
-                 where not known: those that the stack holds
+                 where not known; only the ones that the stack holds
     """
 
     image: np.ndarray
@@ -51,7 +51,7 @@ class Repaired:
     parts: dict[str, np.ndarray] = field(default_factory=dict)
 
     def known_variances(self) -> dict[str, np.ndarray]:
-        """Those of image, dx and dy that the stack holds, by the names of its layers; see ``variances``."""
+        """The variances of image, dx and dy that the stack holds, by the names of its layers; see ``variances``."""
         if self.variances is not None:
             return dict(zip(("primal_var", "dx_var", "dy_var"), self.variances, strict=True))
         return {} if self.noise is None else {"primal_var": self.noise}
@@ -86,7 +86,7 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
         image, direct = _from_neighbours(image, good), np.where(good[..., None], direct, 0)
         caustic = None if caustic is None else _from_neighbours(caustic, good)
     features = {name: _finite(stack[name]) for name in ("albedo", "normal", "depth") if name in stack}
-    # Where the camera sees an emitter, the primal's variance is that of primal and direct emission together.
+    # Where the camera sees an emitter, the primal's variance includes the direct emission.
     known = good & ~direct.any(axis=-1) if direct.any() else good
     noise = _where(known, variance_of_primal(stack, gradients)) if "primal_var" in stack else None
     said = stack.number(FEATURE_NOISE)
@@ -178,7 +178,7 @@ def _from_neighbours(light: np.ndarray, good: np.ndarray) -> np.ndarray:
 
 
 def _from_blocks(total: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Sums (H, W, 3) over counts (H, W, 1); where nothing was counted, those of the smallest block that has any."""
+    """Sums (H, W, 3) over counts (H, W, 1); where the count is 0, the ratio of the smallest block that has any."""
     mean = total / np.maximum(count, 1)
     if count.all() or count.size == 1:
         return mean

@@ -63,8 +63,8 @@ class GradientStack:
     ) -> "GradientStack":
         """A stack of the (height, width, channels) tensor that ``mi.render(scene)`` returns of one of our integrators.
 
-        ``names`` are the integrator's ``aov_names()``, a channel each: "primal.R". Raises NgptError where their number
-        is not that of the channels, for a name that is no layer's, and for a layer of which channels are missing.
+        ``names`` are the integrator's ``aov_names()``, one for each channel: "primal.R". Raises NgptError if there are
+        more or fewer names than channels, for a name of no layer, and for a layer with missing channels.
         """
         array = np.asarray(tensor)
         if array.ndim != 3 or array.shape[2] != len(names):

@@ -1,7 +1,7 @@
-"""Statistical tests of renderings, for our own tests and for those of anyone who writes a sampler.
+"""Statistical tests of renderings, for our own tests and for anyone who writes a sampler.
 
-A sampler is right when its mean is. That cannot be seen in one image against a fixed tolerance, but independent
-renders of both sides give their own standard errors, and the number of comparisons fixes the level of each.
+A sampler is right if its mean is right. A single image and a fixed tolerance cannot show that. But independent renders
+of both sides give their own standard errors, and the number of comparisons sets the significance level of each.
 """
 
 from dataclasses import dataclass

@@ -22,10 +22,10 @@ from ngpt.stack import GradientStack
 
 T = TypeVar("T")
 
-# What Mitsuba's denoiser does not know: further layers that methods take beside the image.
+# Further layers that methods take beside the image; Mitsuba's denoiser does not have them.
 _FURTHER = ("depth", "dx", "dy", "direct", "caustic", "primal_var", "dx_var", "dy_var", "caustic_var")
 _BESIDE = ("albedo", "normal", *_FURTHER)
-# What a denoiser is given only if it was announced -> the keyword that announces it.
+# Inputs that a denoiser takes only if they were announced -> the keyword that announces them.
 _ANNOUNCED = {"albedo": "albedo", "normals": "normals", "flow": "temporal", "previous_denoised": "temporal"}
 # From Mitsuba's sensor (+x left, +y up, +z forward) to the camera of the contract (+x right, +y up, +z backward).
 _TO_CAMERA = np.array([-1, 1, -1], np.float32)
@@ -96,11 +96,11 @@ def denoise(
 
     ``image``    (H, W, 3) or (H, W, 4), floats: an array of NumPy, PyTorch (any device), Dr.Jit, or a Mitsuba bitmap.
                  The same kind comes back, of the same type and shape; alpha comes back as it is. A bitmap of many
-                 channels is read by their names, as files are, and gives its colour and alpha alone. A
+                 channels is read by their names, as files are, and gives only its colour and alpha. A
                  ``GradientStack`` gives (H, W, 3) float32.
     ``method``   "auto", the best for the layers given and the packages installed, or one of those below
     ``albedo``, ``normal``, ``depth``  features of the same size, in the units of ``GradientStack``: normals in camera
-                 space, +x right, +y up, +z toward the viewer (``Denoiser`` turns those of Mitsuba)
+                 space, +x right, +y up, +z toward the viewer (``Denoiser`` converts Mitsuba's normals)
     ``dx``, ``dy``, ``direct``, ``caustic``, ``primal_var``, ``dx_var``, ``dy_var``, ``caustic_var``  further layers of
                  a gradient stack
     ``options``  of the method, see below

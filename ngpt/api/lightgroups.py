@@ -25,17 +25,17 @@ from ngpt.stack import GradientStack
 PATTERNS = {"Cycles": "Combined_*", "Arnold": "RGBA_*"}
 # The header's list of groups of a result.
 ATTRIBUTE = "ngpt:groups"
-# Light in no group, as a share of all of it, that is no more than rounding.
+# Light in no group, as a share of all light, that may be due to rounding.
 NEGLIGIBLE = 2e-3
 
 
 def find(stack: GradientStack, patterns: Sequence[str] = ()) -> dict[str, np.ndarray]:
     """The groups in the file of a stack: name -> (H, W, 3) float32.
 
-    ``patterns``  of the names of layers, such as "Combined_*"; by default those of ``PATTERNS``
+    ``patterns``  patterns of layer names, such as "Combined_*"; the default is ``PATTERNS``
 
-    In a file of several view layers those of the one that holds the primal. Raises NgptError where there are none,
-    and where they were denoised before.
+    If a file has several view layers, the groups are taken from the one that holds the primal. Raises NgptError if
+    there are no groups, or if they were denoised before.
     """
     if ATTRIBUTE in stack.attributes:
         raise NgptError(f"{stack.path}: its light groups are denoised already; give the file of the renderer")

@@ -1,17 +1,18 @@
 """How far a reconstruction may be from the converged image: a standard error for each pixel, for any method.
 
-The method runs once more, on the stack with as much noise again as its variances say it has: primal, dx, dy and caustic
-each with independent normal noise. How much that changes the image, over about 9x9 pixels, is how much of the noise
-comes through. What the method itself gets wrong, by blur above all, lies in about the same places. So the change is
-multiplied by a factor. It is measured for each method: the interval of one standard error then holds the truth in 68 %
-of the pixels, and that of 1.96 in 95 %, in the mean over scenes that no factor was chosen on (docs/use/uncertainty.md).
+The method runs a second time, on the stack with more noise added: independent normal noise in primal, dx, dy and
+caustic, with the variances of the stack. The change of the image, over about 9x9 pixels, shows how much noise comes
+through. The method's own errors, mostly blur, lie in about the same places. So the change is multiplied by a factor,
+which is measured for each method. With it, an interval of one standard error holds the truth in 68 % of the pixels, and
+an interval of 1.96 standard errors in 95 %. Both are means over scenes that no factor was chosen on
+(docs/use/uncertainty.md).
 
-The error is one of most pixels and not of the worst ones: about 1 % of the values are more than five standard errors
+The standard error describes most pixels, not the worst ones: about 1 % of the values are more than five standard errors
 off, and hold most of the squared error. They lie where a rare bright path was spread into a blotch, which its variance
-understates. Stacks of two *halves* of the samples, each with seeds of its own, show such blotches: one has them and the
-other has not.
+understates. Stacks of two *halves* of the samples, each with its own seeds, show such blotches: one half has them and
+the other does not.
 
-Not handled: what is wrong in the same way whatever the noise, such as a caustic that all samples missed.
+Not handled: errors that do not depend on the noise, such as a caustic that all samples missed.
 """
 
 from dataclasses import replace
@@ -122,7 +123,7 @@ def noisier(stack: GradientStack) -> GradientStack:
                 known = np.where(empty_pixels(stack)[..., None], 0, known)
             layers[name] = stack[name] + np.sqrt(known) * drawn
     if "caustic" in layers:
-        # Part of the primal, whose variance is that of the rest.
+        # The caustic is part of the primal; the noise above covers only the rest of it.
         layers["primal"] = layers["primal"] + (layers["caustic"] - stack["caustic"])
     return stack.replace(**layers)
 

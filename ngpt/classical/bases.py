@@ -83,8 +83,8 @@ CLASSICAL = {
     "wl2": Classical(_ALL, partial(_keeping_energy, weighted.wl2), {}),
 }
 
-# Those a network can start from: they cost less than itself. Of wcv the sweeps alone, which see no more of the image
-# than a tile has.
+# The methods a network can start from: they cost less than the network. wcv is reduced to its sweeps, which see no more
+# of the image than a tile has.
 BASES = {
     "l2": CLASSICAL["l2"],
     "cv": CLASSICAL["cv"],

@@ -37,7 +37,7 @@ def cv(
     constant plus the integrated gradients.
     """
     equations = Equations(primal, dx, dy, trusted)
-    # Equal weights are those of exact differences.
+    # Exact differences give equal weights.
     one = np.ones_like(equations.primal[:1])
     exact = without_missing(np.zeros((2, *one.shape[1:]), one.dtype), trusted)
     return _sweep(equations, one, exact, [1.0] * sweeps)

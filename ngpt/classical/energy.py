@@ -15,7 +15,7 @@ from ngpt.classical.leastsquares import solve
 # Pixels over which energy is compared: the screened Poisson equation's length. 16 and 64 pixels are as good.
 REACH = 32
 
-# How many times brighter or darker a neighbourhood becomes at most: beside pixels of 1e12 sums have no digits left.
+# A neighbourhood becomes at most this many times brighter or darker: sums with pixels of 1e12 lose all other digits.
 MOST = 4.0
 
 

@@ -50,7 +50,7 @@ def adjoint(dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
 
 
 def adjoint_by_rows(function: Callable[[int, int], tuple], *out: np.ndarray) -> tuple:
-    """As ``by_rows``, but the function's first three values are v, dx, dy, of which v + adjoint(dx, dy) is made.
+    """As ``by_rows``, but the function's first three values v, dx, dy are combined into v + adjoint(dx, dy).
 
     v may be None for 0.
     """

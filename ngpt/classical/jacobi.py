@@ -1,14 +1,14 @@
 """The sweeps of ``ngpt.classical.controlvariates`` on NumPy arrays, arranged for the caches of a processor.
 
-NumPy alone, and faster than its expressions over bands of an image (docs/lab/log), by these means:
+It uses only NumPy, and is faster than plain NumPy expressions over bands of an image (docs/lab/log), because:
 
-- The image is cut into strips of rows, which threads work on. A strip has ``DEPTH`` rows more on both sides, copies of
-  its neighbours', so that so many sweeps need no word from them: what is wrong at its ends moves in by a row a sweep.
-- Within a strip, sweeps follow each other a row apart, on some rows at a time. What they read stays in the cache.
-- Few calls do much each: x and y, and all colours, in one. Each call of NumPy takes Python's lock at its end, and a
-  thread that finds it taken sleeps; of short calls, two threads take longer than one.
-- Rows are padded to whole vectors and laid end to end, so that operations see one long aligned array. What the last
-  pixel of a row says of the first of the next has weight 0.
+- The image is cut into strips of rows, which threads work on. A strip has ``DEPTH`` more rows on both sides, copies of
+  its neighbours' rows. So it needs no exchange for ``DEPTH`` sweeps: errors at its ends move in by one row a sweep.
+- Within a strip, sweeps follow each other one row apart, on some rows at a time. What they read stays in the cache.
+- There are few calls, and each does much: x and y, and all colours, in one. Each call of NumPy takes Python's lock at
+  its end, and a thread that finds it taken sleeps. With short calls, two threads take longer than one.
+- Rows are padded to whole vectors and laid end to end, so that operations see one long aligned array. The difference
+  between the last pixel of a row and the first of the next has weight 0.
 """
 
 import math
@@ -21,7 +21,7 @@ from ngpt.classical.arrays import map_silent
 
 # Sweeps between two exchanges of rows.
 DEPTH = 5
-# Rows of a strip without those of its neighbours; fewer make more of these, more leave threads without work.
+# Rows of a strip without the neighbours' rows. Fewer rows mean more copies; more rows leave threads without work.
 _STRIP = 180
 # Pixels that are worked on at a time: fewer make more calls, more leave the cache.
 _PIXELS = 30720
@@ -54,8 +54,8 @@ def jacobi(r: np.ndarray, primal_var: np.ndarray, difference_var: np.ndarray, fa
 class _Strip:
     """Rows first .. last - 1 of the image, and ``DEPTH`` more on both sides.
 
-    All arrays are (..., rows * pitch). ``ratio`` is, for the neighbours right, below, left and above, the variance of
-    the difference over that of the pixel, and infinite where there is none.
+    All arrays are (..., rows * pitch). ``ratio`` is the variance of the difference divided by the variance of the
+    pixel, for the neighbours right, below, left and above. It is infinite where there is no neighbour.
     """
 
     def __init__(self, r: np.ndarray, v: np.ndarray, differences: np.ndarray, first: int, last: int):
@@ -64,14 +64,14 @@ class _Strip:
         self.lead = _VECTOR // dtype.itemsize
         self.pitch = -(-width // self.lead) * self.lead
         self.rows = last - first + 2 * DEPTH
-        # Those of them that the image has: of the image, and of the strip.
+        # The rows that exist in the image, as slices of the image and of the strip.
         image = slice(max(first - DEPTH, 0), min(last + DEPTH, height))
         strip = slice(image.start - first + DEPTH, image.stop - first + DEPTH)
         size = self.rows * self.pitch
         # One row more on top, to which the first one has no difference, and below.
         self.u = _aligned((channels, size + 2 * self.pitch), dtype, 0)
         self.r = _aligned((2, channels, size), dtype, 0)
-        # Of each pixel the one to its right, and the one below.
+        # For each pixel, its neighbours to the right and below.
         self.neighbours = _pair(self.u[:, self.pitch + 1 :], self.u[:, 2 * self.pitch :], size)
         self.ratio = _aligned((4, size), dtype, np.inf)
         self._grid(self.r)[:, :, strip, :width] = r[:, :, image]
@@ -117,7 +117,7 @@ class _Strip:
         np.add.reduce(weights, axis=0, initial=1, out=share)
         np.subtract(self.neighbours[..., first:last], u, out=d)
         d -= self.r[..., first:last]
-        # Of dy, the row above, as it was before this sweep.
+        # dy of the row above, as it was before this sweep.
         scratch.rows[:, :pitch] = above
         above[...] = scratch.rows[:, size : size + pitch]
         np.multiply(weights[2:, None], before, out=said)
@@ -132,10 +132,10 @@ class _Strip:
 
 
 class _Scratch:
-    """What a thread needs beside the strip for so many rows; ``above`` is of each of the sweeps under way.
+    """The memory a thread needs beside the strip for so many rows; ``above`` has an entry for each sweep under way.
 
-    ``arrays`` (..., pixels): the weights of the neighbours, their sum with the pixel's own, dx and dy, those of the
-    pixels to the left and above, and room for as much. ``rows`` (C, pixels) is dy with one row more on top.
+    ``arrays`` (..., pixels): the weights of the neighbours, their sum with the pixel's own weight, dx and dy, dx and dy
+    of the pixels to the left and above, and as much scratch space. ``rows`` (C, pixels) is dy with one more row on top.
     """
 
     def __init__(self, strip: _Strip, rows: int):

@@ -141,7 +141,7 @@ class Weighted:
 
     D is the mean weight around a pixel where ``screen`` varies, and 1 where it does not [Concus and Golub 1973, "Use of
     Fast Direct Methods for the Efficient Numerical Solution of Nonseparable Elliptic Equations"]. In the latter case
-    the mean of the solution is 0, as that of the right-hand side.
+    the mean of the solution is 0, like the mean of the right-hand side.
     """
 
     def __init__(self, screen: np.ndarray | float, weights: np.ndarray):
@@ -230,7 +230,7 @@ def total_of(bands: list) -> float:
 def robust_mean(*layers: np.ndarray) -> float:
     """The mean of values >= 0, in arrays of any shape, when none counts as more than ``CLIP`` times this mean.
 
-    Of ordinary data it is nearly the mean; a few pixels of 1e12 do not move it.
+    It is close to the ordinary mean for ordinary data; a few pixels of 1e12 do not move it.
     """
     rows = [layer.reshape(-1, layer.shape[-1]) for layer in layers if math.prod(layer.shape)]
     count = sum(math.prod(values.shape) for values in rows)

@@ -28,8 +28,9 @@ from ngpt.errors import NgptError
 DEFAULT_ALPHA = 0.2
 
 # ADMM: over-relaxation, and the threshold in units of the mean residual, 1 + FIRST_STRIDE · DECAYⁿ. Long strides at
-# first move the outliers, for which short ones alone take hundreds of iterations. Of twenty such schedules this takes
-# the fewest iterations to within 0.5 % of the minimum in the worst of eight stacks: 46, and 28 to 41 in the others.
+# first move the outliers; with only short strides this takes hundreds of iterations. Among twenty such schedules, this
+# one takes the fewest iterations to within 0.5 % of the minimum in the worst of eight stacks: 46, and 28 to 41 in the
+# others.
 RELAXATION = 1.6
 FIRST_STRIDE = 300.0
 DECAY = 0.75
@@ -135,8 +136,8 @@ def least_norms(
     b, _ = adjoint_by_rows(lambda i, j: (None, *r[..., i:j, :]), empty(r, channels))
     u, free = solve(b, alpha**2, mean=0.0), [empty(b, channels), empty(b, channels)]
     s, norms, _ = by_rows(start, empty(r, 3, channels), empty(r, 3, 1))
-    # In units of the mean residual, the iteration follows the exposure of the image. Outliers must neither set this
-    # unit nor, by an energy beside which the rest of the image is nothing, decide when to stop.
+    # In units of the mean residual, the iteration follows the exposure of the image. Outliers must not set this unit.
+    # Nor must they decide when to stop, with an energy that dwarfs the rest of the image.
     mean = robust_mean(norms)
     limit, stride = 1000 * mean, max(FIRST_STRIDE * mean, float(norms.max()) / 10)
     threshold = mean + stride
@@ -160,7 +161,7 @@ def least_norms(
 
 
 def _counts(r: np.ndarray, trusted) -> np.ndarray:
-    """(3, 1, H, W): 1 for the equations that count, 0 for the others; those of the primal all do."""
+    """(3, 1, H, W): 1 for the equations that count, 0 for the others; all equations of the primal count."""
     return np.stack([np.ones_like(trusted[0]), *trusted]).astype(r.dtype)[:, None]
 
 

@@ -1,19 +1,19 @@
 """Variances of a stack made fit for weights, and the α they suggest.
 
-Given are sample variances of pixel means, from as few as two samples: too noisy to be used pixel by pixel, zero where
-all samples missed the light, and, like the values, larger where a sample hit it. Weights made of them as they are would
-believe the pixels that saw nothing.
+The input is sample variances of pixel means, from as few as two samples. They are too noisy to be used pixel by pixel,
+zero where all samples missed the light, and larger where a sample hit it, as the values are. Weights computed directly
+from them would trust the pixels that saw nothing.
 
-Of the primal that darkens the image: its variances are averaged over a neighbourhood.
+For the primal, such weights darken the image. So its variances are averaged over a neighbourhood.
 
-Of a difference it only smooths it. But few differences hold most of the variance: those of light that no shift follows.
-An average over neighbours would hand their variance to clean ones, and make them look better than they are. So a
-difference has its own variance where that is large, and otherwise a typical one of its neighbourhood, the mean of
-fourth roots to the fourth power, which outliers do not rule.
+For differences, such weights only smooth. But few differences hold most of the variance: differences of light that no
+shift follows. An average over neighbours would pass their variance on to clean differences, and make the noisy ones
+look better than they are. So a difference has its own variance where that is large. Elsewhere it has a typical one of
+its neighbourhood, the fourth power of the mean of fourth roots, which outliers do not dominate.
 
-All are summed over colours (a colour is weighted as one vector), and bounded from below in proportion to their mean.
-All of this follows the exposure of the image: k times the image, with k² times the variances, has the same weights but
-for the factor k⁻².
+All variances are summed over colours (a colour is weighted as one vector), and bounded from below in proportion to
+their mean. The weights follow the exposure of the image: k times the image, with k² times the variances, has k⁻² times
+the weights.
 """
 
 import math
@@ -27,14 +27,15 @@ from ngpt.classical.leastsquares import robust_mean, sum_of
 # What is added to every variance, as a share of the mean over primal and differences.
 FLOOR = 3e-3
 
-# How many times the typical variance around it a difference has at least: the mean of fourth roots lies below the mean.
-# Of 2, 3 and 4 wcv has the least error with 2, by 1 %, and wl2 with 3.
+# A difference has at least this many times the typical variance around it: the mean of fourth roots is below the mean.
+# Among 2, 3 and 4, wcv has the least error with 2, by 1 %, and wl2 with 3.
 TYPICAL = 3
 
-# What a difference's variance counts beside the primal's. Neighbouring pixels share paths, so that errors of
-# differences cancel in sums, which is what a reconstruction makes of them: means over blocks of 8x8 have .56 to .92 of
-# the variance that independent ones would have (docs/samplers/points.md), those of the primal .8 to 1. Of 1, .7, .5 and
-# .35, wcv and wl2 have the least error with .7 at 4 samples and with .35 to .5 from 16 on (docs/lab/log).
+# The factor on the variance of differences relative to the primal's. Neighbouring pixels share paths, so errors of
+# differences cancel in the sums that a reconstruction takes. Means of differences over blocks of 8x8 have .56 to .92 of
+# the variance that independent differences would have (docs/samplers/points.md). Means of the primal have .8 to 1.
+# Among 1, .7, .5 and .35, wcv and wl2 have the least error with .7 at 4 samples and with .35 to .5 from 16 on
+# (docs/lab/log).
 SHARED = 0.6
 
 # What a count of values that are there, a mean, is divided by at least.
@@ -48,7 +49,8 @@ def auto_alpha(primal_var: np.ndarray, dx_var: np.ndarray, dy_var: np.ndarray, n
     """The α that weights the primal against the gradients as their noise does; variances are (H, W, C).
 
     ``norm`` 2: the square root of mean gradient variance over mean primal variance, which weights the two terms of l2
-    by inverse variance. ``norm`` 1: mean standard deviation of gradients over that of the primal, the same for l1.
+    by inverse variance. ``norm`` 1: mean standard deviation of gradients over mean standard deviation of the primal,
+    which does the same for l1.
     Values that are not finite or negative are left out, and so are the largest: one in ten thousand, but at least one.
     The result is in [1e-3, 1e3], and 1 without any noise.
 
@@ -75,11 +77,11 @@ def smooth_variances(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Variances of the primal (1, H, W) and of the differences (2, 1, H, W), summed over colours, relative, positive.
 
-    Those of the primal are averaged twice over 3 x 3 pixels, over the values that are there: those that are not finite
-    or negative are missing. Those of differences are at least ``TYPICAL`` times their neighbourhood's, the fourth power
-    of such an average of their fourth roots. The result is divided by the mean of all three layers (a robust one), and
-    ``FLOOR`` is added; without any noise it is 1 everywhere. Then those of differences count ``SHARED`` of the
-    primal's. Differences that are not ``trusted``, and those that do not exist, have infinite variance.
+    Variances of the primal are averaged twice over 3 x 3 pixels, over the valid values only: values that are negative
+    or not finite are left out. A difference has at least ``TYPICAL`` times the variance of its neighbourhood, which is
+    the fourth power of such an average of fourth roots. The result is divided by a robust mean of all three layers,
+    and ``FLOOR`` is added; without any noise it is 1 everywhere. Then variances of differences are multiplied by
+    ``SHARED``. Differences that are not ``trusted``, and differences that do not exist, have infinite variance.
     """
     layers = [smoothed(primal_var), *(smoothed(layer, True) for layer in (dx_var[:, :-1], dy_var[:-1]))]
     mean = robust_mean(*layers)
@@ -142,7 +144,7 @@ def smoothed(variance: np.ndarray, outliers: bool = False) -> np.ndarray:
             total = (total if good.all() else np.where(good, total, 0)).astype(variance.dtype, copy=False)
         total = _box(_box(total))
         if good.all():
-            # The counts of rows times those of columns.
+            # The counts of rows times the counts of columns.
             ones = np.ones_like(total)
             count = _box(_box(ones[:, :1])) * _box(_box(ones[:1]))
         else:

@@ -21,8 +21,8 @@ from ngpt.version import __version__
 
 
 class Verb(NamedTuple):
-    """What a verb does, the package whose module of the verb's name does it, which extra of ngpt-recon brings what it
-    needs, what an interrupt means for its work, and under which of ``HEADINGS`` help has it."""
+    """A verb: its summary, the package that holds its module (named after the verb), the extra of ngpt-recon that
+    installs what it needs, what an interrupt means for its work, and its heading in help, one of ``HEADINGS``."""
 
     summary: str
     room: str = "ngpt.cli"
@@ -126,9 +126,9 @@ def parsers() -> dict[str, argparse.ArgumentParser]:
 def main(arguments: list[str] | None = None) -> int:
     """Runs a command line and returns its exit status."""
     words = sys.argv[1:] if arguments is None else arguments
-    # Of the options of ngpt itself one has a value, and ends the command. The first other word is the verb.
+    # Only one option of ngpt itself has a value, and it ends the command. The first other word is the verb.
     called = "" if words[:1] == ["--completion"] else next((word for word in words if not word.startswith("-")), "")
-    # To look for those of others takes time.
+    # Looking for verbs of other packages takes time.
     verbs = VERBS if called in VERBS else all_verbs()
     interrupted = verbs[called].interrupted if called in verbs else "interrupted"
     return run_command(lambda: _work(_parser(called, verbs), verbs, words, "ngpt"), interrupted=interrupted)
@@ -149,7 +149,7 @@ def door(
 
 
 def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
-    """Of all ``verbs``, with the arguments of the one that is called."""
+    """A parser of all ``verbs``, with the arguments of the one that is called."""
     if called and called not in verbs:
         meant = did_you_mean(called, verbs)
         if not meant and verbs.keys() == VERBS.keys():

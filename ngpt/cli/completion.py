@@ -4,7 +4,7 @@ import argparse
 import re
 from collections.abc import Iterable
 
-# Options whose value is a file or a folder are known by how help calls it.
+# Options whose value is a file or a folder are recognised by the name of the value in help.
 _FILES = re.compile(r"FILE|OUT|REF|PATH|DIR|FOLDER|PAGE|CONFIG|\.\w+$")
 
 

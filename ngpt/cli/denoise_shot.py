@@ -15,11 +15,11 @@ from ngpt.stack import GradientStack
 
 
 def way(sources: Sequence[Path], names: Mapping[str, str], by_wcv: bool) -> tuple[bool, str]:
-    """Whether windows reconstruct the shot, and what to say of it: by the headers of all its files.
+    """Whether windows reconstruct the shot, and a message about it, from the headers of all its files.
 
-    They do where ``wcv`` is the method, and all frames but the first have the layers that lead to the frame before.
-    ``names`` are those of layers, as of ``ngpt.io.exr.read``. Files that cannot be read do not count: each is a cut,
-    and told when its turn has come.
+    They do if the method is ``wcv``, and all frames but the first have the layers that lead to the frame before.
+    ``names`` maps layer names, as for ``ngpt.io.exr.read``. Files that cannot be read do not count: each is a cut, and
+    is reported when its turn comes.
     """
     history = "history, each frame by those before it"
     if not by_wcv:
@@ -49,7 +49,7 @@ def motion_hint(pairs: Sequence[tuple[Path, Path]], reports: Sequence[dict], arg
 
 
 def one_view_only(target: Path, args: argparse.Namespace, files: Mapping[str, str]) -> str:
-    """What there is of one view only, by the options; "" if nothing."""
+    """The part of the options that allows only one view; "" if there is none."""
     if target.suffix.lower() != ".exr":
         return f"{target} is of one"
     if args.ref:
@@ -63,9 +63,10 @@ def windowed(
     write: Callable[[Any], dict],
     reference: Reference | None,
 ) -> Iterator[dict | NgptError]:
-    """What there is to report of each pair, in order: files that cannot be read are cuts, and reported.
+    """The report on each pair, in order; files that cannot be read are cuts, and are reported.
 
-    ``read`` and ``write`` are those of ``ngpt.cli.denoise``, of frames; what is ``there`` is read and not written.
+    ``read`` and ``write`` are the functions of ``ngpt.cli.denoise`` for frames. A frame marked ``there`` is read but
+    not written.
     """
     frames: dict[int, Any] = {}
     told: dict[int, dict | NgptError] = {}

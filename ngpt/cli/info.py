@@ -61,7 +61,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def told(args: argparse.Namespace, console: Console) -> int:
-    """What there is to say of a file, a folder or a name."""
+    """Prints the description of a file, a folder or a name; returns the exit status."""
     path = Path(args.file)
     if is_run(path):
         show(run_summary(path), args.json)

@@ -77,7 +77,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
             with atomic_output(out / SETTINGS, overwrite=True) as temporary:
                 temporary.write_text(json.dumps(settings.to_dict(), indent=2) + "\n")
             write_record(out, settings, config, trainer.model, trainer.device)
-        # Of several processes one is enough to listen to.
+        # With several processes, one reports for all.
         listener = console if processes.rank == 0 else Console(quiet=True)
         with listener.progress("train", "steps", rate=True) as progress:
             finished = trainer.run(progress)

@@ -40,7 +40,7 @@ def denoised(data: Repaired, by_oidn: bool = False) -> np.ndarray:
         return doubled(of_half_size(data))[:height, :width]
     scale = float(np.abs(data.caustic).max())
     light = _planes(data.caustic) / np.float32(scale)
-    # What is not known of a variance is that of an estimate that is all noise.
+    # Where the variance is not known, the estimate counts as pure noise.
     noise = light**2
     if data.caustic_var is not None:
         variance = _planes(data.caustic_var) / np.float32(scale) / np.float32(scale)

@@ -1,11 +1,12 @@
 """The diffusion of ``ngpt.denoisers.caustic`` on NumPy arrays, arranged for the caches of a processor.
 
-As little processor time as NumPy alone allows (docs/lab/log), by these means:
+It takes as little processor time as pure NumPy allows (docs/lab/log), by these means:
 
 - Rows are laid end to end with a gap after each, and with empty rows above and below. So a neighbour at any distance is
-  at the same offset from all pixels, and borders need no care: nothing is exchanged with a gap, which is too far away.
-- Pixels are worked on some thousands at a time, which stay in the cache.
-- What two pixels exchange is computed once and written down for both. Then each pixel is a weighted sum over 3x3.
+  at the same offset from all pixels. Borders need no special case: nothing is exchanged with a gap, which is too far
+  away.
+- Pixels are processed some thousands at a time, which stay in the cache.
+- What two pixels exchange is computed once and stored for both. Then each pixel is a weighted sum over 3x3.
 - No exponential is so small that a processor takes its slow path, and shares below the smallest one are exactly 0.
 """
 
@@ -21,9 +22,9 @@ SIGNIFICANT = 3.0
 NEIGHBOURS = ((0, 1, 1 / 8), (1, 0, 1 / 8), (1, 1, 1 / 16), (1, -1, 1 / 16))
 # Pixels that are worked on at a time: fewer make more calls, more leave the cache.
 _PIXELS = 16384
-# What gaps hold for a surface.
+# The value of surfaces in gaps.
 _FAR = float(np.finfo(np.float32).max)
-# The largest negative logarithm of a share, and the share beside it.
+# The largest negative logarithm of a share, and that share itself.
 SMALLEST = np.float32(20)
 _LEAST = np.exp(np.full(1, -SMALLEST))
 

@@ -5,11 +5,12 @@ For each pixel p, the light of its neighbourhood is fitted by a linear function 
     min over F_p, G_p of  Σ_q  w_pq |F_p + G_pᵀ (f_q - f_p) - I_q|²
 
 [survey, equation 24; Bitterli et al. 2016, "Nonlinearly weighted first-order regression for denoising Monte Carlo
-renderings", section 4], with weights w of non-local means on the colours, and what a fit says of all pixels of its
-neighbourhood is averaged, weighted alike (their collaborative filtering). Bitterli et al. have two half buffers, of
-which one weights what of the other is fitted; a stack holds one image, so the patch distance subtracts what its
-variance explains instead [Rousselle et al. 2012, "Adaptive rendering with non-local means filtering", equation 4].
-Of two bandwidths each pixel takes a mixture by Stein's unbiased estimate of their errors, where they use the halves.
+renderings", section 4], with weights w of non-local means on the colours. The values that a fit gives for all pixels of
+its neighbourhood are averaged with the same weights (their collaborative filtering). Bitterli et al. have two half
+buffers: each gives the weights for the fit to the other. A stack holds one image, so the patch distance subtracts what
+its variance explains instead [Rousselle et al. 2012, "Adaptive rendering with non-local means filtering", equation 4].
+Each pixel takes a mixture of two bandwidths by Stein's unbiased estimate of their errors; Bitterli et al. use the
+halves for this.
 """
 
 import math
@@ -28,8 +29,9 @@ BANDWIDTHS = (0.5, 1.0)
 RIDGE = 1e-3
 # Variance, over the median of the neighbourhood, at which a pixel counts half.
 OUTLIER = 1000.0
-# Of the light of the brightest hundredth: what is above is cut, and counts no more than FLOOR in the noise that is
-# nothing beside the image. One pixel of 1e30 would leave the range of single precision, and blur all others.
+# In units of the light of the brightest hundredth: brighter light is cut at FAR, and counts no more than FLOOR in the
+# noise that is negligible beside the image. One pixel of 1e30 would leave the range of single precision, and blur all
+# others.
 FAR, FLOOR = 1e6, 1e3
 _TILE = 48  # pixels of a tile's side: what is summed for it stays in the processor's cache
 
@@ -37,8 +39,8 @@ _TILE = 48  # pixels of a tile's side: what is summed for it stays in the proces
 def nfor(image: np.ndarray, variance: np.ndarray, features: list[np.ndarray]) -> np.ndarray:
     """The denoised image, (H, W, 3) float32.
 
-    ``image`` is (H, W, 3), finite, ``variance`` that of its pixels as means, NaN where it is not known, ``features`` a
-    list of (H, W, C). Memory is about 100 floats a pixel.
+    ``image`` is (H, W, 3), finite. ``variance`` is the variance of its pixels as means, NaN where it is not known.
+    ``features`` is a list of (H, W, C). Memory is about 100 floats a pixel.
     """
     # As they are: averaged with their neighbours', which is safer elsewhere, they blur (docs/lab/log).
     variance = np.where(np.isfinite(variance), np.maximum(variance, 0), 0).astype(np.float32)
@@ -84,7 +86,7 @@ def estimated_variance(image: np.ndarray) -> np.ndarray:
 
 
 def _trust(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """(H, W, 1) in (0, 1]: near 1 but for pixels whose variance is far beyond that of their neighbourhood.
+    """(H, W, 1) in (0, 1]: near 1 except for pixels whose variance is far above their neighbourhood's.
 
     A spot of light in the dark differs from the dark by little more than its own noise, and the patches around it are
     alike: without this it is smeared over them.

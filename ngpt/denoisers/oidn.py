@@ -27,11 +27,11 @@ def missing() -> str:
 def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
     """Intel Open Image Denoise, its filter "RT" for HDR images, with albedo, or albedo and normal, where there are any.
 
-    OIDN knows no normals without albedo: they are left out then.
+    OIDN takes no normals without albedo: they are left out then.
 
-    ``auxiliary``  what OIDN is told of the features: "prefiltered" denoises them by its own models first and calls them
-                   clean then, which is how its documentation has the best quality made; "clean" calls them clean as
-                   they are; "noisy" does not; "none" hides them
+    ``auxiliary``  how OIDN uses the features: "prefiltered" denoises them with its own models first and then marks
+                   them as clean, which its documentation recommends for the best quality; "clean" marks them as clean
+                   as they are; "noisy" does not; "none" leaves them out
     ``quality``    "high", "balanced" or "fast", for the image and for features that are denoised first
     """
     require_oidn()

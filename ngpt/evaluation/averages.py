@@ -14,7 +14,7 @@ def summary(values: list[float]) -> dict[str, float]:
 
 
 def median(values: Iterable[float | None]) -> float | None:
-    """Of those that are known."""
+    """The median of the known values; None if there are none."""
     known = [value for value in values if value is not None]
     return float(np.median(known)) if known else None
 

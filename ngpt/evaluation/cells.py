@@ -23,10 +23,10 @@ from ngpt.stack import GradientStack
 from ngpt.system.machine import versions
 from ngpt.system.writing import write_json
 
-# That numbers depend on, or whose absence makes rows absent.
+# Packages that numbers depend on, or whose absence makes rows absent.
 PACKAGES = ("numpy", "scipy", "mitsuba", "torch", "mitsuba-oidn", "scikit-image", "flip-evaluator")
 
-# Of a cell in the cache: its time by both clocks
+# The format of a cell in the cache: its time by both clocks
 _FORMAT = 2
 
 

@@ -15,7 +15,7 @@ from ngpt.methods import METHODS
 from ngpt.system.parts import find_renderer
 from ngpt.system.records import check, from_table, read_toml
 
-# Of which seeds pictures are kept.
+# The seeds whose pictures are kept.
 IMAGES = ("first", "all", "none")
 # What equal time is: of the wall, or of all processors, which other work on the machine does not change.
 CLOCKS = ("wall", "processor")
@@ -65,7 +65,7 @@ class Config:
     ``elpips``    files of E-LPIPS: backbone and weights
     ``references``  references from elsewhere, NAME = "FILE" or NAME = ["FILE", "FILE"] for two halves
     ``groups``    of scenes, NAME = ["SCENE", ...]: rows of means in the tables
-    ``against``   rivals at equal whole time, NAME = ["COLUMN", ...]: settings, of which the best counts at each time
+    ``against``   rivals at equal whole time, NAME = ["COLUMN", ...]: settings; the best one counts at each time
     ``variants``  methods with options of their own, by name
     """
 
@@ -164,7 +164,7 @@ class Config:
         return [Column(n, name, method, s, self.render(kind, s), table) for n, s in zip(names, samplers, strict=True)]
 
     def render(self, kind: str, sampler: str) -> Render:
-        """A kind of stack by one of the samplers; features are left out where they can be, by that of the image alone.
+        """A kind of stack by one of the samplers; only the default sampler of plain images leaves the features out.
 
         Raises NgptError for a sampler's options that it does not take.
         """
@@ -216,9 +216,9 @@ def scene_name(scene: str) -> str:
 def read_config(path: str | Path) -> Config:
     """Reads a TOML file; raises NgptError for entries that do not exist or have the wrong type.
 
-    ``base`` names another file, from the folder of this one: what it has and this one has not is taken from there.
-    ``samplers`` may be tables of options: those of samplers with gradients are compared, others are for ``rivals``, and
-    those that a variant names are for this variant alone.
+    ``base`` names another file, relative to the folder of this one: entries that this file lacks are taken from there.
+    ``samplers`` may be tables of options. Samplers with gradients are compared, others are for ``rivals``, and samplers
+    that a variant names are only for this variant.
     """
     values = _with_base(Path(path))
     if isinstance(tables := values.get("samplers"), dict):
@@ -231,7 +231,7 @@ def read_config(path: str | Path) -> Config:
 
 
 def _with_base(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """The entries of a file, and those of its base; ``above`` are the files whose base it is."""
+    """The entries of a file and of its base; ``above`` are the files whose base it is."""
     values = read_toml(path)
     base = values.pop("base", None)
     if base is None:

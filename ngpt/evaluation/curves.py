@@ -75,7 +75,7 @@ def joined(marks: Iterable[str]) -> str:
 
 
 def _curve(points: Points) -> tuple[list[tuple[float, float]], list[_Segment]]:
-    """Logarithms of the running minimum, and those of its segments that fall."""
+    """The running minimum and its falling segments, in logarithms."""
     curve: list[tuple[float, float]] = []
     for x, error in sorted(points):
         lowest = min(math.log(error), curve[-1][1] if curve else math.inf)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from ngpt.report.axes import Axes
 from ngpt.system.text import markup
 
-# Of the samplers of one method.
+# The dash patterns that tell the samplers of one method apart.
 DASHES = ("", "7 3", "2 3", "7 3 2 3", "12 4", "1 5")
 COLORS = ("#777777", "#2f7fd6", "#d9772b", "#3a9a5b", "#b0489a", "#c9a400", "#17a2a8", "#8a5a2b", "#d62f45", "#5b4fd6")
 

@@ -13,7 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-# Of the library: rooms that decide no image and no number.
+# Packages of the library that affect no image and no number.
 _PRESENTATION = ("cli", "evaluation", "export", "report", "system")
 
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
@@ -43,7 +43,7 @@ def code_text(path: Path) -> str:
 
 @lru_cache(maxsize=1)
 def library_hash() -> str:
-    """Of the library's source and weights: a cell of other code is another cell."""
+    """A hash of the library's source and weights: a cell of other code is another cell."""
     folder = Path(__file__).parents[1]
     digest = hashlib.sha256(source_hash(folder, _PRESENTATION).encode())
     for path in sorted((folder / "weights").iterdir()):
@@ -64,7 +64,7 @@ def code_of(function: Any) -> str:
 
 
 def scene_hash(scene: str) -> str:
-    """Of a scene's file and the files it names, those included in turn."""
+    """A hash of a scene's file and of all files it names, directly or through other files."""
     digest = hashlib.sha256()
     queue, seen = [Path(scene)], set()
     while queue:
@@ -81,5 +81,5 @@ def scene_hash(scene: str) -> str:
 
 
 def file_hash(path: str) -> str:
-    """Of a file's contents; "" where there is none."""
+    """A hash of a file's contents; "" if there is no file."""
     return hashlib.sha256(Path(path).read_bytes()).hexdigest() if path and Path(path).is_file() else ""

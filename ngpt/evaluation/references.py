@@ -67,11 +67,12 @@ class Reference:
 
     @property
     def doubt(self) -> float | None:
-        """The relMSE below which an order of methods means little; None where the files hold no variances.
+        """The relMSE below which the order of methods means little; None if the files hold no variances.
 
-        With one image three times its noise, which is part of every error. With two halves three standard errors of
-        what is left of their noise: the mean of (a - t)(b - t) / (m² + 1e-3), t the truth, has expectation 0 and the
-        variance of a times that of b in each pixel. Channels count as one, as if their noise were the same.
+        With one image, it is three times the image's noise, which is part of every error. With two halves, it is three
+        standard errors of their remaining noise: the mean of (a - t)(b - t) / (m² + 1e-3), with t the truth. In each
+        pixel the product (a - t)(b - t) has expectation 0, and its variance is the variance of a times the variance
+        of b. Channels count as one, as if their noise were the same.
         """
         noise = self.noise
         if noise is None or len(self.stacks) == 1:

@@ -8,7 +8,7 @@ from typing import Any
 # Kind of stack -> the sampler that renders it unless another is named:
 #   gradients  a gradient stack
 #   features   the image with albedo, normal and depth, no gradients
-#   path       the image alone
+#   path       only the image
 KINDS = {"gradients": "auto", "features": "primal", "path": "primal"}
 
 
@@ -35,7 +35,7 @@ class Render:
 
     @property
     def options(self) -> dict[str, Any]:
-        """What the renderer is told of it: ``ngpt.renderer.Options``."""
+        """The options for the renderer: ``ngpt.renderer.Options``."""
         given: dict[str, Any] = dict(option.split("=") for option in self.given.split(", ") if option)
         return {"sampler": self.sampler} | given | ({"with_features": False} if self.kind == "path" else {})
 

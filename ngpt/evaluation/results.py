@@ -109,7 +109,7 @@ def _write_worth(results: dict[str, Any], out: Path) -> None:
 
 
 def shared_scenes(results: dict[str, Any]) -> list[str]:
-    """The scenes that are there: the ones that means are over."""
+    """The scenes that have results; means are over these."""
     return [name for name, entry in results["scenes"].items() if not entry.get("absent")]
 
 

@@ -181,8 +181,8 @@ def _scene(
 
 
 def _seconds(render: float | None, reconstruct: dict[str, float], clock: str) -> dict[str, float | None]:
-    """Of a cell by the ``clock``: to render, features, film and what recording takes included, to reconstruct, and the
-    whole; and the wall seconds to reconstruct. Kernels are compiled and weights are read before."""
+    """The seconds of a cell by the ``clock``: to render (with features, film and recording), to reconstruct, and in
+    total; and the wall seconds to reconstruct. Kernels are compiled and weights are read before."""
     total = None if render is None else render + reconstruct[clock]
     seconds = {"render": render, "reconstruct": reconstruct[clock], "total": total}
     return seconds | {"reconstruct wall": reconstruct["wall"]}

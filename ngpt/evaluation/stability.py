@@ -1,11 +1,11 @@
-"""Temporal stability: how much a method's image changes with the noise alone.
+"""Temporal stability: how much a method's image changes when only the noise changes.
 
     python -m ngpt.evaluation.stability DIR
 
 DIR is a folder of results with pictures of all seeds (images = "all", configs/eval-stability.toml). A still scene
 rendered with a new seed for each frame should not move; what does move flickers. Writes DIR/stability.json, a table
-DIR/stability.md, and for each scene and method DIR/stability/SCENE-SPP-METHOD.png, the picture of a rolling shutter:
-each band of rows is of another seed, so flicker shows as steps between bands, bias does not.
+DIR/stability.md, and for each scene and method DIR/stability/SCENE-SPP-METHOD.png. In this picture, as with a rolling
+shutter, each band of rows comes from another seed, so flicker shows as steps between bands; bias does not show.
 """
 
 from __future__ import annotations

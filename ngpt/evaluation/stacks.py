@@ -31,7 +31,7 @@ from ngpt.system.machine import version
 from ngpt.system.writing import write_json
 from ngpt.version import __version__
 
-# Of the first half; far from the seeds 0, 1 ... of what is judged.
+# The seed of the first half; far from the seeds 0, 1 ... of the stacks that are judged.
 REFERENCE_SEED = 1 << 20
 
 USUAL = DEFAULTS[0]

@@ -51,7 +51,7 @@ def tables(results: dict[str, Any]) -> str:
 
 
 def _against(results: dict[str, Any]) -> list[str]:
-    """Errors over those of rivals at equal whole time."""
+    """Errors divided by the errors of rivals at equal whole time."""
     found = results.get("against", {}).get("tables", {})
     if not found:
         return []
@@ -132,7 +132,7 @@ def _several_samplers(results: dict[str, Any]) -> bool:
 
 
 def _samplers(results: dict[str, Any]) -> list[str]:
-    """Which methods have the stacks of which sampler, where it is not always the usual one."""
+    """Which sampler made the stacks of each method, if it is not always the usual one."""
     if not _several_samplers(results):
         return []
     found: dict[str, list[str]] = {}

@@ -1,11 +1,11 @@
-"""What gradients are worth in whole time: that without them over that with them, for the same error.
+"""What gradients are worth in whole time: the time without them divided by the time with them, for the same error.
 
     n, e    samples of a pipeline with gradients (a sampler and a method), and its error
     T       its whole time: seconds to render and to reconstruct
     T'      the whole time after which a pipeline without gradients first has the error e, and m its samples then
     W / C   T' / T of the pipeline without gradients that is first: gradients pay above 1
-    W       m / n, by how many times more samples that pipeline needs
-    C       the seconds of a further sample with gradients over the seconds of one of that pipeline
+    W       m / n: how many times more samples that pipeline needs
+    C       the seconds of a further sample with gradients over the seconds of a further sample of that pipeline
 
 W / C is more than W over C where a rival's reconstruction takes longer, and less where ours does. T' and m are read off
 curves of errors (``ngpt.evaluation.curves``, which explains the marks; W has the mark of W / C). C compares the renders

@@ -28,7 +28,7 @@ def block_size(width: int) -> int:
 
 
 def block_errors(image: np.ndarray, *halves: np.ndarray, block: int) -> np.ndarray:
-    """Sums of relative squared errors over blocks, (rows, columns); those at the right and below may be smaller.
+    """Sums of relative squared errors over blocks, (rows, columns); blocks at the right and below may be smaller.
 
     With two halves of a reference they are free of its noise, and may be negative.
     """
@@ -40,7 +40,7 @@ def block_errors(image: np.ndarray, *halves: np.ndarray, block: int) -> np.ndarr
 
 
 def log_ratio(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-    """log2 of the error without gradients, ``theirs``, over that with them: above 0 gradients pay.
+    """log2 of the error without gradients, ``theirs``, over the error with them: above 0 gradients pay.
 
     An error that is not positive is too small for the reference to tell: of one of the two the ratio is infinite, of
     both unknown (NaN).
@@ -50,7 +50,7 @@ def log_ratio(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
 
 
 def share_that_pays(ratio: np.ndarray) -> float | None:
-    """Of the blocks whose ratio is known; None where there is none."""
+    """The share of blocks where gradients pay, among blocks whose ratio is known; None if there are none."""
     known = ratio[~np.isnan(ratio)]
     return float(np.mean(known > 0)) if known.size else None
 

@@ -28,8 +28,8 @@ PRECISIONS = ("float32", "float16")
 def network_model(weights: str | Path, name: str, precision: str = "float32") -> onnx.ModelProto:
     """The graph of the weights in that file; ``name`` is what its metadata call it.
 
-    ``precision`` is that of the convolutions but the last; what surrounds them is float32 always. float16 is for GPUs:
-    ONNX Runtime's CPU provider computes it in float32, with conversions, which hides overflows and takes longer.
+    ``precision`` is the precision of all convolutions but the last; everything else is always float32. float16 is for
+    GPUs: ONNX Runtime's CPU provider computes it in float32, with conversions, which hides overflows and takes longer.
 
     Raises NgptError for weights that cannot be read, and for those that start from a base that has no graph.
     """
@@ -48,7 +48,7 @@ def statistics_model(weights: str | Path, name: str) -> onnx.ModelProto:
 def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
     """What a host may want to know, by key; CONTRACT.md explains them."""
     seen, light = reach(model), REACH if model.config.reads_gradients else 0
-    # Of every second pixel another denoiser's image of ``caustic`` is made: tiles begin at even ones.
+    # Another denoiser's image of ``caustic`` is made from blocks of 2x2 pixels, so tiles begin at even pixels.
     step = max(model.alignment, 2)
 
     def overlap(*pixels: int) -> str:
@@ -74,12 +74,13 @@ def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
 
 
 def _base_reach(model: Reconstructor) -> int:
-    """What the control variates, and the smoothing of their weights before them, see; a multiple of the alignment."""
+    """How far the control variates and the smoothing of their weights see, in pixels, rounded up to the alignment."""
     return -(-(SWEEPS + 2) // model.alignment) * model.alignment if model.config.base else 0
 
 
 def bytes_per_pixel(model: Reconstructor) -> int:
-    """What a run takes at most for each pixel, beside the image's layers; measured in tests/network/test_run_onnx.py.
+    """The most memory that a run takes for each pixel, beside the image's layers; measured in
+    tests/network/test_run_onnx.py.
 
     The last convolution reads the longest list of tensors there is; it exists as the list, as one tensor, and about
     once more in units that are at work. The channels exist raw, cleaned, scaled, encoded, padded, and as one tensor.

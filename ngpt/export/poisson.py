@@ -40,7 +40,7 @@ def _correction(primal: Value, dx: Value, dy: Value, alpha: float) -> Value:
     coefficients = op.MatMul(op.MatMul(basis_y, right_hand_side), op.Transpose(basis_x, perm=[1, 0]))
     eigenvalues = op.Unsqueeze(eigenvalues_y, [1]) + op.Unsqueeze(eigenvalues_x, [0])
     solution = coefficients / (eigenvalues + alpha**2)
-    # A divergence has no mean; what rounding leaves of it would be divided by no more than alpha squared.
+    # The mean of a divergence is 0; its rounding error would be divided by only alpha squared.
     solution = op.Where(op.LessOrEqual(eigenvalues, 0.0), 0.0, solution)
     return op.MatMul(op.MatMul(op.Transpose(basis_y, perm=[1, 0]), solution), basis_x)
 

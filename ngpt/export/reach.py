@@ -1,9 +1,9 @@
-"""How far around a pixel a network has to see, which is what its tiles overlap by.
+"""How far around a pixel a network has to see: the overlap of its tiles.
 
-How far it can see is ``Reconstructor.radius``. Networks with kernels or sweeps at several resolutions can see twice as
-far as makes any difference: what lies at the end of that comes through every convolution, every coarse pixel and every
-sweep, each time with a small weight. Tiles that overlap by all of it take four times the memory. So it is measured, on
-noise that is worse than that of images.
+``Reconstructor.radius`` is how far it can see. Networks with kernels or sweeps at several resolutions can see twice as
+far as makes any difference: light from the far end passes through every convolution, every coarse pixel and every
+sweep, each time with a small weight. Tiles that overlap by the whole radius take four times the memory. So the distance
+that matters is measured, on noise that is worse than in images.
 """
 
 import numpy as np
@@ -62,7 +62,7 @@ def _least(model: Reconstructor, whole: int, seed: int) -> int:
 
 
 def _example(model: Reconstructor, side: int, seed: int) -> dict[str, Tensor]:
-    """Layers (1, C, side, side): rectangles of all brightnesses under noise of which a hundredth is a hundredfold."""
+    """Layers (1, C, side, side): rectangles of all brightnesses under noise; 1 % of it is a hundred times as strong."""
     rng = np.random.default_rng(seed)
     image = np.ones((3, side, side))
     for _ in range(side):

@@ -31,9 +31,9 @@ def quiet() -> Any:
 def example_layers() -> dict[str, np.ndarray]:
     """Layers (1, C, height, width) of a noisy picture, the same on every machine.
 
-    A bright disk on a gradient; a lamp above, which a mirror below shows again, darker; rare bright light that
-    gradients hold nothing of; and what renderers get wrong: values that are not finite, in every kind of layer, alone
-    and in a hole of 7x7 pixels, and variances of -1.
+    It shows a bright disk on a gradient, a lamp above, a darker image of the lamp in a mirror below, and rare bright
+    light that gradients do not contain. It also has typical faults of renderers: non-finite values in every kind of
+    layer, in single pixels and in a hole of 7x7 pixels, and variances of -1.
     """
     width, height = SIZE
     rng = np.random.default_rng(7)
@@ -64,12 +64,12 @@ def example_layers() -> dict[str, np.ndarray]:
 
 
 def _light(layers: dict[str, np.ndarray], lamp: tuple, mirror: tuple) -> None:
-    """A lamp, and a mirror that shows it: behind a mirror, features are those of what it shows."""
+    """A lamp, and a mirror that shows it: in a mirror, features describe the reflected object."""
     direct = layers["direct"] = np.zeros_like(layers["primal"])
     direct[lamp] = np.reshape([60.0, 50.0, 35.0], (3, 1, 1))
     direct[mirror][:, 1:4, 2:8] = 0.9 * direct[lamp]
     layers["primal"] += direct
-    # A pixel at the border of a lamp is partly lamp, from sample to sample: its variance is not that of the rest.
+    # In a pixel at the border of a lamp, only some samples hit the lamp: its variance is larger.
     layers["primal_var"] += (0.3 * direct) ** 2
     layers["albedo"][mirror], layers["depth"][mirror] = 0.7, 6.0
     layers["normal"][mirror] = np.reshape([0.0, -1.0, 0.0], (3, 1, 1))

@@ -2,8 +2,8 @@
 
 Images of other formats are read as well (``ngpt.io.foreign``), each as an OpenEXR file with the same light would be.
 
-Layers go by their names, those of the contract or of other renderers (``ngpt.io.aliases``). All else that a file
-holds, layers the toolkit does not know included, passes through as ``ngpt.io.openexr`` describes.
+Layers are found by their names, in the contract or in other renderers (``ngpt.io.aliases``). Everything else in a file,
+including layers that the toolkit does not know, passes through as ``ngpt.io.openexr`` describes.
 """
 
 import logging
@@ -76,7 +76,7 @@ def read(
     ``view`` is one of a stereo file (``ngpt.io.views``): by default the first.
 
     ``files`` maps names of the contract to files of their own, ``{"albedo": "albedo.exr"}``, which win over layers of
-    that name in ``path``. Of several layers in such a file the one of a known name counts, else its root.
+    that name in ``path``. If such a file has several layers, the one with a known name counts, else the root.
 
     ``isolated`` decodes the file in a process of its own, so that one made to crash the decoder is an NgptError too:
     for files of strangers (``ngpt.io.isolated``).
@@ -252,11 +252,13 @@ def write(
     root of its view.
 
     Channels keep their type, half or float, and become float where half cannot hold the values (above 65504, or all
-    below 6.1e-5). Gradients, variances and depth are written as float. An ``image`` alone is written as float R G B.
+    below 6.1e-5). Gradients, variances and depth are written as float. An ``image`` without ``like`` is written as
+    float R G B.
 
-    ``attributes`` go into the header beside those of the stack: ``Result.attributes`` say what made a result. What a
-    stack that is itself a result says of its own making (``MADE_BY``) is left out of the new result, and so is the
-    layer ``error`` that was read with it. One that was put in its place (``like=stack.replace(error=...)``) is written.
+    ``attributes`` go into the header beside the attributes of the stack; ``Result.attributes`` say what made a result.
+    If the stack is itself a result, the attributes on how it was made (``MADE_BY``) are left out of the new result, and
+    so is the layer ``error`` that was read with it. A new layer ``error`` (``like=stack.replace(error=...)``) is
+    written.
     """
     if structural := STRUCTURE & (attributes or {}).keys():
         raise NgptError(f"{path}: attribute '{min(structural)}' is OpenEXR's own; give it another name")
@@ -330,13 +332,13 @@ def pass_through(stack: GradientStack) -> dict[str, np.ndarray]:
 
 
 def channels_alone(stack: GradientStack) -> dict[str, np.ndarray]:
-    """Of what ``pass_through`` gives, the channels that are in none of the ``layers_of_light``."""
+    """The channels of ``pass_through`` that are in none of the ``layers_of_light``."""
     light = {id(part.channels[name]) for part, names in _light(stack).values() for name in names}
     return {name: channel for name, channel in pass_through(stack).items() if id(channel) not in light}
 
 
 def layers_of_light(stack: GradientStack) -> dict[str, np.ndarray]:
-    """The layers of colour that a stack carries along beside those of the contract: name -> (H, W, 3) float32."""
+    """The layers of colour that a stack holds beside the layers of the contract: name -> (H, W, 3) float32."""
     return {name: gather(part, names) for name, (part, names) in _light(stack).items()}
 
 

@@ -85,7 +85,7 @@ def in_order(files: Iterable[Path]) -> list[Path]:
 def series(files: Iterable[Path]) -> list[Series]:
     """The series among files, in natural order of their first names.
 
-    Of several numbers in a name the last one that differs among names alike counts the frames: ``take2.0007``.
+    If a name has several numbers, the last one that differs among similar names counts the frames: ``take2.0007``.
     """
     alike: dict[str, list[Path]] = {}
     for path in sorted(files, key=natural):

@@ -32,7 +32,7 @@ _COMPRESSIONS = {
 
 @dataclass(frozen=True)
 class PartHeader:
-    """What of a part's header says how large it is.
+    """The entries of a part's header that say how large it is.
 
     ``name``      "" if it has none
     ``label``     "part 0 'left'", for messages
@@ -40,7 +40,7 @@ class PartHeader:
     ``channels``  name -> (bytes of a value, x and y step of its subsampling)
     ``deep``      whether pixels hold lists of samples
     ``chunks``    pieces that its full-size image is stored in
-    ``table``     entries of the table that says where pieces begin: those of smaller levels too, where that is told
+    ``table``     number of entries in the table of where pieces begin, with those for smaller levels if known
     ``tiled``     whether pieces are tiles
     ``ratio``     the most bytes of image that one byte of the file can stand for
     ``attributes``  name -> type and data, as they are in the file
@@ -80,7 +80,7 @@ class PartHeader:
 
     @property
     def bytes(self) -> int:
-        """Of the decoded image."""
+        """The size of the decoded image in bytes."""
         return self.size[0] * self.size[1] * sum(size for size, _ in self.channels.values())
 
 
@@ -187,7 +187,7 @@ def _part(index: int, attributes: dict[bytes, tuple[bytes, bytes]], flags: int) 
         across, down = struct.unpack_from("<2I", data("tiles", "tiledesc"))
         if not (0 < across < 2**31 and 0 < down < 2**31):
             raise _Damage(f"{label} has tiles of {across}x{down} pixels")
-        # OpenEXR takes memory for whole tiles, of which the image may be a corner.
+        # OpenEXR allocates whole tiles, even if the image covers only a corner of one.
         if across * down > max(MAX_TILE, 4 * width * height):
             raise _Excess(f"{label} is {width}x{height} pixels in tiles of {across}x{down}")
         chunks = -(-width // across) * -(-height // down)

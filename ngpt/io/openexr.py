@@ -5,7 +5,7 @@ that Python's OpenEXR knows, data and display windows, tiles, line order. The ex
 
 - Lossy compression (PXR24, B44, B44A, DWAA, DWAB) becomes ZIP, since a second pass through it would damage the image
   once more, and gradients, variances and depth for the first time.
-- Of mipmaps and ripmaps the full-size level is kept.
+- Only the full-size level of mipmaps and ripmaps is kept.
 - Attributes that are empty lists are dropped, and a rational is reduced (48/2 becomes 24/1).
 
 Deep images and subsampled channels are refused. OpenEXR holds whole files in memory, and hands over the readable parts
@@ -56,7 +56,7 @@ _ATTRIBUTE_TYPES = (
     OpenEXR.TileDescription,
     OpenEXR.TimeCode,
 )
-# Where open files have names by their number, which open them anew; Linux alone has such.
+# The folder where Linux names open files by their number; opening such a name opens the file again. Only Linux has it.
 _NUMBERS = Path("/proc/self/fd")
 # Two calls would end the threads of each other, and each would restore the other's stdout and stderr instead of the
 # program's. OpenEXR keeps Python's lock anyway.
@@ -160,7 +160,7 @@ def _numbered(file: BinaryIO) -> str:
 
 @contextlib.contextmanager
 def _name_to_write(path: Path) -> Iterator[str]:
-    """The same for a file to be written; where it has its own name only, it is closed, lest it be refused as in use."""
+    """``_numbered`` for a file to write. With only its own name, it is closed, since it may count as in use."""
     if _NUMBERS.is_dir():
         with open(path, "r+b") as file:
             yield _numbered(file)

@@ -46,7 +46,7 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
     else:
         own = stack.source.image.parts
         image = ExrImage([replace(part, channels=dict(part.channels)) for part in (base.parts if base else own)])
-        # What was done to this view beside its layers, such as to its light groups, the file by now lacks.
+        # The file does not yet have other changes to this view, such as changes to its light groups.
         for part, source, (_, channels) in zip(image.parts, own, stack.source.view.parts, strict=False):
             part.channels.update({name: source.channels[name] for name in channels.values() if base})
         resolution = dict(stack.source.resolution)

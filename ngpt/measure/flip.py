@@ -31,9 +31,10 @@ def flip(image: np.ndarray, reference: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def flip_exposures(reference: np.ndarray) -> tuple[float, float, int]:
-    """(first, last, number) of HDR-FLIP's exposures in stops, from the reference alone.
+    """(first, last, number) of HDR-FLIP's exposures in stops, which depend only on the reference.
 
-    Those at which the brightest and the median luminance reach 0.85 under the ACES curve, one a stop [section 4.3].
+    They range over the exposures at which the brightest and the median luminance reach 0.85 under the ACES curve, one
+    for each stop [section 4.3].
     """
     luminance = np.maximum(reference, 0).astype(np.float64) @ np.array([0.2126, 0.7152, 0.0722])
     lit = luminance[luminance > 0]

@@ -33,8 +33,8 @@ class Gain:
     """What an addition to a stack, or to the machine, would buy.
 
     ``add``     layers, and "OIDN" for the package
-    ``method``  that ``auto`` would take then
-    ``error``   by samples per pixel: the error over that of what ``auto`` takes now
+    ``method``  the method that ``auto`` would take then
+    ``error``   by samples per pixel: the error divided by the error of the method that ``auto`` takes now
     """
 
     add: tuple[str, ...]
@@ -51,7 +51,7 @@ def gains(layers: Container[str]) -> list[Gain]:
     found: list[Gain] = []
     if before is None:
         return found
-    # OIDN by itself: once it is there, this answers anew. The networks beside it need a runtime that has to be there.
+    # OIDN only by itself: once it is installed, this gives a new answer. Networks with it need an installed runtime.
     package = [(OIDN,)] if METHODS["oidn"].missing() and not METHODS["ngpt-fast"].missing() else []
     for added in [*package, *_subsets(groups)]:
         more = {name for group in added for name in group}

@@ -4,11 +4,12 @@ x is the image, scene-linear (H, W, 3). The reference is one image r, or two ind
 same scene with seeds of their own. Means run over pixels and channels. Pixels that are not finite in any of the images
 are left out and counted, since one of them would hide all others.
 
-A reference has noise. With one image r = t + n, t the truth, the mean of (x - r)² is that of (x - t)² plus the mean of
-n². With two halves the square becomes the product (x - a)(x - b): their noises are independent and of mean zero, so the
-product's expectation is (x - t)², whatever the noise. The product of a pixel, and even a mean, may be negative where an
-image is nearer to the truth than the reference can tell. Denominators use the mean m = (a + b) / 2, whose noise is not
-taken off: for a relative variance v of m it adds about 6 v² to relMSE, and 4 v times a relative bias of the image.
+A reference has noise. With one image r = t + n, t the truth, the mean of (x - r)² is the mean of (x - t)² plus the mean
+of n². With two halves the square becomes the product (x - a)(x - b). The noises of a and b are independent with mean
+zero, so the expectation of the product is (x - t)², whatever the noise. The product in a pixel, and even a mean, may be
+negative if the image is nearer to the truth than the reference can tell. Denominators use the mean m = (a + b) / 2,
+whose noise is not corrected for: a relative variance v of m adds about 6 v² to relMSE, and 4 v times a relative bias of
+the image.
 """
 
 from collections.abc import Callable, Iterable
@@ -23,7 +24,7 @@ from ngpt.measure import flip, perceptual
 from ngpt.measure.images import check_size, middle, reinhard
 from ngpt.system.parts import Registry
 
-# Published relMSE values differ in this constant; ours is that of gradient-domain VCM and photon mapping.
+# Published relMSE values differ in this constant; ours is used in gradient-domain VCM and photon mapping.
 EPSILON = 1e-3
 
 
@@ -152,7 +153,7 @@ METRICS = Registry("ngpt.metrics", "metric", Metric, _OURS)
 def scores(
     names: Iterable[str], image: np.ndarray, *halves: np.ndarray, options: dict[str, dict[str, Any]] | None = None
 ) -> dict[str, float]:
-    """Metrics of ``METRICS`` by name, in double precision; ``options`` are those of each metric's function.
+    """Metrics of ``METRICS`` by name, in double precision; ``options`` go to each metric's function.
 
     Squared metrics are given all ``halves`` (one image or two), the others their mean. Raises NgptError if the images
     differ in size or have no pixel that is finite in all of them.

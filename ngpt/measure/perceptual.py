@@ -14,7 +14,7 @@ from ngpt.measure.images import check_size, reinhard
 from ngpt.system.forks import in_children
 from ngpt.system.install import install_command
 
-# Of the random transforms of E-LPIPS; the standard error of the mean is then a few per cent.
+# The number of random transforms of E-LPIPS; the standard error of the mean is then a few per cent.
 _DRAWS = 16
 
 

@@ -30,8 +30,8 @@ class ModelConfig:
 
     ``network``   "dense" or "plain", see ``ngpt.network.unet``, "kpcn", see ``ngpt.network.kpcn``, or "oidn", see
                   ``ngpt.network.oidnet``
-    ``channels``  for each level, finest first: what each unit adds (dense), the width (plain, and kpcn, of one level),
-                  those of OIDN's small or default network (oidn)
+    ``channels``  for each level, finest first: what each unit adds (dense), the width (plain, and kpcn, which has one
+                  level), or the channels of OIDN's small or default network (oidn)
     ``units``     for each level, units on the way down and again on the way up (dense), or 5x5 convolutions (kpcn);
                   none for plain and oidn
     ``inputs``    the layers it reads, in order; names of ``ngpt.network.features.CHANNELS``
@@ -43,12 +43,12 @@ class ModelConfig:
                   base, in proportion and in the logarithm: as noise vanishes it converges with the base, whatever the
                   network says. Where the variance is 0, or not known, it does not. 0: nowhere
     ``kernel``    the side, in pixels, of the kernels by which it averages those images instead, see
-                  ``ngpt.network.heads``; odd. 0: it weighs and corrects them pixel by pixel. Of
-                  kpcn those of both parts of the light
-    ``scales``    at how many resolutions there are kernels, each half as fine as the last; from 2 on of the
-                  weighted mean of these images
-    ``demodulate``  whether these average the image over the albedo, and multiply by it again; needs the input albedo,
-                  and ``scales``
+                  ``ngpt.network.heads``; odd. 0: it weighs and corrects them pixel by pixel. For kpcn, the side of the
+                  kernels of both parts of the light
+    ``scales``    the number of resolutions that have kernels, each half as fine as the last; from 2 on the kernels
+                  average the weighted mean of these images
+    ``demodulate``  whether the kernels average the image divided by the albedo, and multiply by it again; needs the
+                  input albedo, and ``scales``
     ``sweeps``    at each of several resolutions, steps that draw the image toward the gradients, by weights that the
                   network predicts, see ``ngpt.network.poisson``; needs the inputs dx_noise and dy_noise. 0: none
     ``pooling``   how the network halves and doubles sizes: "convolution", as NGPT does, or by 1x1 convolutions and
@@ -102,7 +102,7 @@ class ModelConfig:
     def layers(self) -> tuple[str, ...]:
         """The layers its inputs are, or are computed of: of a stack, or made of one (``ngpt.network.inputs``)."""
         names = features.sources(self.inputs)
-        # Exposure is that of the primal.
+        # The exposure is computed from the primal.
         return names if "primal" in names else ("primal", *names)
 
     @property
@@ -250,7 +250,7 @@ KINDS: dict[str, Kind] = {"dense": Dense(), "plain": Plain(), "kpcn": Kpcn(), "o
 
 
 def check_layers(config: ModelConfig, units: bool) -> None:
-    """Raises NgptError unless inputs, levels, base and start are those of a network of ours, with ``units`` or not."""
+    """Raises NgptError unless inputs, levels, base and start are valid for our networks, with ``units`` or not."""
     names, levels = ", ".join(config.inputs), len(config.channels)
     if "primal" not in config.inputs or len(set(config.inputs)) < len(config.inputs):
         raise NgptError(f"inputs {names}: each once, and 'primal' among them")

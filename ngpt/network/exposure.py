@@ -16,8 +16,8 @@ def statistics(layers: Mapping[str, np.ndarray]) -> np.ndarray:
     """(5,) float32: exposure, largest depth, least and largest radiance (0 within), and 0 for the mean variance.
 
     ``layers`` (H, W, C): ``primal``, and ``depth`` where there is one; values that are not finite count as 0. The
-    exposure is that of ``ngpt.network.features.exposure``. The mean variance is of use only to those who let the graph
-    make the base, see export/CONTRACT.md.
+    exposure is computed as in ``ngpt.network.features.exposure``. The mean variance is needed only if the graph
+    makes the base, see export/CONTRACT.md.
     """
     primal, low, high, means = layers["primal"], 0.0, 0.0, []
     for top in range(0, len(primal), _BAND):

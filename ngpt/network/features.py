@@ -75,7 +75,7 @@ ENLARGED, NOISE_ENLARGED, LEAST_DEPTH = 20, 100, 1e-10
 # What is added to albedo before radiance is divided by it: what dark surfaces reflect beside their colour.
 GLOSS = 0.1
 
-# What is computed of other layers: of which, beside ``compared``.
+# The layers that are computed, and the layers that they are computed from, in addition to ``compared``.
 SOURCES = {
     **{f"{name}_change": (name,) for name in ("primal", "base", "denoised_base")},
     **{f"{axis}_{name}": (axis, name) for axis in ("dx", "dy") for name in ("base", *DENOISED)},
@@ -88,7 +88,7 @@ RADIANCE = frozenset(
     | {"diffuse", "specular", "diffuse_se", "specular_se"}
 )
 
-# Those that are images of the scene: what a network may start from.
+# The layers that are images of the scene: a network may start from them.
 IMAGES = ("primal", *MADE)
 
 # Images of parts of its light.
@@ -114,7 +114,7 @@ def compared(inputs: tuple[str, ...]) -> str:
 
 
 def completed(layers: Mapping[str, Tensor], inputs: tuple[str, ...]) -> dict[str, Tensor]:
-    """Normalised layers with what is computed of them, for those of ``inputs`` that are; before any padding."""
+    """Normalised layers, and those ``inputs`` that are computed from them; before any padding."""
     return dict(layers) | {name: _computed(name, layers, compared(inputs)) for name in inputs if name in SOURCES}
 
 
@@ -132,10 +132,11 @@ def _computed(name: str, layers: Mapping[str, Tensor], compared_with: str) -> Te
 
 
 def reflectance(albedo: Tensor) -> Tensor:
-    """What radiance (N, 3, H, W) may be divided by: albedo and ``GLOSS``. Where no albedo is known it is one number.
+    """What radiance (N, 3, H, W) may be divided by: albedo + ``GLOSS``. Where no albedo is known it is one number.
 
-    It is continuous. If an albedo of 0 stood for 1, say, pixels of a black cable, the albedo of which is 0 in some and
-    0.1 in others by chance, would swap their light with those around them ten times too bright.
+    It is a continuous function of the albedo. Suppose instead that an albedo of 0 stood for 1. The pixels of a black
+    cable have an albedo of 0 or 0.1 by chance. They would then exchange light with their neighbours ten times too
+    bright.
     """
     return albedo + GLOSS
 

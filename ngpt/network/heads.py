@@ -23,7 +23,7 @@ from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from ngpt.network.transfer import signed_log
 
-# Of ``Pyramid``: what no pixel is trusted less; the logarithm of how much pixels beyond the border are.
+# For ``Pyramid``: the least trust of a pixel; the logarithm of the trust of pixels beyond the border.
 LEAST_TRUST, NEVER = 1e-4, -1e9
 
 
@@ -151,20 +151,20 @@ class Kernels(Head):
 class Pyramid(Head):
     """Kernels of ``size`` x ``size`` pixels at ``scales`` resolutions of one image, each half as fine as the last.
 
-    Of several images it is the mean, by a weight for each in each pixel (softmax). With w the trust in each pixel of
-    the image D, in (0, 1), and D_s, w_s both averaged over 2^s x 2^s pixels:
+    If there are several images, this image is their mean, with a weight for each in each pixel (softmax). With w the
+    trust in each pixel of the image D, in (0, 1), and D_s, w_s both averaged over 2^s x 2^s pixels:
 
         I_s(p) = sum of k_s(p, q) w_s(q) D_s(q) / sum of k_s(p, q) w_s(q)       q in the kernel around p
         o_s    = I_s + a_s up(o_(s+1) - down(I_s)),  the coarsest o_s = I_s     a_s in (0, 1)
 
-    o_0 is the result. A pixel that a rare bright path has hit is trusted by nobody, at no resolution [in the manner of
-    Gharbi et al. 2019, "Sample-based Monte Carlo denoising using a kernel-splatting network"]. Trust is over 1 + D to
-    begin with, so that such pixels do not rule what is learnt. The prediction of k_s
-    and a_s is averaged over the pixels of the resolution.
+    o_0 is the result. A pixel that a rare bright path has hit is trusted by no neighbour, at any resolution [as in
+    Gharbi et al. 2019, "Sample-based Monte Carlo denoising using a kernel-splatting network"]. Trust is divided by
+    1 + D at the start, so that such pixels do not dominate the training. The prediction of k_s and a_s is averaged over
+    the pixels of the resolution.
 
-    ``demodulate``  they average the image over the reflectance, which is multiplied again afterwards: what of the image
-                    is texture is not averaged. A pixel counts by its reflectance then, as it does in a fit of the
-                    image to the reflectance: a lamp, whose albedo is 0, would spread ten times its light otherwise
+    ``demodulate``  the kernels average the image divided by the reflectance, and the result is multiplied by it again,
+                    so texture is not averaged. A pixel is then weighted by its reflectance, as in a fit of the image
+                    to the reflectance: otherwise a lamp, whose albedo is 0, would spread ten times its light
     """
 
     normalise = True
@@ -284,7 +284,7 @@ def mixed(weights: Tensor, images: list[Tensor]) -> Tensor:
 
 
 def _mixed(op: Any, weights: Any, images: list[Any]) -> Any:
-    """The same as nodes of a graph."""
+    """``mixed`` as nodes of a graph."""
     total = 0.0
     for i, image in enumerate(images):
         total = op.Slice(weights, [i], [i + 1], [1]) * image + total
@@ -310,7 +310,7 @@ def _shifted(op: Any, image: Any, size: int) -> list[Any]:
 def head_of(start: tuple[str, ...], kernel: int, scales: int = 1, demodulate: bool = False) -> Head:
     """The head of a network that starts from these images, by kernels of that size or (0) pixel by pixel.
 
-    ``scales`` and ``demodulate`` are those of ``Pyramid``.
+    ``scales`` and ``demodulate`` are as in ``Pyramid``.
     """
     if scales > 1:
         return Pyramid(start, kernel, scales, demodulate)

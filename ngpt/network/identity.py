@@ -47,6 +47,6 @@ def identify(path: str | Path) -> Identity:
 
 @lru_cache(maxsize=32)
 def _digest(path: str, _modified: int) -> str:
-    """Of a file; computed again when the file has changed."""
+    """The digest of a file; computed again when the file has changed."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -43,7 +43,7 @@ DENOISED = ("denoised", "denoised_base")
 # one. Their variance by itself does not tell: at 7e-4 prefiltering is worth a fifth of the error in simple scenes, as
 # their images have little noise, and at 2e-3 nothing in rooms (docs/lab/log).
 CLEAN = 0.003
-# Of the mean: light below its root is dark, and its relative variance counts less.
+# A share of the mean: light below its square root is dark, and its relative variance counts less.
 _DARK = 1e-3
 
 # The inputs that are no layers of a stack, but made of them.
@@ -110,9 +110,9 @@ def base_image(data: Repaired, base: str) -> np.ndarray:
 class Oidn:
     """OIDN's images of one frame, by features that it takes for clean.
 
-    Of the primal its largest network makes one, which takes most of the time and is worth it: smaller ones leave the
-    combination 8 % more error. Of the base its smallest does: larger ones change the combination by less than 1 %
-    in rooms (docs/lab/log). Features are prefiltered, once, unless they are known to be clean.
+    The primal is denoised by OIDN's largest network. This takes most of the time and is worth it: with smaller networks
+    the combination has 8 % more error. The base is denoised by its smallest network: larger ones change the combination
+    by less than 1 % in rooms (docs/lab/log). Features are prefiltered, once, unless they are known to be clean.
     """
 
     def __init__(self, data: Repaired):
@@ -124,7 +124,7 @@ class Oidn:
         return oidn(self._with_clean_features, "clean", "high")
 
     def of_base(self, base: np.ndarray) -> np.ndarray:
-        """The same of a reconstruction without direct emission."""
+        """OIDN's image of a reconstruction, (H, W, 3) float32; both without direct emission."""
         return oidn(replace(self._with_clean_features, image=base), "clean", "fast")
 
     @cached_property
@@ -147,7 +147,7 @@ def features_are_clean(data: Repaired) -> bool:
 
 
 def denoised(by_oidn: Oidn, base: np.ndarray | None, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Those of ``DENOISED`` that are among ``names`` and have a source: (H, W, 3) without direct emission.
+    """The layers of ``DENOISED`` that are among ``names`` and have a source: (H, W, 3) without direct emission.
 
     Raises NgptError where OIDN is not installed.
     """

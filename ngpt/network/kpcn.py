@@ -4,10 +4,11 @@
                                                                                                                      +
     specular, its error, features ─ 5x5 ── ... ── 5x5 ── 1x1 ── kernels of ln(1 + specular) ──────── exp - 1 ────────┘
 
-"Kernel-Predicting Convolutional Networks for Denoising Monte Carlo Renderings", sections 4 and 5. Here the last
-convolution is 1x1 and reads normalised features, as before all softmax heads of ours, and convolutions are those of
-``ngpt.network.unet``. Both networks read logarithms, since one path may be a thousand times as bright as its pixel; but
-kernels average what the paper's do. Left out are the features' own gradients and variances among the inputs.
+"Kernel-Predicting Convolutional Networks for Denoising Monte Carlo Renderings", sections 4 and 5. There are three
+differences from the paper. The last convolution is 1x1 and reads normalised features, as before all our softmax heads;
+convolutions are implemented in ``ngpt.network.unet``. Both networks read logarithms, since one path may be a thousand
+times as bright as its pixel, but kernels average the same values as in the paper. The inputs do not include gradients
+and variances of the features.
 """
 
 from dataclasses import dataclass
@@ -38,9 +39,9 @@ class KPCN(nn.Module):
 
     ``inputs``   the layers that these channels are, in order, ``NEEDED`` among them
     ``width``    the channels of each 5x5 convolution, ``layers`` of them in each network
-    ``outputs``  the logits of both: first those of diffuse light. A network reads its own part of the light and of the
-                 errors, and all other inputs but the primal
-    ``zero`` and ``normalise`` are those of ``LastConvolution``, ``radius`` that of the receptive field
+    ``outputs``  the number of logits of both networks, diffuse light first. A network reads its own part of the light
+                 and of the errors, and all other inputs but the primal
+    ``zero`` and ``normalise`` are as in ``LastConvolution``; ``radius`` is the radius of the receptive field
     """
 
     alignment = 1

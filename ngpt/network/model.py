@@ -11,8 +11,8 @@ from ngpt.network import features, padding
 from ngpt.network.config import ModelConfig
 from ngpt.network.transfer import signed_exp, signed_log
 
-# Of ``quiet``: the side of the window, in pixels, over which noise is averaged, since the variance of one pixel knows
-# too little; what is added to radiance before noise is divided by it; the largest number whose square is no overflow.
+# For ``quiet``: the side of the window, in pixels, over which noise is averaged, since the variance of one pixel is too
+# noisy; what is added to radiance before noise is divided by it; a large number whose square does not overflow.
 WINDOW, DARK, HUGE = 15, 0.01, 1e15
 
 
@@ -41,7 +41,7 @@ class Reconstructor(nn.Module):
     def radius(self) -> int:
         """How far, in pixels, an input's influence on the image reaches, beside exposure, depth scale and bounds."""
         head = self.config.head
-        # Kernels alone move pixels; pyramids and sweeps move what the network says of them, too.
+        # Plain kernels only move pixels; pyramids and sweeps also move the network's predictions.
         moves = self.config.scales > 1 or self.config.sweeps
         own = self.network.radius + head.reach if moves else max(self.network.radius, head.reach)
         return max(own, WINDOW // 2 if self.config.quiet else 0)

@@ -14,12 +14,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d, pad, relu
 
-# Channels of the decoder, in order, by those of the encoder's levels: OIDN's small network and its default one.
+# Channels of the encoder's levels -> channels of the decoder, in order: OIDN's small network and its default one.
 SHAPES: dict[tuple[int, ...], tuple[int, ...]] = {
     (32, 32, 32, 32, 32): (64, 64, 64, 32, 32, 32),
     (32, 48, 64, 80, 96): (112, 96, 64, 64, 64, 32),
 }
-# What it reads beside the colour.
+# The layers that it reads beside the colour.
 FEATURES = ("albedo", "normal")
 
 # Exposure: what the geometric mean of the luminances of bins of about so many pixels is brought to. Darker ones than
@@ -71,10 +71,10 @@ def exposure(colour: Tensor) -> Tensor:
 
 
 class OidnUNet(nn.Module):
-    """(N, 9, H, W) to (N, 3, H, W), codes, of which negative ones count as 0; H and W divisible by ``alignment``.
+    """(N, 9, H, W) to (N, 3, H, W), codes; negative codes count as 0. H and W are divisible by ``alignment``.
 
-    ``channels`` are a key of ``SHAPES``. Untrained it returns the first three channels, the colour. Names of layers are
-    those that OIDN looks for.
+    ``channels`` are a key of ``SHAPES``. Without training it returns the first three channels, the colour. Layers have
+    the names that OIDN looks for.
     """
 
     alignment = 16
@@ -103,7 +103,7 @@ class OidnUNet(nn.Module):
         self._pass_on_the_colour(d2b)
 
     def _pass_on_the_colour(self, before: int) -> None:
-        """Training begins at the image that it is to correct, of which each channel has a way of its own."""
+        """Makes the untrained network return the image that it is to correct; each channel has its own path."""
         with torch.no_grad():
             self.dec_conv0.weight.zero_()
             for i in range(3):

@@ -25,9 +25,10 @@ def pads(height: int, width: int, alignment: int, margin: int = MARGIN) -> Pads:
 def pad(layers: Mapping[str, Tensor], pads: Pads) -> dict[str, Tensor]:
     """The layers (..., H, W) with reflected borders; the border pixels themselves are not repeated.
 
-    dx and dy become the differences of the reflected image: across a mirror their sign is the other one, and the unused
-    last column of dx (row of dy), inside the image now, is that of its mirror. Sizes smaller than the padding are
-    reflected to and fro. So do layers whose names begin with dx or dy; those that end with _se or _noise have no sign.
+    dx and dy, and layers whose names begin with dx or dy, become the differences of the reflected image. Across a
+    mirror their sign is flipped; layers whose names end with _se or _noise have no sign. The unused last column of dx
+    (row of dy) is now inside the image, and gets the value of its mirror image. If an image is smaller than the
+    padding, it is reflected back and forth.
     """
     height, width = next(iter(layers.values())).shape[-2:]
     device = next(iter(layers.values())).device

@@ -74,8 +74,8 @@ class Network:
             raise NgptError(
                 f"{path}: lacks the metadata {error} of an ngpt network; write it anew: ngpt export"
             ) from error
-        # Light that is apart is taken out, and pixels are repaired, before layers come here: the graph, which does so
-        # for other hosts, is told that there is none. Graphs of earlier versions ask for less of it.
+        # Separate light is taken out, and pixels are repaired, before layers come here. The graph does the same for
+        # other hosts, so here it gets zeros for this light. Graphs of earlier versions have fewer such inputs.
         self.apart = tuple(name for name in names if name in _APART)
         self.inputs = tuple(name for name in names if name not in _APART)
         optional = metadata.get("ngpt.optional", "direct").split(", ")
@@ -89,7 +89,7 @@ class Network:
         return session(self.path, self.device, self.threads)
 
     def _check(self) -> None:
-        """Raises NgptError unless the metadata make sense, and are those of the graph beside them."""
+        """Raises NgptError unless the metadata make sense and match the graph."""
         for name, value, most in (("alignment", self.alignment, 2**12), ("overlap", self.overlap, 2**12)):
             if not (name == "overlap" or value) or not 0 <= value <= most:
                 raise NgptError(f"{self.path}: its {name} is {value}; it must be at most {most}: export it anew")
@@ -97,7 +97,7 @@ class Network:
             raise NgptError(f"{self.path}: {self.bytes} bytes per pixel, base '{self.base}': export it anew")
         own = {*self.inputs, *self.apart, "statistics"} | ({"base"} if self.base else set())
         graph = {given.name for given in self.session.get_inputs()}
-        # Those that a host may leave out have a value in the graph.
+        # Inputs that a host may leave out have a value in the graph.
         optional = {given.name for given in self.session.get_overridable_initializers()}
         self.types, self.output = floats(self.session, self.path)
         if not graph <= own <= graph | optional:
@@ -254,13 +254,13 @@ def _made(path: str, _modified: int, device: str, threads: int):
         raise NgptError(f"device '{device}': this build of ONNX Runtime has only: {', '.join(have)}; install another")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
-    # The plan of which buffers to use again takes most of the start, six times as long as all else, and gains neither
-    # time nor memory: the arena has the same buffers again.
+    # Planning the reuse of buffers takes most of the start, six times as long as all else. It saves neither time nor
+    # memory: the arena reuses the same buffers anyway.
     options.enable_mem_reuse = False
-    # Threads that wait for each other would keep their cores busy: a fifth of the processor time of ngpt-fast, which
-    # whatever works beside it lacks.
+    # Spinning threads would keep their cores busy while they wait: a fifth of the processor time of ngpt-fast, which
+    # other work on the machine would lack.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # What goes wrong comes as an exception; in the log it would stand a second time.
+    # Errors come as exceptions; the log would repeat them.
     options.log_severity_level = 4
     try:
         session = onnxruntime.InferenceSession(path, options, providers=[provider])

@@ -49,10 +49,10 @@ def layers_of(
 
 @torch.inference_mode()
 def reconstruct(model: Reconstructor, layers: dict[str, Tensor], tile: int = TILE) -> Tensor:
-    """What ``model(layers)`` returns, computed tile by tile of at most ``tile`` padded pixels' side.
+    """What ``model(layers)`` returns, computed in tiles whose padded side is at most ``tile`` pixels.
 
-    Exposure and bounds are those of the whole image. Layers may lie on another device than the model. A network of
-    OIDN's shape, the tiles of which are OIDN's own, is computed in one piece.
+    Exposure and bounds are computed from the whole image. Layers may lie on another device than the model. A network of
+    OIDN's shape is computed in one piece, since OIDN makes its own tiles.
     """
     if model.config.network == "oidn":
         device = next(model.parameters()).device

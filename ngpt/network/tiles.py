@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from itertools import product
 
-# Of a side: what each piece is for, and where it begins; and how long all of them are.
+# The pieces of one side: the pixels that each piece is for, and where it begins; and the length of all pieces.
 Cuts = tuple[list[tuple[slice, int]], int]
 
 

@@ -9,8 +9,8 @@
         bytes                   the layout: "oihw" for kernels, "x" for biases
         "f" or "h", u64         32 or 16 bits, and where it lies
 
-All numbers are little-endian [Intel Open Image Denoise 2.4.1, core/tza.cpp]. OIDN takes 16 bits alone.
-It leaves tensors alone that it has no use for; one of these says which image of ours is the colour.
+All numbers are little-endian [Intel Open Image Denoise 2.4.1, core/tza.cpp]. OIDN takes only 16 bits.
+It ignores tensors that it has no use for; one of these says which of our images is the colour.
 """
 
 import struct
@@ -24,7 +24,7 @@ from ngpt.errors import NgptError
 from ngpt.system.reading import read_bytes
 
 MAGIC, VERSION, ALIGNMENT = 0x41D7, 2, 64
-# The mark's name, before that of the image: "primal", or the base.
+# The prefix of the mark's name; the name of the image follows: "primal", or the base.
 MARK = "ngpt.colour."
 # More than any network has, for files that lie.
 MOST_TENSORS, MOST_BYTES = 4096, 2**28
@@ -61,7 +61,7 @@ def read(path: Path) -> tuple[bytes, str]:
 
 
 def _shapes(data: bytes, path: Path) -> dict[str, tuple[int, ...]]:
-    """The tensors of a file by name, each of which lies within it."""
+    """Name -> shape of the tensors of a file; raises NgptError if a tensor does not lie within the file."""
     try:
         magic, version, _, place = struct.unpack_from("<HBBQ", data)
         if magic != MAGIC or version != VERSION:

@@ -101,9 +101,9 @@ def doubled(inputs: int, outputs: int, pooling: str) -> nn.Module:
 class LastConvolution(nn.Module):
     """The 1x1 convolution to ``outputs`` channels: float32, whatever autocast does, and not activated.
 
-    It predicts logarithms, where 16 bits are off by percents. ``zero`` is for predictions of which 0 is a sensible
-    one, such as corrections: it starts there, and its weights are not normalised, since what is to be small should not
-    need a direction first. ``normalise``: what it reads is divided by its root mean square in each pixel, if ``zero``.
+    It predicts logarithms, where 16 bits are off by percents. ``zero`` is for predictions where 0 is sensible, such as
+    corrections: it starts at 0, and its weights are not normalised, since a small prediction should not need a
+    direction first. ``normalise``: its input is divided by the root mean square in each pixel, if ``zero``.
     """
 
     def __init__(self, inputs: int, outputs: int, zero: bool, normalise: bool = False):
@@ -156,8 +156,8 @@ class DenseUNet(nn.Module):
     """(N, inputs, H, W) to (N, outputs, H, W); H and W divisible by ``alignment``.
 
     ``growth`` and ``units`` have one number for each level: the channels each unit adds, and how many units there are
-    on the way down and again on the way up. ``zero`` and ``normalise`` are those of ``LastConvolution``, ``pooling``
-    is one of ``POOLING``, ``radius`` that of the receptive field.
+    on the way down and again on the way up. ``zero`` and ``normalise`` are as in ``LastConvolution``, ``pooling`` is
+    one of ``POOLING``, ``radius`` is the radius of the receptive field.
     """
 
     def __init__(

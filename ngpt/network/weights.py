@@ -17,7 +17,8 @@ from ngpt.network.model import Reconstructor
 from ngpt.system.files import atomic_output
 from ngpt.system.records import parse_json
 
-# The shipped networks in PyTorch's form: beside their .onnx in an installed package, apart from them in the repository
+# The shipped networks in PyTorch's form: beside the .onnx files in an installed package, in another folder in the
+# repository
 _PACKAGE = Path(__file__).parents[1]
 FOLDERS = (_PACKAGE / "weights", _PACKAGE.parent / "export" / "weights")
 FORMAT = 1
@@ -99,7 +100,7 @@ def fill(module: torch.nn.Module, tensors: dict[str, Tensor], path: str) -> None
 
 
 def check_fit(own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], path: str) -> None:
-    """Raises NgptError unless ``tensors`` are those of ``own`` by name and shape, of floats, and finite."""
+    """Raises NgptError unless ``tensors`` have the names and shapes of ``own``, hold floats, and are finite."""
     missing, extra = own.keys() - tensors.keys(), tensors.keys() - own.keys()
     if missing or extra:
         what = "lacks" if missing else "has an unexpected"

@@ -78,8 +78,8 @@ class Axes:
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """1, 2 and 5 times powers of ten between the two; powers alone where that would be many, and numbers evenly
-    apart where there would be fewer than two."""
+    """1, 2 and 5 times powers of ten between the two. If these are too many, only powers of ten; if fewer than two,
+    evenly spaced numbers."""
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     steps = (1, 2, 5) if math.log10(high / low) < 3.5 else (1,)
     found = [value for p in powers for m in steps if low <= (value := m * 10.0**p) <= high]

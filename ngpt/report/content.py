@@ -18,7 +18,7 @@ class Entry:
     name: str  #                  'primal', 'l2', ...: unique in its scene
     image: np.ndarray  #          (H, W, 3) scene-linear, any value, non-finite ones included
     seconds: float | None = None  # reconstruction time
-    # e.g. {'relMSE': 0.012}, or one value per seed, of which the table shows the median and the range
+    # e.g. {'relMSE': 0.012}, or one value per seed; the table then shows their median and range
     metrics: Mapping[str, float | Sequence[float]] = field(default_factory=dict)
     # Maps of the difference to the reference by name, (H, W) from 0, equal, to 1: 'FLIP', 'SSIM'
     maps: dict[str, np.ndarray] = field(default_factory=dict)
@@ -35,8 +35,8 @@ class Scene:
     # Extra views, (H, W), (H, W, 1) or (H, W, 3): 'dx', 'dy', 'normal' and 'depth' get a map of their own, the others
     # show as colour.
     layers: dict[str, np.ndarray] = field(default_factory=dict)
-    rising: Collection[str] = ()  # the metrics of which more is better; every other is an error
-    # Of maps whose colours say something else than how different: name -> meaning, five marks of the scale from 0 to 1
+    rising: Collection[str] = ()  # the metrics for which higher is better; every other is an error
+    # Maps whose colours do not show a difference: name -> meaning, five marks of the scale from 0 to 1
     meanings: dict[str, tuple[str, list[str]]] = field(default_factory=dict)
 
     @property

@@ -32,7 +32,7 @@ def to_srgb8(image: np.ndarray, exposure_stops: float = 0.0) -> np.ndarray:
 
 
 def encoded_srgb(light: np.ndarray) -> np.ndarray:
-    """Linear values from 0 on -> those of sRGB, in [0, 1]."""
+    """Linear values >= 0 -> sRGB values in [0, 1]."""
     linear = np.minimum(light, 1.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 

@@ -97,7 +97,7 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
     clock = f"sampler {results['settings']['clock']}" if _several_samplers(results) else "gradients"
     size = f"{scene['size'][0]}x{scene['size'][1]}"
     facts = [f"{size}, equal rendering time to {spp} spp of {clock}; times are render and method"]
-    # Of references from elsewhere the number of samples may not be known.
+    # For references from elsewhere the number of samples may be unknown.
     samples = f"reference {reference['spp']:g} spp" if reference.get("spp") else "reference"
     facts += [samples] if image is not None else ["no reference"]
     floors = [f"{metric} {value:.3g}" for metric, value in reference.get("floors", {}).items() if value is not None]

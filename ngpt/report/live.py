@@ -1,11 +1,11 @@
 """The page of a render that goes on: a small web server on the loopback address, which nobody beyond this machine sees.
 
     GET  /         the page of the newest images; the report's, with a script that asks for more
-    GET  /status   {"number": of those images, "text": how far the render is, "ended": whether it is over}
+    GET  /status   {"number": of the newest images, "text": how far the render is, "ended": whether it is over}
     POST /enough   ends the render, as Ctrl-C does; only from the page itself
 
-Nothing else is answered, and nothing that a browser sends is kept. A page that another site makes a browser open is
-told nothing: requests by another name than ours are refused, and so is an ``enough`` of another origin.
+Nothing else is answered, and nothing that a browser sends is kept. Other sites learn nothing through a browser:
+requests under a host name other than ours are refused, and so is an ``enough`` from another origin.
 """
 
 import json
@@ -91,7 +91,7 @@ class LivePage:
         self.line, self.ended = line, True
         if self.watched:
             self._told_end.wait(_FAREWELL)
-            time.sleep(0.2)  # Who was told asks for the last images.
+            time.sleep(0.2)  # Pages that saw the end ask for the last images.
         self.server.shutdown()
         self.server.server_close()
 

@@ -71,7 +71,7 @@ def _note(metric: str, value: float) -> str:
 
 
 def _table(scene: Scene) -> str:
-    """Pictures down, metrics and seconds across; the best value is bold, all are compared to those of one picture."""
+    """Pictures down, metrics and seconds across; the best value is bold, and one picture is the base of comparison."""
     metrics = list(dict.fromkeys(metric for entry in scene.entries for metric in entry.metrics))
     best = {metric: scene.best(metric) for metric in metrics}
     baseline = scene.baseline

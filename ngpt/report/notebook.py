@@ -18,7 +18,7 @@ def stack_html(title: str, layers: Mapping[str, np.ndarray]) -> str:
     Values count where they are finite; the last column says how many pixels have one that is not.
     """
     name, image = next(iter(layers.items()))
-    # Of a large image some pixels will do: it should show at once.
+    # Some pixels of a large image are enough: it should show at once.
     step = max(1, image.shape[1] // (4 * WIDTH))
     picture = encode_png(display.thumbnail(display.layer_view(name, image[::step, ::step]), WIDTH))
     source = "data:image/png;base64," + base64.b64encode(picture).decode()

@@ -42,9 +42,9 @@ def write_report(
     """Writes the page to ``path`` and returns it. The same arguments give the same bytes.
 
     ``command`` is the command line that made the pictures, ``footer`` further facts (versions, device, seed, date).
-    Pictures are stored to 0.14 % of their value, or as much coarser as a page of PAGE_LIMIT bytes demands, those of
-    most noise first; the page states the worst error of each. The scenes of a ``shot`` are its frames: they are
-    played, at one exposure.
+    Pictures are stored to 0.14 % of their value. If the page would exceed PAGE_LIMIT bytes, they are stored more
+    coarsely, starting with the noisiest; the page states the worst error of each. The scenes of a ``shot`` are its
+    frames: they are played, at one exposure.
     """
     path = Path(path)
     if not scenes:
@@ -61,7 +61,7 @@ def write_report(
 
 
 def auto_exposure(scene: Scene) -> float:
-    """The exposure of a scene's pictures, in stops: that of its reference, or of the first."""
+    """The exposure of a scene's pictures, in stops, computed from its reference, or else from the first picture."""
     return display.auto_exposure(scene.entries[0].image if scene.reference is None else scene.reference)
 
 

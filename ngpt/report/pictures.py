@@ -1,7 +1,7 @@
 """Pictures and films of 8-bit sRGB: PNG by ourselves, JPEG and WebP by Pillow, MP4 by FFmpeg.
 
-A shot is an animated WebP, without loss, or an MP4 (H.264 where FFmpeg has it). FFmpeg is the program of that name, or
-that of the package imageio-ffmpeg.
+A shot is a lossless animated WebP, or an MP4 (H.264 where FFmpeg has it). FFmpeg is the program of that name, or the
+one in the package imageio-ffmpeg.
 """
 
 import os
@@ -104,7 +104,7 @@ def _ffmpeg(path: Path) -> str:
 def _write_mp4(path: Path, temporary: Path, frames: Iterable[np.ndarray], size: tuple[int, int], fps: float) -> None:
     command = [_ffmpeg(path), "-loglevel", "error", "-nostdin", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
     command += ["-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}", "-i", "-", "-an"]
-    # Players want even sides, and are told which colours these are.
+    # Players need even sides, and tags that name the colour space.
     command += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2,scale=out_color_matrix=bt709:out_range=tv", "-pix_fmt", "yuv420p"]
     command += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "iec61966-2-1", "-f", "mp4"]
     # As it would be without: a name that begins with a dash, or like a protocol, is a file's all the same.

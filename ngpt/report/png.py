@@ -11,7 +11,7 @@ from ngpt.errors import NgptError
 def encode_png(image: np.ndarray, level: int = 9) -> bytes:
     """Encodes (H, W, 3) uint8, row 0 on top, as an sRGB PNG. The same pixels give the same bytes.
 
-    ``level`` is that of zlib: 9 makes the smallest file, 1 takes a tenth of the time.
+    ``level`` is zlib's compression level: 9 makes the smallest file, 1 takes a tenth of the time.
     """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
         raise NgptError(f"PNG: needs a non-empty (H, W, 3) uint8 image, got {image.shape} {image.dtype}")

@@ -35,7 +35,7 @@ class Preview:
 
 
 def preview(stack: GradientStack) -> Preview:
-    """Of the samples that a stack holds by now; with maps of the standard errors where it has variances."""
+    """A preview from the samples that a stack holds so far, with maps of the standard errors if it has variances."""
     method = next((name for name in _QUICK if not METHODS[name].missing() and _able(name, stack)), "")
     light = stack["primal"]
     unit = np.square(light).mean(axis=-1) + ERROR_EPSILON * 4.0 ** -auto_exposure(light)

@@ -19,7 +19,7 @@ import numpy as np
 
 from ngpt.errors import NgptError, WrongUse
 
-PORT = 14158  # where tev listens unless it is told otherwise
+PORT = 14158  # tev's default port
 SECONDS = 5.0  # in which a viewer must take what it is sent
 _CLOSE, _CREATE, _UPDATE = 2, 4, 6
 
@@ -43,7 +43,7 @@ class Tev:
             raise NgptError(f"--view {address}: no viewer there ({reason}); start tev first") from error
 
     def show(self, images: Mapping[str, np.ndarray]) -> None:
-        """Shows images (H, W, 3), scene-linear; those of a name and size that are there are brought up to date."""
+        """Shows images (H, W, 3), scene-linear; an image that is there with the same name and size is updated."""
         for name, image in images.items():
             if self.sizes.get(name) != image.shape:
                 if name in self.sizes:

@@ -8,7 +8,7 @@ from ngpt.system.late import ndimage
 
 # Pixels, of the window of the evidence (standard deviation).
 WINDOW = 4.0
-# What b may be off from that of the variances, before there is evidence (standard deviation).
+# How far b may be from the b of the variances, before there is evidence (standard deviation).
 DOUBT = 0.12
 # Differences of features beyond what is allowed, at which history counts exp(-1) = 0.37. A pixel that two surfaces
 # share in parts u and 1 - u has features with a standard deviation of sqrt(u (1 - u) / spp) times what they differ by.
@@ -26,7 +26,7 @@ class Evidence:
     ``rest``    primal - x, within 4 standard deviations of that noise
     ``best``    b*, of least squared error by this frame's primal; 0 where h is x
     ``weight``  how much of that counts beside the b of the variances, 0 to 1
-    ``share``   b of both together, from 0 to that of the variances
+    ``share``   b of both together, from 0 to the b of the variances
     """
 
     noise: np.ndarray
@@ -37,7 +37,7 @@ class Evidence:
 
 
 def agreement(now: dict[str, np.ndarray], then: dict[str, np.ndarray], found: np.ndarray) -> np.ndarray:
-    """How far the features ``then`` are those of each pixel now, (H, W) from 0 to 1."""
+    """How well the features ``then`` agree with the features of each pixel now, (H, W) from 0 to 1."""
     strange = np.zeros(found.shape)
     for name, scale in (("albedo", ALBEDO), ("normal", NORMAL), ("depth", DEPTH)):
         if name not in then:
@@ -57,15 +57,15 @@ def agreement(now: dict[str, np.ndarray], then: dict[str, np.ndarray], found: np
 def weighed(
     x: np.ndarray, h: np.ndarray, p: np.ndarray, variance: np.ndarray | None, trust: np.ndarray, first: np.ndarray
 ) -> Evidence:
-    """What this frame's primal p says of x and h (H, W, 3), where ``trust`` (H, W) is that of features.
+    """The evidence of this frame's primal p on x and h (H, W, 3); ``trust`` (H, W) is the agreement of features.
 
-    ``variance`` is that of p, (H, W, 3), NaN where not known, None where it is nowhere; ``first`` is the b (H, W) of
-    the variances.
+    ``variance`` is the variance of p, (H, W, 3), NaN where not known, None if it is known nowhere; ``first`` is the b
+    (H, W) of the variances.
     """
     rest, change = p - x, h - x
     if variance is None:
         variance = np.full_like(p, np.nan)
-    # That of single pixels is known no better than they are, and goes with their values.
+    # The variance of a single pixel is as noisy as its value, and correlated with it.
     noise = _noise(variance, rest)
     rest = np.clip(rest, -4 * np.sqrt(noise), 4 * np.sqrt(noise))
     trust = trust * _usual((np.square(change) / noise).mean(axis=-1), trust)

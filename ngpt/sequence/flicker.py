@@ -14,10 +14,10 @@ def flicker_maps(
 ) -> list[np.ndarray]:
     """(H, W, 3) for each frame but the first: (d - d_r)² / (m + 1e-3), NaN where that is not known.
 
-    d = x_t(p) - x_{t-1}(p + motion) is the difference in time along motion of the images x, d_r that of the references
-    r, m the mean of r² in both frames. ``motions`` (H, W, 2) are those of the frames, of which the first is not used;
-    None and NaN: unknown. What changes in the reference too, a moving shadow or a reflection, is no flicker. Raises
-    NgptError for lists of different lengths.
+    d = x_t(p) - x_{t-1}(p + motion) is the difference in time along motion of the images x, d_r the same difference of
+    the references r, m the mean of r² in both frames. ``motions`` (H, W, 2) has one entry for each frame, and the first
+    is not used; None and NaN: unknown. Changes that the reference has too, such as a moving shadow or a reflection, are
+    not flicker. Raises NgptError for lists of different lengths.
     """
     if not len(images) == len(references) == len(motions) or len(images) < 2:
         raise NgptError(
@@ -51,7 +51,7 @@ def _changes(
             maps.append(np.full(value.shape, np.nan))
             continue
         before, found = warped(last, motion)
-        # Of both frames: what goes from a lamp to what is dark beside it is not worth thousands of other pixels.
+        # The mean of both frames: a pixel that goes from a lamp to the dark should not count like thousands of others.
         level = (square + warped(square_before, motion)[0]) / 2
         relative = np.square(value - before) / (level + EPSILON)
         maps.append(np.where(found[..., None], relative, np.nan))

@@ -4,10 +4,10 @@
 
 How much history counts, b, is made of
 
-    features      no history where albedo, normal and depth of the frame before are not those of this pixel now: what
-                  comes into sight takes nothing from what hid it
-    variances     with r the variance of h over that of x: b = 1 / (1 + r), and y has (1 - b)² + b² r. So the first n
-                  frames of a shot at rest are averaged, up to ``LONGEST`` of them, and fewer of a fast one
+    features      no history where albedo, normal and depth of the frame before differ from this pixel's: a surface
+                  that comes into sight takes nothing from what hid it
+    variances     with r the variance of h over the variance of x: b = 1 / (1 + r), and y has (1 - b)² + b² r. So the
+                  first n frames of a shot at rest are averaged, up to ``LONGEST`` of them, and fewer of a fast shot
     evidence      h knows nothing of this frame's noisy primal p, of variance σ². In a window with weights w,
 
                       b* = [Σ w (h - x)(p - x) + k] / Σ w (h - x)²,    k = d Σ w σ²
@@ -22,7 +22,7 @@ How much history counts, b, is made of
 b* is the minimum of Stein's unbiased risk over the line from x to h; Rousselle et al. 2013, "Robust denoising using
 feature and color information", choose between filters by that risk. These are rules (``ngpt.sequence.evidence``); a
 network that sees them and more corrects b, at each of several scales of h - x (``ngpt.sequence.network``). Where direct
-emission is known, the rest alone is blended. The method may be any, and knows nothing of time.
+emission is known, only the rest is blended. The method may be any, and knows nothing of time.
 """
 
 from dataclasses import dataclass, replace
@@ -50,8 +50,8 @@ NO_MOTION = "no layer 'motion'"
 
 @dataclass(frozen=True)
 class _History:
-    """What a frame hands on to the next: result without direct emission, that, relative variance, features, where it
-    lies, frame."""
+    """What a frame passes on to the next: the result without direct emission, the direct emission, the relative
+    variance, the features, its place, and the frame."""
 
     light: np.ndarray
     direct: np.ndarray
@@ -64,8 +64,8 @@ class _History:
 class Temporal:
     """Blends the frames of a shot, in their order, one after the other.
 
-    ``corrections``  of the rules, by a network (``ngpt.sequence.network``): by default the one that comes with ngpt,
-                     where ONNX Runtime is installed; None for the rules alone
+    ``corrections``  corrections of the rules by a network (``ngpt.sequence.network``): by default the one that comes
+                     with ngpt, if ONNX Runtime is installed; None for only the rules
     """
 
     def __init__(self, corrections: Corrections | Literal["shipped"] | None = "shipped") -> None:
@@ -131,7 +131,7 @@ class Temporal:
             relative = (np.square(1 - b) + np.square(b) * spread).astype(np.float32)
             self.weight = b
             self.reason = _doubt(b, found, trust)
-            # They have noise as well, and are blended as the light is, that they stay those of its pixels.
+            # Features have noise as well. They are blended as the light is, so that they still belong to its pixels.
             features = features | {name: features[name] + b[..., None] * (then[name] - features[name]) for name in then}
         # In the units of the stack: the next one may be of another magnitude.
         light, direct = enlarged(now, power), enlarged(data.direct, power)

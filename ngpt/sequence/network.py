@@ -2,12 +2,13 @@
 
     y = x + t Σ_s b_s D_s,        b_s = min(MOST sigmoid(logit(b / t MOST) + C tanh(c_s / C)), f)
 
-D_s are the bands of h - x, fine to coarse, which add up to it; b and t are share and trust of the rules, f the b of the
-variances (``ngpt.sequence.evidence``), c_s is what the network says, from ``Blend.inputs``. Where it says nothing, c_s
-= 0, y is that of the rules. It corrects them by no more than C: where their evidence is plain, as after a change of all
-light, it stands. Changes of light are of coarse scales, and moving reflections of fine ones; noise that is left in x is
-of both. So y lies between x and h at each scale, and what comes into sight takes nothing from what hid it, whatever the
-network says. It was trained on frames of moving shots, by histories of its own making (``ngpt.sequence.train``).
+D_s are the bands of h - x, fine to coarse, which add up to h - x. b and t are share and trust of the rules, f is the b
+of the variances (``ngpt.sequence.evidence``), and c_s is the output of the network for ``Blend.inputs``. If c_s = 0, y
+is the result of the rules. The network corrects the rules by no more than C: where their evidence is clear, as after a
+change of all light, it stands. Changes of light have coarse scales, and moving reflections fine ones; noise that is
+left in x has both. Whatever the network says, y lies between x and h at each scale, and a surface that comes into sight
+takes nothing from what hid it. The network was trained on frames of moving shots, with histories that it made itself
+(``ngpt.sequence.train``).
 """
 
 from __future__ import annotations

@@ -2,18 +2,18 @@
 
     python -m ngpt.sequence.train DATA... --out temporal.safetensors
 
-A frame's history is made by the network itself: in each round the network, as it is by then, plays the shots, and what
-it meets is what it learns from until the next [Ross et al. 2011, "A reduction of imitation learning and structured
-prediction to no-regret online learning"]. Results frame by frame are those of several methods, so it learns to go with
+A frame's history is made by the network itself: in each round the current network plays the shots, and it learns from
+the resulting histories until the next round [Ross et al. 2011, "A reduction of imitation learning and structured
+prediction to no-regret online learning"]. Results frame by frame come from several methods, so it learns to work with
 any. The loss of a frame is
 
     E |y - r|² / E_x + FLICKER E |(y - r) - W (y' - r')|² / F_x
 
-relative to the reference r, where W is what is seen along motion, ' the frame before, and E_x, F_x are the same of x:
-all shots count alike. A reference's noise is none of y's, and adds the same whatever the network does. Beside it stands
-the square of how much darker or brighter y is than x, in the mean of a batch: the easiest way to be rid of specks
-would be to lose their light. What y does to later frames is left out: of filters that know their own variance, the one
-of least error now is the best for later too.
+relative to the reference r, where W looks up values along motion and ' marks the frame before. E_x and F_x are the same
+errors of x, so all shots count alike. The noise of a reference is independent of y, and adds the same constant whatever
+the network does. Added to the loss is the square of how much darker or brighter y is than x, in the mean of a batch:
+otherwise the easiest way to remove specks would be to lose their light. The effect of y on later frames is left out:
+among filters that know their own variance, the one with the least error now is also the best for later.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def relit(clip: Clip, rng: np.random.Generator) -> Clip:
 
 
 def _robust(squares):  # type: ignore[no-untyped-def]
-    """Of squares, arrays or tensors: the same for small ones, at most ``OUTLIER``."""
+    """Squares (arrays or tensors) limited to ``OUTLIER``; small ones stay nearly as they are."""
     return squares / (1 + squares / OUTLIER)
 
 
@@ -186,7 +186,7 @@ def network() -> PlainUNet:
 
 
 def loss(model: PlainUNet, batch: dict[str, Tensor]) -> Tensor:
-    """Of frames (N, C, H, W) as ``play`` gives them: 1 + FLICKER where results are no better than frame by frame."""
+    """The loss of frames (N, C, H, W) from ``play``: 1 + FLICKER if results are no better than frame by frame."""
     shares = MOST * torch.sigmoid(batch["prior"] + LARGEST * torch.tanh(model(batch["inputs"]) / LARGEST))
     shares = batch["trust"] * torch.minimum(shares, batch["first"])
     bands = batch["bands"].unflatten(1, (BANDS, 3))

@@ -9,10 +9,9 @@ def warped(
     """``image`` (h, w, C) of one frame at x + motion for the pixels x of another, and where that is in the image.
 
     ``motion`` is (H, W, 2), pixels to the right and down; where it is not finite nothing is found. ``shift`` is the
-    place (x, y) in the image at which the first pixel of the other frame lies. Between pixels the
-    value is bilinear, or with ``sharp`` that of a Catmull-Rom spline within the range of the four pixels around: a
-    bilinear image loses detail each time. Returns (H, W, C) of the image's type, 0 where nothing is found, and (H, W)
-    booleans.
+    place (x, y) in the image at which the first pixel of the other frame lies. Between pixels the value is bilinear, or
+    with ``sharp`` a Catmull-Rom spline clamped to the range of the four pixels around, since bilinear interpolation
+    loses detail each time. Returns (H, W, C) of the image's type, 0 where nothing is found, and (H, W) booleans.
     """
     (x, y), (height, width) = _aims(motion, shift), image.shape[:2]
     with np.errstate(invalid="ignore"):

@@ -30,17 +30,17 @@ from ngpt.classical.variances import FLOOR, SHARED, smoothed
 from ngpt.sequence.warp import bilinear_taps, warped
 from ngpt.system.late import ndimage, sparse
 
-# Times the squared difference of two interpolations, what is added to the variance of dt. Of 3, 10 and 30 the one of
+# This times the squared difference of two interpolations is added to the variance of dt. Among 3, 10 and 30 it has the
 # least error on slow shots of the built-in scenes `diffuse` and `glossy`.
 INTERPOLATION = 10
-# Times the variance of dt. It is that of few pairs, most of which saw nothing of what is rare: gloss and caustics above
-# all. Of 1, 4 and 16 the one of least error over slow and fast shots of those scenes and `coffee`, at 2 pairs a pixel.
+# A factor on the variance of dt, which comes from few pairs. Most of them missed rare light, mainly gloss and caustics.
+# Among 1, 4 and 16 it has the least error over slow and fast shots of those scenes and `coffee`, at 2 pairs a pixel.
 DOUBT = 4
 
 
 @dataclass(frozen=True)
 class Link:
-    """What is known of a frame beside the one before: ``motion`` (H, W, 2), ``dt``, ``dt_var`` (H, W, 3), or NaN.
+    """The relation of a frame to the one before: ``motion`` (H, W, 2), ``dt``, ``dt_var`` (H, W, 3); NaN: not known.
 
     ``shift`` is the place (x, y) in the frame before at which the first pixel of this one lies.
     """
@@ -87,7 +87,7 @@ def wcv_frames(frames: Sequence[Frame], sweeps: int = SWEEPS) -> list[np.ndarray
         None if i == 0 or (link := frame.link) is None else _Step(link, frame.guess, frames[i - 1].guess, level, dtype)
         for i, frame in enumerate(frames)
     ]
-    # What dt says of the corrections: those of both frames differ by this.
+    # The difference, according to dt, between the corrections of both frames.
     rest = [
         None if step is None else step.offset - total[i] + step.before(total[i - 1]) for i, step in enumerate(steps)
     ]
@@ -110,7 +110,7 @@ def _wide(images: Sequence[np.ndarray]) -> bool:
 
 
 class _Still:
-    """A frame by itself: ``primal`` is the relative variance (H, W, 1), x and y those of differences."""
+    """A frame by itself: ``primal`` is its relative variance (H, W, 1), x and y are the variances of differences."""
 
     def __init__(self, frame: Frame, dtype: type):
         p, x, y = frame.variances
@@ -122,7 +122,7 @@ class _Still:
         self.trusted = frame.trusted
 
     def divide(self, level: float) -> None:
-        """Variances are relative to those of the whole window from here on."""
+        """Makes the variances relative to the variance level of the whole window."""
         self.primal, self.x, self.y = (
             (share * _relative(v, level))[..., None].astype(self.dtype)
             for share, v in ((1, self.primal), (SHARED, self.x), (SHARED, self.y))
@@ -132,7 +132,7 @@ class _Still:
             self.y[~self.trusted[1][:-1]] = np.inf
 
     def swept(self, u: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
-        """What the neighbours in the image say beyond u, times weight, and the sum of weights, with u's own of 1."""
+        """The weighted sum of changes to u from its neighbours in the image, and the sum of weights; u's own is 1."""
         own = factor * self.primal
         change, weight = np.zeros_like(u), np.ones_like(own)
         for here, there, r, v in (

@@ -9,7 +9,7 @@ from ngpt.errors import NgptError, did_you_mean
 _PACKAGE = Path(__file__).parents[1]
 FOLDER = next((f for f in (_PACKAGE / "configs", _PACKAGE.parent / "configs") if f.is_dir()), _PACKAGE / "configs")
 
-# Three kinds, by what their names begin with; those of training begin with neither of the others.
+# The prefixes of the names of the three kinds; configurations of training have neither of the other prefixes.
 DATASET, EVALUATION, TRAINING = "data-", "eval-", ""
 # What a configuration of one's own begins with where none is named
 STARTS = {DATASET: "data-cpu", EVALUATION: "eval-tiny", TRAINING: "fast"}

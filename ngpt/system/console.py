@@ -23,8 +23,8 @@ from ngpt.system.text import printable
 SECONDS_BETWEEN_LINES = 5.0
 LINES = 50
 
-# Columns that a bar takes beside its label: with all of its parts, with a rate too, and with numbers and time left
-# alone. The first has to leave so many for the label.
+# Columns that a bar takes beside its label: with all of its parts, for a rate in addition, and with only numbers and
+# time left. The last number is what the first form has to leave for the label.
 WIDE, RATE, NARROW, LABEL = 58, 14, 22, 12
 
 # MiB of address space.
@@ -32,7 +32,7 @@ FEWEST_MIB = 512
 
 
 def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "interrupted") -> int:
-    """The exit status of a command: what ``run`` returns, or that of whatever stopped it, which is told in one line.
+    """The exit status of a command: what ``run`` returns, or the status for what stopped it, with a one-line message.
 
     1 for an error, and where nobody reads standard output any more; 2 for ``WrongUse``; 130 after Ctrl-C and 143 after
     SIGTERM. ``interrupted`` says what an interrupt means for the work.
@@ -115,7 +115,7 @@ def _open_standard_streams() -> None:
             os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", closefd=False))
-    # Files may have letters in them that standard output has not: on Windows a pipe has those of one language.
+    # Text from files may have letters that standard output cannot encode: on Windows a pipe has only one language's.
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")
 
@@ -212,7 +212,7 @@ class _Pace:
         self.past: deque[tuple[float, int]] = deque()
 
     def __call__(self, done: int, total: int) -> list[str]:
-        """What there is to tell of the pace, in a few words each."""
+        """Phrases about the pace, of a few words each."""
         if not self.past:
             self.start = time.monotonic()
             self.past.append((0.0, done))
@@ -268,7 +268,7 @@ def _bar(label: str, unit: str, pace: _Pace) -> Iterator[Callable[[int, int], No
     phrase: Callable[[list[str]], str] = ", ".join
     taken = WIDE + (RATE if pace.rate else 0)
     if terminal.width < taken + LABEL:
-        # What counts is how far it is and how long it takes.
+        # A narrow terminal shows only the progress and the time left.
         columns, phrase, taken = [columns[0], columns[2], columns[5]], _last, NARROW
     label = _shortened(label, terminal.width - taken)
     # Lines on standard output go above the bar, unless they go into a file.
@@ -288,7 +288,7 @@ def _shortened(text: str, most: int) -> str:
 
 
 def _last(words: list[str]) -> str:
-    """Of the pace, the time that is left."""
+    """The time left: the last word on the pace."""
     return words[-1].removeprefix("about ") if words else ""
 
 

@@ -41,7 +41,7 @@ def packages_of(extra: str) -> list[str]:
 
 
 def _pip() -> str:
-    """The one that installs for this Python: that of the shell may be another's."""
+    """The command of the pip that installs for this Python; the shell's pip may belong to another Python."""
     found = shutil.which("pip")
     beside = found is not None and Path(found).parent == Path(sys.executable).parent
     return "pip" if beside else f"{shlex.quote(sys.executable)} -m pip"

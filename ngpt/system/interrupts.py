@@ -28,9 +28,9 @@ class Interrupt:
 
 @contextmanager
 def raised() -> Iterator[Interrupt]:
-    """Both signals raise ``Interrupted`` in the block, so that all of it is cleaned up after, and are noted.
+    """Both signals raise ``Interrupted`` in the block, so that everything is cleaned up, and are noted.
 
-    One that somebody else handles or has switched off is left alone, and so are both outside of the main thread.
+    A signal that other code handles or has switched off is not touched. Outside of the main thread neither is.
     """
     found = Interrupt()
 
@@ -38,7 +38,7 @@ def raised() -> Iterator[Interrupt]:
         found.signal = found.signal or number
         raise Interrupted
 
-    # Python's own handlers tell that nobody has set another; those of the background of a script are others.
+    # Python's own handlers show that no other code has set one. The background jobs of a script have other handlers.
     ours = [number for number, usual in _SIGNALS.items() if signal.getsignal(number) is usual]
     with _handled(ours, note):
         yield found
@@ -59,7 +59,7 @@ def noted(told: Callable[[], None] = lambda: None) -> Iterator[Interrupt]:
             signal.signal(other, handler)
         told()
 
-    # None: that of a program in C around us.
+    # None: a handler of a C program that embeds Python.
     before = {number: old for number in _SIGNALS if (old := signal.getsignal(number)) not in (signal.SIG_IGN, None)}
     with _handled(list(before), note):
         yield found
@@ -67,7 +67,7 @@ def noted(told: Callable[[], None] = lambda: None) -> Iterator[Interrupt]:
 
 @contextmanager
 def _handled(numbers: Sequence[int], handler: Callable) -> Iterator[None]:
-    """Handles these signals in the block, in the main thread, where alone they arrive; then as they were before."""
+    """Handles these signals in the block, then restores the handlers. Only in the main thread, where signals arrive."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -60,7 +60,7 @@ def _physical() -> int:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     kibibytes = ctypes.c_ulonglong()
     with suppress(AttributeError):  # neither POSIX nor Windows
-        # False, and nothing is told, on virtual machines without the tables of a real one's firmware.
+        # It returns False, and sets nothing, on virtual machines that lack the firmware tables of a real machine.
         ctypes.windll.kernel32.GetPhysicallyInstalledSystemMemory(ctypes.byref(kibibytes))  # type: ignore[attr-defined]
     return kibibytes.value * 1024 or _ASSUMED
 

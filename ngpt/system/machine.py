@@ -12,7 +12,7 @@ from ngpt.version import __version__
 
 
 def versions(*packages: str) -> dict[str, str | None]:
-    """Of ngpt and of these packages; None for those that are not installed."""
+    """The versions of ngpt and of these packages; None for packages that are not installed."""
     return {"ngpt-recon": __version__, **{package: version(package) for package in packages}}
 
 

@@ -1,6 +1,6 @@
-"""What other packages bring, by entry points: the renderer, whom nothing in ngpt imports, and verbs that render.
+"""What other packages add by entry points: the renderer, which nothing in ngpt imports, and verbs that render.
 
-Methods, samplers, losses and metrics of anyone, too: each registry is a ``Registry``.
+Anyone can also add methods, samplers, losses and metrics: each registry is a ``Registry``.
 """
 
 import sys

@@ -15,12 +15,12 @@ Told = TypeVar("Told")
 def overlapped(
     items: Sequence[Item], read: Callable[[Item], Read], compute: Callable[[Read], Made], write: Callable[[Made], Told]
 ) -> Generator[Told | NgptError, None, None]:
-    """``write(compute(read(item)))`` of each item, in order; of an item that fails, its NgptError.
+    """``write(compute(read(item)))`` of each item, in order; for an item that fails, its NgptError.
 
     ``read`` is one item ahead and ``write`` one behind, each in a thread of its own; ``compute`` runs in the caller's.
-    So at most three items are held at once. Any other error, and WrongUse, which is that of all, is raised when its
-    item's turn has come. Whatever ends the work early, an interrupt or ``close()``, the threads finish what they have
-    begun and start nothing else. A single item needs no threads. Raises MemoryError where there is no room for two.
+    So at most three items are held at once. Any other error is raised when its item's turn comes, and so is WrongUse,
+    which concerns all items. If an interrupt or ``close()`` ends the work early, the threads finish what they have
+    begun and start nothing else. A single item needs no threads. Raises MemoryError if there is no room for two.
     """
     if len(items) == 1:
         yield _told(_attempt(write, _attempt(compute, _attempt(read, items[0]))))
@@ -40,7 +40,7 @@ def overlapped(
             if going:
                 yield _told(going.result())
             going = writer.submit(_attempt, write, value)
-            del value  # the writer's alone, that it be gone when it is written
+            del value  # only the writer keeps it, so that it is freed once written
         if going:
             yield _told(going.result())
 

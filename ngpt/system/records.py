@@ -13,7 +13,7 @@ from ngpt.system.reading import read_text
 T = TypeVar("T")
 
 # A type, several of them, [shape]: a list of such, {name: shape}: a table with at least these entries, {str: shape}: a
-# table of any names. Whole numbers are those of 64 bits.
+# table of any names. Whole numbers have 64 bits.
 Shape = type | tuple[type, ...] | list["Shape"] | dict["str | type[str]", "Shape"]
 
 

@@ -17,7 +17,7 @@ from ngpt.stack import GradientStack
 
 Layers = dict[str, Tensor]
 
-# Layers with three colours that change with those of the light, and with those of the surfaces.
+# Layers with three colours that change with the colours of the light, and with the colours of the surfaces.
 _LIGHT = RADIANCE | {"target"}
 _COLOR = _LIGHT | {"albedo"}
 _VARIANCES = ("primal_var", "dx_var", "dy_var", "caustic_var")
@@ -78,7 +78,7 @@ def quieter(
     """The stack with ``factor`` times its noise, as of 1 / factor² times the samples: a mean with the reference.
 
     ``reference`` (H, W, 3) includes emission seen directly and the light of the layer ``caustic``; ``direct`` and
-    ``caustic`` are these alone. Features stay as they are.
+    ``caustic`` hold these two parts separately. Features stay as they are.
     """
     light = reference - direct - caustic
     truth = {
@@ -96,10 +96,11 @@ def quieter(
 def rarer(stack: GradientStack, k: float, share: float, rng: np.random.Generator) -> GradientStack:
     """The stack as if ``share`` of the light in each pixel were found by one path in ``k``, then k times as bright.
 
-    With B = 1 at probability 1/k, else 0, in each pixel, its light is multiplied by w = 1 - share + share k B, of mean
-    1. A difference is made of the paths of both its pixels, so its factor is the mean of theirs. Means stay those of
-    the stack. Those of variances are what they would be: with the variance V of an estimate X, that of w X is
-    E[w²] V + Var[w] E[X]². Emission seen directly, the layer ``caustic`` and features stay as they are.
+    In each pixel B = 1 with probability 1/k, else 0. Its light is multiplied by w = 1 - share + share k B, with mean 1.
+    A difference is made of the paths of both its pixels, so its factor is the mean of their factors. Means over B stay
+    equal to the stack. Variances become what they would be in such a stack: if an estimate X has the variance V, w X
+    has the variance E[w²] V + Var[w] E[X]². Emission seen directly, the layer ``caustic`` and features stay as they
+    are.
     """
     height, width = stack["primal"].shape[:2]
     found = np.float32(rng.random((height, width, 1)) * k < 1)

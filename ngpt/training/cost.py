@@ -18,7 +18,7 @@ def per_pixel(model: Reconstructor) -> tuple[float, float]:
         nonlocal macs, numbers
         module = getattr(module, "convolution", module)
         weight = module.v if isinstance(module, Convolution) else module.weight
-        # Of a transposed 2x2 kernel with stride 2 each output pixel sees one tap, of any other all of them.
+        # Each output pixel sees one tap of a transposed 2x2 kernel with stride 2, and all taps of any other kernel.
         taps = weight.shape[0] if getattr(module, "kind", "") == "unpool" else weight[0].numel()
         macs += taps * output.numel()
         numbers += args[0].numel() + output.numel()

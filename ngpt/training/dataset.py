@@ -100,7 +100,7 @@ class Crop:
 
     @property
     def reference_direct(self) -> np.ndarray:
-        """(H, W, 3) float32, that emission alone."""
+        """(H, W, 3) float32, only the emission seen directly."""
         return self.shard.crop("reference_direct", self.index)
 
     @property

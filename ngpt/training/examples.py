@@ -24,9 +24,9 @@ JITTER = 7
 
 
 class Crop(Protocol):
-    """One view with a reference and several inputs; what ``ngpt.training.dataset`` gives, and ``StackFolder``.
+    """One view with a reference and several inputs, from ``ngpt.training.dataset`` or ``StackFolder``.
 
-    Of what has no reference, only ``paired`` is asked, and its two stacks.
+    Of a crop without a reference, only ``paired`` and its two stacks are used.
     """
 
     scene: str
@@ -74,8 +74,8 @@ class Examples(TorchDataset):
     middle of that, where no padding is whatever its jitter [NGPT's code]. Crops larger than ``size`` are cut at random.
     What was read and prepared once is kept in memory, up to ``cache`` bytes.
 
-    Of a pair the input is one half, and in place of the target there is the ``other``: what ``ngpt.training.halves``
-    judges by, names beginning with "other/". Where there are pairs and crops with references, the share ``pairs`` of
+    The input from a pair is one half. In place of the target, ``ngpt.training.halves`` judges by the other half, in
+    layers whose names begin with "other/". If there are both pairs and crops with references, the share ``pairs`` of
     the examples are pairs.
     """
 
@@ -121,7 +121,7 @@ class Examples(TorchDataset):
         return {name: layer.contiguous() for name, layer in (padding.pad(layers, pads) | inside).items()}
 
     def _drawn(self, rng: np.random.Generator) -> tuple[int, Crop]:
-        """A crop, uniform over those of its kind, whatever the number of their inputs."""
+        """A crop, uniform over all crops of its kind, whatever the number of their inputs."""
         paired = None if self.pairs is None else bool(rng.random() < self.pairs)
         while True:
             which = int(rng.integers(len(self.crops)))
@@ -215,7 +215,7 @@ def judges_of(crop: Crop, config: ModelConfig) -> tuple[np.ndarray, ...]:
     halves = crop.reference_halves
     if not halves:
         return (target_of(crop, config),)
-    # Halves have no image of the layer of their own; for networks without gradients that of all samples counts.
+    # Halves have no caustic layer of their own; networks without gradients use the one of all samples.
     beside = np.zeros_like(halves[0]) if config.reads_gradients else crop.reference_caustic
     return tuple(half + beside for half in halves)
 

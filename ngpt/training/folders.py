@@ -1,4 +1,4 @@
-"""What training is given: training sets, and folders of stacks with references."""
+"""The data for training: training sets, and folders of stacks with references."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -60,7 +60,7 @@ class StackCrop:
 
     @property
     def reference_caustic(self) -> np.ndarray:
-        """Of the reference, or that of all stacks together, spread; zeros if they have no such layer.
+        """The layer ``caustic`` of the reference, or else the mean of all stacks, denoised; zeros if they have none.
 
         Raises NgptError if only some of the stacks have it.
         """

@@ -1,4 +1,4 @@
-"""The loss of pairs: what a network makes of one half of the samples, judged by the other half, with no reference.
+"""The loss of pairs: a network's result from one half of the samples, judged by the other half, with no reference.
 
 A and B are independent renders of one view, f the network. f(A) is compared with the image of B at three scales, and
 its differences with the gradients of B:
@@ -8,15 +8,15 @@ its differences with the gradients of B:
 
     y, g     the image of B, without emission seen directly, and its dx, dy
     D_s      mean over 2^s x 2^s pixels
-    m        mean over 3x3 pixels of f(A), of which no gradient is taken
-    v, v_g   variances of the image and of dx, dy, as A tells them, see ``spread``
+    m        mean over 3x3 pixels of f(A), a constant for the derivative
+    v, v_g   variances of the image and of dx, dy, taken from A, see ``spread``
     rho      Huber's function of the squared error: itself up to ``KNEE``², straight in the error beyond it
 
-The noise of B is independent of A and of mean 0: in a square it adds a constant, and the least of it is at the truth
-[Lehtinen et al. 2018, "Noise2Noise"]. Differences have 5 to 24 times less noise than the image, so their term says what
-drowns in the image's [compare Guo et al. 2019, "GradNet", where input and target are one render].
+The noise of B is independent of A and has mean 0: it adds a constant to a square, so the minimum is at the truth
+[Lehtinen et al. 2018, "Noise2Noise"]. Differences have 5 to 24 times less noise than the image, so their term shows
+what the noise of the image hides [compare Guo et al. 2019, "GradNet", where input and target are one render].
 
-Weights are made of A alone. Made of B they would be small where B is bright by chance, and results too dark.
+Weights are computed only from A. From B they would be small where B is bright by chance, and results too dark.
 """
 
 import torch
@@ -24,9 +24,9 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 SCALES, KNEE = 3, 3.0
-# ε in radiance over the exposure, of which 4 is typical: that of relMSE where 1/4 is.
+# ε, for radiance over the exposure, where 4 is typical. It equals relMSE's ε for a typical radiance of 1/4.
 DARK = 0.25
-# Of the light, squared: errors of differences below it count as little as noise does.
+# As a share of the squared light: errors of differences below it count as little as noise does.
 RELATIVE = 0.01
 # A variance is at least this part of those around it: few samples know little of their own.
 AROUND, WINDOW = 3.0, 5
@@ -36,7 +36,7 @@ def halves(prediction: Tensor, other: dict[str, Tensor]) -> Tensor:
     """L of f(A) (N, 3, H, W), radiance over the exposure of A. ``other``, in the same units, is what judges it:
 
     ``primal``, ``dx``, ``dy``           (N, 3, H, W) of B
-    ``primal_se``, ``dx_se``, ``dy_se``  (N, 3, H, W) standard errors that A tells
+    ``primal_se``, ``dx_se``, ``dy_se``  (N, 3, H, W) standard errors from A
     ``counts``                           (N, 1, H, W) 1, or 0 where the image says nothing, as where lamps are seen
     """
     return judged(prediction, avg_pool2d(prediction.detach(), 3, 1, 1, count_include_pad=False), other)

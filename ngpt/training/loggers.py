@@ -1,7 +1,7 @@
 """Where the numbers of a run go beside ``log.jsonl``, and how fast and with how much memory it runs.
 
-A logger has ``log(step, values)``. TensorBoard takes part wherever it is installed, Weights & Biases where it is asked
-for: it alone sends anything.
+A logger has ``log(step, values)``. TensorBoard is used if it is installed, Weights & Biases if it is asked for. Only
+Weights & Biases sends data to anyone.
 """
 
 import sys
@@ -66,7 +66,7 @@ class WeightsAndBiases:
 
 
 def loggers(out: Path, step: int, settings: Settings) -> list[Logger]:
-    """Those of a run in the folder ``out`` that begins with ``step``."""
+    """The loggers of a run in the folder ``out`` that begins with ``step``."""
     found: list[Logger] = []
     with suppress(ImportError):  # not installed
         found.append(TensorBoard(out, step))

@@ -43,7 +43,8 @@ class LossSettings:
     ``scales``       largest downscaling among the transforms; NGPT trains with 2
     ``l1``, ``gradient``, ``relative``, ``logarithmic``, ``huber``, ``pyramid``, ``flip``
                      weights of the pixelwise parts; NGPT has 0.01, 0.01, 0, 0, 0, 0, 0
-    ``halves``       weight of the loss of pairs, ``ngpt.training.halves``; 0.25 pulls like those of combine.toml
+    ``halves``       weight of the loss of pairs, ``ngpt.training.halves``; 0.25 has as much effect as the weights in
+                     combine.toml
     ``backbone``, ``weights``  files of E-LPIPS (docs/train/losses.md); "" looks for the backbone in PyTorch's cache
     """
 
@@ -62,7 +63,7 @@ class LossSettings:
     weights: str = ""
 
 
-# Weights of other packages' terms stand beside these in [loss], by the terms' names.
+# Weights of terms from other packages also go into [loss], by the terms' names.
 _TAKEN = (*KINDS, *(field.name for field in fields(LossSettings)))
 TERMS: Registry[Term] = Registry("ngpt.losses", "loss", Callable, _OURS, _TAKEN)
 

@@ -12,7 +12,8 @@ from ngpt.network.transfer import signed_log, srgb
 
 # Resolutions of ``pyramid``, and the exposures at which a viewer may look at them.
 _SCALES, _EXPOSURES = 4, (0.25, 1.0, 4.0)
-# Of ``flip``: the typical radiance over the exposure is 4, white at the first; at the last 32 times as much is.
+# For ``flip``: typical radiance over the exposure is 4. The first exposure makes it white; the last makes 32 times as
+# much white.
 _WHITES = (0.25, 0.0078)
 # The parts of ``pu``.
 _PU_L1, _PU_STRUCTURE = 0.16, 0.84
@@ -43,9 +44,9 @@ def relative(prediction: Tensor, target: Tensor, epsilon: float = 1e-2) -> Tenso
 def huber(prediction: Tensor, target: Tensor, epsilon: float = 1e-2, knee: float = 0.5) -> Tensor:
     """Mean of Huber's function of e = (p - t) / √(p² + ε): e² / 2 up to the knee, straight beyond it.
 
-    In its gradient √(p² + ε) counts as a constant. Where the target is noisy by less than the knee, the least of it is
-    at the mean of what the target may be, so that noise of mean 0 does no harm [Lehtinen et al. 2018, "Noise2Noise",
-    section 3.3]; fireflies of the target, which squares alone would chase, count by their number.
+    In its gradient √(p² + ε) counts as a constant. Where the noise of the target is below the knee, the minimum is at
+    the expectation of the target, so noise of mean 0 does no harm [Lehtinen et al. 2018, "Noise2Noise", section 3.3].
+    Fireflies of the target count only by their number; a plain squared error would chase them.
     """
     error = ((prediction - target) / (prediction.detach().square() + epsilon).sqrt()).abs()
     return torch.where(error < knee, error.square() / 2, knee * (error - knee / 2)).mean()
@@ -59,9 +60,9 @@ def logarithmic(prediction: Tensor, target: Tensor) -> Tensor:
 def pyramid(prediction: Tensor, target: Tensor) -> Tensor:
     """Mean |p - t| of display-encoded images at 4 resolutions and 3 exposures, in [0, 1].
 
-    What a viewer sees of an error depends on how wide it is: eyes average fine noise away, above all that of colours,
-    and not what a patch is off by [Andersson et al. 2020, "FLIP", section 4.1, with boxes for their filters]. SSIM of
-    the structural distance takes patches' means off. Each resolution has half the pixels of the last, rounded up.
+    How visible an error is depends on its width: eyes average out fine noise, above all noise of colours, but not an
+    offset of a whole patch [Andersson et al. 2020, "FLIP", section 4.1, here with box filters]. The SSIM in the
+    structural distance subtracts the means of patches. Each resolution has half the pixels of the last, rounded up.
     """
     total = prediction.new_zeros(())
     for exposure in _EXPOSURES:

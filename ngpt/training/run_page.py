@@ -1,7 +1,7 @@
 """The page of a training run, written while it goes on, and the page that compares several. Needs no PyTorch.
 
-Of a folder it reads ``log.jsonl``, and as far as they are there ``settings.json``, ``run.json`` and the last
-``validation-STEP``: a page can be made of any run, at any time.
+It reads ``log.jsonl`` in the folder of a run, and ``settings.json``, ``run.json`` and the last ``validation-STEP`` if
+they exist: a page can be made of any run, at any time.
 """
 
 import base64
@@ -52,7 +52,7 @@ class Run:
 
     @property
     def steps(self) -> int:
-        """Those that it is to make; 0 where that is not known."""
+        """The number of steps that the run is to make; 0 if it is not known."""
         return int(self.settings.get("run", {}).get("steps", 0))
 
     @property
@@ -159,7 +159,7 @@ def _state(run: Run) -> str:
 
 
 def _plots(runs: list[Run]) -> dict[str, str]:
-    """Curves over the steps: of one run those of all its numbers, of several a line each."""
+    """Curves over the steps: for one run, curves of all its numbers; for several runs, one line for each run."""
     if len(runs) == 1:
         run = runs[0]
         error = {"network": run.line("relMSE"), "base": run.line("relMSE base"), "input": run.line("relMSE primal")}
@@ -233,7 +233,7 @@ def _key(run: Run) -> str:
 
 
 def _style(runs: list[Run]) -> str:
-    """Each picture once, as a background of which a strip shows one row."""
+    """Style rules that hold each picture once, as a background; a strip shows one row of it."""
     rules = [STYLE]
     for run in runs:
         if (found := _drawn(run)) is not None:

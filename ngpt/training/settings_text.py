@@ -4,7 +4,7 @@ from typing import Any
 
 
 def flat(values: dict[str, Any]) -> dict[str, Any]:
-    """Of "table.key" their value."""
+    """The settings as one dictionary: "table.key" -> value."""
     found: dict[str, Any] = {}
     for table, value in values.items():
         found |= {f"{table}.{key}": one for key, one in value.items()} if isinstance(value, dict) else {table: value}

@@ -11,7 +11,7 @@ Tensors, N crops of K inputs each, (N, K, H, W, C) unless said otherwise, scene-
     reference_caustic           (N, H, W, 3)
     reference_indirect, reference_direct    (N, H, W, 3)
     reference_halves            (N, 2, H, W, 3), optional: reference_indirect by each half of its samples
-    samples                     optional: those of each pixel, where inputs have them in different numbers
+    samples                     optional: the number of samples of each pixel, if it varies within inputs
     diffuse, diffuse_se, specular, specular_se    all or none: parts of indirect, where the sampler splits it
     motion                      (N, H, W, 2), optional: the layer of that name, floats, ``FAR`` where it is not known
     spp                         (N, K) samples per pixel, int32
@@ -61,18 +61,19 @@ FAR = 1e6
 # Types of numbers in safetensors
 _TYPES = {"F16": np.float16, "F32": np.float32, "F64": np.float64, "U8": np.uint8, "I32": np.int32, "I64": np.int64}
 
-# Share of the sum of absolute values that conversion to half floats may change; rounding alone takes about 1.8e-4.
+# Share of the sum of absolute values that conversion to half floats may change; plain rounding changes about 1.8e-4.
 MAX_LOSS = 1e-3
 
 
 @dataclass(frozen=True)
 class CropData:
-    """One crop as it was rendered: K finite stacks, and the converged image; None of a pair, which has no references.
+    """One crop as it was rendered: K finite stacks, and the converged image; None for a pair, which has no reference.
 
-    ``reference`` is all of it, ``reference_direct`` the emission seen directly in it, and ``reference_caustic`` what
-    the layer ``caustic`` of the stacks estimates; None where they have no such layer. ``halves`` are two independent
-    images, each of half of the reference's samples, without ``reference_caustic``; () where it was not made so.
-    ``motion`` (H, W, 2) is that of a frame of a shot, NaN where it is not known; None for single images.
+    ``reference`` is the whole converged image, ``reference_direct`` the emission seen directly in it, and
+    ``reference_caustic`` the light that the layer ``caustic`` of the stacks estimates; None if they have no such layer.
+    ``halves`` are two independent images, each from half of the reference's samples, without ``reference_caustic``; ()
+    if the reference was not made of halves. ``motion`` (H, W, 2) is the motion in a frame of a shot, NaN where it is
+    not known; None for single images.
     """
 
     stacks: Sequence[GradientStack]
@@ -152,7 +153,7 @@ def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]
     for name, tensor in tensors.items():
         if not np.isfinite(tensor).all():
             raise NgptError(f"{path}: tensor '{name}' has {np.sum(~np.isfinite(tensor))} values that are not finite")
-    # Of arrays in another order of memory safetensors writes the bytes as they lie there.
+    # safetensors writes the bytes as they lie in memory, so arrays must be contiguous in C order.
     tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
     data = save(tensors, {"ngpt": json.dumps(record)})
 

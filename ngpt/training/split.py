@@ -21,8 +21,9 @@ class Split(NamedTuple):
 def split(crops: Sequence[Any], validation: tuple[str, ...] = (), share: float = 0.0) -> Split:
     """Sets whole scenes aside for validation: those whose names begin with one of ``validation``.
 
-    Where that names none, it is a ``share`` of the scenes, at least one. A hash of the names chooses them, so that the
-    same set is always split the same way. Of a single scene it is a share of the crops; a single crop is trained on.
+    If ``validation`` is empty, a ``share`` of the scenes is set aside, at least one. A hash of the names chooses them,
+    so that the same set is always split the same way. With a single scene, a share of the crops is set aside; a single
+    crop is trained on.
 
     Pairs of scenes that are set aside are in neither part: they have no reference to measure by.
 

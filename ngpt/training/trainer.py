@@ -52,12 +52,12 @@ def show(text: str) -> None:
 class Trainer:
     """One run in the folder ``out``, new or continued.
 
-    ``crops`` and ``held_out`` are for training and validation, ``loss`` takes scene-linear prediction and target
-    (N, 3, H, W) and a generator of the step's random numbers; where there are pairs, what judges them too, and the
-    target is that of the others, None without. Files in ``out``: ``checkpoint.safetensors``, ``weights.safetensors``
-    (for inference), ``best.safetensors`` (those of the validation with the least error), ``log.jsonl``, ``log.csv``,
-    ``run.html``, ``tensorboard/``, ``validation-STEP.png``. Where crops are rendered meanwhile, as in a stream, no two
-    runs are alike.
+    ``crops`` and ``held_out`` are for training and validation. ``loss`` takes scene-linear prediction and target
+    (N, 3, H, W) and a generator of the step's random numbers. If there are pairs, it also takes what judges them, and
+    the target covers only the other examples, None if there are none. Files in ``out``: ``checkpoint.safetensors``,
+    ``weights.safetensors`` (for inference), ``best.safetensors`` (the weights with the least validation error),
+    ``log.jsonl``, ``log.csv``, ``run.html``, ``tensorboard/``, ``validation-STEP.png``. If crops are rendered
+    meanwhile, as in a stream, no two runs are alike.
     """
 
     def __init__(
@@ -267,7 +267,7 @@ class Trainer:
         return values | {f"loss {name}": float(part.detach()) for name, part in parts.items()}
 
     def _batches(self) -> Iterator[dict[str, Tensor]]:
-        """The batches from the current step on; those of this process."""
+        """The batches of this process, from the current step on."""
         run, processes = self.settings.run, self.processes
         size = run.batch // processes.count
         first = self.step * run.batch

@@ -31,7 +31,7 @@ def _spread(layers: Mapping[str, Value], depth: Value, scale: Value) -> Value:
     light, variance = layers["caustic"] / scale, layers["caustic_var"] / scale / scale
     own = light * light
     known = op.And(finite(variance), op.GreaterOrEqual(variance, 0.0))
-    # What is not known of a variance is that of an estimate that is all noise.
+    # Where the variance is not known, the estimate counts as pure noise.
     noise = op.ReduceMean(op.Where(known, op.Min(variance, LOUDEST), own), [1], keepdims=1)
     floor = op.ReduceMean(own, keepdims=0) * 1e-12 + 1e-37
     surfaces = _surfaces(layers, depth)

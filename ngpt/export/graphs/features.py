@@ -9,9 +9,10 @@ from ngpt.network.features import ENLARGED, GLOSS, IMAGES, LEAST_DEPTH, NOISE_EN
 
 
 def normalised(finite: Mapping[str, Value], names: tuple[str, ...], exposure: Value, depth: Value) -> dict[str, Value]:
-    """Those of the layers ``names`` that are inputs of the graph (the base is none), or the roots of such.
+    """The layers among ``names`` that are inputs of the graph, or square roots of inputs; the base is not an input.
 
-    Radiance is over the exposure, depth over the image's largest. ``finite`` are the inputs, all but variances finite.
+    Radiance is divided by the exposure, depth by the image's largest depth. ``finite`` are the inputs, all finite
+    except for variances.
     """
     scaled = {}
     for name in names:
@@ -27,7 +28,7 @@ def normalised(finite: Mapping[str, Value], names: tuple[str, ...], exposure: Va
 
 
 def completed(scaled: Mapping[str, Value], inputs: tuple[str, ...]) -> dict[str, Value]:
-    """The layers with what is computed of them, for those of ``inputs`` that are; before any padding."""
+    """The layers, and those ``inputs`` that are computed from them; before any padding."""
     return dict(scaled) | {name: _computed(name, scaled, compared(inputs)) for name in inputs if name in SOURCES}
 
 

@@ -53,7 +53,7 @@ def layers(config: ModelConfig) -> tuple[str, ...]:
 
 
 def optional(config: ModelConfig) -> tuple[str, ...]:
-    """Those that may be zeros everywhere."""
+    """The layers that may be zero everywhere."""
     return tuple(name for name in layers(config) if name in ("direct", *_APART))
 
 

@@ -10,7 +10,7 @@ from ngpt.network.padding import MARGIN
 class Side:
     """One side of an image, padded: for each place the pixel that lies there, and its difference to the next.
 
-    ``axis``     which it is, of (N, C, H, W)
+    ``axis``     its axis in (N, C, H, W)
     ``size``     pixels of the side, a scalar
     ``here``     which pixel lies at each place
     ``nearest``  which difference stands between there and the next place
@@ -24,7 +24,7 @@ class Side:
     step: Value
 
     def borders(self, values: Value, more: int) -> tuple[Value, Value]:
-        """What of one of these lies before the image, and what after all of it but ``more`` pixels."""
+        """The entries of ``values`` before the image, and the entries after all of the image but ``more`` pixels."""
         last = op.Reshape(self.size + (MARGIN - more), [1])
         return op.Slice(values, [0], [MARGIN], [0]), op.Slice(values, last, [END], [0])
 
@@ -62,7 +62,7 @@ def _pixels(layer: Value, side: Side) -> Value:
 
 
 def _differences(layer: Value, side: Side, signed: bool) -> Value:
-    """The same for differences along that side. The last of them leads out of the image, and belongs to the border."""
+    """``_pixels`` for differences along that side. The last difference leads out of the image; it is in the border."""
     steps = [
         op.Reshape(step if signed else abs(step), [-1, 1] if side.axis == 2 else [-1])
         for step in side.borders(side.step, 1)

@@ -57,7 +57,7 @@ def repaired(raw: Mapping[str, Value], gradients: bool) -> Repaired:
     layers["primal"] = filled(rest if gradients else light)
     if gradients and "caustic" in raw:
         layers["caustic"] = filled(raw["caustic"])
-    # Where the camera sees an emitter, the primal's variance is that of primal and direct emission together.
+    # Where the camera sees an emitter, the primal's variance includes the direct emission.
     known = {"primal_var": op.And(good, _everywhere(op.Equal(direct, 0.0), 1))}
     trusted = {}
     for name, axis in (("dx", 3), ("dy", 2)):
@@ -115,6 +115,6 @@ def _mean(sums: Value, otherwise: Value | float) -> Value:
 
 
 def _spread(blocks: Value, like: Value) -> Value:
-    """What each block holds, at all of its pixels."""
+    """The value of each block, at all of its pixels."""
     rows, columns = (op.Range(0, op.Squeeze(op.Shape(like, start=a, end=a + 1)), 1) / BLOCK for a in (2, 3))
     return op.Gather(op.Gather(blocks, rows, axis=2), columns, axis=3)

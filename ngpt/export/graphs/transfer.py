@@ -14,7 +14,7 @@ def signed_log(x: Value) -> Value:
 
 
 def signed_log_for_networks(x: Value) -> Value:
-    """The same to 6e-8, which networks do not see, in half the nodes."""
+    """``signed_log`` to 6e-8, in half the nodes; networks do not see the difference."""
     return op.Sign(x) * log_for_networks(abs(x))
 
 

@@ -7,9 +7,10 @@ from ngpt.export.graphs.repair import finite
 
 
 def smoothed(primal: Value, primal_var: Value, dx_var: Value, dy_var: Value) -> tuple[Value, Value]:
-    """Twice the mean over 3x3 values that are known, where there are none the mean of all; and ``inside``.
+    """The mean over 3x3 known values, taken twice; where none is known, the mean of all values; and ``inside``.
 
-    Of differences, means of fourth roots, and what is larger than ``TYPICAL`` times their fourth power stays as it is.
+    For differences it is the mean of fourth roots. Values larger than ``TYPICAL`` times its fourth power stay as they
+    are.
     """
     there = inside(primal)
     (vp, gp), (vx, gx), (vy, gy) = (_over_colours(layer) for layer in (primal_var, dx_var, dy_var))
@@ -42,7 +43,7 @@ def robust_mean(values: Value, there: Value) -> Value:
         mean = op.ReduceSum(_rows(op.Min(used, last * float(CLIP))), keepdims=0) / count
         return mean, op.Less(mean, last * 0.5)
 
-    # In place of infinity, the largest number of which CLIP times are one.
+    # In place of infinity, the largest number whose CLIP-fold is still finite.
     return repeat(64, clipped, count * 0.0 + 3e36, ())
 
 

@@ -12,7 +12,7 @@ from torch.nn.functional import avg_pool2d
 
 SCALES = 8
 OFFSET = 7
-# Sides of images after downscaling, at least; half of what E-LPIPS has, whose images are not cut from crops of 114.
+# The least side of an image after downscaling. E-LPIPS has twice as much; its images are not cut from crops of 114.
 SMALLEST = 32
 _PERMUTATIONS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
 

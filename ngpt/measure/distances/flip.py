@@ -33,7 +33,7 @@ _TO_XYZ = torch.tensor(
 )
 _TO_RGB = torch.linalg.inv(_TO_XYZ)
 _WHITE = _TO_XYZ.sum(1)
-# Of ACES' curve as HDR-FLIP has it: (a x² + b x) / (c x² + d x + e).
+# The coefficients of the ACES curve in HDR-FLIP: (a x² + b x) / (c x² + d x + e).
 _ACES = (0.6 * 0.6 * 2.51, 0.6 * 0.03, 0.6 * 0.6 * 2.43, 0.6 * 0.59, 0.14)
 
 
