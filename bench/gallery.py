@@ -34,7 +34,6 @@ PAGE = ROOT / "docs" / "gallery.md"
 RESULT = ROOT / "bench" / "results" / "gallery.json"
 MARKS = ("<!-- python -m bench.gallery: rows -->", "<!-- rows ends -->")
 REFERENCE_SEED = 1 << 20
-NO_GRADIENTS = ("primal", "bdpt", "vcm")
 WIPE_FRAMES, WIPE_MS, REST_MS = 24, 60, 1400  # of the moving line; milliseconds of a frame, and at each end
 
 
@@ -142,9 +141,7 @@ def rendered(args: argparse.Namespace, row: Shown, sampler: str, spp: int, seed:
         stack, _ = data_gen.render_scene(path, spp, seed, sampler, size=tuple(args.size), unbiased=unbiased)
         stack.attributes["gallery:seconds"] = time.process_time() - start
         ngpt.write(file, stack)
-    # Without gradients beside it the reader takes the name "direct" for direct light.
-    stack = ngpt.read(file)
-    return ngpt.read(file, {"direct": "direct"}) if stack.attributes.get("ngpt:sampler") in NO_GRADIENTS else stack
+    return ngpt.read(file)
 
 
 def table(found: dict[str, Any]) -> str:

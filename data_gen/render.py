@@ -24,7 +24,7 @@ from data_gen.scenes.cameras import place_of
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import check_scene
-from data_gen.tails.schedule import FIRST, LEAST_MIB, LEAST_PATHS, MIB
+from data_gen.tails.schedule import LEAST_MIB, MIB, enough
 from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
 from ngpt.io.exr import with_channels
 from ngpt.merging import UNFINISHED
@@ -154,7 +154,7 @@ def render_stack(
 def _enough_to_share(scene: mi.Scene, budget: Budget) -> bool:
     """Whether a render has paths and memory enough for a cache that they share."""
     pixels = math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
-    return pixels * (budget.spp or FIRST) >= LEAST_PATHS and budget.memory >= LEAST_MIB
+    return enough(pixels, budget.spp) and budget.memory >= LEAST_MIB
 
 
 def options_as_attribute(entry: Entry, settings: dict[str, Any]) -> dict[str, str]:

@@ -24,8 +24,8 @@ from data_gen.choosing.pipelines import Pipeline, choose, measure, methods_for
 from data_gen.choosing.trials import PIXELS, Trial, at_most, candidates, try_all
 from data_gen.passes import film_within
 from data_gen.samplers import SAMPLERS
-from data_gen.scenes.facts import scene_facts
-from data_gen.tails.schedule import FIRST, LEAST_PATHS
+from data_gen.scenes.facts import Facts, scene_facts
+from data_gen.tails.schedule import enough
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS
 from ngpt.system.console import brief
@@ -178,10 +178,11 @@ def plan(
     if ranked := choose(whole, left):
         first = ranked[0]
         return Plan(first.sampler, first.method, first.shared, left - first.after, _why(ranked, left))
-    if method in ("auto", _ROOM_METHOD) and in_a_room(scene, None):
+    facts = scene_facts(scene)
+    if method in ("auto", _ROOM_METHOD) and in_a_room(scene, facts, None):
         sampler, method, why = "primal", _ROOM_METHOD, _ROOM_REASON
     else:
-        sampler, why = able[0], samplers.choose(scene_facts(scene))[1]
+        sampler, why = able[0], samplers.choose(facts)[1]
     after = _beside(scene) + _METHOD_SECONDS.get(method, _OTHERS) * _pixels(scene) / 1e6
     # However slow the method may be here, half of the time is rendered.
     return Plan(sampler, method, False, max(left - after, left / 2, 1e-3), f"{why}; there is no time for a pilot")
@@ -207,9 +208,10 @@ def plan_sampler(
     before anything is tried where the image does not fit into ``memory`` (MiB).
     """
     start = time.perf_counter()
-    sampler, reason = samplers.choose(scene_facts(scene))
+    facts = scene_facts(scene)
+    sampler, reason = samplers.choose(facts)
     described = Plan(sampler, "", False, seconds, reason)
-    if not gradients and in_a_room(scene, spp):
+    if not gradients and in_a_room(scene, facts, spp):
         # One sample has no variance, which the method needs.
         method = _ROOM_METHOD if spp != 1 else ""
         return replace(described, sampler="primal", method=method, reason=_ROOM_REASON)
@@ -240,16 +242,14 @@ def plan_sampler(
     return replace(described, sampler=found[0], reason=found[1], render=left)
 
 
-def in_a_room(scene: mi.Scene, spp: int | None) -> bool:
+def in_a_room(scene: mi.Scene, facts: Facts, spp: int | None) -> bool:
     """Whether ``primal`` and ``ngpt-primal`` leave less error and FLIP than gradients would, after the same whole time.
 
     They do in rooms of surfaces, where paths share their tails (docs/lab/worth.md). Small images are the same to both,
     and without OIDN gradients clean better.
     """
-    facts = scene_facts(scene)
-    paths = _pixels(scene) * (spp or FIRST)
     able = samplers.choose(facts)[0] == "gpt" and not facts.media and not SAMPLERS["primal"].refuses(facts)
-    return able and paths >= LEAST_PATHS and not METHODS[_ROOM_METHOD].missing() and enclosed(scene)
+    return able and enough(_pixels(scene), spp) and not METHODS[_ROOM_METHOD].missing() and enclosed(scene)
 
 
 def _pixels(scene: mi.Scene) -> int:

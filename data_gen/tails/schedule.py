@@ -18,6 +18,11 @@ FINENESS, _RATE = 16.0, 1 / 6
 NEAR = 1 / 8
 
 
+def enough(pixels: int, spp: int | None) -> bool:
+    """Whether a render of so many pixels has paths enough for a cache; without ``spp``, by the first round."""
+    return pixels * (spp or FIRST) >= LEAST_PATHS
+
+
 def end_of_round(sample: int) -> int:
     """The number of the first sample that is in a later round than ``sample``."""
     return FIRST if sample < FIRST else 1 << sample.bit_length()

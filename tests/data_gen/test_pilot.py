@@ -122,6 +122,20 @@ def test_short_renders_are_not_measured(renderer, monkeypatch):
         assert choice.sampler == "gpt" and "too short" in choice.reason and choice.render == seconds
 
 
+@pytest.mark.parametrize("walls", [1, -1])
+def test_a_room_is_one_whichever_way_its_walls_face(renderer, walls):
+    """And a floor beneath the open sky is none."""
+    from data_gen.choosing.enclosed import enclosed
+
+    to = renderer.ScalarTransform4f()
+    camera = {"type": "perspective", "fov": 60, "film": {"type": "hdrfilm", "width": 8, "height": 8}}
+    camera["to_world"] = to.look_at([0, 0, 0.5], [0.3, -0.4, 0], [0, 1, 0])
+    room = {"type": "cube", "flip_normals": walls < 0}
+    floor = {"type": "rectangle", "to_world": to.translate([0, -1, 0]).scale(9).rotate([1, 0, 0], -90 * walls)}
+    assert enclosed(renderer.load_dict({"type": "scene", "camera": camera, "room": room}))
+    assert not enclosed(renderer.load_dict({"type": "scene", "camera": camera, "floor": floor}))
+
+
 def test_rooms_are_rendered_without_gradients(renderer, monkeypatch):
     """Where the renders have paths enough to share, nothing asks for gradients, and OIDN is there."""
     from data_gen.choosing import plans
