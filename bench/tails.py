@@ -239,7 +239,7 @@ def show(cells: list[dict], groups: dict[str, list[str]]) -> None:
             print(f"\n{title}")
             table(head, lines)
     for tails in sorted({cell["tails"] for cell in cells}):
-        print(f"\npipelines after equal whole time, tails={tails}: error and FLIP over those of `primal` and `oidn`")
+        print(f"\npipelines after equal whole time, tails={tails}: error and FLIP relative to `primal` with `oidn`")
         table(["scenes", "processor s", *pipelines(), "mitsuba+oidn"], against_oidn(cells, tails, groups))
     loads = [cell["load average"] for cell in cells]
     print(f"\nload average {min(loads):.1f} to {max(loads):.1f}")
