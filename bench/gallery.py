@@ -44,7 +44,7 @@ class Shown(NamedTuple):
     spp: int = 16
     sampler: str = "auto"
     reference: str = "primal"
-    reference_spp: int = 64  # of each half
+    reference_spp: int = 256  # of each half
 
 
 SCENES_SHOWN = (
@@ -54,9 +54,9 @@ SCENES_SHOWN = (
     Shown("lens"),
     Shown("living-room/scene.xml"),
     Shown("kitchen/scene.xml"),
-    Shown("haze", reference_spp=32),
+    Shown("haze", reference_spp=64),
     Shown("lamp/scene.xml"),
-    Shown("veach-bidir/scene.xml", 64, "gbdpt", "bdpt"),
+    Shown("veach-bidir/scene.xml", 64, "gbdpt", "bdpt", 64),
     Shown("coffee/scene.xml"),
     Shown("bedroom/scene.xml"),
     Shown("classroom/scene.xml", 4),
