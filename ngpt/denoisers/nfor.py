@@ -77,7 +77,7 @@ def estimated_variance(image: np.ndarray) -> np.ndarray:
     """The variance of an image (H, W, 3) that comes without, by what sets pixels apart from the median of 3 x 3.
 
     What is finer than that counts as noise. It leaves 1.3 to 1.7 times the error of true variances at 4 and 16 spp; a
-    second estimate, by what is left to the first result, is no better (docs/lab/log/2026-W47.md).
+    second estimate, by what is left to the first result, is no better (docs/lab/log/2026-W48.md).
     """
     squares = (image.astype(np.float64) - ndimage.median_filter(image, (3, 3, 1), mode="nearest")) ** 2
     for _ in range(2):
