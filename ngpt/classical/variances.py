@@ -33,7 +33,7 @@ TYPICAL = 3
 
 # The factor on the variance of differences relative to the primal's. Neighbouring pixels share paths, so errors of
 # differences cancel in the sums that a reconstruction takes. Means of differences over blocks of 8x8 have .56 to .92 of
-# the variance that independent differences would have (docs/lab/log/2026-W47.md). Means of the primal have .8 to 1.
+# the variance that independent differences would have (96x64, eight scenes). Means of the primal have .8 to 1.
 # Among 1, .7, .5 and .35, wcv and wl2 have the least error with .7 at 4 samples and with .35 to .5 from 16 on
 # (docs/lab/log).
 SHARED = 0.6
