@@ -41,12 +41,6 @@ def test_nonfinite_samples_have_no_weight_and_are_counted(renderer, rng):
     assert np.isnan(layer[1]).all()  # nothing is known about it, which must not look like black
 
 
-def test_a_single_sample_has_no_variance(renderer, rng):
-    target = film(2, 2)
-    fill(renderer, target, rng.random((4, 1, 3)))
-    assert set(target.develop()) == {"primal"}
-
-
 def test_gradients_are_half_of_each_direction(renderer, rng):
     """Forward from a pixel, and backward from the next one; their variances are those of the means."""
     target, names = film(4, 3), ("dx+", "dx-", "dy+", "dy-")
