@@ -41,9 +41,9 @@ def rendered(shot, frames, **options):
 def test_a_frame_is_the_same_whatever_others_are_rendered(renderer, tmp_path):
     """And whether differences in time, for which scenes of before are loaded again, are rendered beside it."""
     paired = rendered(shot(tmp_path), range(1, 4), dt=2)
-    last = rendered(shot(tmp_path), range(1, 4), skip=lambda frame: frame < 3, dt=2)
+    last = rendered(shot(tmp_path), range(1, 4), skip=lambda frame: frame == 2, dt=2)
     farm = rendered(shot(tmp_path), range(2, 4))
-    assert list(last) == [3] and list(farm) == [2, 3]
+    assert list(last) == [1, 3] and list(farm) == [2, 3]
     assert all(np.array_equal(last[3][name], paired[3][name], equal_nan=True) for name in paired[3].names)
     for frame, stack in farm.items():
         assert set(paired[frame].names) - set(stack.names) == {"dt", "dt_var"}
