@@ -2,10 +2,13 @@
 
 import gc
 import logging
+import shlex
 from collections import Counter
 from functools import wraps
 
 import pytest
+
+from ngpt.cli import main
 
 
 class Recordings:
@@ -54,3 +57,22 @@ def kernels_are_recorded_once(request):
     log.removeHandler(handler)
     if lines and "recorded_anew" not in request.keywords:
         pytest.fail("; ".join(lines))
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capsys):
+    """Runs a command line in an empty folder, checks its exit status (0, or one of others), returns its errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(line, *status):
+        capsys.readouterr()
+        try:
+            found = main(shlex.split(line))
+        except SystemExit as stop:  # of the parser
+            found = stop.code
+        printed = capsys.readouterr()
+        assert found in (status or (0,)), printed.err
+        run.output = printed.out
+        return printed.err
+
+    return run

@@ -1,30 +1,46 @@
-"""Samples shared out by the error of the result."""
+"""Samples shared out by the error of the result: ``ngpt render --adaptive`` and ``--error``."""
 
+import json
+from functools import cache
 from itertools import count
 
 import numpy as np
 import pytest
 from unbiased import load, same
 
-from ngpt.errors import NgptError
+import ngpt
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
+
+pytest.importorskip("mitsuba")
+
+from data_gen import adaptive, passes
+from data_gen.adaptive import Adaptive, assess, share_out
+from data_gen.choosing import plans
+from data_gen.render import render_stack
 
 SIZE = (24, 16)
 
 
 def render(mi, spp, seed=0, scene="glossy", sampler="gpt", error=None, method="wcv", **options):
-    from data_gen.adaptive import Adaptive
-    from data_gen.render import render_stack
-
     scene = load(mi, scene, SIZE) if isinstance(scene, str) else scene
     return render_stack(scene, spp, seed, sampler, adaptive=Adaptive(error, method), **options)
 
 
-def test_counts_are_proportional_to_what_is_needed(renderer, rng):
-    from data_gen.adaptive import share_out
+@pytest.fixture(scope="module")
+def converged(renderer):
+    """Two independent images of a scene at 48x32."""
 
+    @cache
+    def images(scene):
+        loaded = load(renderer, scene, (48, 32))
+        return [render_stack(loaded, 512, 100 + i, "primal", with_features=False)["primal"] for i in range(2)]
+
+    return images
+
+
+def test_counts_are_proportional_to_what_is_needed(renderer, rng):
     need, n = rng.lognormal(size=5000), np.full(5000, 16)
     after = n + 16 * share_out(need, n, 5000 * 1600)
     assert after.sum() == pytest.approx(5000 * 1616, rel=0.01)
@@ -40,8 +56,6 @@ def test_counts_are_proportional_to_what_is_needed(renderer, rng):
 
 
 def test_the_mean_number_is_kept_and_passes_are_not_seen(renderer, monkeypatch):
-    from data_gen import passes
-
     stack = render(renderer, 40, 3)
     samples = stack["samples"]
     assert samples.mean() == 40 and samples.min() == 16 and samples.max() > 60
@@ -51,25 +65,11 @@ def test_the_mean_number_is_kept_and_passes_are_not_seen(renderer, monkeypatch):
     monkeypatch.setattr(passes, "PASS_SECONDS", 0.3)
     same(stack, render(renderer, 40, 3, progress=lambda *call: calls.append(call)))
     assert calls[0] == (0, 40) and calls[-1] == (40, 40) and len(calls) > 5
-
-
-def test_what_ends_it_is_not_seen(renderer, monkeypatch):
-    """By Ctrl-C it is the beginning of any longer render: the same number of samples gives the same counts."""
-    from data_gen import passes
-
-    monkeypatch.setattr(passes, "PASS_SECONDS", 0.3)
-    calls = []
-    stopped = render(renderer, 1 << 20, 3, stop=lambda: len(calls) > 7, progress=lambda *call: calls.append(call))
-    mean = stopped["samples"].mean() if "samples" in stopped else stopped.attributes["ngpt:spp"]
-    if mean >= 33:
-        few, many = (s["samples"].astype(int) for s in (render(renderer, int(mean), 3), stopped))
-        assert (few <= many).all() and (many - few).sum() < few.size + 16
+    assert render(renderer, 1 << 20, 3, stop=lambda: True).attributes["ngpt:spp"] == 16
 
 
 def test_time_is_kept(renderer, monkeypatch):
     """On a clock that a look at it takes forward, whatever the machine is at."""
-    from data_gen import adaptive
-
     looks = count()
     monkeypatch.setattr(adaptive.time, "perf_counter", lambda: 0.05 * next(looks))
     stack = render(renderer, None, 3, load(renderer, "diffuse", SIZE), seconds=2.0)
@@ -79,8 +79,6 @@ def test_time_is_kept(renderer, monkeypatch):
 
 def test_a_firefly_gets_no_samples_for_all_around_it(renderer, rng):
     """A pixel whose noise is a thousand times that of others is one pixel, and left out of the error of all."""
-    from data_gen.adaptive import assess
-
     primal = rng.uniform(0.5, 1.0, (48, 48, 3)).astype(np.float32)
     variance = np.full_like(primal, 1e-4)
     calm = assess(GradientStack({"primal": primal, "primal_var": variance}), "primal")
@@ -92,8 +90,6 @@ def test_a_firefly_gets_no_samples_for_all_around_it(renderer, rng):
 
 def test_what_a_choice_takes_is_known_ahead(renderer, monkeypatch):
     """A method that takes long for its pixels is not begun where it would end too late."""
-    from data_gen import adaptive
-
     calls = []
 
     def slow(stack, method):
@@ -115,13 +111,9 @@ def test_what_a_choice_takes_is_known_ahead(renderer, monkeypatch):
     assert adaptive.seconds_to_assess(GradientStack({"primal": stack["primal"][:79, :80]}), "primal") == 0.0
 
 
-def test_samples_go_where_the_error_is(renderer):
+def test_samples_go_where_the_error_is(renderer, converged):
     """The same number makes a better image, by the method they were meant for."""
-    from data_gen.render import render_stack
-
-    scene = load(renderer, "glossy", (48, 32))
-    halves = [render_stack(scene, 512, 100 + i, "primal", with_features=False)["primal"] for i in range(2)]
-    errors = []
+    scene, halves, errors = load(renderer, "glossy", (48, 32)), converged("glossy"), []
     for seed in range(3):
         stacks = (render_stack(scene, 96, seed, "gpt"), render(renderer, 96, seed, scene))
         errors.append([relmse_trimmed(reconstruct(stack, "wcv").image, *halves) for stack in stacks])
@@ -132,8 +124,6 @@ def test_samples_go_where_the_error_is(renderer):
 @pytest.mark.slow
 def test_samples_that_choose_hardly_bias_the_mean(renderer, monkeypatch):
     """They stay in the means: were each pixel judged by its own noise alone, the image would be too dark."""
-    from data_gen import adaptive
-    from data_gen.render import render_stack
 
     def by_pixel(stack, method):
         return adaptive.Assessment(np.sqrt(stack["primal_var"].sum(axis=-1)).ravel(), 1.0, method)
@@ -165,11 +155,8 @@ def test_gradients_are_shared_out_by_what_is_quick(renderer):
 
 
 @pytest.mark.parametrize("sampler", ["primal", "gpt"])
-def test_an_error_is_reached(renderer, sampler):
-    from data_gen.render import render_stack
-
-    scene = load(renderer, "diffuse", (48, 32))
-    halves = [render_stack(scene, 512, 100 + i, "primal", with_features=False)["primal"] for i in range(2)]
+def test_an_error_is_reached(renderer, converged, sampler):
+    scene, halves = load(renderer, "diffuse", (48, 32)), converged("diffuse")
     method = "primal" if sampler == "primal" else "wcv"
     stack = render(renderer, None, 1, scene, sampler, 0.1, method)
     assert 0.05 < stack.attributes["ngpt:error"] <= 0.1
@@ -178,19 +165,31 @@ def test_an_error_is_reached(renderer, sampler):
     assert ended["samples"].mean() == 32 and ended.attributes["ngpt:error"] > 1e-4
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"spp": 31}, "31 samples per pixel are too few .* from 32 on"),
-        ({"spp": 64, "sampler": "bdpt"}, "'bdpt' depend on each other.* use: gpt, gpt-basic, gpt-simple, primal"),
-        ({"spp": 64, "sampler": "gbdpt"}, "'gbdpt' depend on each other"),
-        ({"spp": 64, "reuse": True}, "'reuse' and 'shift=manifold' need samples of all pixels"),
-        ({"spp": None, "error": 0.0}, "an error of 0 is never reached"),
-        ({"spp": None}, "neither a number of samples"),
-        ({"spp": 64, "method": "magic"}, "unknown method 'magic'"),
-        ({"spp": 64, "sampler": "primal", "method": "l1"}, "needs"),
-    ],
-)
-def test_refusals(renderer, options, message):
-    with pytest.raises(NgptError, match=message):
-        render(renderer, **({"scene": "diffuse"} | options))
+def test_an_error_and_counts_are_said_and_written(renderer, command):
+    options = "--size 24x16 --for wcv --sampler gpt --spp 48 --json"
+    said = command(f"render diffuse -o error.exr --error 0.5 {options}")
+    assert "'wcv' is expected to have an error of" in said
+    assert json.loads(command.output)["adaptive"] == "wcv" and json.loads(command.output)["error"] <= 0.5
+    command(f"render diffuse -o stack.exr --adaptive {options}")
+    stack = ngpt.read("stack.exr")
+    assert stack.attributes["ngpt:spp"] == 48 and stack["samples"].mean() == 48 and stack["samples"].max() > 48
+    command("info stack.exr")
+    assert "samples" in command.output
+
+
+def test_a_pilot_chooses_for_a_method(renderer, command, monkeypatch):
+    """What it chose is rendered, in the time that is left, and written down."""
+    asked = []
+
+    def plan(scene, seconds, method, memory, **told):
+        asked.append((seconds, method))
+        return plans.Plan("primal", "oidn", True, 1.5, "for a test")
+
+    monkeypatch.setattr(plans, "plan", plan)
+    said = command("render diffuse -o stack.exr --size 24x16 --time 60 --for auto")
+    assert asked == [(60.0, "auto")] and "method 'oidn': for a test" in said
+    assert "then: ngpt denoise stack.exr, which takes method 'oidn'" in said
+    attributes = ngpt.read("stack.exr").attributes
+    assert attributes["ngpt:for"] == "oidn" and attributes["ngpt:sampler"] == "primal"
+    # The first 16 samples of those that are shared out are rendered in any case, and may have taken all the time.
+    assert "samples shared out" in said and attributes["ngpt:spp"] >= 16 and attributes["ngpt:seconds"] < 50

@@ -1,20 +1,23 @@
 """``ngpt advise``: by a pilot of this scene, for a time or an error."""
 
 import json
-import shlex
+from itertools import count
+from pathlib import Path
 
 import pytest
 
 import ngpt
-from ngpt.cli import main
+
+pytest.importorskip("mitsuba")
+
+from data_gen.choosing import pipelines, plans
+from data_gen.choosing.pipelines import Pipeline, usual_fall
+from data_gen.scenes.load import load_scene
 
 
 @pytest.fixture
 def seen(renderer, monkeypatch):
     """A scene in which samples of two samplers leave known errors."""
-    from data_gen.choosing import plans
-    from data_gen.choosing.pipelines import Pipeline, usual_fall
-
     usual = {m: usual_fall("gpt", m) for m in ("wcv", "primal", "l1")}
     found = [
         Pipeline("primal", "primal", 16, 0.02, usual["primal"], 0.001, 0.0),
@@ -26,13 +29,19 @@ def seen(renderer, monkeypatch):
     return found
 
 
-def advice(capsys, *goal):
-    assert main(["advise", "diffuse", "--size", "32x24", "--json", "-q", *goal]) == 0
-    return json.loads(capsys.readouterr().out)["advice"]
+@pytest.fixture
+def advice(command):
+    """The rows of ``ngpt advise`` for a goal."""
+
+    def rows(goal):
+        command(f"advise diffuse --size 32x24 --json -q {goal}")
+        return json.loads(command.output)["advice"]
+
+    return rows
 
 
-def test_the_least_error_in_a_time(seen, capsys):
-    rows = advice(capsys, "--seconds", "0.1")
+def test_the_least_error_in_a_time(seen, advice):
+    rows = advice("--seconds 0.1")
     assert [(r["sampler"], r["method"], r["adaptive"]) for r in rows] == [
         ("primal", "primal", False),
         ("gpt", "wcv", False),
@@ -40,14 +49,12 @@ def test_the_least_error_in_a_time(seen, capsys):
     ]
     assert rows[0]["spp"] in (99, 100) and rows[0]["error"] == pytest.approx(0.02 * 16 / 100, rel=0.02)
     assert all(row["seconds"] <= 0.1 + 1e-9 for row in rows)
-    best = advice(capsys, "--seconds", "1")[0]
+    assert all(row["low"] < row["error"] < row["high"] for row in rows)
+    best = advice("--seconds 1")[0]
     assert (best["sampler"], best["method"], best["adaptive"]) == ("gpt", "wcv", True)
 
 
-def test_the_pilot_takes_no_longer_than_the_time_it_advises_on(renderer, capsys, monkeypatch):
-    from data_gen.choosing import plans
-    from data_gen.choosing.pipelines import Pipeline
-
+def test_the_pilot_takes_no_longer_than_the_time_it_advises_on(renderer, advice, monkeypatch):
     asked = []
 
     def explore(scene, seconds, **options):
@@ -57,19 +64,14 @@ def test_the_pilot_takes_no_longer_than_the_time_it_advises_on(renderer, capsys,
 
     monkeypatch.setattr(plans, "explore", explore)
     # One pilot each, however slow the machine is.
-    for goal in (("--seconds", "1"), ("--seconds", "40"), ("--seconds", "900"), ("--error", "0.01")):
-        advice(capsys, *goal)
+    for goal in ("--seconds 1", "--seconds 40", "--seconds 900", "--error 0.01"):
+        advice(goal)
     # Kernels take some seconds whatever is to be advised on.
     assert asked == pytest.approx([12, 40, 60, 60])
 
 
 def test_on_a_busy_machine_one_sampler_is_tried_and_no_more(renderer, monkeypatch):
     """Every look at the clock is a second late: nothing fits, and the first trial ends all the same."""
-    from itertools import count
-
-    from data_gen.choosing import plans
-    from data_gen.scenes.load import load_scene
-
     scene, seconds = load_scene("diffuse", (48, 32)), count()
     monkeypatch.setattr(plans, "candidates", lambda scene: ["gpt", "bdpt"])
     found = plans.explore(scene, 30.0, clock=lambda: float(next(seconds)), patient=True)
@@ -77,50 +79,42 @@ def test_on_a_busy_machine_one_sampler_is_tried_and_no_more(renderer, monkeypatc
     assert plans.explore(scene, 30.0, clock=lambda: float(next(seconds))) == []
 
 
-def test_what_is_expected_comes_with_where_it_may_lie(seen, capsys):
-    rows = advice(capsys, "--seconds", "0.5")
-    assert all(row["low"] < row["error"] < row["high"] for row in rows)
-    # The further beyond the pilot's samples, the less is known, and least about networks with gradients.
-    from data_gen.choosing.pipelines import Pipeline
+def test_the_further_beyond_the_samples_of_a_pilot_the_less_is_known():
+    """And least about networks with gradients."""
 
     combine, wcv = (Pipeline("gpt", name, 16, 0.01, -0.9, 0.001, 0.0) for name in ("ngpt-combine", "wcv"))
     spreads = [p.likely(spp)[1] / p.expected(spp) for p in (combine, wcv) for spp in (8, 16, 64, 256, 4096)]
     assert spreads == pytest.approx([2.3, 2.3, 3.2, 5.1, 5.1, 1.8, 1.8, 2.4, 2.6, 2.6])
 
 
-def test_the_least_time_to_an_error(seen, capsys):
-    rows = advice(capsys, "--error", "0.001")
+def test_the_least_time_to_an_error(seen, advice, command):
+    rows = advice("--error 0.001")
     assert all(row["error"] <= 0.001 * (1 + 1e-9) for row in rows)
     assert [row["seconds"] for row in rows] == sorted(row["seconds"] for row in rows)
     assert rows[0]["adaptive"] and rows[0]["spp"] < rows[-1]["spp"]
-    for wrong, message in ((("--seconds", "1e-9"), "nothing fits into"), (("--error", "1e-12"), "no method reaches")):
-        assert main(["advise", "diffuse", "--size", "32x24", *wrong]) == 1
-        assert message in capsys.readouterr().err
+    for wrong, message in (("--seconds 1e-9", "nothing fits into"), ("--error 1e-12", "no method reaches")):
+        assert message in command(f"advise diffuse --size 32x24 {wrong}", 1)
 
 
-def test_the_commands_of_a_pilot_run_as_printed(seen, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "my scene").mkdir()
-    scene = tmp_path / "my scene" / "a box.xml"
-    scene.write_text(BOX)
-    assert main(["advise", str(scene), "--size", "16x12", "--seconds", "0.4", "-D", "light=3", "-q"]) == 0
-    render, denoise = (line for line in capsys.readouterr().out.splitlines() if line.startswith("ngpt "))
+def test_the_commands_of_a_pilot_run_as_printed(seen, command):
+    Path("my scene").mkdir()
+    Path("my scene/a box.xml").write_text(BOX)
+    command("advise 'my scene/a box.xml' --size 16x12 --seconds 0.4 -D light=3 -q")
+    render, denoise = (line for line in command.output.splitlines() if line.startswith("ngpt "))
     for line in (render, denoise):
-        assert main(shlex.split(line)[1:]) == 0
-    (stack,) = tmp_path.glob("a box-*spp.exr")
+        command(line.removeprefix("ngpt "))
+    (stack,) = Path().glob("a box-*spp.exr")
     assert "samples" in ngpt.read(stack) and "--adaptive" in render
-    (result,) = tmp_path.glob("a box-*-wcv.exr")
+    (result,) = Path().glob("a box-*-wcv.exr")
     assert ngpt.read(result).attributes["ngpt:method"] == "wcv"
 
 
-def test_a_pilot_advises(renderer, capsys, monkeypatch):
+def test_a_pilot_advises(renderer, advice, monkeypatch):
     """Whatever it may be: a row for each method of each sampler that was tried."""
-    from data_gen.choosing import pipelines, plans
-
     monkeypatch.setattr(plans, "candidates", lambda scene: ["gpt"])
     monkeypatch.setattr(pipelines, "WITH_GRADIENTS", ("wcv", "l1"))
     monkeypatch.setattr(pipelines, "WITHOUT", ("primal",))
-    rows = advice(capsys, "--seconds", "100")  # of no more samples than a render may have
+    rows = advice("--seconds 100")  # of no more samples than a render may have
     assert {(row["sampler"], row["method"]) for row in rows} == {("gpt", "wcv"), ("gpt", "l1"), ("primal", "primal")}
     assert all(row["error"] > 0 and row["spp"] > 100 for row in rows)
 

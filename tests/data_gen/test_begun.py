@@ -1,21 +1,28 @@
 """What is there of a render counts as far as it goes: the same command goes on with it, and takes no other for it."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import ngpt
-from data_gen import begun
-from data_gen.begun import Asked, Rest, frame_seed, part_seed, scene_name
-from data_gen.cli import render
-from data_gen.session import render_scene
-from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 
-SIZE = ["--size", "16x12"]
+pytest.importorskip("mitsuba")
+
+from data_gen import begun, passes
+from data_gen.adaptive import LEAST
+from data_gen.begun import Asked, Rest, frame_seed, part_seed, scene_name
+from data_gen.cli import onlook, render
+from data_gen.film import GradientFilm
+from data_gen.session import render_scene
+from data_gen.shot_files import write_frames
+
 UNIFORM, TAILS = {"lamps": "uniform"}, {"tails": "paths"}
+GPT = "render diffuse --size 16x12 --sampler gpt"
+ONE_PASS = 16 * 12 * 16  # lanes
 
 
 def there(path, software="", **attributes):
@@ -117,63 +124,53 @@ def test_parts_and_frames_have_seeds_of_their_own(tmp_path):
     assert len(set(names)) == 3 and all(name.startswith("box.xml ") for name in names)
 
 
-def test_the_same_command_goes_on_and_then_is_done(renderer, tmp_path, capsys):
-    target, words = tmp_path / "it.exr", ["render", "diffuse", *SIZE, "--seed", "3", "--sampler", "gpt"]
-    from data_gen.adaptive import LEAST
-
+def test_the_same_command_goes_on_and_then_is_done(renderer, command):
     assert begun.SHARED == LEAST
-    assert main([*words, "--spp", "16", "-o", str(target)]) == 0
-    first = ngpt.read(target)
-    on = [*words, "--spp", "48", "--skip-existing", "-o", str(target)]
-    assert main(on) == 0
-    assert "has 16 samples per pixel; going on with it" in capsys.readouterr().err
-    whole = ngpt.read(target)
+    command(f"{GPT} --seed 3 --spp 16 -o it.exr")
+    first, on = ngpt.read("it.exr"), f"{GPT} --seed 3 --spp 48 --skip-existing -o it.exr"
+    assert "has 16 samples per pixel; going on with it" in command(on)
+    whole = ngpt.read("it.exr")
     assert whole.attributes["ngpt:spp"] == 48 and whole.attributes["ngpt:seed"] == f"3 {part_seed(3, 1)}"
     # The samples that were there, and others: to the bit what merging them gives.
-    rest = tmp_path / "rest.exr"
-    assert main([*words[:-4], "--seed", str(part_seed(3, 1)), "--sampler", "gpt", "--spp", "32", "-o", str(rest)]) == 0
-    merged = ngpt.merge([first, ngpt.read(rest)])
+    command(f"{GPT} --seed {part_seed(3, 1)} --spp 32 -o rest.exr")
+    merged = ngpt.merge([first, ngpt.read("rest.exr")])
     assert all(np.array_equal(whole[name], merged[name], equal_nan=True) for name in merged.names)
-    data = target.read_bytes()
-    capsys.readouterr()
-    assert main(on) == 0 and "skipped: the stack is there" in capsys.readouterr().err
-    assert main([*on, "--seed", "4"]) == 1 and "seed 3 " in capsys.readouterr().err
-    assert main([*on, "-D", "a=1"]) == 1 and "another render: scene" in capsys.readouterr().err
-    assert target.read_bytes() == data
+    data = Path("it.exr").read_bytes()
+    assert "skipped: the stack is there" in command(on)
+    assert "seed 3 " in command(f"{on} --seed 4", 1)
+    assert "another render: scene" in command(f"{on} -D a=1", 1)
+    assert Path("it.exr").read_bytes() == data
+    # In place of a file that is not whole
+    Path("it.exr").write_bytes(data[: len(data) // 2])
+    command(on)
+    assert len(Path("it.exr").read_bytes()) > len(data) // 2 and ngpt.read("it.exr").attributes["ngpt:spp"] == 48
 
 
-@pytest.mark.parametrize("more", [["--adaptive"], ["--error", "0.001"]])
-def test_samples_that_are_shared_out_go_on_so(renderer, tmp_path, more):
-    target = tmp_path / "it.exr"
-    words = ["render", "diffuse", *SIZE, "--sampler", "gpt", *more, "--skip-existing", "-o", str(target)]
-    assert main([*words, "--spp", "32"]) == 0
-    assert main([*words, "--spp", "80"]) == 0
-    found = ngpt.read(target)
+@pytest.mark.parametrize("more", ["--adaptive", "--error 0.001"])
+def test_samples_that_are_shared_out_go_on_so(renderer, command, more):
+    for spp in (32, 80):
+        command(f"{GPT} {more} --skip-existing -o it.exr --spp {spp}")
+    found = ngpt.read("it.exr")
     assert found.attributes["ngpt:spp"] == 80 and len(found.attributes["ngpt:seed"].split()) == 2
     assert found.attributes["ngpt:adaptive"] and "samples" in found
 
 
-def test_frames_go_on_too(renderer, tmp_path, capsys):
-    words = ["render", "diffuse", "--frames", "0:3", *SIZE, "--sampler", "gpt", "-o", str(tmp_path / "shot")]
-    assert main([*words, "--spp", "4"]) == 0
-    (tmp_path / "shot/diffuse.0001.exr").unlink()
-    assert main([*words, "--spp", "12", "--skip-existing"]) == 0
-    stacks = [ngpt.read(tmp_path / f"shot/diffuse.{frame:04d}.exr") for frame in range(3)]
+def test_frames_go_on_too(renderer, command):
+    words = f"{GPT} --frames 0:3 -o shot"
+    command(f"{words} --spp 4")
+    Path("shot/diffuse.0001.exr").unlink()
+    command(f"{words} --spp 12 --skip-existing")
+    stacks = [ngpt.read(f"shot/diffuse.{frame:04d}.exr") for frame in range(3)]
     assert [stack.attributes["ngpt:spp"] for stack in stacks] == [12, 12, 12]
     assert [len(stack.attributes["ngpt:seed"].split()) for stack in stacks] == [2, 1, 2]
     assert all("motion" in stack and stack.attributes["ngpt:frame"] == i for i, stack in enumerate(stacks))
-    capsys.readouterr()
-    assert main([*words, "--spp", "12", "--skip-existing"]) == 0
-    assert "3 of 3 frames were skipped" in capsys.readouterr().err
-    assert main([*words, "--spp", "12", "--seed", "1", "--skip-existing"]) == 1
-    assert "diffuse.0000.exr: is another render: seed" in capsys.readouterr().err
+    assert "3 of 3 frames were skipped" in command(f"{words} --spp 12 --skip-existing")
+    said = command(f"{words} --spp 12 --seed 1 --skip-existing", 1)
+    assert "diffuse.0000.exr: is another render: seed" in said
 
 
 def test_a_frame_that_is_broken_off_is_kept_and_gone_on_with(renderer, tmp_path, monkeypatch):
-    from data_gen import passes
-    from data_gen.shot_files import write_frames
-
-    monkeypatch.setattr(passes, "FIRST_LANES", 16 * 12 * 16)  # several passes
+    monkeypatch.setattr(passes, "FIRST_LANES", ONE_PASS)
     files = {frame: tmp_path / f"{frame}.exr" for frame in range(2)}
     asked = {"size": (16, 12), "sampler": "gpt", "spp": 64, "skip_existing": True}
     written = write_frames("diffuse", files, stop=lambda: True, **asked)
@@ -188,10 +185,7 @@ def test_a_frame_that_is_broken_off_is_kept_and_gone_on_with(renderer, tmp_path,
 
 def failing(monkeypatch, passes_before):
     """Has the sampler `gpt` fail after so many passes."""
-    from data_gen import passes
-    from data_gen.film import GradientFilm
-
-    monkeypatch.setattr(passes, "FIRST_LANES", 16 * 12 * 16)
+    monkeypatch.setattr(passes, "FIRST_LANES", ONE_PASS)
     end, ended = GradientFilm.end_pass, []
 
     def end_pass(film, *args):
@@ -203,54 +197,45 @@ def failing(monkeypatch, passes_before):
     monkeypatch.setattr(GradientFilm, "end_pass", end_pass)
 
 
-def test_a_pass_that_fails_takes_none_before_it_along(renderer, tmp_path, monkeypatch, capsys):
-    target = tmp_path / "it.exr"
-    words = ["render", "diffuse", *SIZE, "--sampler", "gpt", "--spp", "64", "-o", str(target)]
+def test_a_pass_that_fails_takes_none_before_it_along(renderer, command, monkeypatch):
     with monkeypatch.context() as patched:
         failing(patched, 1)
-        assert main(words) == 1
-    assert f"the device is gone; {target} has the 16 samples per pixel done before" in capsys.readouterr().err
-    kept = ngpt.read(target)
+        said = command(f"{GPT} --spp 64 -o it.exr", 1)
+    assert "the device is gone; it.exr has the 16 samples per pixel done before" in said
+    kept = ngpt.read("it.exr")
     assert kept.attributes["ngpt:spp"] == 16 and kept.attributes["ngpt:unfinished"] == "failed"
-    assert main([*words[:-4], "--spp", "16", "-o", str(tmp_path / "same.exr")]) == 0
-    same = ngpt.read(tmp_path / "same.exr")
-    assert np.allclose(kept["primal"], same["primal"], rtol=0.5, atol=0.1)
-    assert main([*words, "--skip-existing"]) == 0 and ngpt.read(target).attributes["ngpt:spp"] == 64
+    command(f"{GPT} --spp 16 -o same.exr")
+    assert np.allclose(kept["primal"], ngpt.read("same.exr")["primal"], rtol=0.5, atol=0.1)
+    command(f"{GPT} --spp 64 -o it.exr --skip-existing")
+    assert ngpt.read("it.exr").attributes["ngpt:spp"] == 64
     # One that fails at first leaves nothing.
-    with monkeypatch.context() as patched:
-        failing(patched, 0)
-        with pytest.raises(RuntimeError):
-            main([*words[:-1], str(tmp_path / "none.exr")])
-    assert not (tmp_path / "none.exr").exists()
+    failing(monkeypatch, 0)
+    with pytest.raises(RuntimeError):
+        command(f"{GPT} --spp 64 -o none.exr")
+    assert not Path("none.exr").exists()
 
 
-def test_what_was_rendered_is_kept_where_it_cannot_be_written(renderer, tmp_path, monkeypatch, capsys):
-    target = tmp_path / "asked" / "it.exr"
-    target.parent.mkdir()
-    monkeypatch.chdir(tmp_path)
+def test_what_was_rendered_is_kept_where_it_cannot_be_written(renderer, command, monkeypatch):
+    folder = Path("asked")
+    folder.mkdir()
 
     def moved(*args, **given):
-        target.parent.rename(tmp_path / "moved")
+        folder.rename("moved")
         return render_scene(*args, **given)
 
     monkeypatch.setattr(render, "render_scene", moved)
-    words = ["render", "diffuse", *SIZE, "--sampler", "primal", "--spp", "4", "-o", str(target)]
-    assert main(words) == 1
-    assert f"what was made is kept in {tmp_path / 'it.kept.exr'}" in capsys.readouterr().err
-    assert ngpt.read(tmp_path / "it.kept.exr").attributes["ngpt:spp"] == 4
+    said = command(f"{GPT} --sampler primal --spp 4 -o {folder.absolute()}/it.exr", 1)
+    assert f"what was made is kept in {Path('it.kept.exr').absolute()}" in said
+    assert ngpt.read("it.kept.exr").attributes["ngpt:spp"] == 4
 
 
-def test_light_that_overflows_ends_no_render_that_somebody_looks_at(renderer, tmp_path, capsys):
-    from data_gen.cli import onlook
-
-    scene = tmp_path / "nan.xml"
-    scene.write_text(
+def test_light_that_overflows_ends_no_render_that_somebody_looks_at(renderer, command, monkeypatch):
+    Path("nan.xml").write_text(
         '<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"><film type="hdrfilm">'
         '<integer name="width" value="24"/><integer name="height" value="16"/></film></sensor>'
         '<emitter type="constant"><rgb name="radiance" value="3e38 3e38 3e38"/></emitter></scene>'
     )
-    target = tmp_path / "it.exr"
-    words = ["render", str(scene), "--sampler", "gpt", "--spp", "32", "-o", str(target)]
+    words = "render nan.xml --sampler gpt --spp 32 -o it.exr"
 
     class Page:
         watched, enough, ended = True, False, False
@@ -264,12 +249,9 @@ def test_light_that_overflows_ends_no_render_that_somebody_looks_at(renderer, tm
         def close(self, line):
             raise OSError("gone")
 
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(onlook, "onlookers", lambda *args: onlook.Onlookers(Page(), None, args[4].say, "spp"))
-        assert main([*words, "--live"]) == 0
-    told = [line for line in capsys.readouterr().err.splitlines() if "the render goes on" in line]
-    assert len(told) == 1 and told[0].startswith("no image for who looks on: ") and target.exists()
-    target.unlink()
-    assert main([*words, "--adaptive"]) == 1
-    assert f"; {target} has the 16 samples per pixel done before" in capsys.readouterr().err
-    assert ngpt.read(target).attributes["ngpt:spp"] == 16
+    monkeypatch.setattr(onlook, "onlookers", lambda *args: onlook.Onlookers(Page(), None, args[4].say, "spp"))
+    told = [line for line in command(f"{words} --live").splitlines() if "the render goes on" in line]
+    assert len(told) == 1 and told[0].startswith("no image for who looks on: ")
+    Path("it.exr").unlink()
+    assert "; it.exr has the 16 samples per pixel done before" in command(f"{words} --adaptive", 1)
+    assert ngpt.read("it.exr").attributes["ngpt:spp"] == 16

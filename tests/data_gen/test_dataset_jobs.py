@@ -14,23 +14,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from full_stack import full_stack
 
 from ngpt.errors import NgptError
-from ngpt.methods import reconstruct
-from ngpt.stack import GradientStack
 from ngpt.training.dataset import Dataset, problems, read_manifest
 
 pytest.importorskip("safetensors")
 pytest.importorskip("mitsuba")
 
-from data_gen.dataset import crops, jobs
+from data_gen.dataset import jobs
+from data_gen.dataset.cameras import Surroundings, View, find_view, random_view, what_shows, with_one_kernel
 from data_gen.dataset.config import Config, Files, read_config
-from data_gen.scenes.procedural.scenes import make_scene
-from ngpt.training.shards import Shard, write_shard
+from data_gen.scenes.load import load_scene
+from data_gen.scenes.procedural import scenes
+from ngpt.training.shards import write_shard
 
 ROOT = Path(__file__).parents[2]
-TINY = replace(read_config(ROOT / "configs" / "data-tiny.toml"))
+PAIRS = "scenes = 1\nreference_spp = 0"
 
 
 def stand_in(config, job, folder, variant):
@@ -67,15 +66,17 @@ def test_configurations_can_be_read():
         ("scenes = 1\nadaptive = 1\nspp = [2, 16]", "fewer than 32 samples cannot be shared out; spp goes up to 16"),
         ("scenes = 1\nadaptive = 1\nframes = 2", "frames of shots have even samples"),
         ("scenes = 1\nadaptive = 1\nsampler = 'gbdpt'", "the samples of 'gbdpt' depend on each other; use 'gpt'"),
-        (
-            "scenes = 1\n[samplers.gpt]\nshift = 'x'",
-            "sampler 'gpt', option 'shift': 'x' is not allowed",
-        ),
+        ("scenes = 1\n[samplers.gpt]\nshift = 'x'", "sampler 'gpt', option 'shift': 'x' is not allowed"),
         ("scenes = 1\n[samplers.ppm]\nradius = 1", r"samplers\.ppm: this set is rendered by 'gpt'"),
         ("spp = 3", r"spp = 3: must be a list of 2 whole numbers, like \[2, 64\]"),
         ("[[files]]\npattern = 3\ncrops = 1", r"\[files\]\[0\]: pattern = 3: must be a string"),
         ("[[files]]\ncrops = 1", r"\[files\]\[0\]: lacks 'pattern'"),
         ("files = 1", "files = 1: must be a list of tables"),
+        (f"{PAIRS}\ninputs = 3", "set inputs = 2"),
+        (f"{PAIRS}\ninputs = 2\nframes = 2", "learnt from references"),
+        (f"{PAIRS}\ninputs = 2\nadaptive = 0.5\nspp = [2, 64]", "halves are alike"),
+        (f"{PAIRS}\ninputs = 2\nsampler = 'primal'", "renders no gradients"),
+        ("scenes = 1\nreference_spp = 2", "at least 4, two for each of its halves; or 0, for pairs"),
     ],
 )
 def test_bad_configurations(tmp_path, text, message):
@@ -84,24 +85,16 @@ def test_bad_configurations(tmp_path, text, message):
         read_config(tmp_path / "c.toml")
 
 
-def test_parts_make_the_whole(tmp_path, monkeypatch):
+@pytest.mark.parametrize("way", ["one process", "threads", "parts"])
+def test_a_set_is_the_same_however_it_is_made(tmp_path, monkeypatch, way):
     monkeypatch.setattr(jobs, "make_shard", stand_in)
-    config = Config(scenes=5, crops=3, crops_per_shard=2)
-    for i in range(3):
-        jobs.generate(config, tmp_path, jobs.Serial(), shard=(i, 3))
-    assert len(hashes(tmp_path)) == len(config.plan()) == 10
-    assert problems(tmp_path) == []
-
-
-def test_executors_and_orders_agree(tmp_path, monkeypatch):
-    monkeypatch.setattr(jobs, "make_shard", stand_in)
-    config = Config(scenes=6, crops=1)
-    made = []
-    for name, executor in (("serial", jobs.Serial()), ("threads", ThreadPoolExecutor(3))):
-        with executor:
-            jobs.generate(config, tmp_path / name, executor)
-        made.append(hashes(tmp_path / name))
-    assert made[0] == made[1]
+    config, folder = Config(scenes=5, crops=3, crops_per_shard=2), tmp_path / "again"
+    jobs.generate(config, tmp_path / "whole", jobs.Serial())
+    for i in range(3 if way == "parts" else 1):
+        with ThreadPoolExecutor(3) if way == "threads" else jobs.Serial() as executor:
+            jobs.generate(config, folder, executor, **({"shard": (i, 3)} if way == "parts" else {}))
+    assert hashes(folder) == hashes(tmp_path / "whole") and len(hashes(folder)) == len(config.plan()) == 10
+    assert problems(folder) == []
 
 
 def test_goes_on_where_it_stopped(tmp_path, monkeypatch):
@@ -142,38 +135,15 @@ def test_scene_files_as_sources(tmp_path):
         Config(files=(Files(str(tmp_path / "nothing"), 3),)).plan()
 
 
-def test_a_scene_comes_from_its_seed(tmp_path):
-    for name in ("a", "b", "c"):
-        (tmp_path / name).mkdir()
-        make_scene(8 if name == "c" else 7, tmp_path / name)
-    a, b, c = ({p.name: p.read_bytes() for p in (tmp_path / name).iterdir()} for name in ("a", "b", "c"))
-    assert a == b
-    assert a["scene.xml"] != c["scene.xml"]
-
-
 def test_a_scene_can_be_saved_by_its_seed(tmp_path, monkeypatch, capsys):
-    from data_gen.scenes.procedural import scenes
-
     monkeypatch.setattr(sys, "argv", ["scenes", "5", str(tmp_path / "new")])
     assert scenes.main() == 0 and (tmp_path / "new/scene.xml").is_file()
     assert scenes.main() == 2 and "exists and is not an empty folder" in capsys.readouterr().err
 
 
-def test_sample_counts_are_stratified():
-    config = Config(scenes=1, inputs=5, spp=(2, 1023))
-    counts = np.array([crops.sample_counts(np.random.default_rng(i), config) for i in range(400)])
-    assert counts.min() >= 2 and counts.max() <= 1023
-    assert np.all(np.diff(counts, axis=1) >= 0)
-    edges = np.exp(np.linspace(np.log(2), np.log(1024), 6))
-    assert np.all((counts + 1 > edges[:-1]) & (counts <= edges[1:]))
-
-
 @pytest.mark.slow
 def test_a_small_object_in_the_middle_of_nowhere_is_found(renderer):
-    import mitsuba as mi
-
-    from data_gen.dataset.cameras import Surroundings, find_view, random_view, what_shows
-
+    mi = renderer
     pose = mi.ScalarTransform4f().look_at([0, 0, -20], [0, 0, 0], [0, 1, 0])
     cube = {"type": "cube", "to_world": mi.ScalarTransform4f().rotate([1, 1, 0], 40).scale(0.7)}
     scene = mi.load_dict({"type": "scene", "camera": {"type": "perspective", "fov": 10, "to_world": pose}, "c": cube})
@@ -185,9 +155,7 @@ def test_a_small_object_in_the_middle_of_nowhere_is_found(renderer):
 
 def test_a_scene_has_its_parts_in_the_same_order_whenever_it_is_loaded(renderer, tmp_path):
     """Merging of equal parts shuffles them, and with the lamps the light that a random number stands for."""
-    from data_gen.scenes.load import load_scene
-
-    path = str(make_scene((1, 2), tmp_path))
+    path = str(scenes.make_scene((1, 2), tmp_path))
     orders = set()
     for _ in range(6):
         scene = load_scene(path)
@@ -198,10 +166,8 @@ def test_a_scene_has_its_parts_in_the_same_order_whenever_it_is_loaded(renderer,
 def test_views_of_a_scene_share_their_kernels(renderer):
     """Where two factors of the projection were equal to the last bit, everything was compiled once more."""
     import drjit as dr
-    import mitsuba as mi
 
-    from data_gen.dataset.cameras import Surroundings, View, random_view, with_one_kernel
-
+    mi = renderer
     ball = {"type": "sphere", "center": [0, 0, 5], "to_world": mi.ScalarTransform4f().scale(0.5)}
     scene = mi.load_dict({"type": "scene", "camera": {"type": "thinlens", "aperture_radius": 0.1}, "ball": ball})
     around = Surroundings(scene)
@@ -251,16 +217,6 @@ def test_tiny(renderer, tmp_path):
     assert (tmp_path / "a" / "README.md").exists() and (tmp_path / "a" / "contact.png").exists()
 
 
-def test_crops_of_a_sampler_without_gradients(renderer, tmp_path):
-    config = Config(
-        size=16, inputs=2, spp=(2, 4), sampler="primal", scenes=1, crops=1, reference_spp=8, reference_method="primal"
-    )
-    (tmp_path / "shards").mkdir()
-    crops.make_shard(config, config.plan()[0], str(tmp_path), "llvm_ad_rgb")
-    shard = Shard(tmp_path / config.plan()[0].file)
-    assert shard.shape("primal_se") == (1, 2, 16, 16, 3) and "dx" not in shard.names
-
-
 @pytest.mark.slow
 def test_dask_cluster_with_a_worker_killed(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
@@ -287,47 +243,3 @@ def test_a_dead_worker_is_an_error_that_says_how_to_go_on(tmp_path, monkeypatch)
 
 def die(config, job, folder, variant):
     os._exit(9)
-
-
-def lit_stack():
-    """A stack with light that gradients hold nothing of, at 2 of its 20x24 pixels not finite."""
-    stack = full_stack(20, 24)
-    light = np.zeros_like(stack["primal"])
-    light[::4, ::5] = 6
-    primal = stack["primal"] + light
-    primal[3, 4], light[10, 12] = np.nan, np.inf
-    return stack.replace(primal=primal, direct=0 * primal, caustic=light, caustic_var=light**2)
-
-
-def test_crops_keep_light_that_gradients_lack_apart():
-    """Made finite as the rest is; targets without it are those of networks that read gradients."""
-    given = lit_stack()
-    stack, bad = crops.finite(given)
-    assert bad >= 2 and all(np.isfinite(stack[name]).all() for name in stack.names)
-    same = np.isfinite(given["primal"]).all(axis=-1) & np.isfinite(given["caustic"]).all(axis=-1)
-    for name in ("primal", "caustic"):
-        assert np.allclose(stack[name][same], given[name][same], rtol=1e-5)
-    rest, light = crops.references(stack, "wcv")
-    assert light.sum(dtype=np.float64) == pytest.approx(stack["caustic"].sum(dtype=np.float64), rel=1e-3)
-    assert np.allclose(rest + light, reconstruct(stack, "wcv").image, rtol=1e-5, atol=1e-5)
-    plain = full_stack(20, 24)
-    assert crops.references(plain, "wcv")[1] is None
-
-
-def test_crops_keep_split_light():
-    """Made finite as the rest is: pixels come from their neighbours, and what is not known of a variance is its own."""
-    stack = full_stack(20, 24)
-    layers = {"primal": stack["primal"], "direct": 0 * stack["primal"], "diffuse": stack["primal"] / 4}
-    layers |= {"specular": 0.75 * stack["primal"], "primal_var": stack["primal_var"]}
-    layers |= {f"{name}_var": 0.1 * layers[name] ** 2 for name in ("diffuse", "specular")}
-    layers |= {name: stack[name] for name in ("albedo", "normal", "depth")}
-    layers["primal"] = layers["primal"].copy()
-    layers["primal"][3, 4] = layers["specular"][3, 4] = np.nan
-    layers["diffuse_var"][10, 12] = np.inf
-    made, bad = crops.finite(GradientStack(layers))
-    assert bad >= 2 and made.names == GradientStack(layers).names
-    assert all(np.isfinite(made[name]).all() for name in made.names)
-    around = layers["specular"][2:5, 3:6]
-    assert np.nanmin(around) < made["specular"][3, 4].mean() < np.nanmax(around)
-    assert np.allclose(made["diffuse_var"][10, 12], layers["diffuse"][10, 12] ** 2)
-    assert np.array_equal(made["diffuse"][:3], layers["diffuse"][:3])

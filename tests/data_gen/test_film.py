@@ -1,14 +1,14 @@
 """The film's statistics against NumPy's on all samples at once."""
 
+import math
+
 import numpy as np
 import pytest
 
+pytest.importorskip("mitsuba")
 
-@pytest.fixture
-def film(renderer):
-    from data_gen.film import GradientFilm
-
-    return GradientFilm
+import data_gen.film.gradient_film as module
+from data_gen.film import GradientFilm as film
 
 
 def fill(mi, film, samples, **kwargs):
@@ -16,7 +16,7 @@ def fill(mi, film, samples, **kwargs):
     film.put("primal", mi.Color3f(*samples.reshape(-1, 3).T.astype(np.float32)), **kwargs)
 
 
-def test_mean_and_variance_over_passes_of_different_size(renderer, film, rng):
+def test_mean_and_variance_over_passes_of_different_size(renderer, rng):
     samples = (1000 + rng.normal(size=(6, 7, 3))).astype(np.float32)  # mean large beside the deviation
     whole = film(3, 2)
     fill(renderer, whole, samples[:, :4])
@@ -28,7 +28,7 @@ def test_mean_and_variance_over_passes_of_different_size(renderer, film, rng):
     assert np.allclose(layers["primal_var"].reshape(6, 3), expected, rtol=1e-3)
 
 
-def test_nonfinite_samples_have_no_weight_and_are_counted(renderer, film, rng):
+def test_nonfinite_samples_have_no_weight_and_are_counted(renderer, rng):
     samples = rng.random((4, 5, 3)).astype(np.float32)
     spoiled = samples.copy()
     spoiled[0, 2, 1], spoiled[3, 0, 0], spoiled[1] = np.nan, -np.inf, np.inf
@@ -41,47 +41,25 @@ def test_nonfinite_samples_have_no_weight_and_are_counted(renderer, film, rng):
     assert np.isnan(layer[1]).all()  # nothing is known about it, which must not look like black
 
 
-def test_a_single_sample_has_no_variance(renderer, film, rng):
-    target = film(2, 2)
-    fill(renderer, target, rng.random((4, 1, 3)))
-    assert set(target.develop()) == {"primal"}
-
-
-def test_gradients_combine_both_directions(renderer, film):
-    mi = renderer
-    target = film(3, 1)
-    fill(mi, target, np.zeros((3, 2, 3)))
-
-    def put(name, *pixels):
-        target.put(name, mi.Color3f(mi.Float(np.repeat(pixels, 2).astype(np.float32))))
-
-    # Differences "neighbour - base", two equal samples a pixel; the outer neighbours do not exist.
-    put("dx+", 1, 2, 99)
-    put("dx-", 99, -3, -5)
-    put("dy+", 99, 99, 99)
-    put("dy-", 99, 99, 99)
-    layers = target.develop()
-    assert layers["dx"][0, :, 0].tolist() == [(1 + 3) / 2, (2 + 5) / 2, 0]
-    assert not layers["dy"].any()
-
-
-def test_variance_of_a_gradient_is_that_of_its_mean(renderer, film, rng):
-    mi = renderer
-    target = film(4, 4)
-    fill(mi, target, np.zeros((16, 8, 3)))
-    samples = {name: rng.normal(size=(16, 8)).astype(np.float32) for name in ("dx+", "dx-", "dy+", "dy-")}
+def test_gradients_are_half_of_each_direction(renderer, rng):
+    """Forward from a pixel, and backward from the next one; their variances are those of the means."""
+    target, names = film(4, 3), ("dx+", "dx-", "dy+", "dy-")
+    fill(renderer, target, np.zeros((12, 8, 3)))
+    samples = {name: rng.normal(size=(3, 4, 8)).astype(np.float32) for name in names}
     for name, values in samples.items():
-        target.put(name, mi.Color3f(mi.Float(values.ravel())))
-    variance = {name: values.var(axis=1, ddof=1).reshape(4, 4) / 8 for name, values in samples.items()}
-    layers = target.develop()
-    assert np.allclose(layers["dx_var"][:, :-1, 0], (variance["dx+"][:, :-1] + variance["dx-"][:, 1:]) / 4)
-    assert np.allclose(layers["dy_var"][:-1, :, 0], (variance["dy+"][:-1] + variance["dy-"][1:]) / 4)
+        target.put(name, renderer.Color3f(renderer.Float(values.ravel())))
+    mean = {name: values.mean(axis=-1) for name, values in samples.items()}
+    variance = {name: values.var(axis=-1, ddof=1) / 8 for name, values in samples.items()}
+    layers = {name: layer[..., 0] for name, layer in target.develop().items()}
+    for name, here, there in (("dx", np.s_[:, :-1], np.s_[:, 1:]), ("dy", np.s_[:-1], np.s_[1:])):
+        forward, backward = f"{name}+", f"{name}-"
+        assert np.allclose(layers[name][here], (mean[forward][here] - mean[backward][there]) / 2, atol=1e-6)
+        assert np.allclose(layers[f"{name}_var"][here], (variance[forward][here] + variance[backward][there]) / 4)
+    assert not layers["dx"][:, -1].any() and not layers["dy"][-1].any()
 
 
 @pytest.mark.parametrize("strands", [1, 6 * 5])
-def test_feature_noise_is_that_of_the_noisier_feature(renderer, film, rng, strands, monkeypatch):
-    import data_gen.film.gradient_film as module
-
+def test_feature_noise_is_that_of_the_noisier_feature(renderer, rng, strands, monkeypatch):
     monkeypatch.setattr(module, "_STRANDS", strands)
     target = film(3, 2)
     assert target.feature_noise is None
@@ -103,7 +81,7 @@ def test_feature_noise_is_that_of_the_noisier_feature(renderer, film, rng, stran
     assert target.feature_noise == pytest.approx(some, rel=1e-4)
 
 
-def test_diagnostics_are_images_beside_the_layers(renderer, film, rng):
+def test_diagnostics_are_images_beside_the_layers(renderer, rng):
     mi = renderer
     target = film(2, 2)
     for _ in range(2):
@@ -118,7 +96,7 @@ def test_diagnostics_are_images_beside_the_layers(renderer, film, rng):
     assert images["diagnostics.discarded"].tolist() == [[0, 0], [0, 0.125]]
 
 
-def test_constant_samples_have_no_variance_and_float64_keeps_long_sums(renderer, film):
+def test_constant_samples_have_no_variance_and_float64_keeps_long_sums(renderer):
     mi = renderer
     target = film(1, 1)
     for _ in range(50):
@@ -127,9 +105,7 @@ def test_constant_samples_have_no_variance_and_float64_keeps_long_sums(renderer,
     assert (layers["primal"] == np.float32(0.1)).all() and not layers["primal_var"].any()
 
 
-def test_blocks_and_strands_lose_no_sample(renderer, film, rng, monkeypatch):
-    import data_gen.film.gradient_film as module
-
+def test_blocks_and_strands_lose_no_sample(renderer, rng, monkeypatch):
     samples = rng.random((6, 40, 3)).astype(np.float32)
     results = []
     for strands in (1, 6 * 3, 6 * 64):
@@ -148,10 +124,8 @@ def test_blocks_and_strands_lose_no_sample(renderer, film, rng, monkeypatch):
         assert np.allclose(layers["primal_var"].reshape(6, 3), samples.var(axis=1, ddof=1) / 40, rtol=1e-5)
 
 
-def test_splats_add_up_in_any_order(renderer, film, rng):
+def test_splats_add_up_in_any_order(renderer, rng):
     """Values over 16 orders of magnitude, to the last bit; those that are not finite are counted where they fell."""
-    import math
-
     mi, n = renderer, 20000
     pixel = rng.integers(0, 6, n).astype(np.uint32)
     value = (rng.normal(size=(3, n)) * 10.0 ** rng.uniform(-8, 8, n)).astype(np.float32)
@@ -170,7 +144,7 @@ def test_splats_add_up_in_any_order(renderer, film, rng):
     assert np.array_equal(results[0], np.array(exact, np.float32))
 
 
-def test_batches_have_the_variance_of_their_means(renderer, film, rng):
+def test_batches_have_the_variance_of_their_means(renderer, rng):
     """Samples of a pass that share their error: over samples the variance would be far too small."""
     mi = renderer
     shared = rng.normal(size=(24, 1, 1, 3))
@@ -187,27 +161,23 @@ def test_batches_have_the_variance_of_their_means(renderer, film, rng):
     assert np.allclose(layers["primal_var"].reshape(6, 3), means.var(axis=0, ddof=1) / 24, rtol=1e-6)
 
 
-def test_a_last_batch_with_fewer_samples_counts_for_less(renderer, film, rng):
+def test_a_last_batch_with_fewer_samples_counts_for_less(renderer, rng):
     """Eight, eight and one samples: the mean is over all 17, and its variance as for independent ones."""
-    claimed, real = [], []
-    for _ in range(400):
-        samples = rng.normal(size=(6, 17, 3)).astype(np.float32)
-        target = film(3, 2, batches=True)
-        for part in np.split(samples, (8, 16), axis=1):
-            fill(renderer, target, part)
-            target.end_pass(part.shape[1])
-        layers = target.develop()
-        assert np.allclose(layers["primal"].reshape(6, 3), samples.mean(axis=1), rtol=1e-4, atol=1e-6)
-        claimed.append(layers["primal_var"].mean())
-        real.append(np.square(layers["primal"]).mean())
-    assert np.mean(claimed) == pytest.approx(1 / 17, rel=0.1)
-    assert np.mean(real) == pytest.approx(1 / 17, rel=0.1)
+    samples = rng.normal(size=(2400, 17, 3)).astype(np.float32)
+    target = film(60, 40, batches=True)
+    for part in np.split(samples, (8, 16), axis=1):
+        fill(renderer, target, part)
+        target.end_pass(part.shape[1])
+    layers = target.develop()
+    assert np.allclose(layers["primal"].reshape(-1, 3), samples.mean(axis=1), rtol=1e-4, atol=1e-6)
+    assert layers["primal_var"].mean() == pytest.approx(1 / 17, rel=0.1)
+    assert np.square(layers["primal"]).mean() == pytest.approx(1 / 17, rel=0.1)
     with pytest.raises(ValueError, match="only the last may be smaller"):
-        fill(renderer, target, np.zeros((6, 9, 3), np.float32))
+        fill(renderer, target, np.zeros((2400, 9, 3), np.float32))
         target.end_pass(9)
 
 
-def test_what_is_put_and_what_is_splatted_are_one_value(renderer, film):
+def test_what_is_put_and_what_is_splatted_are_one_value(renderer):
     mi = renderer
     target = film(2, 1, batches=True)
     for scale in (1, 3):
@@ -222,6 +192,6 @@ def test_what_is_put_and_what_is_splatted_are_one_value(renderer, film):
     assert image.tolist() == [(6 + 18) / 2, 10]
 
 
-def test_films_of_independent_samples_take_no_splats(renderer, film):
+def test_films_of_independent_samples_take_no_splats(renderer):
     with pytest.raises(ValueError, match="make it with batches"):
         film(2, 1).splat("primal", renderer.UInt32([0]), renderer.Color3f(1))

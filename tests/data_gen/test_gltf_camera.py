@@ -18,9 +18,6 @@ TIMES = np.array([0, 1], np.float32)
 MOVES = np.array([[0, 1, 4], [2, 1, 4]], np.float32)
 TURNS = np.array([[0, 0, 0, 1], Rotation.from_euler("y", 60, degrees=True).as_quat()], np.float32)
 
-# Times that never end, where content() has its own.
-INFINITE = np.full(64, np.inf, np.float32).tobytes()
-
 
 def content(buffer, way="LINEAR", moves=MOVES, turns=TURNS):
     """A camera that moves and turns, in a node that stands one unit higher; and its bytes."""
@@ -48,6 +45,11 @@ def content(buffer, way="LINEAR", moves=MOVES, turns=TURNS):
 
 def embedded(data):
     return "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+
+
+# Times that never end, and times that fall
+INFINITE = embedded(np.full(64, np.inf, np.float32).tobytes())
+FALLING = embedded(np.array([1, 0], np.float32).tobytes() + content(None)[1][8:])
 
 
 @pytest.fixture(params=["embedded", "beside", "glb"])
@@ -79,17 +81,15 @@ def test_a_camera_moves_as_in_the_file(file):
     assert np.isclose(np.linalg.det(middle.to_world), 1)
 
 
+def read(folder, scene, fps=24):
+    (folder / "a.gltf").write_text(json.dumps(scene))
+    return read_gltf_camera(folder / "a.gltf", fps)
+
+
 def test_steps_and_splines(tmp_path):
-    path = tmp_path / "a.gltf"
-    path.write_text(json.dumps(content(embedded, "STEP")[0]))
-    assert np.allclose(read_gltf_camera(path, 10).at(9).to_world[:3, 3], [0, 2, 4])
-    rest = np.zeros((2, 3, 4))
-    rest[:, 1] = TURNS
-    moves = np.zeros((2, 3, 3))
-    moves[:, 1] = MOVES
-    scene = content(embedded, "CUBICSPLINE", moves.reshape(6, 3), rest.reshape(6, 4))[0]
-    path.write_text(json.dumps(scene))
-    spline = read_gltf_camera(path, 10)
+    assert np.allclose(read(tmp_path, content(embedded, "STEP")[0], 10).at(9).to_world[:3, 3], [0, 2, 4])
+    moves, turns = (np.insert(np.zeros((4, keys.shape[1])), [1, 3], keys, axis=0) for keys in (MOVES, TURNS))
+    spline = read(tmp_path, content(embedded, "CUBICSPLINE", moves, turns)[0], 10)
     # Without tangents the way eases in and out: 3 t² - 2 t³.
     assert np.isclose(spline.at(2).to_world[0, 3], 2 * (3 * 0.04 - 2 * 0.008))
 
@@ -110,7 +110,8 @@ def test_steps_and_splines(tmp_path):
         (lambda scene: scene["buffers"][0].update(uri="http://a.b/c.bin"), "is not in its folder or below"),
         (lambda scene: scene["buffers"][0].update(uri="c:\\b.bin"), "is not in its folder or below"),
         (lambda scene: scene["buffers"][0].update(uri="pipe.bin"), "pipe.bin: is a pipe or a device"),
-        (lambda scene: scene["buffers"][0].update(uri=embedded(INFINITE)), "accessor 0 has numbers that are not"),
+        (lambda scene: scene["buffers"][0].update(uri=INFINITE), "accessor 0 has numbers that are not"),
+        (lambda scene: scene["buffers"][0].update(uri=FALLING), "do not rise"),
         (lambda scene: scene["animations"][0]["channels"][0].update(target=[]), "can be understood"),
         (lambda scene: scene["nodes"][1].update(translation=[0, math.nan, 0]), "frame 0: .* not finite, or beyond"),
         (lambda scene: scene["nodes"][1].update(translation=[0, 1e200, 0]), "frame 0: .* not finite, or beyond"),
@@ -118,19 +119,15 @@ def test_steps_and_splines(tmp_path):
         (lambda scene: scene["nodes"][1].update(matrix=[0] * 16), "frame 0: .* flattens space"),
         (lambda scene: scene["cameras"][0]["perspective"].update(yfov=math.nan), "yfov .* between 0 and 180"),
         (lambda scene: scene["cameras"][0]["perspective"].update(yfov=0), "yfov"),
-        (lambda scene: scene["cameras"][0]["perspective"].update(yfov=-1), "yfov"),
         (lambda scene: scene["cameras"][0]["perspective"].update(yfov=10), "yfov"),
-        (lambda scene: scene["cameras"][0]["perspective"].update(yfov=math.inf), "yfov"),
     ],
 )
 def test_files_that_cannot_be_used_are_refused(tmp_path, change, complaint):
     scene, _ = content(embedded)
     change(scene)
     os.mkfifo(tmp_path / "pipe.bin")
-    path = tmp_path / "a.gltf"
-    path.write_text(json.dumps(scene))
     with pytest.raises(NgptError, match=complaint):
-        read_gltf_camera(path, 24)
+        read(tmp_path, scene)
 
 
 @pytest.mark.parametrize("data", [b"glTF123", b"[]", b'"text"', b"5", b"null", b"[" * 100_000, b"\xff\xfe{}"])
@@ -143,24 +140,13 @@ def test_what_is_no_gltf_is_refused(tmp_path, data):
         read_camera_path(path)
 
 
-def test_times_that_do_not_rise_are_refused(tmp_path):
-    scene, data = content(embedded)
-    scene["buffers"][0]["uri"] = embedded(np.array([1, 0], np.float32).tobytes() + data[8:])
-    path = tmp_path / "a.gltf"
-    path.write_text(json.dumps(scene))
-    with pytest.raises(NgptError, match="do not rise"):
-        read_gltf_camera(path, 24)
-
-
 def test_scaled_cameras_and_parents_are_cameras_without_scale(tmp_path):
-    path = tmp_path / "a.gltf"
     paths = []
     for scale in ([1, 1, 1], [2, 2, 2], [1e-3, 1e-3, 1e-3]):
         scene, _ = content(embedded)
         # The camera's own place is in units of its parent.
         scene["nodes"][1]["scale"], scene["nodes"][2]["scale"] = scale, [3, 4, 5]
-        path.write_text(json.dumps(scene))
-        paths.append(read_gltf_camera(path, 24))
+        paths.append(read(tmp_path, scene))
     plain, *others = paths
     for other, factor in zip(others, (2, 1e-3), strict=True):
         for one, two in zip(plain.keys, other.keys, strict=True):

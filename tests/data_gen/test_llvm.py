@@ -8,21 +8,15 @@ from data_gen import llvm
 from ngpt.errors import NgptError
 
 
-@pytest.fixture(autouse=True)
-def clean_environment(monkeypatch):
-    # monkeypatch restores the variable afterwards, use_llvm() having set it or not.
-    monkeypatch.setenv(llvm.ENVIRONMENT, "")
-    monkeypatch.delenv(llvm.ENVIRONMENT)
-
-
 @pytest.fixture
 def machine(tmp_path, monkeypatch):
-    """Makes empty files of these names the only libraries there are."""
+    """Makes empty files of these names the only libraries there are; the user may have chosen one."""
 
-    def install(*names):
+    def install(*names, chosen=""):
         for name in names:
-            (tmp_path / name).touch()
+            (tmp_path / f"libLLVM{name}").touch()
         monkeypatch.setattr(llvm, "_PATTERNS", (f"{tmp_path}/libLLVM*.so*",))
+        monkeypatch.setenv(llvm.ENVIRONMENT, str(tmp_path / f"libLLVM{chosen}") if chosen else "")
 
     return install
 
@@ -42,32 +36,30 @@ def test_version_from_the_name(name, version):
     assert llvm.llvm_version(Path(name)) == version
 
 
-def test_takes_the_newest(machine):
-    machine("libLLVM-14.so.1", "libLLVM.so.19.1", "libLLVM-17.so.1")
-    assert llvm.use_llvm().name == "libLLVM.so.19.1"
-    assert llvm.os.environ[llvm.ENVIRONMENT].endswith("libLLVM.so.19.1")
+@pytest.mark.parametrize(
+    ("names", "chosen", "taken"),
+    [
+        (["-14.so.1", ".so.19.1", "-17.so.1"], "", ".so.19.1"),
+        (["-15.so.1", "-16.so.1", ".so.19.1"], "-16.so.1", "-16.so.1"),
+    ],
+)
+def test_the_newest_is_taken_or_the_users_choice(machine, names, chosen, taken):
+    machine(*names, chosen=chosen)
+    assert llvm.use_llvm().name == f"libLLVM{taken}"
+    assert llvm.os.environ[llvm.ENVIRONMENT].endswith(f"libLLVM{taken}")
 
 
-def test_says_what_to_install_when_all_are_too_old(machine):
-    machine("libLLVM-14.so.1", "libLLVM-15.so.1")
-    with pytest.raises(NgptError, match=r"only versions \[14, 15\] found.*install libllvm19"):
+@pytest.mark.parametrize(
+    ("names", "chosen", "message"),
+    [
+        (["-14.so.1", "-15.so.1"], "", r"only versions \[14, 15\] found.*install libllvm19"),
+        ([], "", r"none found.*install libllvm19"),
+        (["-15.so.1", ".so.19.1"], "-15.so.1", "older than LLVM 16"),
+        ([".so.19.1"], "-99.so", "no such file"),
+    ],
+)
+def test_what_cannot_work_is_said_with_what_to_install(machine, names, chosen, message):
+    machine(*names, chosen=chosen)
+    with pytest.raises(NgptError, match=message):
         llvm.use_llvm()
-    assert llvm.ENVIRONMENT not in llvm.os.environ
-
-
-def test_says_what_to_install_when_there_is_none(machine):
-    machine()
-    with pytest.raises(NgptError, match=r"none found.*install libllvm19"):
-        llvm.use_llvm()
-
-
-def test_respects_the_users_choice_if_it_can_work(machine, tmp_path, monkeypatch):
-    machine("libLLVM-15.so.1", "libLLVM-16.so.1", "libLLVM.so.19.1")
-    monkeypatch.setenv(llvm.ENVIRONMENT, str(tmp_path / "libLLVM-16.so.1"))
-    assert llvm.use_llvm().name == "libLLVM-16.so.1"
-    monkeypatch.setenv(llvm.ENVIRONMENT, str(tmp_path / "libLLVM-15.so.1"))
-    with pytest.raises(NgptError, match="older than LLVM 16"):
-        llvm.use_llvm()
-    monkeypatch.setenv(llvm.ENVIRONMENT, str(tmp_path / "libLLVM-99.so"))
-    with pytest.raises(NgptError, match="no such file"):
-        llvm.use_llvm()
+    assert not llvm.os.environ[llvm.ENVIRONMENT] or chosen

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 
+from data_gen.scenes.load import load_scene
 from ngpt.errors import NgptError
 
 QUAD = """ply
@@ -63,8 +64,6 @@ def scene_file(tmp_path):
 
 
 def test_meshes_of_one_material_are_one(renderer, scene_file):
-    from data_gen.scenes.load import load_scene
-
     merged = load_scene(str(scene_file))
     plain = load_scene(str(scene_file), merged=False)
     assert [s.id() for s in plain.shapes()] == ["a", "b", "c", "lamp", "smooth", "d", "fog"]
@@ -77,8 +76,6 @@ def test_meshes_of_one_material_are_one(renderer, scene_file):
 
 def test_it_is_the_same_scene(renderer, scene_file):
     import mitsuba as mi
-
-    from data_gen.scenes.load import load_scene
 
     views = mi.load_dict({"type": "aov", "aovs": "n:sh_normal,g:geo_normal,u:uv,d:depth,a:albedo"})
     images = [
@@ -93,8 +90,6 @@ def test_it_is_the_same_scene(renderer, scene_file):
 
 def test_a_scene_of_nothing_else_has_its_bounds(renderer, tmp_path):
     """Of rectangles that Mitsuba merges by itself they are lost, and with them the sky's sphere."""
-    from data_gen.scenes.load import load_scene
-
     for i, name in enumerate("abc"):
         (tmp_path / f"{name}.ply").write_text(quad(1.2 * i))
     shapes = "".join(shape(name, '<ref id="red"/>') for name in "abc")
@@ -130,8 +125,6 @@ def test_files_are_found_beside_their_scene_alone(renderer, scene_file, tmp_path
     """A scene that was loaded before is not where the next one's meshes come from."""
     import mitsuba as mi
 
-    from data_gen.scenes.load import load_scene
-
     before = list(mi.file_resolver())
     load_scene(str(scene_file))
     assert list(mi.file_resolver()) == before
@@ -145,8 +138,6 @@ def test_files_are_found_beside_their_scene_alone(renderer, scene_file, tmp_path
 
 
 def test_parameters_and_errors_are_those_of_mitsuba(renderer, scene_file):
-    from data_gen.scenes.load import load_scene
-
     text = scene_file.read_text().replace(
         '<scene version="3.0.0">', '<scene version="3.0.0"><default name="n" value="48"/>'
     )

@@ -6,22 +6,22 @@ from unbiased import load
 
 from ngpt.errors import NgptError
 
+pytest.importorskip("mitsuba")
+
+from data_gen.frames.motion import motion_vectors, seen, snapshot
+from data_gen.scenes.geometry import Mesh, geometry, geometry_of, put_vertices, vertices, vertices_name
+from data_gen.scenes.load import set_film_size
+
 SIZE = (32, 24)
 
 
-def floats(values):
+def floats(*values):
     return [float(value) for value in values]
 
 
-def looking(mi, origin, target, up=(0, 1, 0)):
-    return mi.Transform4f().look_at(origin=floats(origin), target=floats(target), up=floats(up))
-
-
-def scene_of(mi, origin=(0, 0, 5), target=(0, 0, 0), sensor=(), **objects):
-    from data_gen.scenes.load import set_film_size
-
+def scene_of(mi, origin=(0, 0, 5), target=(0, 0, 0), **objects):
     to_world = mi.ScalarTransform4f().look_at(origin=list(origin), target=list(target), up=[0, 1, 0])
-    camera = {"type": "perspective", "fov": 30, "to_world": to_world} | dict(sensor)
+    camera = {"type": "perspective", "fov": 30, "to_world": to_world}
     scene = load(mi, {"type": "scene", "sensor": camera, "light": {"type": "constant"}, **objects})
     set_film_size(scene, SIZE)
     return scene
@@ -29,7 +29,7 @@ def scene_of(mi, origin=(0, 0, 5), target=(0, 0, 0), sensor=(), **objects):
 
 def move_camera(mi, scene, origin, target):
     params = mi.traverse(scene.sensors()[0])
-    params["to_world"] = looking(mi, origin, target)
+    params["to_world"] = mi.Transform4f().look_at(floats(*origin), floats(*target), floats(0, 1, 0))
     params.update()
 
 
@@ -44,19 +44,12 @@ def pixel_width(distance, fov=30):
 
 def moved(mi, scene, change):
     """Motion from the state of a scene to that after ``change``, which is thus the current one."""
-    from data_gen.frames.motion import motion_vectors, snapshot
-
     before = snapshot(scene)
     change()
     return motion_vectors(scene, snapshot(scene), before)
 
 
-def test_nothing_moves_where_nothing_changes(renderer):
-    scene = scene_of(renderer, wall=wall(renderer), ball={"type": "sphere"})
-    assert np.array_equal(moved(renderer, scene, lambda: None), np.zeros((24, 32, 2)))
-
-
-@pytest.mark.parametrize("across, up", [(1, 0), (0, 1), (-2, 0.5)])
+@pytest.mark.parametrize("across, up", [(1, 0), (-2, 0.5)])
 def test_a_camera_that_moves_by_pixels_sees_a_wall_move_by_pixels(renderer, across, up):
     scene = scene_of(renderer, wall=wall(renderer))
     step = pixel_width(5)
@@ -70,9 +63,8 @@ def test_a_sky_turns_with_the_camera_and_stays_when_that_moves(renderer):
     scene = scene_of(renderer)
     assert np.allclose(moved(renderer, scene, lambda: move_camera(renderer, scene, (3, 1, 5), (3, 1, 0))), 0, atol=1e-3)
     angle = np.arctan(pixel_width(1))
-    motion = moved(
-        renderer, scene, lambda: move_camera(renderer, scene, (3, 1, 5), (3 + np.tan(angle), 1, 4))
-    )  # turned right
+    right = (3 + np.tan(angle), 1, 4)
+    motion = moved(renderer, scene, lambda: move_camera(renderer, scene, (3, 1, 5), right))
     assert np.allclose(motion[12, 16], [1, 0], atol=0.02)
 
 
@@ -83,7 +75,7 @@ def test_a_sphere_moves_in_front_of_a_wall_at_rest(renderer):
     key = next(filter(lambda name: name.endswith("ball.to_world"), params.keys()))
 
     def change():
-        params[key] = mi.Transform4f().translate(floats([2 * pixel_width(5), 0, 0])).scale(0.5)
+        params[key] = mi.Transform4f().translate(floats(2 * pixel_width(5), 0, 0)).scale(0.5)
         params.update()
 
     motion = moved(mi, scene, change)
@@ -93,8 +85,6 @@ def test_a_sphere_moves_in_front_of_a_wall_at_rest(renderer):
 
 def test_vertices_have_the_names_of_this_mitsuba_and_of_the_next(renderer):
     """Mitsuba 3.10 has "positions", a tensor (V, 3); what is installed is asked for its own."""
-    from data_gen.scenes.geometry import Mesh, geometry, geometry_of, put_vertices, vertices, vertices_name
-
     mi = renderer
     box = mi.load_dict({"type": "cube"})
     installed, found = mi.traverse(box), geometry(box)
@@ -111,8 +101,6 @@ def test_vertices_have_the_names_of_this_mitsuba_and_of_the_next(renderer):
 
 
 def test_any_deformation_of_a_mesh_is_followed(renderer):
-    from data_gen.scenes.geometry import put_vertices, vertices, vertices_name
-
     mi = renderer
     scene = scene_of(mi, box={"type": "cube", "to_world": mi.ScalarTransform4f().scale([1.5, 1.5, 0.1])})
     params = mi.traverse(scene)
@@ -132,7 +120,6 @@ def test_any_deformation_of_a_mesh_is_followed(renderer):
 
 def test_instances_move_by_their_own_matrix(renderer):
     mi = renderer
-    from data_gen.frames.motion import motion_vectors, snapshot
 
     def scene(shift):
         instance = {"type": "instance", "to_world": mi.ScalarTransform4f().translate([shift, 0, 0])}
@@ -148,7 +135,6 @@ def test_instances_move_by_their_own_matrix(renderer):
 def test_what_is_seen_here_was_seen_there(renderer):
     """Under a turn and a move of camera and box: the hit's place in the scene before is that of the pixel before."""
     mi = renderer
-    from data_gen.frames.motion import motion_vectors, seen, snapshot
 
     def scene(angle, origin):
         box = {"type": "cube", "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], angle)}
@@ -188,7 +174,6 @@ def test_a_plane_mirror_shows_what_stands_behind_it(renderer):
 
 def test_what_was_not_there_or_behind_the_camera_has_no_motion(renderer):
     mi = renderer
-    from data_gen.frames.motion import motion_vectors, snapshot
 
     scene, before = scene_of(mi, wall=wall(mi)), snapshot(scene_of(mi))
     assert np.isnan(motion_vectors(scene, snapshot(scene), before)).all()
@@ -198,8 +183,6 @@ def test_what_was_not_there_or_behind_the_camera_has_no_motion(renderer):
 
 
 def test_a_camera_without_a_projection_is_refused(renderer):
-    from data_gen.frames.motion import snapshot
-
     sensor = {"type": "orthographic", "to_world": renderer.ScalarTransform4f().translate([0, 0, 5])}
     scene = renderer.load_dict({"type": "scene", "sensor": sensor, "light": {"type": "constant"}})
     with pytest.raises(NgptError, match="perspective or thinlens"):

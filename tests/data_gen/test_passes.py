@@ -8,14 +8,20 @@ import numpy as np
 import pytest
 from unbiased import load, same
 
-from data_gen.budget import Budget
 from ngpt.errors import NgptError
+
+pytest.importorskip("mitsuba")
+
+from data_gen import passes
+from data_gen.adaptive import Adaptive
+from data_gen.budget import Budget
+from data_gen.film import GradientFilm
+from data_gen.passes import blocks_within, foretold, render_passes
+from data_gen.render import render_stack
+from data_gen.scenes.load import set_film_size
 
 
 def test_large_images_with_small_blocks(renderer, monkeypatch):
-    from data_gen import passes
-    from data_gen.render import render_stack
-
     scene = load(renderer, "glossy", (33, 21))
     monkeypatch.setattr(passes, "_BLOCK_LANES", 33 * 21 * 5)
     whole = render_stack(scene, 14, 7)
@@ -25,17 +31,12 @@ def test_large_images_with_small_blocks(renderer, monkeypatch):
 
 
 def test_passes_do_not_move_blocks_within_packets(renderer):
-    from data_gen.film import GradientFilm
-    from data_gen.passes import blocks_within
-
     assert blocks_within(1000, GradientFilm(32, 21), 4) > 1
     # 33 * 21 * 4 lanes are no whole number of packets of 16: a second block would start amid one.
     assert blocks_within(1000, GradientFilm(33, 21), 4) == 1
 
 
 def test_time_is_kept_and_its_samples_are_those_of_spp(renderer):
-    from data_gen.render import render_stack
-
     scene = load(renderer, "diffuse", (64, 48))
     render_stack(scene, 1)
     calls = []
@@ -52,8 +53,6 @@ class Fake:
     """A sampler whose passes take a known time by a clock of its own; it notes the blocks that it is given."""
 
     def __init__(self, mitsuba, monkeypatch, begin, each, compile_once=0.0):
-        from data_gen import passes
-
         self.mitsuba, self.begin, self.each, self.compile_once = mitsuba, begin, each, compile_once
         self.now, self.blocks = 0.0, []
         monkeypatch.setattr(passes.time, "perf_counter", lambda: self.now)
@@ -75,12 +74,11 @@ class Fake:
         film.put("primal", self.mitsuba.Color3f(1) + self.mitsuba.Float(camera.sample))
 
 
-@pytest.mark.parametrize("begin", [0, 0.5])
-@pytest.mark.parametrize("each", [0.06, 0.4, 1.7])
-@pytest.mark.parametrize("compile_once", [0, 4])
+@pytest.mark.parametrize(
+    ("begin", "each", "compile_once"),
+    [(0, 0.06, 0), (0.5, 0.06, 4), (0, 0.4, 4), (0.5, 0.4, 0), (0, 1.7, 0), (0.5, 1.7, 4)],
+)
 def test_time_is_kept_whatever_a_sample_takes(renderer, monkeypatch, begin, each, compile_once):
-    from data_gen.passes import render_passes
-
     sensor = load(renderer, "diffuse", (128, 64)).sensors()[0]
     fake = Fake(renderer, monkeypatch, begin, each, compile_once)
     film = render_passes(fake, sensor, 0, Budget(seconds=10), points="rounds")
@@ -91,9 +89,17 @@ def test_time_is_kept_whatever_a_sample_takes(renderer, monkeypatch, begin, each
     assert again.blocks == fake.blocks and sum(fake.blocks) == film.samples
 
 
-def test_what_takes_longer_than_the_time_is_rendered_once(renderer, monkeypatch):
-    from data_gen.passes import render_passes
+def test_the_time_of_a_pass_is_foretold():
+    assert foretold([(100, 3.0)]) == (0.0, 0.03)
+    # The first compiles.
+    assert foretold([(100, 30.0), (100, 0.4), (300, 0.8), (50, 0.3)]) == pytest.approx((0.2, 0.002))
+    assert foretold([(100, 30.0), (100, 0.4), (100, 0.5)]) == pytest.approx((0.0, 0.004))
+    # Never nothing at all, however the times of busy machines fall.
+    begin, each = foretold([(1, 9.0), (100, 0.4), (300, 0.2), (200, 0.3)])
+    assert begin >= 0 and each > 0
 
+
+def test_what_takes_longer_than_the_time_is_rendered_once(renderer, monkeypatch):
     sensor = load(renderer, "diffuse", (128, 64)).sensors()[0]
     fake = Fake(renderer, monkeypatch, 0, 20)
     assert render_passes(fake, sensor, 0, Budget(seconds=10), points="rounds").samples == 1
@@ -102,8 +108,6 @@ def test_what_takes_longer_than_the_time_is_rendered_once(renderer, monkeypatch)
 
 
 def test_stopping_keeps_the_samples_done(renderer):
-    from data_gen.render import render_stack
-
     scene = load(renderer, "diffuse", (256, 256))
     stack = render_stack(scene, 1 << 20, 3, "primal", stop=lambda: True, points="rounds")
     assert 1 <= stack.attributes["ngpt:spp"] < 100
@@ -111,10 +115,6 @@ def test_stopping_keeps_the_samples_done(renderer):
 
 
 def test_sizes_that_memory_cannot_hold(renderer, monkeypatch):
-    from data_gen import passes
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import set_film_size
-
     scene = load(renderer, "diffuse", (4, 4))
     set_film_size(scene, (20000, 10000))
     # More than a machine has is no advice.
@@ -130,6 +130,10 @@ def test_sizes_that_memory_cannot_hold(renderer, monkeypatch):
     assert render_stack(scene, 1, memory=int(str(error.value).split("--memory ")[1].split(",")[0]))
 
 
+def adaptive(error=None, method="wcv", **options):
+    return {"spp": 64, "sampler": "gpt", "adaptive": Adaptive(error, method)} | options
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -141,18 +145,26 @@ def test_sizes_that_memory_cannot_hold(renderer, monkeypatch):
         ({"spp": None, "seconds": 0}, "cannot render for 0 s"),
         ({"spp": None, "seconds": float("nan")}, "cannot render for nan s"),
         ({"spp": 1, "memory": 0}, "0 MiB"),
+        ({"sampler": "bdpt", "joined_depth": 0}, "'0' is not allowed; it takes a whole number from 1 to 64$"),
+        ({"sampler": "ppm", "radius": 0}, "'radius': '0' is not allowed; it takes a number from 1e-06 to 1e.06$"),
+        ({"sampler": "gpt", "shift": "half-vektor"}, "takes replay, half-vector, manifold; did you mean 'half-vector'"),
+        ({"sampler": "gpt", "reus": True}, "sampler 'gpt' has no option 'reus'; did you mean 'reuse'"),
+        ({"sampler": "split", "reuse": True}, "'split' has no option 'reuse'; it has: points, lamps"),
+        (adaptive(spp=31), "31 samples per pixel are too few .* from 32 on"),
+        (adaptive(sampler="bdpt"), "'bdpt' depend on each other.* use: gpt, gpt-basic, gpt-simple, primal"),
+        (adaptive(reuse=True), "'reuse' and 'shift=manifold' need samples of all pixels"),
+        (adaptive(0.0, spp=None), "an error of 0 is never reached"),
+        (adaptive(spp=None), "neither a number of samples"),
+        (adaptive(method="magic"), "unknown method 'magic'"),
+        (adaptive(method="l1", sampler="primal"), "needs"),
     ],
 )
-def test_bad_options(renderer, options, message):
-    from data_gen.render import render_stack
-
+def test_refusals(renderer, options, message):
     with pytest.raises(NgptError, match=message):
-        render_stack(load(renderer, "diffuse", (4, 4)), **options)
+        render_stack(load(renderer, "diffuse", (4, 4)), **{"spp": 1} | options)
 
 
 def test_a_million_samples_of_one_pixel(renderer):
-    from data_gen.render import render_stack
-
     stack = render_stack(load(renderer, "diffuse", (1, 1)), 1 << 20, sampler="primal")
     assert stack.attributes["ngpt:spp"] == 1 << 20
     assert np.allclose(np.linalg.norm(stack["normal"]), 1, atol=1)

@@ -13,12 +13,17 @@ from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS, reconstruct
 from ngpt.stack import GradientStack
 
+pytest.importorskip("mitsuba")
+
+from data_gen.adaptive import gain
+from data_gen.choosing import pipelines, plans, trials
+from data_gen.choosing.pipelines import Pipeline, choose, measure, methods_for
+from data_gen.choosing.trials import Trial, by_processor, try_out
+
 SHAPE = (48, 64)
 
 
 def pipeline(sampler="gpt", method="wcv", error=0.01, fall=-0.8, seconds=0.01, after=0.0, **more):
-    from data_gen.choosing.pipelines import Pipeline
-
     return Pipeline(sampler, method, 16, error, fall, seconds, after, **more)
 
 
@@ -45,23 +50,14 @@ def stack(rng, seed, spp=8, variance=0.5, of_gradients=None):
     return GradientStack({k: np.asarray(v, np.float32) for k, v in layers.items()}, attributes)
 
 
-def trials(rng):
-    from data_gen.choosing.trials import Trial
-
-    return {
+def test_what_is_measured_is_the_true_error(renderer, rng, monkeypatch):
+    """Of every method, whatever it blurs: no pilot knows the truth."""
+    monkeypatch.setattr(pipelines, "WITH_GRADIENTS", ("wcv", "ngpt-fast"))
+    monkeypatch.setattr(pipelines, "WITHOUT", ("primal", "oidn"))
+    made = {
         "gpt": Trial([stack(rng, i, of_gradients=0.01) for i in range(4)], 0.02),
         "primal": Trial([stack(rng, i) for i in range(4)], 0.01),
     }
-
-
-def test_what_is_measured_is_the_true_error(renderer, rng, monkeypatch):
-    """Of every method, whatever it blurs: no pilot knows the truth."""
-    from data_gen.choosing import pipelines
-    from data_gen.choosing.pipelines import measure, methods_for
-
-    monkeypatch.setattr(pipelines, "WITH_GRADIENTS", ("wcv", "ngpt-fast"))
-    monkeypatch.setattr(pipelines, "WITHOUT", ("primal", "oidn"))
-    made = trials(rng)
     found = measure(made)
     names = {(p.sampler, p.method) for p in found}
     assert names == {(s, m) for s in made for m in methods_for(s)} and ("gpt", "wcv") in names
@@ -74,40 +70,39 @@ def test_what_is_measured_is_the_true_error(renderer, rng, monkeypatch):
     assert noise.step == pytest.approx(-1, abs=0.15)
 
 
-def test_the_best_depends_on_the_time(renderer):
-    """A denoiser that hardly improves wins at first, gradients in the end."""
-    from data_gen.choosing.pipelines import choose
-
-    flat = pipeline("primal", "oidn", error=0.005, fall=-0.4, seconds=0.005)
-    steep = pipeline("gpt", "wcv", error=0.01, fall=-0.9)
-    assert choose([flat, steep], 0.2)[0] == flat and choose([flat, steep], 20.0)[0] == steep
-    for best in choose([flat, steep], 5.0):
-        assert math.isfinite(best.expected(best.samples(5.0)))
+FLAT = pipeline("primal", "oidn", error=0.005, fall=-0.4, seconds=0.005)
+STEEP = pipeline("gpt", "wcv", error=0.01, fall=-0.9)
+QUICK, SLOW = pipeline(error=0.011), pipeline(method="ngpt-combine", after=0.5)
+EVEN, SHARED, DEAR = pipeline(), pipeline(adaptive=0.6, choosing=0.01), pipeline(adaptive=0.95, choosing=1.0)
 
 
-def test_time_of_the_method_counts(renderer):
-    from data_gen.choosing.pipelines import choose
+@pytest.mark.parametrize(
+    ("both", "seconds", "best"),
+    [
+        # A denoiser that hardly improves wins at first, gradients in the end.
+        ([FLAT, STEEP], 0.2, FLAT),
+        ([FLAT, STEEP], 20.0, STEEP),
+        # The time of the method counts.
+        ([QUICK, SLOW], 1.0, QUICK),
+        ([QUICK, SLOW], 100.0, SLOW),
+        # Samples are shared out where that pays: not where there are too few.
+        ([EVEN, SHARED], 2.0, SHARED),
+        ([EVEN, SHARED], 0.3, EVEN),
+        ([EVEN, DEAR], 10.0, EVEN),
+    ],
+)
+def test_the_best_depends_on_the_time(both, seconds, best):
+    assert choose(both, seconds)[0] == best
+    assert all(math.isfinite(p.expected(p.samples(seconds))) for p in choose(both, seconds))
 
-    quick, slow = pipeline(error=0.011), pipeline(method="ngpt-combine", after=0.5)
-    assert slow.samples(1.0) == pytest.approx(50) and quick.samples(1.0) == pytest.approx(100)
-    assert choose([quick, slow], 1.0)[0] == quick and choose([quick, slow], 100.0)[0] == slow
-    assert choose([slow], 0.4) == []
 
-
-def test_samples_are_shared_out_where_that_pays(renderer):
-    from data_gen.choosing.pipelines import choose
-
-    even, shared = pipeline(), pipeline(adaptive=0.6, choosing=0.01)
-    assert shared.shared and not even.shared and shared.samples(2.0) < even.samples(2.0)
-    assert choose([even, shared], 2.0)[0] == shared
-    assert choose([even, shared], 0.3)[0] == even  # too few samples
-    dear = pipeline(adaptive=0.95, choosing=1.0)
-    assert choose([even, dear], 10.0)[0] == even
+def test_what_fits_into_a_time():
+    assert SLOW.samples(1.0) == pytest.approx(50) and QUICK.samples(1.0) == pytest.approx(100)
+    assert choose([SLOW], 0.4) == []
+    assert SHARED.shared and not EVEN.shared and SHARED.samples(2.0) < EVEN.samples(2.0)
 
 
 def test_the_gain_of_shared_out_samples(renderer):
-    from data_gen.adaptive import gain
-
     assert gain(np.ones(100)) == pytest.approx(1)
     need = np.where(np.arange(100) < 50, 1.0, 2.0)
     assert gain(need) == pytest.approx(1.5**2 / 2.5)
@@ -120,8 +115,6 @@ def ticking(tick):
 
 
 def test_a_plan_fits_into_the_time_and_leaves_the_scene_as_it_was(renderer, monkeypatch):
-    from data_gen.choosing import plans
-
     scene = load(renderer, "diffuse", (48, 32))
     monkeypatch.setattr(plans, "PIXELS", 24 * 16)
     monkeypatch.setattr(plans, "candidates", lambda scene: ["gpt"])
@@ -140,8 +133,6 @@ def test_a_plan_fits_into_the_time_and_leaves_the_scene_as_it_was(renderer, monk
 
 
 def test_stop_ends_a_pilot_and_the_render_begins(renderer, monkeypatch):
-    from data_gen.choosing import plans
-
     scene = load(renderer, "diffuse", (48, 32))
     told = []
     found = plans.plan(scene, 200.0, said=told.append, stop=lambda: len(told) > 1)
@@ -151,8 +142,6 @@ def test_stop_ends_a_pilot_and_the_render_begins(renderer, monkeypatch):
 
 def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
     """All trials together have a fifth of the time; and the less time, the smaller the images."""
-    from data_gen.choosing import plans, trials
-
     scene = load(renderer, "diffuse", (48, 32))
     monkeypatch.setattr(plans, "PIXELS", 24 * 16)
     monkeypatch.setattr(plans, "candidates", lambda scene: ["gpt", "bdpt", "gbdpt"])
@@ -178,8 +167,6 @@ def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
 
 def test_a_busy_moment_moves_no_sampler_against_another(rng):
     """Samples are compared by processor seconds, and cost in sum what the wall says."""
-    from data_gen.choosing.trials import Trial, by_processor
-
     found = by_processor({"gpt": Trial([], 0.9, 0.6), "primal": Trial([], 0.1, 0.4)})
     assert [trial.seconds for trial in found.values()] == pytest.approx([0.6, 0.4])
     unknown = {"gpt": Trial([], 0.9, 0.6), "primal": Trial([], 0.1)}
@@ -187,8 +174,6 @@ def test_a_busy_moment_moves_no_sampler_against_another(rng):
 
 
 def test_a_trial_measures_both_clocks_on_a_processor(renderer, monkeypatch):
-    from data_gen.choosing import trials
-
     scene = load(renderer, "diffuse", (16, 12))
     trial, _ = trials.try_out(scene, "primal")
     assert trial.seconds > 0 and trial.processor > 0
@@ -200,8 +185,6 @@ def test_a_trial_measures_both_clocks_on_a_processor(renderer, monkeypatch):
 def test_all_that_follows_a_render_is_counted_at_its_size(renderer, monkeypatch):
     """Methods are measured on small images: they grow a little slower than the pixels, and files and a process come
     on top."""
-    from data_gen.choosing import plans
-
     scene = load(renderer, "diffuse", (96, 64))
     monkeypatch.setattr(plans, "PIXELS", 48 * 32)
     monkeypatch.setattr(plans, "try_all", lambda *args, **options: {"gpt": None})
@@ -216,8 +199,6 @@ def test_all_that_follows_a_render_is_counted_at_its_size(renderer, monkeypatch)
 
 def test_slow_compilation_keeps_other_samplers_out(renderer, monkeypatch):
     """gbdpt takes three times as long as gpt: where that took 20 s, it is not begun in a rest of 40."""
-    from data_gen.choosing import trials
-
     scene, tried = load(renderer, "diffuse", (16, 12)), []
     for took, names in ((20.0, ["gpt"]), (10.0, ["gpt", "gbdpt"])):
         tried.clear()
@@ -232,8 +213,6 @@ def test_slow_compilation_keeps_other_samplers_out(renderer, monkeypatch):
 
 
 def test_a_sampler_that_takes_too_long_is_not_tried(renderer):
-    from data_gen.choosing.trials import try_out
-
     scene = load(renderer, "diffuse", (16, 12))
     # A second to compile; a render of 8 samples takes another, and there are four of these and two of 16.
     assert try_out(scene, "primal", ticking(1.0), 8.5)[0] is None
@@ -245,8 +224,6 @@ def test_a_sampler_that_takes_too_long_is_not_tried(renderer):
 
 
 def test_a_method_is_tried_where_it_can_run(renderer):
-    from data_gen.choosing.pipelines import methods_for
-
     assert methods_for("primal", "wcv") == [] and methods_for("gpt", "wcv") == ["wcv"]
     assert methods_for("primal", "primal") == ["primal"]
     for sampler in ("gpt", "primal", "bdpt"):

@@ -14,15 +14,17 @@ from unbiased import load
 pytest.importorskip("mitsuba")
 
 from data_gen.dataset import crops, jobs
-from data_gen.dataset.config import Config, made_name, read_config
+from data_gen.dataset.cameras import Surroundings, find_view
+from data_gen.dataset.config import Config, made_name
+from data_gen.scenes.builtin import _box, _camera, _diffuse, _sphere, _volume, _wall
 from data_gen.scenes.procedural import media, variety
 from data_gen.scenes.procedural.scenes import make_scene
 from data_gen.scenes.procedural.stage import Stage
 from ngpt.errors import NgptError
 from ngpt.system.writing import write_json
 from ngpt.training.dataset import MANIFEST, read_manifest
+from ngpt.training.shards import Shard
 
-ROOT = Path(__file__).parents[2]
 RENDERED = """
 import sys, mitsuba as mi, numpy as np
 mi.set_variant("scalar_rgb")
@@ -38,14 +40,10 @@ for path in sys.argv[1:]:
 """
 
 
-def files(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
 def made(tmp_path: Path, name: str, seed, varied: bool = True) -> dict[str, bytes]:
     (tmp_path / name).mkdir()
     make_scene(seed, tmp_path / name, variety.SHARES if varied else None)
-    return files(tmp_path / name)
+    return {path.name: path.read_bytes() for path in (tmp_path / name).iterdir()}
 
 
 def only(monkeypatch, *sights: str, kind: str = "") -> None:
@@ -147,27 +145,18 @@ def test_each_kind_renders(tmp_path, monkeypatch):
 @pytest.mark.parametrize("kind", [pytest.param("fog", marks=pytest.mark.slow), "smoke"])
 def test_cameras_are_found_beside_media_and_see_through_their_boundaries(renderer, kind):
     """A camera's medium is said once: those in fog stay in it, those outside of smoke stay outside."""
-    from data_gen.dataset.cameras import Surroundings, find_view
-    from data_gen.scenes.builtin import _box, _camera, _diffuse, _sphere, _volume, _wall
-
     low, high = ([-3, -0.5, -3], [3, 3, 3]) if kind == "fog" else ([-0.5, 0, -0.5], [0.5, 2, 0.5])
     air = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.8}
-    lens = {"type": "thinlens", "aperture_radius": 0.01, "focus_distance": 2.0}
-    things = {
-        f"ball{i}": _sphere([1.8 * np.sin(i), 0.3, 1.8 * np.cos(i)], 0.3, _diffuse(0.5, 0.5, 0.5)) for i in range(7)
+    lens, grey = {"type": "thinlens", "aperture_radius": 0.01, "focus_distance": 2.0}, _diffuse(0.5, 0.5, 0.5)
+    scene = {
+        "type": "scene",
+        "sensor": _camera([0.2, 1, 2.6], [0, 0.5, 0], 60) | lens,
+        "floor": _wall([0, 0, 0], [0, 1, 0], (20, 20), grey),
+        "block": _box([0.2, 0.6, 0], [0.3, 1.2, 0.3], 10, grey),
+        "medium": _volume((low, high), air),
+        **{f"ball{i}": _sphere([1.8 * np.sin(i), 0.3, 1.8 * np.cos(i)], 0.3, grey) for i in range(7)},
     }
-    scene = load(
-        renderer,
-        {
-            "type": "scene",
-            "sensor": _camera([0.2, 1, 2.6], [0, 0.5, 0], 60) | lens,
-            "floor": _wall([0, 0, 0], [0, 1, 0], (20, 20), _diffuse(0.5, 0.5, 0.5)),
-            "block": _box([0.2, 0.6, 0], [0.3, 1.2, 0.3], 10, _diffuse(0.5, 0.5, 0.5)),
-            "medium": _volume((low, high), air),
-            **things,
-        },
-    )
-    around, rng = Surroundings(scene), np.random.default_rng(0)
+    around, rng = Surroundings(load(renderer, scene)), np.random.default_rng(0)
     for _ in range(4):
         origin = np.array(find_view(around, rng, 32, 20, 0.005).origin)
         assert np.all((origin > low) & (origin < high)) == (kind == "fog")
@@ -184,9 +173,6 @@ def test_cameras_are_found_beside_media_and_see_through_their_boundaries(rendere
 @pytest.mark.parametrize("kind", list(media.KINDS))
 def test_crops_of_scenes_with_media(renderer, tmp_path, monkeypatch, kind):
     """By the sampler that `auto` takes; every layer is finite."""
-    from data_gen.dataset import crops
-    from ngpt.training.shards import Shard
-
     only(monkeypatch, "media", kind=kind)
     config = Config(size=16, inputs=1, spp=(2, 4), sampler="auto", scenes=1, varied=True, crops=1, reference_spp=8)
     (tmp_path / "shards").mkdir()
@@ -206,21 +192,15 @@ def test_a_set_begun_before_there_was_an_entry_goes_on(tmp_path):
         jobs.start(replace(config, varied=True), tmp_path, 8)
 
 
-def test_the_configuration_of_varied_scenes():
-    config = read_config(ROOT / "configs" / "data-varied.toml")
-    assert config.varied and config.sampler == "auto"
-
-
 def test_a_configuration_sets_shares(tmp_path):
     config = Config(scenes=40, varied=True, sights={"media": 1.0, "hair": 0.0})
-    plain, more = tmp_path / "plain", tmp_path / "more"
     for number in range(40):
         seed = crops.scene_seed(config, made_name(number))
         sights = variety.further_sights(seed, variety.SHARES | config.sights)[0]
         assert "media" in sights and "hair" not in sights
         # The other sights fall to the scenes that they fell to.
         assert sights - {"media", "hair"} == variety.further_sights(seed)[0] - {"media", "hair"}
-    plain.mkdir()
-    more.mkdir()
-    assert "<medium" not in crops.made_scene(replace(config, sights={"media": 0.0}), made_name(0), plain).read_text()
-    assert "<medium" in crops.made_scene(config, made_name(0), more).read_text()
+    for share in (0.0, 1.0):
+        (tmp_path / str(share)).mkdir()
+        scene = crops.made_scene(replace(config, sights={"media": share}), made_name(0), tmp_path / str(share))
+        assert ("<medium" in scene.read_text()) == bool(share)

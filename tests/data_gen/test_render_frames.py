@@ -6,6 +6,8 @@ import signal
 import socket
 import subprocess
 import sys
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +19,12 @@ from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.system.console import Console
 from ngpt.system.interrupts import Interrupt
+
+pytest.importorskip("mitsuba")
+
+from data_gen import shot_files
+from data_gen.cli import render
+from data_gen.dataset import jobs
 
 
 def test_frames_are_ranges_lists_and_steps():
@@ -70,147 +78,86 @@ def test_targets_are_patterns_and_folders(tmp_path):
     assert not (tmp_path / "a.PNG").exists()
 
 
-def test_what_belongs_to_shots_is_refused_without(tmp_path, capsys):
-    assert main(["render", "diffuse", "--camera", "x.json", "-o", str(tmp_path / "a.exr")]) == 2
-    assert "--frames" in capsys.readouterr().err
-    assert main(["render", "diffuse", "-D", "a={frame}", "-o", str(tmp_path / "a.exr")]) == 2
-    assert "changes from frame to frame" in capsys.readouterr().err
+SMALL = "render diffuse --size 16x12 --spp 1 --sampler primal"
 
 
-def test_a_shot_is_rendered_and_gone_on_with(renderer, tmp_path, capsys):
-    path = tmp_path / "path.json"
+def test_a_shot_is_rendered_and_gone_on_with(renderer, command):
     keys = [{"frame": f, "origin": [f / 10, 1.25, 3.9], "target": [0, 1.15, 0]} for f in (0, 2)]
-    path.write_text(json.dumps({"keys": keys}))
-    words = [
-        "--camera",
-        str(path),
-        "--size",
-        "16x12",
-        "--spp",
-        "1",
-        "--sampler",
-        "primal",
-        "-o",
-        str(tmp_path / "shot"),
-    ]
-    assert main(["render", "diffuse", "--frames", "0:2", *words]) == 0
-    first = (tmp_path / "shot/diffuse.0001.exr").read_bytes()
-    assert main(["render", "diffuse", "--frames", "0:3", *words]) == 1
-    assert "exists already" in capsys.readouterr().err
-    assert main(["render", "diffuse", "--frames", "0:3", *words, "--skip-existing"]) == 0
-    assert "2 of 3 frames were skipped" in capsys.readouterr().err
-    assert (tmp_path / "shot/diffuse.0001.exr").read_bytes() == first
-    (tmp_path / "shot/diffuse.0001.exr").write_bytes(first[:-5])
-    assert main(["render", "diffuse", "--frames", "0:3", *words, "--skip-existing"]) == 0
-    told = capsys.readouterr().err
+    Path("path.json").write_text(json.dumps({"keys": keys}))
+    words, one = f"{SMALL} --camera path.json -o shot --frames", Path("shot/diffuse.0001.exr")
+    command(f"{words} 0:2")
+    first = one.read_bytes()
+    assert "exists already" in command(f"{words} 0:3", 1)
+    assert "2 of 3 frames were skipped" in command(f"{words} 0:3 --skip-existing")
+    assert one.read_bytes() == first
+    one.write_bytes(first[:-5])
+    told = command(f"{words} 0:3 --skip-existing")
     assert "2 of 3 frames were skipped" in told and "in place of a file that was not whole" in told
-    assert len((tmp_path / "shot/diffuse.0001.exr").read_bytes()) == len(first)
-    stack = ngpt.read(tmp_path / "shot/diffuse.0002.exr")
+    assert len(one.read_bytes()) == len(first)
+    stack = ngpt.read("shot/diffuse.0002.exr")
     assert stack.attributes["ngpt:frame"] == 2 and abs(stack["motion"]).max() > 0.05
 
 
-def parts(renderer, tmp_path, name, monkeypatch, *more):
-    monkeypatch.chdir(tmp_path)
-    words = ["--frames", "0:10:2", "--size", "16x12", "--spp", "1", "--sampler", "primal"]
-    assert main(["render", "diffuse", *words, "-o", name, *more]) == 0
-    return {file.name: ngpt.read(file) for file in sorted((tmp_path / name).iterdir())}
+@pytest.fixture
+def shot(renderer, command):
+    """Renders the frames 0, 2 and 4 into a folder; returns the stacks there by name."""
+
+    def render(folder, more=""):
+        command(f"{SMALL} --frames 0:6:2 -o {folder} {more}")
+        return {file.name: ngpt.read(file) for file in sorted(Path(folder).iterdir())}
+
+    return render
 
 
 def alike(stack, other):
     same = {name: value for name, value in stack.attributes.items() if name != "ngpt:seconds"}
-    assert same.items() <= other.attributes.items() | {("ngpt:seconds", 0)}
+    assert same.items() <= other.attributes.items()
     assert all(np.array_equal(stack[name], other[name], equal_nan=True) for name in stack.names)
 
 
-def test_parts_of_a_shot_are_its_frames(renderer, tmp_path, monkeypatch, capsys):
-    whole = parts(renderer, tmp_path, "whole", monkeypatch)
-    found = [list(parts(renderer, tmp_path, f"part{i}", monkeypatch, "--shard", f"{i}/2")) for i in range(2)]
-    assert [len(names) for names in found] == [3, 2] and sorted(found[0] + found[1]) == list(whole)
-    second = parts(renderer, tmp_path, "part1", monkeypatch, "--shard", "1/2", "--force")
-    for name, stack in second.items():
+def test_parts_of_a_shot_are_its_frames(shot):
+    whole, parts = shot("whole"), [shot(f"part{i}", f"--shard {i}/2") for i in range(2)]
+    assert [len(part) for part in parts] == [2, 1] and sorted([*parts[0], *parts[1]]) == list(whole)
+    for name, stack in (parts[0] | parts[1]).items():
         alike(stack, whole[name])
-    assert second["diffuse.0006.exr"].attributes["ngpt:previousFrame"] == 4
-    assert main(["render", "diffuse", "--shard", "0/2", "-o", str(tmp_path / "a.exr")]) == 2
-    assert "--shard belongs to a shot" in capsys.readouterr().err
+    assert whole["diffuse.0004.exr"].attributes["ngpt:previousFrame"] == 2
 
 
-def test_a_cluster_renders_the_parts_that_are_missing(renderer, tmp_path, monkeypatch, capsys):
-    from data_gen import shot_files
-    from data_gen.dataset import jobs
-
+def test_a_cluster_renders_the_parts_that_are_missing(shot, command, monkeypatch):
     monkeypatch.setattr(jobs, "cluster", lambda address: jobs.Serial())
-    monkeypatch.setattr(shot_files, "FRAMES_OF_A_PART", 2)
-    whole = parts(renderer, tmp_path, "whole", monkeypatch)
-    cluster = ["--cluster", "tcp://nowhere:1", "--json"]
-    assert list(parts(renderer, tmp_path, "farm", monkeypatch, *cluster)) == list(whole)
-    report = json.loads(capsys.readouterr().out)
-    assert [frame["frame"] for frame in report["frames"]] == [0, 2, 4, 6, 8] and report["skipped"] == 0
-    (tmp_path / "farm/diffuse.0004.exr").unlink()
-    again = parts(renderer, tmp_path, "farm", monkeypatch, *cluster, "--skip-existing")
-    report = json.loads(capsys.readouterr().out)
-    assert [frame["frame"] for frame in report["frames"]] == [4] and report["skipped"] == 4
+    monkeypatch.setattr(shot_files, "FRAMES_OF_A_PART", 1)
+    whole, cluster = shot("whole"), "--cluster tcp://nowhere:1 --json"
+    assert list(shot("farm", cluster)) == list(whole)
+    report = json.loads(command.output)
+    assert [frame["frame"] for frame in report["frames"]] == [0, 2, 4] and report["skipped"] == 0
+    Path("farm/diffuse.0004.exr").unlink()
+    again = shot("farm", f"{cluster} --skip-existing")
+    report = json.loads(command.output)
+    assert [frame["frame"] for frame in report["frames"]] == [4] and report["skipped"] == 2
     for name, stack in again.items():
         alike(stack, whole[name])
-    words = ["--frames", "0:2", "--cluster", "tcp://nowhere:1", "--shard", "0/2", "-o", str(tmp_path / "other")]
-    assert main(["render", "diffuse", *words]) == 2
-    assert "leave --shard out" in capsys.readouterr().err
 
 
-def test_one_pair_is_refused_and_two_are_rendered(renderer, tmp_path, capsys):
-    words = ["render", "diffuse", "--size", "16x12", "--spp", "1", "--sampler", "primal", "-o", str(tmp_path / "shot")]
-    assert main([*words, "--frames", "0:2", "--dt", "1"]) == 2
-    assert "use --dt 2" in capsys.readouterr().err
-    assert main([*words[:-1], str(tmp_path / "a.exr"), "--dt", "2"]) == 2
-    assert "--dt belongs to a shot" in capsys.readouterr().err
-    assert main([*words, "--frames", "0:2", "--dt", "2"]) == 0
-    stack = ngpt.read(tmp_path / "shot/diffuse.0001.exr")
+def test_two_pairs_are_rendered(renderer, command):
+    command(f"{SMALL} --frames 0:2 --dt 2 -o shot")
+    stack = ngpt.read("shot/diffuse.0001.exr")
     assert not stack["dt"].any() and stack["dt_var"].shape == stack["primal"].shape
 
 
-def test_ctrl_c_interrupts_a_cluster_at_once_and_no_render_that_is_done(renderer, tmp_path, monkeypatch):
-    from contextlib import contextmanager
-
-    from data_gen.cli import render
-    from data_gen.shot_files import Written
-
-    before = signal.getsignal(signal.SIGINT)
-    seen = []
-    note = lambda *_, **__: seen.append(signal.getsignal(signal.SIGINT)) or Written()  # noqa: E731
+def test_ctrl_c_interrupts_a_cluster_at_once_and_no_render_that_is_done(renderer, command, monkeypatch):
+    before, seen = signal.getsignal(signal.SIGINT), []
+    note = lambda *_, **__: seen.append(signal.getsignal(signal.SIGINT)) or shot_files.Written()  # noqa: E731
     monkeypatch.setattr(render, "write_frames_on_cluster", note)
-    words = ["render", "diffuse", "--frames", "0:2", "--cluster", "tcp://nowhere:1", "-o", str(tmp_path / "shot")]
-    args = parser_of(words)
+    parser = argparse.ArgumentParser()
+    render.add_arguments(parser)
+    args = parser.parse_args(["diffuse", "--frames", "0:2", "--cluster", "tcp://nowhere:1", "-o", "shot"])
     assert render.run(args, Console(quiet=True)) == 0 and seen == [before]
     interrupt = Interrupt()
     interrupt.signal = signal.SIGINT
-    pressed = contextmanager(lambda noted: iter([interrupt]))
-    monkeypatch.setattr(render, "stop_on_ctrl_c", pressed)
-    one = ["render", "diffuse", "--size", "8x8", "-q", "--sampler", "primal", "-o", str(tmp_path / "a.exr")]
-    assert main(one) == 0 and ngpt.read(tmp_path / "a.exr").attributes["ngpt:spp"] == 32
-    assert main([*one, "--force", "--spp", "100000"]) == 130
-
-
-def parser_of(words):
-    import argparse
-
-    from data_gen.cli import render
-
-    parser = argparse.ArgumentParser()
-    render.add_arguments(parser)
-    return parser.parse_args(words[1:])
-
-
-def test_one_image_that_is_there_is_left_out(renderer, tmp_path, capsys):
-    """So that a queue of parts with seeds of their own can be started again."""
-    target = tmp_path / "part.1.exr"
-    words = ["render", "diffuse", "--size", "16x12", "--spp", "1", "--sampler", "primal", "-o", str(target)]
-    assert main([*words, "--skip-existing"]) == 0
-    whole = target.read_bytes()
-    assert main([*words, "--skip-existing"]) == 0
-    assert "part.1.exr: skipped: the stack is there" in capsys.readouterr().err
-    assert target.read_bytes() == whole
-    target.write_bytes(whole[: len(whole) // 2])
-    assert main([*words, "--skip-existing"]) == 0
-    assert len(target.read_bytes()) == len(whole)
+    monkeypatch.setattr(render, "stop_on_ctrl_c", contextmanager(lambda noted: iter([interrupt])))
+    command("render diffuse --size 8x8 --sampler primal -o a.exr")
+    assert ngpt.read("a.exr").attributes["ngpt:spp"] == 32
+    command(f"{SMALL} -o a.exr --force --spp 100000", 130)
 
 
 @pytest.mark.slow

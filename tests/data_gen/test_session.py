@@ -3,13 +3,20 @@
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from unbiased import load
 
 import data_gen
+import ngpt
 from ngpt.errors import NgptError
+
+pytest.importorskip("mitsuba")
+
+from data_gen.inspect import inspect_scene
+from data_gen.render import render_stack
 
 SIZE = (16, 12)
 
@@ -18,21 +25,18 @@ def same(a, b):
     return a.names == b.names and all(np.array_equal(a[name], b[name], equal_nan=True) for name in a.names)
 
 
-def test_a_file_a_name_and_a_scene_give_the_bits_of_the_command(renderer, tmp_path):
-    import ngpt
-    from ngpt.cli import main
-
-    target = tmp_path / "s.exr"
-    assert main(["render", "diffuse", "--size", "16x12", "--spp", "4", "--seed", "3", "-q", "-o", str(target)]) == 0
+def test_a_file_a_name_and_a_scene_give_the_bits_of_the_command(renderer, command):
+    assert "sampler 'gpt': " in command("render diffuse --size 16x12 --spp 4 --seed 3 -o s.exr")
     told = []
     stack, plan = data_gen.render_scene("diffuse", 4, 3, size=SIZE, chosen=told.append)
-    assert same(ngpt.read(target), stack) and told == [plan]
+    assert same(ngpt.read("s.exr"), stack) and told == [plan]
     assert (plan.sampler, plan.method, plan.shared) == ("gpt", "", False) and "the integrator is" in plan.reason
     scene = data_gen.load_scene("diffuse", SIZE)
     again, plan = data_gen.render_scene(scene, 4, 3, "gpt", chosen=told.append)
     assert same(stack, again) and plan.sampler == "gpt" and len(told) == 1
-    with pytest.raises(NgptError, match="load it with them"):
-        data_gen.render_scene(scene, size=SIZE)
+    for asked in ({"size": SIZE}, {"sensor": 1}):
+        with pytest.raises(NgptError, match="has its size, parameters and sensor; load it with them"):
+            data_gen.render_scene(scene, **asked)
 
 
 def test_options_samples_that_differ_and_what_ends_a_render(renderer):
@@ -62,12 +66,9 @@ SENSORS = """<scene version="3.0.0"><integrator type="path"/>
 </scene>"""
 
 
-def test_one_of_several_sensors_by_number_or_id(renderer, tmp_path, capsys):
-    import ngpt
-    from ngpt.cli import main
-
-    file, told = tmp_path / "three.xml", []
-    file.write_text(SENSORS)
+def test_one_of_several_sensors_by_number_or_id(renderer, command):
+    Path("three.xml").write_text(SENSORS)
+    file, told = "three.xml", []
     stack, _ = data_gen.render_scene(file, 2, said=told.append)
     assert told == ["there are 3 sensors (0 'wide', 1 'close', 2), and none is named: 0 is rendered"]
     assert stack["primal"].shape == (6, 8, 3) and stack["primal"].mean() > 0
@@ -75,35 +76,31 @@ def test_one_of_several_sensors_by_number_or_id(renderer, tmp_path, capsys):
     assert close[0]["primal"].shape == (4, 6, 3) and all(same(close[0], other) for other in close) and len(told) == 1
     # What is asked of size goes to that sensor's film, and to frames the same.
     assert data_gen.render_scene(file, 2, sensor="close", size=(5, 3)).stack["primal"].shape == (3, 5, 3)
-    ((_, frame),) = data_gen.render_frames(str(file), [0], 2, sensor=1)
+    ((_, frame),) = data_gen.render_frames(file, [0], 2, sensor=1)
     assert frame["primal"].shape == (4, 6, 3)
-    target = str(tmp_path / "s.exr")
-    assert main(["render", str(file), "--sensor", "close", "--spp", "2", "-o", target]) == 0
-    assert same(close[0], ngpt.read(target)) and "none is named" not in capsys.readouterr().err
-    assert len(data_gen.load_scene(str(file)).sensors()) == 3
-    for sensor, message in {
-        "clos": r"there is no sensor 'clos'; did you mean 'close'\? choose one of: 0 'wide', 1 'close', 2$",
-        3: "there is no sensor '3'",
-        -1: "there is no sensor '-1'",
-        2: "camera 'batch': several cameras",
-    }.items():
-        with pytest.raises(NgptError, match=message):
-            data_gen.render_scene(file, 2, sensor=sensor)
-    with pytest.raises(NgptError, match=r"diffuse: there is no sensor 'wide'; choose one of: 0 'sensor'$"):
-        data_gen.render_scene("diffuse", 2, sensor="wide")
-    with pytest.raises(NgptError, match="has its size, parameters and sensor; load it with them"):
-        data_gen.render_scene(data_gen.load_scene(str(file)), 2, sensor=1)
-
-
-def test_info_tells_the_sensors_of_a_scene_and_which_is_rendered(renderer, tmp_path):
-    from data_gen.inspect import inspect_scene
-
-    file = tmp_path / "three.xml"
-    file.write_text(SENSORS)
-    found = inspect_scene(str(file))
+    assert "none is named" not in command("render three.xml --sensor close --spp 2 -o s.exr")
+    assert same(close[0], ngpt.read("s.exr")) and len(data_gen.load_scene(file).sensors()) == 3
+    found = inspect_scene(file)
     wide = "0 'wide': perspective, 8x6, the one that is rendered"
     assert found["sensors"] == [wide, "1 'close': perspective, 6x4", "2: batch, size not given"]
     assert found["size"] == (8, 6)
+
+
+@pytest.mark.parametrize(
+    ("scene", "sensor", "message"),
+    [
+        ("three.xml", "clos", r"no sensor 'clos'; did you mean 'close'\? choose one of: 0 'wide', 1 'close', 2$"),
+        ("three.xml", 3, "there is no sensor '3'"),
+        ("three.xml", -1, "there is no sensor '-1'"),
+        ("three.xml", 2, "camera 'batch': several cameras"),
+        ("diffuse", "wide", r"diffuse: there is no sensor 'wide'; choose one of: 0 'sensor'$"),
+    ],
+)
+def test_sensors_that_cannot_be_rendered(renderer, tmp_path, monkeypatch, scene, sensor, message):
+    monkeypatch.chdir(tmp_path)
+    Path("three.xml").write_text(SENSORS)
+    with pytest.raises(NgptError, match=message):
+        data_gen.render_scene(scene, 2, sensor=sensor)
 
 
 def test_frames_end_where_they_are_stopped(renderer):
@@ -130,8 +127,6 @@ def test_a_variant_is_chosen_by_a_render_alone():
 
 
 def test_what_is_no_scene_is_said_with_its_remedy(renderer):
-    from data_gen.render import render_stack
-
     box = renderer.cornell_box()
     for given, said in ((box, "load it: mi.load_dict"), ("diffuse", "data_gen.load_scene"), (3, "an int is given")):
         with pytest.raises(NgptError, match=said):
@@ -143,8 +138,6 @@ def test_what_is_no_scene_is_said_with_its_remedy(renderer):
 
 
 def test_the_tensor_of_an_integrator_is_told_how_it_becomes_a_stack(renderer):
-    import ngpt
-
     box = renderer.cornell_box() | {"integrator": {"type": "gpt", "max_depth": 3}}
     box["sensor"]["film"] |= {"width": 16, "height": 12}
     scene = load(renderer, box)

@@ -3,92 +3,61 @@
 import numpy as np
 import pytest
 from references import references
-from unbiased import assert_unbiased, load
+from unbiased import assert_unbiased, load, same
 
-from data_gen.budget import Budget
 from ngpt.stack import GradientStack
+
+pytest.importorskip("mitsuba")
+
+from data_gen import passes
+from data_gen.film import GradientFilm
+from data_gen.render import render_stack
+from data_gen.samplers import find
+from data_gen.uneven import UnevenRender
 
 SIZE = (12, 8)
 PIXELS = SIZE[0] * SIZE[1]
 
 
-def render(mi, scene, blocks, seed=0, sampler="gpt", memory=1000, **limits):
-    """The layers of a render of so many blocks of each pixel, after a first one of all."""
-    from data_gen.samplers import find
-    from data_gen.uneven import UnevenRender
-
-    limits |= {"budget": Budget(memory=memory), "points": "independent"}
-    work = UnevenRender(find(sampler).made(scene), scene.sensors()[0], seed, **limits)
+def render(mi, scene, blocks, seed=0, sampler="gpt", points="independent", **limits):
+    """A render of so many blocks of each pixel, after a first one of all."""
+    work = UnevenRender(find(sampler).made(scene), scene.sensors()[0], seed, points=points, **limits)
     work.add(np.ones(PIXELS, int), whole=True)
     work.add(blocks)
-    return work.film.develop()
+    return GradientStack(work.film.develop())
 
 
 def uneven(rng):
     return rng.integers(0, 5, PIXELS) * (rng.random(PIXELS) < 0.6)
 
 
-def same(a, b):
-    assert list(a) == list(b)
-    for name in a:
-        assert np.array_equal(a[name], b[name], equal_nan=True), name
-
-
 @pytest.mark.parametrize("sampler", ["primal", "gpt", "gpt-basic", "gpt-simple"])
 def test_even_counts_are_the_render_of_ever(renderer, sampler):
-    from data_gen.render import render_stack
-
     scene = load(renderer, "diffuse", SIZE)
-    same(
-        render(renderer, scene, np.full(PIXELS, 2), 3, sampler),
-        render_stack(scene, 48, 3, sampler, points="independent").layers,
-    )
+    even = render_stack(scene, 48, 3, sampler, points="independent")
+    same(render(renderer, scene, np.full(PIXELS, 2), 3, sampler), even)
 
 
-def test_each_pixel_has_its_points_of_rounds(renderer, rng):
-    from data_gen.render import render_stack
-    from data_gen.samplers import find
-    from data_gen.uneven import UnevenRender
-
+@pytest.mark.parametrize(("points", "of_even"), [("independent", "independent"), ("sobol", "rounds")])
+def test_each_pixel_has_the_bits_of_its_own_samples(renderer, rng, points, of_even):
+    """With any points; of gradients and variances where those are independent."""
     scene, blocks = load(renderer, "glossy", SIZE), uneven(rng)
-    work = UnevenRender(find("gpt").made(scene), scene.sensors()[0], 3)
-    work.add(np.ones(PIXELS, int), whole=True)
-    work.add(blocks)
-    layers, counts = work.film.develop(), 16 * (1 + blocks.reshape(SIZE[::-1]))
-    for n in np.unique(counts):
-        even, here = render_stack(scene, int(n), 3, "gpt", points="rounds").layers, counts == n
-        assert np.array_equal(layers["primal"][here], even["primal"][here])
-
-
-def test_each_pixel_has_the_bits_of_its_own_samples(renderer, rng):
-    from data_gen.render import render_stack
-
-    scene, blocks = load(renderer, "glossy", SIZE), uneven(rng)
-    layers = render(renderer, scene, blocks, 3)
+    layers = render(renderer, scene, blocks, 3, points=points)
     counts = 16 * (1 + blocks.reshape(SIZE[::-1]))
     assert np.array_equal(layers["samples"][..., 0], counts)
     for n in np.unique(counts):
-        even, here = render_stack(scene, int(n), 3, "gpt", points="independent").layers, counts == n
-        for name in ("primal", "primal_var", "albedo"):
+        even, here = render_stack(scene, int(n), 3, "gpt", points=of_even), counts == n
+        assert np.array_equal(layers["primal"][here], even["primal"][here])
+        if points == "sobol":
+            continue
+        for name in ("primal_var", "albedo"):
             assert np.array_equal(layers[name][here], even[name][here], equal_nan=True)
         pairs = here[:, :-1] & here[:, 1:]
         assert np.array_equal(layers["dx"][:, :-1][pairs], even["dx"][:, :-1][pairs])
         assert np.array_equal(layers["dx_var"][:, :-1][pairs], even["dx_var"][:, :-1][pairs])
 
 
-def test_passes_are_not_seen(renderer, rng, monkeypatch):
-    from data_gen import passes
-
-    scene, blocks = load(renderer, "glossy", SIZE), uneven(rng)
-    whole = render(renderer, scene, blocks)
-    monkeypatch.setattr(passes, "FIRST_LANES", 16 * 37)
-    monkeypatch.setattr(passes, "PASS_SECONDS", 0.2)
-    same(whole, render(renderer, scene, blocks))
-
-
 def test_what_ends_it_is_not_seen(renderer, rng, monkeypatch):
-    from data_gen import passes
-
     scene, blocks = load(renderer, "diffuse", SIZE), uneven(rng)
     monkeypatch.setattr(passes, "FIRST_LANES", 16 * 90)
     monkeypatch.setattr(passes, "PASS_SECONDS", 1e-9)  # one block in each pass after the first
@@ -102,7 +71,11 @@ def test_what_ends_it_is_not_seen(renderer, rng, monkeypatch):
 
 @pytest.mark.parametrize(
     ("scene", "sampler"),
-    [("diffuse", "gpt"), pytest.param("glossy", "gpt", marks=pytest.mark.slow), ("diffuse", "gpt-simple")],
+    [
+        ("diffuse", "gpt"),
+        pytest.param("glossy", "gpt", marks=pytest.mark.slow),
+        pytest.param("diffuse", "gpt-simple", marks=pytest.mark.slow),
+    ],
 )
 def test_uneven_counts_are_unbiased(renderer, rng, scene, sampler):
     """Also where one end of a pair has five times the samples of the other; and variances are those of the means."""
@@ -122,8 +95,6 @@ def test_uneven_counts_are_unbiased(renderer, rng, scene, sampler):
 
 def test_directions_are_means_over_their_own_ends(renderer, rng):
     """Against NumPy: the forward part by the counts of this pixel, the backward part by those of the other."""
-    from data_gen.film import GradientFilm
-
     mi, film = renderer, GradientFilm(3, 1)
     values = {name: rng.normal(size=(3, 4, 16)).astype(np.float32) for name in ("primal", "dx+", "dx-")}
     blocks = [1, 4, 2]
@@ -144,15 +115,3 @@ def test_directions_are_means_over_their_own_ends(renderer, rng):
         assert np.allclose(layers["dx_var"][0, pixel], (forward[1] + backward[1]) / 4, rtol=1e-5)
     assert layers["samples"].ravel().tolist() == [16, 64, 32]
     assert GradientStack(layers)["samples"].shape == (1, 3, 1)
-
-
-def test_the_time_of_a_pass_is_foretold(renderer):
-    from data_gen.uneven import foretold
-
-    assert foretold([(100, 3.0)]) == (0.0, 0.03)
-    # The first compiles.
-    assert foretold([(100, 30.0), (100, 0.4), (300, 0.8), (50, 0.3)]) == pytest.approx((0.2, 0.002))
-    assert foretold([(100, 30.0), (100, 0.4), (100, 0.5)]) == pytest.approx((0.0, 0.004))
-    # Never nothing at all, however the times of busy machines fall.
-    begin, each = foretold([(1, 9.0), (100, 0.4), (300, 0.2), (200, 0.3)])
-    assert begin >= 0 and each > 0
