@@ -3,11 +3,11 @@
 import numpy as np
 from data_gen_scenes import caustics, furnace, glass, hidden_lamp, plenty, polished
 
+from data_gen.scenes.builtin import _box, _camera, _diffuse, _light, _rgb, _sky, _sphere, _wall
+
 
 def _stage(**lamps):
     """A corner with a metal ball, without lamps but those given."""
-    from data_gen.scenes.builtin import _camera, _diffuse, _sphere, _wall
-
     return {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 6, "rr_depth": 3},
@@ -23,8 +23,6 @@ def points():
     """What has no area, without glass: ``path`` cannot see its caustics."""
     import mitsuba as mi
 
-    from data_gen.scenes.builtin import _rgb
-
     toward = mi.ScalarTransform4f().look_at([-0.5, 2.5, 1.5], [0, 0.3, 0], [0, 0, 1])
     return _stage(
         point={"type": "point", "position": [0.5, 2, 1], "intensity": _rgb(4, 3, 2), "sampling_weight": 0.4},
@@ -36,8 +34,6 @@ def points():
 def areas():
     """A textured rectangle, a sphere, a cylinder, a disk and a mesh."""
     import mitsuba as mi
-
-    from data_gen.scenes.builtin import _box, _diffuse, _light, _rgb, _sphere
 
     def glows(*rgb):
         return {"emitter": {"type": "area", "radiance": _rgb(*rgb)}}
@@ -60,8 +56,6 @@ def sky():
     """An environment with a sun, a lamp before it, and choices of unequal weight."""
     import mitsuba as mi
 
-    from data_gen.scenes.builtin import _diffuse, _rgb, _sky, _sphere
-
     bulb = _sphere([-0.3, 1.9, 0.5], 0.25, _diffuse(0.3, 0.3, 0.3))
     return _stage(
         sky={"type": "envmap", "bitmap": mi.Bitmap(_sky(16, 32)), "sampling_weight": 2.0},
@@ -80,8 +74,6 @@ def hidden_sky():
 def bumps():
     """Materials with normals of their own, which the shape does not know: a wall, a floor and a pane of glass."""
     import mitsuba as mi
-
-    from data_gen.scenes.builtin import _diffuse, _light, _sphere
 
     def bitmap(values):
         bitmap = mi.Bitmap(np.asarray(values, np.float32))
@@ -109,42 +101,27 @@ def without_the_point():
     return scene
 
 
-def by_a_point():
-    """The same ball and mirror, lit by a point."""
-    from data_gen.scenes.builtin import _rgb
+def lit_instead(name, lamp):
+    """``caustics`` with another lamp of that name."""
 
-    scene = caustics()
-    del scene["lamp"]
-    return scene | {"point": {"type": "point", "position": [0.2, 2.6, -0.2], "intensity": _rgb(9, 9, 9)}}
+    def scene():
+        return {part: value for part, value in caustics().items() if part != "lamp"} | {name: lamp}
+
+    return scene
 
 
-def by_the_sun():
-    """The same ball and mirror, lit from one direction."""
-    from data_gen.scenes.builtin import _rgb
-
-    scene = caustics()
-    del scene["lamp"]
-    return scene | {"sun": {"type": "directional", "direction": [0.1, -1, 0.05], "irradiance": _rgb(9, 9, 9)}}
+by_a_point = lit_instead("point", {"type": "point", "position": [0.2, 2.6, -0.2], "intensity": _rgb(9, 9, 9)})
+by_the_sun = lit_instead("sun", {"type": "directional", "direction": [0.1, -1, 0.05], "irradiance": _rgb(9, 9, 9)})
+# By a sky alone: chains end where it is.
+under_a_sky = lit_instead("sky", {"type": "constant", "radiance": _rgb(1, 2, 3)})
 
 
 def by_a_wall():
     """The same ball and mirror, lit by what a lamp lights: the light's end is not what stays."""
-    from data_gen.scenes.builtin import _diffuse, _light, _wall
-
-    scene = caustics()
-    return scene | {
+    return caustics() | {
         "lamp": _light([0.2, 1.2, -0.2], [0, 1, 0], (0.6, 0.6), (20, 20, 20)),
         "ceiling": _wall([0, 2.4, 0], [0, -1, 0], (4, 4), _diffuse(0.8, 0.6, 0.5)),
     }
-
-
-def under_a_sky():
-    """A ball and a mirror on a floor, lit by a sky alone: chains end where it is."""
-    from data_gen.scenes.builtin import _rgb
-
-    scene = caustics()
-    del scene["lamp"]
-    return scene | {"sky": {"type": "constant", "radiance": _rgb(1, 2, 3)}}
 
 
 def lacquered():
@@ -157,8 +134,6 @@ def lacquered():
 
 def corner():
     """All is diffuse or glossy, and one lamp is a rectangle of area 1; some paths begin in a mirror."""
-    from data_gen.scenes.builtin import _camera, _diffuse, _light, _sphere, _wall
-
     return {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 8, "rr_depth": 100},
@@ -174,14 +149,12 @@ def corner():
 
 def seen_through_glass():
     """A floor under a pane of thick glass, lit through it by a point: no connection finds that light."""
-    floor = {
-        key: value for key, value in SCENES["points"]().items() if key in ("type", "integrator", "sensor", "floor")
-    }
-    pane = {"type": "cube", "bsdf": {"type": "dielectric"}}
     import mitsuba as mi
 
+    pane = {"type": "cube", "bsdf": {"type": "dielectric"}}
     pane["to_world"] = mi.ScalarTransform4f().translate([0, 0.3, 0]).scale([5, 0.1, 5])
-    return floor | {"pane": pane, "point": {"type": "point", "position": [0, 2, 0], "intensity": 5.0}}
+    scene = {part: value for part, value in _stage().items() if part not in ("wall", "ball")}
+    return scene | {"pane": pane, "point": {"type": "point", "position": [0, 2, 0], "intensity": 5.0}}
 
 
 SCENES = {

@@ -7,6 +7,7 @@ import numpy as np
 from data_gen_scenes import _scale
 from unbiased import differences, light_apart, load
 
+from data_gen.scenes.builtin import _diffuse, _light, _sphere, _wall
 from ngpt.testing import z_test
 
 # Pixels, and those of blocks whose means are compared
@@ -43,8 +44,6 @@ def orthographic(scale, **parameters):
 
 def card():
     """Between the camera and a near plane at 1.6, before the middle of the picture; the side that is seen is lit."""
-    from data_gen.scenes.builtin import _diffuse, _wall
-
     grey = {"type": "twosided", "bsdf": _diffuse(0.5, 0.5, 0.5)}
     return {"card": _wall([0.2, 0.45, 2.3], [0, 0.95, 0.3], (0.4, 0.5), grey)}
 
@@ -56,16 +55,12 @@ def meter(kind):
 
 def irradiance():
     """Of what falls on a small card above the floor, from the side of the lamp."""
-    from data_gen.scenes.builtin import _diffuse, _wall
-
     shape = _wall([-0.5, 0.2, 0.9], [0.3, 1, 0.1], (0.4, 0.4), _diffuse(0.3, 0.3, 0.3))
     return {"sensor": shape | {"sensor": {"type": "irradiancemeter", "film": film(16, 16)}}}
 
 
 def distant():
     """What leaves the ball and the floor along one direction."""
-    from data_gen.scenes.builtin import _wall
-
     target = {key: value for key, value in _wall([0, 0.3, 0], [0, 1, 0], (1.6, 1.2), {}).items() if key != "bsdf"}
     return {"sensor": {"type": "distant", "direction": [-0.3, -1, -0.4], "target": target, "film": film(1, 1)}}
 
@@ -110,8 +105,6 @@ RENDERED = [view for view in CAMERAS if view not in ("batch", "radiancemeter, sc
 
 def corner(media=False):
     """A corner with a ball and a lamp beside the view; with ``media`` the air scatters light."""
-    from data_gen.scenes.builtin import _diffuse, _light, _sphere, _wall
-
     scene = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 4, "rr_depth": 100},

@@ -1,5 +1,7 @@
 """Lamps of all kinds that light can be traced from, over a floor before a wall."""
 
+import tempfile
+
 import numpy as np
 
 
@@ -30,8 +32,8 @@ def lamps() -> dict:
     }
 
 
-def lit_by(only=None, fog: bool = False) -> dict:
-    """A floor, a lacquered wall and a ball lit by all ``lamps``, or by one; in a box of fog, or not.
+def lit_by(fog: bool = False) -> dict:
+    """A floor, a lacquered wall and a ball lit by all ``lamps``; in a box of fog, or not.
 
     Lamps hide from the camera: their edges would be noisier than all that is gathered.
     """
@@ -48,7 +50,7 @@ def lit_by(only=None, fog: bool = False) -> dict:
         "wall": _wall([0, 1, -1], [0.2, 0, 1], (2.6, 2), {"type": "twosided", "nested": lacquer}),
         "ball": _sphere([-0.5, 0.5, 0.2], 0.45, _diffuse(0.5, 0.6, 0.3)),
     }
-    lit |= {name: lamp for name, lamp in lamps().items() if only in (None, name)}
+    lit |= lamps()
     if fog:
         air = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 0.3}
         place = mi.ScalarTransform4f().translate([0, 1, 0.3]).scale([1.6, 0.95, 1.2])
@@ -75,17 +77,10 @@ def bowl(centre, radius: float, rows: int = 6) -> dict:
     params["vertex_normals"] = np.ravel(normals).astype(np.float32)
     params["faces"] = np.ravel(faces).astype(np.uint32)
     params.update()
-    path = _kept(mesh)
-    return {"type": "ply", "filename": path, "bsdf": _diffuse(0.5, 0.2, 0.1)}
-
-
-def _kept(mesh) -> str:
-    """Where a mesh is written to: Mitsuba takes none with normals and emitters from memory."""
-    import tempfile
-
+    # Mitsuba takes no mesh with normals and emitters from memory.
     path = f"{tempfile.mkdtemp()}/mesh.ply"
     mesh.write_ply(path)
-    return path
+    return {"type": "ply", "filename": path, "bsdf": _diffuse(0.5, 0.2, 0.1)}
 
 
 def gallery(flat=True, sky=True, fog=False, low=False):

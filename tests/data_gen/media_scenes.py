@@ -22,24 +22,15 @@ def room(medium, walls=(0.6, 0.6, 0.6), **more):
     }
 
 
-def haze():
-    """Isotropic, of one colour."""
-    return room({"albedo": 0.9, "sigma_t": 0.4})
+def filled(medium):
+    return lambda: room(medium)
 
 
-def forward():
-    """Scatters forward, with g = 0.8."""
-    return room({"albedo": 0.95, "sigma_t": 0.6, "phase": {"type": "hg", "g": 0.8}})
-
-
-def colours():
-    """Extinction and albedo of other values in each colour."""
-    return room({"albedo": _rgb(0.9, 0.8, 0.6), "sigma_t": _rgb(0.3, 0.6, 1.0)})
-
-
-def dense():
-    """An optical depth of 4 across the view."""
-    return room({"albedo": 0.8, "sigma_t": 1.5})
+# Isotropic, of one colour; with g = 0.8; with another extinction and albedo in each colour; of depth 4 across the view
+haze = filled({"albedo": 0.9, "sigma_t": 0.4})
+forward = filled({"albedo": 0.95, "sigma_t": 0.6, "phase": {"type": "hg", "g": 0.8}})
+colours = filled({"albedo": _rgb(0.9, 0.8, 0.6), "sigma_t": _rgb(0.3, 0.6, 1.0)})
+dense = filled({"albedo": 0.8, "sigma_t": 1.5})
 
 
 def milk():
@@ -57,13 +48,8 @@ def milk():
 def nested():
     """A cloud behind boundaries that bend nothing, with another one inside, a ball half in it, and mist around both."""
     mist = {"type": "ref", "id": "air"}
-    cloud = {
-        "type": "homogeneous",
-        "id": "cloud",
-        "albedo": _rgb(0.9, 0.7, 0.8),
-        "sigma_t": _rgb(0.6, 0.4, 0.5),
-        "scale": 2.0,
-    }
+    cloud = {"albedo": _rgb(0.9, 0.7, 0.8), "sigma_t": _rgb(0.6, 0.4, 0.5), "scale": 2.0}
+    cloud = {"type": "homogeneous", "id": "cloud", **cloud}
     core = {"type": "homogeneous", "albedo": 0.6, "sigma_t": 3.0, "phase": {"type": "hg", "g": -0.3}}
     inside = {"interior": {"type": "ref", "id": "cloud"}, "exterior": mist}
     scene = room({"albedo": 0.8, "sigma_t": 0.15})
@@ -91,15 +77,10 @@ def standing():
 def above_the_floor(gap):
     import mitsuba as mi
 
-    box = mi.ScalarTransform4f().translate([0, gap - 0.6, 0]).scale([0.8, 0.4, 0.8])
-    scene = room({"sigma_t": 0.1}) | {
-        "box": {
-            "type": "cube",
-            "to_world": box,
-            "bsdf": {"type": "null"},
-            "interior": {"type": "homogeneous", "albedo": 0.8, "sigma_t": 1.2},
-        }
-    }
+    place = mi.ScalarTransform4f().translate([0, gap - 0.6, 0]).scale([0.8, 0.4, 0.8])
+    fog = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 1.2}
+    scene = room({"sigma_t": 0.1})
+    scene["box"] = {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": fog}
     for name in ("air", "wall", "back", "ball", "lamp") if not gap else ("air", "ball"):
         del scene[name]
     del scene["sensor"]["medium"]

@@ -1,8 +1,10 @@
 """What is particular to ``gbdpt``: copies of paths and the weights of pairs, by brute force in float64; roulette."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from bdpt_ends import fresh, plan_of
+from bdpt_ends import Copies, compare_copies, plan_of
 from bdpt_scenes import SCENES, corner
 from unbiased import FAR, load, render_ours
 
@@ -10,8 +12,6 @@ from unbiased import FAR, load, render_ours
 @pytest.fixture
 def long_passes(monkeypatch):
     """A pass of 64 samples per pixel: much less of the time goes by with recording kernels."""
-    from dataclasses import replace
-
     from data_gen.samplers import SAMPLERS
 
     monkeypatch.setitem(SAMPLERS, "gbdpt", replace(SAMPLERS["gbdpt"], batch=64))
@@ -38,310 +38,100 @@ def test_lights_seen_from_elsewhere_are_the_same_lights(renderer):
     assert np.array(r).ravel().tolist() == [1]
 
 
-class Paths:
-    """Paths from either end of ``corner`` and the copies of them, and brute-force densities and f in float64.
-
-    One of each for each lane, in evaluated arrays. Offset paths go through pixels 3 to the right and 2 down.
-    """
-
-    SHIFT = (3, 2)
-    LENGTH = 4
-
-    def __init__(self, mi):
-        import drjit as dr
-
-        from data_gen.paths.camera import CameraSamples
-        from data_gen.paths.eye import Eye
-        from data_gen.samplers.bdpt import mis
-        from data_gen.samplers.bdpt.vertex import Vertex, cosine
-        from data_gen.samplers.gbdpt.base_path import base_step
-        from data_gen.samplers.gbdpt.offset_path import start, take_step
-
-        self.mi, self.dr = mi, dr
-        self.scene = scene = load(mi, corner, (24, 24))
-        self.camera = camera = CameraSamples(scene.sensors()[0], 1, 64)
-        self.sensor, self.lens = camera.sensor, camera.lens
-        self.plan = plan = plan_of(scene)
-        ray, _, _ = camera.rays()
-        self.random = camera.random.clone()
-        self.first = plan.lights.sample(scene, self.random, ray.time, ray.wavelengths)
-        self.from_light = self.light_path()
-        # Steps of the camera path, and its offset path before each
-        self.steps, self.offsets = [], []
-        x = scene.ray_intersect(mi.Ray3f(ray))
-        _, e = self.sensor.sample_direction(x, self.lens)
-        offset_ray, importance, inside = camera.rays(self.SHIFT)
-        hit = scene.ray_intersect_preliminary(offset_ray)
-        offsets = [start(Eye.of(camera), x, (offset_ray, importance, inside), hit)]
-        z = Vertex(x, mi.Spectrum(1), mis.begin_camera(e[0], cosine(x, ray.d)), mi.UInt32(1))
-        active = x.is_valid()
-        for _ in range(self.LENGTH):
-            step, _ = base_step(plan, self.random, z, fresh(mi), active, brightest_offset=mi.Float(0))
-            self.steps.append(step)
-            self.offsets.append(offsets[0])
-            offsets = take_step(plan, step, offsets)
-            z = Vertex(step.x1, step.β1, step.end1, z.depth + 1)
-            active = step.goes_on & step.x1.is_valid()
-            dr.eval(step, offsets, z, active)
-
-    def light_path(self):
-        """(Vertex, whether it is there, whether it was left smoothly, density with which it was left)"""
-        from data_gen.paths.vertex import SMOOTH, event_kind
-        from data_gen.samplers.bdpt import mis
-        from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, context, cosine, light_leaves
-
-        mi, dr, scene, lights = self.mi, self.dr, self.scene, self.plan.lights
-        si, β = scene.ray_intersect(self.first.ray), self.first.β
-        e, p = lights.densities(scene, self.first, si)
-        end, found, there = mis.begin_light(e, p, self.first.delta, cosine(si, self.first.ray.d)), [], si.is_valid()
-        d = self.first.ray.d
-        for depth in range(1, self.LENGTH + 1):
-            vertex, bsdf = Vertex(si, β, end, mi.UInt32(depth)), si.bsdf()
-            random = self.random
-            sample, f_p = bsdf.sample(context(IMPORTANCE), si, random.next_1d(), random.next_2d(), there)
-            found.append((vertex, there, event_kind(sample.sampled_type) == SMOOTH, mi.Float(sample.pdf), d))
-            d, f_p, end = light_leaves(vertex, bsdf, sample, f_p, there)
-            β = β * f_p
-            there = there & (sample.pdf > 0)
-            si = scene.ray_intersect(si.spawn_ray(d), there)
-            there &= si.is_valid()
-            end = mis.arrive(end, cosine(si, d), dr.square(si.t))
-            dr.eval(found, si, end, there, d)
-        return found
-
-    @np.errstate(divide="ignore", invalid="ignore")
-    def brute(self, vertices, lamp):
-        """Of paths through these interactions to the point of a lamp: the densities p_0 .. p_k of all strategies, f,
-        and the density of the first vertex as the film samples it; all per area."""
-        mi, dr = self.mi, self.dr
-        points = [np.array(self.sensor.world_transform().translation(), np.float64).reshape(1, 3)]
-        points += [np.array(v.p, np.float64).T for v in vertices] + [np.array(lamp[0], np.float64).T]
-        normals = [None] + [np.array(v.n, np.float64).T for v in vertices] + [np.array(lamp[1], np.float64).T]
-        k = len(points) - 1
-
-        def cosine(i, j):
-            d = points[j] - points[i]
-            return np.abs((normals[i] * d).sum(axis=1)) / np.linalg.norm(d, axis=1)
-
-        def per_area(i, j):
-            return cosine(j, i) / ((points[j] - points[i]) ** 2).sum(axis=1)
-
-        def scatter(i, come_from, go_to):
-            si = mi.SurfaceInteraction3f(vertices[i - 1])
-            wi, wo = (
-                si.to_local(dr.normalize(mi.Vector3f(*(points[j] - points[i]).T.astype(np.float32))))
-                for j in (come_from, go_to)
-            )
-            si.wi = wi
-            f, p = si.bsdf().eval_pdf(mi.BSDFContext(), si, wo)
-            return np.array(f, np.float64).T, np.array(p, np.float64)
-
-        forward = {i: scatter(i, i - 1, i + 1) for i in range(1, k)}
-        backward = {i: scatter(i, i + 1, i - 1) for i in range(1, k)}
-        _, importance = self.sensor.sample_direction(vertices[0], self.lens)
-        first = np.array(importance[0], np.float64) * cosine(1, 0)
-        densities = []
-        for s in range(k + 1):
-            last = k - s
-            p = np.ones(len(first))
-            if last > 0:
-                p = p * first
-            for i in range(1, last):
-                p = p * forward[i][1] * per_area(i, i + 1)
-            if s > 1:
-                p = p * cosine(k, k - 1) / np.pi * per_area(k, k - 1)
-            for i in range(k - 1, last + 1, -1):
-                p = p * backward[i][1] * per_area(i, i - 1)
-            densities.append(p)
-        f = first[:, None]
-        for i in range(1, k):
-            f = f * forward[i][0] * per_area(i, i + 1)[:, None]
-        return densities, f, first
-
-    def compare(self, C, found, base, copy, s, good):
-        """``found`` = (C', r, others') of the copies of bases of contribution C against brute force, and which of them
-        were compared."""
-        C, shifted, r, others = (np.array(v, np.float64) for v in (C, *found))
-        (p, f, first), (p1, f1, first1) = base, copy
-        good = np.array(good) & (shifted.max(axis=0) > 0) & (C.max(axis=0) > 0)
-        assert good.sum() > 100
-        with np.errstate(divide="ignore", invalid="ignore"):
-            J, W, W1 = first / first1, sum(p) / p[s], sum(p1) / p1[s]
-            ratio, brute_ratio = shifted / C, (f1 * J[:, None] / f).T
-            # The share of strategy s, from this end, of a pair; over all of them, from both ends, they sum to 1.
-            share, brute_share = 1 / (W + r * (1 + others)), p[s] / (sum(p) + J * sum(p1))
-            pairs = [(r, p1[s] * J / p[s]), (1 + others, W1), (share, brute_share)]
-            pairs += [(ratio[c], brute_ratio[c]) for c in range(3)]
-            for number, (ours, theirs) in enumerate(pairs):
-                error = np.abs(ours / theirs - 1)[good]
-                # Of grazing directions float32 leaves little: some densities are 0 by one way and not by the other.
-                assert np.isfinite(error).mean() > 0.97, number
-                error = error[np.isfinite(error)]
-                assert np.median(error) < 1e-3 and np.quantile(error, 0.97) < 0.02, (number, np.median(error))
+# ------------------------- Copies -------------------------
 
 
 @pytest.fixture(scope="module")
-def paths(renderer):
-    return Paths(renderer)
-
-
-def vertices_of(paths, t):
-    """The first ``t`` vertices of the camera path, of its copy, and where both are there, without mirrors."""
-    from data_gen.paths.vertex import SMOOTH
-    from data_gen.samplers.gbdpt.offset_path import own_vertex
-
-    base = [step.z.si for step in paths.steps[:t]]
-    good = paths.offsets[0].apart & (paths.dr.max(paths.offsets[t - 1].β) > 0)
-    for step in paths.steps[: t - 1]:
-        good &= step.goes_on & (step.kind == SMOOTH)
-    return base, [own_vertex(paths.offsets[0], base[0]), *base[1:]], good
+def copies(renderer):
+    return Copies(renderer, load(renderer, corner, (24, 24)), (3, 2))
 
 
 @pytest.mark.parametrize("t", [1, 2, 3, 4])
-def test_copies_of_paths_to_a_light(paths, t):
+def test_copies_of_paths_to_a_light(copies, t):
     """The fourth vertex is one step behind what both have in common: an error of that step shows there alone."""
     from data_gen.samplers.bdpt import mis
     from data_gen.samplers.bdpt.vertex import cosine
-    from data_gen.samplers.gbdpt.offset_path import own_vertex, to_same_light
+    from data_gen.samplers.gbdpt.offset_path import to_same_light
 
-    base, copy, good = vertices_of(paths, t)
-    step, offset = paths.steps[t - 1], paths.offsets[t - 1]
-    lamp = (step.light.p, step.light.n)
+    step, offset, own, good = copies.steps[t - 1], copies.offsets[t - 1], copies.copied[t - 1], copies.straight(t)
+    good &= step.connectable
     if t < 3:
-        si = own_vertex(offset, step.z.si)
-        C, r, others = to_same_light(paths.plan, step, offset, si, si.bsdf(), good)
+        good &= copies.materials.connectable(own.bsdf)
+        C, r, others = to_same_light(copies.plan, step, offset, own.si, own.bsdf, good)
         r *= offset.r
     else:  # settled
         cos = cosine(step.z.si, step.light.d)
         others = mis.others_to_light(offset.end, step.e_light, step.light.pdf, cos, step.p_light, step.q_light)
         C, r = offset.β * step.f_light * step.weight, offset.r
-    paths.compare(step.C_light, (C, r, others), paths.brute(base, lamp), paths.brute(copy, lamp), 1, good)
-
-
-def joined(paths, t, s, end=None):
-    """Arguments of ``compare`` for camera paths of ``t`` vertices connected to light paths of ``s``.
-
-    ``end`` is what the copy's partial sums of weights are, if they are not its own.
-    """
-    from data_gen.samplers.bdpt import mis
-    from data_gen.samplers.bdpt.strategies import connection
-    from data_gen.samplers.bdpt.vertex import Vertex
-    from data_gen.samplers.gbdpt.offset_path import own_vertex
-
-    base, copy, good = vertices_of(paths, t)
-    step, offset = paths.steps[t - 1], paths.offsets[t - 1]
-    behind = [vertex.si for vertex, *_ in paths.from_light[:s]][::-1]
-    y, there, *_ = paths.from_light[s - 1]
-    good &= there & step.connectable
-    for _, _, smooth, *_ in paths.from_light[: s - 1]:
-        good &= smooth
-    g, edge = connection(paths.scene, step.z, step.z.si.bsdf(), y, good)
-    C, end = step.z.β * g, end or offset.end
-    if t < 3:
-        v = Vertex(own_vertex(offset, step.z.si), offset.β, end, step.z.depth)
-        g, edge = connection(paths.scene, v, v.si.bsdf(), y, good, seen=offset.joined)
-    others = mis.others_connected(end, y.end, edge)
-    lamp = (paths.first.end.p, paths.first.end.n)
-    brute = paths.brute(base + behind, lamp), paths.brute(copy + behind, lamp)
-    return C, (offset.β * g, offset.r, others), *brute, s + 1, good
+    lamp = step.light.p, step.light.n
+    compare_copies(step.C_light, (C, r, others), copies.brute(t, 0, lamp), copies.copy.brute(t, 0, lamp), 1, good)
 
 
 @pytest.mark.parametrize(("t", "s"), [(1, 1), (2, 1), (3, 1), (4, 1), (1, 2), (2, 2), (3, 2)])
-def test_copies_of_paths_joined_to_light_paths(paths, t, s):
-    paths.compare(*joined(paths, t, s))
-
-
-def splatted(paths, s):
-    """The light path of ``s`` vertices beside its light's own, ended at the camera."""
-    from data_gen.paths.eye import Eye
-    from data_gen.samplers.bdpt.strategies import to_camera
-    from data_gen.samplers.gbdpt.light_shift import Splatted
-
-    mi = paths.mi
-    y, good, _, _, d = paths.from_light[s - 1]
-    before, _, _, p, _ = paths.from_light[max(s - 2, 0)]
-    for _, _, smooth, *_ in paths.from_light[: s - 1]:
-        good &= smooth
-    good &= paths.plan.materials.connectable(y.si.bsdf())
-    nothing_between = lambda si, to, active: paths.scene.ray_test(si.spawn_ray_to(to.p), active)  # noqa: E731
-    C, others, uv = to_camera(Eye.of(paths.camera), paths.lens, y, y.si.bsdf(), good, nothing_between)
-    before_it = {"first": mi.Bool(s == 1), "start": paths.first, "before": before, "p": p, "survival": mi.Float(1)}
-    return Splatted(y, d, uv, paths.lens, C, others, **before_it, events=mi.UInt32(0), allowed=mi.Bool(good))
-
-
-def seen_elsewhere(paths, s):
-    """The copy of ``splatted`` through another pixel: path, copy's place and vertex, and arguments of ``compare``."""
-    from data_gen.paths.eye import Eye
-    from data_gen.samplers.gbdpt.light_shift import shifted
-
-    mi, scene, eye = paths.mi, paths.scene, Eye.of(paths.camera)
-    path = splatted(paths, s)
-    uv = path.uv + mi.Vector2f(*paths.SHIFT)
-    good = path.allowed & eye.shows(uv) & (paths.dr.max(path.C) > 0)
-    found = shifted(paths.plan, eye, path, uv, good)
-    x = scene.ray_intersect(eye.ray(uv, paths.lens), good)
-    behind = [vertex.si for vertex, *_ in paths.from_light[: s - 1]][::-1]
-    lamp = (paths.first.end.p, paths.first.end.n)
-    base, copy = paths.brute([path.y.si, *behind], lamp), paths.brute([x, *behind], lamp)
-    return path, uv, x, (path.C, found, base, copy, s + 1, good)
+def test_copies_of_paths_joined_to_light_paths(copies, t, s):
+    compare_copies(*copies.joined(t, s))
 
 
 @pytest.mark.parametrize("s", [1, 2, 3])
-def test_copies_of_light_paths_to_the_camera(paths, s):
-    """Against brute force; and the copy's copy is the path itself, with 1 / r."""
-    from dataclasses import replace
-
-    from data_gen.paths.eye import Eye
+def test_copies_of_light_paths_to_the_camera(copies, s):
+    """Of ``s`` vertices beside their light's own; and the copy's copy is the path itself, with 1 / r."""
+    from data_gen.samplers.bdpt.strategies import to_camera
     from data_gen.samplers.bdpt.vertex import Vertex
-    from data_gen.samplers.gbdpt.light_shift import shifted
+    from data_gen.samplers.gbdpt.light_shift import Splatted, shifted
 
-    mi, dr, scene = paths.mi, paths.dr, paths.scene
-    path, uv, x, (C, found, base, copy, _, good) = seen_elsewhere(paths, s)
-    paths.compare(C, found, base, copy, s + 1, good)
+    mi, dr, scene, eye = copies.mi, copies.dr, copies.scene, copies.eye
+    y, before = copies.from_light[s - 1], copies.from_light[max(s - 2, 0)]
+    good = y.there & copies.materials.connectable(y.bsdf)
+    for met in copies.from_light[: s - 1]:
+        good &= ~met.sharp
+    nothing_between = lambda si, to, active: scene.ray_test(si.spawn_ray_to(to.p), active)  # noqa: E731
+    C, others, uv = to_camera(eye, copies.lens, y.vertex, y.bsdf, good, nothing_between)
+    path = {"first": dr.opaque(mi.Bool, s == 1), "start": copies.start, "before": before.vertex, "p": before.sample.pdf}
+    path |= {"survival": mi.Float(1), "events": mi.UInt32(0), "allowed": mi.Bool(good)}
+    path = Splatted(y.vertex, y.d, uv, copies.lens, C, others, **path)
+    # All have the same kernels.
+    dr.eval(path)
+    uv = path.uv + mi.Vector2f(*copies.shift)
+    good = path.allowed & eye.shows(uv) & (dr.max(C) > 0)
+    found = shifted(copies.plan, eye, path, uv, good)
+    x = scene.ray_intersect(eye.ray(uv, copies.lens), good)
+    moved = replace(y, vertex=Vertex(x, y.vertex.β, y.vertex.end, y.vertex.depth), bsdf=x.bsdf())
+    own = copies.densities([moved, *copies.from_light[: s - 1][::-1]], 0)
+    compare_copies(C, found, copies.brute(0, s), own, s + 1, good)
 
-    # And back
+    # -------------------------- And back -------------------------
     C, r, others = found
     good &= dr.max(C) > 0
-    origin = paths.first.end.p if s == 1 else path.before.si.p
-    d = dr.normalize(mi.Vector3f(x.p - origin))
-    start = path.start
+    d = dr.normalize(mi.Vector3f(x.p - (copies.start.end.p if s == 1 else before.si.p)))
+    back = replace(path, y=moved.vertex, d=d, uv=uv, C=C, others=others)
     if s == 1:
-        start, *_ = paths.plan.lights.redirected(scene, path.start, x)
-        p = path.p
+        start, *_ = copies.plan.lights.redirected(scene, path.start, x)
+        back = replace(back, start=start)
     else:
-        before = path.before.si
-        p = before.bsdf().pdf(mi.BSDFContext(), before, before.to_local(d))
-    y = Vertex(x, path.y.β, path.y.end, path.y.depth)
-    back = replace(path, y=y, d=d, uv=uv, C=C, others=others, start=start, p=p)
-    C, r_back, others = shifted(paths.plan, Eye.of(paths.camera), back, path.uv, good)
+        back = replace(back, p=before.bsdf.pdf(mi.BSDFContext(), before.si, before.si.to_local(d)))
+    C, r_back, others = shifted(copies.plan, eye, back, path.uv, good)
     good = np.array(good & (dr.max(C) > 0))
     assert good.sum() > 100
-    error = np.abs(np.array(r, np.float64) * np.array(r_back, np.float64) - 1)[good]
-    assert np.median(error) < 5e-4 and np.quantile(error, 0.98) < 2e-2
-    error = np.abs(np.array(others, np.float64) / np.array(path.others, np.float64) - 1)[good]
-    assert np.quantile(error, 0.98) < 2e-2
+    for ours, theirs in ((r * r_back, 1), (others, path.others)):
+        error = np.abs(np.array(ours, np.float64) / np.array(theirs, np.float64) - 1)[good]
+        assert np.median(error) < 5e-4 and np.quantile(error, 0.98) < 2e-2
 
 
-def test_going_straight_to_a_vertex_and_back(paths):
+def test_going_straight_to_a_vertex_and_back(copies):
     """r(T(x)) r(x) = 1 of the camera path's shift, and the copy's copy has the throughput of the path."""
-    from dataclasses import replace
-
-    from data_gen.samplers.bdpt.vertex import Vertex, evaluate
+    from data_gen.samplers.bdpt.vertex import evaluate
     from data_gen.samplers.gbdpt.offset_path import reconnect
 
-    mi, dr, plan = paths.mi, paths.dr, paths.plan
-    step, offset = paths.steps[0], paths.offsets[0]
-    base, (own, *_), good = vertices_of(paths, 2)
-    good &= paths.offsets[1].joined
+    mi, dr, plan = copies.mi, copies.dr, copies.plan
+    step, offset, base, own = copies.steps[0], copies.offsets[0], copies.from_camera[0], copies.copied[0]
+    good = copies.straight(2) & copies.offsets[1].joined
     none = replace(offset, β=mi.Spectrum(0))
-    there, _, _ = reconnect(plan, step, offset, none, own, own.bsdf())
-    d = there.ray.d
-    _, p, _ = evaluate("Radiance", own, own.bsdf(), own.to_local(d), good)
-    z = Vertex(own, offset.β, offset.end, step.z.depth)
-    reverse = replace(step, z=z, wo=own.to_local(d), d=d, p=p, survival=mi.Float(1))
-    x = base[0]
+    there, _, _ = reconnect(plan, step, offset, none, own.si, own.bsdf)
+    d = own.si.to_local(there.ray.d)
+    _, p, _ = evaluate("Radiance", own.si, own.bsdf, d, good)
+    reverse = replace(step, z=own.vertex, wo=d, d=there.ray.d, p=p, survival=mi.Float(1))
     as_offset = replace(offset, β=step.z.β, r=mi.Float(1), end=step.z.end, apart=mi.Bool(True))
-    back, _, _ = reconnect(plan, reverse, as_offset, none, x, x.bsdf())
+    back, _, _ = reconnect(plan, reverse, as_offset, none, base.si, base.bsdf)
     good = np.array(good & (dr.max(back.β) > 0))
     assert good.sum() > 1000
     error = np.abs(np.array(there.r, np.float64) * np.array(back.r, np.float64) - 1)[good]
@@ -350,42 +140,30 @@ def test_going_straight_to_a_vertex_and_back(paths):
     assert np.quantile(np.abs(ends - 1)[good], 0.98) < 1e-2
 
 
-@pytest.fixture
-def rough_roulette(monkeypatch):
-    """Few survive."""
-    from data_gen.samplers.gbdpt import roulette
-
-    monkeypatch.setattr(roulette, "SHARE", 0.4)
+# ------------------------- Roulette -------------------------
 
 
-def shares_lost(renderer, monkeypatch, seeds=6):
-    """For each seed the share of the differences without roulette that is missing with it: of the same paths, so that
-    the noise is that of the roulette alone. Its mean is 0."""
-    from data_gen.samplers.gbdpt import integrator
+def test_roulette_leaves_differences_as_they_are(renderer, long_passes, monkeypatch):
+    """Few survive, of the same paths as without: so the noise is that of the roulette alone."""
+    from data_gen.samplers.gbdpt import integrator, roulette
+
+    scene = load(renderer, "diffuse", (16, 16))
 
     def gradients():
-        stacks = render_ours(load(renderer, "diffuse", (16, 16)), "gbdpt", seeds, 64, FAR)
+        stacks = render_ours(scene, "gbdpt", 6, 64, FAR)
         return np.stack([np.stack([stack["dx"], stack["dy"]]) for stack in stacks]).astype(np.float64)
 
+    monkeypatch.setattr(roulette, "SHARE", 0.4)
     with_it = gradients()
     all_survive = lambda camera, rater, lane, depth, threshold: (lane, depth, renderer.Float(1))  # noqa: E731
-    with monkeypatch.context() as patch:
-        patch.setattr(integrator, "survivors", all_survive)
-        without = gradients()
+    monkeypatch.setattr(integrator, "survivors", all_survive)
+    without = gradients()
+    # For each seed the share of the differences that is missing; its mean is 0.
     mean = without.mean(axis=0)
-    return ((with_it - without) * mean).sum(axis=(1, 2, 3, 4)) / (mean**2).sum()
-
-
-def z_of(values):
-    return values.mean() / (values.std(ddof=1) / np.sqrt(len(values)))
-
-
-def test_roulette_leaves_differences_as_they_are(renderer, long_passes, rough_roulette, monkeypatch):
-    lost = shares_lost(renderer, monkeypatch)
-    # Student's t, 5 degrees of freedom: p = 0.001
-    assert 0 < np.abs(lost).max() < 0.1 and abs(z_of(lost)) < 6.9, lost
-    # Survivors that are counted once lose 2 % and more.
-    assert abs(lost.mean()) < 0.02
+    lost = ((with_it - without) * mean).sum(axis=(1, 2, 3, 4)) / (mean**2).sum()
+    z = lost.mean() / (lost.std(ddof=1) / np.sqrt(len(lost)))
+    # Student's t, 5 degrees of freedom: p = 0.001. Survivors that are counted once lose 2 % and more.
+    assert 0 < np.abs(lost).max() < 0.1 and abs(z) < 6.9 and abs(lost.mean()) < 0.02, lost
 
 
 def test_who_survives(renderer):

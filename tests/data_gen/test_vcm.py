@@ -1,24 +1,36 @@
-"""What is particular to ``vcm``: weights with merging, the map of light paths, its image."""
+"""What is particular to ``vcm`` and ``gvcm``: weights with merging, of paths and of copies, and pairs by merging."""
+
+from dataclasses import replace
+from operator import itemgetter
 
 import numpy as np
 import pytest
-from bdpt_ends import Ends, check_weights, compare, plan_of, without_hole
-from bdpt_scenes import SCENES, seen_through_glass
-from unbiased import REFERENCES, light_of_gradients, load
+from bdpt_ends import Copies, Ends, check_weights, compare, compare_copies, plan_of, without_hole
+from bdpt_scenes import SCENES
+from photon_laws import passes
+from unbiased import light_of_gradients, load
 
 ETA = 0.05
 
 
 @pytest.fixture(scope="module")
 def ends(renderer):
+    return ends_of(renderer, ETA)
+
+
+def ends_of(mi, η):
     from data_gen.paths.vertex import Materials
 
-    scene = load(renderer, without_hole, (24, 24))
-    return Ends(renderer, scene, ETA, Materials(scene, 0.05).connectable, spp=64)
+    scene = load(mi, without_hole, (24, 24))
+    return Ends(mi, scene, η, Materials(scene, 0.05).connectable, spp=64)
+
+
+def test_weights_of_bdpt_are_those_of_all_densities(renderer):
+    """Brute force in float64, on stored paths: no z-test sees every wrong term."""
+    check_weights(ends_of(renderer, 0.0))
 
 
 def test_weights_count_merging_too(ends):
-    """Of all connections, brute force in float64."""
     check_weights(ends)
 
 
@@ -34,37 +46,142 @@ def test_weights_of_merging_are_those_of_all_densities(ends):
     class Gathered:
         η = ends.mi.Float(ETA)
 
-    merging = Merging(Gathered, plan_of(ends.scene, 10))
+    mi, merging = ends.mi, Merging(Gathered, plan_of(ends.scene, 10))
     for t in range(3):
         for s in range(2, 4):
-            (y, _, y_bsdf, _), (*_, delta) = ends.from_light[s - 1], ends.from_light[s - 2]
-            good = delta & scatters_smoothly(y_bsdf) & ends.connectable(y_bsdf)
-            si = ends.mi.SurfaceInteraction3f(y.si)
+            y = ends.from_light[s - 1]
+            good = ends.from_light[s - 2].sharp & scatters_smoothly(y.bsdf) & ends.connectable(y.bsdf)
+            si = mi.SurfaceInteraction3f(y.si)
             if t:
                 # The camera path, had it come to y
-                z, _, z_bsdf, _ = ends.from_camera[t - 1]
-                to = ends.mi.Vector3f(y.si.p - z.si.p)
+                z = ends.from_camera[t - 1]
+                to = mi.Vector3f(si.p - z.si.p)
                 distance2 = dr.squared_norm(to)
                 d = to * dr.rsqrt(distance2)
-                f, p, q = evaluate(RADIANCE, z.si, z_bsdf, z.si.to_local(d))
-                end = mis.leave(z.end, cosine(z.si, d), p, q, ends.mi.Bool(False))
-                end = mis.arrive(end, cosine(y.si, d), distance2)
-                good &= scatters_smoothly(z_bsdf) & (dr.max(f) > 0)
-                good &= ~ends.scene.ray_test(z.si.spawn_ray_to(y.si.p))
+                f, p, q = evaluate(RADIANCE, z.si, z.bsdf, z.si.to_local(d))
+                end = mis.leave(z.vertex.end, cosine(z.si, d), p, q, mi.Bool(False))
+                end = mis.arrive(end, cosine(si, d), distance2)
+                good &= scatters_smoothly(z.bsdf) & (dr.max(f) > 0)
+                good &= ~ends.scene.ray_test(z.si.spawn_ray_to(si.p))
             else:
-                camera, e = ends.sensor.sample_direction(y.si, ends.lens)
-                d, end = -camera.d, mis.begin_camera(e[0], cosine(y.si, camera.d))
+                camera, e = ends.sensor.sample_direction(si, ends.lens)
+                d, end = -camera.d, mis.begin_camera(e[0], cosine(si, camera.d))
                 good &= camera.pdf > 0
+            photon = Photon(si.p, si.n, -si.to_world(si.wi), mi.Spectrum(1))
             si.wi = si.to_local(-d)
-            x = Vertex(si, ends.mi.Spectrum(1), end, ends.mi.UInt32(t + 1))
-            photon = Photon(y.si.p, y.si.n, -y.si.to_world(y.si.wi), ends.mi.Spectrum(1))
-            C, others = merging.merged(x, y_bsdf, photon, y.end, True)
-            vertices = ends.from_camera[:t] + ends.from_light[:s]
-            # Merging at the first vertex that the camera sees comes behind all connections.
-            densities = ends.densities(t, s)
-            connections = len(vertices) + 2
-            # More of these directions graze than of connections that were seen to carry light.
-            compare(others, densities, connections + t, good & (dr.max(C) > 0), vertices, worst=0.03, least=30)
+            x = Vertex(si, mi.Spectrum(1), end, mi.UInt32(t + 1))
+            C, others = merging.merged(x, y.bsdf, photon, y.vertex.end, True)
+            path = ends.from_camera[:t] + ends.from_light[:s]
+            # Merging comes behind all connections. More of these directions graze than of those seen to carry light.
+            strategy = len(path) + 2 + t
+            compare(others, ends.brute(t, s)[0], strategy, good & (dr.max(C) > 0), path, worst=0.03, least=30)
+
+
+# ------------------------- Copies -------------------------
+
+
+@pytest.fixture(scope="module")
+def copies(renderer):
+    """Of so many light paths, or of such a radius, that merging has its share."""
+    return Copies(renderer, load(renderer, without_hole, (24, 24)), (2, 1), η=1000.0, length=5)
+
+
+@pytest.mark.parametrize(("t", "s"), [(1, 1), (1, 2), (2, 1), (2, 2), (3, 2), (4, 1), (4, 2), (5, 1)])
+def test_weights_of_copies_count_merging(copies, t, s):
+    """At their own vertices, at the one where they join, and behind mirrors and glass beyond that."""
+    C, found, base, copy, strategy, good = copies.joined(t, s)
+    errors, good = compare_copies(C, found, base, copy, strategy, good)
+    # Where merging counts little these weights are those of ``gbdpt``.
+    densities = np.stack([np.broadcast_to(p, good.shape)[good] for p in copy[0]])
+    much = densities[t + s + 2 :].sum(axis=0) > 0.05 * densities.sum(axis=0)
+    assert much.sum() > {(2, 2): 10, (5, 1): 30}.get((t, s), -1)
+    assert not much.any() or np.quantile(errors[:, much], 0.9, axis=1).max() < 0.02
+
+
+class Beside:
+    """Copies at their vertex ``t``, the same the other way, and a photon beside each vertex on the same surface."""
+
+    def __init__(self, copies, t, radius, number=4096):
+        import drjit as dr
+
+        from data_gen.samplers.bdpt.vertex import Vertex
+        from data_gen.samplers.vcm.differences import ShiftedMerging
+        from data_gen.samplers.vcm.merging import Map, Photons
+
+        mi, connectable = copies.mi, copies.materials.connectable
+        base, own, offset = copies.from_camera[t - 1], copies.copied[t - 1], copies.offsets[t - 1]
+        good = base.there & own.there & connectable(base.bsdf) & connectable(own.bsdf)
+        some = np.flatnonzero(np.array(good & (offset.apart if t == 1 else offset.joined)))
+        some = mi.UInt32(some[:: max(1, len(some) // number)])
+        z, y, offset = (dr.gather(type(value), value, some) for value in (base.vertex, own.vertex, offset))
+        # From the other end the base path is the copy: of its own density.
+        ray = mi.Ray3f(z.si.p + z.si.to_world(z.si.wi), -z.si.to_world(z.si.wi))
+        hit = copies.scene.ray_intersect_preliminary(ray)
+        back = replace(offset, ray=ray, hit=hit, β=z.β / offset.r, r=1 / offset.r, end=z.end)
+        self.pairs = (z, offset), (Vertex(y.si, y.β / offset.r, y.end, y.depth), back)
+        dr.eval(self.pairs)
+        self.n = n = dr.width(z.depth)
+        kept, turned = Map.empty(n, 1), np.random.default_rng(0).normal(size=(3, n)).astype(np.float32)
+        d = -dr.normalize(z.si.n * 1.2 + dr.normalize(mi.Vector3f(turned)))
+        aside = dr.cross(z.si.n, dr.normalize(mi.Vector3f(turned))) * 0.02
+        fields = {"o": z.si.p + aside - d, "d": d, "t": 1, "n": z.si.n, "β": 1.0, "vcm": 1, "vc": 0.3, "depth": 2}
+        for name, value in fields.items():
+            old = getattr(kept.vertices, name)
+            setattr(kept.vertices, name, type(old)(value) + dr.zeros(type(old), n))
+        kept.photon = dr.full(mi.UInt32, 1, n)
+        self.photons = Photons(kept, radius, n, mi.UInt32(0))
+        self.places = np.array(z.si.p).T, np.array(z.si.p + aside).T
+        self.merging = ShiftedMerging(self.photons, copies.plan)
+
+    def found(self, end, η=1.0):
+        """L and Δ of the base paths of that ``end``, 0 or 1, where paths merge with this η: (3, n) of each."""
+        import drjit as dr
+        import mitsuba as mi
+
+        x, shifted = self.pairs[end]
+        self.photons.η = dr.opaque(mi.Float, η)
+        shifted, everywhere = replace(shifted, Δ=dr.zeros(mi.Spectrum, self.n)), dr.full(mi.Bool, True, self.n)
+        L, (Δ,) = self.merging.differences(x, x.si.bsdf(), everywhere, [shifted])
+        return np.array(L, np.float64), np.array(Δ, np.float64)
+
+
+def test_pairs_at_shared_vertices_have_the_weight_of_all_strategies(copies):
+    """Δ = 2 (b' - b) / (W(x) + r W(y)) at the vertex where copies join, of points with one photon near by."""
+    from scipy.spatial import cKDTree
+
+    beside = Beside(copies, 2, 0.025, number=600)
+    points, photons = beside.places
+    alone = np.array([len(near) == 1 for near in cKDTree(photons).query_ball_point(points, 0.026)])
+    # Where η is beyond all bounds merging has all the weight, W = 1.
+    (L, Δ), (L1, _), (b, _), (b1, _) = (beside.found(*args) for args in ((0,), (1,), (0, 1e30), (1, 1e30)))
+    r = np.array(beside.pairs[0][1].r, np.float64)
+    good = alone & (L.min(axis=0) > 0) & (L1.min(axis=0) > 0)
+    assert good.sum() > 100
+    L, Δ, L1, b, b1, r = (value[..., good] for value in (L, Δ, L1, b, b1, r))
+    error = np.abs(Δ - 2 * (r * b1 - b) / (b / L + r * b1 / L1)) / L
+    assert np.median(error) < 1e-4 and np.quantile(error, 0.95) < 1e-2, np.quantile(error, [0.5, 0.95])
+
+
+@pytest.mark.parametrize("t", [1, 2])
+def test_pairs_that_merging_completes_are_the_same_from_both_ends(copies, t):
+    """Δ(y) = -Δ(x), where r r' = 1: at a vertex of the copy's own, and at the one where it joins."""
+    # So wide that disks of neighbouring pixels overlap
+    beside = Beside(copies, t, 0.4 if t == 1 else 0.05)
+    (L, there), (L1, back_again) = beside.found(0), beside.found(1)
+    # Some photons may not be near to both, and light may have no way to the copy.
+    lit = (L.max(axis=0) > 0) & (L1.max(axis=0) > 0)
+    whole = lit & (np.abs(there + 2 * L).max(axis=0) > 1e-3 * L.max(axis=0))
+    assert whole.sum() > max(500, 0.5 * lit.sum()), (whole.sum(), lit.sum())
+    L, L1, there, back_again = (value[:, whole] for value in (L, L1, there, back_again))
+    if t == 1:
+        # Those near to one of both bring -2 b / W from there, and nothing from the other end.
+        error = np.abs(there - back_again - 2 * (L1 - L)) / (L + L1)
+    else:
+        error = np.abs(there + back_again) / (np.abs(there) + L)
+    assert np.median(error) < 1e-5 and np.quantile(error, 0.85) < 1e-2
+
+
+# ------------------------- Where nothing merges -------------------------
 
 
 def test_where_nothing_merges_it_is_bdpt(renderer):
@@ -72,90 +189,23 @@ def test_where_nothing_merges_it_is_bdpt(renderer):
     from data_gen.render import render_stack
 
     scene = load(renderer, SCENES["glass"], (24, 16))
-    ours = light_of_gradients(render_stack(scene, 8, 3, "vcm", radius=1e-5).layers)
-    theirs = light_of_gradients(render_stack(scene, 8, 3, "bdpt").layers)
-    close = np.isclose(ours, theirs, rtol=1e-3, atol=1e-4)
+    ours, theirs = (
+        light_of_gradients(render_stack(scene, 8, 3, name, **options).layers)
+        for name, options in (("vcm", {"radius": 1e-5}), ("bdpt", {}))
+    )
     # A ray that grazes an edge may go another way where its neighbours are others.
-    assert close.mean() > 0.99 and abs(ours.mean() / theirs.mean() - 1) < 0.01
-
-
-def images(scene, sampler, n, spp=1, **options):
-    """Independent images of one pass each, without emission seen directly: (n, H, W, 3); kernels recorded once."""
-    from data_gen.film import GradientFilm
-    from data_gen.passes import recording
-    from data_gen.paths.camera import CameraSamples
-    from data_gen.samplers import find
-
-    passes, sensor, found = find(sampler).made(scene, **options), scene.sensors()[0], []
-    width, height = (int(size) for size in sensor.film().crop_size())
-    for i in range(n):
-        film = GradientFilm(width, height, batches=True)
-        with recording():
-            passes(CameraSamples(sensor, i if sampler == "vcm" else REFERENCES + i, spp), film)
-            film.end_pass(spp)
-        found.append(light_of_gradients(film.develop()))
-    return np.stack(found)
-
-
-def blocks(images, block=6):
-    """Means of blocks of pixels over images, and the variances of those."""
-    n, height, width, _ = images.shape
-    x = images.reshape(n, height // block, block, width // block, block, 3).mean(axis=(2, 4))
-    return x.mean(axis=0), x.var(axis=0, ddof=1) / n
-
-
-def assert_same_image(ours, theirs, share=0.02):
-    """Means of blocks differ by no more than 4 standard errors and a share of the image, which may be bias."""
-    (a, a_var), (b, b_var) = blocks(ours), blocks(theirs)
-    off = np.abs(a - b) - 4 * np.sqrt(a_var + b_var)
-    assert b.mean() > 0.01 and off.max() < share * b.mean(), (off.max(), b.mean())
-
-
-@pytest.mark.parametrize(
-    "name", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("areas", "sky")), "glass", "points"]
-)
-def test_small_radii_have_the_image_of_bdpt(renderer, name):
-    """All lights, mirrors, glass, holes: whatever merging finds is found less by connections."""
-    scene = load(renderer, SCENES[name], (24, 24))
-    assert_same_image(images(scene, "vcm", 64, radius=0.5), images(scene, "bdpt", 8, 32))
-
-
-def test_light_that_merging_alone_finds(renderer):
-    """As much as ``ppm`` does, where ``bdpt`` is black."""
-    scene = load(renderer, seen_through_glass, (24, 24))
-    photons = images(scene, "ppm", 32, radius=2.0)
-    assert_same_image(images(scene, "vcm", 32, radius=2.0), photons)
-    assert images(scene, "bdpt", 1, 8).mean() < 0.01 * photons.mean()
+    assert np.isclose(ours, theirs, rtol=1e-3, atol=1e-4).mean() > 0.99 and abs(ours.mean() / theirs.mean() - 1) < 0.01
 
 
 @pytest.mark.slow
-def test_vcm_converges_where_only_merging_finds_the_light(renderer):
-    """The error of the mean over n passes falls about like n^(-2/3)."""
-    from data_gen.render import render_stack
+def test_where_nothing_merges_it_is_gbdpt(renderer, monkeypatch):
+    """Without glass, through which ``gbdpt`` walks camera paths, and without its roulette of splats."""
+    from data_gen.samplers.gbdpt import roulette
 
-    scene = load(renderer, seen_through_glass, (24, 24))
-    reference = render_stack(scene, 768, REFERENCES, "ppm", photons=4, radius=1.0)["primal"]
-
-    def error(n):
-        x = render_stack(scene, n, 0, "vcm", radius=2.0)["primal"]
-        return np.mean((x - reference) ** 2 / (reference**2 + 0.01))
-
-    counts = 4, 16, 64, 256
-    slope, _ = np.polyfit(np.log(counts), np.log([error(n) for n in counts]), 1)
-    assert slope < -0.55
-
-
-def test_kernels_of_vcm_are_recorded_once(renderer, recordings):
-    """But for widths that happen to be equal; other passes launch them again."""
-    from data_gen.film import GradientFilm
-    from data_gen.passes import recording
-    from data_gen.paths.camera import CameraSamples
-    from data_gen.samplers import find
-
-    scene = load(renderer, "diffuse", (16, 12))
-    passes, film = find("vcm").made(scene), GradientFilm(16, 12, batches=True)
-    for i in range(4):
-        with recording():
-            passes(CameraSamples(scene.sensors()[0], 3, 1, i), film)
-            film.end_pass(1)
-    assert len(recordings.of) == 3 and recordings.total() <= 4
+    monkeypatch.setattr(roulette, "SHARE", float("inf"))
+    scene = load(renderer, lambda: {k: v for k, v in SCENES["areas"]().items() if k != "glass"}, (12, 12))
+    ours = passes(scene, 2, 1, "gvcm", radius=1e-5, joined_depth=10)
+    theirs = passes(scene, 2, 1, "gbdpt")
+    for layer in (light_of_gradients, itemgetter("dx"), itemgetter("dy")):
+        a, b = (np.stack([layer(stack) for stack in stacks]) for stacks in (ours, theirs))
+        assert b.any() and np.isclose(a, b, rtol=1e-3, atol=1e-4).mean() > 0.99, layer

@@ -1,0 +1,399 @@
+"""Paths of ``gbdpt`` that go through mirrors or glass beside the vertex that the camera sees, and their copies.
+
+Camera paths do so behind it, up to a vertex that stays; light paths in front of it, from one that stays.
+"""
+
+from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from bdpt_ends import Ends, fresh, plan_of
+from bdpt_scenes import ENDS, LIT, by_a_wall, by_the_sun
+from data_gen_scenes import glass
+from unbiased import load, render_ours
+
+
+@np.errstate(divide="ignore", invalid="ignore")
+def close(ours, theirs, good, median=1e-3, most=0.03):
+    error = np.abs(np.array(ours, np.float64) / np.array(theirs, np.float64) - 1)
+    error = error[..., np.array(good)]
+    assert np.median(error) < median and np.quantile(error, 0.97) < most, (np.median(error), np.quantile(error, 0.97))
+
+
+def event(mi, dr, si, code, mode, active):
+    """The event of that code that a path meets at ``si``: a sample, and f / p."""
+    from data_gen.samplers.bdpt.vertex import context
+
+    lobe = dr.select(code == 1, mi.Float(0), 1 - dr.epsilon(mi.Float))
+    return si.bsdf().sample(context(mode), si, lobe, mi.Point2f(0.5), active)
+
+
+def some_slow(scenes, quick):
+    return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in scenes]
+
+
+# ------------------------- Camera paths -------------------------
+
+
+class Bent(Ends):
+    """The first camera path of each lane that is bent right behind what the camera sees, up to the end of its chain."""
+
+    def __init__(self, mi, description):
+        from data_gen.samplers.gbdpt.pairs import difference_of_one
+
+        scene = load(mi, description, (32, 32))
+        self.plan = plan_of(scene, pair=difference_of_one)
+        super().__init__(mi, scene, spp=64, length=0)
+
+    def camera_path(self, x, end, d):
+        from data_gen.samplers.bdpt.vertex import Vertex
+        from data_gen.samplers.gbdpt.base_path import base_step
+        from data_gen.samplers.gbdpt.chain_shift import along, no_chain, straight
+
+        mi, dr, z = self.mi, self.dr, Vertex(x, self.mi.Spectrum(1), end, self.mi.UInt32(1))
+        active, course, chain, self.good = x.is_valid(), straight(), no_chain(dr.width(d)), mi.Bool(False)
+        for depth in range(1, 5):
+            step, _ = base_step(self.plan, self.random, z, fresh(mi), active, brightest_offset=mi.Float(0))
+            step, course, chain = along(self.plan, step, course, chain)
+            here = active & chain.arrives & ~self.good & dr.all(chain.x1.p == x.p)
+            found = (step, chain)
+            self.step, self.chain = dr.select(here, found, (self.step, self.chain)) if depth > 1 else found
+            self.good |= here
+            active = step.goes_on & step.x1.is_valid()
+            z = Vertex(step.x1, step.β1, step.end1, mi.UInt32(depth + 1))
+            dr.eval(z, active, course, chain, self.step, self.chain, self.good)
+        return []
+
+    def own(self, pixels):
+        """Where the camera looks so many pixels to the right and half as many down, and what an end knows there."""
+        ray, _, inside = self.camera.rays((pixels, pixels / 2))
+        x = self.scene.ray_intersect(self.mi.Ray3f(ray))
+        active = self.good & inside & x.is_valid() & self.plan.materials.connectable(x.bsdf())
+        return x, self.first_end(x, ray.d), active
+
+    def copy(self, chain, x, end, active):
+        from data_gen.samplers.gbdpt.chain_shift import follow_chain
+
+        start = SimpleNamespace(β=self.mi.Spectrum(1), r=self.mi.Float(1), end=end)
+        found = follow_chain(self.plan, self.step, chain, start, x, self.mi.Bool(active))
+        self.dr.eval(found)
+        return found[1:]
+
+    def direction(self, x, active):
+        """That in which the copy leaves its own vertex."""
+        from data_gen.paths.manifold import Target, follow, shoot
+        from data_gen.samplers.gbdpt import chain_shift
+
+        step, chain, dr = self.step, self.chain, self.dr
+        reached = step.x1.is_valid()
+        target = Target(step.x1.p, dr.select(reached, self.mi.Vector3f(step.x1.n), step.d), ~reached)
+        base = shoot(self.scene, chain.x1, chain.ω, chain.events, target, active)
+        to = {"target": target, "active": active, "ends": partial(chain_shift.ends, self.plan)}
+        ω, _, _, _ = follow(self.scene, chain.x1, chain.ω, base, x, chain.events, **to)
+        dr.eval(ω)
+        return ω
+
+    def forward(self, x, ω, end, good):
+        """The copy as a camera path: the point where it arrives, its direction, f / p, both densities, and what its
+        end knows there."""
+        from data_gen.samplers.bdpt import mis
+        from data_gen.samplers.bdpt.vertex import RADIANCE, cosine, evaluate
+
+        mi, dr, scene = self.mi, self.dr, self.scene
+        f, p, q = evaluate(RADIANCE, x, x.bsdf(), x.to_local(ω), good)
+        P, β, end, d = mi.Float(1), f / p, mis.leave(end, cosine(x, ω), p, q, mi.Bool(False)), mi.Vector3f(ω)
+        si, events = scene.ray_intersect(x.spawn_ray(ω), good), mi.UInt32(self.chain.events)
+        end = mis.arrive(end, cosine(si, d), dr.square(si.t))
+        for _ in range(6):
+            here = good & (events != 0)
+            sample, f_p = event(mi, dr, si, events & 3, RADIANCE, here)
+            d1 = si.to_world(sample.wo)
+            reached = scene.ray_intersect(si.spawn_ray(d1), here)
+            end1 = mis.leave(end, cosine(si, d1), sample.pdf, mi.Float(0), mi.Bool(True))
+            end1 = mis.arrive(end1, cosine(reached, d1), dr.square(reached.t))
+            si, d, β, P, end = dr.select(here, (reached, d1, β * f_p, P * sample.pdf, end1), (si, d, β, P, end))
+            events >>= 2
+            dr.eval(si, d, β, P, end, events)
+        return si, d, β, p, P, end
+
+    def spread(self, x, ω, end, good, h=1e-3):
+        """The area that directions about ω light where their chains arrive, by finite differences."""
+        frame, dr = self.mi.Frame3f(ω), self.dr
+        turns = (frame.s, -frame.s, frame.t, -frame.t)
+        corners = [self.forward(x, dr.normalize(ω + h * turn), end, good)[0].p for turn in turns]
+        s0, s1, t0, t1 = (np.array(corner, np.float64).T for corner in corners)
+        return np.linalg.norm(np.cross(s0 - s1, t0 - t1), axis=-1)
+
+
+@pytest.fixture(scope="module", params=some_slow(("lacquer", "lamp", "wall", "room", "sky"), ("lacquer",)))
+def bent(renderer, request):
+    return Bent(renderer, ENDS[request.param])
+
+
+def test_a_camera_path_is_its_own_copy_in_its_own_place(bent):
+    dr, step = bent.dr, bent.step
+    x, end, active = bent.own(0)
+    β, r, end1, C, others = bent.copy(bent.chain, x, end, active)
+    good, asked = active & (dr.max(β) > 0), np.array(active).sum()
+    assert asked > 500 and np.array(good).sum() > 0.9 * asked, (np.array(good).sum(), asked)
+    close(r, 1, good)
+    close(β, step.β1, good)
+    there = np.array(good & step.x1.is_valid())
+    if there.any():
+        close(end1.vc, step.end1.vc, there)
+        assert not np.array(end1.vcm).any() and not np.array(step.end1.vcm)[there].any()
+    lit = np.array(good & (dr.max(step.C_met) > 0))
+    if lit.sum() > 20:
+        close(C, step.C_met, lit)
+        close(others, step.others_met, lit & (np.array(step.others_met) > 0))
+
+
+def test_copies_of_camera_paths_are_paths_that_the_camera_could_have_found(bent):
+    """β / r is the copy's own throughput, traced forward; weights are those along it; and the copy's copy is the path,
+    with 1 / r."""
+    dr, step, chain = bent.dr, bent.step, bent.chain
+    x, end, active = bent.own(0.25)
+    β, r, end1, _, _ = bent.copy(chain, x, end, active)
+    good, asked = active & (dr.max(β) > 0), np.array(active).sum()
+    assert np.array(good).sum() > 0.4 * asked, (np.array(good).sum(), asked)
+    # -------------------------- Forward --------------------------
+    ω, far = bent.direction(x, good), ~step.x1.is_valid()
+    si, d, β_own, p, P, end_own = bent.forward(x, ω, end, good)
+    off = dr.select(far, dr.norm(d - step.d), dr.norm(si.p - step.x1.p))
+    assert np.quantile(np.array(off)[np.array(good)], 0.95) < 3e-3
+    close(β / r, β_own, good, most=0.1)
+    # ---------------------- Brute force for r --------------------
+    x0, end0, _ = bent.own(0)
+    there = np.array(good & ~far)
+    if there.any():
+        close(end1.vc, end_own.vc, there, most=0.1)
+        _, _, _, p0, P0, _ = bent.forward(x0, chain.ω, end0, good)
+        area, area0 = bent.spread(x, ω, end, good), bent.spread(x0, chain.ω, end0, good)
+        r_own = np.array(p * P / (p0 * P0), np.float64) * area0 / area
+        error = np.abs(np.array(r, np.float64) / r_own - 1)[there & (np.array(p0) > 0)]
+        # Of 1000 some arrive beside an edge, or by a tangent.
+        assert np.median(error) < 0.01 and np.quantile(error, 0.8) < 0.05, np.quantile(error, [0.5, 0.8])
+    # -------------------------- And back -------------------------
+    β0, r0, end2, _, _ = bent.copy(replace(chain, x1=x, ω=ω, p=p), x0, end0, good)
+    back = good & (dr.max(β0) > 0)
+    assert np.array(back).sum() > 0.97 * np.array(good).sum()
+    close(r * r0, 1, back, median=1e-2, most=0.1)
+    close(β0 / r0, step.β1, back, median=1e-2, most=0.1)
+    there = np.array(back & ~far)
+    if there.any():
+        close(end2.vc, step.end1.vc, there, median=1e-2, most=0.1)
+
+
+# ------------------------- Light paths -------------------------
+
+
+class Caustics(Ends):
+    """One light path of each lane up to the first vertex behind mirrors or glass, which the camera sees."""
+
+    def __init__(self, mi, description):
+        import drjit as dr
+
+        from data_gen.samplers.bdpt.strategies import to_camera
+        from data_gen.samplers.bdpt.vertex import scatters_smoothly
+        from data_gen.samplers.gbdpt.light_again import first_link, next_link
+        from data_gen.samplers.gbdpt.light_shift import Splatted
+
+        super().__init__(mi, load(mi, description, (32, 32)), spp=64, length=5)
+        self.plan = plan_of(self.scene)
+        link, before, found = first_link(), self.from_light[0].vertex, None
+        for depth, met in enumerate(self.from_light, 1):
+            y, rough = met.vertex, scatters_smoothly(met.bsdf)
+            good = met.there & (link.events != 0) & link.whole & rough & self.plan.materials.connectable(met.bsdf)
+            here = y, met.d, link, before, good
+            found = dr.select(good & ~found[4], here, found) if found else here
+            before = dr.select(met.there & rough, y, before)
+            link = next_link(link, mi.UInt32(depth), met.sample, mi.Float(1))
+            dr.eval(found, before, link)
+        y, d, link, before, good = found
+        C, others, uv = to_camera(self.eye, self.lens, y, y.si.bsdf(), good, self.hidden)
+        before_it = {"first": link.depth == 0, "start": self.start, "before": before, "p": link.p}
+        before_it |= {"survival": link.survival, "events": link.events}
+        self.path = Splatted(y, d, uv, self.lens, C, others, **before_it, allowed=good)
+        dr.eval(self.path)
+
+    def camera_path(self, z, end, d):
+        return []
+
+    def hidden(self, si, to, active):
+        return self.scene.ray_test(si.spawn_ray_to(to.p), active)
+
+    def shift(self, path, uv, active):
+        """(C', r, others') at that place on the film."""
+        from data_gen.samplers.gbdpt.light_shift import shifted
+
+        return shifted(self.plan, self.eye, path, uv, active, True)
+
+    def copy(self, pixels):
+        """The path's copy so many pixels to the right and half as many down: where it is, and C', r, others'."""
+        uv = self.path.uv + self.mi.Vector2f(pixels, pixels / 2)
+        active = self.path.allowed & self.eye.shows(uv) & (self.dr.max(self.path.C) > 0)
+        return uv, active, self.shift(self.path, uv, active)
+
+    def moved(self, uv, good):
+        """The copy at ``uv`` as if light had found it: traced forward from the vertex that stays."""
+        from data_gen.samplers.bdpt import mis
+        from data_gen.samplers.bdpt.strategies import to_camera
+        from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, Vertex, cosine, evaluate, light_leaves
+        from data_gen.samplers.gbdpt.light_shift import through_glass
+
+        mi, dr, scene, path = self.mi, self.dr, self.scene, self.path
+        x = scene.ray_intersect(self.eye.ray(uv, path.lens), good)
+        d, β, *_ = through_glass(self.plan, path, x, good & x.is_valid())
+        good &= dr.max(β) > 0
+        dr.eval(x, d, good)
+        # ------------------- To the vertex that stays ----------------
+        events, ray, last = mi.UInt32(path.events), x.spawn_ray(-d), mi.Point3f(x.p)
+        for _ in range(6):
+            here = good & (events != 0)
+            si = scene.ray_intersect(ray, here)
+            last = dr.select(here, si.p, last)
+            sample, _ = event(mi, dr, si, events & 3, RADIANCE, here)
+            ray = dr.select(here, si.spawn_ray(si.to_world(sample.wo)), ray)
+            events >>= 2
+            dr.eval(events, ray, last)
+        # -------------------------- And back -------------------------
+        beyond = mi.SurfaceInteraction3f(x)
+        beyond.p = last
+        start, ratio, _ = self.lights.redirected(scene, path.start, beyond)
+        start.β /= ratio
+        before = path.before.si
+        away = dr.normalize(last - before.p)
+        f, p, q = evaluate(IMPORTANCE, before, before.bsdf(), before.to_local(away), good & ~path.first)
+        # What is infinitely far away begins elsewhere.
+        far = path.first & self.lights.far(path.start.index)
+        origin = dr.select(far, last - 3 * start.ray.d, start.end.p)
+        ray = dr.select(path.first, mi.Ray3f(origin, start.ray.d), before.spawn_ray(away))
+        d = mi.Vector3f(dr.select(path.first, start.ray.d, away))
+        β = dr.select(path.first, start.β, path.before.β * f / p)
+        si = scene.ray_intersect(ray, good)
+        end = mis.leave(path.before.end, cosine(before, d), p, q, mi.Bool(False))
+        e, p_light = self.lights.densities(scene, start, si)
+        begun = mis.begin_light(e, p_light, start.delta, cosine(si, d))
+        end = dr.select(path.first, begun, mis.arrive(end, cosine(si, d), dr.square(si.t)))
+        for k in range(5, -1, -1):
+            code = (path.events >> (2 * k)) & 3
+            here = good & (code != 0)
+            y = Vertex(si, β, end, mi.UInt32(1))
+            sample, f_p = event(mi, dr, si, code, IMPORTANCE, here)
+            d_next, f_p, left = light_leaves(y, si.bsdf(), sample, f_p, here)
+            reached = scene.ray_intersect(si.spawn_ray(d_next), here)
+            left = mis.arrive(left, cosine(reached, d_next), dr.square(reached.t))
+            si, d, β, end = dr.select(here, (reached, d_next, β * f_p, left), (si, d, β, end))
+            dr.eval(si, d, β, end)
+        y = Vertex(si, β, end, path.y.depth)
+        C, others, uv = to_camera(self.eye, path.lens, y, si.bsdf(), good, self.hidden)
+        p = dr.select(path.first, path.p, p)
+        moved = replace(path, y=y, d=d, uv=uv, C=C, others=others, start=start, p=p)
+        dr.eval(moved, good)
+        return moved, good
+
+
+@pytest.fixture(scope="module", params=some_slow(LIT, ("lamp", "sun")))
+def caustics(renderer, request):
+    return Caustics(renderer, LIT[request.param])
+
+
+def test_a_light_path_is_its_own_copy_in_its_own_place(caustics):
+    _, good, (C, r, others) = caustics.copy(0)
+    found, path = good & (caustics.dr.max(C) > 0), caustics.path
+    assert np.array(good).sum() > 500 and np.array(found).sum() > 0.9 * np.array(good).sum()
+    close(C, path.C, found)
+    close(r, 1, found)
+    close(others, path.others, np.array(found) & (np.array(path.others) > 0))
+
+
+def test_copies_of_light_paths_are_paths_that_light_could_have_found(caustics):
+    """C' / r is the contribution of the copy by its own density, traced forward; weights are those along it; and the
+    copy's copy is the path, with 1 / r."""
+    dr, path = caustics.dr, caustics.path
+    uv, active, (C, r, others) = caustics.copy(0.25)
+    good, asked = active & (dr.max(C) > 0), np.array(active).sum()
+    # Of large curved things; where a copy would leave them, there is none.
+    assert np.array(good).sum() > 0.4 * asked, (np.array(good).sum(), asked)
+    moved, good = caustics.moved(uv, good)
+    assert np.quantile(np.linalg.norm(np.array(moved.uv - uv), axis=0)[np.array(good)], 0.95) < 0.1
+    lit = good & (dr.max(moved.C) > 0)
+    assert np.array(lit).sum() > 0.9 * np.array(good).sum()
+    close(C / r, moved.C, lit, most=0.1)
+    close(others, moved.others, np.array(lit) & (np.array(others) > 0), most=0.1)
+    C_back, r_back, _ = caustics.shift(moved, path.uv, lit)
+    back = lit & (dr.max(C_back) > 0)
+    assert np.array(back).sum() > 0.97 * np.array(lit).sum()
+    close(r * r_back, 1, back, median=1e-2, most=0.1)
+    close(C_back * r, path.C, back, median=1e-2, most=0.1)
+
+
+# ------------------------- In renders -------------------------
+
+
+def test_what_is_bent_is_shifted_by_a_kernel_of_its_own(renderer, monkeypatch):
+    """All of it, and from the vertex that light has left: Dr.Jit 1.5 (LLVM) once read another lane's."""
+    import drjit as dr
+
+    from data_gen.paths.frozen import evaluated
+    from data_gen.render import render_stack
+    from data_gen.samplers.gbdpt import integrator, light_shift
+
+    found, differences = {False: renderer.UInt32(0), True: renderer.UInt32(0)}, light_shift.differences
+
+    def counted(plan, eye, path, lit, bent=False):
+        # A light path without a vertex of its own to come from is the light's.
+        there = path.first | (path.before.depth > 0)
+        dr.scatter_add(found[bent], 1, 0, (dr.max(path.C) > 0) & (path.events != 0) & path.allowed & there)
+        return differences(plan, eye, path, lit, bent)
+
+    monkeypatch.setattr(light_shift, "differences", counted)
+    # Not frozen: what is counted is no argument, so a recorded kernel would count in its first pass only.
+    plain = lambda f, *args, sums=None: evaluated(f)(*args, *([sums()] if sums else []))  # noqa: E731
+    monkeypatch.setattr(integrator, "Frozen", lambda *_: plain)
+    stack = render_stack(load(renderer, by_a_wall, (32, 32)), 64, 3, "gbdpt")
+    first, again = (int(np.array(found[bent])[0]) for bent in (False, True))
+    # 293 and 39 of 1120 where the vertex before was another's.
+    assert stack["primal"].any() and first == again > 1000, (first, again)
+
+
+def crop_below_the_glass(mi):
+    """Under a ball of glass in a room, as it looks in an image of 384x384 pixels."""
+    scene = load(mi, glass, (384, 384))
+    film = mi.traverse(scene.sensors()[0])
+    film["film.crop_size"], film["film.crop_offset"] = [32, 32], [176, 208]
+    film.update()
+    return scene
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("light", [False, True])
+def test_less_noise_than_without(renderer, monkeypatch, light):
+    """Of camera paths under glass; of light of one direction, through a ball, by a mirror and straight to a floor."""
+    from data_gen.samplers import SAMPLERS
+    from data_gen.samplers.gbdpt import chain_shift, light_shift
+
+    scene = load(renderer, by_the_sun, (48, 48)) if light else crop_below_the_glass(renderer)
+    follow = chain_shift.follow
+    monkeypatch.setitem(SAMPLERS, "gbdpt", replace(SAMPLERS["gbdpt"], batch=64))
+
+    def noise():
+        layers = render_ours(scene, "gbdpt", 1, 128 if light else 64)[0]
+        return layers["dx_var"].mean() + layers["dy_var"].mean()
+
+    def without_chains(*args, **more):
+        ω, shot, J, found = follow(*args, **more)
+        return ω, shot, J, found & False
+
+    def without_glass(plan, path, x, active):
+        return renderer.Vector3f(path.d), renderer.Spectrum(0), renderer.Float(0), renderer.Float(0)
+
+    followed = noise()
+    if light:
+        monkeypatch.setattr(light_shift, "through_glass", without_glass)
+    else:
+        monkeypatch.setattr(chain_shift, "follow", without_chains)
+    without = noise()
+    assert followed < 0.5 * without, (followed, without)
