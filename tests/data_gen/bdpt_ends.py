@@ -6,6 +6,27 @@ from typing import Any
 
 import numpy as np
 from data_gen_scenes import glass
+from renders import dr, mi
+
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.eye import Eye
+from data_gen.paths.light_ends import LightEnds
+from data_gen.paths.vertex import SMOOTH, Materials, event_kind
+from data_gen.paths.walk import Limits, Sky
+from data_gen.samplers import SAMPLERS
+from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.strategies import connected, connection, to_camera, to_light
+from data_gen.samplers.bdpt.vertex import (
+    IMPORTANCE,
+    RADIANCE,
+    Vertex,
+    context,
+    cosine,
+    evaluate,
+    leave,
+    light_leaves,
+    scatters_smoothly,
+)
 
 
 def without_hole():
@@ -17,10 +38,6 @@ def without_hole():
 
 def plan_of(scene, longest=8, **more):
     """That of ``gbdpt``, for paths of at most so many edges, whose roulette lets all of them live."""
-    from data_gen.paths.light_ends import LightEnds
-    from data_gen.paths.vertex import Materials
-    from data_gen.paths.walk import Limits
-    from data_gen.samplers import SAMPLERS
     from data_gen.samplers.gbdpt.base_path import Plan
 
     lights, materials, integrator = LightEnds(scene), Materials(scene, 0.05), SAMPLERS["gbdpt"].integrator(scene)
@@ -28,9 +45,8 @@ def plan_of(scene, longest=8, **more):
     return Plan(scene, lights, materials, limits=Limits(longest, 100), longest=longest, **ways, **more)
 
 
-def fresh(mi):
+def fresh():
     """What the base path has gone through at its first vertex."""
-    from data_gen.paths.walk import Sky
     from data_gen.samplers.gbdpt.base_path import Past
 
     return Past(mi.Float(1), Sky.from_camera(False))
@@ -58,16 +74,8 @@ class Ends:
     ``η`` is that of ``mis``, and photons are gathered at materials that are ``connectable``; None: nowhere.
     """
 
-    def __init__(self, mi, scene, η=0.0, connectable=None, spp=16, length=4):
-        import drjit as dr
-
-        from data_gen.paths.camera import CameraSamples
-        from data_gen.paths.eye import Eye
-        from data_gen.paths.light_ends import LightEnds
-        from data_gen.samplers.bdpt import mis
-        from data_gen.samplers.bdpt.vertex import cosine
-
-        self.mi, self.dr, self.scene, self.connectable, self.length = mi, dr, scene, connectable, length
+    def __init__(self, scene, η=0.0, connectable=None, spp=16, length=4):
+        self.scene, self.connectable, self.length = scene, connectable, length
         self.η = dr.opaque(mi.Float, η)
         self.camera = camera = CameraSamples(scene.sensors()[0], 1, spp)
         self.sensor, self.lens, self.eye = camera.sensor, camera.lens, Eye.of(camera)
@@ -82,23 +90,15 @@ class Ends:
 
     def first_end(self, z, d):
         """What a path knows at the first vertex that the camera sees."""
-        from data_gen.samplers.bdpt import mis
-        from data_gen.samplers.bdpt.vertex import cosine
-
         _, e = self.sensor.sample_direction(z, self.lens)
         return mis.begin_camera(e[0], cosine(z, d))
 
     def camera_path(self, z, end, d):
-        return self.walk("Radiance", z, self.mi.Spectrum(1), end, d)
+        return self.walk("Radiance", z, mi.Spectrum(1), end, d)
 
     def walk(self, mode, si, β, end, d):
         """The vertices of one end."""
-        from data_gen.paths.vertex import SMOOTH, event_kind
-        from data_gen.samplers.bdpt import mis
-        from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, context, cosine, leave, light_leaves
-
-        mi, dr, random = self.mi, self.dr, self.random
-        found, there = [], si.is_valid()
+        found, there, random = [], si.is_valid(), self.random
         for depth in range(1, self.length + 1):
             bsdf = si.bsdf()
             η = dr.select(self.connectable(bsdf), self.η, 0) if self.connectable else mi.Float(0)
@@ -130,7 +130,6 @@ class Ends:
         By the number of vertices that come from the light, its own point included (or another point of it, ``lamp``);
         behind them those that merge, at the first vertex that the camera sees, the second ...; all of them per area.
         """
-        mi, dr = self.mi, self.dr
         ends = [*((met.si.p, met.si.n) for met in path), lamp or (self.start.end.p, self.start.end.n)]
         points, normals = ([np.array(each, np.float64).T for each in some] for some in zip(*ends, strict=True))
         points.insert(0, np.array(self.sensor.world_transform().translation(), np.float64).reshape(1, 3))
@@ -140,12 +139,12 @@ class Ends:
         for i in {t, t + 1} - {k + 1}:
             sharp[i] = np.zeros_like(sharp[i])
 
-        def cosine(i, j):
+        def cos_at(i, j):
             d = points[j] - points[i]
             return np.abs((normals[i] * d).sum(axis=1)) / np.linalg.norm(d, axis=1)
 
         def per_area(i, j):
-            return cosine(j, i) / ((points[j] - points[i]) ** 2).sum(axis=1)
+            return cos_at(j, i) / ((points[j] - points[i]) ** 2).sum(axis=1)
 
         def scatter(i, come_from, go_to):
             """f and p per area; what smooth events alone have is 1 of others."""
@@ -158,14 +157,14 @@ class Ends:
 
         # Of all vertices up to i: from the camera, and from the light
         _, importance = self.sensor.sample_direction(path[0].si, self.lens)
-        first = np.array(importance[0], np.float64) * cosine(1, 0)
+        first = np.array(importance[0], np.float64) * cos_at(1, 0)
         area = self.scene.emitters()[0].get_shape().surface_area()[0]
         f, from_camera, from_light = first, [np.ones(len(first)), first], {k + 1: np.ones(len(first)), k: 1 / area}
         for i in range(1, k):
             f_i, p = scatter(i, i - 1, i + 1)
             f = f * f_i
             from_camera.append(from_camera[i] * p)
-        from_light[k - 1] = from_light[k] * cosine(k, k - 1) / np.pi * per_area(k, k - 1)
+        from_light[k - 1] = from_light[k] * cos_at(k, k - 1) / np.pi * per_area(k, k - 1)
         for i in range(k - 1, 1, -1):
             from_light[i - 1] = from_light[i] * scatter(i, i + 1, i - 1)[1]
         found = []
@@ -188,28 +187,23 @@ class Copies(Ends):
     ``steps`` and ``offsets`` are those of the base paths at each of their vertices.
     """
 
-    def __init__(self, mi, scene, shift, η=0.0, length=4):
-        from data_gen.paths.vertex import Materials
-
+    def __init__(self, scene, shift, η=0.0, length=4):
         self.shift, self.materials = shift, Materials(scene, 0.05)
         self.plan = plan_of(scene, 12, **({"η": mi.Float(η)} if η else {}))
-        super().__init__(mi, scene, η, self.materials.connectable, 64, length)
+        super().__init__(scene, η, self.materials.connectable, 64, length)
         self.copy = copy(self)
         self.copy.from_camera = self.copied
 
     def camera_path(self, x, end, d):
-        from data_gen.paths.vertex import SMOOTH
-        from data_gen.samplers.bdpt.vertex import Vertex
         from data_gen.samplers.gbdpt.base_path import base_step
         from data_gen.samplers.gbdpt.offset_path import own_vertex, start, take_step
 
-        mi, dr, scene = self.mi, self.dr, self.scene
         shifted = self.camera.rays(self.shift)
-        offsets = [start(self.eye, x, shifted, scene.ray_intersect_preliminary(shifted[0]))]
+        offsets = [start(self.eye, x, shifted, self.scene.ray_intersect_preliminary(shifted[0]))]
         z, active = Vertex(x, mi.Spectrum(1), end, mi.UInt32(1)), x.is_valid()
         found, self.copied, self.steps, self.offsets = [], [], [], []
         for _ in range(self.length):
-            step, _ = base_step(self.plan, self.random, z, fresh(mi), active, brightest_offset=mi.Float(0))
+            step, _ = base_step(self.plan, self.random, z, fresh(), active, brightest_offset=mi.Float(0))
             offset, sharp = offsets[0], step.kind != SMOOTH
             si = dr.select(offset.apart | offset.joined, own_vertex(offset, z.si), z.si)
             found.append(Met(z, active, z.si.bsdf(), sharp))
@@ -230,17 +224,13 @@ class Copies(Ends):
 
     def joined(self, t, s):
         """Arguments of ``compare_copies`` for paths of ``t`` vertices that are connected to light paths of ``s``."""
-        from data_gen.samplers.bdpt import mis
-        from data_gen.samplers.bdpt.strategies import connection
-        from data_gen.samplers.bdpt.vertex import scatters_smoothly
-
         z, own, y, offset = self.from_camera[t - 1], self.copied[t - 1], self.from_light[s - 1], self.offsets[t - 1]
         good = self.straight(t) & scatters_smoothly(y.bsdf)
         for met in (z, own, y):
             good &= self.materials.connectable(met.bsdf)
         for met in self.from_light[:s]:
             good &= met.there
-        self.dr.eval(good)
+        dr.eval(good)
         g, _ = connection(self.scene, z.vertex, z.bsdf, y.vertex, good)
         g1, edge = connection(self.scene, own.vertex, own.bsdf, y.vertex, good, seen=offset.joined)
         found = offset.β * g1, offset.r, mis.others_connected(own.vertex.end, y.vertex.end, edge)
@@ -275,8 +265,6 @@ def compare_copies(C, found, base, copy, s, good):
 
 def compare(others, densities, strategy, good, path, worst=0.01, least=100):
     """``others`` of ``mis`` and what it is by brute force, where ``good`` and all vertices of the path are there."""
-    import drjit as dr
-
     dr.eval(good, others)
     good = np.array(good & dr.all([met.there for met in path]))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -291,12 +279,7 @@ def compare(others, densities, strategy, good, path, worst=0.01, least=100):
 
 def check_weights(ends):
     """Of all connections, to vertices, the light's own point and the camera."""
-    import drjit as dr
-
-    from data_gen.samplers.bdpt.strategies import connected, to_camera, to_light
-    from data_gen.samplers.bdpt.vertex import RADIANCE, evaluate, scatters_smoothly
-
-    mi, scene = ends.mi, ends.scene
+    scene = ends.scene
     for t in range(1, 4):
         for s in range(1, 4):
             z, y = ends.from_camera[t - 1], ends.from_light[s - 1]

@@ -2,6 +2,7 @@
 
 import numpy as np
 from data_gen_scenes import caustics, furnace, glass, hidden_lamp, plenty, polished
+from renders import mi
 
 from data_gen.scenes.builtin import _box, _camera, _diffuse, _light, _rgb, _sky, _sphere, _wall
 
@@ -21,8 +22,6 @@ def _stage(**lamps):
 
 def points():
     """What has no area, without glass: ``path`` cannot see its caustics."""
-    import mitsuba as mi
-
     toward = mi.ScalarTransform4f().look_at([-0.5, 2.5, 1.5], [0, 0.3, 0], [0, 0, 1])
     return _stage(
         point={"type": "point", "position": [0.5, 2, 1], "intensity": _rgb(4, 3, 2), "sampling_weight": 0.4},
@@ -33,7 +32,6 @@ def points():
 
 def areas():
     """A textured rectangle, a sphere, a cylinder, a disk and a mesh."""
-    import mitsuba as mi
 
     def glows(*rgb):
         return {"emitter": {"type": "area", "radiance": _rgb(*rgb)}}
@@ -54,8 +52,6 @@ def areas():
 
 def sky():
     """An environment with a sun, a lamp before it, and choices of unequal weight."""
-    import mitsuba as mi
-
     bulb = _sphere([-0.3, 1.9, 0.5], 0.25, _diffuse(0.3, 0.3, 0.3))
     return _stage(
         sky={"type": "envmap", "bitmap": mi.Bitmap(_sky(16, 32)), "sampling_weight": 2.0},
@@ -73,7 +69,6 @@ def hidden_sky():
 
 def bumps():
     """Materials with normals of their own, which the shape does not know: a wall, a floor and a pane of glass."""
-    import mitsuba as mi
 
     def bitmap(values):
         bitmap = mi.Bitmap(np.asarray(values, np.float32))
@@ -149,8 +144,6 @@ def corner():
 
 def seen_through_glass():
     """A floor under a pane of thick glass, lit through it by a point: no connection finds that light."""
-    import mitsuba as mi
-
     pane = {"type": "cube", "bsdf": {"type": "dielectric"}}
     pane["to_world"] = mi.ScalarTransform4f().translate([0, 0.3, 0]).scale([5, 0.1, 5])
     scene = {part: value for part, value in _stage().items() if part not in ("wall", "ball")}

@@ -5,9 +5,14 @@ The scenes have no symmetry. A card stands before some near planes, and somethin
 
 import numpy as np
 from data_gen_scenes import _scale
+from renders import mi
 from unbiased import differences, light_apart, load
 
+from data_gen.render import render_stack
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
 from data_gen.scenes.builtin import _diffuse, _light, _sphere, _wall
+from data_gen.scenes.facts import scene_facts
+from ngpt.errors import NgptError
 from ngpt.testing import z_test
 
 # Pixels, and those of blocks whose means are compared
@@ -23,8 +28,6 @@ def film(width=SIZE[0], height=SIZE[1], **crop):
 
 def camera(kind="perspective", turned=None, film=None, **parameters):
     """A camera before the scene; ``turned`` is put behind its view, ``film`` in place of its own."""
-    import mitsuba as mi
-
     view = mi.ScalarTransform4f().look_at(origin=EYE, target=TARGET, up=[0, 1, 0])
     to_world = view if turned is None else view @ turned
     return {"type": kind, "to_world": to_world, "film": film or globals()["film"](), **parameters}
@@ -67,8 +70,6 @@ def distant():
 
 def two_cameras():
     """The first is rendered; the second is another kind, elsewhere."""
-    import mitsuba as mi
-
     view = mi.ScalarTransform4f().look_at(origin=[2, 2, 2], target=[0, 0, 0], up=[0, 1, 0])
     return perspective() | {"second": {"type": "orthographic", "to_world": view, "film": film(8, 8)}}
 
@@ -165,15 +166,10 @@ def block_means(image, edge):
 
 def stacks_of(scene, sampler, batches, spp):
     """Layers of independent stacks by any sampler; those by photons with a radius that hardly blurs."""
-    from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
-    from data_gen.scenes.facts import scene_facts
-    from ngpt.errors import NgptError
-
     if sampler in FRAME_SAMPLERS:
         if reason := FRAME_SAMPLERS[sampler].refuses(scene_facts(scene)):
             raise NgptError(reason)
         return [last_frame(scene, FRAME_SAMPLERS[sampler], seed, spp) for seed in range(batches)]
-    from data_gen.render import render_stack
 
     options = {}
     if "photons" in SAMPLERS[sampler].options:

@@ -3,14 +3,13 @@
 import tempfile
 
 import numpy as np
+from renders import mi
+
+from data_gen.scenes.builtin import _camera, _diffuse, _light, _rgb, _sphere, _wall
 
 
 def lamps() -> dict:
     """Of each kind one: areas (a textured rectangle, a coarse mesh with smooth normals), points, and what is far."""
-    import mitsuba as mi
-
-    from data_gen.scenes.builtin import _light, _rgb
-
     rng, toward = np.random.default_rng(5), mi.ScalarTransform4f().look_at
     texels = {"type": "bitmap", "bitmap": mi.Bitmap((rng.random((3, 5, 3)) ** 3 * 30).astype(np.float32)), "raw": True}
     slide = {"type": "bitmap", "bitmap": mi.Bitmap(rng.random((4, 4, 3)).astype(np.float32)), "raw": True}
@@ -37,10 +36,6 @@ def lit_by(fog: bool = False) -> dict:
 
     Lamps hide from the camera: their edges would be noisier than all that is gathered.
     """
-    import mitsuba as mi
-
-    from data_gen.scenes.builtin import _camera, _diffuse, _rgb, _sphere, _wall
-
     lacquer = {"type": "roughplastic", "alpha": 0.3, "nonlinear": True, "diffuse_reflectance": _rgb(0.3, 0.5, 0.7)}
     lit = {
         "type": "scene",
@@ -60,10 +55,6 @@ def lit_by(fog: bool = False) -> dict:
 
 def bowl(centre, radius: float, rows: int = 6) -> dict:
     """A sphere of few faces, which meet at up to 60 degrees, with the normals of a sphere at its vertices."""
-    import mitsuba as mi
-
-    from data_gen.scenes.builtin import _diffuse
-
     θ, φ = np.linspace(0.02, np.pi - 0.02, rows)[:, None], np.linspace(0, 2 * np.pi, rows + 1)[None, :-1]
     normals = np.stack(np.broadcast_arrays(np.sin(θ) * np.cos(φ), np.cos(θ), np.sin(θ) * np.sin(φ)), -1).reshape(-1, 3)
     faces = []
@@ -88,10 +79,6 @@ def gallery(flat=True, sky=True, fog=False, low=False):
 
     Lamps that hang ``low`` light up little of the floor each.
     """
-    import mitsuba as mi
-
-    from data_gen.scenes.builtin import _camera, _diffuse, _sphere
-
     place = mi.ScalarTransform4f
     rng, parts = np.random.default_rng(4), {}
     for number in range(14):

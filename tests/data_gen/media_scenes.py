@@ -1,6 +1,7 @@
 """Scenes with media for the statistical tests: small rooms seen from near by, so that pixels are wide."""
 
 from data_gen_scenes import _scale
+from renders import mi
 
 from data_gen.scenes.builtin import _camera, _diffuse, _light, _rgb, _sphere, _wall
 
@@ -75,8 +76,6 @@ def standing():
 
 
 def above_the_floor(gap):
-    import mitsuba as mi
-
     place = mi.ScalarTransform4f().translate([0, gap - 0.6, 0]).scale([0.8, 0.4, 0.8])
     fog = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 1.2}
     scene = room({"sigma_t": 0.1})
@@ -146,8 +145,6 @@ def by_mis(scene):
 
 
 def cloudy(cloud, mist=None):
-    import mitsuba as mi
-
     around = {"exterior": {"type": "ref", "id": "air"}} if mist else {}
     scene = room(mist or {"sigma_t": 0.1})
     if not mist:
@@ -165,14 +162,11 @@ def grid(channels):
 
 def placed():
     """Where grids are: smaller than their box."""
-    import mitsuba as mi
-
     return {"to_world": mi.ScalarTransform4f().translate([-0.7, -0.7, -0.6]).scale(1.4)}
 
 
 def density(channels, low, high, seed, fades=False):
     """Random values from ``low`` to ``high``; where it ``fades``, 0 along its edges."""
-    import mitsuba as mi
     import numpy as np
 
     values = np.random.default_rng(seed).uniform(low, high, (5, 5, 5, channels)).astype(np.float32)

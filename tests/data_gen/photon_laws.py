@@ -1,14 +1,30 @@
 """What tests of photons share: passes, differences pair by pair, images beside each other, copies of photons."""
 
 import numpy as np
+from renders import dr, mi
 from unbiased import differences, far_shifts, light_of_gradients
+
+from data_gen.film import GradientFilm
+from data_gen.passes import recording
+from data_gen.paths import media
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.light_ends import LightEnds, LightRay
+from data_gen.paths.streams import sample_streams
+from data_gen.paths.vertex import Materials
+from data_gen.paths.world import World
+from data_gen.samplers import find
+from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
+from data_gen.samplers.photons.gradients.copies import LightPaths, start_of
+from data_gen.samplers.photons.map.photon import Photon, photon_of
+from data_gen.samplers.photons.map.trace import trace
+from data_gen.samplers.photons.map.vertices import vertex_in_media_of, vertex_of
 
 
 def largest(value) -> float:
     return np.abs(np.array(value, np.float64)).max()
 
 
-def joined(one, other, mi, dr):
+def joined(one, other):
     """Two records as one: all arrays of the other behind those of the first."""
     n, m = dr.width(one.p), dr.width(other["p"])
     index = dr.arange(mi.UInt32, n + m)
@@ -23,11 +39,6 @@ def joined(one, other, mi, dr):
 
 def passes(scene, n, pixels=1, sampler="gpm", **options):
     """The layers of ``n`` first passes, each of another seed: what ``render_ours`` has, prepared once."""
-    from data_gen.film import GradientFilm
-    from data_gen.passes import recording
-    from data_gen.paths.camera import CameraSamples
-    from data_gen.samplers import find
-
     sample, sensor = find(sampler).made(scene, **options), scene.sensors()[0]
     stacks = []
     with far_shifts(pixels), recording():
@@ -86,22 +97,12 @@ def assert_alike(images, references, block, share=0.03):
 
 def traced(world, paths=4096, max_depth=6):
     """The light's end of so many light paths, and their maps."""
-    import drjit as dr
-    import mitsuba as mi
-
-    from data_gen.paths.streams import sample_streams
-    from data_gen.samplers.photons.map.trace import trace
-
     start, maps = trace(world, sample_streams(0, dr.arange(mi.UInt32, paths), mi.UInt32(0)), max_depth, 4)
     return start, list(maps)
 
 
 def world_of(scene, **more):
     """What photons are traced in; ``more`` as of ``Materials``."""
-    from data_gen.paths.light_ends import LightEnds
-    from data_gen.paths.vertex import Materials
-    from data_gen.paths.world import World
-
     return World(scene, LightEnds(scene), Materials(scene, 0.05, **more))
 
 
@@ -111,16 +112,6 @@ def assert_copies_are_light_paths(world, paths, j, shift, least=0.0):
     ``shift(paths, photon, back)`` gives (copy, r, whether there is one, whether it was asked for) of photons, those
     ``j`` of the map of ``paths``; ``back`` is None, or says which copies go back. ``least``: the share that have one.
     """
-    import drjit as dr
-    import mitsuba as mi
-
-    from data_gen.paths import media
-    from data_gen.paths.light_ends import LightRay
-    from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
-    from data_gen.samplers.photons.gradients.copies import LightPaths, start_of
-    from data_gen.samplers.photons.map.photon import Photon, photon_of
-    from data_gen.samplers.photons.map.vertices import vertex_in_media_of, vertex_of
-
     photons, starts, fog, lights = paths.photons, paths.starts, world.fog is not None, world.lights
     photon, n, m = photon_of(photons, j), dr.width(paths.starts.ray.d), dr.width(j)
     moved, r, good, apart = shift(paths, photon, None)
@@ -147,7 +138,7 @@ def assert_copies_are_light_paths(world, paths, j, shift, least=0.0):
     fields = {field: dr.gather(type(value), value, j) for field, value in vars(photons).items()}
     fields |= {"p": moved.p, "n": moved.n, "d": moved.d, "β": moved.Φ, "t": dr.norm(to)}
     fields |= {"density": dr.select(first, 0, density), "parent": dr.select(first, lane + n, parent)}
-    more = joined(photons, fields, mi, dr)
+    more = joined(photons, fields)
     index = dr.arange(mi.UInt32, n + m)
 
     def both(one, other):

@@ -1,22 +1,27 @@
 """What is particular to ``bdpt``: what is kept of light paths. Its weights are tested beside those of ``vcm``."""
 
+from typing import get_type_hints
+
 import numpy as np
 import pytest
 from bdpt_ends import plan_of
 from data_gen_scenes import glass
+from renders import dr, mi
 from unbiased import load
+
+from data_gen.film.splats import Splats
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.eye import Sight
+from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.choice import choose
+from data_gen.samplers.bdpt.light_path import light_path
+from data_gen.samplers.bdpt.vertex import Vertex, cosine
 
 
 @pytest.fixture(scope="module")
 def light(renderer):
     """Camera samples of a 16x16 image, their light paths, and the depths of the vertices kept of these, (5, N)."""
-    import drjit as dr
-
-    from data_gen.film.splats import Splats
-    from data_gen.paths.camera import CameraSamples
-    from data_gen.paths.eye import Sight
     from data_gen.samplers.bdpt.integrator import Splatter
-    from data_gen.samplers.bdpt.light_path import light_path
 
     scene = load(renderer, glass, (16, 16))
     camera = CameraSamples(scene.sensors()[0], 0, 256)
@@ -38,12 +43,8 @@ def test_light_vertices_are_kept_where_they_belong(light):
 
 def test_every_connection_counts_once_in_the_mean(renderer, light):
     """One of them is made, with 1 / its probability: chance and factor cancel for each of them."""
-    from data_gen.samplers.bdpt import mis
-    from data_gen.samplers.bdpt.choice import choose
-    from data_gen.samplers.bdpt.vertex import Vertex, cosine
-
-    mi, longest = renderer, 5
     scene, camera, path, depths = light
+    longest = 5
     ray, _, _ = camera.rays()
     z = scene.ray_intersect(mi.Ray3f(ray))
     _, e = camera.sensor.sample_direction(z, camera.lens)
@@ -61,8 +62,6 @@ def test_every_connection_counts_once_in_the_mean(renderer, light):
 
 def test_nothing_kept_is_a_bool(renderer):
     """Dr.Jit 1.5 aborts the whole process where there is one in local memory."""
-    from typing import get_type_hints
-
     from data_gen.samplers.bdpt import vertex
 
     hints = get_type_hints(vertex.record_class(renderer.variant()), {"mi": renderer})

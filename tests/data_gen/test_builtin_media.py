@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from unbiased import load
 
+from data_gen.inspect import inspect_scene
+from data_gen.render import render_stack
 from data_gen.scenes import builtin, grids
+from data_gen.scenes.facts import scene_facts
 
 MEDIA = ("haze", "smoke", "cloud")
 
@@ -12,9 +15,6 @@ MEDIA = ("haze", "smoke", "cloud")
 @pytest.mark.parametrize("name", MEDIA)
 def test_a_built_in_scene_with_media_renders(renderer, name):
     """By the sampler that `auto` takes, and by volpathmis alike; without the media it is another image."""
-    from data_gen.render import render_stack
-    from data_gen.scenes.facts import scene_facts
-
     scene = load(renderer, name, (24, 16))
     facts, stack = scene_facts(scene), render_stack(scene, 16)
     assert facts.integrator.lower().startswith("vol") and facts.media
@@ -33,8 +33,6 @@ def test_a_built_in_scene_with_media_renders(renderer, name):
 
 @pytest.mark.parametrize("name", MEDIA)
 def test_inspection_tells_of_media(renderer, name):
-    from data_gen.inspect import inspect_scene
-
     told = inspect_scene(name)
     assert told["media"] and told["plugins"]["medium"] and (name != "haze" or told["plugins"]["emitter"]["spot"] == 1)
     photons = "media whose density varies: photons are gathered in them by `--sampler bre`"

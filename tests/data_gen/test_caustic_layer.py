@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 from data_gen_scenes import glass, plenty
 from references import references
+from renders import mi
 from unbiased import differences, light_of_gradients, load, render_ours
 
+from data_gen.paths.caustic import classes, lit_late
+from data_gen.paths.vertex import DELTA, NULL, SMOOTH
+from data_gen.render import render_stack
 from ngpt.testing import z_test
 
 
@@ -31,10 +35,6 @@ def test_differences_are_those_of_the_rest_and_nothing_is_lost(renderer, name):
 
 
 def test_classes(renderer):
-    from data_gen.paths.caustic import classes, lit_late
-    from data_gen.paths.vertex import DELTA, NULL, SMOOTH
-
-    mi = renderer
 
     def walk(*vertices):
         """Whether the path that leaves vertices (kind of event, connectable) is of the layer."""
@@ -55,8 +55,6 @@ def test_classes(renderer):
 
 
 def test_gradients_have_less_noise_for_it(renderer):
-    from data_gen.render import render_stack
-
     scene = load(renderer, "glossy", (64, 64))
     without, with_layer = (render_stack(scene, 32, 0, "gpt", caustic=caustic) for caustic in (False, True))
     assert "caustic" not in without and "caustic_var" not in without

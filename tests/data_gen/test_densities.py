@@ -2,6 +2,9 @@
 
 import numpy as np
 import pytest
+from renders import dr
+
+from data_gen.paths.vertex import SMOOTH, consistent, evaluate, event_kind
 
 MATERIALS = {
     "diffuse": {"type": "diffuse"},
@@ -25,8 +28,6 @@ LANES = 1 << 14
 
 def sampled(mi, material):
     """A vertex seen from all sides, its material, and samples with what was said of them: as they come."""
-    import drjit as dr
-
     bsdf = mi.load_dict(material)
     numbers = np.random.default_rng(4).random((5, LANES), np.float32)
     si = dr.zeros(mi.SurfaceInteraction3f, LANES)
@@ -39,8 +40,6 @@ def sampled(mi, material):
 
 @pytest.mark.parametrize("name", MATERIALS)
 def test_a_sampled_direction_has_the_density_that_others_are_told(renderer, name):
-    from data_gen.paths.vertex import SMOOTH, consistent, evaluate, event_kind
-
     si, bsdf, sample, f_p = sampled(renderer, MATERIALS[name])
     before = np.array(sample.pdf)
     ours = np.array(consistent(bsdf, si, sample, f_p).pdf)

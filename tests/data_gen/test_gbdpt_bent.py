@@ -12,7 +12,25 @@ import pytest
 from bdpt_ends import Ends, fresh, plan_of
 from bdpt_scenes import ENDS, LIT, by_a_wall, by_the_sun
 from data_gen_scenes import glass
+from renders import dr, mi
 from unbiased import load, render_ours
+
+from data_gen.paths.frozen import evaluated
+from data_gen.render import render_stack
+from data_gen.samplers import SAMPLERS
+from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.strategies import to_camera
+from data_gen.samplers.bdpt.vertex import (
+    IMPORTANCE,
+    RADIANCE,
+    Vertex,
+    context,
+    cosine,
+    evaluate,
+    light_leaves,
+    scatters_smoothly,
+)
+from data_gen.samplers.gbdpt.pairs import difference_of_one
 
 
 @np.errstate(divide="ignore", invalid="ignore")
@@ -22,10 +40,8 @@ def close(ours, theirs, good, median=1e-3, most=0.03):
     assert np.median(error) < median and np.quantile(error, 0.97) < most, (np.median(error), np.quantile(error, 0.97))
 
 
-def event(mi, dr, si, code, mode, active):
+def event(si, code, mode, active):
     """The event of that code that a path meets at ``si``: a sample, and f / p."""
-    from data_gen.samplers.bdpt.vertex import context
-
     lobe = dr.select(code == 1, mi.Float(0), 1 - dr.epsilon(mi.Float))
     return si.bsdf().sample(context(mode), si, lobe, mi.Point2f(0.5), active)
 
@@ -40,22 +56,19 @@ def some_slow(scenes, quick):
 class Bent(Ends):
     """The first camera path of each lane that is bent right behind what the camera sees, up to the end of its chain."""
 
-    def __init__(self, mi, description):
-        from data_gen.samplers.gbdpt.pairs import difference_of_one
-
+    def __init__(self, description):
         scene = load(mi, description, (32, 32))
         self.plan = plan_of(scene, pair=difference_of_one)
-        super().__init__(mi, scene, spp=64, length=0)
+        super().__init__(scene, spp=64, length=0)
 
     def camera_path(self, x, end, d):
-        from data_gen.samplers.bdpt.vertex import Vertex
         from data_gen.samplers.gbdpt.base_path import base_step
         from data_gen.samplers.gbdpt.chain_shift import along, no_chain, straight
 
-        mi, dr, z = self.mi, self.dr, Vertex(x, self.mi.Spectrum(1), end, self.mi.UInt32(1))
+        z = Vertex(x, mi.Spectrum(1), end, mi.UInt32(1))
         active, course, chain, self.good = x.is_valid(), straight(), no_chain(dr.width(d)), mi.Bool(False)
         for depth in range(1, 5):
-            step, _ = base_step(self.plan, self.random, z, fresh(mi), active, brightest_offset=mi.Float(0))
+            step, _ = base_step(self.plan, self.random, z, fresh(), active, brightest_offset=mi.Float(0))
             step, course, chain = along(self.plan, step, course, chain)
             here = active & chain.arrives & ~self.good & dr.all(chain.x1.p == x.p)
             found = (step, chain)
@@ -69,16 +82,16 @@ class Bent(Ends):
     def own(self, pixels):
         """Where the camera looks so many pixels to the right and half as many down, and what an end knows there."""
         ray, _, inside = self.camera.rays((pixels, pixels / 2))
-        x = self.scene.ray_intersect(self.mi.Ray3f(ray))
+        x = self.scene.ray_intersect(mi.Ray3f(ray))
         active = self.good & inside & x.is_valid() & self.plan.materials.connectable(x.bsdf())
         return x, self.first_end(x, ray.d), active
 
     def copy(self, chain, x, end, active):
         from data_gen.samplers.gbdpt.chain_shift import follow_chain
 
-        start = SimpleNamespace(β=self.mi.Spectrum(1), r=self.mi.Float(1), end=end)
-        found = follow_chain(self.plan, self.step, chain, start, x, self.mi.Bool(active))
-        self.dr.eval(found)
+        start = SimpleNamespace(β=mi.Spectrum(1), r=mi.Float(1), end=end)
+        found = follow_chain(self.plan, self.step, chain, start, x, mi.Bool(active))
+        dr.eval(found)
         return found[1:]
 
     def direction(self, x, active):
@@ -86,9 +99,9 @@ class Bent(Ends):
         from data_gen.paths.manifold import Target, follow, shoot
         from data_gen.samplers.gbdpt import chain_shift
 
-        step, chain, dr = self.step, self.chain, self.dr
+        step, chain = self.step, self.chain
         reached = step.x1.is_valid()
-        target = Target(step.x1.p, dr.select(reached, self.mi.Vector3f(step.x1.n), step.d), ~reached)
+        target = Target(step.x1.p, dr.select(reached, mi.Vector3f(step.x1.n), step.d), ~reached)
         base = shoot(self.scene, chain.x1, chain.ω, chain.events, target, active)
         to = {"target": target, "active": active, "ends": partial(chain_shift.ends, self.plan)}
         ω, _, _, _ = follow(self.scene, chain.x1, chain.ω, base, x, chain.events, **to)
@@ -98,17 +111,14 @@ class Bent(Ends):
     def forward(self, x, ω, end, good):
         """The copy as a camera path: the point where it arrives, its direction, f / p, both densities, and what its
         end knows there."""
-        from data_gen.samplers.bdpt import mis
-        from data_gen.samplers.bdpt.vertex import RADIANCE, cosine, evaluate
-
-        mi, dr, scene = self.mi, self.dr, self.scene
+        scene = self.scene
         f, p, q = evaluate(RADIANCE, x, x.bsdf(), x.to_local(ω), good)
         P, β, end, d = mi.Float(1), f / p, mis.leave(end, cosine(x, ω), p, q, mi.Bool(False)), mi.Vector3f(ω)
         si, events = scene.ray_intersect(x.spawn_ray(ω), good), mi.UInt32(self.chain.events)
         end = mis.arrive(end, cosine(si, d), dr.square(si.t))
         for _ in range(6):
             here = good & (events != 0)
-            sample, f_p = event(mi, dr, si, events & 3, RADIANCE, here)
+            sample, f_p = event(si, events & 3, RADIANCE, here)
             d1 = si.to_world(sample.wo)
             reached = scene.ray_intersect(si.spawn_ray(d1), here)
             end1 = mis.leave(end, cosine(si, d1), sample.pdf, mi.Float(0), mi.Bool(True))
@@ -120,7 +130,7 @@ class Bent(Ends):
 
     def spread(self, x, ω, end, good, h=1e-3):
         """The area that directions about ω light where their chains arrive, by finite differences."""
-        frame, dr = self.mi.Frame3f(ω), self.dr
+        frame = mi.Frame3f(ω)
         turns = (frame.s, -frame.s, frame.t, -frame.t)
         corners = [self.forward(x, dr.normalize(ω + h * turn), end, good)[0].p for turn in turns]
         s0, s1, t0, t1 = (np.array(corner, np.float64).T for corner in corners)
@@ -129,11 +139,11 @@ class Bent(Ends):
 
 @pytest.fixture(scope="module", params=some_slow(("lacquer", "lamp", "wall", "room", "sky"), ("lacquer",)))
 def bent(renderer, request):
-    return Bent(renderer, ENDS[request.param])
+    return Bent(ENDS[request.param])
 
 
 def test_a_camera_path_is_its_own_copy_in_its_own_place(bent):
-    dr, step = bent.dr, bent.step
+    step = bent.step
     x, end, active = bent.own(0)
     β, r, end1, C, others = bent.copy(bent.chain, x, end, active)
     good, asked = active & (dr.max(β) > 0), np.array(active).sum()
@@ -153,7 +163,7 @@ def test_a_camera_path_is_its_own_copy_in_its_own_place(bent):
 def test_copies_of_camera_paths_are_paths_that_the_camera_could_have_found(bent):
     """β / r is the copy's own throughput, traced forward; weights are those along it; and the copy's copy is the path,
     with 1 / r."""
-    dr, step, chain = bent.dr, bent.step, bent.chain
+    step, chain = bent.step, bent.chain
     x, end, active = bent.own(0.25)
     β, r, end1, _, _ = bent.copy(chain, x, end, active)
     good, asked = active & (dr.max(β) > 0), np.array(active).sum()
@@ -192,15 +202,11 @@ def test_copies_of_camera_paths_are_paths_that_the_camera_could_have_found(bent)
 class Caustics(Ends):
     """One light path of each lane up to the first vertex behind mirrors or glass, which the camera sees."""
 
-    def __init__(self, mi, description):
-        import drjit as dr
-
-        from data_gen.samplers.bdpt.strategies import to_camera
-        from data_gen.samplers.bdpt.vertex import scatters_smoothly
+    def __init__(self, description):
         from data_gen.samplers.gbdpt.light_again import first_link, next_link
         from data_gen.samplers.gbdpt.light_shift import Splatted
 
-        super().__init__(mi, load(mi, description, (32, 32)), spp=64, length=5)
+        super().__init__(load(mi, description, (32, 32)), spp=64, length=5)
         self.plan = plan_of(self.scene)
         link, before, found = first_link(), self.from_light[0].vertex, None
         for depth, met in enumerate(self.from_light, 1):
@@ -232,18 +238,15 @@ class Caustics(Ends):
 
     def copy(self, pixels):
         """The path's copy so many pixels to the right and half as many down: where it is, and C', r, others'."""
-        uv = self.path.uv + self.mi.Vector2f(pixels, pixels / 2)
-        active = self.path.allowed & self.eye.shows(uv) & (self.dr.max(self.path.C) > 0)
+        uv = self.path.uv + mi.Vector2f(pixels, pixels / 2)
+        active = self.path.allowed & self.eye.shows(uv) & (dr.max(self.path.C) > 0)
         return uv, active, self.shift(self.path, uv, active)
 
     def moved(self, uv, good):
         """The copy at ``uv`` as if light had found it: traced forward from the vertex that stays."""
-        from data_gen.samplers.bdpt import mis
-        from data_gen.samplers.bdpt.strategies import to_camera
-        from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, Vertex, cosine, evaluate, light_leaves
         from data_gen.samplers.gbdpt.light_shift import through_glass
 
-        mi, dr, scene, path = self.mi, self.dr, self.scene, self.path
+        scene, path = self.scene, self.path
         x = scene.ray_intersect(self.eye.ray(uv, path.lens), good)
         d, β, *_ = through_glass(self.plan, path, x, good & x.is_valid())
         good &= dr.max(β) > 0
@@ -254,7 +257,7 @@ class Caustics(Ends):
             here = good & (events != 0)
             si = scene.ray_intersect(ray, here)
             last = dr.select(here, si.p, last)
-            sample, _ = event(mi, dr, si, events & 3, RADIANCE, here)
+            sample, _ = event(si, events & 3, RADIANCE, here)
             ray = dr.select(here, si.spawn_ray(si.to_world(sample.wo)), ray)
             events >>= 2
             dr.eval(events, ray, last)
@@ -281,7 +284,7 @@ class Caustics(Ends):
             code = (path.events >> (2 * k)) & 3
             here = good & (code != 0)
             y = Vertex(si, β, end, mi.UInt32(1))
-            sample, f_p = event(mi, dr, si, code, IMPORTANCE, here)
+            sample, f_p = event(si, code, IMPORTANCE, here)
             d_next, f_p, left = light_leaves(y, si.bsdf(), sample, f_p, here)
             reached = scene.ray_intersect(si.spawn_ray(d_next), here)
             left = mis.arrive(left, cosine(reached, d_next), dr.square(reached.t))
@@ -297,12 +300,12 @@ class Caustics(Ends):
 
 @pytest.fixture(scope="module", params=some_slow(LIT, ("lamp", "sun")))
 def caustics(renderer, request):
-    return Caustics(renderer, LIT[request.param])
+    return Caustics(LIT[request.param])
 
 
 def test_a_light_path_is_its_own_copy_in_its_own_place(caustics):
     _, good, (C, r, others) = caustics.copy(0)
-    found, path = good & (caustics.dr.max(C) > 0), caustics.path
+    found, path = good & (dr.max(C) > 0), caustics.path
     assert np.array(good).sum() > 500 and np.array(found).sum() > 0.9 * np.array(good).sum()
     close(C, path.C, found)
     close(r, 1, found)
@@ -312,7 +315,7 @@ def test_a_light_path_is_its_own_copy_in_its_own_place(caustics):
 def test_copies_of_light_paths_are_paths_that_light_could_have_found(caustics):
     """C' / r is the contribution of the copy by its own density, traced forward; weights are those along it; and the
     copy's copy is the path, with 1 / r."""
-    dr, path = caustics.dr, caustics.path
+    path = caustics.path
     uv, active, (C, r, others) = caustics.copy(0.25)
     good, asked = active & (dr.max(C) > 0), np.array(active).sum()
     # Of large curved things; where a copy would leave them, there is none.
@@ -335,10 +338,6 @@ def test_copies_of_light_paths_are_paths_that_light_could_have_found(caustics):
 
 def test_what_is_bent_is_shifted_by_a_kernel_of_its_own(renderer, monkeypatch):
     """All of it, and from the vertex that light has left: Dr.Jit 1.5 (LLVM) once read another lane's."""
-    import drjit as dr
-
-    from data_gen.paths.frozen import evaluated
-    from data_gen.render import render_stack
     from data_gen.samplers.gbdpt import integrator, light_shift
 
     found, differences = {False: renderer.UInt32(0), True: renderer.UInt32(0)}, light_shift.differences
@@ -372,7 +371,6 @@ def crop_below_the_glass(mi):
 @pytest.mark.parametrize("light", [False, True])
 def test_less_noise_than_without(renderer, monkeypatch, light):
     """Of camera paths under glass; of light of one direction, through a ball, by a mirror and straight to a floor."""
-    from data_gen.samplers import SAMPLERS
     from data_gen.samplers.gbdpt import chain_shift, light_shift
 
     scene = load(renderer, by_the_sun, (48, 48)) if light else crop_below_the_glass(renderer)

@@ -10,15 +10,19 @@ import numpy as np
 import pytest
 from lamps_scenes import GALLERIES, gallery
 from references import references
+from renders import dr, mi
 from unbiased import FAR, assert_unbiased, load, render_ours
+
+from data_gen.paths.lights import Lights, emission, replay_lamp, shared_emission
+from data_gen.paths.vertex import seen_from
+from data_gen.scenes.lamps import weighed
+from data_gen.scenes.places import Places, Table
 
 LANES = 1 << 14
 
 
 def any_places(scene, side=4, seed=1):
     """A table of probabilities that have nothing to do with the scene."""
-    from data_gen.scenes.places import Places, Table
-
     lamps = len(scene.emitters())
     table = np.random.default_rng(seed).dirichlet(np.full(lamps, 0.5), side**3 + 1)
     low, high = np.array([-2.5, -0.1, -2.5]), np.array([2.5, 2.5, 2.5])
@@ -36,8 +40,6 @@ def by_any_places(monkeypatch):
 
 def vertices(mi, seed):
     """Points in the gallery, with normals."""
-    import drjit as dr
-
     random = mi.PCG32(LANES, seed)
     si = dr.zeros(mi.SurfaceInteraction3f, LANES)
     si.p = mi.Point3f(5 * random.next_float32() - 2.5, 2 * random.next_float32(), 5 * random.next_float32() - 2.5)
@@ -46,8 +48,6 @@ def vertices(mi, seed):
 
 
 def test_probabilities_are_those_of_the_choice(renderer):
-    import drjit as dr
-
     mi, scene = renderer, load(renderer, gallery, (4, 4))
     places, lamps = any_places(scene), len(scene.emitters())
     x, u = vertices(mi, 3)
@@ -76,7 +76,6 @@ def test_probabilities_are_those_of_the_choice(renderer):
 def test_no_lamp_is_out_of_the_question(renderer):
     """Not even one that the pilot sees nothing of; each place has its own."""
     from data_gen.scenes import lamps
-    from data_gen.scenes.lamps import weighed
 
     description = gallery(low=True)
     hidden = {"type": "rectangle", "emitter": {"type": "area"}}
@@ -91,8 +90,6 @@ def test_no_lamp_is_out_of_the_question(renderer):
 
 
 def test_taken_for_many_lamps_that_the_scene_leaves_open(renderer):
-    from data_gen.scenes.lamps import weighed
-
     def places_of(change=None, lamps="power", by_place=True):
         description = gallery(low=True)
         if change:
@@ -116,11 +113,6 @@ def nearly(one, other, good, most=2e-3):
 @pytest.mark.parametrize("flat", [True, False])
 def test_a_shifted_path_keeps_its_lamp(renderer, flat):
     """It has the density of its own end and the weight of the base path's, and r(T(x)) r(x) = 1."""
-    import drjit as dr
-
-    from data_gen.paths.lights import Lights, replay_lamp
-
-    mi = renderer
     scene = load(mi, lambda: gallery(flat), (4, 4))
     places = any_places(scene)
     lights, yes = Lights(scene, places), mi.Bool(True)
@@ -146,11 +138,6 @@ def test_a_shifted_path_keeps_its_lamp(renderer, flat):
 
 
 def test_emission_that_is_met_has_the_density_of_the_vertex(renderer):
-    import drjit as dr
-
-    from data_gen.paths.lights import Lights, emission, shared_emission
-    from data_gen.paths.vertex import seen_from
-
     mi, scene = renderer, load(renderer, gallery, (4, 4))
     places = any_places(scene)
     lights, yes = Lights(scene, places), mi.Bool(True)

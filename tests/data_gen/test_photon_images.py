@@ -11,7 +11,10 @@ from photon_laws import assert_alike, assert_no_bias, gain, passes
 from references import REFERENCES, references
 from unbiased import light_of_gradients, load, render_ours
 
+from data_gen.render import render_stack
+from data_gen.samplers.photons.gradients.differences import Gathered
 from data_gen.scenes import builtin
+from ngpt.io.exr import pass_through
 
 # Rooms whose images are stored, (16, 16), and where no light is seen directly
 STORED = ("haze", "colours", "forward", "dense", "nested", "fog")
@@ -145,8 +148,6 @@ def test_paths_are_no_longer_than_the_scene_says(renderer, sampler, name, max_de
 def test_it_converges(renderer, sampler, name, size, photons, least):
     """The squared error of the mean falls with passes: noise like n^-α, what is left of the blur like n^(-2/3), of
     balls n^(-4/9)."""
-    from data_gen.render import render_stack
-
     scene = load(renderer, named(name), (size, size))
     if photons:
         options, counts = {"radius": 1.0, "photons": photons}, (2, 8, 32)
@@ -191,7 +192,6 @@ def without_glass():
 @pytest.fixture
 def by_planes_alone(monkeypatch):
     """What changes a sampler of that name into one without beams."""
-    from data_gen.samplers.photons.gradients.differences import Gathered
     from data_gen.samplers.photons.media.gplanes import GPLANES, NearPlanes
     from data_gen.samplers.photons.media.planes import planes_of
 
@@ -287,9 +287,6 @@ def test_there_are_copies_and_differences_have_little_noise(
     renderer, by_planes_alone, sampler, name, size, options, fails, mean, median
 ):
     """No z-test asks for that: a sampler that rejects every shift is unbiased."""
-    from data_gen.render import render_stack
-    from ngpt.io.exr import pass_through
-
     scene, sampler = load(renderer, named(name), (size, size)), by_planes_alone(sampler)
     if fails:
         stack = render_stack(scene, 2, 0, sampler, diagnostics=True, **options)

@@ -7,15 +7,17 @@ import pytest
 from lamps_scenes import lit_by
 from photon_laws import world_of
 from references import references
+from renders import dr, mi
 from unbiased import differences, load, render_ours
+
+from data_gen.samplers.photons.map.edges import spread
+from data_gen.scenes.builtin import _camera, _diffuse
 
 # ------------------------- Where surfaces end -------------------------
 
 
 def squares(*others):
     """A square of edge 2 about the origin, in z = 0, with others."""
-    from data_gen.scenes.builtin import _camera, _diffuse
-
     scene = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 2},
@@ -28,8 +30,6 @@ def squares(*others):
 
 def pane():
     """Above the square; and a wall stands on it."""
-    import mitsuba as mi
-
     at = mi.ScalarTransform4f()
     wall = {"type": "rectangle", "to_world": at.translate([0.02, 0, 0]).rotate([0, 1, 0], -90)}
     return {"type": "rectangle", "to_world": at.translate([0, 0, 0.05]), "bsdf": {"type": "thindielectric"}}, wall
@@ -37,8 +37,6 @@ def pane():
 
 def bent(angle):
     """The square goes on beyond x = 1, turned down."""
-    import mitsuba as mi
-
     turn = mi.ScalarTransform4f().translate([1, 0, 0]).rotate([0, 1, 0], angle).translate([1, 0, 0])
     return [{"type": "rectangle", "to_world": turn, "bsdf": {"type": "diffuse"}}]
 
@@ -61,10 +59,6 @@ def ball():
 )
 def test_the_area_at_edges_is_that_of_geometry(renderer, others, places):
     """The mean of π r² / A at places where z is the normal, over passes."""
-    import drjit as dr
-
-    from data_gen.samplers.photons.map.edges import spread
-
     mi, n, radius = renderer, 20000, 0.3 if others not in (tuple, pane) else 0.2
     world = world_of(load(mi, lambda: squares(*others()), (4, 4)))
     for p, area in places.items():

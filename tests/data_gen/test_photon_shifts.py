@@ -7,7 +7,21 @@ import numpy as np
 import pytest
 from bdpt_scenes import SCENES
 from photon_laws import assert_copies_are_light_paths, largest, traced, world_of
+from renders import dr
+from scipy.spatial import cKDTree
 from unbiased import load
+
+from data_gen.paths import media
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.light_ends import LightEnds
+from data_gen.paths.vertex import Materials
+from data_gen.paths.world import World
+from data_gen.samplers import find
+from data_gen.samplers.photons.gradients import shift as shifts
+from data_gen.samplers.photons.gradients.copies import LightPaths, copy
+from data_gen.samplers.photons.map.fog import Fog
+from data_gen.samplers.photons.map.photon import is_near
+from data_gen.samplers.photons.map.vertices import vertex_of
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +30,6 @@ def rays(renderer):
 
     b is a place beside the first ray, a one from which light comes there; x, y are points with normals n, m.
     """
-    import drjit as dr
     from drjit.llvm import Array3f64 as Vector
     from drjit.llvm import Float64
 
@@ -64,8 +77,6 @@ def assert_told(measured, told, most=1e-5, quantile=0.99):
 @pytest.mark.parametrize("far", [False, True])
 def test_jacobian_by_finite_differences(rays, far):
     """Of directions from the predecessor; of light from infinity, of origins on a plane across the light."""
-    from data_gen.samplers.photons.gradients.shift import jacobian, moved, on_plane
-
     g, dr = rays, rays.dr
     way, a = -g.d, g.x + g.d * g.t
     s, t = across(g, way)
@@ -73,13 +84,13 @@ def test_jacobian_by_finite_differences(rays, far):
     def copied(i, j):
         """(direction or origin, J) of what is i and j along s and t aside."""
         origin, d = (a + s * i + t * j, way) if far else (a, dr.normalize(way + s * i + t * j))
-        b = on_plane(origin, d, g.x, g.n)
-        c = moved(b, g.x, g.n, g.y, g.m)
+        b = shifts.on_plane(origin, d, g.x, g.n)
+        c = shifts.moved(b, g.x, g.n, g.y, g.m)
         if far:
-            return c - d * dr.dot(c, d), jacobian(d, g.n, 1, d, g.m, 1)
+            return c - d * dr.dot(c, d), shifts.jacobian(d, g.n, 1, d, g.m, 1)
         to = c - a
         d1 = dr.normalize(to)
-        return d1, jacobian(d, g.n, dr.squared_norm(b - a), d1, g.m, dr.squared_norm(to))
+        return d1, shifts.jacobian(d, g.n, dr.squared_norm(b - a), d1, g.m, dr.squared_norm(to))
 
     told = np.array(copied(0, 0)[1])
     # Lines along a plane meet it anywhere.
@@ -91,12 +102,6 @@ def test_jacobian_by_finite_differences(rays, far):
 @pytest.mark.parametrize("name", ["areas", "sky", "points", "glossy"])
 def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(renderer, name):
     """Points where photons are gathered are beside photons, on the surfaces where other photons are."""
-    from scipy.spatial import cKDTree
-
-    from data_gen.samplers.photons.gradients.copies import LightPaths, copy
-    from data_gen.samplers.photons.map.photon import is_near
-    from data_gen.samplers.photons.map.vertices import vertex_of
-
     mi, world = renderer, world_of(load(renderer, SCENES[name], (8, 8)))
     starts, (photons,) = traced(world, 1 << 14)
     some = np.flatnonzero((np.array(photons.depth) > 0) & np.isfinite(np.array(photons.density)))
@@ -118,21 +123,17 @@ def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(rend
 
 def beside(g, b, o, d, u, e):
     """The copy, beside the ray (u, e), of a photon beside (o, d)."""
-    from data_gen.samplers.photons.gradients.shift import moved
-
     t = g.dr.dot(b - o, d)
-    return moved(b, o + d * t, d, u + e * t, e)
+    return shifts.moved(b, o + d * t, d, u + e * t, e)
 
 
 def test_photons_are_mirrored_and_volumes_kept(rays):
     """What is near to one of two points, or beside one of two rays, alone goes to the other."""
-    from data_gen.samplers.photons.gradients.shift import image
-
     g, dr = rays, rays.dr
-    c = image(g.b, g.o, g.u)
+    c = shifts.image(g.b, g.o, g.u)
     assert largest(dr.norm(c - g.u) - dr.norm(g.b - g.o)) < 1e-11
     assert largest(dr.norm(c - g.o) - dr.norm(g.b - g.u)) < 1e-11
-    assert np.abs(volume_ratio(g, lambda step: image(g.b + step, g.o, g.u)) - 1).max() < 1e-6
+    assert np.abs(volume_ratio(g, lambda step: shifts.image(g.b + step, g.o, g.u)) - 1).max() < 1e-6
     c = beside(g, g.b, g.o, g.d, g.u, g.e)
     assert largest(dr.dot(c - g.u, g.e) - g.t) < 1e-12
     assert largest(dr.norm(c - g.u - g.e * g.t) - dr.norm(g.b - g.o - g.d * g.t)) < 1e-12
@@ -145,8 +146,6 @@ def test_photons_are_mirrored_and_volumes_kept(rays):
 
 def test_jacobian_in_media_by_finite_differences(rays):
     """Of directions and distances from the predecessor."""
-    from data_gen.samplers.photons.gradients.shift import jacobian_in_medium
-
     g, dr = rays, rays.dr
     to, to1 = g.b - g.a, beside(g, g.b, g.o, g.d, g.u, g.e) - g.a
     length, d = dr.norm(to), dr.normalize(to)
@@ -158,13 +157,11 @@ def test_jacobian_in_media_by_finite_differences(rays):
         c = beside(g, b, g.o, g.d, g.u, g.e) - g.a
         return g.Vector(dr.dot(dr.normalize(c), s1), dr.dot(dr.normalize(c), t1), dr.norm(c))
 
-    assert_told(volume_ratio(g, copied), jacobian_in_medium(dr.squared_norm(to), dr.squared_norm(to1)))
+    assert_told(volume_ratio(g, copied), shifts.jacobian_in_medium(dr.squared_norm(to), dr.squared_norm(to1)))
 
 
 def balls(mi, eye, p, medium, rng):
     """Camera paths scatter near by, a hundredth of their length apart."""
-    import drjit as dr
-
     from data_gen.samplers.photons.media.gvpm import InBall
 
     n, length = p.shape[1], np.linalg.norm(p - eye, axis=0)
@@ -176,8 +173,6 @@ def balls(mi, eye, p, medium, rng):
 
 def ray(mi, o, d, medium):
     """A long one, through clear air."""
-    import drjit as dr
-
     from data_gen.samplers.photons.media.gbre import Beside
 
     n, d = d.shape[1], mi.Vector3f(d / np.linalg.norm(d, axis=0))
@@ -198,14 +193,6 @@ MEDIA = ["nested", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ha
 @pytest.mark.parametrize("receivers", [balls, camera_rays])
 @pytest.mark.parametrize("name", MEDIA)
 def test_copies_in_media_are_light_paths_and_their_copies_are_the_photons(renderer, receivers, name):
-    import drjit as dr
-
-    from data_gen.paths import media
-    from data_gen.paths.light_ends import LightEnds
-    from data_gen.paths.vertex import Materials
-    from data_gen.paths.world import World
-    from data_gen.samplers.photons.gradients.copies import LightPaths
-    from data_gen.samplers.photons.map.fog import Fog
     from data_gen.samplers.photons.media.gbre import copy_beside
 
     mi, scene, rng = renderer, load(renderer, getattr(media_scenes, name), (8, 8)), np.random.default_rng(0)
@@ -234,7 +221,6 @@ def test_copies_in_media_are_light_paths_and_their_copies_are_the_photons(render
 @pytest.mark.parametrize("far", [False, True])
 def test_beams_turn_to_and_fro(rays, far):
     """Past the other ray at the same distance along it, on the other side; J by finite differences."""
-    from data_gen.samplers.photons.gradients.shift import past
     from data_gen.samplers.photons.media.beams import nearest
 
     g, dr = rays, rays.dr
@@ -244,7 +230,7 @@ def test_beams_turn_to_and_fro(rays, far):
         """The copy, past (u, f), of a beam from ``a`` along ``d`` past (o, e); light from infinity is moved."""
         s, t, _, _ = nearest(o, e, a, d)
         aside = dr.dot(a + d * s - o - e * t, dr.normalize(dr.cross(e, d)))
-        target = past(a, d, u + f * t, f, -aside, g.dr.mask_t(aside)(far))
+        target = shifts.past(a, d, u + f * t, f, -aside, g.dr.mask_t(aside)(far))
         return (target - d * s, d, target) if far else (a, dr.normalize(target - a), target)
 
     d = dr.normalize(g.b - a)
@@ -274,7 +260,6 @@ def test_beams_turn_to_and_fro(rays, far):
 
 def test_planes_turn_to_and_fro(rays):
     """To where the other ray is as far along it, with the same angle between both edges; J by finite differences."""
-    from data_gen.samplers.photons.gradients.shift import about, jacobian_of_planes
     from data_gen.samplers.photons.media.planes import crossing
 
     g, dr = rays, rays.dr
@@ -283,29 +268,25 @@ def test_planes_turn_to_and_fro(rays):
     e = dr.normalize(g.b - a - d * 0.4)
     at = crossing(a, d, e, g.o, g.d)
     assert np.array(at.t > 0).all() and np.array(at.u > 0).all()
-    e1, s1, t1 = about(a, d, e, g.u + g.e * at.u)
+    e1, s1, t1 = shifts.about(a, d, e, g.u + g.e * at.u)
     there = crossing(a, d, e1, g.u, g.e)
     assert max(largest(there.u - at.u), largest(there.s - s1), largest(there.t - t1)) < 1e-8
     assert largest(dr.dot(d, e1) - dr.dot(d, e)) < 1e-12 and largest(dr.norm(e1) - 1) < 1e-12
-    back, s, t = about(a, d, e1, g.o + g.d * there.u)
+    back, s, t = shifts.about(a, d, e1, g.o + g.d * there.u)
     assert max(largest(dr.norm(back - e)), largest(s - at.s), largest(t - at.t)) < 1e-7
     x, y = across(g, e)
 
     def copied(i, j):
         """Another second edge meets the ray at another distance along it."""
         e2 = dr.normalize(e + x * i + y * j)
-        return about(a, d, e2, g.u + g.e * crossing(a, d, e2, g.o, g.d).u)[0]
+        return shifts.about(a, d, e2, g.u + g.e * crossing(a, d, e2, g.o, g.d).u)[0]
 
-    assert_told(area_ratio(g, copied, 1e-6), jacobian_of_planes(at.t, at.volume, t1, there.volume), 1e-5, 0.95)
+    assert_told(area_ratio(g, copied, 1e-6), shifts.jacobian_of_planes(at.t, at.volume, t1, there.volume), 1e-5, 0.95)
 
 
 @pytest.mark.parametrize("name", ["forward", *(pytest.param(n, marks=pytest.mark.slow) for n in ("haze", "nested"))])
 def test_copies_of_planes_are_planes_and_their_copies_are_the_planes(renderer, name):
     """Of light paths in a scene: r(T(x)) r(x) = 1, T(T(x)) = x, and Φ'' = Φ."""
-    import drjit as dr
-
-    from data_gen.paths.camera import CameraSamples
-    from data_gen.samplers import find
     from data_gen.samplers.photons.media.gplanes import copied
     from data_gen.samplers.photons.media.planes import crossing, planes_of
 

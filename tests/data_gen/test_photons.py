@@ -9,8 +9,21 @@ from bdpt_scenes import SCENES
 from data_gen_scenes import _scale
 from photon_laws import passes, traced, world_of
 from references import REFERENCES, references
+from renders import dr, mi
 from unbiased import assert_unbiased, load, render_ours
 
+from data_gen.film import GradientFilm
+from data_gen.passes import recording
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.frozen import Frozen
+from data_gen.paths.light_ends import LightEnds
+from data_gen.render import render_stack
+from data_gen.samplers import find
+from data_gen.samplers.photons.map import trace
+from data_gen.samplers.photons.map.fog import Fog
+from data_gen.samplers.photons.map.grid import Grid
+from data_gen.samplers.photons.map.radius import ALPHA, shrunk
+from data_gen.samplers.photons.map.vertices import vertex_of
 from data_gen.scenes.builtin import _camera, _diffuse, _rgb, _sphere
 from ngpt.errors import Interrupted
 from ngpt.testing import z_test
@@ -21,8 +34,6 @@ from ngpt.testing import z_test
 @pytest.fixture
 def points(renderer):
     """Points in a flat box, which of them exist, and what numbers those that are found are added up to."""
-    import drjit as dr
-
     rng = np.random.default_rng(0)
     points = (rng.random((3000, 3)) * [2, 1, 0.2] - [1, 0, 0]).astype(np.float32)
     exist, numbers = rng.random(3000) < 0.8, renderer.UInt32(np.arange(1, 3001))
@@ -37,8 +48,6 @@ def points(renderer):
 @pytest.mark.parametrize("radius", [0.3, 0.05, 0.004])
 def test_the_grid_finds_what_brute_force_finds(renderer, points, radius):
     """Each once, on and beyond the box too; with the least radius cells are larger than they need be."""
-    from data_gen.samplers.photons.map.grid import Grid
-
     mi, (rng, points, exist, number) = renderer, points
     around = points[:600] + rng.normal(size=(600, 3)) * radius
     queries = np.concatenate([around, rng.random((100, 3)) * 6 - 3, points[:9]]).astype(np.float32)
@@ -54,7 +63,6 @@ def test_the_grid_finds_what_brute_force_finds(renderer, points, radius):
 @pytest.mark.parametrize("radius", [0.3, 0.05, 0.01])
 def test_the_grid_finds_what_is_beside_a_ray(renderer, points, radius):
     """Each point once, whatever its cell, on and beyond the box too; rays without end are cut at the box."""
-    from data_gen.samplers.photons.map.grid import Grid
     from data_gen.samplers.photons.media.bre import BALL
 
     mi, (rng, points, exist, number) = renderer, points
@@ -100,9 +108,8 @@ def entries(photons, *names):
 
 def test_vertices_know_their_parents(renderer):
     """From the parent a vertex lies along its direction; what the ray met there is found again."""
-    from data_gen.samplers.photons.map.vertices import vertex_of
-
-    start, (photons,) = traced(world_of(load(renderer, SCENES["glass"], (8, 8))))
+    world = world_of(load(renderer, SCENES["glass"], (8, 8)))
+    start, (photons,) = traced(world)
     p, n, d, t, depth, parent, first = entries(photons, "p", "n", "d", "t", "depth")
     assert 0 < first.sum() <= 4096 and (parent[~first] < np.flatnonzero(~first)).all()
     origin = np.where(first[:, None], np.array(start.ray.o).T[parent * first], p[parent * ~first])
@@ -117,8 +124,6 @@ def test_vertices_know_their_parents(renderer):
 
 def test_maps_of_many_vertices_are_cut(renderer, monkeypatch):
     """Into some, which have the same photons each once, whose parents are with them."""
-    from data_gen.samplers.photons.map import trace
-
     world = world_of(load(renderer, "diffuse", (8, 8)))
     _, (whole,) = traced(world)
     monkeypatch.setattr(trace, "VERTICES_PER_PATH", 2)
@@ -140,12 +145,6 @@ def test_maps_of_many_vertices_are_cut(renderer, monkeypatch):
 
 def test_kernels_are_recorded_once_and_make_the_same_bits(renderer, monkeypatch, recordings):
     """As if they were recorded in each pass."""
-    from data_gen.film import GradientFilm
-    from data_gen.passes import recording
-    from data_gen.paths.camera import CameraSamples
-    from data_gen.paths.frozen import Frozen
-    from data_gen.samplers import find
-
     scene = load(renderer, "diffuse", (16, 12))
 
     def rendered(others=()):
@@ -172,7 +171,6 @@ def test_kernels_are_recorded_once_and_make_the_same_bits(renderer, monkeypatch,
 @pytest.mark.parametrize("kind", [KeyboardInterrupt, Interrupted])
 def test_an_interrupt_while_a_plugin_is_made_is_one(renderer, monkeypatch, kind):
     """Mitsuba makes a text of what a plugin raises."""
-    from data_gen.samplers import find
     from data_gen.samplers.photons.surfaces.ppm import PPM
 
     def interrupted(self, props):
@@ -186,8 +184,6 @@ def test_an_interrupt_while_a_plugin_is_made_is_one(renderer, monkeypatch, kind)
 
 def test_radii_shrink_as_told():
     """On surfaces by area, in media by volume."""
-    from data_gen.samplers.photons.map.radius import ALPHA, shrunk
-
     r2 = 1.0
     for i in range(50):
         assert shrunk(i) == pytest.approx(r2**0.5, rel=1e-9) and shrunk(i, 3) == pytest.approx(r2 ** (1 / 3), rel=1e-9)
@@ -200,12 +196,6 @@ def test_radii_shrink_as_told():
 
 def test_the_medium_around_a_lamp_is_found(renderer):
     """Behind walls too, and on either side of a boundary."""
-    import drjit as dr
-
-    from data_gen.paths.light_ends import LightEnds
-    from data_gen.samplers.photons.map.fog import Fog
-
-    mi = renderer
     scene = load(mi, media_scenes.nested, (8, 8))
     ways = Fog(scene, scene.sensors()[0], LightEnds(scene), "vpm")
     # Outside of all, in the cloud, in its core, and behind the wall at the back
@@ -259,7 +249,6 @@ def test_boundaries_within_one_medium_change_nothing(renderer):
 @pytest.mark.slow
 def test_beams_are_cut_the_same_in_windows(renderer, monkeypatch):
     """All parts at once, or few at a time: the same light."""
-    from data_gen.render import render_stack
     from data_gen.samplers.photons.media import beams
 
     scene = load(renderer, media_scenes.haze, (8, 8))
@@ -315,8 +304,6 @@ def test_light_by_planes_has_no_bias(renderer, planes_alone):
 
 def test_paths_of_planes_are_no_longer_than_the_scene_says(renderer, planes_alone):
     """A plane and the way to the camera are three edges."""
-    from data_gen.render import render_stack
-
     scenes = [load(renderer, partial(black_room, depth), (8, 8)) for depth in (2, 3)]
     light = [render_stack(scene, 1, 0, "planes")["primal"].sum() for scene in scenes]
     assert light[0] == 0 < light[1]

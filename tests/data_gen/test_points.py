@@ -2,10 +2,20 @@
 
 import numpy as np
 import pytest
+from renders import dr, mi
+from scipy.ndimage import uniform_filter
 from scipy.stats import kstest
 from unbiased import load
 
+from data_gen.film import GradientFilm
+from data_gen.film.claims import box_means
+from data_gen.film.nets import RATES, SHARES, law, split
+from data_gen.paths import streams
+from data_gen.paths.streams import sample_streams
+from data_gen.render import render_stack
 from data_gen.samplers import SAMPLERS
+from data_gen.scenes.facts import scene_facts
+from data_gen.scenes.lamps import lamp_weights, weighed
 from ngpt import GradientStack
 from ngpt.errors import NgptError
 from ngpt.merging import merge
@@ -13,17 +23,8 @@ from ngpt.merging import merge
 SIDE = 16
 
 
-@pytest.fixture
-def streams(renderer):
-    from data_gen.paths import streams
-
-    return streams
-
-
-def of_image(mi, streams, samples, first=0, net=16, seed=3):
+def of_image(samples, first=0, net=16, seed=3):
     """Streams of some samples of each pixel of a SIDE x SIDE image, pixel by pixel."""
-    import drjit as dr
-
     lane = dr.arange(mi.UInt32, SIDE * SIDE * samples)
     return streams.sample_streams(seed, lane // samples, lane % samples + first, SIDE, net)
 
@@ -44,8 +45,8 @@ def fills(points):
 
 
 @pytest.mark.parametrize(("net", "first", "n"), [(16, 0, 16), (4, 0, 4), (16, 16, 16), (4, 8, 8), (64, 0, 64)])
-def test_a_round_is_a_net_of_each_pixel_and_of_each_aligned_block(renderer, streams, net, first, n):
-    stream = of_image(renderer, streams, n, first, net)
+def test_a_round_is_a_net_of_each_pixel_and_of_each_aligned_block(renderer, net, first, n):
+    stream = of_image(n, first, net)
     for _ in range(3):
         points = pairs(stream, n)
         assert all(fills(points[y, x]) for y in (0, 5) for x in (0, 9))
@@ -53,25 +54,22 @@ def test_a_round_is_a_net_of_each_pixel_and_of_each_aligned_block(renderer, stre
         assert not fills(points[1:3, 8:10].reshape(-1, 2))  # not aligned
 
 
-def test_single_numbers_are_stratified_too(renderer, streams):
-    numbers = np.array(of_image(renderer, streams, 16).next_1d()).reshape(-1, 16)
+def test_single_numbers_are_stratified_too(renderer):
+    numbers = np.array(of_image(16).next_1d()).reshape(-1, 16)
     assert (np.sort(np.floor(numbers * 16), axis=1) == np.arange(16)).all()
 
 
-def test_each_point_is_uniform_over_seeds(renderer, streams):
-    found = np.array([pairs(of_image(renderer, streams, 4, seed=seed), 4) for seed in range(64)])
+def test_each_point_is_uniform_over_seeds(renderer):
+    found = np.array([pairs(of_image(4, seed=seed), 4) for seed in range(64)])
     tests = [kstest(found[:, 3, 11, sample, axis], "uniform") for sample in range(4) for axis in range(2)]
     assert min(test.pvalue for test in tests) > 0.01 / 8
     assert np.allclose(found.mean(axis=(0, 1, 2, 3)), 0.5, atol=1e-3) and found.min() >= 0 and found.max() < 1
 
 
-def test_dimensions_rounds_seeds_and_tiles_are_independent(renderer, streams):
-    import drjit as dr
-
-    mi = renderer
-    stream = of_image(mi, streams, 16)
+def test_dimensions_rounds_seeds_and_tiles_are_independent(renderer):
+    stream = of_image(16)
     one, other = pairs(stream, 16), pairs(stream, 16)
-    further, again = pairs(of_image(mi, streams, 16, 16), 16), pairs(of_image(mi, streams, 16, seed=4), 16)
+    further, again = pairs(of_image(16, 16), 16), pairs(of_image(16, seed=4), 16)
     pixel = dr.arange(mi.UInt32, 64 * 64 * 4)
     tiles = np.array(streams.sample_streams(3, pixel, mi.UInt32(0), 128, 16).next_1d()).reshape(128, 128)
     light = np.array(streams.light_streams(3, dr.arange(mi.UInt32, SIDE * SIDE * 16), 0).next_1d())
@@ -82,9 +80,8 @@ def test_dimensions_rounds_seeds_and_tiles_are_independent(renderer, streams):
 
 
 @pytest.mark.parametrize("net", [0, 16])
-def test_streams_replay_skip_and_gather(renderer, streams, net):
-    mi = renderer
-    stream = of_image(mi, streams, 4, net=net)
+def test_streams_replay_skip_and_gather(renderer, net):
+    stream = of_image(4, net=net)
     copy, ahead, idle = stream.clone(), stream.clone(), stream.clone()
     numbers = [pairs(stream, 4), np.array(stream.next_1d()), pairs(stream, 4)]
     # Lanes that do not draw stay where they are.
@@ -98,7 +95,7 @@ def test_streams_replay_skip_and_gather(renderer, streams, net):
     assert len(np.unique(keys)) > 0.99 * len(keys)
 
 
-def test_first_rounds(streams):
+def test_first_rounds():
     assert [streams.first_round("sobol", n) for n in (1, 4, 5, 64, 100, None)] == [1, 4, 8, 64, 128, 16]
     assert streams.first_round("rounds", 64) == 16
     assert streams.first_round("independent", 64) == 0
@@ -112,8 +109,6 @@ def block_means(images, side=8):
 
 def test_points_take_noise_away(renderer):
     """Of pixels, and more of blocks; that they take no light, see ``laws``."""
-    from data_gen.render import render_stack
-
     scene, found = load(renderer, "diffuse", (24, 16)), []
     for points in ("sobol", "independent"):
         stacks = [render_stack(scene, 16, seed, "gpt", points=points) for seed in range(16)]
@@ -128,8 +123,6 @@ def test_points_take_noise_away(renderer):
 
 
 def test_a_render_by_time_can_be_had_again_by_its_number_of_samples(renderer):
-    from data_gen.render import render_stack
-
     scene, calls = load(renderer, "diffuse", (16, 12)), []
 
     def stop():
@@ -146,8 +139,6 @@ def test_a_render_by_time_can_be_had_again_by_its_number_of_samples(renderer):
 
 
 def test_images_of_one_row_or_column_have_no_differences_in_them(renderer, rng):
-    from data_gen.film.gradient_film import GradientFilm
-
     for width, height in ((1, 1), (2, 1), (1, 2)):
         film = GradientFilm(width, height, net=2)
         for _ in range(2):
@@ -161,10 +152,6 @@ def test_images_of_one_row_or_column_have_no_differences_in_them(renderer, rng):
 @pytest.mark.parametrize("shape", [(36, 64), (5, 4), (1, 7), (0, 7)])
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 def test_box_means_are_those_of_scipy_to_the_bit(renderer, rng, shape, kind):
-    from scipy.ndimage import uniform_filter
-
-    from data_gen.film.claims import box_means
-
     image = rng.gamma(0.2, size=shape).astype(kind)
     for size in (5, 4):
         assert np.array_equal(box_means(image, size), uniform_filter(image, size))
@@ -172,8 +159,6 @@ def test_box_means_are_those_of_scipy_to_the_bit(renderer, rng, shape, kind):
 
 @pytest.mark.parametrize(("sampler", "spp"), [("primal", 17), ("gpt", 17)])
 def test_claims_are_those_over_seeds(renderer, sampler, spp):
-    from data_gen.render import render_stack
-
     scene, options = load(renderer, "glossy", (48, 32)), {"features": False} if sampler == "primal" else {}
     stacks = [render_stack(scene, spp, seed, sampler, **options) for seed in range(16)]
     for layer in ("primal", "dx", "dy", "caustic"):
@@ -187,8 +172,6 @@ def test_claims_are_those_over_seeds(renderer, sampler, spp):
 
 
 def test_noise_of_features_is_that_over_seeds(renderer):
-    from data_gen.render import render_stack
-
     scene = load(renderer, "lens", (64, 40))
     stacks = [render_stack(scene, 16, seed, "primal") for seed in range(8)]
     seen = max(np.var([s[name] for s in stacks], axis=0, ddof=1).mean() for name in ("albedo", "normal"))
@@ -202,10 +185,8 @@ def test_noise_of_features_is_that_over_seeds(renderer):
 EXTENT = 48, 32
 
 
-def put_samples(mi, film, seed, numbers, net, some=None):
+def put_samples(film, seed, numbers, net, some=None):
     """Samples of these ``numbers`` of all pixels, or of ``some``: steps in four dimensions, and rare bright ones."""
-    from data_gen.paths.streams import sample_streams
-
     some = np.arange(EXTENT[0] * EXTENT[1], dtype=np.uint32) if some is None else some
     pixel, sample = np.repeat(some, len(numbers)), np.tile(np.asarray(numbers, np.uint32), len(some))
     stream = sample_streams(seed, mi.UInt32(pixel), mi.UInt32(sample), EXTENT[0], net)
@@ -217,34 +198,30 @@ def put_samples(mi, film, seed, numbers, net, some=None):
     film.end_pass(len(numbers), *([] if len(some) == EXTENT[0] * EXTENT[1] else [some]))
 
 
-def evenly(mi, seed, n, net):
+def evenly(seed, n, net):
     """The first ``n`` samples of each pixel, in blocks of 16 and what is left over, as renders put them."""
-    from data_gen.film import GradientFilm
-
     film = GradientFilm(*EXTENT, net=net)
     for begin in range(0, n, 16):
-        put_samples(mi, film, seed, range(begin, min(n, begin + 16)), net)
+        put_samples(film, seed, range(begin, min(n, begin + 16)), net)
     return film.develop()
 
 
-def adaptively(mi, seed):
+def adaptively(seed):
     """Blocks of 16 samples, 1 to 5 of them by the row of the pixel."""
-    from data_gen.film import GradientFilm
-
     film = GradientFilm(*EXTENT, net=16)
     each = 1 + np.arange(EXTENT[0] * EXTENT[1]) // EXTENT[0] % 5
     for begin in range(5):
         some = np.flatnonzero(each > begin).astype(np.uint32)
-        put_samples(mi, film, seed, range(16 * begin, 16 * begin + 16), 16, some)
+        put_samples(film, seed, range(16 * begin, 16 * begin + 16), 16, some)
     return film.develop()
 
 
-def merged(mi, seed):
+def merged(seed):
     """Stacks of 17, 9 and 4 samples as one."""
     parts = []
     for i, n in enumerate((17, 9, 4)):
         attributes = {"ngpt:spp": n, "ngpt:seed": str(i), "ngpt:sampler": "primal"}
-        parts.append(GradientStack(evenly(mi, 100 * i + seed, n, 32), attributes=attributes))
+        parts.append(GradientStack(evenly(100 * i + seed, n, 32), attributes=attributes))
     return merge(parts)
 
 
@@ -255,20 +232,19 @@ def check_claims(stacks):
 
 @pytest.mark.parametrize("n", [7, 16, 17, 31, 65, 129])
 @pytest.mark.parametrize("kind", ["sobol", "rounds", "cut"])
-def test_claims_hold_at_any_number_of_samples(renderer, streams, kind, n):
+def test_claims_hold_at_any_number_of_samples(renderer, kind, n):
     net = 4096 if kind == "cut" else streams.first_round(kind, n)
-    check_claims([evenly(renderer, seed, n, net) for seed in range(8)])
+    check_claims([evenly(seed, n, net) for seed in range(8)])
 
 
 @pytest.mark.parametrize("stack_of", [adaptively, merged])
 def test_claims_hold_where_samples_come_in_parts(renderer, stack_of):
-    check_claims([stack_of(renderer, seed) for seed in range(10)])
+    check_claims([stack_of(seed) for seed in range(10)])
 
 
 @pytest.mark.parametrize("net", [1, 16, 64])
 def test_laws_are_sums_over_pairs_of_samples(net):
     """For any number of samples: the covariances of all pairs, added up one by one."""
-    from data_gen.film.nets import RATES, SHARES, law, split
 
     def variance_of(m):
         return SHARES / m + (1 - SHARES) * m**-RATES
@@ -302,8 +278,6 @@ def lamp_at(kind, radiance, weight, place):
 
 
 def seen(origin, target):
-    import mitsuba as mi
-
     return {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 3},
@@ -315,7 +289,7 @@ def seen(origin, target):
     }
 
 
-def room(mi, weights=(None, None, None)):
+def room(weights=(None, None, None)):
     """A floor under a strong lamp and two weak ones."""
     at, lamps = mi.ScalarTransform4f(), {}
     for i, weight in enumerate(weights):
@@ -326,9 +300,7 @@ def room(mi, weights=(None, None, None)):
 
 
 def test_lamps_are_chosen_by_what_they_bring_and_left_as_they_were(renderer):
-    from data_gen.scenes.lamps import lamp_weights, weighed
-
-    scene = load(renderer, room(renderer))
+    scene = load(renderer, room())
 
     def chosen():
         return [float(scene.pdf_emitter(i)[0]) for i in range(3)]
@@ -345,18 +317,14 @@ def test_lamps_are_chosen_by_what_they_bring_and_left_as_they_were(renderer):
 
 
 def test_weights_that_a_scene_gives_are_honoured(renderer):
-    from data_gen.scenes.lamps import weighed
-
-    scene = load(renderer, room(renderer, (1.0, 0.0, 3.0)))
+    scene = load(renderer, room((1.0, 0.0, 3.0)))
     with weighed(scene, "power"):
         assert sorted(float(scene.pdf_emitter(i)[0]) for i in range(3)) == [0, 0.25, 0.75]
 
 
 @pytest.mark.parametrize("sampler", ["gpt", pytest.param("gbdpt", marks=pytest.mark.slow)])
 def test_lamps_take_noise_away_and_no_light(renderer, sampler):
-    from data_gen.render import render_stack
-
-    scene, found = load(renderer, room(renderer)), []
+    scene, found = load(renderer, room()), []
     for lamps in ("power", "uniform"):
         stacks = [render_stack(scene, 16, seed, sampler, points="independent", lamps=lamps) for seed in range(16)]
         found.append(np.array([stack["primal"] for stack in stacks], np.float64).mean(axis=-1))
@@ -367,7 +335,7 @@ def test_lamps_take_noise_away_and_no_light(renderer, sampler):
     assert abs(z) < 4
 
 
-def box(mi, weight, fog=False):
+def box(weight, fog=False):
     """Within a grey box, two lamps beside each other, a ball and a square; the ball is chosen by ``weight``."""
     at = mi.ScalarTransform4f()
     ball, square = at.translate([-0.5, -0.2, 0.6]).scale(0.3), at.translate([0.5, -0.2, 0.98]).rotate([1, 0, 0], 180)
@@ -386,7 +354,7 @@ def box(mi, weight, fog=False):
 @pytest.fixture(scope="module")
 def light_of_box(renderer):
     """Means of images, where both lamps are chosen."""
-    scene = load(renderer, box(renderer, 1.0))
+    scene = load(renderer, box(1.0))
     return np.array([np.array(renderer.render(scene, spp=256, seed=100 + seed)).mean() for seed in range(8)])
 
 
@@ -395,12 +363,9 @@ def light_of_box(renderer):
     [n if e.standing != "study" else pytest.param(n, marks=pytest.mark.slow) for n, e in SAMPLERS.items()],
 )
 def test_light_of_a_lamp_that_is_chosen_never_is_found_or_refused(renderer, light_of_box, sampler):
-    from data_gen.render import render_stack
-    from data_gen.scenes.facts import scene_facts
-
-    scene = load(renderer, box(renderer, 0.0))
+    scene = load(renderer, box(0.0))
     if SAMPLERS[sampler].refuses(scene_facts(scene)):
-        scene = load(renderer, box(renderer, 0.0, fog=True))
+        scene = load(renderer, box(0.0, fog=True))
     # Of what gathers photons alone
     if "photons" in SAMPLERS[sampler].options:
         with pytest.raises(NgptError, match=f"'{sampler}' .*'hidden' has sampling_weight 0; give it a positive"):
@@ -414,9 +379,7 @@ def test_light_of_a_lamp_that_is_chosen_never_is_found_or_refused(renderer, ligh
 
 
 def test_a_point_that_is_chosen_never_is_off(renderer):
-    from data_gen.render import render_stack
-
-    description = box(renderer, 1.0) | {"point": {"type": "point", "position": [0, 0, 0], "sampling_weight": 0.0}}
-    without = render_stack(load(renderer, box(renderer, 1.0)), 64, 0, "ppm", lamps="uniform")["primal"].mean()
+    description = box(1.0) | {"point": {"type": "point", "position": [0, 0, 0], "sampling_weight": 0.0}}
+    without = render_stack(load(renderer, box(1.0)), 64, 0, "ppm", lamps="uniform")["primal"].mean()
     found = render_stack(load(renderer, description), 64, 0, "ppm")["primal"].mean()
     assert found == pytest.approx(without, rel=0.05)

@@ -1,33 +1,38 @@
 """What is particular to ``vcm`` and ``gvcm``: weights with merging, of paths and of copies, and pairs by merging."""
 
 from dataclasses import replace
-from operator import itemgetter
 
 import numpy as np
 import pytest
 from bdpt_ends import Copies, Ends, check_weights, compare, compare_copies, plan_of, without_hole
 from bdpt_scenes import SCENES
-from photon_laws import passes
+from renders import dr, mi
+from scipy.spatial import cKDTree
 from unbiased import light_of_gradients, load
+
+from data_gen.paths.vertex import Materials
+from data_gen.render import render_stack
+from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, cosine, evaluate, scatters_smoothly
+from data_gen.samplers.photons.map.photon import Photon
+from data_gen.samplers.vcm.merging import Map, Merging, Photons
 
 ETA = 0.05
 
 
 @pytest.fixture(scope="module")
 def ends(renderer):
-    return ends_of(renderer, ETA)
+    return ends_of(ETA)
 
 
-def ends_of(mi, η):
-    from data_gen.paths.vertex import Materials
-
+def ends_of(η):
     scene = load(mi, without_hole, (24, 24))
-    return Ends(mi, scene, η, Materials(scene, 0.05).connectable, spp=64)
+    return Ends(scene, η, Materials(scene, 0.05).connectable, spp=64)
 
 
 def test_weights_of_bdpt_are_those_of_all_densities(renderer):
     """Brute force in float64, on stored paths: no z-test sees every wrong term."""
-    check_weights(ends_of(renderer, 0.0))
+    check_weights(ends_of(0.0))
 
 
 def test_weights_count_merging_too(ends):
@@ -36,17 +41,11 @@ def test_weights_count_merging_too(ends):
 
 def test_weights_of_merging_are_those_of_all_densities(ends):
     """So the weights of all ways to find a path sum to 1, merging at each of its vertices among them."""
-    import drjit as dr
-
-    from data_gen.samplers.bdpt import mis
-    from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, cosine, evaluate, scatters_smoothly
-    from data_gen.samplers.photons.map.photon import Photon
-    from data_gen.samplers.vcm.merging import Merging
 
     class Gathered:
-        η = ends.mi.Float(ETA)
+        η = mi.Float(ETA)
 
-    mi, merging = ends.mi, Merging(Gathered, plan_of(ends.scene, 10))
+    merging = Merging(Gathered, plan_of(ends.scene, 10))
     for t in range(3):
         for s in range(2, 4):
             y = ends.from_light[s - 1]
@@ -83,7 +82,7 @@ def test_weights_of_merging_are_those_of_all_densities(ends):
 @pytest.fixture(scope="module")
 def copies(renderer):
     """Of so many light paths, or of such a radius, that merging has its share."""
-    return Copies(renderer, load(renderer, without_hole, (24, 24)), (2, 1), η=1000.0, length=5)
+    return Copies(load(renderer, without_hole, (24, 24)), (2, 1), η=1000.0, length=5)
 
 
 @pytest.mark.parametrize(("t", "s"), [(1, 1), (1, 2), (2, 1), (2, 2), (3, 2), (4, 1), (4, 2), (5, 1)])
@@ -102,13 +101,9 @@ class Beside:
     """Copies at their vertex ``t``, the same the other way, and a photon beside each vertex on the same surface."""
 
     def __init__(self, copies, t, radius, number=4096):
-        import drjit as dr
-
-        from data_gen.samplers.bdpt.vertex import Vertex
         from data_gen.samplers.vcm.differences import ShiftedMerging
-        from data_gen.samplers.vcm.merging import Map, Photons
 
-        mi, connectable = copies.mi, copies.materials.connectable
+        connectable = copies.materials.connectable
         base, own, offset = copies.from_camera[t - 1], copies.copied[t - 1], copies.offsets[t - 1]
         good = base.there & own.there & connectable(base.bsdf) & connectable(own.bsdf)
         some = np.flatnonzero(np.array(good & (offset.apart if t == 1 else offset.joined)))
@@ -135,9 +130,6 @@ class Beside:
 
     def found(self, end, η=1.0):
         """L and Δ of the base paths of that ``end``, 0 or 1, where paths merge with this η: (3, n) of each."""
-        import drjit as dr
-        import mitsuba as mi
-
         x, shifted = self.pairs[end]
         self.photons.η = dr.opaque(mi.Float, η)
         shifted, everywhere = replace(shifted, Δ=dr.zeros(mi.Spectrum, self.n)), dr.full(mi.Bool, True, self.n)
@@ -147,8 +139,6 @@ class Beside:
 
 def test_pairs_at_shared_vertices_have_the_weight_of_all_strategies(copies):
     """Δ = 2 (b' - b) / (W(x) + r W(y)) at the vertex where copies join, of points with one photon near by."""
-    from scipy.spatial import cKDTree
-
     beside = Beside(copies, 2, 0.025, number=600)
     points, photons = beside.places
     alone = np.array([len(near) == 1 for near in cKDTree(photons).query_ball_point(points, 0.026)])
@@ -186,8 +176,6 @@ def test_pairs_that_merging_completes_are_the_same_from_both_ends(copies, t):
 
 def test_where_nothing_merges_it_is_bdpt(renderer):
     """With a radius of nearly nothing: the same paths from the same random numbers, one by one."""
-    from data_gen.render import render_stack
-
     scene = load(renderer, SCENES["glass"], (24, 16))
     ours, theirs = (
         light_of_gradients(render_stack(scene, 8, 3, name, **options).layers)
@@ -195,17 +183,3 @@ def test_where_nothing_merges_it_is_bdpt(renderer):
     )
     # A ray that grazes an edge may go another way where its neighbours are others.
     assert np.isclose(ours, theirs, rtol=1e-3, atol=1e-4).mean() > 0.99 and abs(ours.mean() / theirs.mean() - 1) < 0.01
-
-
-@pytest.mark.slow
-def test_where_nothing_merges_it_is_gbdpt(renderer, monkeypatch):
-    """Without glass, through which ``gbdpt`` walks camera paths, and without its roulette of splats."""
-    from data_gen.samplers.gbdpt import roulette
-
-    monkeypatch.setattr(roulette, "SHARE", float("inf"))
-    scene = load(renderer, lambda: {k: v for k, v in SCENES["areas"]().items() if k != "glass"}, (12, 12))
-    ours = passes(scene, 2, 1, "gvcm", radius=1e-5, joined_depth=10)
-    theirs = passes(scene, 2, 1, "gbdpt")
-    for layer in (light_of_gradients, itemgetter("dx"), itemgetter("dy")):
-        a, b = (np.stack([layer(stack) for stack in stacks]) for stacks in (ours, theirs))
-        assert b.any() and np.isclose(a, b, rtol=1e-3, atol=1e-4).mean() > 0.99, layer
