@@ -1,17 +1,60 @@
-"""What light photons bring: all of it along edges, that of all lamps, and that of paths as the radius goes to 0."""
+"""What light photons bring: the power of lamps, also along edges, and the light of paths as the radius goes to 0."""
 
 from functools import partial
 
 import numpy as np
 import pytest
-from lamps_scenes import lit_by
+from lamps_scenes import lamps, lit_by
 from photon_laws import world_of
 from references import references
 from renders import dr, mi
 from unbiased import differences, load, render_ours
 
+from data_gen.paths.light_ends import LightEnds
+from data_gen.paths.streams import sample_streams
 from data_gen.samplers.photons.map.edges import spread
 from data_gen.scenes.builtin import _camera, _diffuse
+
+# ------------------------- The start of light paths -------------------------
+
+
+def power_of(kind, scene, radius):
+    """Of a lamp, in each colour; of one that is far, what crosses a disk of that radius in every direction of it."""
+    if kind == "picture":
+        # A bilinear texture that is clamped: its mean is not that of its texels.
+        u, v = np.meshgrid(*[(np.arange(200) + 0.5) / 200] * 2)
+        si = mi.SurfaceInteraction3f()
+        si.uv, si.wi = mi.Point2f(u.ravel(), v.ravel()), mi.Vector3f(0, 0, 1)
+        return np.pi * 0.8 * 0.5 * np.array(scene.emitters()[0].eval(si)).mean(axis=1)
+    if kind == "spot":
+        # By its intensity as Mitsuba has it at distance 1, over equal parts of all directions
+        z, φ = np.meshgrid((np.arange(256) - 127.5) / 128, np.pi * (np.arange(512) + 0.5) / 256, indexing="ij")
+        d, it = np.stack([np.sqrt(1 - z**2) * np.cos(φ), np.sqrt(1 - z**2) * np.sin(φ), z]), mi.Interaction3f()
+        it.p = mi.Point3f(np.array(lamps()[kind]["to_world"].matrix)[:3, 3]) + mi.Vector3f(d.reshape(3, -1))
+        return 4 * np.pi * np.array(scene.emitters()[0].sample_direction(it, mi.Point2f(0.5))[1]).mean(axis=1)
+    area = next((shape.surface_area()[0] for shape in scene.shapes() if shape.is_emitter()), 0)
+    return (
+        np.pi
+        * {
+            "glow": area * np.array([4, 5, 2]),
+            "sun": radius**2 * np.array([1, 0.8, 0.5]),
+            "sky": 4 * np.pi * radius**2 * np.array([0.2, 0.25, 0.4]),
+            "point": 4 * np.array([1.5, 2, 2.5]),
+        }[kind]
+    )
+
+
+@pytest.mark.parametrize("kind", ["picture", "glow", "point", "spot", "sun", "sky"])
+def test_lamps_send_their_power(renderer, kind):
+    """The mean of what light paths begin with is the power of the lamp, in each colour."""
+    everything = lit_by()
+    scene = load(mi, {name: part for name, part in everything.items() if name == kind or name not in lamps()})
+    lights, random = LightEnds(scene), sample_streams(0, dr.arange(mi.UInt32, 1 << 18), mi.UInt32(0))
+    β = np.array(lights.sample(scene, random, mi.Float(0), dr.zeros(mi.Ray3f).wavelengths).β, np.float64)
+    β = np.broadcast_to(β, (3, β.shape[1]))
+    mean, error, power = β.mean(axis=1), β.std(axis=1) / np.sqrt(1 << 18), power_of(kind, scene, lights.radius)
+    assert (np.abs(mean - power) < 4.5 * error + 2e-3 * power).all(), (mean, power, error)
+
 
 # ------------------------- Where surfaces end -------------------------
 
