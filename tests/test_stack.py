@@ -56,14 +56,8 @@ def test_numbers_are_numbers():
         ({"primal": image()[None]}, "layer 'primal' has shape (1, 3, 4, 3)"),
         ({"primal": image(0, 4)}, "layer 'primal' is 4x0; it has no pixels"),
         ({"primal": 1.0}, "layer 'primal' has shape ()"),
-        (
-            {"dx": image(3, 3), "primal": image()},
-            "layer 'dx' is 3x3 but 'primal' is 4x3; gradients are stored at image size with an unused last column",
-        ),
-        (
-            {"dy": image(2, 4), "primal": image()},
-            "layer 'dy' is 4x2 but 'primal' is 4x3; gradients are stored at image size with an unused last row",
-        ),
+        ({"dx": image(3, 3), "primal": image()}, "stored at image size with an unused last column: pad it with zeros"),
+        ({"dy": image(2, 4), "primal": image()}, "stored at image size with an unused last row: pad it with zeros"),
         ({"dx": image(2, 4), "primal": image()}, "layer 'dx' is 4x2 but 'primal' is 4x3; all layers of a stack"),
         ({"albedo": image(1, 2), "primal": image()}, "layer 'albedo' is 2x1 but 'primal' is 4x3; all layers of a"),
     ],

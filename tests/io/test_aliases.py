@@ -255,10 +255,6 @@ def test_layers_that_nobody_else_writes_tell_what_those_beside_them_mean(layer, 
     assert layer in resolve([("", names("RGB", f"{layer}.RGB", f"{beside}.RGB"))])
 
 
-def test_variances_of_a_sample_are_not_taken_for_variances_of_the_mean():
-    assert "primal_var" not in resolve([("", names("RGB", "Variance.RGB", "Ci_var.RGB", "mse.RGB"))])
-
-
 def test_the_alias_table_is_complete_and_printed_in_full():
     assert {alias.layer for alias in ALIASES} == set(LAYERS)
     lines = format_aliases().splitlines()
