@@ -1,6 +1,6 @@
 """Renderer x layers x OIDN: what `auto` takes of files with each renderer's names, and the error that it leaves.
 
-Two built-in scenes, 16 samples per pixel, 72x48 pixels; errors are geometric means of the trimmed relMSE over both. The
+Two built-in scenes, 16 samples per pixel, 96x64 pixels; errors are geometric means of the trimmed relMSE over both. The
 same at 192x108 pixels over four scenes is in docs/use/from-your-renderer.md, by `python -m bench.layers`.
 """
 
@@ -23,7 +23,7 @@ def rows(renderer, tmp_path_factory):
     from data_gen.render import render_stack
     from data_gen.scenes.load import load_scene
 
-    scenes = [load_scene(name, (72, 48)) for name in ("diffuse", "glossy")]
+    scenes = [load_scene(name, (96, 64)) for name in ("diffuse", "glossy")]
     truths = [render_stack(scene, 512, seed=1, sampler="primal")["primal"] for scene in scenes]
     stacks = [render_stack(scene, 16, seed=0) for scene in scenes]
     return renderers(list(zip(stacks, truths, strict=True)), tmp_path_factory.mktemp("files"))
