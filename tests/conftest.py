@@ -1,6 +1,7 @@
 """Fixtures that several tests share."""
 
 import os
+import shlex
 import signal
 
 import numpy as np
@@ -9,6 +10,7 @@ from browser import Session, browser_command
 from skips import allowed
 
 from ngpt.classical.gradients import forward_differences
+from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 
@@ -34,8 +36,10 @@ def pytest_make_collect_report(collector):
 
 # A fixture -> the marker of all tests that stand on it.
 MARKERS = {"renderer": "renders", "chromium": "browser", "toolchain": "hosts", "one_thread": "trains"}
+MARKERS |= {"wheel": "processes"}
 # Names that a test calls where it starts programs.
-PROGRAMS = {"subprocess", "complete", "start", "shell", "in_a_child"}
+PROGRAMS = {"subprocess", "complete", "start", "shell", "in_a_child", "in_a_process", "imported_by", "run_python"}
+PROGRAMS |= {"on_terminal", "read_exr_isolated"}
 
 
 def pytest_collection_modifyitems(items):
@@ -67,6 +71,23 @@ def noisy_stack(rng):
     dx, dy = (g + rng.normal(0, 0.01, g.shape) for g in forward_differences(clean))
     stack = GradientStack.from_arrays(primal=clean + rng.normal(0, 0.1, clean.shape), dx=dx, dy=dy)
     return stack, clean
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capfd):
+    """Calls a command line in the folder ``tmp_path``; returns what it wrote to standard output and error."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(line, status=0):
+        try:
+            found = main(shlex.split(line))
+        except SystemExit as stop:  # of the parser
+            found = stop.code or 0
+        told = capfd.readouterr()
+        assert found == status, (line, found, told.err)
+        return told
+
+    return call
 
 
 @pytest.fixture

@@ -1,10 +1,12 @@
 """OpenEXR files made and read without ngpt, so that tests do not trust what they test."""
 
 import struct
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
+from exr_structure import TILED, Attribute, Chunk, Exr
 
 
 def bits(array: np.ndarray) -> np.ndarray:
@@ -68,40 +70,26 @@ def noise(rng: np.random.Generator, shape: tuple[int, ...], dtype: type) -> np.n
 
 
 def write_levels(path: Path, pixels: np.ndarray, rip: bool) -> Path:
-    """Writes a 4x4 float channel Z as one tile with all mipmap or ripmap levels, smaller levels full of 99.
+    """Writes 4x4 pixels as one tile with all mipmap or ripmap levels, smaller levels full of 99.
 
     Byte by byte, since OpenEXR's Python module cannot write such files.
     """
-
-    def attribute(name: str, kind: str, data: bytes) -> bytes:
-        return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(data)) + data
-
     box = struct.pack("<4i", 0, 0, 3, 3)
     channels = b"".join(name + b"\0" + struct.pack("<iB3x2i", 2, 0, 1, 1) for name in (b"B", b"G", b"R")) + b"\0"
-    header = b"".join(
-        (
-            attribute("channels", "chlist", channels),
-            attribute("compression", "compression", b"\0"),
-            attribute("dataWindow", "box2i", box),
-            attribute("displayWindow", "box2i", box),
-            attribute("lineOrder", "lineOrder", b"\0"),
-            attribute("pixelAspectRatio", "float", struct.pack("<f", 1)),
-            attribute("screenWindowCenter", "v2f", struct.pack("<2f", 0, 0)),
-            attribute("screenWindowWidth", "float", struct.pack("<f", 1)),
-            attribute("tiles", "tiledesc", struct.pack("<2IB", 4, 4, 2 if rip else 1)),
-        )
-    )
-    start = b"\x76\x2f\x31\x01" + struct.pack("<I", 2 | 0x200) + header + b"\0"
-    levels = [(x, y) for y in range(3) for x in range(3)] if rip else [(level, level) for level in range(3)]
+    attributes = [
+        Attribute(b"channels", b"chlist", channels),
+        Attribute(b"compression", b"compression", b"\0"),
+        Attribute(b"dataWindow", b"box2i", box),
+        Attribute(b"displayWindow", b"box2i", box),
+        Attribute(b"lineOrder", b"lineOrder", b"\0"),
+        Attribute(b"pixelAspectRatio", b"float", struct.pack("<f", 1)),
+        Attribute(b"screenWindowCenter", b"v2f", struct.pack("<2f", 0, 0)),
+        Attribute(b"screenWindowWidth", b"float", struct.pack("<f", 1)),
+        Attribute(b"tiles", b"tiledesc", struct.pack("<2IB", 4, 4, 2 if rip else 1)),
+    ]
     chunks = []
-    for x, y in levels:
-        width, height = 4 >> x, 4 >> y
-        level = pixels if (x, y) == (0, 0) else np.full((height, width, 3), 99)
-        data = level[..., ::-1].transpose(0, 2, 1).astype("<f4").tobytes()
-        chunks.append(struct.pack("<5i", 0, 0, x, y, len(data)) + data)
-    position, table = len(start) + 8 * len(chunks), b""
-    for chunk in chunks:
-        table += struct.pack("<Q", position)
-        position += len(chunk)
-    path.write_bytes(start + table + b"".join(chunks))
+    for y, x in product(range(3), range(3)) if rip else zip(range(3), range(3), strict=True):
+        level = np.full((4 >> y, 4 >> x, 3), 99) if x or y else pixels
+        chunks.append(Chunk([0, 0, x, y], level[..., ::-1].transpose(0, 2, 1).astype("<f4").tobytes()))
+    path.write_bytes(Exr(2 | TILED, [attributes], [len(chunks)], chunks).pack())
     return path

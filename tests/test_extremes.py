@@ -16,16 +16,10 @@ from ngpt.sequence.wcv_windows import reconstruct_shot
 from ngpt.stack import GradientStack
 
 SCALES = (2.0**-60, 2.0**60, 1e-30, 1e30)
-USABLE = {name: entry for name, entry in METHODS.items() if not entry.missing()}
+USABLE = {name: entry.standing for name, entry in METHODS.items() if not entry.missing()}
 # Studies take seconds an image.
-every_method = pytest.mark.parametrize(
-    "method",
-    [
-        pytest.param(name, marks=pytest.mark.slow) if entry.standing == "study" else name
-        for name, entry in USABLE.items()
-    ],
-)
-every_scale = pytest.mark.parametrize("scale", SCALES)
+SLOW = {name: [pytest.mark.slow] if standing == "study" else [] for name, standing in USABLE.items()}
+every_method = pytest.mark.parametrize("method", [pytest.param(name, marks=marks) for name, marks in SLOW.items()])
 
 
 def layers_of(height=9, width=12, seed=0):
@@ -58,64 +52,51 @@ def test_every_method_follows_the_exposure(method):
         assert_alike(reconstruct(times(layers_of(), scale), method).image, scale, expected)
 
 
-def frames(scale):
-    """Three frames of a pan."""
-    rng, found = np.random.default_rng(0), []
+def blended(scale, corrections):
+    """Three frames of a pan, by history."""
+    rng, temporal = np.random.default_rng(0), Temporal(corrections)
     for i in range(3):
         image, features = view(16, 20, offset=i)
-        found.append(times(frame_of(image, features, rng, motion=(1, 0)), scale))
-    return found
+        stack = times(frame_of(image, features, rng, motion=(1, 0)), scale)
+        yield temporal.next(stack, stack["primal"])
+    assert temporal.share > 0.05
 
 
-@every_scale
-@pytest.mark.parametrize("corrections", ["shipped", None])
-def test_history_follows_the_exposure(corrections, scale):
-    def blended(scale):
-        temporal, found = Temporal(corrections), []
-        for stack in frames(scale):
-            image = temporal.next(stack, reconstruct(stack, "nfor").image)
-            found.append((image, temporal.share))
-        return found
-
-    expected = blended(1)
-    assert max(share for _, share in expected) > 0.05
-    for (image, share), (wanted, other) in zip(blended(scale), expected, strict=True):
-        assert_alike(image, scale, wanted)
-        assert abs(share - other) < 1e-3
+def by_windows(scale):
+    return [r.image for _, _, r in reconstruct_shot(times(s, scale) for s in wall(np.random.default_rng(0), 5))]
 
 
-@every_scale
-def test_windows_follow_the_exposure(scale, rng):
-    shot = wall(rng, 5)
-    expected = [result.image for _, _, result in reconstruct_shot(shot)]
-    images = [result.image for _, _, result in reconstruct_shot(times(stack, scale) for stack in shot)]
-    for image, wanted in zip(images, expected, strict=True):
-        assert_alike(image, scale, wanted)
+def groups_and_error(scale):
+    stack = times(layers_of(), scale)
+    groups = {"key": stack["primal"] * np.float32(0.3), "fill": stack["primal"] * np.float32(0.5)}
+    result = reconstruct_with_error(stack, "l1")
+    return [*lightgroups.denoised(stack, groups, result.image, "nfor").values(), result.error]
 
 
-@every_scale
-def test_light_groups_and_errors_follow_the_exposure(scale):
-    def made(scale):
-        stack = times(layers_of(), scale)
-        groups = {"key": stack["primal"] * np.float32(0.3), "fill": stack["primal"] * np.float32(0.5)}
-        result = reconstruct_with_error(stack, "l1")
-        return [*lightgroups.denoised(stack, groups, result.image, "nfor").values(), result.error]
+WAYS = {
+    "history": lambda scale: blended(scale, "shipped"),
+    "history by itself": lambda scale: blended(scale, None),
+    "windows": by_windows,
+    "groups and error": groups_and_error,
+}
 
-    for image, wanted in zip(made(scale), made(1), strict=True):
-        assert_alike(image, scale, wanted)
+
+@pytest.mark.parametrize("way", WAYS)
+def test_all_that_is_made_of_images_follows_the_exposure(way):
+    expected = list(WAYS[way](1))
+    for scale in SCALES:
+        for image, wanted in zip(WAYS[way](scale), expected, strict=True):
+            assert_alike(image, scale, wanted)
 
 
 @pytest.mark.parametrize("power", [-ORDINARY, -1, 0, ORDINARY])
 def test_ordinary_light_stays_as_it_is(power):
-    layers = full_layers(9, 12)
-    layers["primal"][:] = 1.5
-    stack = times(layers, 2.0**power)
+    stack = times(full_layers(9, 12) | {"primal": np.full((9, 12, 3), 1.5, np.float32)}, 2.0**power)
     assert magnitude(stack) == 0 and scaled(stack, 0) is stack
 
 
 def test_magnitude_is_that_of_most_light():
-    layers = full_layers(9, 12)
-    layers["primal"][:] = 1.5
+    layers = full_layers(9, 12) | {"primal": np.full((9, 12, 3), 1.5, np.float32)}
     layers["primal"][0, 0], layers["primal"][1, 1], layers["primal"][2, 2] = np.nan, np.inf, 0
     assert magnitude(times(layers, 2.0**50)) == 50 and magnitude(times(layers, 2.0**-50)) == -50
     layers["primal"][3, 3] = 2.0**70
@@ -142,13 +123,11 @@ def test_variances_that_float32_lost_are_not_known():
 @pytest.mark.parametrize("scale", [1e-30, 1e30])
 def test_files_lose_what_floats_cannot_hold_and_say_nothing(tmp_path, scale):
     stack = times(full_layers(9, 12), scale)
-    ngpt.write(tmp_path / "a.exr", stack)
-    read = ngpt.read(tmp_path / "a.exr")
+    read = ngpt.read(ngpt.write(tmp_path / "a.exr", stack))
     assert np.array_equal(read["primal"], stack["primal"]) and read["primal_var"].max() == (0 if scale < 1 else np.inf)
     # As one that was read, and has got its variances back since.
-    again = read.replace(primal_var=stack["primal_var"])
-    ngpt.write(tmp_path / "b.exr", again)
-    assert np.array_equal(ngpt.read(tmp_path / "b.exr")["primal_var"], read["primal_var"])
+    again = ngpt.read(ngpt.write(tmp_path / "b.exr", read.replace(primal_var=stack["primal_var"])))
+    assert np.array_equal(again["primal_var"], read["primal_var"])
 
 
 def odd_images():
@@ -159,15 +138,13 @@ def odd_images():
     exact = layers | dict.fromkeys(light, none)
     firefly = layers["primal"].copy()
     firefly[4, 6] = 1e30
+    unknown_there = {"primal": firefly, "primal_var": np.where(firefly == 1e30, np.inf, 0.1)}
     flat = {"albedo": none + 0.5, "normal": none + np.float32([0, 0, 1]), "depth": np.ones((9, 12, 1))}
     return {
         "constant": (exact | flat | {"primal": none + np.float32(0.7)}, 0.7),
         "black": (exact | flat, 0),
         "firefly": (layers | {"primal": firefly}, None),
-        "firefly of unknown noise": (
-            layers | {"primal": firefly, "primal_var": np.where(firefly == 1e30, np.inf, 0.1)},
-            None,
-        ),
+        "firefly of unknown noise": (layers | unknown_there, None),
         "negative": (layers | {name: -layers[name] for name in ("primal", "dx", "dy")}, None),
         "no variance": (layers | {name: none + np.nan for name in VARIANCES if name in layers}, None),
         "no features": (layers | {name: np.full_like(layers[name], np.nan) for name in flat}, None),
@@ -203,12 +180,9 @@ def test_odd_images_over_time_and_in_groups(name):
     layers, _ = odd_images()[name]
     height, width = layers["primal"].shape[:2]
     still = {"motion": np.zeros((height, width, 2)), "dt": np.zeros((height, width, 3)), "dt_var": layers["dx_var"]}
-    odd = GradientStack(layers | still)
-    plain = GradientStack(full_layers(height, width) | still)
-    shot = [plain, odd, plain]
-    for corrections in ("shipped", None):
-        temporal = Temporal(corrections)
-        assert all(np.isfinite(temporal.next(s, reconstruct(s, "l1").image)).all() for s in shot)
+    odd, plain = GradientStack(layers | still), GradientStack(full_layers(height, width) | still)
+    shot, temporal = [plain, odd, plain], Temporal("shipped")
+    assert all(np.isfinite(temporal.next(s, reconstruct(s, "l1").image)).all() for s in shot)
     assert all(np.isfinite(result.image).all() for _, _, result in reconstruct_shot(shot))
     whole = reconstruct_with_error(odd, "l1")
     # Where a variance is unknown, so is the error.

@@ -8,7 +8,7 @@ from shots import part_of
 
 import ngpt
 from ngpt.api.uncertainty import known_noise
-from ngpt.cli import main
+from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError
 from ngpt.io.exr import pass_through, with_channels
 from ngpt.merging import merge
@@ -50,36 +50,20 @@ def test_noise_of_features_falls_with_the_samples(rng):
     noise = "ngpt:featureNoise"
     a, b = (stack_of(rng.random((n, *SHAPE)), n, **{noise: 0.3 / n}) for n in (2, 4))
     assert merge([a, b]).attributes[noise] == pytest.approx(0.3 / 6)
-    left, right = (Place(Window(x, 0, 4, 5), Window(0, 0, 8, 5)) for x in (0, 4))
-    tiles = [GradientStack(s.layers, s.attributes, place=at) for s, at in ((a, left), (b, right))]
+    places = (Place(Window(x, 0, 4, 5), Window(0, 0, 8, 5)) for x in (0, 4))
+    tiles = [GradientStack(s.layers, s.attributes, place=at) for s, at in zip((a, b), places, strict=True)]
     assert merge(tiles).attributes[noise] == pytest.approx((0.3 / 2 + 0.3 / 4) / 2)
     assert noise not in merge([a, stack_of(rng.random((3, *SHAPE)), 7)]).attributes
     assert noise not in merge([stack_of(rng.random((3, *SHAPE)), 7), a]).attributes
 
 
-def test_a_part_that_was_broken_off_is_named(rng, tmp_path, capsys):
+def test_a_part_that_was_broken_off_is_named(rng, tmp_path, command):
     samples = 5 + rng.normal(size=(6, *SHAPE))
     ngpt.write(tmp_path / "a.exr", stack_of(samples[:2], 1, **{"ngpt:unfinished": "interrupted"}))
     ngpt.write(tmp_path / "b.exr", stack_of(samples[2:], 2))
-    parts = [str(tmp_path / name) for name in ("a.exr", "b.exr")]
-    assert main(["merge", *parts, "-o", str(tmp_path / "all.exr")]) == 0
-    told = capsys.readouterr().err
-    assert f"{parts[0]}: was interrupted at 2 samples per pixel; " in told and f"{parts[1]}: was" not in told
-    assert "ngpt:unfinished" not in ngpt.read(tmp_path / "all.exr").attributes
-
-
-def test_frames_are_not_merged_with_others_and_keep_their_motion(rng):
-    motion = rng.normal(size=(*SHAPE[:2], 2)).astype(np.float32)
-    motion[0, 0] = np.nan
-    a, b = (stack_of(rng.random((4, *SHAPE)), seed, **{"ngpt:frame": 3}).replace(motion=motion) for seed in range(2))
-    assert np.array_equal(merge([a, b])["motion"], motion, equal_nan=True)
-
-
-def test_the_order_of_merging_does_not_matter(rng):
-    a, b, c = (stack_of(rng.random((n, *SHAPE)), seed) for seed, n in enumerate((2, 5, 3)))
-    left, right = merge([merge([a, b]), c]), merge([a, merge([c, b])])
-    for name in left.names:
-        assert np.allclose(left[name], right[name], rtol=1e-5, atol=1e-7), name
+    told = command("merge a.exr b.exr -o all.exr").err
+    assert "a.exr: was interrupted at 2 samples per pixel; " in told and "b.exr: was" not in told
+    assert "ngpt:unfinished" not in ngpt.read("all.exr").attributes
 
 
 def test_pixels_without_samples_count_nothing(rng):
@@ -94,42 +78,6 @@ def test_pixels_without_samples_count_nothing(rng):
     assert np.isfinite(merged["primal"][2:]).all()
 
 
-def test_rendered_stacks(renderer):
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
-
-    scene = load_scene("glossy", (16, 12))
-    parts = [render_stack(scene, spp, seed, diagnostics=True) for seed, spp in enumerate((8, 24))]
-    merged = merge(parts)
-    assert merged.attributes["ngpt:spp"] == 32 and merged.attributes["ngpt:seed"] == "0 1"
-    for name in ("primal", "dx", "albedo", "depth"):
-        expected = (8.0 * parts[0][name] + 24.0 * parts[1][name]) / 32
-        assert np.allclose(merged[name], expected, rtol=1e-5, atol=1e-6), name
-    assert "diagnostics.discarded" in pass_through(merged)
-
-
-def test_films_of_both_parts_and_of_all_samples(renderer, rng):
-    """The primal exactly; gradients, whose two directions a stack does not tell apart, in the mean."""
-    from data_gen.film import GradientFilm
-
-    mi = renderer
-    samples = rng.normal(size=(5, 16 * 16, 96)).astype(np.float32)
-
-    def stack(part, seed):
-        film = GradientFilm(16, 16)
-        for name, values in zip(("primal", "dx+", "dx-", "dy+", "dy-"), samples[:, :, part], strict=True):
-            film.put(name, mi.Color3f(mi.Float(values.ravel())))
-        attributes = {"ngpt:spp": film.samples, "ngpt:seed": str(seed)}
-        layers = film.develop()
-        return GradientStack(layers, attributes | {"ngpt:spp": film.samples})
-
-    merged, whole = merge([stack(np.s_[:32], 0), stack(np.s_[32:], 1)]), stack(np.s_[:], 2)
-    for name in ("primal", "primal_var", "dx", "dy"):
-        assert np.allclose(merged[name], whole[name], rtol=1e-4, atol=1e-6), name
-    assert np.allclose(merged["dx_var"], whole["dx_var"], rtol=0.15)
-    assert merged["dx_var"].mean() == pytest.approx(whole["dx_var"].mean(), rel=0.01)
-
-
 def parts(stack, seed, *windows):
     """Tiles of a stack, with seeds and names of their own."""
     tiles = [part_of(stack, *window) for window in windows]
@@ -141,130 +89,110 @@ def parts(stack, seed, *windows):
 LARGE = (9, 12, 3)
 
 
-def changed(stack, **attributes):
-    """A stack with other attributes, without those that are None; names are ngpt's."""
-    stack.attributes |= {f"ngpt:{name}": value for name, value in attributes.items()}
+def stack_with(rng, seed=1, shape=SHAPE, gradients=True, **attributes):
+    """A stack of noise with other attributes of ngpt, without those that are None."""
+    stack = stack_of(rng.random((4, *shape)), seed, gradients)
+    stack.attributes |= {f"ngpt:{name}": value for name, value in (attributes | {"seed": seed}).items()}
     stack.attributes = {name: value for name, value in stack.attributes.items() if value is not None}
     return stack
 
 
+# What the second of two stacks has -> what is said of it.
+REFUSED = {
+    "another size": ({"shape": (5, 6, 3)}, "2.exr is 6x5 but 1.exr is 4x5"),
+    "fewer layers": ({"gradients": False}, "1.exr has 'd[xy]' and 2.exr has not"),
+    "the same seed": ({"seed": "7 1"}, "both rendered with seed 1"),
+    "no seed": ({"seed": None}, "has no attribute 'ngpt:seed'"),
+    "no count": ({"spp": None}, "2.exr: has no attribute 'ngpt:spp'"),
+    "no samples": ({"spp": 0}, "2.exr: attribute 'ngpt:spp' is 0, so its weight is not known"),
+    "a count in words": ({"spp": "16"}, "2.exr: attribute 'ngpt:spp' is '16', so its weight is not known"),
+    "another sampler": ({"sampler": "primal"}, "2.exr was made by sampler 'primal' and 1.exr by 'gpt'"),
+    "a sampler of numbers": ({"sampler": np.ones(2, np.float32)}, "merged"),
+    "another frame": ({"frame": 4}, "stacks of one frame"),
+    "no time": ({"seconds": "long"}, "2.exr: attribute 'ngpt:seconds' is 'long', and no number that can be merged"),
+    "negative": ({"discarded": -1.0}, "2.exr: attribute 'ngpt:discarded' is -1.0, and no number that can be merged"),
+    "noise in words": ({"featureNoise": "low"}, "attribute 'ngpt:featureNoise' is 'low'"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_pairs_that_cannot_be_merged(rng, name):
+    wrong, message = REFUSED[name]
+    good = {option: 1 for option in wrong if option in ("discarded", "featureNoise", "frame")}
+    other = stack_with(rng, **({"seed": 2} | wrong))
+    other.path = "2.exr"
+    with pytest.raises(NgptError, match=message):
+        merge([stack_with(rng, **good), other])
+
+
+def samples_of(stack, value):
+    counts = np.full((*SHAPE[:2], 1), 4, np.float32)
+    counts[2, 1] = value
+    return stack.replace(samples=counts)
+
+
 def error_cases(rng):
-    def stack(seed=1, shape=SHAPE, spp=4, **options):
-        return stack_of(rng.random((spp, *shape)), seed, **options)
-
-    def counted(seed, value):
-        counts = np.full((*SHAPE[:2], 1), 4, np.float32)
-        counts[2, 1] = value
-        return stack(seed).replace(samples=counts)
-
-    unknown = stack(2)
+    one, two = (stack_with(rng, seed) for seed in (1, 2))
+    bare, unknown = stack_with(rng, gradients=False), stack_with(rng, 2)
     for name in ("primal_var", "dx_var", "dy_var"):
         del unknown.layers[name]
-    vector, nothing = np.ones(2, np.float32), np.zeros((*SHAPE[:2], 1), np.float32)
-    far = [stack_of(rng.random((4, *LARGE)), seed) for seed in range(2)]
+    none = [stack.replace(samples=np.zeros(SHAPE[:2])) for stack in (one, two)]
+    far, whole = [stack_with(rng, seed, LARGE) for seed in range(2)], stack_with(rng, 0, LARGE)
     for tile, corner in zip(far, (0, 2**30), strict=True):
         tile.place = Place(Window(corner, corner, 12, 9), Window(0, 0, 2**31, 2**31))
-    whole = stack_of(rng.random((4, *LARGE)), 0)
-    overlapping = [changed(tile, seed="3") for tile in parts(whole, 1, (0, 0, 5, 9), (4, 0, 8, 9))]
-    (tile,) = parts(whole, 1, (0, 0, 4, 5))
-    return [
-        ([stack()], "at least two stacks, and got 1"),
-        ([stack(), stack(2, (5, 6, 3))], "2.exr is 6x5 but 1.exr is 4x5"),
-        ([stack(), stack(2, gradients=False)], "1.exr has 'd[xy]' and 2.exr has not"),
-        ([stack(), stack()], "both rendered with seed 1"),
-        ([stack("0 1"), stack("1")], "both rendered with seed 1"),
-        ([stack(), changed(stack(2), spp=None)], "2.exr: has no attribute 'ngpt:spp'"),
-        ([stack(), changed(stack(2), seed=None)], "2.exr: has no attribute 'ngpt:seed'"),
-        ([stack(), changed(stack(2), sampler="primal")], "made by sampler 'primal'"),
-        ([changed(stack(gradients=False), sampler="primal"), stack(2)], "2.exr was made by sampler 'gpt' and 1.exr by"),
-        ([stack(gradients=False), stack(2)], "2.exr has 'd[xy]' and 1.exr has not"),
-        ([stack(), unknown], "2.exr has no 'primal_var' though it has 4 samples"),
-        ([with_channels(stack(i), {"id": np.zeros(SHAPE[:2])}) for i in range(2)], "channel 'id' is no layer"),
-        *(
-            (
-                [stack(), counted(2, value)],
-                r"2.exr: layer 'samples' has .* at pixel \(1, 2\), and 1 of 20 pixels are no",
-            )
-            for value in (np.nan, np.inf, -1, 1e30)
-        ),
-        ([stack(i).replace(samples=nothing) for i in range(2)], "layer 'samples' is 0 in all pixels"),
-        *(
-            (
-                [changed(stack(), **{name: 1}), changed(stack(2), **{name: value})],
-                f"2.exr: attribute 'ngpt:{name}' is .* no number that can be merged",
-            )
-            for name in ("seconds", "discarded")
-            for value in ("long", np.nan, -1.0, vector, True)
-        ),
-        *(
-            ([stack(), changed(stack(2), spp=value)], r"2.exr: attribute 'ngpt:spp' is .*, so its weight is not known")
-            for value in ("16", np.nan, 1e30, -4, 0, vector)
-        ),
-        *(([stack(), changed(stack(2), **{name: vector})], "merged") for name in ("sampler", "frame")),
-        (
-            [changed(stack(), featureNoise=0.3), changed(stack(2), featureNoise="low")],
-            "attribute 'ngpt:featureNoise' is 'low'",
-        ),
-        ([changed(stack(i), frame=i) for i in range(3, 5)], "stacks of one frame"),
-        (
-            parts(whole, 1, (0, 0, 5, 9), (5, 0, 7, 5)),
-            r"no stack has all pixels of 7x4 at \(5, 5\): tile0.exr 5x9 at \(0, 0\), tile1",
-        ),
-        (overlapping, "both rendered with seed 3"),
-        (far, r"no stack has all pixels of 1073741836x1073741833 at \(0, 0\)"),
-        (
-            [tile, stack(2, (5, 4, 3))],
-            r"2.exr is 4x5 but tile0.exr is 4x5 at \(0, 0\) of 12x9; only stacks of one image",
-        ),
-    ]
+    overlapping = parts(whole, 1, (0, 0, 5, 9), (4, 0, 8, 9))
+    for tile in overlapping:
+        tile.attributes["ngpt:seed"] = "3"
+    hole, (tile,) = parts(whole, 1, (0, 0, 5, 9), (5, 0, 7, 5)), parts(whole, 1, (0, 0, 4, 5))
+    strange = [with_channels(stack, {"id": np.zeros(SHAPE[:2])}) for stack in (one, two)]
+    no_number = r"2.exr: layer 'samples' has .* at pixel \(1, 2\), and 1 of 20 pixels are no"
+    return {
+        "one": ([one], "at least two stacks, and got 1"),
+        "more layers": ([bare, two], "2.exr has 'd[xy]' and 1.exr has not"),
+        "no variance": ([one, unknown], "2.exr has no 'primal_var' though it has 4 samples"),
+        "a strange channel": (strange, "channel 'id' is no layer"),
+        "counts of nan": ([one, samples_of(two, np.nan)], no_number),
+        "negative counts": ([one, samples_of(two, -1)], no_number),
+        "endless counts": ([one, samples_of(two, 1e30)], no_number),
+        "counts of 0": (none, "layer 'samples' is 0 in all pixels"),
+        "a hole": (hole, r"no stack has all pixels of 7x4 at \(5, 5\): tile0.exr 5x9 at \(0, 0\), tile1"),
+        "overlapping": (overlapping, "both rendered with seed 3"),
+        "far apart": (far, r"no stack has all pixels of 1073741836x1073741833 at \(0, 0\)"),
+        "a whole": ([tile, two], r"2.exr is 4x5 but tile0.exr is 4x5 at \(0, 0\) of 12x9; only stacks of one image"),
+    }
 
 
-@pytest.mark.parametrize("case", range(len(error_cases(np.random.default_rng(0)))))
-def test_stacks_that_cannot_be_merged(rng, case):
-    stacks, message = error_cases(rng)[case]
+@pytest.mark.parametrize("name", error_cases(np.random.default_rng(0)))
+def test_stacks_that_cannot_be_merged(rng, name):
+    stacks, message = error_cases(rng)[name]
     with pytest.raises(NgptError, match=message):
         merge(stacks)
 
 
 def test_results_are_not_merged(rng, tmp_path):
-    paths = []
-    for seed in range(2):
-        stack = stack_of(rng.random((4, *SHAPE)), seed)
-        paths.append(ngpt.write(tmp_path / f"{seed}.exr", ngpt.denoise(stack, "l2"), like=stack))
+    stacks = [stack_with(rng, seed) for seed in range(2)]
+    paths = [ngpt.write(tmp_path / f"{i}.exr", ngpt.denoise(s, "l2"), like=s) for i, s in enumerate(stacks)]
     with pytest.raises(NgptError, match="before they are reconstructed"):
         merge([ngpt.read(path) for path in paths])
 
 
 def test_files_of_samplers_without_gradients(rng, tmp_path):
     """Their emission seen directly is that of the contract too: a sampler of ours is named in the file."""
-    paths = []
-    for seed in range(2):
-        stack = stack_of(rng.random((4, *SHAPE)), seed, gradients=False)
-        paths.append(ngpt.write(tmp_path / f"{seed}.exr", stack.replace(direct=0.5 * stack["primal"])))
-    merged = merge([ngpt.read(path) for path in paths])
+    bare = [stack_with(rng, seed, gradients=False) for seed in range(2)]
+    direct = [stack.replace(direct=0.5 * stack["primal"]) for stack in bare]
+    merged = merge([ngpt.read(ngpt.write(tmp_path / f"{i}.exr", stack)) for i, stack in enumerate(direct)])
     assert np.allclose(merged["direct"], 0.5 * merged["primal"], atol=1e-6)
 
 
-def test_command(rng, tmp_path, capsys):
-    paths = []
-    for seed in range(3):
-        stack = stack_of(rng.random((4, *SHAPE)), seed)
-        stack = with_channels(stack, {"diagnostics.discarded": np.full(SHAPE[:2], seed / 4)})
-        paths.append(str(ngpt.write(tmp_path / f"{seed}.exr", stack)))
-    out = str(tmp_path / "out.exr")
-    assert main(["merge", *paths, "-o", out, "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert report["spp"] == 12 and report["seed"] == "0 1 2"
-    merged = ngpt.read(out)
-    assert merged.attributes["ngpt:spp"] == 12
-    assert np.allclose(merged["dx"], sum(ngpt.read(path)["dx"] for path in paths) / 3, atol=1e-6)
+def test_command(rng, tmp_path, command):
+    stacks = [stack_with(rng, seed) for seed in range(3)]
+    for i, stack in enumerate(stacks):
+        ngpt.write(tmp_path / f"{i}.exr", with_channels(stack, {"diagnostics.discarded": np.full(SHAPE[:2], i / 4)}))
+    report, merged = json.loads(command("merge 0.exr 1.exr 2.exr -o out.exr --json").out), ngpt.read("out.exr")
+    assert report["spp"] == merged.attributes["ngpt:spp"] == 12 and report["seed"] == "0 1 2"
+    assert np.allclose(merged["dx"], sum(stack["dx"] for stack in stacks) / 3, atol=1e-6)
     assert np.allclose(pass_through(merged)["diagnostics.discarded"], 0.25)
-    assert main(["info", out]) == 0
-    assert "discarded" in capsys.readouterr().out
-    assert main(["merge", *paths, "-o", out]) == 1
-    assert "--force" in capsys.readouterr().err
-    assert main(["merge", paths[0], paths[0], "-o", out, "--force"]) == 1
-    assert "seed 0" in capsys.readouterr().err
+    assert "discarded" in command("info out.exr").out
 
 
 def test_pixels_with_samples_in_different_numbers(rng):
@@ -296,6 +224,7 @@ def test_merged_differences_of_uneven_counts_have_the_right_variance(rng):
     deviation, runs = np.array([1.0, 3.0]), 4000
     counts = [np.array([4, 32]), np.array([16, 16]), np.array([32, 2])]
     means, variances = [], []
+    known, one = {"ngpt:spp": 16, "ngpt:sampler": "gpt"}, np.ones((200, 2, 3))
     for _ in range(runs // 200):
         stacks = []
         for seed, n in enumerate(counts):
@@ -304,10 +233,9 @@ def test_merged_differences_of_uneven_counts_have_the_right_variance(rng):
             dx, var = np.zeros((2, 200, 2, 3))
             dx[:, 0] = ((each[0].mean(axis=1) - each[1].mean(axis=1)) / 2)[:, None]
             var[:, 0] = (sum(e.var(axis=1, ddof=1) / e.shape[1] for e in each) / 4)[:, None]
-            known = {"ngpt:spp": 16, "ngpt:seed": str(seed), "ngpt:sampler": "gpt"}
-            layers = {"dx": dx, "dx_var": var, "samples": np.broadcast_to(n[:, None], (200, 2, 1)).astype(np.float32)}
-            stacks.append(GradientStack.from_arrays(attributes=known, primal=np.ones((200, 2, 3)), **layers))
-            stacks[-1].layers["primal_var"] = np.zeros((200, 2, 3), np.float32)
+            layers = {"primal": one, "primal_var": 0 * one, "dx": dx, "dx_var": var}
+            layers["samples"] = np.broadcast_to(n[:, None], (200, 2, 1)).astype(np.float32)
+            stacks.append(GradientStack.from_arrays(attributes=known | {"ngpt:seed": str(seed)}, **layers))
         merged = merge(stacks)
         means.append(merged["dx"][:, 0, 0])
         variances.append(merged["dx_var"][:, 0, 0])
@@ -376,20 +304,16 @@ def test_tiles_with_seeds_of_their_own_are_merged_like_others(rng):
     assert merge([part, other, tiles[0]]).place == whole.place
 
 
-@pytest.mark.parametrize("method", ["l2", "l1", "cv", "wcv", "wl2", "ngpt-fast", "ngpt-combine"])
+@pytest.mark.parametrize("method", ["l2", "wcv", "ngpt-fast"])
 def test_merged_tiles_have_no_seams(rng, method):
     """A slope of 0 across a border would show as a step of 0.05 to 0.08. Of tiles that overlap all slopes are known."""
-    if method.startswith("ngpt"):
-        pytest.importorskip("onnxruntime")
     y, x = np.mgrid[:32, :48]
     truth = np.repeat((1 + 0.08 * x + 0.05 * y)[..., None], 3, axis=-1)
-    layers = {"primal": truth, "dx": np.diff(truth, axis=1, append=truth[:, -1:])}
-    layers["dy"] = np.diff(truth, axis=0, append=truth[-1:])
     noise = {"primal": 0.2, "dx": 0.02, "dy": 0.02}
+    layers = dict(zip(noise, (truth, *forward_differences(truth)), strict=True))
     layers = {name: layer + rng.normal(0, noise[name], truth.shape) for name, layer in layers.items()}
     layers |= {f"{name}_var": np.full(truth.shape, sigma**2) for name, sigma in noise.items()}
-    layers |= {"albedo": np.full(truth.shape, 0.5), "normal": np.broadcast_to([0.0, 0.0, 1.0], truth.shape)}
-    layers["depth"] = np.ones(truth.shape[:2])
+    layers |= {"albedo": 0 * truth + 0.5, "normal": 0 * truth + [0.0, 0.0, 1.0], "depth": np.ones(truth.shape[:2])}
     known = {"ngpt:spp": 4, "ngpt:seed": "0", "ngpt:sampler": "gpt"}
     whole = GradientStack({name: layer.astype(np.float32) for name, layer in layers.items()}, known)
     expected = reconstruct(whole, method).image
@@ -403,20 +327,19 @@ def test_merged_tiles_have_no_seams(rng, method):
         assert known_noise(merged).all()  # the noise of differences that are left out does not matter
 
 
-def test_tiles_from_files_keep_what_else_they_carry(rng, tmp_path):
+def test_tiles_from_files_keep_what_else_they_carry(rng, tmp_path, command):
     """Diagnostics, samples that differ, motion; of frames that lie beyond the display window too."""
     whole = stack_of(rng.random((4, *LARGE)), 0, **{"ngpt:frame": 2})
     motion = rng.normal(size=(*LARGE[:2], 2)).astype(np.float32)
     motion[2, 7] = np.nan
     whole = whole.replace(motion=motion, samples=rng.integers(2, 9, LARGE[:2]))
     whole.place = Place(Window(-2, -3, 12, 9), Window(0, 0, 8, 4))
-    rates, files = rng.random(LARGE[:2]).astype(np.float32), []
+    rates = rng.random(LARGE[:2]).astype(np.float32)
     for tile in parts(whole, 1, (-2, -3, 5, 9), (3, -3, 7, 9)):
         there = tile.place.data.within(whole.place.data)
-        tile = with_channels(tile, {"diagnostics.discarded": rates[there]})
-        files.append(str(ngpt.write(tmp_path / tile.path, tile)))
-    assert main(["merge", *files, "-o", str(tmp_path / "merged.exr")]) == 0
-    merged = ngpt.read(tmp_path / "merged.exr")
+        ngpt.write(tmp_path / tile.path, with_channels(tile, {"diagnostics.discarded": rates[there]}))
+    command("merge tile0.exr tile1.exr -o merged.exr")
+    merged = ngpt.read("merged.exr")
     assert merged.place == whole.place and merged.attributes["ngpt:frame"] == 2
     assert np.array_equal(merged["motion"], motion, equal_nan=True)
     assert np.array_equal(merged["samples"], whole["samples"])

@@ -11,7 +11,6 @@ from full_stack import full_stack
 
 import ngpt
 from data_gen.samplers import SAMPLERS
-from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import METRICS
 from ngpt.methods import METHODS
@@ -29,12 +28,8 @@ def install(folder: Path, name: str, groups: dict[str, dict[str, str]]) -> None:
     info = folder / f"{name.replace('-', '_')}-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-    lines = [
-        line
-        for group, found in groups.items()
-        for line in [f"[{group}]", *(f"{point} = {target}" for point, target in found.items())]
-    ]
-    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    points = {group: "".join(f"{key} = {value}\n" for key, value in found.items()) for group, found in groups.items()}
+    (info / "entry_points.txt").write_text("".join(f"[{group}]\n{lines}" for group, lines in points.items()))
 
 
 def install_page(folder: Path, page: str) -> None:
@@ -71,42 +66,37 @@ def site(tmp_path, monkeypatch):
             del sys.modules[name]
 
 
-@pytest.fixture
-def stack_file(tmp_path):
-    ngpt.write(tmp_path / "stack.exr", full_stack(18, 26))
-    return str(tmp_path / "stack.exr")
+@pytest.fixture(autouse=True)
+def stack(tmp_path):
+    stack = full_stack(18, 26)
+    ngpt.write(tmp_path / "stack.exr", stack)
+    return stack
 
 
-def test_the_method_of_the_page(site, stack_file, tmp_path, capsys):
+def test_the_method_of_the_page(site, stack, command):
     install_page(site, PAGES["method"])
-    image = str(tmp_path / "image.exr")
-    assert main(["denoise", stack_file, "-o", image, "--method", "median", "-O", "size=5"]) == 0
-    assert ": median, " in capsys.readouterr().err
-    stack = ngpt.read(stack_file)
+    assert ": median, " in command("denoise stack.exr --method median -O size=5").err
     assert not (ngpt.denoise(stack, "median") == ngpt.denoise(stack, "primal")).all()
-    assert main(["info", "median"]) == 0 and "pixels of its side" in capsys.readouterr().out
-    for lists in ([], [stack_file]):
-        assert main(["info", *lists]) == 0 and "median" in capsys.readouterr().out
-    assert main(["denoise", stack_file, "-o", image, "-m", "median", "-O", "size=x", "--force"]) == 2
-    assert "method 'median', option 'size': 'x' is not allowed" in capsys.readouterr().err
+    assert "pixels of its side" in command("info median").out
+    assert "median" in command("info").out and "median" in command("info stack.exr").out
+    told = command("denoise stack.exr -m median -O size=x --force", 2).err
+    assert "method 'median', option 'size': 'x' is not allowed" in told
 
 
-def test_the_metric_of_the_page(site, stack_file, capsys):
+def test_the_metric_of_the_page(site, command):
     install_page(site, PAGES["method"])
-    assert main(["diff", stack_file, stack_file]) == 0
-    assert re.search(r"^bias +0$", capsys.readouterr().out, re.M)
+    assert re.search(r"^bias +0$", command("diff stack.exr stack.exr").out, re.M)
 
 
-def test_the_sampler_of_the_page(renderer, site, tmp_path, capsys):
+def test_the_sampler_of_the_page(renderer, site, command):
     """It is random replay, to the last bit."""
     install_page(site, PAGES["sampler"])
     for sampler in ("replay", "replay-path", "gpt-basic"):
-        call = ["render", "diffuse", "--sampler", sampler, "--spp", "2", "--size", "12x8"]
-        assert main([*call, "-o", str(tmp_path / f"{sampler}.exr")]) == 0, capsys.readouterr().err
-    *both, theirs = (ngpt.read(tmp_path / f"{name}.exr") for name in ("replay", "replay-path", "gpt-basic"))
+        command(f"render diffuse --sampler {sampler} --spp 2 --size 12x8 -o {sampler}.exr")
+    *both, theirs = (ngpt.read(f"{name}.exr") for name in ("replay", "replay-path", "gpt-basic"))
     for ours in both:
         assert ours.names == theirs.names and all((ours[n] == theirs[n]).all() for n in ("primal", "dx", "dy"))
-    assert main(["info", "replay"]) == 0 and "gradients by random replay" in capsys.readouterr().out
+    assert "gradients by random replay" in command("info replay").out
     from data_gen.code import code
 
     before = code("replay")
@@ -114,20 +104,19 @@ def test_the_sampler_of_the_page(renderer, site, tmp_path, capsys):
     assert code("replay") != before
 
 
-@pytest.mark.parametrize("changes", [["loss.squared=0.5"], ["loss.kind=squared", "loss.relative=0", "loss.gradient=0"]])
-def test_the_loss_of_the_page(site, tmp_path, capsys, changes, one_thread):
+@pytest.mark.parametrize("changes", ["loss.squared=0.5", "loss.kind=squared loss.relative=0 loss.gradient=0"])
+def test_the_loss_of_the_page(site, tmp_path, command, changes, one_thread):
     install_page(site, PAGES["loss"])
     for i in range(2):
         view = tmp_path / "views" / f"view{i}"
         view.mkdir(parents=True)
         ngpt.write(view / "few.exr", full_stack(32, 32, seed=i))
         ngpt.write(view / "reference.exr", full_stack(32, 32, seed=2 + i)["primal"])
-    changes = [f"data.folders={[str(tmp_path / 'views')]}", "data.crop=32", "run.steps=2", "run.batch=1", *changes]
-    given = [word for change in changes for word in ("--set", change)]
-    assert main(["train", "--config", "tiny", "--out", str(tmp_path / "run"), *given]) == 0, capsys.readouterr().err
-    output = capsys.readouterr().out
+    changes = f"data.folders=['views'] data.crop=32 run.steps=2 run.batch=1 {changes}".split()
+    given = " ".join(f'--set "{change}"' for change in changes)
+    output = command(f"train --config tiny --out run {given}").out
     assert "loss squared" in output and ("loss relative" in output) == (len(changes) == 5)
-    assert main(["train", "--config", "tiny", "--init", str(tmp_path / "mine.toml")]) == 0
+    command("train --config tiny --init mine.toml")
     assert "another package's term: Mean of (p - t)^2 / (t^2 + 1).\n# squared = 0.0\n" in (
         (tmp_path / "mine.toml").read_text()
     )
@@ -162,30 +151,23 @@ FAULTS = {
 }
 
 
-def test_a_package_that_is_broken_costs_one_line_and_nothing_else(site, stack_file, tmp_path, capsys):
+def test_a_package_that_is_broken_costs_one_line_and_nothing_else(site, command):
     for name, (target, code) in FAULTS.items():
         if name != "nowhere":
             (site / f"{name}.py").write_text(code)
         install(site, name, {"ngpt.methods": {name: target}})
     install_page(site, PAGES["method"])
-    assert main(["info"]) == 0
-    output = capsys.readouterr()
-    assert "median" in output.out and "wcv" in output.out
-    lines = output.err.splitlines()
-    assert sorted(line.partition(" of the package")[0] for line in lines) == [
+    output, errors = command("info")
+    assert "median" in output and "wcv" in output
+    assert sorted(line.partition(" of the package")[0] for line in errors.splitlines()) == [
         f"ngpt: ngpt.methods: '{name}'" for name in ("absent", "broken", "wrong")
     ]
-    assert "cannot be imported: RuntimeError: no" in output.err
+    assert "cannot be imported: RuntimeError: no" in errors
     for name in ("absent", "broken", "wrong"):
-        image = str(tmp_path / "image.exr")
-        assert main(["denoise", stack_file, "-o", image, "-m", name]) == 1
-        (line,) = capsys.readouterr().err.splitlines()
+        (line,) = command(f"denoise stack.exr -m {name}", 1).err.splitlines()
         assert line.startswith(f"ngpt: error: ngpt.methods: '{name}' of the package '{name}'")
-    with pytest.raises(SystemExit, match="2"):
-        main(["denoise", stack_file, "-o", image, "-m", "nowhere"])
-    capsys.readouterr()
-    assert main(["denoise", stack_file, "-o", image, "-m", "wcv"]) == 0
-    assert len(capsys.readouterr().err.splitlines()) == 1
+    command("denoise stack.exr -m nowhere", 2)
+    assert len(command("denoise stack.exr -m wcv").err.splitlines()) == 1
 
 
 def test_names_of_ours_are_refused(site, capsys):
@@ -206,14 +188,14 @@ def test_names_of_ours_are_refused(site, capsys):
     assert "Traceback" not in told and len(told.splitlines()) == 5
 
 
-def test_a_method_of_ours_is_found_without_a_look_at_other_packages(site, stack_file, tmp_path):
+def test_a_method_of_ours_is_found_without_a_look_at_other_packages(site, tmp_path):
     install_page(site, PAGES["method"])
     code = (
         "import sys\nimport ngpt.system.parts\nngpt.system.parts.points = None\nfrom ngpt.cli import main\n"
-        f"assert main(['denoise', {stack_file!r}, '-o', {str(tmp_path / 'image.exr')!r}, '-m', 'wcv']) == 0\n"
+        "assert main(['denoise', 'stack.exr', '-m', 'wcv']) == 0\n"
         "heavy = {'ngpt_median', 'torch', 'mitsuba', 'data_gen'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )
-    path = f"{site}:{ROOT}"
-    done = subprocess.run([sys.executable, "-c", code], env={"PYTHONPATH": path}, capture_output=True, text=True)
+    environment = {"PYTHONPATH": f"{site}:{ROOT}"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

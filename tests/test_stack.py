@@ -11,29 +11,11 @@ def image(height=3, width=4, channels=3, dtype=np.float32):
     return np.arange(height * width * channels).reshape(height, width, channels).astype(dtype)
 
 
-@pytest.mark.parametrize("dtype", ["f2", "f4", "f8", "g", ">f4", ">f8", "u1", "i2", "i4", "u8"])
+@pytest.mark.parametrize("dtype", ["f2", "g", ">f4", ">f8", "u1", "i4", "u8"])
 def test_every_real_type_becomes_contiguous_float32(dtype):
     stack = GradientStack.from_arrays(primal=image(dtype=dtype))
     assert stack["primal"].dtype == np.float32 and stack["primal"].flags.c_contiguous
     assert np.array_equal(stack["primal"], image())
-
-
-@pytest.mark.parametrize(
-    "view",
-    [
-        lambda a: a[::-1],
-        lambda a: a[:, ::-1],
-        lambda a: a[1:, 2:],
-        lambda a: a.transpose(1, 0, 2),
-        lambda a: np.asfortranarray(a),
-        lambda a: np.broadcast_to(a[:1], a.shape),
-        lambda a: a[..., ::-1],
-    ],
-)
-def test_every_memory_layout_becomes_contiguous(view):
-    array = view(image(5, 6))
-    stack = GradientStack.from_arrays(primal=array)
-    assert stack["primal"].flags.c_contiguous and np.array_equal(stack["primal"], array)
 
 
 def test_arrays_that_fit_are_neither_copied_nor_modified():
@@ -44,23 +26,19 @@ def test_arrays_that_fit_are_neither_copied_nor_modified():
     assert stack["dx"][0, -1, 0] != 0, "the unused column is left alone"
 
 
-def test_one_channel_layers_may_be_flat():
-    stack = GradientStack.from_arrays(primal=image(), depth=image()[..., 0], alpha=image(channels=1))
+def test_what_a_stack_holds():
+    stack = GradientStack.from_arrays(dy=image(), primal=image(), depth=image()[..., 0], alpha=image(channels=1))
+    assert (stack.height, stack.width, stack.source) == (3, 4, None)
+    assert stack.names == ("primal", "dy", "depth", "alpha") and "dy" in stack and "dx" not in stack
     assert stack["depth"].shape == stack["alpha"].shape == (3, 4, 1)
 
 
-def test_non_finite_values_are_legal():
-    primal = image()
-    primal[0, 0] = np.nan, np.inf, -np.inf
-    assert np.array_equal(GradientStack.from_arrays(primal=primal.astype("f8"))["primal"], primal, equal_nan=True)
-
-
-def test_sizes_names_and_membership():
-    stack = GradientStack.from_arrays(dy=image(), primal=image(), attributes={"ngpt:spp": 4})
-    assert (stack.height, stack.width) == (3, 4)
-    assert stack.names == ("primal", "dy")
-    assert "dy" in stack and "dx" not in stack
-    assert stack.attributes == {"ngpt:spp": 4} and stack.source is None
+def test_numbers_are_numbers():
+    stack = GradientStack.from_arrays(primal=image(), attributes={"a": 3, "b": 0.5, "c": np.float32(2)})
+    assert [stack.number(name) for name in "abc"] == [3, 0.5, 2] and stack.number("d") is None
+    for value in ("3", True, np.nan, -np.inf, np.ones(2), None, [1.0]):
+        stack.attributes["a"] = value
+        assert stack.number("a") is None
 
 
 @pytest.mark.parametrize(
@@ -73,13 +51,15 @@ def test_sizes_names_and_membership():
         ({"primal": image().astype(object)}, "layer 'primal' is of type object"),
         ({"primal": image().astype(str)}, "layer 'primal' is of type <U"),
         ({"primal": image(channels=4)}, "layer 'primal' has shape (3, 4, 4); it must be (height, width, 3)"),
-        ({"primal": image(channels=1)}, "layer 'primal' has shape (3, 4, 1)"),
         ({"primal": image()[..., 0]}, "layer 'primal' has shape (3, 4)"),
         ({"primal": image(), "depth": image()}, "layer 'depth' has shape (3, 4, 3); it must be (height, width, 1)"),
         ({"primal": image()[None]}, "layer 'primal' has shape (1, 3, 4, 3)"),
         ({"primal": image(0, 4)}, "layer 'primal' is 4x0; it has no pixels"),
-        ({"primal": image(3, 0)}, "layer 'primal' is 0x3; it has no pixels"),
         ({"primal": 1.0}, "layer 'primal' has shape ()"),
+        ({"dx": image(3, 3), "primal": image()}, "stored at image size with an unused last column: pad it with zeros"),
+        ({"dy": image(2, 4), "primal": image()}, "stored at image size with an unused last row: pad it with zeros"),
+        ({"dx": image(2, 4), "primal": image()}, "layer 'dx' is 4x2 but 'primal' is 4x3; all layers of a stack"),
+        ({"albedo": image(1, 2), "primal": image()}, "layer 'albedo' is 2x1 but 'primal' is 4x3; all layers of a"),
     ],
 )
 def test_arrays_that_are_no_layers(layers, expected):
@@ -88,39 +68,13 @@ def test_arrays_that_are_no_layers(layers, expected):
     assert str(caught.value).startswith("a.exr: ") and expected in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("name", "shape", "expected"),
-    [
-        (
-            "dx",
-            (360, 639),
-            "a.exr: layer 'dx' is 639x360 but 'primal' is 640x360; "
-            "gradients are stored at image size with an unused last column: pad it with zeros",
-        ),
-        (
-            "dy",
-            (359, 640),
-            "a.exr: layer 'dy' is 640x359 but 'primal' is 640x360; "
-            "gradients are stored at image size with an unused last row: pad it with zeros",
-        ),
-        ("dx", (359, 640), "a.exr: layer 'dx' is 640x359 but 'primal' is 640x360; all layers of a stack"),
-        ("albedo", (180, 320), "a.exr: layer 'albedo' is 320x180 but 'primal' is 640x360; all layers of a stack"),
-    ],
-)
-def test_layers_of_different_size(name, shape, expected):
-    layers = {name: np.zeros((*shape, 3), np.float32), "primal": np.zeros((360, 640, 3), np.float32)}
-    with pytest.raises(NgptError) as caught:
-        GradientStack.from_arrays(path="a.exr", **layers)
-    assert str(caught.value).startswith(expected)
-
-
 def test_finite_numbers_beyond_float32_are_refused_and_counted():
     primal = image(dtype="f8")
     primal[0, 0] = 1e39, -2e300, np.inf
     with pytest.raises(NgptError, match=r"layer 'primal' has 2 values that float32 cannot hold \(up to 2e\+300"):
         GradientStack.from_arrays(primal=primal)
-    primal[0, 0] = 3.4e38, -1e12, np.inf
-    assert GradientStack.from_arrays(primal=primal)["primal"][0, 0, 1] == np.float32(-1e12)
+    primal[0, 0], primal[0, 1] = (3.4e38, -1e12, np.inf), (np.nan, -np.inf, 0)
+    assert np.array_equal(GradientStack.from_arrays(primal=primal)["primal"], np.float32(primal), equal_nan=True)
 
 
 def test_missing_layers_are_named_with_the_remedy():

@@ -1,4 +1,4 @@
-"""Typed options: what they take, and what they say to what they do not."""
+"""Options of methods and samplers: what they take, and what they say to what they do not."""
 
 import math
 
@@ -16,46 +16,41 @@ OPTIONS = {
     "caustic": Option(True, "whether"),
     "weights": Option("", "a file"),
 }
+TAKEN = [
+    ("depth", "3", 3),
+    ("depth", 4.0, 4),
+    ("radius", "1e-2", 0.01),
+    ("radius", 2, 2.0),
+    ("alpha", "auto", "auto"),
+    ("alpha", ".25", 0.25),
+    ("shift", "half-vector", "half-vector"),
+    ("tile", "4", 4),
+    ("caustic", "False", False),
+    ("weights", "a.onnx", "a.onnx"),
+]
+REFUSED = [
+    ("depth", 0, "method 'x', option 'depth': '0' is not allowed; it takes a whole number from 1 to 64"),
+    ("depth", "2.5", "'2.5' is not allowed"),
+    ("depth", True, "'true' is not allowed"),
+    ("radius", math.nan, "'nan' is not allowed; it takes a number of 0 or more"),
+    ("alpha", "aut", "'aut' is not allowed; it takes a number of 0 or more, or auto; did you mean 'auto'"),
+    ("alpha", -1, "'-1' is not allowed"),
+    ("shift", "half", "'half' is not allowed; it takes replay, half-vector"),
+    ("tile", 3, "it takes 2, 4"),
+    ("caustic", 1, "it takes true or false"),
+    ("weights", 3, "it takes a text"),
+    ("dept", 3, "method 'x' has no option 'dept'; did you mean 'depth'?"),
+    ("zoom", 3, "method 'x' has no option 'zoom'; it has: depth, radius"),
+]
 
 
-@pytest.mark.parametrize(
-    ("name", "given", "value"),
-    [
-        ("depth", "3", 3),
-        ("depth", 4.0, 4),
-        ("radius", "1e-2", 0.01),
-        ("radius", 2, 2.0),
-        ("alpha", "auto", "auto"),
-        ("alpha", ".25", 0.25),
-        ("shift", "half-vector", "half-vector"),
-        ("tile", "4", 4),
-        ("caustic", "False", False),
-        ("weights", "a.onnx", "a.onnx"),
-    ],
-)
+@pytest.mark.parametrize(("name", "given", "value"), TAKEN)
 def test_texts_and_values_become_the_options_type(name, given, value):
     got = settings("method 'x'", OPTIONS, {name: given})[name]
-    assert got == value
-    assert type(got) is type(value)
+    assert got == value and type(got) is type(value)
 
 
-@pytest.mark.parametrize(
-    ("name", "given", "complaint"),
-    [
-        ("depth", 0, "method 'x', option 'depth': '0' is not allowed; it takes a whole number from 1 to 64"),
-        ("depth", "2.5", "'2.5' is not allowed"),
-        ("depth", True, "'true' is not allowed"),
-        ("radius", math.nan, "'nan' is not allowed; it takes a number of 0 or more"),
-        ("alpha", "aut", "'aut' is not allowed; it takes a number of 0 or more, or auto; did you mean 'auto'"),
-        ("alpha", -1, "'-1' is not allowed"),
-        ("shift", "half", "'half' is not allowed; it takes replay, half-vector"),
-        ("tile", 3, "it takes 2, 4"),
-        ("caustic", 1, "it takes true or false"),
-        ("weights", 3, "it takes a text"),
-        ("dept", 3, "method 'x' has no option 'dept'; did you mean 'depth'?"),
-        ("zoom", 3, "method 'x' has no option 'zoom'; it has: depth, radius"),
-    ],
-)
+@pytest.mark.parametrize(("name", "given", "complaint"), REFUSED)
 def test_what_is_not_allowed_is_said_in_one_line(name, given, complaint):
     with pytest.raises(NgptError) as error:
         settings("method 'x'", OPTIONS, {name: given})

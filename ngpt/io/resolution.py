@@ -263,7 +263,7 @@ def _chosen(layer: Layer, text: str, groups: list[_Group], home: _Home, path: st
             channels = tuple(sorted(name for index, name in place if index == part)[0] for place in places)
             factors = tuple(float((term[1] or "") + (term[2] or "1")) for term in terms if term)
             return Found(part, channels, text, factors)
-    wanted, meant = f'--layer {layer.name}="{text}"', did_you_mean(text, {group.name for group in groups})
+    wanted, meant = f'--layer {layer.name}="{text}"', did_you_mean(text, {group.name for group in groups} - {text})
     raise NgptError(
         f"{path}: {wanted} fits no layer with channels {' '.join(layer.channels)}; "
         f"{meant}the file holds {_listing(groups)}"

@@ -34,13 +34,8 @@ def bitmap(renderer, arrays):
     return renderer.Bitmap(np.float32(pixels), channel_names=names)
 
 
-def call(denoiser, arrays):
-    arrays = dict(arrays)
-    return denoiser(arrays.pop("noisy"), **arrays)
-
-
 def test_the_same_as_denoise(arrays):
-    result = call(ngpt.Denoiser((26, 18), albedo=True, normals=True), arrays)
+    result = ngpt.Denoiser((26, 18), albedo=True, normals=True)(**arrays)
     assert np.array_equal(result, ngpt.denoise(full_stack(18, 26)))
 
 
@@ -58,26 +53,22 @@ def test_normals_in_world_space(arrays, size):
     matrix[:3, :3] = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     denoiser = ngpt.Denoiser((26, 18), albedo=True, normals=True)
     world = arrays | {"normals": (arrays["normals"] @ matrix[:3, :3]).astype(np.float32)}
-    turned = call(denoiser, world | {"to_sensor": matrix[:size, :size]})
-    assert np.allclose(turned, call(denoiser, arrays), rtol=1e-4)
-    assert not np.allclose(call(denoiser, world), turned, rtol=1e-3)
+    turned = denoiser(**world, to_sensor=matrix[:size, :size])
+    assert np.allclose(turned, denoiser(**arrays), rtol=1e-4)
+    assert not np.allclose(denoiser(**world), turned, rtol=1e-3)
 
 
 def stub():
-    """The signatures of ``mi.OptixDenoiser`` in the stub file of the installed Mitsuba: "" -> its two forms."""
+    """The signatures of ``mi.OptixDenoiser`` in the stub file of the installed Mitsuba: name -> its forms."""
     place = find_spec("mitsuba")
     if place is None or place.origin is None:
         pytest.skip("Mitsuba is not installed")
     tree = ast.parse(Path(place.origin).with_name("__init__.pyi").read_text())
     (theirs,) = [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == "OptixDenoiser"]
     found: dict[str, list] = {}
-    for node in theirs.body:
-        if isinstance(node, ast.FunctionDef):
-            names, defaults = (
-                [argument.arg for argument in node.args.args],
-                [ast.unparse(d) for d in node.args.defaults],
-            )
-            found.setdefault(node.name, []).append((names, defaults))
+    for node in (node for node in theirs.body if isinstance(node, ast.FunctionDef)):
+        defaults = [ast.unparse(default).replace("...", "None") for default in node.args.defaults]
+        found.setdefault(node.name, []).append(([argument.arg for argument in node.args.args], defaults))
     return found
 
 
@@ -89,29 +80,25 @@ def signature(function):
 def test_the_signatures_are_those_of_mitsuba():
     """Names, order and defaults; where its stub leaves a default open, an empty tensor, ours is None."""
     theirs = stub()
-    constructor, calls = theirs["__init__"][0], theirs["__call__"]
-    assert signature(ngpt.Denoiser.__init__) == constructor
-    tensors, channels = (([*names], [d.replace("...", "None") for d in defaults]) for names, defaults in calls)
-    assert [signature(form) for form in get_overloads(ngpt.Denoiser.__call__)] == [tensors, channels]
+    assert signature(ngpt.Denoiser.__init__) == theirs["__init__"][0]
+    assert [signature(form) for form in get_overloads(ngpt.Denoiser.__call__)] == theirs["__call__"]
     # What runs is neither of the two: every argument of both must find its place in it, by position and by name.
     accepted = inspect.signature(ngpt.Denoiser.__call__)
-    for names, _ in calls:
+    for names, _ in theirs["__call__"]:
         accepted.bind(*names)
         accepted.bind(None, **dict.fromkeys(names[1:]))
 
 
 def test_code_written_for_mitsuba_runs(renderer, arrays):
     """By position, with the transform that its documentation shows, normals in world space, and empty tensors."""
-    mi = renderer
+    mi, stack = renderer, full_stack(18, 26)
     world = mi.ScalarTransform4f().look_at(origin=[3, 2, 5], target=[0, 1, 0], up=[0, 1, 0])
-    turn = np.array(world.matrix)[:3, :3]
-    in_world = (arrays["normals"] @ turn.T).astype(np.float32)
+    in_world = (arrays["normals"] @ np.array(world.matrix)[:3, :3].T).astype(np.float32)
     noisy, albedo, normals = (mi.TensorXf(array) for array in (arrays["noisy"], arrays["albedo"], in_world))
     denoiser = ngpt.Denoiser([26, 18], True, True, False, False)
+    expected = ngpt.denoise(stack["primal"], albedo=stack["albedo"], normal=stack["normal"])
     for to_sensor in (world.inverse(), mi.Transform4f(world).inverse()):
         result = denoiser(noisy, albedo, normals, to_sensor, mi.TensorXf(), mi.TensorXf())
-        stack = full_stack(18, 26)
-        expected = ngpt.denoise(stack["primal"], albedo=stack["albedo"], normal=stack["normal"])
         assert np.allclose(result.numpy(), expected, rtol=1e-3, atol=1e-5)
 
 
@@ -211,8 +198,7 @@ def test_the_previous_frame_is_taken_as_it_was_given(shot):
 
 def test_transforms_may_scale_and_not_flatten(arrays):
     denoiser = ngpt.Denoiser((26, 18), albedo=True, normals=True)
-    arguments = [arrays[name] for name in ("noisy", "albedo", "normals")]
-    assert np.allclose(denoiser(*arguments, 7 * np.eye(3)), denoiser(*arguments), rtol=1e-4)
+    assert np.allclose(denoiser(**arrays, to_sensor=7 * np.eye(3)), denoiser(**arrays), rtol=1e-4)
     for flat in (np.diag([1, 1, 0]), np.full((3, 3), np.nan)):
         with pytest.raises(NgptError, match="to_sensor has determinant"):
-            denoiser(*arguments, flat)
+            denoiser(**arrays, to_sensor=flat)

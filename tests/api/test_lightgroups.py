@@ -5,7 +5,6 @@ import pytest
 
 import ngpt
 from ngpt.api import lightgroups
-from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
 
@@ -37,24 +36,16 @@ def cycles(path, noisy, more=(), **options):
     return written(path, layers | {f"ViewLayer.Combined_{name}": light for name, light in noisy.items()}, **options)
 
 
-def total(path, *names):
-    layers = lightgroups.layers_of_light(ngpt.read(path))
-    return sum(layers[name].astype(np.float64) for name in names)
-
-
 @pytest.mark.parametrize("method", ["auto", "nfor", "primal"])
-def test_groups_add_up_to_the_result(lights, tmp_path, method):
+def test_groups_add_up_to_the_result(lights, tmp_path, method, command):
     clean, noisy = lights
-    path, out = cycles(tmp_path / "render.exr", noisy), tmp_path / "out.exr"
-    assert main(["denoise", str(path), "-o", str(out), "-m", method, "--groups"]) == 0
-    result = ngpt.read_image(out)
-    names = [f"ViewLayer.Combined_{name}" for name in clean]
-    assert np.abs(total(out, *names) - result).max() <= 1e-5 * np.abs(result).max()
-    denoised = lightgroups.layers_of_light(ngpt.read(out))
-    for name in clean:
-        before, after = (
-            np.mean((image - clean[name]) ** 2) for image in (noisy[name], denoised[f"ViewLayer.Combined_{name}"])
-        )
+    cycles(tmp_path / "render.exr", noisy)
+    command(f"denoise render.exr -o out.exr -m {method} --groups")
+    result, denoised = ngpt.read_image("out.exr"), lightgroups.layers_of_light(ngpt.read("out.exr"))
+    parts = {name: denoised[f"ViewLayer.Combined_{name}"] for name in clean}
+    assert np.abs(sum(part.astype(np.float64) for part in parts.values()) - result).max() <= 1e-5 * np.abs(result).max()
+    for name, light in clean.items():
+        before, after = (np.mean((image - light) ** 2) for image in (noisy[name], parts[name]))
         assert method == "primal" or after < 0.5 * before, name
 
 
@@ -87,12 +78,11 @@ def test_groups_are_found_by_the_names_of_renderers(lights, tmp_path):
         lightgroups.find(ngpt.read(own))
 
 
-def test_all_else_in_the_file_stays_and_types_too(lights, tmp_path):
+def test_all_else_in_the_file_stays_and_types_too(lights, tmp_path, command):
     _, noisy = lights
-    mist = {"ViewLayer.Mist": noisy["Key"]}
-    path, out = cycles(tmp_path / "half.exr", noisy, mist, type=np.float16), tmp_path / "out.exr"
-    assert main(["denoise", str(path), "-o", str(out), "-m", "nfor", "--groups"]) == 0
-    before, after = (ngpt.read(file) for file in (path, out))
+    cycles(tmp_path / "half.exr", noisy, {"ViewLayer.Mist": noisy["Key"]}, type=np.float16)
+    command("denoise half.exr -o out.exr -m nfor --groups")
+    before, after = ngpt.read("half.exr"), ngpt.read("out.exr")
     assert np.array_equal(*(lightgroups.layers_of_light(s)["ViewLayer.Mist"] for s in (before, after)))
     assert after.source.image.parts[0].channels["ViewLayer.Combined_Key.R"].dtype == np.float16
     assert after.attributes["ngpt:groups"] == "ViewLayer.Combined_Fill, ViewLayer.Combined_Key"
@@ -100,16 +90,15 @@ def test_all_else_in_the_file_stays_and_types_too(lights, tmp_path):
         lightgroups.find(after)
 
 
-def test_groups_of_every_view_are_denoised(lights, tmp_path):
+def test_groups_of_every_view_are_denoised(lights, tmp_path, command):
     _, noisy = lights
     layers = {"": sum(noisy.values())} | {f"RGBA_{name}": light for name, light in noisy.items()}
     both = layers | {f"right.{name}" if name else "right": np.flip(light, 1) for name, light in layers.items()}
-    path = written(tmp_path / "stereo.exr", both, {"multiView": ["left", "right"]})
-    out = tmp_path / "out.exr"
-    assert main(["denoise", str(path), "-o", str(out), "-m", "nfor", "--groups"]) == 0
+    written(tmp_path / "stereo.exr", both, {"multiView": ["left", "right"]})
+    command("denoise stereo.exr -o out.exr -m nfor --groups")
     for view in ("left", "right"):
-        parts = lightgroups.layers_of_light(ngpt.read(out, view=view))
+        parts = lightgroups.layers_of_light(ngpt.read("out.exr", view=view))
         groups = [parts[name] for name in parts if "RGBA_" in name]
-        result = ngpt.read_image(out, view=view)
+        result = ngpt.read_image("out.exr", view=view)
         assert len(groups) == 2, parts.keys()
         assert np.abs(sum(groups) - result).max() <= 1e-5 * result.max(), view

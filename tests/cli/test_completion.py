@@ -35,34 +35,31 @@ ASK = '\nCOMP_WORDS=({words}); COMP_CWORD={last}; _ngpt; echo "${{COMPREPLY[@]}}
 
 @pytest.mark.parametrize("name", ["bash", "zsh", "fish"])
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("line", "expected"),
     [
-        (["den"], {"denoise"}),
-        (["--comp"], {"--completion"}),
-        (["--completion", "b"], {"bash"}),
-        (["denoise", "-m", "wc"], {"wcv"}),
-        (["denoise", "x.exr", "--skip"], {"--skip-existing"}),
-        (["render", "sc", "--ad"], {"--adaptive"}),
-        (["denoise", "-o", "fil"], {"file.exr"}),
-        (["denoise", "fil"], {"file.exr"}),
+        ("den", "denoise"),
+        ("--comp", "--completion"),
+        ("--completion b", "bash"),
+        ("denoise -m wc", "wcv"),
+        ("denoise x.exr --skip", "--skip-existing"),
+        ("render sc --ad", "--adaptive"),
+        ("denoise -o fil", "file.exr"),
     ],
 )
-def test_words_are_completed(name, words, expected, capfd, tmp_path):
-    script = printed(capfd, "--completion", name)
+def test_words_are_completed(name, line, expected, capfd, tmp_path):
+    script, words = printed(capfd, "--completion", name), ["ngpt", *line.split()]
     (tmp_path / "file.exr").touch()
+    ask = ASK.format(words=" ".join(words), last=len(words) - 1)
     if name == "fish":
-        source = f"{script}\ncomplete -C 'ngpt {' '.join(words)}'\n"
+        ask = f"\ncomplete -C '{' '.join(words)}'\n"
     elif name == "zsh":
-        # Without a line editor nobody completes, so compinit is left out. With arrays from 0, as bashcompinit has it.
-        script = "compdef() { :; }\n" + script
-        source = f"{script}\nemulate sh" + ASK.format(words=" ".join(["ngpt", *words]), last=len(words))
-    else:
-        source = script + ASK.format(words=" ".join(["ngpt", *words]), last=len(words))
-    options = ["--no-config"] if name == "fish" else ["-f"] if name == "zsh" else ["--norc"]
-    done = subprocess.run([shell(name), *options], input=source, capture_output=True, text=True, cwd=tmp_path)
+        # Without a line editor nobody completes: compinit is left out. With arrays from 0, as bashcompinit has it.
+        script, ask = f"compdef() {{ :; }}\n{script}", f"\nemulate sh{ask}"
+    command = [shell(name), {"fish": "--no-config", "zsh": "-f", "bash": "--norc"}[name]]
+    done = subprocess.run(command, input=script + ask, capture_output=True, text=True, cwd=tmp_path)
     # zsh leaves it to its line editor to take those that begin so.
-    offered = {line.split("\t")[0] for line in done.stdout.replace(" ", "\n").split("\n")}
-    assert {one for one in offered if one and one.startswith(words[-1])} == expected, done.stderr
+    offered = {word.split("\t")[0] for word in done.stdout.replace(" ", "\n").split("\n")}
+    assert {one for one in offered if one and one.startswith(words[-1])} == {expected}, done.stderr
 
 
 def test_completion_and_manual_know_every_option(verbs, capfd):

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from ngpt.cli import main
 from ngpt.system import configs
 
 pytest.importorskip("torch")
@@ -51,11 +50,10 @@ def found(verb: str, text: str) -> set[str]:
 
 
 @pytest.mark.parametrize(("verb", "name"), ALL)
-def test_it_is_the_configuration_and_offers_all_that_could_be_set(verb, name, tmp_path, capsys):
+def test_it_is_the_configuration_and_offers_all_that_could_be_set(verb, name, tmp_path, command):
     """Read back it gives the same settings, and again with everything that it offers."""
     path, offered = tmp_path / "mine.toml", tmp_path / "offered.toml"
-    assert main([verb, "--config", name, "--init", str(path)]) == 0
-    assert f"ngpt {verb} --config {path} --out DIR" in capsys.readouterr().err
+    assert f"ngpt {verb} --config mine.toml --out DIR" in command(f"{verb} --config {name} --init mine.toml").err
     read, text = READERS[verb], path.read_text()
     given = read(configs.find_config(name, KINDS[verb]))
     assert read(path) == given
@@ -70,12 +68,8 @@ def test_it_is_the_configuration_and_offers_all_that_could_be_set(verb, name, tm
 
 
 @pytest.mark.parametrize("verb", KINDS)
-def test_without_a_configuration_it_begins_with_one_that_is_shipped(verb, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main([verb, "--init", "mine.toml"]) == 0
+def test_without_a_configuration_it_begins_with_one_that_is_shipped(verb, command):
+    command(f"{verb} --init mine.toml")
     assert READERS[verb]("mine.toml") == READERS[verb](configs.find_config(configs.STARTS[KINDS[verb]], KINDS[verb]))
-    capsys.readouterr()
-    assert main([verb, "--init", "mine.toml"]) == 1 and "exists already" in capsys.readouterr().err
-    assert main([verb, "--out", "x"]) == 2 and "--config is missing: a TOML file, or" in capsys.readouterr().err
-    assert main([verb, "--config", "mine.toml"]) == 2 and "--out is missing" in capsys.readouterr().err
+    assert "--out is missing" in command(f"{verb} --config mine.toml", 2).err
     assert [path.name for path in Path().iterdir()] == ["mine.toml"]

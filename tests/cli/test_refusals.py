@@ -16,7 +16,6 @@ from full_stack import full_stack
 
 import ngpt
 from ngpt.cli import main
-from ngpt.denoisers import oidn
 from ngpt.network.shipped import WEIGHTS
 from ngpt.stack import GradientStack
 from ngpt.windows import Place, Window
@@ -29,45 +28,43 @@ NEEDS = {"train": "torch", "export": "onnx"}
 def shelf(tmp_path_factory):
     """A folder of good and bad inputs of all kinds, and the empty folder ``out``; no refused command changes it."""
     folder = tmp_path_factory.mktemp("shelf")
-    for name in ("out", "empty", "older", "shot", "lines"):
+    for name in ("out", "empty"):
         (folder / name).mkdir()
-    for name in ("noisy", "other"):
-        ngpt.write(folder / f"{name}.exr", full_stack(12, 14))
-    for name in ("plain", "plain2", "shot/1", "shot/2"):
-        ngpt.write(folder / f"{name}.exr", np.ones((4, 5, 3)))
-    ngpt.write(folder / "small.exr", np.ones((1, 2, 3)))
-    ngpt.write(folder / "nothing.exr", np.full((4, 5, 3), np.nan))
-    for name, x in (("left", 0), ("right", 5)):
-        place = Place(Window(x, 0, 5, 4), Window(0, 0, 10, 4))
-        ngpt.write(folder / f"{name}.exr", GradientStack({"primal": np.ones((4, 5, 3), np.float32)}, place=place))
-    one = np.ones((4, 5), np.float32)
-    write_raw(folder / "moved.exr", (dict.fromkeys("RGB", one), {"dataWindow": window(3, 2, 5, 4)}))
-    write_raw(folder / "depth.exr", ({"Z": one},))
     network, bare = (WEIGHTS / "ngpt-fast.onnx").read_bytes(), struct.pack("<Q", 2) + b"{}"
     for name, data in {
         "notes.exr": b"no image",
-        "cut.exr": (folder / "noisy.exr").read_bytes()[:2000],
         "page.html": b"mine",
         "raw": b"mine",
         "older/dy.f32": b"mine",
         "empty.onnx": b"",
-        "notes.onnx": b"no network at all",
         "cut.onnx": network[:5000],
         "statistics.onnx": (WEIGHTS / "ngpt-fast.statistics.onnx").read_bytes(),
         "empty.safetensors": b"",
         "bare.safetensors": bare,
         "nonsense.xml": b'<scene version="3.0.0"><shape type="nonsense"/></scene>',
-        "moving.xml": (
-            b'<scene version="3.0.0"><sensor type="perspective"><animation name="to_world"/></sensor></scene>'
-        ),
+        "moving.xml": b'<scene version="3.0.0"><sensor type="perspective"><animation name="a"/></sensor></scene>',
+        "list/log.jsonl": b"[]\n{}\n",
+        "word/log.jsonl": b'{"step": 1, "loss": "low"}\n',
+        "bytes/log.jsonl": b"\xff\xfe\n",
+        "short/checkpoint.safetensors": b"\0\0",
+        "long/checkpoint.safetensors": struct.pack("<Q", 2**60) + b"{}",
     }.items():
+        (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(data)
-    for name, log in {"list": b"[]\n{}\n", "word": b'{"step": 1, "loss": "low"}\n', "bytes": b"\xff\xfe\n"}.items():
-        (folder / "lines" / name).mkdir()
-        (folder / "lines" / name / "log.jsonl").write_bytes(log)
-    for name, data in {"short": b"\0\0", "long": struct.pack("<Q", 2**60) + b"{}"}.items():
-        (folder / "lines" / name).mkdir()
-        (folder / "lines" / name / "checkpoint.safetensors").write_bytes(data)
+    plain, one = np.ones((4, 5, 3), np.float32), np.ones((4, 5), np.float32)
+    images = dict.fromkeys(("plain", "plain2", "shot/1", "shot/2"), plain)
+    images |= dict.fromkeys(("noisy", "other"), full_stack(12, 14))
+    images |= {"small": plain[:1, :2], "nothing": np.nan * plain}
+    for name, x in (("left", 0), ("right", 5)):
+        images[name] = GradientStack({"primal": plain}, place=Place(Window(x, 0, 5, 4), Window(0, 0, 10, 4)))
+    (folder / "shot").mkdir()
+    for name, image in images.items():
+        ngpt.write(folder / f"{name}.exr", image)
+    (folder / "cut.exr").write_bytes((folder / "noisy.exr").read_bytes()[:2000])
+    write_raw(folder / "moved.exr", (dict.fromkeys("RGB", one), {"dataWindow": window(3, 2, 5, 4)}))
+    write_raw(folder / "depth.exr", ({"Z": one},))
+    eyes = {f"{view}{c}": one for view in ("", "right.") for c in "RGB"}
+    write_raw(folder / "eyes.exr", (eyes, {"multiView": ["left", "right"]}))
     return folder
 
 
@@ -106,56 +103,39 @@ ROWS = [
     ("denoise plain.exr -o out/o.exr --layer albdo=x", 1, "did you mean 'albedo'? use one of"),
     ("denoise plain.exr -o out/o.tiff", 2, "let the name end in .exr .pfm .png"),
     ("denoise plain.exr -o notes.exr/o.exr", 1, "notes.exr: cannot be made: "),
-    ("denoise plain.exr -o notes.exr", 1, "notes.exr: exists already; pass --force"),
+    ("denoise plain.exr -o notes.exr", 1, "to replace it, or --skip-existing (skip_existing=True) to"),
     ("denoise plain.exr plain2.exr -o notes.exr", 2, "is a file; the results of 2 stacks need a folder"),
     ("denoise plain.exr plain2.exr -o out/one.exr", 2, "file; the results of 2 stacks need a folder"),
+    ("denoise plain.exr shot/../plain.exr -o out/", 2, "out/plain.exr: would be the result of two"),
     ("denoise plain.exr -o out/o.exr --method odin", 2, "'odin'; did you mean 'oidn'? choose one of: auto"),
     ("denoise plain.exr -o out/o.exr -m l2 -O alhpa=1", 2, "did you mean 'alpha'?"),
+    ("denoise noisy.exr other.exr -o out/ -m wcv -O alpha=1", 2, "'wcv' has no option 'alpha'; it has: none"),
+    (
+        "denoise noisy.exr other.exr -o out/ -m l1 -O alpha=much",
+        2,
+        "method 'l1', option 'alpha': 'much' is not allowed",
+    ),
+    ("denoise noisy.exr -O memory", 2, "'memory' is not of the form NAME=VALUE"),
+    (
+        "denoise eyes.exr -m primal -o out/a.png",
+        1,
+        "has several views, and out/a.png is of one; choose one, as in --vi",
+    ),
+    ("denoise eyes.exr -m primal -o out/a.exr --ref plain.exr", 1, "has several views, and --ref is of one"),
     ("denoise plain.exr --methd l2", 2, "argument '--methd'; did you mean '--method'? see `ngpt denoise --help`"),
     ("denoise plain.exr --wieghts=x", 2, "argument '--wieghts=x'; did you mean '--weights'?"),
     ("denoise plain.exr --skip-existing --force", 2, "not allowed with"),
     ("denoise plain.exr -o out/o.exr --ref small.exr", 1, "small.exr is 2x1 but"),
     ("denoise left.exr -m primal -o out/o.exr --ref right.exr", 1, "these have no pixel in common"),
-    (
-        "denoise noisy.exr other.exr -o out/ -m oidn -O quality=best",
-        2,
-        "option 'quality': 'best' is not allowed; it takes high, balanced, fast",
-    ),
-    (
-        "denoise noisy.exr other.exr -o out/ -m oidn -O auxiliary=7",
-        2,
-        "option 'auxiliary': '7' is not allowed; it takes prefiltered, clean",
-    ),
-    (
-        "denoise noisy.exr other.exr -o out/ -m oidn -O alpha=1",
-        2,
-        "method 'oidn' has no option 'alpha'; it has: auxiliary, quality",
-    ),
-    ("denoise noisy.exr other.exr -o out/ -m wcv -O alpha=1", 2, "method 'wcv' has no option 'alpha'; it has: none"),
-    (
-        "denoise noisy.exr other.exr -o out/ -m l1 -O alpha=much",
-        2,
-        "method 'l1', option 'alpha': 'much' is not allowed; it takes a number from 1e-15 to 1e+15, or auto",
-    ),
-    (
-        "denoise noisy.exr other.exr -o out/ -m ngpt-fast -O memory=much",
-        2,
-        "option 'memory': 'much' is not allowed; it takes a whole number",
-    ),
-    ("denoise noisy.exr -O memory", 2, "'memory' is not of the form NAME=VALUE"),
-    (
-        "denoise plain.exr --albedo small.exr",
-        1,
-        "small.exr: albedo is 2x1 but plain.exr is 5x4; render them at one size",
-    ),
-    ("denoise plain.exr --normal small.exr", 1, "small.exr: normal is 2x1"),
+    ("denoise plain.exr --albedo small.exr", 1, "small.exr: albedo is 2x1 but plain.exr is 5x4; render them at one"),
     ("denoise plain.exr --albedo moved.exr", 1, "moved.exr: albedo starts at pixel (3, 2) but plain.exr at (0, 0)"),
     ("denoise plain.exr --normal depth.exr", 1, "depth.exr: no layer with channels X Y Z for 'normal'"),
     ("denoise plain.exr --depth nowhere.exr", 1, "nowhere.exr: not found"),
     ("denoise plain.exr plain2.exr --albedo small.exr", 2, "--albedo belongs to one stack, and 2 are given"),
-    ("denoise shot -o out/shot --temporal --error", 2, "--temporal goes without"),
-    ("denoise shot -o out/shot --temporal --groups", 2, "--temporal goes without"),
-    ("denoise shot -o out/shot --temporal --group 'fog*'", 2, "--temporal goes without"),
+    ("denoise noisy.exr other.exr -o out/ --halves noisy.exr other.exr", 2, "--halves are of one stack"),
+    ("denoise noisy.exr -o out/a.pfm -m primal --error", 2, "--error makes layers, and out/a.pfm can have none"),
+    ("denoise shot -o out/shot --temporal --error", 2, "--temporal goes without --error"),
+    ("denoise shot -o out/shot --temporal --group 'fog*'", 2, "--temporal goes without --groups"),
     ("denoise -", 1, "standard input has no name to go by"),
     ("denoise - noisy.exr -o out/", 1, "'-' is one stack, and 2 are given"),
     ("denoise noisy.exr noisy.exr -o -", 1, "'-' is one result, and 2 stacks are given"),
@@ -166,51 +146,41 @@ ROWS = [
     ("diff - -", 2, "'-' is one image, and is given 2 times"),
     ("diff left.exr right.exr", 1, "left.exr is 5x4 at (0, 0) of 10x4, right.exr is 5x4 at (5, 0) of 10x4"),
     ("diff left.exr small.exr", 1, "small.exr is 2x1 but left.exr is 5x4 at (0, 0) of 10x4"),
-    ("info missing.exr", 1, "missing.exr: not found"),
     ("info nowhere.onnx", 1, "nowhere.onnx: not found; check the name"),
     ("info nowhere.safetensors", 1, "nowhere.safetensors: not found; check the name"),
     ("info ngpt-fst", 1, "did you mean 'ngpt-fast'?"),
     ("info difuse", 1, "did you mean 'diffuse'?"),
     ("info empty.onnx", 1, "cannot load it"),
-    ("info notes.onnx", 1, "cannot load it"),
     ("info cut.onnx", 1, "cannot load it"),
     ("info statistics.onnx", 1, "lacks the metadata 'ngpt.inputs'"),
     ("info empty.safetensors", 1, "not a readable safetensors file"),
     ("info bare.safetensors", 1, "holds no configuration of ngpt"),
-    ("info lines/short", 1, "is no checkpoint of ngpt, or damaged"),
-    ("info lines/long", 1, "is no checkpoint of ngpt, or damaged"),
-    ("info lines/list", 1, "line 1 is []; it must be a table"),
-    ("info lines/word", 1, "line 1: 'loss' is 'low'"),
-    ("info lines/bytes", 1, "cannot be read"),
+    ("info short", 1, "is no checkpoint of ngpt, or damaged"),
+    ("info long", 1, "is no checkpoint of ngpt, or damaged"),
+    ("info list", 1, "line 1 is []; it must be a table"),
+    ("info word", 1, "line 1: 'loss' is 'low'"),
+    ("info bytes", 1, "cannot be read"),
     ("merge plain.exr plain2.exr -o notes.exr/o.exr", 1, "notes.exr: cannot be made: "),
+    ("merge noisy.exr other.exr -o notes.exr", 1, "notes.exr: exists already; pass --force"),
     ("merge noisy.exr noisy.exr -o out/o.exr", 1, "noisy.exr"),
     ("unpack plain.exr -o x", 2, "see `ngpt unpack --help`"),
     ("unpack noisy.exr raw", 1, "raw"),
     ("unpack noisy.exr older", 1, "older"),
-    (
-        "report -q plain.exr small.exr -o out/p.html",
-        1,
-        "small.exr is 2x1 but plain.exr is 5x4; render or crop them to one size",
-    ),
+    ("report -q plain.exr small.exr -o out/p.html", 1, "small.exr is 2x1 but plain.exr is 5x4; render or crop them to"),
     ("report -q plain.exr --ref small.exr -o out/p.html", 1, "small.exr is 2x1 but plain.exr is 5x4"),
     ("report -q plain.exr plain.exr -o out/p.html", 2, "plain.exr: is given twice"),
-    (
-        "report -q nothing.exr --ref plain.exr -o out/p.html",
-        1,
-        "nothing.exr and plain.exr: none of 20 pixels is finite in both images",
-    ),
+    ("report -q nothing.exr --ref plain.exr -o out/p.html", 1, "none of 20 pixels is finite in both images"),
     ("report -q nowhere.exr -o out/p.html", 1, "nowhere.exr"),
-    ("report -q plain.exr -o page.html", 1, "exists already"),
+    ("report -q plain.exr -o page.html", 1, "exists already; pass --force"),
     ("report -q plain.exr -o out/page", 2, "let it end in .html"),
-    (
-        "report -q left.exr right.exr -o out/p.html",
-        1,
-        "left.exr is 5x4 at (0, 0) of 10x4, right.exr is 5x4 at (5, 0) of 10x4",
-    ),
+    ("report -q left.exr right.exr -o out/p.html", 1, "left.exr is 5x4 at (0, 0) of 10x4, right.exr is 5x4 at (5, 0)"),
     ("report -q shot plain.exr -o out/p.html", 1, "plain.exr: is no folder, and others are"),
     ("picture plain.exr -o out/a.gif", 1, "one of .png .jpg"),
+    ("picture plain.exr -o page.html/a.png", 1, "page.html: cannot be made: "),
     ("picture shot -o out/a.png", 1, "one of .webp .mp4"),
     ("picture plain.exr -o out/a.png --exposure bright", 2, "nor auto"),
+    ("picture plain.exr --view top -o out/a.png", 1, "has no view 'top'; it has one view of no name"),
+    ("picture eyes.exr --view top -o out/a.png", 1, "has no view 'top'; it has left, right"),
     ("picture shot -o out/a.webp --fps 0", 2, "frames a second"),
     ("picture empty -o out/a.webp", 1, "no .exr files"),
     ("picture no.####.exr -o out/f.webp", 1, "no.####.exr: no frames of that name"),
@@ -220,40 +190,22 @@ ROWS = [
     ("render diffuse --spp 0", 2, "'0' is not a whole number of 1 or more"),
     ("render diffuse --spp -1", 2, "argument --spp: '-1' is not a"),
     ("render diffuse --time 0", 2, "argument --time: '0' is not a"),
-    ("render diffuse --time -3", 2, "argument --time: '-3' is not a"),
     ("render diffuse --memory 0", 2, "argument --memory: '0' is not a"),
     ("render diffuse --seed -1", 2, "argument --seed: '-1' is not a"),
     ("render diffuse -o out/s.tga", 2, "let the name end in .exr"),
     ("demo --scene difuse", 2, "did you mean 'diffuse'?"),
     ("train", 2, "--config is missing: a TOML file, or one of: ablations, "),
     ("train --config papr", 1, "did you mean 'paper'?"),
-    (
-        "train --config nowhere --out out/x",
-        1,
-        "nowhere: cannot be read: no such file; configurations that come with ngpt: ",
-    ),
     ("train --config nowhere.toml --dry-run", 1, "nowhere.toml: cannot be read"),
     ("train --config fast", 2, "--out is missing"),
     ("train --config fast --dry-run --set model.units=3", 1, "units = 3: must be a list"),
     ("train --config fast --dry-run --set model.base=x", 1, "choose one of"),
     ("train --config fast --dry-run --set model.base", 2, "give it as table.key=value"),
     ("train --config tiny --set run.stepz=3", 1, "unknown key 'stepz'; did you mean 'steps'?"),
-    (
-        "dataset --config nowhere --out out/x",
-        1,
-        "nowhere: cannot be read: no such file; configurations that come with ngpt: ",
-    ),
-    (
-        "evaluate --config nowhere --out out/x",
-        1,
-        "nowhere: cannot be read: no such file; configurations that come with ngpt: ",
-    ),
+    ("train --config tiny --init notes.exr", 1, "notes.exr: exists already; pass --force"),
+    ("dataset --config nowhere --out out/x", 1, "nowhere: cannot be read: no such file; configurations that come with"),
     ("evaluate --config eval-mian --out x", 1, "did you mean 'eval-main'?"),
-    (
-        "evaluate --config eval-640 --init out/mine.toml",
-        2,
-        "eval-640 is eval-main.toml with other numbers: give --init that one",
-    ),
+    ("evaluate --config eval-640 --init out/a.toml", 2, "eval-640 is eval-main.toml with other numbers: give --init"),
 ]
 
 
@@ -262,8 +214,6 @@ def test_refused(shelf, line, status, words, monkeypatch, capfd):
     verb = line.partition(" ")[0]
     if verb in NEEDS:
         pytest.importorskip(NEEDS[verb])
-    if "-m oidn" in line and "alpha" not in line and oidn.missing():
-        pytest.skip(oidn.missing())
     refused(shelf, line, status, words, monkeypatch, capfd)
 
 
@@ -271,13 +221,11 @@ RENDERS = [
     ("render nonsense.xml", 1, '"nonsense" not found'),
     ("render absent.xml", 1, "absent.xml: no such file"),
     ("render diffuse --variant scalar_rgb", 2, "'scalar_rgb' is not one"),
-    ("render diffuse --sampler best", 2, "unknown sampler 'best'"),
     ("render diffuse --size 30000x30000", 1, "; render a smaller image"),
     ("render absent.xml --spp 9999999999", 2, "9999999999 samples per pixel"),
     ("render diffuse -o notes.exr/s.exr", 1, "notes.exr: cannot be made: "),
     ("render moving.xml", 1, "animated transforms"),
     ("info moving.xml", 1, "animated transforms"),
-    ("demo --scene attic", 2, "no built-in scene is called 'attic'"),
 ]
 
 

@@ -1,7 +1,5 @@
 """Stacks and results in OpenEXR files: what is written is read again, and what is not ours passes through."""
 
-from itertools import pairwise
-
 import numpy as np
 import OpenEXR
 import pytest
@@ -17,9 +15,7 @@ from ngpt.stack import GradientStack
 
 LAYOUTS = {
     "plain": lambda a: a,
-    "fortran": np.asfortranarray,
     "reversed": lambda a: a[::-1, ::-1],
-    "cropped": lambda a: np.pad(a, ((1, 2), (3, 1), (0, 0)))[1:-2, 3:-1],
     "channels first": lambda a: np.ascontiguousarray(a.transpose(2, 0, 1)).transpose(1, 2, 0),
     "every other": lambda a: np.repeat(a, 2, axis=1)[:, ::2],
     "read-only": lambda a: np.broadcast_to(a, a.shape),
@@ -100,16 +96,19 @@ def files(draw):
 
 @quick
 @given(parts=files())
-def test_all_else_passes_through_a_result(tmp_path, parts):
+def test_all_else_passes_through_a_copy_and_a_result(tmp_path, parts):
     source = write_raw(tmp_path / "source.exr", *parts)
     stack = read(source)
     result = np.full((stack.height, stack.width, 3), 0.1, np.float32)
-    written = read_raw(write(tmp_path / "result.exr", result, like=stack, overwrite=True))
-    assert len(written) == len(parts)
+    olds = read_raw(source)
+    copy, written = (
+        read_raw(write(tmp_path / "result.exr", *what, overwrite=True)) for what in ((stack,), (result, stack))
+    )
+    assert len(copy) == len(written) == len(parts)
+    for (_, _, channels), (_, _, old) in zip(copy, olds, strict=True):
+        assert set(channels) == set(old) and all(same_bits(channels[name], old[name]) for name in old)
     root_type = parts[0][0]["R"].dtype
-    for index, ((name, header, channels), (_, old_header, old)) in enumerate(
-        zip(written, read_raw(source), strict=True)
-    ):
+    for index, ((name, header, channels), (_, old_header, old)) in enumerate(zip(written, olds, strict=True)):
         assert name == parts[index][2]
         expected = dict(old)
         if index == 0:
@@ -126,15 +125,6 @@ def test_all_else_passes_through_a_result(tmp_path, parts):
         }
 
 
-@quick
-@given(parts=files())
-def test_a_stack_that_was_read_is_written_as_it_was(tmp_path, parts):
-    source = write_raw(tmp_path / "source.exr", *parts)
-    written = read_raw(write(tmp_path / "copy.exr", read(source), overwrite=True))
-    for (_, _, channels), (_, _, old) in zip(written, read_raw(source), strict=True):
-        assert set(channels) == set(old) and all(same_bits(channels[name], old[name]) for name in old)
-
-
 def small(*names: str, dtype=np.float32, start: float = 0.0) -> dict[str, np.ndarray]:
     """2x3 channels, all different."""
     return {name: np.arange(6).reshape(2, 3).astype(dtype) + dtype(start + 10 * i) for i, name in enumerate(names)}
@@ -145,23 +135,9 @@ ROOT = ("R", "G", "B")
 PRIMAL = ("primal.R", "primal.G", "primal.B")
 
 
-def test_a_result_of_a_result_keeps_the_first_primal(tmp_path):
-    source = write_raw(tmp_path / "0.exr", (small(*"RGBA", "dx.R", "dx.G", "dx.B", dtype=np.float16),))
-    paths = [source, tmp_path / "1.exr", tmp_path / "2.exr"]
-    for number, (before, after) in enumerate(pairwise(paths), start=1):
-        write(after, RESULT * number, like=read(before))
-    first, last = read(source), read(paths[2])
-    assert first.names == last.names
-    for name in first.names:
-        assert same_bits(first[name], last[name]), name
-    ((_, _, channels),) = read_raw(paths[2])
-    assert set(channels) == set(read_raw(paths[1])[0][2])
-    assert same_bits(channels["G"], (2 * RESULT[..., 1]).astype(np.float16))
-
-
 @pytest.mark.parametrize(
     ("peak", "expected"),
-    [(65504.0, np.float16), (65505.0, np.float32), (1e12, np.float32), (1e-6, np.float32), (0.0, np.float16)],
+    [(65504.0, np.float16), (65505.0, np.float32), (1e-6, np.float32), (0.0, np.float16)],
 )
 def test_half_becomes_float_where_half_cannot_hold_the_result(tmp_path, peak, expected):
     stack = read(write_raw(tmp_path / "a.exr", (small(*ROOT, dtype=np.float16),)))
@@ -205,13 +181,11 @@ def test_a_primal_in_a_later_part_puts_the_result_in_a_new_first_part(tmp_path):
     assert again.attributes == {"owner": "me", "ngpt:version": ngpt.__version__}
     twice = read_raw(write(tmp_path / "c.exr", 2 * RESULT, like=again))
     assert [name for name, _, _ in twice] == ["ngpt", "depth", "Combined"]
-    assert same_bits(twice[0][2]["B"], 2 * RESULT[..., 2]) and same_bits(
-        twice[0][2]["primal.R"], stack["primal"][..., 0]
-    )
+    assert same_bits(twice[0][2]["B"], 2 * RESULT[..., 2])
+    assert same_bits(twice[0][2]["primal.R"], stack["primal"][..., 0])
 
 
-@pytest.mark.parametrize("name", ["ViewLayer.Combined", "C", "beauty"])
-@pytest.mark.parametrize("part", ["", "beauty"])
+@pytest.mark.parametrize(("name", "part"), [("ViewLayer.Combined", ""), ("C", "beauty"), ("beauty", "beauty")])
 def test_a_result_replaces_the_layer_that_its_input_came_from(tmp_path, name, part):
     """Who loads that layer in a compositor wants the image; the input is kept to the bit, and is denoised again."""
     before = small(*(f"{name}.{c}" for c in "RGBA"), "albedo.R", "albedo.G", "albedo.B", dtype=np.float16)
@@ -275,10 +249,8 @@ def test_changed_and_added_layers_go_where_they_belong(tmp_path):
     ("arguments", "expected"),
     [
         (lambda stack: ("out.png", RESULT), "out.png: ngpt writes OpenEXR; let the name end in .exr"),
-        (lambda stack: ("out", stack), "let the name end in .exr"),
         (lambda stack: ("out.exr", RESULT[:1], stack), "the result is 3x1 but the stack"),
         (lambda stack: ("out.exr", RESULT[..., :2], stack), "out.exr: layer 'primal' has shape (2, 3, 2)"),
-        (lambda stack: ("out.exr", RESULT[..., 0]), "has shape (2, 3)"),
         (lambda stack: ("out.exr", RESULT * 1j, stack), "is of type complex64"),
         (lambda stack: ("out.exr", RESULT.astype(np.float64) * 1e300), "values that float32 cannot hold"),
         (lambda stack: ("out.exr", stack, stack), "`like` goes with an image"),
@@ -306,16 +278,18 @@ def test_nothing_is_overwritten_unasked(tmp_path):
 
 
 def test_layers_in_parts_of_other_size_or_place_are_refused(tmp_path):
-    shifted = {"dataWindow": window(5, 0, 3, 2)}
-    path = write_raw(tmp_path / "a.exr", (small(*ROOT), {}, "rgb"), (small("X", "Y", "Z"), shifted, "N"))
-    with pytest.raises(NgptError, match=r"layer 'normal' starts at pixel \(5, 0\) but 'primal' at \(0, 0\)"):
-        read(path)
     larger = {name: np.zeros((4, 4), np.float32) for name in "XYZ"}
-    path = write_raw(
-        tmp_path / "b.exr", (small(*ROOT), {}, "rgb"), (larger, {"displayWindow": window(0, 0, 3, 2)}, "N")
-    )
-    with pytest.raises(NgptError, match=r"b\.exr: layer 'normal' is 4x4 but 'primal' is 3x2"):
-        read(path)
+    for normal, header, expected in (
+        (
+            small("X", "Y", "Z"),
+            {"dataWindow": window(5, 0, 3, 2)},
+            r"starts at pixel \(5, 0\) but 'primal' at \(0, 0\)",
+        ),
+        (larger, {"displayWindow": window(0, 0, 3, 2)}, "is 4x4 but 'primal' is 3x2"),
+    ):
+        path = write_raw(tmp_path / "a.exr", (small(*ROOT), {}, "rgb"), (normal, header, "N"))
+        with pytest.raises(NgptError, match=f"a.exr: layer 'normal' {expected}"):
+            read(path)
 
 
 def test_uint_channels_are_read_as_numbers(tmp_path):

@@ -2,7 +2,6 @@
 
 import os
 import struct
-import threading
 import time
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from exr_files import comparable, same_bits, window, write_raw
 from exr_structure import Attribute, parse
 
 import ngpt
-import ngpt.cli
 from ngpt.errors import NgptError
 from ngpt.io import header, isolated, openexr
 from ngpt.io.isolated import read_exr_isolated
@@ -74,7 +72,6 @@ def box(*numbers):
         (setting(b"dataWindow", box(0, 0, 65534, 65534)), "is 65535x65535 pixels, and 256 million are read at most"),
         (setting(b"dataWindow", box(-(2**31), 0, 2**31 - 1, 0)), "is 4294967296x1 pixels"),
         (setting(b"dataWindow", box(0, 0, 2**27 - 1, 0)), "bytes cannot hold 3 channels of 134217728x1 pixels"),
-        (setting(b"dataWindow", box(0, 0, 0, 2**27 - 1)), "bytes cannot hold 3 channels of 1x134217728 pixels"),
         (setting(b"dataWindow", box(5, 5, 4, 9)), "part 0 is 0x5 pixels"),
         (setting(b"channels", chlist(*(b"c%05d" % i for i in range(100_000)))), "part 0 has more than 4096 channels"),
         (setting(b"channels", chlist(b"B", b"G", b"R", b"R")), "part 0 has two channels b'R'"),
@@ -112,16 +109,14 @@ def test_more_than_half_of_the_memory_is_not_decoded(tmp_path, monkeypatch):
     assert "its 3 channels take 0.0 GiB, more than half of" in refused(path)
 
 
-@pytest.mark.parametrize(
-    "name", ["RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB", "HTJ2K256", "HTJ2K32"]
-)
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.uint32])
-def test_what_compresses_best_is_no_bomb(tmp_path, name, dtype):
+@pytest.mark.parametrize("name", ["RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB", "HTJ2K256"])
+def test_what_compresses_best_is_no_bomb(tmp_path, name):
     """Bounds on how much a byte may stand for hold for black images, which are the smallest."""
     header = {"compression": getattr(OpenEXR, f"{name}_COMPRESSION")}
-    black = {channel: np.zeros((1024, 512), dtype) for channel in "RGB"}
-    path = write_raw(tmp_path / "a.exr", (black, header))
-    assert all(same_bits(pixels, black["R"]) for pixels in read_exr(path).parts[0].channels.values())
+    for dtype in (np.float16, np.float32, np.uint32):
+        black = {channel: np.zeros((512, 512), dtype) for channel in "RGB"}
+        image = read_exr(write_raw(tmp_path / "a.exr", (black, header)))
+        assert all(same_bits(pixels, black["R"]) for pixels in image.parts[0].channels.values())
 
 
 def test_a_part_that_openexr_reads_otherwise_than_its_header_is_refused(tmp_path, monkeypatch):
@@ -131,33 +126,33 @@ def test_a_part_that_openexr_reads_otherwise_than_its_header_is_refused(tmp_path
     assert "damaged or incomplete" in refused(path)
 
 
-@pytest.mark.parametrize("kind", ["fifo", "device", "loop", "zero", "long"])
-def test_what_is_no_file_ends_at_once(tmp_path, kind):
-    path = tmp_path / "a.exr"
-    if kind == "fifo":
-        os.mkfifo(path)
-        assert "is a pipe or a device" in refused(path)
-    elif kind == "device":
-        path.symlink_to("/dev/zero")
-        assert "is a pipe or a device" in refused(path)
-    elif kind == "loop":
-        path.symlink_to(path)
-        assert "cannot be read: Too many levels of symbolic links" in refused(path)
-    elif kind == "zero":
-        assert "embedded null byte" in refused(tmp_path / "a\0.exr")
-    else:
-        assert "File name too long" in refused(tmp_path / ("a" * 300 + ".exr"))
+@pytest.mark.parametrize(
+    ("name", "make", "expected"),
+    [
+        ("a.exr", os.mkfifo, "is a pipe or a device"),
+        ("a.exr", lambda path: path.symlink_to("/dev/zero"), "is a pipe or a device"),
+        ("a.exr", lambda path: path.symlink_to(path), "cannot be read: Too many levels of symbolic links"),
+        ("a\0.exr", None, "embedded null byte"),
+        ("a" * 300, None, "File name too long"),
+    ],
+    ids=["fifo", "device", "loop", "zero", "long"],
+)
+def test_what_is_no_file_ends_at_once(tmp_path, name, make, expected):
+    path = tmp_path / name
+    if make:
+        make(path)
+    assert expected in refused(path)
 
 
-def test_names_that_are_not_utf8(tmp_path, capfd):
+def test_names_that_are_not_utf8(tmp_path, command):
     path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff\xfe.exr"))
     write_raw(tmp_path / "a.exr", (PIXELS,)).rename(path)
     assert read_exr(path).parts[0].channels.keys() == set("RGB")
     result = path.with_name(f"{path.stem}_denoised.exr")
-    assert ngpt.cli.main(["denoise", "-m", "primal", str(path)]) == 0 and read_exr(result)
+    command(f"denoise -m primal {path}")
+    assert read_exr(result)
     path.write_bytes(b"")
-    assert ngpt.cli.main(["denoise", "-m", "primal", "--force", str(path)]) == 1
-    assert "is empty" in capfd.readouterr().err
+    assert "is empty" in command(f"denoise -m primal --force {path}", 1).err
 
 
 @pytest.mark.parametrize("how", ["cut", "longer", "another"])
@@ -182,55 +177,14 @@ def test_a_file_that_changes_while_it_is_read_is_named(tmp_path, monkeypatch, ho
         assert "changed while it was read; wait until its writer is done" in refused(path)
 
 
-def test_many_threads_cut_and_write_while_others_read(tmp_path):
-    """Neither a crash nor a hang, and never an image that is not one of those written."""
-    path, stop, seen = tmp_path / "a.exr", threading.Event(), []
-    versions = []
-    for value in (1, 2):
-        channels = {name: np.full((64, 64), value, np.float32) for name in "RGB"}
-        versions.append(write_raw(tmp_path / "v.exr", (channels, {"compression": OpenEXR.NO_COMPRESSION})).read_bytes())
-
-    def write():
-        while not stop.is_set():
-            for data in versions:
-                path.write_bytes(data)
-                time.sleep(0.002)
-
-    path.write_bytes(versions[0])
-    writer = threading.Thread(target=write)
-    writer.start()
-    try:
-        for _ in range(100):
-            try:
-                pixels = read_exr(path).parts[0].channels["R"]
-            except NgptError as error:
-                seen.append(str(error))
-            else:
-                assert pixels.min() == pixels.max()
-    finally:
-        stop.set()
-        writer.join()
-    assert all(message.startswith(str(path)) for message in seen)
-
-
-# In a process of its own
-
-
-@pytest.mark.parametrize("compression", ["NO", "PIZ", "ZIP", "DWAA"])
+@pytest.mark.parametrize("compression", ["NO", "DWAA"])
 def test_isolated_is_the_same(tmp_path, compression):
-    rng = np.random.default_rng(1)
-    one = {
-        "R": rng.random((9, 7)).astype("f4"),
-        "G": rng.random((9, 7)).astype("f2"),
-        "id": np.arange(63, dtype="u4").reshape(9, 7),
-    }
-    header = {
-        "compression": getattr(OpenEXR, f"{compression}_COMPRESSION"),
-        "dataWindow": window(-3, 4, 7, 9),
-        "owner": "Zoë",
-    }
+    rng, red = np.random.default_rng(1), np.random.default_rng(1).random((9, 7)).astype("f4")
+    one = {"R": red, "G": rng.random((9, 7)).astype("f2"), "id": np.arange(63, dtype="u4").reshape(9, 7)}
+    header = {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"), "owner": "Zoë"}
+    header |= {"dataWindow": window(-3, 4, 7, 9)}
     tiles = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription(), "lineOrder": OpenEXR.RANDOM_Y}
-    path = write_raw(tmp_path / "a.exr", (one, header, "first"), ({"Z": one["R"]}, tiles, "second"))
+    path = write_raw(tmp_path / "a.exr", (one, header, "first"), ({"Z": red}, tiles, "second"))
     here, there = read_exr(path), read_exr_isolated(path)
     assert [part.name for part in there.parts] == ["first", "second"]
     for expected, part in zip(here.parts, there.parts, strict=True):
@@ -238,6 +192,18 @@ def test_isolated_is_the_same(tmp_path, compression):
         assert all(same_bits(part.channels[name], expected.channels[name]) for name in part.channels)
         for name in expected.header.keys() - {"channels", "chunkCount"}:
             assert comparable(part.header[name]) == comparable(expected.header[name]), name
+
+
+@pytest.fixture
+def decoder(tmp_path, monkeypatch):
+    """Puts a module in the place of OpenEXR, for processes that are started."""
+
+    def put(body):
+        (tmp_path / "lib").mkdir()
+        (tmp_path / "lib" / "OpenEXR.py").write_text(body)
+        monkeypatch.syspath_prepend(tmp_path / "lib")
+
+    return put
 
 
 @pytest.mark.parametrize(
@@ -248,24 +214,19 @@ def test_isolated_is_the_same(tmp_path, compression):
         ("import time; time.sleep(60)", "not decoded after 1 s"),
     ],
 )
-def test_a_decoder_that_crashes_or_stalls_is_an_error(tmp_path, monkeypatch, body, expected):
+def test_a_decoder_that_crashes_or_stalls_is_an_error(tmp_path, monkeypatch, decoder, body, expected):
     path = write_raw(tmp_path / "a.exr", (PIXELS,))
-    (tmp_path / "lib").mkdir()
-    (tmp_path / "lib" / "OpenEXR.py").write_text(body)
-    monkeypatch.syspath_prepend(tmp_path / "lib")
+    decoder(body)
     if "sleep" in body:
         monkeypatch.setattr(isolated, "_SECONDS", 1.0)
     assert expected in refused(path, read_exr_isolated)
 
 
-def test_the_command_line_isolates_on_request(tmp_path, monkeypatch, capsys):
-    path = write_raw(tmp_path / "a.exr", (PIXELS,))
-    (tmp_path / "lib").mkdir()
-    (tmp_path / "lib" / "OpenEXR.py").write_text("import os, signal; os.kill(os.getpid(), signal.SIGBUS)")
-    monkeypatch.syspath_prepend(tmp_path / "lib")
-    assert ngpt.cli.main(["denoise", "-m", "primal", "--untrusted", str(path)]) == 1
-    assert "killed by SIGBUS" in capsys.readouterr().err
-    assert ngpt.cli.main(["denoise", "-m", "primal", str(path)]) == 0
+def test_the_command_line_isolates_on_request(tmp_path, decoder, command):
+    write_raw(tmp_path / "a.exr", (PIXELS,))
+    decoder("import os, signal; os.kill(os.getpid(), signal.SIGBUS)")
+    assert "killed by SIGBUS" in command("denoise -m primal --untrusted a.exr", 1).err
+    command("denoise -m primal a.exr")
 
 
 def test_names_that_collide_with_layers_keep_their_channels(tmp_path):

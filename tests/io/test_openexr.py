@@ -35,16 +35,8 @@ ATTRIBUTES = {
     "x:box2i": window(-4, 7, 9, 2),
     "x:box2f": (np.array([-0.5, 1], np.float32), np.array([2, 3.5], np.float32)),
     "originalDataWindow": window(-4, 7, 9, 2),
-    "x:v2i": np.array([1, -2], np.int32),
-    "x:v2f": np.array([1, -2.5], np.float32),
-    "x:v2d": np.array([1, 0.1]),
-    "x:v3i": np.array([1, -2, 3], np.int32),
-    "x:v3f": np.array([1, -2.5, 3], np.float32),
-    "x:v3d": np.array([1, 0.1, 0.3]),
-    "x:m33f": np.arange(9, dtype=np.float32).reshape(3, 3),
-    "x:m33d": np.arange(9).reshape(3, 3) / 10,
-    "worldToCamera": np.arange(16, dtype=np.float32).reshape(4, 4),
-    "x:m44d": np.arange(16).reshape(4, 4) / 10,
+    **{f"x:v{n}{code}": np.array([1, -2.5, 3], code)[:n] for n in (2, 3) for code in ("i4", "f4", "f8")},
+    **{f"x:m{n}{code}": (np.arange(n * n) / 10).reshape(n, n).astype(code) for n in (3, 4) for code in ("f4", "f8")},
     "framesPerSecond": Fraction(24000, 1001),
     "timeCode": OpenEXR.TimeCode(1, 2, 3, 4, 1, 0, 0, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8),
     "keyCode": OpenEXR.KeyCode(1, 2, 3, 4, 5, 4, 64),
@@ -58,9 +50,7 @@ ATTRIBUTES = {
     "view": "left",
     "pixelAspectRatio": 2.0,
     "screenWindowCenter": np.array([0.5, 0.25], np.float32),
-    "screenWindowWidth": 3.0,
     "adoptedNeutral": np.array([0.25, 0.5], np.float32),
-    "dwaCompressionLevel": 60.0,
     "a name of more than thirty-one characters": 1,
 }
 
@@ -72,11 +62,7 @@ def test_attributes_of_every_type_pass_through(tmp_path, name):
     assert name in old
     new = read_raw(write_exr(tmp_path / "b.exr", read_exr(source)))[0][1]
     del old["channels"], new["channels"]
-    assert repr(comparable_header(new)) == repr(comparable_header(old))
-
-
-def comparable_header(header):
-    return {name: comparable(value) for name, value in header.items()}
+    assert repr({n: comparable(value) for n, value in new.items()}) == repr({n: comparable(old[n]) for n in old})
 
 
 @pytest.mark.parametrize(
@@ -100,23 +86,28 @@ def test_attributes_are_stored_as_they_mean(tmp_path, value, stored):
     assert comparable(read_raw(path)[0][1]["x"]) == comparable(stored)
 
 
-UNSTORABLE = {
-    "numbers": [2**31, -(2**31) - 1, np.int64(2**40), 1e300, 1j, Fraction(2**31, 1), Fraction(1, 2**32), (1, 2**40)],
-    "lists": [[1.0, 1e300], [1, 2], ["a", 1.0]],
-    "arrays": [np.arange(4), np.zeros((2, 2)), np.zeros(3, np.float16), np.array(["a"])],
-    "others": [None, {}, b"a", object, OpenEXR.Rational(1, 2)],
-}
+UNSTORABLE = [
+    *(2**31, -(2**31) - 1, np.int64(2**40), 1e300, 1j, Fraction(2**31, 1), Fraction(1, 2**32), (1, 2**40)),
+    *([1.0, 1e300], [1, 2], ["a", 1.0], np.arange(4), np.zeros((2, 2)), np.zeros(3, np.float16), np.array(["a"])),
+    *(None, {}, b"a", object, OpenEXR.Rational(1, 2)),
+]
 
 
-@pytest.mark.parametrize("value", [value for values in UNSTORABLE.values() for value in values], ids=str)
+@pytest.mark.parametrize("value", UNSTORABLE, ids=str)
 def test_attributes_that_would_change_are_refused_by_name(tmp_path, value):
+    message = not_written(tmp_path, ExrPart("", {"my:value": value}, PIXELS))
+    assert "a.exr: attribute 'my:value' = " in message and "store it as a string" in message
+
+
+def not_written(folder, part):
+    """What is said of a part that cannot be written; no file is left."""
     with pytest.raises(NgptError) as caught:
-        write_exr(tmp_path / "a.exr", ExrImage([ExrPart("", {"my:value": value}, PIXELS)]))
-    assert "a.exr: attribute 'my:value' = " in str(caught.value) and "store it as a string" in str(caught.value)
-    assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
+        write_exr(folder / "a.exr", ExrImage([part]))
+    assert "\n" not in str(caught.value) and not list(folder.iterdir())
+    return str(caught.value)
 
 
-@pytest.mark.parametrize("layout", ["[::-1]", "[:, ::-1]", "[1:, 2:]", ".T", "[::2, ::3]"])
+@pytest.mark.parametrize("layout", ["[::-1]", "[1:, 2:]", ".T"])
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.uint32])
 def test_strided_arrays_are_not_written_as_garbage(tmp_path, layout, dtype):
     base = np.arange(80).reshape(8, 10).astype(dtype)
@@ -190,10 +181,8 @@ def test_parts_of_every_kind_keep_their_names_and_order(tmp_path):
     ],
 )
 def test_what_openexr_cannot_hold_leaves_no_file(tmp_path, part, expected):
-    with pytest.raises(NgptError) as caught:
-        write_exr(tmp_path / "a.exr", ExrImage([part]))
-    assert expected in str(caught.value) and str(tmp_path / "a.exr") in str(caught.value)
-    assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
+    message = not_written(tmp_path, part)
+    assert expected in message and str(tmp_path / "a.exr") in message
 
 
 def deep(path):
@@ -215,11 +204,9 @@ def subsampled(path):
         (lambda path: path.mkdir(), "is a directory"),
         (lambda path: path.touch(), "is empty"),
         (
-            lambda path: path.write_bytes(b"\x93NUMPY" + bytes(90)),
-            "not an OpenEXR file, nor PFM, Radiance HDR, PNG, TIFF or JPEG (it starts with b'\\x93NUM')",
+            lambda path: path.write_bytes(b"\x93NUMPY"),
+            "PFM, Radiance HDR, PNG, TIFF or JPEG (it starts with b'\\x93NUM')",
         ),
-        (lambda path: path.write_bytes(b"PF\n4 3\n-1.0\n" + bytes(144)), "not an OpenEXR file"),
-        (lambda path: path.write_bytes(b"#?RADIANCE\n"), "not an OpenEXR file"),
         (lambda path: path.write_bytes(b"\x76\x2f"), "not an OpenEXR file"),
         (lambda path: path.write_bytes(b"\x76\x2f\x31\x01\x02\0\0\0nonsense"), "its header ends early"),
         (deep, "part 0 is a deep image; flatten it first"),
@@ -240,7 +227,7 @@ def test_truncated_files_are_refused_wherever_they_end(tmp_path, capsys):
     whole = write_raw(tmp_path / "a.exr", (noisy, {}, "one"), (noisy, {}, "two")).read_bytes()
     assert len(read_exr(tmp_path / "a.exr").parts) == 2
     path = tmp_path / "b.exr"
-    for length in (*range(8, len(whole), len(whole) // 40), len(whole) - 1):
+    for length in (*range(8, len(whole), len(whole) // 20), len(whole) - 1):
         path.write_bytes(whole[:length])
         with pytest.raises(NgptError) as caught:
             read_exr(path)
@@ -249,28 +236,20 @@ def test_truncated_files_are_refused_wherever_they_end(tmp_path, capsys):
     assert capsys.readouterr().out == ""
 
 
-# Threads
-
-
 def test_threads_of_openexr_end_with_the_call_and_the_caller_s_number_stays(tmp_path):
     image = ExrImage([ExrPart("", {}, {name: np.ones((40, 30), np.float32) for name in "RGB"})])
+    half, data = tmp_path / "half.exr", write_exr(tmp_path / "a.exr", image).read_bytes()
+    half.write_bytes(data[: len(data) // 2])
     for count in (0, 1):
         OpenEXR.set_global_thread_count(count)
         try:
             write_exr(tmp_path / "a.exr", image, overwrite=True)
             read_exr(tmp_path / "a.exr")
             with pytest.raises(NgptError):
-                read_exr(damaged(tmp_path / "a.exr"))
+                read_exr(half)
             assert OpenEXR.global_thread_count() == count
         finally:
             OpenEXR.set_global_thread_count(0)
-
-
-def damaged(path):
-    """A copy whose last half is missing."""
-    copy = path.with_name("damaged.exr")
-    copy.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    return copy
 
 
 def test_a_stale_chunk_count_is_not_written(tmp_path):

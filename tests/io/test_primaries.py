@@ -5,13 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from ngpt.cli import main
 from ngpt.io.exr import read, read_image, write
 from ngpt.io.primaries import ACES_AP0, ACES_AP1, REC709, REC2020, converted, inside_rec709, to_rec709
 from ngpt.methods import METHODS, reconstruct
 from ngpt.stack import GradientStack
-
-OTHERS = {"AP0": ACES_AP0, "AP1": ACES_AP1, "Rec.2020": REC2020}
 
 
 def of(primaries, image, **layers):
@@ -44,20 +41,14 @@ def test_what_says_nothing_or_nonsense_is_left_as_it_is(caplog):
     assert to_rec709({}) is None and to_rec709({"chromaticities": REC709}) is None
     assert to_rec709({"chromaticities": tuple(np.float32(REC709))}) is None
     assert not caplog.records
-    for wrong in (
-        (1, 2, 3),
-        "sRGB",
-        (np.nan,) * 8,
-        (0.3,) * 8,
-        (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3, 0.0),
-        (3e38,) * 8,
-    ):
+    flat = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3, 0.0)
+    for wrong in ((1, 2, 3), "sRGB", (np.nan,) * 8, (0.3,) * 8, flat, (3e38,) * 8):
         assert to_rec709({"chromaticities": wrong}) is None
         assert "left out of account" in caplog.text
         caplog.clear()
 
 
-@pytest.mark.parametrize("primaries", OTHERS.values(), ids=OTHERS)
+@pytest.mark.parametrize("primaries", [ACES_AP0, REC2020])
 def test_a_result_is_in_the_primaries_of_its_file(tmp_path, image, primaries):
     write(tmp_path / "stack.exr", of(primaries, image, albedo=image))
     stack = read(tmp_path / "stack.exr")
@@ -71,13 +62,11 @@ def test_a_result_is_in_the_primaries_of_its_file(tmp_path, image, primaries):
     np.testing.assert_allclose(read_image(tmp_path / "result.exr"), image, atol=2e-6)
 
 
-@pytest.mark.parametrize("primaries", OTHERS.values(), ids=OTHERS)
+@pytest.mark.parametrize("primaries", [ACES_AP0, REC2020])
 def test_oidn_sees_rec709_and_gives_back_what_it_was_given(image, primaries):
     if METHODS["oidn"].missing():
         pytest.skip("OIDN is not installed")
-    plain = GradientStack.from_arrays(primal=image)
-    other = of(primaries, image)
-    assert inside_rec709(other) is not None
+    plain, other = GradientStack.from_arrays(primal=image), of(primaries, image)
     found = converted(reconstruct(other, "oidn").image, to_rec709(other.attributes))
     np.testing.assert_allclose(found, reconstruct(plain, "oidn").image, rtol=0.02, atol=1e-3)
     # Colours that Rec. 709 does not have stay: there they would have lost their negative component.
@@ -88,25 +77,10 @@ def test_oidn_sees_rec709_and_gives_back_what_it_was_given(image, primaries):
     assert result[..., 1].mean() == pytest.approx(0.8, rel=0.02) and np.abs(result[..., [0, 2]]).max() < 0.02
 
 
-@pytest.mark.parametrize("method", ["l1", "oidn"])
-def test_a_file_without_the_attribute_is_as_before_to_the_bit(image, method):
-    if METHODS[method].missing():
-        pytest.skip(METHODS[method].missing())
-    layers = {"primal": image, "dx": image * 0, "dy": image * 0}
-    results = [
-        reconstruct(GradientStack.from_arrays(**layers, attributes=attributes), method).image
-        for attributes in ({}, {"chromaticities": REC709})
-    ]
-    assert np.array_equal(*results)
-
-
-def test_files_of_different_primaries_are_compared_by_their_light(tmp_path, image, capfd):
+def test_files_of_different_primaries_are_compared_by_their_light(tmp_path, image, command):
     write(tmp_path / "a.exr", of(ACES_AP0, image))
     write(tmp_path / "b.exr", image)
-    a, b = str(tmp_path / "a.exr"), str(tmp_path / "b.exr")
-    assert main(["diff", a, b]) == 0
-    capfd.readouterr()
-    words = ["denoise", a, "-m", "primal", "--ref", b, "-o", str(tmp_path / "c.exr"), "--json"]
-    assert main(words) == 0
-    assert json.loads(capfd.readouterr().out)["files"][0]["metrics"]["relMSE"] < 1e-9
-    assert main(["diff", str(tmp_path / "c.exr"), b]) == 0
+    command("diff a.exr b.exr")
+    report = json.loads(command("denoise a.exr -m primal --ref b.exr -o c.exr --json").out)
+    assert report["files"][0]["metrics"]["relMSE"] < 1e-9
+    command("diff c.exr b.exr")

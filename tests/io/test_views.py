@@ -23,6 +23,10 @@ def channels(name, views=("left", "right"), layers=LAYERS):
     return {name(v, k, c): value(v, k, c) for v in views for k, suffixes in layers.items() for c in suffixes}
 
 
+def held_in(path):
+    return {(name, c): pixels for name, _, parts in read_raw(path) for c, pixels in parts.items()}
+
+
 def bare(layer, suffix):
     return suffix if layer == "Combined" else f"{layer}.{suffix}"
 
@@ -60,17 +64,14 @@ def held(stack):
 
 
 def expected(view):
-    def pixel(layer, suffixes):
-        return tuple(float(value(view, layer, c)[0, 0]) for c in suffixes)
-
-    x, y = pixel("Vector", "XY")
-    return {
-        "primal": pixel("Combined", "RGB"),
-        "albedo": pixel("Denoising Albedo", "RGB"),
-        "depth": pixel("Depth", "Z"),
-        "motion": (x, -y),
-        "alpha": pixel("Combined", "A"),
-    }
+    layers = {"primal": "Combined.RGB", "albedo": "Denoising Albedo.RGB", "depth": "Depth.Z", "motion": "Vector.XY"}
+    pixels = {}
+    for name, (layer, suffixes) in {
+        name: of.split(".") for name, of in (layers | {"alpha": "Combined.A"}).items()
+    }.items():
+        pixels[name] = tuple(float(value(view, layer, c)[0, 0]) for c in suffixes)
+    x, y = pixels["motion"]
+    return pixels | {"motion": (x, -y)}
 
 
 def test_one_view_of_several_is_told(source, caplog):
@@ -104,9 +105,8 @@ def test_results_keep_the_layout_and_the_inputs(source, tmp_path):
         assert [held(stack) for stack in after] == [expected("left"), expected("right")]
         assert (read_image(path) == first).all()
         assert (read_image(path, view="right") == first + 1).all() and (read_image(path, view="left") == first).all()
-        held_before = {(name, c) for name, _, parts in read_raw(source) for c in parts}
-        found = {(name, c): pixels for name, _, parts in read_raw(path) for c, pixels in parts.items()}
-        assert held_before <= set(found)
+        found = held_in(path)
+        assert set(held_in(source)) <= set(found) and {"R", "primal.R"} <= {c for _, c in found}
         # Nothing shows noise any more but what is called primal, in the type it had.
         noisy = {float(value(v, "Combined", c)[0, 0]) for v in ("left", "right") for c in "RGB"}
         kept = [c for (_, c), pixels in found.items() if float(pixels[0, 0]) in noisy]
@@ -121,8 +121,7 @@ def test_results_keep_the_layout_and_the_inputs(source, tmp_path):
 def test_one_view_is_written_and_the_other_stays(source, tmp_path):
     right = read(source, view="right")
     path = write(tmp_path / "right.exr", np.full((*SIZE, 3), 5, np.float32), like=right)
-    before = {(name, c): pixels for name, _, parts in read_raw(source) for c, pixels in parts.items()}
-    after = {(name, c): pixels for name, _, parts in read_raw(path) for c, pixels in parts.items()}
+    before, after = held_in(source), held_in(path)
     changed = {key for key in before if not same_bits(before[key], after[key])}
     assert held(read(path)) == expected("left") and held(read(path, view="right")) == expected("right")
     assert len(changed) == 3 and all((after[key] == 5).all() for key in changed)

@@ -15,37 +15,33 @@ from ngpt.io.whole import finished
 PIXELS = np.random.default_rng(3).random((70, 50)).astype(np.float32)
 
 
-def tiles(across, down):
-    described = OpenEXR.TileDescription()
-    described.xSize, described.ySize = across, down
-    return described
+def parts(path, *sizes):
+    """Parts of lines, 0, or of tiles of so many pixels."""
+    made = []
+    for i, size in enumerate(sizes):
+        described = OpenEXR.TileDescription()
+        described.xSize, described.ySize = size, 2 * size
+        header = {"type": OpenEXR.tiledimage, "tiles": described} if size else {}
+        made.append(({"Y": PIXELS}, header, "ab"[i] if len(sizes) > 1 else ""))
+    write_raw(path, *made)
 
 
-def scanlines(path):
-    ngpt.write(path, full_stack(40, 50, seed=1))
+MAKERS = {
+    "lines": lambda path: ngpt.write(path, full_stack(40, 50, seed=1)),
+    "tiles": lambda path: parts(path, 16),
+    "parts": lambda path: parts(path, 0, 16),
+    "levels": lambda path: write_levels(path, np.ones((4, 4, 3)), rip=False),
+}
 
 
-def tiled(path):
-    write_raw(path, ({"Y": PIXELS}, {"type": OpenEXR.tiledimage, "tiles": tiles(16, 32)}))
-
-
-def parts(path):
-    second = {"type": OpenEXR.tiledimage, "tiles": tiles(16, 16)}
-    write_raw(path, ({"Y": PIXELS}, {}, "a"), ({"Y": PIXELS}, second, "b"))
-
-
-def levels(path):
-    write_levels(path, np.ones((4, 4, 3)), rip=False)
-
-
-@pytest.mark.parametrize("make", [scanlines, tiled, parts, levels])
+@pytest.mark.parametrize("make", MAKERS)
 def test_a_file_is_finished_and_no_beginning_of_it_is(tmp_path, make):
     path = tmp_path / "a.exr"
-    make(path)
+    MAKERS[make](path)
     assert finished(path)
     data = path.read_bytes()
     # The smaller levels, which nobody reads, may be cut.
-    least = 0.8 if make is levels else 1.0
+    least = 0.8 if make == "levels" else 1.0
     for size in [0, 3, 8, *np.linspace(9, least * len(data) - 1, 60).astype(int)]:
         path.write_bytes(data[:size])
         assert not finished(path), f"{size} of {len(data)} bytes"
@@ -55,7 +51,7 @@ def test_a_file_is_finished_and_no_beginning_of_it_is(tmp_path, make):
 
 def test_a_table_that_was_never_filled_in_is_seen(tmp_path):
     path = tmp_path / "a.exr"
-    scanlines(path)
+    MAKERS["lines"](path)
     data = bytearray(path.read_bytes())
     with open(path, "rb") as file:
         (part,) = read_headers(file, "a")
