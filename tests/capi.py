@@ -114,6 +114,9 @@ class Network:
 
     def close(self):
         self.library.ngpt_close(self.handle)
+        self.handle = None
+
+    __del__ = close
 
 
 def place(array) -> tuple:
@@ -131,28 +134,33 @@ class Job:
         self.image = np.full((self.height, self.width, 3), -7, np.float32) if image is None else image
         self.handle = self.library.ngpt_job_new(network.handle)
         for name, layer in layers.items():
-            assert self.library.ngpt_set_layer(self.handle, name.encode(), *place(layer)) == OK, self.message()
-        assert self.library.ngpt_set_output(self.handle, b"image", *place(self.image)) == OK
+            assert self.set_layer(name, *place(layer)) == OK, self.message()
+        assert self.set_output("image", *place(self.image)) == OK
+
+    def set_layer(self, name, *where):
+        return self.library.ngpt_set_layer(self.handle, name.encode(), *where)
+
+    def set_output(self, name, *where):
+        return self.library.ngpt_set_output(self.handle, name.encode(), *where)
 
     def message(self):
         return self.library.ngpt_message(self.handle).decode()
 
-    def run(self, memory=0, progress=None):
+    def run(self, memory=0, progress=None, size=None):
         function = PROGRESS(lambda _, fraction: progress(fraction)) if progress else PROGRESS()
-        return self.library.ngpt_run(self.handle, self.width, self.height, memory, function, None)
+        return self.library.ngpt_run(self.handle, *(size or (self.width, self.height)), memory, function, None)
 
-    def free(self):
+    def prepare(self, size=None):
+        return self.library.ngpt_prepare(self.handle, *(size or (self.width, self.height)), PROGRESS(), None)
+
+    def __del__(self):
         self.library.ngpt_job_free(self.handle)
 
 
 def result(network, layers, memory=0, image=None, progress=None) -> np.ndarray:
     job = Job(network, layers, image)
-    try:
-        assert job.run(memory, progress) == OK, job.message()
-        assert job.message() == ""
-        return job.image
-    finally:
-        job.free()
+    assert job.run(memory, progress) == OK and job.message() == "", job.message()
+    return job.image
 
 
 def example(height=23, width=29) -> dict[str, np.ndarray]:

@@ -9,13 +9,13 @@ from ngpt.classical.gradients import forward_differences
 from ngpt.classical.poisson import l1, l2
 from ngpt.classical.weighted import wl2
 
-# Every method as f(primal, dx, dy, variances).
+# Every method as f(primal, dx, dy, variances, trusted).
 METHODS = {
-    "l2": lambda p, x, y, v: l2(p, x, y),
-    "l1": lambda p, x, y, v: l1(p, x, y),
-    "cv": lambda p, x, y, v: cv(p, x, y),
-    "wcv": lambda p, x, y, v: wcv(p, x, y, *v),
-    "wl2": lambda p, x, y, v: wl2(p, x, y, *v),
+    "l2": lambda p, x, y, v, t=None: l2(p, x, y, trusted=t),
+    "l1": lambda p, x, y, v, t=None: l1(p, x, y, trusted=t),
+    "cv": lambda p, x, y, v, t=None: cv(p, x, y, t),
+    "wcv": lambda p, x, y, v, t=None: wcv(p, x, y, *v, t),
+    "wl2": lambda p, x, y, v, t=None: wl2(p, x, y, *v, t),
 }
 
 
@@ -41,41 +41,36 @@ def operator(height, width, alpha):
     def difference(n):
         return diags([-np.ones(n - 1), np.ones(n - 1)], [0, 1], shape=(n - 1, n))
 
-    return vstack(
-        [
-            alpha * eye(height * width),
-            kron(eye(height), difference(width)),
-            kron(difference(height), eye(width)),
-        ]
-    ).tocsc()
+    right, down = kron(eye(height), difference(width)), kron(difference(height), eye(width))
+    return vstack([alpha * eye(height * width), right, down]).tocsc()
 
 
-def right_hand_side(primal, dx, dy, alpha):
+def residual(image, primal, dx, dy, alpha):
+    """K I - b, one row for each equation."""
     channels = primal.shape[-1]
-    parts = (alpha * primal, dx[:, :-1], dy[:-1])
-    return np.concatenate([part.reshape(-1, channels) for part in parts]).astype(np.float64)
+    b = np.concatenate([part.reshape(-1, channels) for part in (alpha * primal, dx[:, :-1], dy[:-1])])
+    return operator(*primal.shape[:2], alpha) @ image.reshape(-1, channels).astype(np.float64) - b
 
 
 def solve_sparse(primal, dx, dy, alpha, weights=None):
     """argmin |W^1/2 (K I - b)|² by a sparse factorisation in double precision."""
     K = operator(*primal.shape[:2], alpha)
     W = diags(np.ones(K.shape[0]) if weights is None else weights)
-    b = right_hand_side(primal, dx, dy, alpha)
+    b = -residual(np.zeros_like(primal), primal, dx, dy, alpha)
     return splu((K.T @ W @ K).tocsc()).solve(K.T @ (W @ b)).reshape(primal.shape)
 
 
-def energy(image, primal, dx, dy, alpha):
-    """Σ of the colour norms of K I - b: what l1 minimises."""
-    residual = operator(*primal.shape[:2], alpha) @ image.reshape(-1, primal.shape[-1]).astype(np.float64)
-    return np.linalg.norm(residual - right_hand_side(primal, dx, dy, alpha), axis=1).sum()
+def energy(*data):
+    """Σ of the colour norms of K I - b: what l1 minimises; arguments as of ``residual``."""
+    return np.linalg.norm(residual(*data), axis=1).sum()
 
 
 def l1_by_irls(primal, dx, dy, alpha, steps=60, regulariser=0.3, shrink=0.75):
     """The l1 image by iteratively reweighted least squares, every step solved exactly: slow and independent of ADMM."""
-    K, b = operator(*primal.shape[:2], alpha), right_hand_side(primal, dx, dy, alpha)
-    image = solve_sparse(primal, dx, dy, alpha)
-    scale = np.linalg.norm(K @ image.reshape(-1, primal.shape[-1]) - b, axis=1).mean()
+    data = primal, dx, dy, alpha
+    image = solve_sparse(*data)
+    scale = np.linalg.norm(residual(image, *data), axis=1).mean()
     for step in range(steps):
-        norms = np.linalg.norm(K @ image.reshape(-1, primal.shape[-1]) - b, axis=1)
-        image = solve_sparse(primal, dx, dy, alpha, 1 / np.hypot(norms, scale * max(regulariser * shrink**step, 1e-6)))
+        norms = np.linalg.norm(residual(image, *data), axis=1)
+        image = solve_sparse(*data, 1 / np.hypot(norms, scale * max(regulariser * shrink**step, 1e-6)))
     return image

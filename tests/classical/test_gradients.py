@@ -20,11 +20,3 @@ def test_adjoint(rng, shape):
     dx[:, -1], dy[-1] = np.nan, np.nan  # stand for no difference, and must not be looked at
     expected = np.sum(gx[:, :-1] * dx[:, :-1]) + np.sum(gy[:-1] * dy[:-1])
     assert np.sum(image * adjoint_differences(dx, dy)) == pytest.approx(expected, abs=1e-12)
-
-
-def test_mirroring_negates_and_moves_dx(rng):
-    image = rng.normal(size=(4, 6, 3))
-    dx, dy = forward_differences(image)
-    mirrored_dx, mirrored_dy = forward_differences(image[:, ::-1])
-    assert np.allclose(mirrored_dx[:, :-1], -dx[:, -2::-1])
-    assert np.allclose(mirrored_dy, dy[:, ::-1])

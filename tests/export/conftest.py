@@ -16,13 +16,9 @@ def library(prefix):
 
 @pytest.fixture(scope="session")
 def fast(library):
-    network = Network(library)
-    yield network
-    network.close()
+    return Network(library)
 
 
 @pytest.fixture(scope="session")
 def primal(library):
-    network = Network(library, PRIMAL)
-    yield network
-    network.close()
+    return Network(library, PRIMAL)

@@ -2,23 +2,7 @@
 
 import numpy as np
 import pytest
-from capi import (
-    FAST,
-    MISSING_LAYER,
-    OK,
-    PRIMAL,
-    PROGRESS,
-    WEIGHTS,
-    Job,
-    Network,
-    agree,
-    example,
-    in_python,
-    place,
-    result,
-    those,
-)
-from hosts import VECTOR, read_layers
+from capi import MISSING_LAYER, OK, PRIMAL, WEIGHTS, Job, Network, agree, example, in_python, place, result, those
 
 from ngpt.denoisers import caustic
 from ngpt.methods import reconstruct
@@ -26,42 +10,24 @@ from ngpt.network.inputs import DENOISED, Oidn, base_image, denoised
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 
-# --- what it makes ---------------------------------------------------------------------------------------------------
-
 
 @pytest.mark.parametrize("path", sorted(WEIGHTS.glob("ngpt-*[a-z].onnx")), ids=lambda path: path.stem)
-def test_networks_agree_with_python(library, path):
-    if path.stem.endswith(".statistics"):
-        return
-    network = Network(library, path)
-    layers = those(network, example())
-    agree(result(network, layers), in_python(path, layers))
-    network.close()
+@pytest.mark.parametrize("size", [(23, 29), (1, 1), (1, 40), (17, 1), (16, 16)])
+def test_networks_agree_with_python(library, path, size):
+    if not path.stem.endswith(".statistics"):
+        network = Network(library, path)
+        layers = those(network, example(*size))
+        agree(result(network, layers), in_python(path, layers))
 
 
 def stack_of(layers) -> GradientStack:
     return GradientStack.from_arrays(**{name: layer for name, layer in layers.items() if "denoised" not in name})
 
 
-def test_the_vector(fast):
-    layers = {name: np.moveaxis(layer[0], 0, -1) for name, layer in read_layers(VECTOR).items()}
-    agree(result(fast, those(fast, layers)), layers["image"])
-
-
 @pytest.mark.parametrize("memory", [0, 115])
 def test_it_gives_the_pixels_of_denoise(fast, memory):
     layers = example(100, 400)
     agree(result(fast, those(fast, layers), memory), reconstruct(stack_of(layers), "ngpt-fast").image)
-
-
-def test_a_rendered_stack(renderer, fast):
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
-
-    stack = render_stack(load_scene("diffuse", (96, 72)), 8)
-    assert stack["direct"].any()
-    layers = {name: stack[name] for name in fast.names if name in stack}
-    agree(result(fast, layers), reconstruct(stack, "ngpt-fast").image)
 
 
 def test_a_network_that_corrects_another_denoiser(library):
@@ -76,9 +42,9 @@ def test_a_network_that_corrects_another_denoiser(library):
     job = Job(network, those(network, layers))
     images = {name: np.zeros_like(image) for name, image in expected.items()}
     for name, image in images.items():
-        assert library.ngpt_set_output(job.handle, name.encode(), *place(image)) == OK, job.message()
+        assert job.set_output(name, *place(image)) == OK, job.message()
     assert job.run() == MISSING_LAYER and "denoised, denoised_base" in job.message()
-    assert library.ngpt_prepare(job.handle, 150, 60, PROGRESS(), None) == OK, job.message()
+    assert job.prepare() == OK, job.message()
     assert np.allclose(images["oidn_caustic"], expected.pop("oidn_caustic"), rtol=1e-5, atol=1e-6)
     for name, image in expected.items():
         agree(images[name], image)
@@ -86,20 +52,11 @@ def test_a_network_that_corrects_another_denoiser(library):
     other |= {"base": images["oidn_base"], "denoised_caustic": np.zeros_like(data.caustic)}
     other["denoised_caustic"][::2, ::2] = caustic.of_half_size(data)
     for name, image in other.items():
-        assert library.ngpt_set_layer(job.handle, name.encode(), *place(image)) == OK, job.message()
+        assert job.set_layer(name, *place(image)) == OK, job.message()
     expected_image = reconstruct(stack_of(layers), "ngpt-combine").image
     for memory in (0, 60):
         assert job.run(memory) == OK, job.message()
         agree(job.image, expected_image)
-    job.free()
-    network.close()
-
-
-def test_tiles_agree_with_the_whole(fast):
-    layers, fractions = those(fast, example(23, 700)), []
-    tiled = result(fast, layers, 30, progress=lambda fraction: fractions.append(fraction) or 0)
-    assert len(set(fractions)) > 2 and (fractions[0], fractions[-1]) == (0, 1)
-    agree(tiled, result(fast, layers))
 
 
 def test_the_tiles_are_those_of_python(primal):
@@ -109,15 +66,10 @@ def test_the_tiles_are_those_of_python(primal):
     # What two thirds of the image take
     memory = 2 * 200 * 900 * python.bytes // (3 * 2**20)
     layers, fractions = those(primal, example(200, 900)), []
-    result(primal, layers, memory, progress=lambda fraction: fractions.append(fraction) or 0)
-    tiles, _ = python.plan(200, 900, memory)
-    assert len(set(fractions)) == len(tiles) + 1 > 2
-
-
-def test_sizes_from_one_pixel(fast):
-    for height, width in ((1, 1), (1, 40), (17, 1), (16, 16)):
-        layers = those(fast, example(height, width))
-        agree(result(fast, layers), in_python(FAST, layers))
+    tiled = result(primal, layers, memory, progress=lambda fraction: fractions.append(fraction) or 0)
+    assert len(set(fractions)) == len(python.plan(200, 900, memory)[0]) + 1 > 2
+    assert (fractions[0], fractions[-1]) == (0, 1) and fractions == sorted(fractions)
+    agree(tiled, result(primal, layers))
 
 
 # --- where pixels lie ------------------------------------------------------------------------------------------------
@@ -148,13 +100,13 @@ LAYOUTS = {
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-def test_layouts_give_the_same(fast, layout):
-    layers = those(fast, example())
-    expected = result(fast, layers)
+def test_layouts_give_the_same(primal, layout):
+    layers = those(primal, example())
+    expected = result(primal, layers)
     before = {name: layout(layer) for name, layer in layers.items()}
     given = {name: layer.copy() for name, layer in before.items()}
     image = layout(np.full(expected.shape, 7, np.float32))
-    np.testing.assert_array_equal(result(fast, before, image=image)[..., :3], expected)
+    np.testing.assert_array_equal(result(primal, before, image=image)[..., :3], expected)
     assert (image[..., 3:] == 99).all()
     for name in given:
         np.testing.assert_array_equal(before[name], given[name])

@@ -28,8 +28,6 @@ from capi import (
 
 import ngpt
 
-# --- what is wrong ---------------------------------------------------------------------------------------------------
-
 
 def test_null_everywhere(library, fast):
     message = ctypes.create_string_buffer(64)
@@ -41,29 +39,16 @@ def test_null_everywhere(library, fast):
     assert library.ngpt_layer_channels(None, 0) == 0 and library.ngpt_layer_required(None, 0) == 0
     assert library.ngpt_metadata(None, b"ngpt.method") is None and library.ngpt_metadata(fast.handle, None) is None
     assert library.ngpt_job_new(None) is None and library.ngpt_message(None)
-    assert library.ngpt_set_layer(None, b"primal", None, 0, 3, 0, 0, 0) == BAD_ARGUMENT
-    assert library.ngpt_set_output(None, b"image", None, 0, 3, 0, 0, 0) == BAD_ARGUMENT
+    job = Job(fast, those(fast, example()))
+    for handle, name in ((None, b"primal"), (job.handle, None)):
+        assert library.ngpt_set_layer(handle, name, message, 0, 3, 0, 0, 0) == BAD_ARGUMENT
+        assert library.ngpt_set_output(handle, name, message, 0, 3, 0, 0, 0) == BAD_ARGUMENT
     assert library.ngpt_run(None, 1, 1, 0, PROGRESS(), None) == BAD_ARGUMENT
-    job = library.ngpt_job_new(fast.handle)
-    assert library.ngpt_set_layer(job, None, message, 0, 3, 0, 0, 0) == BAD_ARGUMENT
-    assert library.ngpt_set_output(job, None, message, 0, 3, 0, 0, 0) == BAD_ARGUMENT
     assert library.ngpt_prepare(None, 1, 1, PROGRESS(), None) == BAD_ARGUMENT
-    library.ngpt_job_free(job)
 
 
 def test_the_network_is_described(library, fast, primal):
-    assert fast.names[:10] == [
-        "primal",
-        "direct",
-        "dx",
-        "dy",
-        "albedo",
-        "normal",
-        "depth",
-        "primal_var",
-        "dx_var",
-        "dy_var",
-    ]
+    assert " ".join(fast.names[:10]) == "primal direct dx dy albedo normal depth primal_var dx_var dy_var"
     about = {
         name: (library.ngpt_layer_channels(fast.handle, i), library.ngpt_layer_required(fast.handle, i))
         for i, name in enumerate(fast.names)
@@ -80,94 +65,100 @@ def test_the_network_is_described(library, fast, primal):
     assert library.ngpt_abi() == int(re.search(r"define NGPT_ABI (\d+)", HEADER.read_text())[1])
 
 
+# A call of a job with the place of a layer of three channels, of one -> status, words
+REFUSALS = {
+    "unknown layer": (lambda j, at, _: j.set_layer("beauty", *at), BAD_ARGUMENT, "'beauty'; it reads primal, d"),
+    "unknown output": (lambda j, at, _: j.set_output("oidn", *at), BAD_ARGUMENT, "no 'oidn'; it makes image$"),
+    "long name": (lambda j, at, _: j.set_layer("x" * 9999, *at), BAD_ARGUMENT, "xxx"),
+    "statistics": (lambda j, at, _: j.set_layer("statistics", *at), BAD_ARGUMENT, "statistics"),
+    "channels": (lambda j, _, one: j.set_layer("albedo", *one), BAD_ARGUMENT, "albedo: has 1 .* have 3"),
+    "many channels": (
+        lambda j, at, _: j.set_layer("albedo", at[0], 0, 2**31 - 1, 0, 0, 0),
+        BAD_ARGUMENT,
+        "65536 at most",
+    ),
+    "format": (lambda j, at, _: j.set_layer("albedo", at[0], 5, *at[2:]), BAD_ARGUMENT, "format is 5"),
+    "output": (lambda j, at, _: j.set_output("image", at[0], 0, 2, 0, 0, 0), BAD_ARGUMENT, "image: has 2"),
+    "no pixels": (lambda j, *_: j.run(size=(0, 5)), BAD_ARGUMENT, "0x5 .* 65536"),
+    "negative size": (lambda j, *_: j.run(size=(5, -1)), BAD_ARGUMENT, "5x-1 .* 65536"),
+    "large size": (lambda j, *_: j.prepare(size=(65537, 1)), BAD_ARGUMENT, "65537x1 .* 65536"),
+    "memory": (lambda j, *_: j.run(-3), BAD_ARGUMENT, "-3 MiB"),
+    "missing layers": (
+        lambda j, *_: [j.set_layer(name, None, 0, 3, 0, 0, 0) for name in ("dx", "depth")] and j.run(),
+        MISSING_LAYER,
+        "needs the layers dx, depth",
+    ),
+    "missing output": (
+        lambda j, *_: j.set_output("image", None, 0, 3, 0, 0, 0) or j.run(),
+        MISSING_LAYER,
+        "'image' is not set",
+    ),
+}
+
+
 def refused(status, expected, job, words):
     assert status == expected, job.message()
     assert re.search(words, job.message()) and "\n" not in job.message()
     assert (job.image == -7).all()
 
 
-def test_what_a_job_refuses(library, fast):
+@pytest.mark.parametrize(("call", "status", "words"), REFUSALS.values(), ids=REFUSALS)
+def test_what_a_job_refuses(fast, call, status, words):
     layers = those(fast, example())
-    job, primal = Job(fast, layers), place(layers["primal"])
-    handle = job.handle
-    refused(library.ngpt_set_layer(handle, b"beauty", *primal), BAD_ARGUMENT, job, "'beauty'; it reads primal, d")
-    refused(library.ngpt_set_output(handle, b"oidn", *primal), BAD_ARGUMENT, job, "no 'oidn'; it makes image$")
-    refused(library.ngpt_set_layer(handle, b"x" * 9999, *primal), BAD_ARGUMENT, job, "xxx")
-    refused(library.ngpt_set_layer(handle, b"statistics", *primal), BAD_ARGUMENT, job, "statistics")
-    refused(
-        library.ngpt_set_layer(handle, b"albedo", *place(layers["depth"])), BAD_ARGUMENT, job, "albedo: has 1 .* have 3"
-    )
-    refused(library.ngpt_set_layer(handle, b"albedo", primal[0], 5, *primal[2:]), BAD_ARGUMENT, job, "format is 5")
-    refused(library.ngpt_set_output(handle, b"image", primal[0], 0, 2, 0, 0, 0), BAD_ARGUMENT, job, "image: has 2")
-    for size in ((0, 5), (5, -1), (65537, 1)):
-        refused(
-            library.ngpt_run(handle, *size, 0, PROGRESS(), None), BAD_ARGUMENT, job, f"{size[0]}x{size[1]} .* 65536"
-        )
-    refused(library.ngpt_run(handle, 29, 23, -3, PROGRESS(), None), BAD_ARGUMENT, job, "-3 MiB")
-    assert job.run() == OK and job.message() == ""
-    job.free()
-
-
-def test_what_is_missing(library, fast):
-    layers = those(fast, example())
-    job = Job(fast, {name: layer for name, layer in layers.items() if name not in ("dx", "depth")})
-    refused(job.run(), MISSING_LAYER, job, "needs the layers dx, depth")
-    job.free()
     job = Job(fast, layers)
-    assert library.ngpt_set_output(job.handle, b"image", None, 0, 3, 0, 0, 0) == OK
-    refused(job.run(), MISSING_LAYER, job, "'image' is not set")
-    job.free()
+    refused(call(job, place(layers["primal"]), place(layers["depth"])), status, job, words)
+    for name, layer in layers.items():
+        assert job.set_layer(name, *place(layer)) == OK
+    assert job.set_output("image", *place(job.image)) == OK
+    assert job.run() == OK and job.message() == ""
 
 
-def test_damaged_networks(library, tmp_path):
-    data = FAST.read_bytes()
-    wrong = {
-        "none": None,
-        "empty": b"",
-        "text": b"not a network",
-        "cut": data[: len(data) // 2],
-        "head": data[:100],
-        "statistics": FAST.with_suffix(".statistics.onnx").read_bytes(),
-        "alignment": data.replace(b"ngpt.alignment\x12\x0216", b"ngpt.alignment\x12\x02-8"),
-        "layers": data.replace(b"dx, dy, albedo", b"dx, dy, albino"),
-        "fewer": data.replace(b", depth, primal_var", b", dx_var, dy_var  "),
-        "metadata": data.replace(b"ngpt.inputs", b"ngpt.outputs"[:11]),
-    }
-    for name, content in wrong.items():
-        path = tmp_path / f"{name}.onnx"
-        if content is not None:
-            path.write_bytes(content)
-        network = Network(library, path)
-        assert network.handle is None and network.message.startswith(str(path)), (name, network.message)
-        assert "\n" not in network.message
+DATA = FAST.read_bytes()
+DAMAGED = {
+    "none": None,
+    "empty": b"",
+    "text": b"not a network",
+    "cut": DATA[: len(DATA) // 2],
+    "head": DATA[:100],
+    "statistics": FAST.with_suffix(".statistics.onnx").read_bytes(),
+    "alignment": DATA.replace(b"ngpt.alignment\x12\x0216", b"ngpt.alignment\x12\x02-8"),
+    "layers": DATA.replace(b"dx, dy, albedo", b"dx, dy, albino"),
+    "fewer": DATA.replace(b", depth, primal_var", b", dx_var, dy_var  "),
+    "metadata": DATA.replace(b"ngpt.inputs", b"ngpt.outputs"[:11]),
+}
+
+
+@pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)
+def test_damaged_networks(library, tmp_path, content):
+    path = tmp_path / "network.onnx"
+    if content is not None:
+        path.write_bytes(content)
+    network = Network(library, path)
+    assert network.handle is None and network.message.startswith(str(path)) and "\n" not in network.message
+
+
+def test_networks_with_random_bytes(library, tmp_path):
     rng = np.random.default_rng(5)
     for _ in range(20):
-        bytes_ = np.frombuffer(data, np.uint8).copy()
-        bytes_[rng.integers(0, len(data), 50)] = rng.integers(0, 256, 50)
-        (tmp_path / "mutant.onnx").write_bytes(bytes_.tobytes())
+        damaged = np.frombuffer(DATA, np.uint8).copy()
+        damaged[rng.integers(0, len(DATA), 50)] = rng.integers(0, 256, 50)
+        (tmp_path / "mutant.onnx").write_bytes(damaged.tobytes())
         network = Network(library, tmp_path / "mutant.onnx")
         assert (network.handle is None) == bool(network.message)
-        network.close()
-    assert Network(library, FAST, threads=-1).message == "the number of threads is -1; it must be 0 to 1024"
 
 
-def test_tiles_need_the_statistics(library, tmp_path):
+def test_tiles_need_the_statistics_of_their_network(library, tmp_path):
     alone = tmp_path / "ngpt-fast.onnx"
     shutil.copy(FAST, alone)
     network = Network(library, alone)
     job = Job(network, those(network, example(23, 700)))
     refused(job.run(30), BAD_NETWORK, job, "ngpt-fast.statistics.onnx: cannot be read.* tiles .*need it")
     assert job.run() == OK
-    job.free()
-    network.close()
-    other = WEIGHTS / "ngpt-fast.statistics.onnx"
     shutil.copy(PRIMAL, tmp_path / "other.onnx")
-    shutil.copy(other, tmp_path / "other.statistics.onnx")
+    shutil.copy(WEIGHTS / "ngpt-fast.statistics.onnx", tmp_path / "other.statistics.onnx")
     network = Network(library, tmp_path / "other.onnx")
     job = Job(network, those(network, example(400, 900)))
     refused(job.run(30), BAD_NETWORK, job, "belongs to another network, it reads dx")
-    job.free()
-    network.close()
 
 
 def test_paths_of_any_letters(library, tmp_path):
@@ -176,10 +167,21 @@ def test_paths_of_any_letters(library, tmp_path):
     shutil.copy(PRIMAL, folder / "network")
     network = Network(library, folder / "network")
     assert network.handle, network.message
-    network.close()
 
 
-# --- progress, threads, time -----------------------------------------------------------------------------------------
+def test_devices_and_threads(library, fast):
+    assert Network(library, FAST, threads=-1).message == "the number of threads is -1; it must be 0 to 1024"
+    assert Network(library, device="gpu").message.startswith("device 'gpu': no, this ONNX Runtime has: cpu")
+    assert Network(library, device="").message.startswith("device '': no, ")
+    assert Network(library, device="cpu").names == fast.names
+    import onnxruntime
+
+    for name, provider in (("cuda", "CUDAExecutionProvider"), ("tensorrt", "TensorrtExecutionProvider")):
+        if provider not in onnxruntime.get_available_providers():
+            assert Network(library, device=name).message.startswith(f"device '{name}': no, this ONNX Runtime has: cpu")
+
+
+# --- progress, threads, life -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("after", [0, 1, 2, 3])
@@ -193,7 +195,6 @@ def test_cancelled_after_so_many_tiles(fast, after):
     refused(job.run(30, progress), CANCELLED, job, "^cancelled$")
     assert fractions == sorted(fractions) and len(set(fractions)) == after + 1
     assert job.run(30) == OK and (job.image != -7).any()
-    job.free()
 
 
 def test_threads_share_a_network(fast):
@@ -218,13 +219,11 @@ def test_a_job_outlives_its_network(library):
     job = Job(network, those(network, example()))
     network.close()
     assert job.run() == OK and (job.image != -7).any()
-    job.free()
 
 
-def test_messages_fit_where_they_go(library, tmp_path):
-    for size in (0, 1, 2, 20):
-        message = ctypes.create_string_buffer(b"?" * 30)
-        assert library.ngpt_open(str(tmp_path / "none.onnx").encode(), 0, message, size) is None
-        assert message.raw[max(size - 1, 0) : size] == b"\0" * min(size, 1) and message.raw[size:30] == b"?" * (
-            30 - size
-        )
+@pytest.mark.parametrize("size", [0, 1, 2, 20])
+def test_messages_fit_where_they_go(library, tmp_path, size):
+    message = ctypes.create_string_buffer(b"?" * 30)
+    assert library.ngpt_open(str(tmp_path / "none.onnx").encode(), 0, message, size) is None
+    assert message.raw[max(size - 1, 0) : size] == b"\0" * min(size, 1)
+    assert message.raw[size:30] == b"?" * (30 - size)

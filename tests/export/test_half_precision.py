@@ -12,33 +12,27 @@ torch = pytest.importorskip("torch")
 # ruff: noqa: E402
 import onnx
 from full_stack import full_stack
+from networks import dense, untrained
 
 import ngpt
 from ngpt.cli import main
 from ngpt.export.halves import POINTS
-from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.weights import load_weights, read_tensors, save_weights, write_tensors
 from ngpt.sequence.network import INPUTS
 from ngpt.sequence.train import WIDTHS, network
 
-CONFIG = ModelConfig("dense", (4, 6), (1, 1), ("primal", "base", "primal_se", "dx_se"), "wcv", start=("primal", "base"))
+CONFIG = dense(("primal", "base", "primal_se", "dx_se"), "wcv", start=("primal", "base"))
 STEPS = 1000
 
 
-def export(weights, output, *options):
-    return main(["export", "--weights", str(weights), "-o", str(output), *map(str, options)])
+def export(weights, output):
+    return main(["export", "--weights", str(weights), "-o", str(output)])
 
 
 @pytest.fixture
-def model():
-    torch.manual_seed(1)
-    return Reconstructor(CONFIG).eval()
-
-
-@pytest.fixture
-def run(tmp_path, model):
+def run(tmp_path):
     """The weights of a run, after so many steps of those that its log tells of."""
-    save_weights(tmp_path / "weights.safetensors", model, {"step": STEPS, "hours": 2})
+    save_weights(tmp_path / "weights.safetensors", untrained(CONFIG), {"step": STEPS, "hours": 2})
     entries = [{"step": n, "loss": 1 / n} for n in range(1, 2 * STEPS)] + [{"step": 2 * STEPS, "relMSE": 0.1}]
     (tmp_path / "log.jsonl").write_text("".join(f"{json.dumps(entry)}\n" for entry in entries))
     return tmp_path / "weights.safetensors"
@@ -48,10 +42,8 @@ def test_half_the_bytes_the_same_model_and_the_curve_until_its_step(run, tmp_pat
     assert export(run, tmp_path / "half.safetensors") == 0
     tensors, header = read_tensors(tmp_path / "half.safetensors")
     own, told = read_tensors(run)
-    assert {tensor.dtype for tensor in tensors.values()} == {torch.float16}
-    assert (
-        all(torch.equal(tensors[name], tensor.half()) for name, tensor in own.items()) and tensors.keys() == own.keys()
-    )
+    assert tensors.keys() == own.keys() and all(tensor.dtype == torch.float16 for tensor in tensors.values())
+    assert all(torch.equal(tensors[name], tensor.half()) for name, tensor in own.items())
     curve = header.pop("curve")
     assert header == told
     steps, losses = curve["steps"], curve["losses"]
@@ -61,15 +53,14 @@ def test_half_the_bytes_the_same_model_and_the_curve_until_its_step(run, tmp_pat
 
 
 def test_what_reads_them_computes_in_32_bits(run, tmp_path):
-    half, onnx = tmp_path / "half.safetensors", tmp_path / "half.onnx"
-    assert export(run, half) == 0 and export(half, onnx) == 0
-    loaded, _ = load_weights(half)
-    assert {parameter.dtype for parameter in loaded.parameters()} == {torch.float32}
+    half, graph = tmp_path / "half.safetensors", tmp_path / "half.onnx"
+    assert export(run, half) == 0 and export(half, graph) == 0
+    assert {parameter.dtype for parameter in load_weights(half)[0].parameters()} == {torch.float32}
     stack = full_stack(20, 26)
-    ours, theirs = (ngpt.denoise(stack, "ngpt", weights=str(path)) for path in (half, run))
+    whole, ours, onnx_image = (ngpt.denoise(stack, "ngpt", weights=str(path)) for path in (run, half, graph))
     assert ours.dtype == np.float32
-    np.testing.assert_allclose(ours, theirs, rtol=2e-3, atol=1e-4 * theirs.max())
-    np.testing.assert_allclose(ngpt.denoise(stack, "ngpt", weights=str(onnx)), ours, rtol=1e-4, atol=1e-5 * ours.max())
+    np.testing.assert_allclose(ours, whole, rtol=2e-3, atol=1e-4 * whole.max())
+    np.testing.assert_allclose(onnx_image, ours, rtol=1e-4, atol=1e-5 * ours.max())
 
 
 def test_networks_that_blend_frames(tmp_path):
@@ -86,7 +77,8 @@ def test_networks_that_blend_frames(tmp_path):
     ("change", "message"),
     [(lambda v: v[0, 0].fill_(1e6), "beyond 65504"), (lambda v: v[1].mul_(1e-6), "too small for 16 bits")],
 )
-def test_numbers_that_16_bits_cannot_hold_are_refused(model, tmp_path, capsys, change, message):
+def test_numbers_that_16_bits_cannot_hold_are_refused(tmp_path, capsys, change, message):
+    model = untrained(CONFIG)
     change(next(tensor for tensor in model.state_dict().values() if tensor.ndim > 1))
     save_weights(tmp_path / "w.safetensors", model, {})
     assert export(tmp_path / "w.safetensors", tmp_path / "half.safetensors") == 1

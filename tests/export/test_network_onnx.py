@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,12 @@ torch = pytest.importorskip("torch")
 import onnx
 import onnxruntime
 from full_stack import full_layers
+from hosts import read_layers
 from networks import ALL, GRAPHED, untrained
 from scipy.ndimage import uniform_filter
 
 from export.__main__ import main
+from ngpt.denoisers import caustic
 from ngpt.export.network import network_model, statistics_model
 from ngpt.export.vector import example_layers, quiet
 from ngpt.methods import reconstruct
@@ -30,7 +33,9 @@ from ngpt.network.weights import save_weights
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 
-FAST = Path(__file__).parents[2] / "export" / "weights" / "ngpt-fast.safetensors"
+ROOT = Path(__file__).parents[2]
+FAST = ROOT / "export" / "weights" / "ngpt-fast.safetensors"
+SHARED = np.array([0.1, 5, 0, 8, 0.05], np.float32)  # statistics of some image
 
 
 def session(model):
@@ -41,7 +46,7 @@ def session(model):
 
 @pytest.fixture(scope="module")
 def fast():
-    return session(onnx.load(WEIGHTS / "ngpt-fast.onnx"))
+    return session(WEIGHTS / "ngpt-fast.onnx")
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +58,26 @@ def weights(tmp_path_factory):
     return folder
 
 
+@cache
+def exported(path):
+    return network_model(path, path.stem)
+
+
+# Of what others have parts of
+MORE = ("relative to its base", "converging", "halved by maxima", "halved by lines")
+
+
+@pytest.fixture(scope="module", params=[pytest.param(n, marks=pytest.mark.slow) if n in MORE else n for n in GRAPHED])
+def pair(request, weights):
+    """A file of weights and its ONNX session."""
+    path = weights / f"{request.param}.safetensors"
+    return path, session(exported(path))
+
+
+def told(model):
+    return {item.key.removeprefix("ngpt."): item.value for item in model.metadata_props}
+
+
 def noisy(height, width, scale=1.0, seed=0):
     """All layers of a stack, (1, C, H, W)."""
     layers = full_layers(height, width, scale, seed)
@@ -61,13 +86,43 @@ def noisy(height, width, scale=1.0, seed=0):
     return {name: np.ascontiguousarray(layer.transpose(2, 0, 1)[None]) for name, layer in layers.items()}
 
 
+def damaged(height, width, scale=1.0, holes=True):
+    """With a lamp, rare bright light that gradients do not hold, and values that are not finite, alone and in holes."""
+    layers, rng = noisy(height, width, scale), np.random.default_rng(height)
+    layers["direct"] = np.zeros_like(layers["primal"])
+    layers["direct"][..., :2, : width // 2] = 30 * scale
+    shape = layers["primal"].shape
+    light = scale * np.where(rng.random((1, 1, height, width)) > 0.9, rng.gamma(0.3, 20, shape), 0).astype(np.float32)
+    layers |= {"caustic": light, "caustic_var": np.where(light > 4 * scale, light**2, np.float32(0.1 * scale**2))}
+    layers["caustic_var"][rng.random(shape) < 0.1] = -1
+    layers["primal"] = layers["primal"] + layers["direct"] + light
+    if holes:
+        for layer in layers.values():
+            layer[rng.random(layer.shape) < 0.03] = rng.choice(np.float32([np.nan, np.inf, -np.inf]))
+        layers["primal"][..., height // 4 : -2, width // 3 : -1] = np.nan
+        layers["primal"][..., 0, 0] = layers["direct"][..., 0, 0] = 1  # so that there is something to repair from
+        layers["caustic"][..., 0, 0] = 0
+    return layers
+
+
+def extreme(height, width):
+    layers = noisy(height, width)
+    layers["primal"][0, :, 10, 12] = 1e6
+    layers["primal_var"][0, :, 20:24, 8:12] = np.nan
+    layers["dx_var"][0, 1, 5, 5], layers["dy_var"][0, 2, 30, 9] = -1, np.inf
+    return layers
+
+
 def stack_of(layers):
     return GradientStack.from_arrays(**{name: layer[0].transpose(1, 2, 0) for name, layer in layers.items()})
 
 
+def planes(image):
+    return np.ascontiguousarray(image.transpose(2, 0, 1)[None])
+
+
 def in_torch(layers, path):
-    stack = stack_of(layers)
-    return reconstruct(stack, "ngpt", weights=str(path)).image.transpose(2, 0, 1)[None]
+    return planes(reconstruct(stack_of(layers), "ngpt", weights=str(path)).image)
 
 
 def run(session, layers, **more):
@@ -81,45 +136,45 @@ def assert_close(ours, theirs, tolerance=1e-4):
     assert (np.abs(ours - theirs) <= tolerance * (np.abs(theirs) + 1e-2 * np.abs(theirs).max())).all()
 
 
-# Weights at random make rounding grow where a pyramid is drawn to gradients.
-TOLERANCE = {"a pyramid drawn to gradients": 1e-3}
-# Of what others have parts of
-MORE = ("with a choice", "relative to its base", "converging", "halved by maxima", "halved by lines")
-
-
-@pytest.fixture(scope="module", params=[pytest.param(n, marks=pytest.mark.slow) if n in MORE else n for n in GRAPHED])
-def pair(request, weights):
-    """A file of weights and its ONNX session."""
-    path = weights / f"{request.param}.safetensors"
-    return path, session(network_model(path, request.param))
-
-
 @pytest.fixture
 def other_denoiser(monkeypatch):
-    """In OIDN's place, which is not everywhere: a blur. Returns the images a combiner is given of it."""
-    monkeypatch.setattr(inputs, "oidn", lambda data, *_: uniform_filter(data.image, (3, 3, 1)))
+    """In OIDN's place, which is not everywhere: a blur. Returns the images of it that a network may be given."""
+    for module in (inputs, caustic):
+        monkeypatch.setattr(module, "oidn", lambda data, *_: uniform_filter(data.image, (3, 3, 1)))
 
-    def images(layers):
-        data = repair(stack_of(layers))
-        made = inputs.denoised(inputs.Oidn(data), inputs.base_image(data, "wcv"), inputs.DENOISED)
-        return {name: np.ascontiguousarray(image.transpose(2, 0, 1)[None]) for name, image in made.items()}
+    def images(layers, config):
+        data = repair(stack_of(layers), config.reads_gradients)
+        base = inputs.base_image(data, "wcv") if config.reads_gradients else None
+        made = inputs.denoised(inputs.Oidn(data), base, inputs.DENOISED)
+        made = {name: planes(image + data.direct) for name, image in made.items()}
+        if data.caustic is not None:
+            made["denoised_caustic"] = np.full_like(layers["caustic"], np.nan)
+            made["denoised_caustic"][..., ::2, ::2] = planes(caustic.of_half_size(data))
+        return made
 
     return images
 
 
+# Weights at random make rounding grow where a pyramid is drawn to gradients.
+TOLERANCE = {"a pyramid drawn to gradients": 1e-3}
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (17, 16), (37, 53)])
-def test_the_same_as_in_torch(pair, size, other_denoiser):
+@pytest.mark.parametrize("made", [noisy, damaged])
+def test_the_same_as_in_torch(pair, size, made, other_denoiser):
     path, onnx_session = pair
-    layers = noisy(*size)
-    assert_close(
-        run(onnx_session, layers | other_denoiser(layers)), in_torch(layers, path), TOLERANCE.get(path.stem, 1e-4)
-    )
+    layers = made(*size)
+    ours = run(onnx_session, layers | other_denoiser(layers, GRAPHED[path.stem]))
+    assert_close(ours, in_torch(layers, path), TOLERANCE.get(path.stem, 1e-4))
 
 
-@pytest.mark.parametrize("size", [(1, 1), (17, 16), (37, 53), (64, 48)])
-def test_the_shipped_file_is_that_of_the_shipped_weights(fast, size):
-    layers = noisy(*size)
-    assert_close(run(fast, layers), in_torch(layers, FAST))
+@pytest.mark.parametrize(
+    ("layers", "tolerance"),
+    [(noisy(1, 1), 1e-4), (noisy(64, 48), 1e-4), (damaged(90, 75), 1e-4), (extreme(40, 33), 1e-3)],
+    ids=["one pixel", "noisy", "damaged", "extreme"],
+)
+def test_the_shipped_file_is_that_of_the_shipped_weights(fast, layers, tolerance):
+    assert_close(run(fast, layers), in_torch(layers, FAST), tolerance)
 
 
 @pytest.mark.slow
@@ -127,31 +182,20 @@ def test_the_shipped_file_is_that_of_the_shipped_weights(fast, size):
 def test_an_export_of_today_gives_what_the_shipped_file_gives(name):
     layers = noisy(37, 53)
     layers |= {other: k * layers["primal"] for other, k in (("denoised", 0.98), ("denoised_base", 0.99))}
-    today, shipped = (
-        session(network_model(FAST.with_name(f"{name}.safetensors"), name)),
-        session(WEIGHTS / f"{name}.onnx"),
-    )
-    assert np.abs(run(today, layers) - run(shipped, layers)).max() <= 1e-6 * run(shipped, layers).max()
-
-
-def test_the_same_with_a_scene_that_has_unknown_variances_and_extreme_pixels(fast):
-    layers = noisy(40, 33)
-    layers["primal"][0, :, 10, 12] = 1e6
-    layers["primal_var"][0, :, 20:24, 8:12] = np.nan
-    layers["dx_var"][0, 1, 5, 5] = -1
-    layers["dy_var"][0, 2, 30, 9] = np.inf
-    assert_close(run(fast, layers), in_torch(layers, FAST), 1e-3)
+    models = exported(FAST.with_name(f"{name}.safetensors")), WEIGHTS / f"{name}.onnx"
+    today, shipped = (run(session(model), layers) for model in models)
+    assert np.abs(today - shipped).max() <= 1e-6 * shipped.max()
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-12, 65504.0, 1e12])
 def test_extremes(fast, value):
-    ours = run(fast, noisy(19, 24, value))
-    assert np.isfinite(ours).all()
-    # In proportion to what goes in: exactly, since powers of two are.
-    layers = noisy(19, 24, 1.0)
-    for k in (2.0**-30, 2.0**30):
-        scaled = noisy(19, 24, k)
-        assert_close(run(fast, scaled) / np.float32(k), run(fast, layers), 1e-3)
+    assert np.isfinite(run(fast, noisy(19, 24, value))).all()
+
+
+@pytest.mark.parametrize("k", [2.0**-30, 2.0**30])
+def test_images_follow_the_exposure(fast, k):
+    scaled = run(fast, damaged(19, 24, k, holes=False))
+    assert_close(scaled / np.float32(k), run(fast, damaged(19, 24, holes=False)), 1e-3)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -162,19 +206,19 @@ def test_values_that_are_not_finite_stay_where_they_are(fast, name, bad):
     layers[name][0, 0, 3, 4] = bad
     harmed = run(fast, layers)
     assert np.isfinite(harmed).all()
-    far = np.abs(harmed - whole)[0, :, 130:]
-    assert far.max() <= 0.02 * whole.mean()
+    assert np.abs(harmed - whole)[0, :, 130:].max() <= 0.02 * whole.mean()
 
 
-@pytest.mark.parametrize("name", ["with a base", "as published"])
-def test_tiles_of_a_host_make_the_whole(weights, name):
+# Tiles
+
+
+@pytest.mark.parametrize("pair", ["with a base", "as published"], indirect=True)
+def test_tiles_of_a_host_make_the_whole(pair):
     """What CONTRACT.md tells a host to do, literally."""
-    path = weights / f"{name}.safetensors"
-    model = network_model(path, name)
-    tell = {item.key: item.value for item in model.metadata_props}
-    alignment, margin = int(tell["ngpt.alignment"]), int(tell["ngpt.overlap"])
-    onnx_session, layers = session(model), noisy(50, 290)
-    shared = run(session(statistics_model(path, name)), layers)
+    path, onnx_session = pair
+    tell = told(exported(path))
+    alignment, margin, layers = int(tell["alignment"]), int(tell["overlap"]), noisy(50, 290)
+    shared = run(session(statistics_model(path, "m")), layers)
     whole, tiled = run(onnx_session, layers), np.zeros((1, 3, 50, 290), np.float32)
     step = 20 * alignment
     for x in range(0, 290, step):
@@ -192,7 +236,7 @@ def test_tiles_of_a_host_make_the_whole(weights, name):
 def test_statistics_are_the_same_by_the_graph_in_numpy_and_in_torch(size, scale):
     layers = noisy(*size, scale)
     layers["primal"][0, :, 0, 0] *= -1
-    graph = run(onnxruntime.InferenceSession(WEIGHTS / "ngpt-fast.statistics.onnx", quiet()), layers)
+    graph = run(session(WEIGHTS / "ngpt-fast.statistics.onnx"), layers)
     ours = statistics({name: layer[0].transpose(1, 2, 0) for name, layer in layers.items()})
     assert np.allclose(ours[:4], graph[:4], rtol=1e-5)
     assert np.isclose(ours[0], float(exposure(torch.from_numpy(layers["primal"]))), rtol=1e-5)
@@ -200,49 +244,42 @@ def test_statistics_are_the_same_by_the_graph_in_numpy_and_in_torch(size, scale)
 
 def test_several_tiles_in_one_run(fast):
     a, b = noisy(30, 20, seed=1), noisy(30, 20, seed=2)
-    statistics = np.array([0.1, 5, 0, 8, 0.05], np.float32)
-    both = {name: np.concatenate([a[name], b[name]]) for name in a}
-    together = run(fast, both, statistics=statistics)
-    assert_close(together[:1], run(fast, a, statistics=statistics), 1e-5)
+    together = run(fast, {name: np.concatenate([a[name], b[name]]) for name in a}, statistics=SHARED)
+    assert_close(together[:1], run(fast, a, statistics=SHARED), 1e-5)
 
 
-def test_the_overlap_is_as_far_as_light_goes_that_gradients_do_not_hold(weights):
+@pytest.mark.parametrize("pair", ["as published"], indirect=True)
+def test_the_overlap_is_as_far_as_light_goes_that_gradients_do_not_hold(pair):
     """Over surfaces that are alike. Measured: what lies beyond does not matter, and half of it would be too little."""
-    path = weights / "as published.safetensors"
-    model = network_model(path, "m")
-    onnx_session, layers = session(model), noisy(9, 160)
+    path, onnx_session = pair
+    layers = noisy(9, 160)
     layers |= {feature: 0 * layers[feature] + 0.5 for feature in ("albedo", "normal", "depth")}
-    statistics = np.array([0.1, 5, 0, 8, 0.05], np.float32)
-    before = run(onnx_session, layers, statistics=statistics)
+    before = run(onnx_session, layers, statistics=SHARED)
     layers["caustic"] = np.where(np.arange(160) < 80, 0, np.ones_like(layers["primal"]))
     layers["primal"] = layers["primal"] + layers["caustic"]
-    changed = np.abs(run(onnx_session, layers, statistics=statistics) - before).max(axis=(0, 1, 2)) > 0
-    reach = 80 - int(np.argmax(changed))
-    margin = int({item.key: item.value for item in model.metadata_props}["ngpt.overlap"])
-    assert margin // 2 < reach <= margin
+    changed = np.abs(run(onnx_session, layers, statistics=SHARED) - before).max(axis=(0, 1, 2)) > 0
+    margin = int(told(exported(path))["overlap"])
+    assert margin // 2 < 80 - int(np.argmax(changed)) <= margin
+
+
+# Files
 
 
 def test_metadata_tell_all_and_nothing_of_this_machine():
     file = WEIGHTS / "ngpt-fast.onnx"
     model = onnx.load(file)
-    tell = {item.key: item.value for item in model.metadata_props}
-    assert tell["ngpt.inputs"].split(", ")[:4] == ["primal", "direct", "dx", "dy"]
-    assert json.loads(tell["ngpt.training"])["step"] > 0
+    assert told(model)["inputs"].split(", ")[:4] == ["primal", "direct", "dx", "dy"]
+    assert json.loads(told(model)["training"])["step"] > 0
     assert str(Path.cwd()).encode() not in file.read_bytes() and b"site-packages" not in file.read_bytes()
     assert not any(initializer.external_data for initializer in model.graph.initializer)
 
 
 def test_the_vector_is_that_of_the_shipped_network(fast):
-    folder = Path(__file__).parents[2] / "export/vector"
-    listing = json.loads((folder / "layers.json").read_text())
-    arrays = {}
-    for name, entry in listing.items():
-        data = (folder / f"{name}.f32").read_bytes()
-        assert hashlib.sha256(data).hexdigest() == entry["sha256"]
-        arrays[name] = np.frombuffer(data, "<f4").reshape(entry["shape"])
-    assert all(
-        np.allclose(arrays[name], layer, equal_nan=True) for name, layer in example_layers().items() if name in arrays
-    )
+    folder, example = ROOT / "export" / "vector", example_layers()
+    arrays = read_layers(folder)
+    for name, entry in json.loads((folder / "layers.json").read_text()).items():
+        assert hashlib.sha256((folder / f"{name}.f32").read_bytes()).hexdigest() == entry["sha256"]
+        assert name == "image" or np.allclose(arrays[name], example[name], equal_nan=True)
     assert_close(run(fast, arrays), arrays["image"])
 
 
@@ -251,16 +288,13 @@ def test_command(tmp_path, weights, capsys):
     command = ["--weights", str(path), "-o", str(output)]
     assert main([*command, "--vector", str(tmp_path / "vector")]) == 0
     # Hosts look for it there.
-    assert onnxruntime.InferenceSession(tmp_path / "m.statistics.onnx", quiet()).get_outputs()[0].shape == [5]
-    listing = json.loads((tmp_path / "vector/layers.json").read_text())
-    assert set(listing) == {*ALL, "direct", "caustic", "caustic_var", "image"}
+    assert session(tmp_path / "m.statistics.onnx").get_outputs()[0].shape == [5]
+    assert set(read_layers(tmp_path / "vector")) == {*ALL, "direct", "caustic", "caustic_var", "image"}
     assert main(command) == 1 and "m.onnx" in capsys.readouterr().err
     output.unlink()
     assert main(command) == 1 and "m.statistics.onnx: exists already" in capsys.readouterr().err
-    assert not output.exists()
-    assert main(["--weights", str(tmp_path / "none.safetensors"), "-o", str(tmp_path / "n.onnx")]) == 1
-    assert "no such file" in capsys.readouterr().err
-    assert not (tmp_path / "n.onnx").exists()
+    assert main(["--weights", str(tmp_path / "none.safetensors"), "-o", str(output)]) == 1
+    assert "no such file" in capsys.readouterr().err and not output.exists()
 
 
 def test_a_base_without_a_graph_is_refused(tmp_path, capsys):
