@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from capi import built
 
+from ngpt.stack import GradientStack
+
 HOSTS = Path(__file__).parents[1] / "export" / "hosts"
 LIBRARY = HOSTS.parent / "capi"
 VECTOR = HOSTS.parent / "vector"
@@ -56,6 +58,21 @@ def read_layers(folder) -> dict[str, np.ndarray]:
     """The layers (1, C, H, W) that a folder of raw files holds, as ``export/vector`` does."""
     shapes = {name: item["shape"] for name, item in json.loads((folder / "layers.json").read_text()).items()}
     return {name: np.fromfile(folder / f"{name}.f32", "<f4").reshape(shape) for name, shape in shapes.items()}
+
+
+def repeated(height, width) -> dict[str, np.ndarray]:
+    """The vector's layers again and again, sixteen times as bright at the right as at the left."""
+    brightness, layers = np.exp2(4 * np.arange(width) / width), {}
+    for name, layer in read_layers(VECTOR).items():
+        if name != "image":
+            power = 2 if name.endswith("_var") else 0 if name in ("albedo", "normal", "depth") else 1
+            many = np.tile(layer, (1, 1, -(-height // 23), -(-width // 29)))[:, :, :height, :width]
+            layers[name] = (many * brightness**power).astype(np.float32)
+    return layers
+
+
+def stack_of(layers) -> GradientStack:
+    return GradientStack.from_arrays(**{name: layer[0].transpose(1, 2, 0) for name, layer in layers.items()})
 
 
 def read_pfm(path) -> np.ndarray:
