@@ -133,6 +133,9 @@ class Job:
         self.height, self.width = layers["primal"].shape[:2]
         self.image = np.full((self.height, self.width, 3), -7, np.float32) if image is None else image
         self.handle = self.library.ngpt_job_new(network.handle)
+        self.set(layers)
+
+    def set(self, layers):
         for name, layer in layers.items():
             assert self.set_layer(name, *place(layer)) == OK, self.message()
         assert self.set_output("image", *place(self.image)) == OK
@@ -180,15 +183,19 @@ def those(network, layers):
     return {name: layers[name] for name in network.names if name in layers}
 
 
-def in_python(path, layers) -> np.ndarray:
-    """What ONNX Runtime in Python makes of all the layers at once."""
+def in_python(path):
+    """A function: what ONNX Runtime in Python makes of all layers at once."""
     import onnxruntime as ort
 
     options = ort.SessionOptions()
     options.log_severity_level = 3
     session = ort.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    feed = {name: np.ascontiguousarray(np.moveaxis(layer, -1, 0)[None]) for name, layer in layers.items()}
-    return np.moveaxis(session.run(["image"], feed)[0][0], 0, -1)
+
+    def run(layers) -> np.ndarray:
+        feed = {name: np.ascontiguousarray(np.moveaxis(layer, -1, 0)[None]) for name, layer in layers.items()}
+        return np.moveaxis(session.run(["image"], feed)[0][0], 0, -1)
+
+    return run
 
 
 def agree(image, expected, tolerance=1e-5):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 METADATA = {
     "ngpt.inputs": "primal",
@@ -22,6 +23,7 @@ def network(
     given: list | None = None,
     more: list | None = None,
     output: str = "image",
+    made: Any = None,
     metadata: dict | None = None,
 ) -> Path:
     """Writes a network that gives `primal` back, and beside it the one of its statistics.
@@ -31,6 +33,7 @@ def network(
     ``shape``     that the output is said to have
     ``given``     the shape of `primal`
     ``more``      further inputs
+    ``made``      what the output is said to be
     ``metadata``  replaced or, where None, taken out
     """
     from onnx import TensorProto, helper
@@ -46,7 +49,7 @@ def network(
     nodes += make(helper) if make else [helper.make_node("Cast", ["same"], [output], to=kind)]
     inputs = [helper.make_tensor_value_info("primal", TensorProto.FLOAT, given or IMAGE)]
     inputs += [helper.make_tensor_value_info("statistics", TensorProto.FLOAT, [5]), *(more or [])]
-    made = helper.make_tensor_value_info(output, kind, shape or IMAGE)
+    made = made or helper.make_tensor_value_info(output, kind, shape or IMAGE)
     known = {key: value for key, value in (METADATA | (metadata or {})).items() if value is not None}
     save(helper.make_graph(nodes, "graph", inputs, [made], [zeros]), path, known)
     statistics(path)
@@ -76,88 +79,63 @@ def save(graph, path: Path, metadata: dict) -> None:
     path.write_bytes(model.SerializeToString())
 
 
-def sequence_input(helper, kind: str = "FLOAT"):
-    from onnx import TensorProto
-
-    return helper.make_tensor_sequence_value_info("list", getattr(TensorProto, kind), None)
-
-
 def reshaped(*shape: int) -> Callable:
     """Nodes that give the first elements another shape than the graph says; sizes are those of runs of 8x8 pixels."""
+    return _with_shape("Reshape", shape)
 
+
+def _with_shape(kind: str, shape: tuple[int, ...]) -> Callable:
     def make(helper):
         constant = helper.make_tensor("to", 7, [len(shape)], list(shape))
-        return [
-            helper.make_node("Constant", [], ["shape"], value=constant),
-            helper.make_node("Reshape", ["same", "shape"], ["image"]),
-        ]
-
-    return make
-
-
-def expanded(size: int) -> Callable:
-    def make(helper):
-        constant = helper.make_tensor("to", 7, [4], [size, 3, 8, 8])
-        return [
-            helper.make_node("Constant", [], ["shape"], value=constant),
-            helper.make_node("Expand", ["same", "shape"], ["image"]),
-        ]
+        nodes = [helper.make_node("Constant", [], ["shape"], value=constant)]
+        return [*nodes, helper.make_node(kind, ["same", "shape"], ["image"])]
 
     return make
 
 
 def hostile(folder: Path) -> dict[str, Path]:
     """Name -> file; all of them are refused when they are opened, or when they run on 8x8 pixels."""
-    from onnx import helper
-
-    def at(name: str) -> Path:
-        return folder / f"{name}.onnx"
-
-    files = {
-        "sequence in": network(at("sequence in"), more=[sequence_input(helper)]),
-        "sequence of integers in": network(at("sequence of integers in"), more=[sequence_input(helper, "INT64")]),
-        "float16 in": network(at("float16 in"), more=[helper.make_tensor_value_info("half", 10, IMAGE)]),
-        "text in": network(at("text in"), more=[helper.make_tensor_value_info("text", 8, [1])]),
-        "transposed": network(at("transposed"), reshaped(1, 8, 8, 3)),
-        "flat": network(at("flat"), reshaped(192), shape=IMAGE),
-        "expanded": network(at("expanded"), expanded(2)),
-        "very large": network(at("very large"), expanded(2**40)),
-        "no image": network(at("no image"), output="picture"),
-        "four channels in": network(at("four channels in"), given=[1, 4, "height", "width"]),
-        "no channels": network(at("no channels"), given=[1, 0, "height", "width"]),
-        "any channels": network(at("any channels"), given=[1, "channels", "height", "width"]),
-        "no rank": network(at("no rank"), given=[3]),
-        "small images only": network(at("small images only"), given=[1, 3, 4, 4]),
-        "twice": network(at("twice"), metadata={"ngpt.inputs": "primal, primal"}),
-        "statistics as a layer": network(at("statistics as a layer"), metadata={"ngpt.inputs": "primal, statistics"}),
-        "no metadata": network(at("no metadata"), metadata=dict.fromkeys(METADATA)),
-    }
-    for kind in ("UINT8", "FLOAT16", "DOUBLE", "INT64", "BOOL", "STRING", "BFLOAT16"):
-        files[f"{kind} out"] = network(at(f"{kind} out"), kind=kind)
-    files["sequence out"] = network(at("sequence out"))
-    model_of_sequence(files["sequence out"])
-    for key in METADATA:
-        for i, value in enumerate(("nan", "-1", "", "1e400", "inf", "0x10", "9" * 400, "\x1b]0;x\x07", "é" * 300)):
-            files[f"{key} {i}"] = network(at(f"{key} {i}"), metadata={key: value})
-    whole = network(at("whole")).read_bytes()
-    for name, content in {"empty": b"", "text": b"not a network", "cut": whole[:-9], "zeros": bytes(999)}.items():
-        at(name).write_bytes(content)
-        files[name] = at(name)
-    (folder / "folder.onnx").mkdir()
-    return files | {"folder": folder / "folder.onnx", "endless": Path("/dev/zero"), "none": at("none")}
-
-
-def model_of_sequence(path: Path) -> None:
-    """Its image is a sequence of one tensor."""
     from onnx import TensorProto, helper
 
-    zeros = helper.make_tensor("statistics", TensorProto.FLOAT, [5], [0.0] * 5)
-    nodes = [
-        helper.make_node("ReduceSum", ["statistics"], ["sum"], keepdims=0),
-        helper.make_node("Add", ["primal", "sum"], ["same"]),
-        helper.make_node("SequenceConstruct", ["same"], ["image"]),
-    ]
-    inputs = [helper.make_tensor_value_info("primal", TensorProto.FLOAT, IMAGE)]
-    inputs += [helper.make_tensor_value_info("statistics", TensorProto.FLOAT, [5])]
-    made = helper.make_tensor_sequence_value_info("image", TensorProto.FLOAT, None)
-    save(helper.make_graph(nodes, "graph", inputs, [made], [zeros]), path, METADATA)
+    files: dict[str, Path] = {}
+
+    def add(name: str, *arguments, **options) -> None:
+        files[name] = network(folder / f"{name}.onnx", *arguments, **options)
+
+    value, sequence = helper.make_tensor_value_info, helper.make_tensor_sequence_value_info
+    add("sequence in", more=[sequence("list", TensorProto.FLOAT, None)])
+    add("sequence of integers in", more=[sequence("list", TensorProto.INT64, None)])
+    add("float16 in", more=[value("half", TensorProto.FLOAT16, IMAGE)])
+    add("text in", more=[value("text", TensorProto.STRING, [1])])
+    add("layer that is not in the metadata", more=[value("other", TensorProto.FLOAT, IMAGE)])
+    add("transposed", reshaped(1, 8, 8, 3))
+    add("flat", reshaped(192), shape=IMAGE)
+    add("expanded", _with_shape("Expand", (2, 3, 8, 8)))
+    add("very large", _with_shape("Expand", (2**40, 3, 8, 8)))
+    add("no image", output="picture")
+    for name, given in {
+        "four channels": [1, 4, "height", "width"],
+        "no channels": [1, 0, "height", "width"],
+        "any channels": [1, "channels", "height", "width"],
+        "no rank": [3],
+        "small images only": [1, 3, 4, 4],
+    }.items():
+        add(name, given=given)
+    for layers in ("primal, primal", "primal, statistics", "primal, albino"):
+        add(layers, metadata={"ngpt.inputs": layers})
+    add("no metadata", metadata=dict.fromkeys(METADATA))
+    for kind in ("UINT8", "FLOAT16", "DOUBLE", "INT64", "BOOL", "STRING", "BFLOAT16"):
+        add(f"{kind} out", kind=kind)
+    made = sequence("image", TensorProto.FLOAT, None)
+    add("sequence out", lambda helper: [helper.make_node("SequenceConstruct", ["same"], ["image"])], made=made)
+    for key in METADATA:
+        for i, text in enumerate(("nan", "-1", "", "1e400", "inf", "0x10", "9" * 400, "\x1b]0;x\x07", "é" * 300)):
+            add(f"{key} {i}", metadata={key: text})
+    whole = network(folder / "whole.onnx").read_bytes()
+    contents = {"empty": b"", "text": b"not a network", "cut": whole[:-9], "head": whole[:100], "zeros": bytes(999)}
+    for name, content in contents.items():
+        files[name] = folder / f"{name}.onnx"
+        files[name].write_bytes(content)
+    (folder / "folder.onnx").mkdir()
+    further = {"statistics": folder / "whole.statistics.onnx", "endless": Path("/dev/zero")}
+    return files | further | {name: folder / f"{name}.onnx" for name in ("folder", "none")}

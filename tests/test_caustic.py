@@ -26,46 +26,37 @@ def with_caustic(stack, scale=1.0):
     return stack.replace(primal=stack["primal"] + light, caustic=light, caustic_var=light**2)
 
 
+PLAIN = full_stack(*SIZE)
+LIT = with_caustic(PLAIN)
+
+
 def test_methods_with_gradients_work_on_what_gradients_are_differences_of():
-    stack = full_stack(*SIZE)
-    data, plain = repair(with_caustic(stack)), repair(stack)
+    data, plain = repair(LIT), repair(PLAIN)
     assert np.allclose(data.image, plain.image, atol=1e-5)
-    assert np.array_equal(data.noise, plain.noise)
-    assert np.array_equal(data.caustic, with_caustic(stack)["caustic"])
+    assert np.array_equal(data.noise, plain.noise) and np.array_equal(data.caustic, LIT["caustic"])
 
 
 def test_other_methods_see_all_light_and_all_its_variance():
-    stack = with_caustic(full_stack(*SIZE))
-    data = repair(stack, gradients=False)
-    assert data.caustic is None
-    assert np.array_equal(data.image, stack["primal"])
-    assert np.array_equal(data.noise, stack["primal_var"] + stack["caustic_var"])
+    data = repair(LIT, gradients=False)
+    assert data.caustic is None and np.array_equal(data.image, LIT["primal"])
+    assert np.array_equal(data.noise, LIT["primal_var"] + LIT["caustic_var"])
+    assert np.array_equal(ngpt.denoise(LIT, "primal"), LIT["primal"])
 
 
 @pytest.mark.parametrize("method", ["l2", "l1", "cv", "wcv", "wl2"])
 def test_its_light_is_added_back_once(method):
-    stack = full_stack(*SIZE)
-    lit, added = with_caustic(stack), with_caustic(stack)["caustic"].sum(dtype=np.float64)
-    more = (ngpt.denoise(lit, method).astype(np.float64) - ngpt.denoise(stack, method)).sum()
-    assert more == pytest.approx(added, rel=0.03)
-
-
-def test_the_identity_keeps_it_to_the_bit():
-    stack = with_caustic(full_stack(*SIZE))
-    assert np.array_equal(ngpt.denoise(stack, "primal"), stack["primal"])
+    more = (ngpt.denoise(LIT, method).astype(np.float64) - ngpt.denoise(PLAIN, method)).sum()
+    assert more == pytest.approx(LIT["caustic"].sum(dtype=np.float64), rel=0.03)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_pixels_that_are_not_finite_are_repaired_and_counted(bad):
-    stack = with_caustic(full_stack(*SIZE))
-    light = stack["caustic"].copy()
+    light = LIT["caustic"].copy()
     light[8, 8, 1] = light[3, 2] = bad
-    broken = stack.replace(caustic=light, primal=stack["primal"] + np.where(np.isfinite(light), 0, bad))
-    for gradients in (True, False):
+    broken = LIT.replace(caustic=light, primal=LIT["primal"] + np.where(np.isfinite(light), 0, bad))
+    for gradients in (False, True):
         data = repair(broken, gradients)
-        assert data.pixels == 2
-        assert np.isfinite(data.image).all()
-    data = repair(broken)
+        assert data.pixels == 2 and np.isfinite(data.image).all()
     assert np.isfinite(data.caustic).all()
     assert np.isnan(data.caustic_var[8, 8]).all() and np.isnan(data.noise[8, 8]).all()
     result = reconstruct(broken, "wcv")
@@ -73,15 +64,14 @@ def test_pixels_that_are_not_finite_are_repaired_and_counted(bad):
 
 
 def test_files_keep_it_in_full_precision(tmp_path):
-    stack = with_caustic(full_stack(*SIZE), scale=1e4)
+    stack = with_caustic(PLAIN, scale=1e4)
     write(tmp_path / "stack.exr", stack)
     part = read_exr(tmp_path / "stack.exr").parts[0]
     assert {part.channels[f"{name}.R"].dtype for name in ("caustic", "caustic_var")} == {np.dtype(np.float32)}
     again = read(tmp_path / "stack.exr")
     write(tmp_path / "result.exr", ngpt.denoise(again, "wcv"), like=again)
     for held in (again, read(tmp_path / "result.exr")):
-        for name in ("primal", "caustic", "caustic_var"):
-            assert np.array_equal(held[name], stack[name]), name
+        assert all(np.array_equal(held[name], stack[name]) for name in ("primal", "caustic", "caustic_var"))
 
 
 def test_the_name_counts_only_in_files_of_ours():
@@ -117,17 +107,13 @@ def test_who_takes_it_out(method, monkeypatch):
     if METHODS[method].missing():
         pytest.skip(METHODS[method].missing())
     told = []
-
-    def denoised(data, by_oidn):
-        told.append("by OIDN" if by_oidn else "by diffusion")
-        return data.caustic
-
-    monkeypatch.setattr("ngpt.methods.caustic.denoised", denoised)
+    record = lambda data, by_oidn: told.append("by OIDN" if by_oidn else "by diffusion") or data.caustic  # noqa: E731
+    monkeypatch.setattr("ngpt.methods.caustic.denoised", record)
     expected = {"ngpt-fast": ["by diffusion"], "ngpt-combine": ["by OIDN"]}.get(method, [])
-    ngpt.denoise(with_caustic(full_stack(*SIZE)), method)
+    ngpt.denoise(LIT, method)
     assert told == expected
     if "weights" in METHODS[method].options:
-        ngpt.denoise(with_caustic(full_stack(*SIZE)), "ngpt", weights=str(WEIGHTS / f"{method}.onnx"))
+        ngpt.denoise(LIT, "ngpt", weights=str(WEIGHTS / f"{method}.onnx"))
         assert told == 2 * expected
 
 
@@ -143,9 +129,7 @@ def test_oidn_runs_once_for_it(method, monkeypatch):
         return real(images, *args, **given)
 
     monkeypatch.setattr(oidn, "filtered", filtered)
-    stack = with_caustic(full_stack(*SIZE))
-    stack.attributes[FEATURE_NOISE] = 0.0
-    ngpt.denoise(stack, method)
+    ngpt.denoise(GradientStack(LIT.layers, {FEATURE_NOISE: 0.0}), method)
     gradients = [("Fast", SIZE), ("High", (10, 14))] if method == "ngpt-combine" else []
     assert sorted(runs) == [*gradients, ("High", SIZE)]
 
@@ -244,6 +228,4 @@ def test_half_the_size_and_back_keeps_the_mean(rng, size):
     half = caustic.halved(image)
     assert half.shape == (-(-size[0] // 2), -(-size[1] // 2), 3)
     assert caustic.doubled(half).mean() == pytest.approx(half.mean(), rel=1e-5)
-    assert np.allclose(caustic.doubled(caustic.halved(0 * image + 3)), 3)
-    if size == (8, 10):
-        assert half.mean() == pytest.approx(image.mean(), rel=1e-5)
+    assert size != (8, 10) or half.mean() == pytest.approx(image.mean(), rel=1e-5)

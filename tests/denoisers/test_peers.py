@@ -38,19 +38,21 @@ def room(rng):
     return stack, clean
 
 
+def error(image, clean):
+    return float(np.mean((image - clean) ** 2 / clean**2))
+
+
 @pytest.mark.parametrize("name", PEERS)
 def test_noise_falls_and_texture_stays(room, name):
     if METHODS[name].missing():
         pytest.skip(METHODS[name].missing())
     stack, clean = room
     image = reconstruct(stack, name).image
-    error = lambda i: np.mean((i - clean) ** 2 / clean**2)  # noqa: E731
     assert image.dtype == np.float32 and image.shape == clean.shape
-    assert error(image) < 0.35 * error(stack["primal"])
+    assert error(image, clean) < 0.35 * error(stack["primal"], clean)
     dark, bright = clean[..., 0] < 0.45, clean[..., 0] > 0.7
-    assert image[bright].mean() / image[dark].mean() == pytest.approx(
-        clean[bright].mean() / clean[dark].mean(), rel=0.1
-    )
+    contrast, expected = (i[bright].mean() / i[dark].mean() for i in (image, clean))
+    assert contrast == pytest.approx(expected, rel=0.1)
     assert image.mean() == pytest.approx(clean.mean(), rel=0.03)
 
 
@@ -77,15 +79,6 @@ def test_nfor_scales_with_the_image_to_the_bit(room, power):
     scaled = silent.replace(primal=np.ldexp(silent["primal"], power))
     image = reconstruct(silent, "nfor").image
     assert np.array_equal(np.ldexp(reconstruct(scaled, "nfor").image, -power), image)
-
-
-@pytest.mark.parametrize("name", ["nfor", "nlm"])
-def test_exposure_only_scales(room, name):
-    if METHODS[name].missing():
-        pytest.skip(METHODS[name].missing())
-    stack, _ = room
-    bright = stack.replace(primal=1000 * stack["primal"], primal_var=1e6 * stack["primal_var"])
-    assert reconstruct(bright, name).image == pytest.approx(1000 * reconstruct(stack, name).image, rel=1e-2)
 
 
 @pytest.mark.skipif(bool(nlm.missing()), reason=nlm.missing())
@@ -128,26 +121,16 @@ def test_nfor_does_not_smear_a_spot_of_light_over_the_dark():
     assert np.abs(result).max() < 0.05
 
 
-@pytest.mark.parametrize("size", [(1, 1), (3, 50), (17, 5)])
-def test_nfor_takes_any_size(rng, size):
-    image = rng.random((*size, 3)).astype(np.float32)
-    result = nfor(image, np.full_like(image, 0.01), [rng.random((*size, 3)).astype(np.float32)])
-    assert result.shape == image.shape and np.isfinite(result).all()
-
-
 def test_nfor_sums_are_those_of_the_plain_double_loop(rng, monkeypatch):
     monkeypatch.setattr(nfor_module, "RADIUS", 2)
     monkeypatch.setattr(nfor_module, "_TILE", 4)
-    image = rng.random((7, 9, 3)).astype(np.float32)
+    image, values = rng.random((7, 9, 3)).astype(np.float32), rng.random((7, 9, 5)).astype(np.float32)
     variance = np.full_like(image, 0.05)
-    values = rng.random((7, 9, 5)).astype(np.float32)
-    weights = {(dy, dx): w for dy, dx, w in nfor_module._weights(image, variance, 1.0)}
     expected = np.zeros_like(values)
-    for y in range(7):
-        for x in range(9):
-            for (dy, dx), w in weights.items():
-                if 0 <= y + dy < 7 and 0 <= x + dx < 9:
-                    expected[y, x] += w[y, x] * values[y + dy, x + dx]
+    for dy, dx, weights in nfor_module._weights(image, variance, 1.0):
+        for y, x in np.ndindex(7, 9):
+            if 0 <= y + dy < 7 and 0 <= x + dx < 9:
+                expected[y, x] += weights[y, x] * values[y + dy, x + dx]
     assert nfor_module._gathered(values, image, variance, 1.0) == pytest.approx(expected, rel=1e-5)
 
 
@@ -167,10 +150,6 @@ def test_oidn_is_given_what_is_best_for_it(room, monkeypatch):
     assert prefiltered["clean_aux"] and clean["clean_aux"] and not noisy["clean_aux"]
     assert prefiltered["albedo"].max() == 0.5 and noisy["albedo"].max() == 1.0
     assert "albedo" not in none and all(call["hdr"] for call in calls)
-    with pytest.raises(NgptError, match="option 'auxiliary': 'dirty' is not allowed; it takes prefiltered"):
-        reconstruct(stack, "oidn", auxiliary="dirty")
-    with pytest.raises(NgptError, match="'quality': 'best'"):
-        reconstruct(stack, "oidn", quality="best")
 
 
 @pytest.mark.parametrize(("name", "package"), [("oidn", "mitsuba-oidn"), ("nlm", r"-e \S+\[peers\]")])
@@ -212,8 +191,7 @@ def test_oidn_takes_what_there_is(rng, layers, auxiliary):
     flat = {"albedo": np.full_like(clean, 0.5), "normal": np.broadcast_to([0.0, 0, 1], clean.shape)}
     poor = GradientStack.from_arrays(primal=noisy, **{name: flat[name] for name in layers})
     image = reconstruct(poor, "oidn", auxiliary=auxiliary).image
-    before, after = (float(np.mean((i - clean) ** 2 / clean**2)) for i in (noisy, image))
-    assert after < 0.2 * before
+    assert error(image, clean) < 0.2 * error(noisy, clean)
     # It knows no normals without albedo.
     if layers == ("normal",):
         bare = reconstruct(GradientStack.from_arrays(primal=noisy), "oidn", auxiliary=auxiliary).image

@@ -5,9 +5,12 @@ from pathlib import Path
 import numpy as np
 
 import ngpt
+from data_gen import service
 from ngpt.classical.gradients import forward_differences
 from ngpt.evaluation.config import Config, read_config
+from ngpt.evaluation.run import evaluate
 from ngpt.stack import GradientStack
+from ngpt.system.console import Console
 
 
 def smooth_image() -> np.ndarray:
@@ -46,6 +49,10 @@ def write_halves(folder: Path, rng: np.random.Generator, deviation: float, name:
         layers["primal_var"] = np.full_like(clean, deviation**2)
         stack = GradientStack.from_arrays(attributes={"ngpt:spp": 100, "ngpt:seconds": 1.5}, **layers)
         ngpt.write(folder / f"{name}-{half}.exr", stack)
+
+
+def evaluated(config: Config, out: Path, command: str = "") -> dict:
+    return evaluate(config, out, Console(quiet=True), command, service)
 
 
 def read(text: str, folder: Path) -> Config:

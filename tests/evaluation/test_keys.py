@@ -22,67 +22,55 @@ def tree(tmp_path, monkeypatch):
     return tmp_path / "data_gen"
 
 
-def replace(path: Path, old: str, new: str) -> None:
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, 1))
-
-
 def key_of(scene: str, folder: Path, sampler: str = "gpt") -> str:
     return SceneStacks("s", scene, Config(scenes=(scene,)), folder, service).key(sampler)
-
-
-def test_a_changed_weight_in_the_film_is_another_key(tree, tmp_path):
-    (tmp_path / "scene.xml").write_text("<scene/>")
-    scenes = ("diffuse", str(tmp_path / "scene.xml"))
-    before = [key_of(scene, tmp_path) for scene in scenes]
-    assert before == [key_of(scene, tmp_path) for scene in scenes]
-    replace(tree / "film" / "gradient_film.py", "gradient[behind] = 0.5 *", "gradient[behind] = 0.25 *")
-    assert not set(before) & {key_of(scene, tmp_path) for scene in scenes}
 
 
 def test_a_sampler_has_the_key_of_the_code_it_runs(tree, tmp_path):
     """What is shared changes all, a sampler's own code that sampler, and those that use it."""
     names = ("auto", "gpt", "gmlt", "bdpt", "gbdpt", "primal", "ppm", "gpm")
+    last: dict[str, str] = {}
 
-    def keys_of() -> dict[str, str]:
-        return {name: key_of("diffuse", tmp_path, name) for name in names}
+    def changed(file: str = "", text: str = "\nsomething = 1\n") -> set[str]:
+        """Whose keys change with that text at the end of a file."""
+        if file:
+            (tree / file).write_text(((tree / file).read_text() if (tree / file).exists() else "") + text)
+        now = {name: key_of("diffuse", tmp_path, name) for name in names}
+        found = {name for name, key in now.items() if key != last.get(name)}
+        last.update(now)
+        return found
 
-    def changed(file: str) -> set[str]:
-        before = keys_of()
-        (tree / file).write_text((tree / file).read_text() + "\nsomething = 1\n")
-        return {name for name, key in keys_of().items() if key != before[name]}
-
-    for shared in ("film/gradient_film.py", "render.py", "passes.py", "samplers/registry.py"):
-        assert changed(shared) == set(names), shared
+    assert changed() == {*names} and changed() == set()
+    for shared in ("film/gradient_film.py", "render.py", "samplers/registry.py"):
+        assert changed(shared) == {*names}, shared
     assert changed("samplers/common.py") == {*names} - {"gmlt"}
     assert changed("samplers/studies/gmlt/chains.py") == changed("samplers/studies/gmlt/integrator.py") == {"gmlt"}
     assert changed("samplers/gpt/about.py") == {"auto", "gpt"}
-    assert changed("samplers/gpt/offset_path.py") == {
-        "auto",
-        "gpt",
-        "gmlt",
-        "primal",
-    }  # gmlt shifts the paths of its chains by it, and primal walks its base paths where lamps are chosen by place
+    # gmlt shifts the paths of its chains by it, and primal walks its base paths where lamps are chosen by place.
+    assert changed("samplers/gpt/offset_path.py") == {"auto", "gpt", "gmlt", "primal"}
     assert {"ppm", "gpm"} <= changed("samplers/photons/map/trace.py") <= {"ppm", "gpm"}
-    (tree / "paths" / "fresh.py").write_text("x = 1\n")
-    before = keys_of()
-    path = tree / "samplers" / "primal" / "sampler.py"
-    path.write_text(path.read_text() + "\ndef late():\n    from data_gen.paths import fresh\n")
-    assert {name for name, key in keys_of().items() if key != before[name]} == {"primal"}
-    assert changed("paths/fresh.py") == {"primal"}
+    assert changed("paths/fresh.py") == set()
+    late = "\ndef late():\n    from data_gen.paths import fresh\n"
+    assert changed("samplers/primal/sampler.py", late) == changed("paths/fresh.py") == {"primal"}
 
 
-def test_a_changed_colour_of_a_built_in_scene_is_another_key_of_built_in_scenes(tree, tmp_path):
+@pytest.mark.parametrize(
+    ("file", "old", "new", "built_in_only"),
+    [
+        ("film/gradient_film.py", "gradient[behind] = 0.5 *", "gradient[behind] = 0.25 *", False),
+        ("scenes/builtin.py", "_diffuse(0.3, 0.42, 0.6)", "_diffuse(0.3, 0.42, 0.7)", True),
+        ("scenes/grids.py", "(1 - height) / 0.4", "(1 - height) / 0.3", True),
+    ],
+)
+def test_what_changes_a_picture_changes_its_key(tree, tmp_path, file, old, new, built_in_only):
     (tmp_path / "scene.xml").write_text("<scene/>")
     scenes = ("diffuse", str(tmp_path / "scene.xml"))
     before = [key_of(scene, tmp_path) for scene in scenes]
-    replace(tree / "scenes" / "builtin.py", "_diffuse(0.3, 0.42, 0.6)", "_diffuse(0.3, 0.42, 0.7)")
+    text = (tree / file).read_text()
+    assert old in text
+    (tree / file).write_text(text.replace(old, new, 1))
     after = [key_of(scene, tmp_path) for scene in scenes]
-    assert after[0] != before[0] and after[1] == before[1]
-    replace(tree / "scenes" / "grids.py", "(1 - height) / 0.4", "(1 - height) / 0.3")
-    last = [key_of(scene, tmp_path) for scene in scenes]
-    assert last[0] not in (before[0], after[0]) and last[1] == before[1]
+    assert after[0] != before[0] and (after[1] == before[1]) == built_in_only
 
 
 def test_what_renders_nothing_does_not_change_the_key(tree, tmp_path):

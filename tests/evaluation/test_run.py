@@ -3,24 +3,22 @@
 import csv
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from folders import read, write_scene
+from folders import evaluated, read, write_scene
 
 import ngpt
-from data_gen import service
 from eval import main as command
 from ngpt.errors import NgptError
 from ngpt.evaluation import cells
 from ngpt.evaluation.config import read_config
-from ngpt.evaluation.run import evaluate, picture_path
+from ngpt.evaluation.run import picture_path
 from ngpt.evaluation.stability import flicker_and_bias, rolling_shutter, study
 from ngpt.io.exr import read_image
-from ngpt.system.console import Console
 
-QUIET = Console(quiet=True)
 CONFIG = """
 scenes = ["{folder}"]
 spp = [4, 16]
@@ -38,25 +36,36 @@ sampler = "primal"
 """
 
 
+def made(folder):
+    """A folder with a scene and the configuration of its evaluation."""
+    write_scene(folder / "room", np.random.default_rng(1))
+    return folder, read(CONFIG.format(folder=folder / "room"), folder)
+
+
 @pytest.fixture
-def room(tmp_path, rng):
-    write_scene(tmp_path / "room", rng)
-    return tmp_path, read(CONFIG.format(folder=tmp_path / "room"), tmp_path)
+def room(tmp_path):
+    return made(tmp_path)
 
 
-def test_the_folder_of_results(room):
-    folder, config = room
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """The same with its results, in `out`."""
+    folder, config = made(tmp_path_factory.mktemp("done"))
+    return folder, config, evaluated(config, folder / "out", "the command")
+
+
+def test_the_folder_of_results(done):
+    folder, _, results = done
     out = folder / "out"
-    evaluate(config, out, QUIET, "the command", service)
-    results = json.loads((out / "results.json").read_text())
+    assert results["cells"] == json.loads((out / "results.json").read_text())["cells"]
     found = {(c["spp"], c["method"], c["seed"]): c for c in results["cells"]}
     assert len(found) == len(results["cells"]) == 2 * 2 * 5
     assert all(found[16, m, 0]["metrics"]["relMSE"] < found[4, m, 0]["metrics"]["relMSE"] for m in ("primal", "l2"))
     cell = found[16, "l2", 1]
     assert cell["seconds"]["render"] == pytest.approx(1.6)
     assert cell["seconds"]["total"] == pytest.approx(1.6 + cell["seconds"]["reconstruct"])
-    assert results["methods"]["primal"]["stack"] == "path" and results["methods"]["nfor"]["stack"] == "features"
-    assert results["methods"]["wcv"]["stack"] == "gradients"
+    stacks = {"primal": "path", "nfor": "features", "wcv": "gradients"}
+    assert all(results["methods"][method]["stack"] == stack for method, stack in stacks.items())
     for cell in results["cells"]:
         if not cell["absent"]:
             assert read_image(out / cell["image"]).shape == (17, 24, 3)
@@ -70,19 +79,22 @@ def test_the_folder_of_results(room):
     assert "the command" in (out / "results.md").read_text()
 
 
-def test_a_missing_method_is_a_row_that_says_why(room):
-    folder, config = room
-    results = evaluate(config, folder / "out", QUIET, "", service)
+def test_a_missing_method_is_a_row_that_says_why(done):
+    folder, _, results = done
     rows = [cell for cell in results["cells"] if cell["method"] == "oracle"]
     assert len(rows) == 4 and all("no method 'oracle'" in row["absent"] for row in rows)
     assert "- `oracle`: there is no method 'oracle'" in (folder / "out" / "results.md").read_text()
 
 
-def test_what_is_done_is_not_done_again(room, monkeypatch):
-    folder, config = room
-    first = evaluate(config, folder / "out", QUIET, "", service)
-    monkeypatch.setattr(cells, "reconstruct", lambda *a, **k: pytest.fail("reconstructed again"))
-    assert evaluate(config, folder / "out", QUIET, "", service)["cells"] == first["cells"]
+def test_what_is_done_is_not_done_again_unless_a_stack_changed(done, tmp_path, monkeypatch):
+    folder, config, first = done
+    shutil.copytree(folder / "out", tmp_path / "out")
+    with monkeypatch.context() as patched:
+        patched.setattr(cells, "reconstruct", lambda *a, **k: pytest.fail("reconstructed again"))
+        assert evaluated(config, tmp_path / "out")["cells"] == first["cells"]
+    write_scene(tmp_path / "room", np.random.default_rng(2))
+    second = evaluated(replace(config, scenes=(str(tmp_path / "room"),), methods=("primal",)), tmp_path / "out")
+    assert first["cells"][0]["metrics"] != second["cells"][0]["metrics"]
 
 
 def test_killed_half_way_goes_on(room, monkeypatch):
@@ -97,14 +109,14 @@ def test_killed_half_way_goes_on(room, monkeypatch):
 
     monkeypatch.setattr(cells, "reconstruct", dies)
     with pytest.raises(KeyboardInterrupt):
-        evaluate(config, folder / "out", QUIET, "", service)
-    done = len(list((folder / "out" / "cache" / "cells").glob("*.json")))
-    assert done > 0
+        evaluated(config, folder / "out")
+    finished = len(list((folder / "out" / "cache" / "cells").glob("*.json")))
+    assert finished > 0
     calls[:] = [None] * 8
-    results = evaluate(config, folder / "out", QUIET, "", service)
+    results = evaluated(config, folder / "out")
     assert sum(not cell["absent"] for cell in results["cells"]) == 16
     # One warm-up for each method, and the cells that were left.
-    assert len(calls) - 8 == 4 + 16 - done
+    assert len(calls) - 8 == 4 + 16 - finished
 
 
 @pytest.mark.parametrize(
@@ -121,8 +133,8 @@ def test_bad_scenes_are_named_and_the_others_go_on(tmp_path, rng, spoil, message
     write_scene(tmp_path / "hall", rng)
     spoil(tmp_path / "room", clean)
     scenes = f'"{tmp_path}/room", "{tmp_path}/hall", "{tmp_path}/none"'
-    config = read(CONFIG.replace('"{folder}"', scenes), tmp_path)
-    results = evaluate(config, tmp_path / "out", QUIET, "", service)
+    config = replace(read(CONFIG.replace('"{folder}"', scenes), tmp_path), methods=("primal", "l2"))
+    results = evaluated(config, tmp_path / "out")
     absent = {cell["absent"] for cell in results["cells"] if cell["scene"] == "room" and cell["method"] == "l2"}
     assert any(why and message in why for why in absent)
     assert results["scenes"]["hall"]["absent"] is None
@@ -148,6 +160,9 @@ def test_bad_scenes_are_named_and_the_others_go_on(tmp_path, rng, spoil, message
         ("rivals = [1]", "must be a list of str"),
         (f'methods = ["l1", "l1-gpt"]\nsamplers = ["gpt", "toy"]\n{TWIN}', "two columns would be called 'l1-gpt'"),
         ('[references]\nroom = ["a.exr"]', "references.room = ['a.exr']: must be a file, or a list of two halves"),
+        ('[against]\noidn = ["oidm"]', "against.oidn: there is no column 'oidm' among: primal, l1, wcv"),
+        ("[against]\noidn = []", "against.oidn is empty"),
+        ('[against]\noidn = "oidn"', "against.oidn = 'oidn': must be a list of columns' names"),
     ],
 )
 def test_errors_of_the_configuration(tmp_path, entry, message):
@@ -157,6 +172,22 @@ def test_errors_of_the_configuration(tmp_path, entry, message):
     with pytest.raises(NgptError) as error:
         read(text, tmp_path)
     assert message in str(error.value) and "config.toml" in str(error.value)
+
+
+def test_a_configuration_may_build_on_another(tmp_path):
+    (tmp_path / "main.toml").write_text('scenes = ["diffuse"]\nspp = [4]\nseeds = 2\n[groups]\nrooms = ["room"]\n')
+    config = read('base = "main.toml"\nspp = [8]\nscenes = []\n[groups]\nhalls = ["hall"]\n', tmp_path)
+    assert (config.spp, config.seeds, config.scenes) == ((8,), 2, ())
+    assert config.groups == {"rooms": ["room"], "halls": ["hall"]}  # tables are put together
+    with pytest.raises(NgptError, match="no scenes: name built-in ones"):
+        config.scene_files()
+    with pytest.raises(NgptError, match=r"none\.toml: not found"):
+        read('base = "none.toml"\n', tmp_path)
+    with pytest.raises(NgptError, match=r"config\.toml: base = 'config\.toml': must be the name of another file"):
+        read('base = "config.toml"\n', tmp_path)
+    (tmp_path / "main.toml").write_text('base = "config.toml"\n')
+    with pytest.raises(NgptError, match=r"main\.toml: base = 'config\.toml': .* which is not built on this one"):
+        read('base = "main.toml"\n', tmp_path)
 
 
 def test_the_command(room, capsys):
@@ -173,18 +204,17 @@ def test_the_command(room, capsys):
     assert command(arguments) == 1
 
 
-def test_stability(room):
-    folder, config = room
-    evaluate(config, folder / "out", QUIET, "", service)
-    rows = {(r["spp"], r["method"]): r for r in study(folder / "out")}
+def test_stability(done, tmp_path):
+    shutil.copytree(done[0] / "out", tmp_path / "out")
+    rows = {(r["spp"], r["method"]): r for r in study(tmp_path / "out")}
     # Noise of 0.5 / sqrt(n) on values of about 1.
     assert 4 * rows[16, "primal"]["flicker"] == pytest.approx(rows[4, "primal"]["flicker"], rel=0.2)
     assert rows[4, "l2"]["flicker"] < 0.5 * rows[4, "primal"]["flicker"]
-    assert (folder / "out/stability/room-4-l2.png").read_bytes().startswith(b"\x89PNG")
-    assert "`primal`" in (folder / "out/stability.md").read_text()
-    (folder / "out" / picture_path("room", 4, "l2", 1)).unlink()
+    assert (tmp_path / "out/stability/room-4-l2.png").read_bytes().startswith(b"\x89PNG")
+    assert "`primal`" in (tmp_path / "out/stability.md").read_text()
+    (tmp_path / "out" / picture_path("room", 4, "l2", 1)).unlink()
     with pytest.raises(NgptError, match=r"4-l2-seed1\.exr: no such picture"):
-        study(folder / "out")
+        study(tmp_path / "out")
 
 
 def test_flicker_and_bias_add_up(rng):
@@ -204,11 +234,12 @@ def test_rolling_shutter_takes_each_row_of_its_seed():
 
 def test_the_tiny_configuration(renderer, tmp_path):
     config = read_config(Path(__file__).parents[2] / "configs/eval-tiny.toml")
-    results = evaluate(config, tmp_path, QUIET, "", service)
-    assert not any(entry["absent"] for entry in results["scenes"].values())
+    assert config.scenes == ("diffuse", "glossy")
+    config = replace(config, scenes=("glossy",), seeds=1, metrics=("relMSE", "relMSE trimmed"))
+    results = evaluated(config, tmp_path)
     costs = results["scenes"]["glossy"]["cost"]
     assert costs["gradients"]["median"] > costs["path"]["median"]
-    used = {(c["method"], c["spp"]): c["spp used"] for c in results["cells"] if c["scene"] == "glossy"}
+    used = {(c["method"], c["spp"]): c["spp used"] for c in results["cells"]}
     ratio = costs["gradients"]["median"] / costs["path"]["median"]
     assert used["primal", 16] == round(16 * ratio) and used["primal-gpt", 16] == used["l1", 16] == 16
     errors = {(r["method"], r["spp"]): r["error"] for r in results["summary"] if r["scene"] is None}
@@ -217,16 +248,4 @@ def test_the_tiny_configuration(renderer, tmp_path):
     assert "albedo" not in ngpt.read(stack)
     # A second run renders nothing.
     stamp = stack.stat().st_mtime_ns
-    assert (
-        evaluate(config, tmp_path, QUIET, "", service)["cells"] == results["cells"]
-        and stack.stat().st_mtime_ns == stamp
-    )
-
-
-def test_a_changed_stack_is_another_cell(room, rng):
-    folder, config = room
-    first = evaluate(config, folder / "out", QUIET, "", service)
-    shutil.rmtree(folder / "room")
-    write_scene(folder / "room", rng)
-    second = evaluate(config, folder / "out", QUIET, "", service)
-    assert first["cells"][0]["metrics"] != second["cells"][0]["metrics"]
+    assert evaluated(config, tmp_path)["cells"] == results["cells"] and stack.stat().st_mtime_ns == stamp

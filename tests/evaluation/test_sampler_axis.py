@@ -5,18 +5,13 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
-from folders import read, write_scene
+from folders import evaluated, read, write_scene
 
 import ngpt
-from data_gen import service
 from ngpt.errors import NgptError
 from ngpt.evaluation.config import Config, read_config
-from ngpt.evaluation.run import evaluate
 from ngpt.evaluation.stacks import SceneStacks
 from ngpt.report.evaluation import write_evaluation_report
-from ngpt.system.console import Console
-
-QUIET = Console(quiet=True)
 
 
 def columns(**entries):
@@ -84,7 +79,7 @@ def test_folders_of_stacks_have_samplers_without_a_renderer(tmp_path, rng, monke
         write_scene(room, rng, gradients=name)
     text = f'scenes = ["{room}"]\nspp = [4, 16]\nseeds = 2\nmethods = ["primal", "l2"]\nimages = "all"\n'
     text += 'samplers = ["ours", "theirs"]\nmetrics = ["relMSE", "relMSE trimmed"]\n'
-    results = evaluate(read(text, tmp_path), tmp_path / "out", QUIET, "", service)
+    results = evaluated(read(text, tmp_path), tmp_path / "out")
     names = ["primal", "l2 (ours)", "l2 (theirs)"]
     assert list(results["methods"]) == names and not any(cell["absent"] for cell in results["cells"])
     entry = results["methods"]["l2 (theirs)"]
@@ -101,9 +96,7 @@ def test_folders_of_stacks_have_samplers_without_a_renderer(tmp_path, rng, monke
     page = write_evaluation_report(tmp_path / "out", tmp_path / "report.html").read_text()
     assert "l2 (theirs)" in page and "equal rendering time to 4 spp of sampler auto" in page
     # A single sampler that is not the usual one: names are those of the methods.
-    results = evaluate(
-        read(text.replace('"theirs"', "").replace('"ours", ', '"ours"'), tmp_path), tmp_path, QUIET, "", service
-    )
+    results = evaluated(read(text.replace('"theirs"', "").replace('"ours", ', '"ours"'), tmp_path), tmp_path)
     assert list(results["methods"]) == ["primal", "l2"]
 
 
@@ -122,9 +115,9 @@ timing_repeats = 3
 
 def test_two_samplers_at_equal_time(renderer, tmp_path):
     out = tmp_path / "out"
-    before = evaluate(read(SETTINGS, tmp_path), out, QUIET, "", service)
+    before = evaluated(read(SETTINGS, tmp_path), out)
     text = SETTINGS + 'samplers = ["gpt", "gpt-basic"]\nrivals = ["primal", "ppn"]\n'
-    results = evaluate(read(text, tmp_path), out, QUIET, "", service)
+    results = evaluated(read(text, tmp_path), out)
     names = ["primal (primal)", "primal (ppn)", "wcv (gpt)", "wcv (gpt-basic)"]
     assert list(results["methods"]) == names
     cells = {(cell["method"], cell["seed"]): cell for cell in results["cells"]}
@@ -166,7 +159,7 @@ def test_two_samplers_at_equal_time(renderer, tmp_path):
     assert "Milliseconds a sample" in page and "gradients gpt-basic" in page
     assert json.loads((out / "results.json").read_text())["methods"]["wcv (gpt)"]["sampler"] == "gpt"
     # Another clock: the nominal samples are those of gpt-basic, of which gpt has more.
-    slow = evaluate(read(SETTINGS + 'clock = "gpt-basic"\n', tmp_path), out, QUIET, "", service)
+    slow = evaluated(read(SETTINGS + 'clock = "gpt-basic"\n', tmp_path), out)
     assert next(c["spp used"] for c in slow["cells"] if c["method"] == "wcv") == round(8 / ratio)
 
 

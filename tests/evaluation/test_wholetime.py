@@ -4,30 +4,11 @@ import csv
 import xml.etree.ElementTree as ElementTree
 
 import pytest
-from folders import read, write_scene
+from folders import evaluated, read, write_scene
 
-from data_gen import service
-from ngpt.errors import NgptError
-from ngpt.evaluation.curves import REACH, error_at, first_at
-from ngpt.evaluation.run import evaluate
+from ngpt.evaluation import cells
 from ngpt.evaluation.wholetime import against_rivals, envelope
 from ngpt.report.evaluation import write_evaluation_report
-from ngpt.system.console import Console
-
-QUIET = Console(quiet=True)
-LAW = [(t, 0.3 * t**-0.7) for t in (8, 32, 128)]
-
-
-@pytest.mark.parametrize(("seconds", "mark"), [(8, ""), (20, ""), (128, ""), (200, "~"), (500, "~"), (2.1, "~")])
-def test_errors_are_read_off_a_power_law_exactly(seconds, mark):
-    error, how = error_at(seconds, LAW)
-    assert error == pytest.approx(0.3 * seconds**-0.7) and (how == mark or seconds in (8, 128))
-
-
-def test_far_outside_a_curve_it_is_read_at_the_factor():
-    assert error_at(1e6, LAW) == (pytest.approx(0.3 * (128 * REACH) ** -0.7), ">")
-    assert error_at(1e-6, LAW) == (pytest.approx(0.3 * (8 / REACH) ** -0.7), "<")
-    assert error_at(8, LAW[:1]) is None and error_at(8, []) is None
 
 
 def made(rows: dict[str, list[tuple[float, float, float]]], scenes=("a",), **settings) -> dict:
@@ -40,8 +21,8 @@ def made(rows: dict[str, list[tuple[float, float, float]]], scenes=("a",), **set
         "summary": [],
     }
     for scene in scenes:
-        for method, cells in rows.items():
-            for spp, (seconds, error, flip) in zip((4, 16, 64), cells, strict=False):
+        for method, values in rows.items():
+            for spp, (seconds, error, flip) in zip((4, 16, 64), values, strict=False):
                 metrics = {"relMSE": {"median": error}, "FLIP": {"median": flip}}
                 place = {"scene": scene, "spp": spp, "method": method, "error": error, "metrics": metrics}
                 results["summary"].append(place | {"seconds": {"total": seconds}})
@@ -111,16 +92,15 @@ def test_an_evaluation_holds_its_methods_against_rivals(tmp_path, rng):
     """Rivals have counts of their own; results, tables, plots and the report say what they are at equal whole time."""
     write_scene(tmp_path / "room", rng, spp=(4, 16, 64), seeds=1)
     config = read(CONFIG.format(folder=tmp_path / "room"), tmp_path)
-    results = evaluate(config, tmp_path / "out", QUIET, "", service)
+    results = evaluated(config, tmp_path / "out")
     measured = {(cell["method"], cell["spp"]) for cell in results["cells"]}
     assert ("primal", 64) in measured and ("l2", 64) not in measured and ("nfor", 64) not in measured
     rows = {(row["method"], row["spp"]): row for row in results["against"]["rows"]}
     assert set(rows) == {(method, spp) for method in ("l2", "nfor") for spp in (4, 16)}
     cell = next(c for c in results["cells"] if (c["method"], c["spp"]) == ("l2", 16))
-    assert (
-        rows["l2", 16]["seconds"] == pytest.approx(1.6 + cell["seconds"]["reconstruct"]) and not rows["l2", 16]["mark"]
-    )
-    assert rows["l2", 16]["error"] < 0.5
+    row = rows["l2", 16]
+    assert row["seconds"] == pytest.approx(1.6 + cell["seconds"]["reconstruct"]) and not row["mark"]
+    assert row["error"] < 0.5
     assert cell["seconds"]["reconstruct wall"] == cell["seconds"]["reconstruct"]  # the clock of this one
     page = (tmp_path / "out" / "results.md").read_text()
     assert "| rooms (1) | 16 | l2 | 1.6" in page and "path (`primal`, `raw`)" in page
@@ -134,54 +114,14 @@ def test_an_evaluation_holds_its_methods_against_rivals(tmp_path, rng):
 
 
 def test_processor_seconds_of_a_reconstruction_are_those_of_all_threads(tmp_path, rng, monkeypatch):
-    from ngpt.evaluation import cells
-
     write_scene(tmp_path / "room", rng, seeds=1)
     ticks = iter(range(100))
     monkeypatch.setattr(cells.time, "process_time", lambda: 3.0 * next(ticks))
     text = CONFIG.format(folder=tmp_path / "room").replace("rival_spp = [4, 16, 64]", 'time = "processor"')
-    found = evaluate(read(text, tmp_path), tmp_path / "out", QUIET, "", service)["cells"]
+    found = evaluated(read(text, tmp_path), tmp_path / "out")["cells"]
     assert {cell["seconds"]["reconstruct"] for cell in found} == {3.0}
     assert all(cell["seconds"]["reconstruct wall"] < 3 for cell in found)
     assert found[0]["seconds"]["total"] == pytest.approx(3.4)
-
-
-def test_a_rival_that_is_no_column_is_refused(tmp_path):
-    with pytest.raises(NgptError, match=r"against\.oidn: there is no column 'oidm' among: primal, l1, wcv"):
-        read('scenes = ["diffuse"]\n[against]\noidn = ["oidm"]\n', tmp_path)
-    with pytest.raises(NgptError, match=r"against\.oidn is empty"):
-        read('scenes = ["diffuse"]\n[against]\noidn = []\n', tmp_path)
-    with pytest.raises(NgptError, match=r"against\.oidn = 'oidn': must be a list of columns' names"):
-        read('scenes = ["diffuse"]\n[against]\noidn = "oidn"\n', tmp_path)
-
-
-def test_a_configuration_may_build_on_another(tmp_path):
-    (tmp_path / "main.toml").write_text('scenes = ["diffuse"]\nspp = [4]\nseeds = 2\n[groups]\nrooms = ["room"]\n')
-    config = read('base = "main.toml"\nspp = [8]\nscenes = []\n[groups]\nhalls = ["hall"]\n', tmp_path)
-    assert (config.spp, config.seeds, config.scenes) == ((8,), 2, ())
-    assert config.groups == {"rooms": ["room"], "halls": ["hall"]}  # tables are put together
-    with pytest.raises(NgptError, match="no scenes: name built-in ones"):
-        config.scene_files()
-    with pytest.raises(NgptError, match=r"none\.toml: not found"):
-        read('base = "none.toml"\n', tmp_path)
-    with pytest.raises(NgptError, match=r"config\.toml: base = 'config\.toml': must be the name of another file"):
-        read('base = "config.toml"\n', tmp_path)
-    (tmp_path / "main.toml").write_text('base = "config.toml"\n')
-    with pytest.raises(NgptError, match=r"main\.toml: base = 'config\.toml': .* which is not built on this one"):
-        read('base = "main.toml"\n', tmp_path)
-
-
-def test_two_renders_of_nearly_the_same_time_say_little_of_later_ones():
-    """Short renders take what recording takes: the slope between them is no law, outside it is at most 1/x."""
-    points = [(1.0, 1.0), (1.01, 0.5)]
-    assert error_at(2.02, points) == (pytest.approx(0.25), "~") and error_at(0.5, points) == (pytest.approx(2), "~")
-    assert first_at(0.25, points) == (pytest.approx(2.02), "~")
-
-
-def test_who_has_more_time_could_have_taken_less():
-    """A point that noise put above the one before counts as that; beyond it, the slope that fell goes on."""
-    points = [(1, 1.0), (4, 0.25), (16, 0.5)]
-    assert error_at(8, points) == (pytest.approx(0.25), "") and error_at(32, points) == (pytest.approx(0.125), "~")
 
 
 def test_an_envelope_goes_from_the_quickest_to_the_slowest_setting():

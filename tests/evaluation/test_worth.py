@@ -5,20 +5,14 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
-from folders import read, smooth_image, write_halves
+from folders import evaluated, read, smooth_image, write_halves
 
 import ngpt
-from data_gen import service
-from ngpt.evaluation.curves import REACH, first_at
-from ngpt.evaluation.run import evaluate
-from ngpt.evaluation.worth import worth_of_gradients, worth_tables
+from ngpt.evaluation.worth import _means, worth_of_gradients, worth_tables
 from ngpt.evaluation.worthplots import block_errors, block_size
 from ngpt.report.evaluation import write_evaluation_report
 from ngpt.stack import GradientStack
-from ngpt.system.console import Console
 
-QUIET = Console(quiet=True)
-LAW = [(n, 0.3 * n**-0.7) for n in (8, 32, 128)]  # error over samples
 WORTH = 3.0
 CONFIG = """
 scenes = ["{folder}"]
@@ -42,27 +36,6 @@ sampler = "slow"
 method = "primal"
 stack = "features"
 """
-
-
-@pytest.mark.parametrize(
-    ("samples", "mark"), [(8, ""), (20, ""), (32, ""), (128, ""), (200, "~"), (127 * REACH, "~"), (4, "~"), (2.1, "~")]
-)
-def test_a_power_law_is_read_exactly(samples, mark):
-    found, how = first_at(0.3 * samples**-0.7, LAW)
-    assert found == pytest.approx(samples, rel=1e-6)
-    assert how == mark or samples in (8, 128)  # the ends, up to rounding
-
-
-def test_a_curve_that_rises_has_the_error_it_had_before():
-    # Noise put the second point above the first: more samples do no harm, so the first crossing counts.
-    points = [(1, 1.0), (4, 2.0), (16, 0.25)]
-    assert first_at(0.5, points) == (pytest.approx(8), "")
-    # It stays at 0.25 until 64 at least: what comes below is sought from there on, by the last slope that falls.
-    found, mark = first_at(0.125, [*points, (64, 0.3)])
-    assert (found, mark) == (pytest.approx(64 * 2), "~")
-    assert first_at(0.2, [(1, 0.5), (4, 0.6)]) is None and first_at(0.2, [(1, 0.5)]) is None and first_at(1, []) is None
-    # A rival whose error only rises has this one from its first point on: it must not be left out.
-    assert first_at(0.55, [(3, 0.5), (4, 0.6)]) == first_at(0.5, [(3, 0.5)]) == (pytest.approx(3), "<")
 
 
 def write_room(folder, rng):
@@ -95,9 +68,7 @@ def room(tmp_path, rng):
 
 def test_stacks_of_known_worth(room):
     folder, text = room
-    results = evaluate(
-        read(text + '\n[groups]\nrooms = ["room"]\n', folder), folder / "out", QUIET, "the command", service
-    )
+    results = evaluated(read(text + '\n[groups]\nrooms = ["room"]\n', folder), folder / "out", "the command")
     best = [row for row in results["worth"]["rows"] if row["best"]]
     assert [(row["spp"], row["method"], row["rival"]) for row in best] == [(n, "ours", "primal") for n in (4, 16, 64)]
     assert [row["W"] for row in best] == pytest.approx([WORTH] * 3, rel=0.15)
@@ -139,24 +110,22 @@ def of_known_costs(costs: dict[str, tuple[float, float]], worth: float = WORTH) 
     return results
 
 
-def test_the_whole_time_makes_the_difference():
+def rows_of(**costs):
+    return {(row["method"], row["spp"]): row for row in worth_of_gradients(of_known_costs(costs))["rows"]}
+
+
+@pytest.mark.parametrize(("begins", "ratio"), [(0, 1), (48.0, 0.5)])
+def test_the_whole_time_makes_the_difference(begins, ratio):
     """W/C is the seconds without over those with, both whole; C that of further samples, whatever a method takes."""
-    rows = {
-        (row["method"], row["spp"]): row
-        for row in worth_of_gradients(of_known_costs({"ours": (0, 3.0), "theirs": (0, 1.0)}))["rows"]
-    }
-    assert (rows["ours", 16]["W"], rows["ours", 16]["C"], rows["ours", 16]["W/C"]) == pytest.approx((3, 3, 1))
-    # Our method takes as long as all of the samples: half as much is left of W/C, and C stays.
-    rows = {
-        (row["method"], row["spp"]): row
-        for row in worth_of_gradients(of_known_costs({"ours": (48.0, 3.0), "theirs": (0, 1.0)}))["rows"]
-    }
-    assert (rows["ours", 16]["W"], rows["ours", 16]["C"], rows["ours", 16]["W/C"]) == pytest.approx((3, 3, 0.5))
-    assert rows["ours", 4]["W/C"] == pytest.approx(12 / 60) and rows["ours", 4]["seconds"] == 60
-    # Of two rivals the one that is done first counts: the quick samples of the one wait for a slow method.
-    costs = {"ours": (0, 3.0), "slow-begin": (100.0, 0.5), "slow-samples": (0.0, 1.0)}
-    rows = {(row["method"], row["spp"]): row for row in worth_of_gradients(of_known_costs(costs))["rows"]}
-    assert rows["ours", 4]["rival"] == "slow-samples" and rows["ours", 4]["rival seconds"] == pytest.approx(12)
+    rows = rows_of(ours=(begins, 3.0), theirs=(0, 1.0))
+    assert (rows["ours", 16]["W"], rows["ours", 16]["C"], rows["ours", 16]["W/C"]) == pytest.approx((3, 3, ratio))
+    assert rows["ours", 4]["W/C"] == pytest.approx(12 / (begins + 12)) and rows["ours", 4]["seconds"] == begins + 12
+
+
+def test_of_two_rivals_the_one_that_is_done_first_counts():
+    """The quick samples of the one wait for a slow method."""
+    row = rows_of(ours=(0, 3.0), slow_begin=(100.0, 0.5), slow_samples=(0.0, 1.0))["ours", 4]
+    assert row["rival"] == "slow_samples" and row["rival seconds"] == pytest.approx(12)
 
 
 def test_blocks_sum_the_error_and_halves_take_its_noise_off(rng):
@@ -174,12 +143,10 @@ def test_blocks_sum_the_error_and_halves_take_its_noise_off(rng):
 
 def test_means_over_scenes_are_geometric_and_carry_marks(room):
     folder, text = room
-    results = evaluate(read(text, folder), folder / "out", QUIET, "", service)
+    results = evaluated(read(text, folder), folder / "out")
     results["settings"]["groups"] = {"rooms": ["b", "c"]}
     row = {"spp": 4, "method": "ours", "sampler": "gpt", "best": True, "error": 1.0, "rival": "primal", "C": 2.0}
     rows = [row | {"scene": s, "W": w, "W/C": w / 2, "mark": m} for s, w, m in (("a", 1.0, ""), ("b", 4.0, ">"))]
-    from ngpt.evaluation.worth import _means
-
     one, best = [mean for mean in _means(results, rows) if mean["method"] is None]
     assert (one["group"], one["scenes"], one["W"]) == ("rooms", 1, pytest.approx(4.0))
     assert (best["group"], best["scenes"], best["mark"]) == ("all", 2, ">")

@@ -10,14 +10,19 @@ from ngpt.network.inputs import DENOISED, Oidn, base_image, denoised
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 
+NETWORKS = [path for path in sorted(WEIGHTS.glob("ngpt-*.onnx")) if not path.stem.endswith(".statistics")]
 
-@pytest.mark.parametrize("path", sorted(WEIGHTS.glob("ngpt-*[a-z].onnx")), ids=lambda path: path.stem)
+
+@pytest.fixture(scope="module", params=NETWORKS, ids=lambda path: path.stem)
+def both(library, request):
+    return Network(library, request.param), in_python(request.param)
+
+
 @pytest.mark.parametrize("size", [(23, 29), (1, 1), (1, 40), (17, 1), (16, 16)])
-def test_networks_agree_with_python(library, path, size):
-    if not path.stem.endswith(".statistics"):
-        network = Network(library, path)
-        layers = those(network, example(*size))
-        agree(result(network, layers), in_python(path, layers))
+def test_networks_agree_with_python(both, size):
+    network, python = both
+    layers = those(network, example(*size))
+    agree(result(network, layers), python(layers))
 
 
 def stack_of(layers) -> GradientStack:

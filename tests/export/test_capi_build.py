@@ -14,6 +14,12 @@ import ngpt
 DOCS = SOURCE.parents[1] / "docs" / "embed" / "c-library.md"
 STRICT = ["-Wall", "-Wextra", "-pedantic", "-Werror"]
 
+
+def shown(language: str) -> str:
+    """The program of the docs."""
+    return re.search(rf"```{language}\n(.*?)```", DOCS.read_text(), re.S)[1]
+
+
 PROJECT = """
 cmake_minimum_required(VERSION 3.16)
 project(renderer C CXX)
@@ -30,15 +36,15 @@ file(WRITE ${CMAKE_BINARY_DIR}/networks.txt ${ngpt_NETWORKS})
 """
 
 
-@pytest.mark.parametrize("standard", ["c89", "c99", "c17"])
-def test_the_header_is_c(standard):
-    command(
-        tool("gcc", "clang"), f"-std={standard}", "-Wall", "-Wextra", "-pedantic", "-Werror", "-fsyntax-only", HEADER
-    )
+C, CPP = ("gcc", "clang"), ("g++", "clang++")
 
 
-def test_the_header_is_cpp():
-    command(tool("g++", "clang++"), "-std=c++98", *STRICT, "-fsyntax-only", "-x", "c++", HEADER)
+@pytest.mark.parametrize(
+    ("compilers", "standard"), [(C, "c89"), (C, "c99"), (C, "c17"), (CPP, "c++98")], ids=lambda value: value[:5]
+)
+def test_the_header_is_c_and_cpp(compilers, standard):
+    language = "c++" if compilers == CPP else "c"
+    command(tool(*compilers), f"-std={standard}", *STRICT, "-fsyntax-only", "-x", language, HEADER)
 
 
 def test_only_functions_of_the_header_are_exported(prefix):
@@ -52,7 +58,7 @@ def test_only_functions_of_the_header_are_exported(prefix):
 def renderer_project(prefix, tmp_path_factory):
     """The build folder of a project that uses the package, with the program of the docs."""
     folder = tmp_path_factory.mktemp("renderer")
-    (folder / "renderer.c").write_text(re.search(r"```c\n(.*?)```", DOCS.read_text(), re.S)[1])
+    (folder / "renderer.c").write_text(shown("c"))
     (folder / "CMakeLists.txt").write_text(PROJECT.replace("VERSION REQUIRED", f"{ngpt.__version__} REQUIRED"))
     command(tool("cmake"), "-S", folder, "-B", folder / "build", f"-DCMAKE_PREFIX_PATH={prefix}")
     command(tool("cmake"), "--build", folder / "build")
@@ -77,10 +83,8 @@ def test_pkg_config_tells_where_it_is(prefix, tmp_path):
     assert command(*words, "--modversion", env=environment).strip() == ngpt.__version__
     networks = command(*words, "--variable=networks", env=environment).strip()
     flags = command(*words, "--cflags", "--libs", env=environment).split()
-    (tmp_path / "program.c").write_text(re.search(r"```c\n(.*?)```", DOCS.read_text(), re.S)[1])
-    command(
-        tool("gcc", "clang"), tmp_path / "program.c", *flags, f"-Wl,-rpath,{prefix}/lib", "-o", tmp_path / "program"
-    )
+    (tmp_path / "program.c").write_text(shown("c"))
+    command(tool(*C), tmp_path / "program.c", *flags, f"-Wl,-rpath,{prefix}/lib", "-o", tmp_path / "program")
     assert 0.7 < float(command(tmp_path / "program", f"{networks}/ngpt-fast.onnx")) < 1.3
 
 
@@ -112,9 +116,8 @@ def test_cmake_tells_where_to_get_what_is_missing(toolchain, tmp_path):
 
 
 def test_python_as_the_docs_show(prefix):
-    (code,) = re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.S)
     environment = os.environ | {"LD_LIBRARY_PATH": str(prefix / "lib")}
-    outcome = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=100)
+    outcome = subprocess.run([sys.executable, "-c", shown("python")], env=environment, capture_output=True, text=True)
     assert outcome.stdout == f"{ngpt.__version__}\n", outcome.stderr
 
 

@@ -1,8 +1,8 @@
 """The hosts in other languages: each is built and run, and must give the pixels of ``ngpt denoise``.
 
-C++ wants a compiler and ONNX Runtime's headers and library, of the system or in ORT_ROOT; Node wants onnxruntime-node in
-a node_modules that NODE_PATH names, or beside the host; the host with OIDN wants mitsuba-oidn, which has its library.
-See docs/embed/hosts.md, which publishes the differences that ``pytest -m slow -s -k pixels`` prints.
+C++ wants a compiler and ONNX Runtime's headers, of the system or in ORT_ROOT; Node wants onnxruntime-node in a
+node_modules that NODE_PATH names, or beside the host; the host with OIDN wants mitsuba-oidn, which has its library. See
+docs/embed/hosts.md, which publishes the differences that ``pytest -m slow -s -k pixels`` prints.
 """
 
 import re
