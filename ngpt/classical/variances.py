@@ -85,14 +85,14 @@ def smooth_variances(
     """
     layers = [smoothed(primal_var), *(smoothed(layer, True) for layer in (dx_var[:, :-1], dy_var[:-1]))]
     mean = robust_mean(*layers)
-    p, x, y = (_relative(layer, mean, primal_var.dtype) for layer in layers)
+    p, x, y = (relative(layer, mean, primal_var.dtype) for layer in layers)
     differences = np.stack([p, p])
     differences[0, :, :-1], differences[1, :-1] = x, y
     return (p / SHARED)[None], without_missing(differences, trusted)
 
 
-def _relative(layer: np.ndarray, mean: float, dtype: Any) -> np.ndarray:
-    """Variances over their mean, with ``FLOOR``."""
+def relative(layer: np.ndarray, mean: float, dtype: Any) -> np.ndarray:
+    """Variances (H, W) over their mean, with ``FLOOR`` added; 1 everywhere without any noise."""
 
     def rows(first: int, last: int) -> tuple:
         part = layer[first:last]

@@ -26,7 +26,7 @@ import numpy as np
 
 from ngpt.classical.controlvariates import SWEEPS, decay
 from ngpt.classical.leastsquares import FLOAT32_RANGE, robust_mean
-from ngpt.classical.variances import FLOOR, SHARED, smoothed
+from ngpt.classical.variances import SHARED, relative, smoothed
 from ngpt.sequence.warp import bilinear_taps, warped
 from ngpt.system.late import ndimage, sparse
 
@@ -124,7 +124,7 @@ class _Still:
     def divide(self, level: float) -> None:
         """Makes the variances relative to the variance level of the whole window."""
         self.primal, self.x, self.y = (
-            (share * _relative(v, level))[..., None].astype(self.dtype)
+            (share * relative(v, level, np.float64))[..., None].astype(self.dtype)
             for share, v in ((1, self.primal), (SHARED, self.x), (SHARED, self.y))
         )
         if self.trusted is not None:
@@ -160,7 +160,8 @@ class _Step:
         apart: np.ndarray = np.where(known[..., None], spline - linear, 0).astype(dtype)
         noise = smoothed(np.where(known[..., None], link.dt_var, np.nan), True)
         wrong = ndimage.maximum_filter(np.square(apart, dtype=np.float64).sum(axis=-1), 3)
-        variance = np.where(known, _relative(DOUBT * noise + INTERPOLATION * wrong, level), np.inf)
+        doubtful = relative(DOUBT * noise + INTERPOLATION * wrong, level, np.float64)
+        variance = np.where(known, doubtful, np.inf)
         self.offset: np.ndarray = np.where(known[..., None], link.dt + apart, 0).astype(dtype)
         self.variance: np.ndarray = variance[..., None].astype(dtype)
         self.known = known[..., None]
@@ -197,8 +198,3 @@ class _Step:
         a = self.cover * own_before / (own_before + self.variance_before)
         said_before[0][...] += a * heard
         said_before[1][...] += a
-
-
-def _relative(variance: np.ndarray, level: float) -> np.ndarray:
-    """Over the mean of all, with the floor of ``smooth_variances``."""
-    return variance / level + FLOOR if level > 0 else np.ones_like(variance)

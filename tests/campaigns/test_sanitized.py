@@ -76,9 +76,8 @@ def networks(tmp_path_factory) -> list[Path]:
     return made
 
 
-@pytest.mark.parametrize("path", [FAST, PRIMAL], ids=lambda path: path.stem)
-def test_every_function(sanitized, path):
-    assert sanitized.run("stress", path, 2) == ""
+def test_shipped_networks(sanitized):
+    assert sanitized.run("open", FAST, PRIMAL) == "0 \n0 \n"
 
 
 def test_networks_that_lie(sanitized, tmp_path):

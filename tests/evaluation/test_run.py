@@ -4,7 +4,6 @@ import csv
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ import ngpt
 from eval import main as command
 from ngpt.errors import NgptError
 from ngpt.evaluation import cells
-from ngpt.evaluation.config import read_config
 from ngpt.evaluation.run import picture_path
 from ngpt.evaluation.stability import flicker_and_bias, rolling_shutter, study
 from ngpt.io.exr import read_image
@@ -230,22 +228,3 @@ def test_flicker_and_bias_add_up(rng):
 def test_rolling_shutter_takes_each_row_of_its_seed():
     images = np.arange(3.0)[:, None, None, None] * np.ones((1, 7, 2, 3))
     assert rolling_shutter(images)[:, 0, 0].tolist() == [0, 0, 0, 1, 1, 2, 2]
-
-
-def test_the_tiny_configuration(renderer, tmp_path):
-    config = read_config(Path(__file__).parents[2] / "configs/eval-tiny.toml")
-    assert config.scenes == ("diffuse", "glossy")
-    config = replace(config, scenes=("glossy",), seeds=1, metrics=("relMSE", "relMSE trimmed"))
-    results = evaluated(config, tmp_path)
-    costs = results["scenes"]["glossy"]["cost"]
-    assert costs["gradients"]["median"] > costs["path"]["median"]
-    used = {(c["method"], c["spp"]): c["spp used"] for c in results["cells"]}
-    ratio = costs["gradients"]["median"] / costs["path"]["median"]
-    assert used["primal", 16] == round(16 * ratio) and used["primal-gpt", 16] == used["l1", 16] == 16
-    errors = {(r["method"], r["spp"]): r["error"] for r in results["summary"] if r["scene"] is None}
-    assert errors["wcv", 16] < errors["primal-gpt", 16] and errors["nfor", 16] < errors["primal-gpt", 16]
-    stack = next((tmp_path / "cache").glob("glossy-*/path-*-0.exr"))
-    assert "albedo" not in ngpt.read(stack)
-    # A second run renders nothing.
-    stamp = stack.stat().st_mtime_ns
-    assert evaluated(config, tmp_path)["cells"] == results["cells"] and stack.stat().st_mtime_ns == stamp

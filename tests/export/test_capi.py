@@ -29,12 +29,6 @@ def stack_of(layers) -> GradientStack:
     return GradientStack.from_arrays(**{name: layer for name, layer in layers.items() if "denoised" not in name})
 
 
-@pytest.mark.parametrize("memory", [0, 115])
-def test_it_gives_the_pixels_of_denoise(fast, memory):
-    layers = example(100, 400)
-    agree(result(fast, those(fast, layers), memory), reconstruct(stack_of(layers), "ngpt-fast").image)
-
-
 def test_a_network_that_corrects_another_denoiser(library):
     pytest.importorskip("mitsuba_oidn")
     network = Network(library, WEIGHTS / "ngpt-combine.onnx")

@@ -122,7 +122,7 @@ def in_torch(layers, path):
 
 
 def run(session, layers, **more):
-    names = [i.name for i in session.get_inputs()]
+    names = [i.name for i in (*session.get_inputs(), *session.get_overridable_initializers())]
     return session.run(None, {name: layers[name] for name in names if name in layers} | more)[0]
 
 
@@ -140,8 +140,8 @@ def other_denoiser(monkeypatch):
 
     def images(layers, config):
         data = repair(stack_of(layers), config.reads_gradients)
-        base = inputs.base_image(data, "wcv") if config.reads_gradients else None
-        made = inputs.denoised(inputs.Oidn(data), base, inputs.DENOISED)
+        base = inputs.base_image(data, config.base) if config.base else None
+        made = inputs.denoised(inputs.Oidn(data), base, config.layers)
         made = {name: planes(image + data.direct) for name, image in made.items()}
         if data.caustic is not None:
             made["denoised_caustic"] = np.full_like(layers["caustic"], np.nan)
