@@ -10,12 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capi import built
+from capi import built, command, example, tool
 
 from ngpt.stack import GradientStack
 
 HOSTS = Path(__file__).parents[1] / "export" / "hosts"
-LIBRARY = HOSTS.parent / "capi"
 VECTOR = HOSTS.parent / "vector"
 
 # mitsuba-oidn has OIDN's library in it, with the same functions in a namespace, and without headers: those that the
@@ -61,14 +60,9 @@ def read_layers(folder) -> dict[str, np.ndarray]:
 
 
 def repeated(height, width) -> dict[str, np.ndarray]:
-    """The vector's layers again and again, sixteen times as bright at the right as at the left."""
-    brightness, layers = np.exp2(4 * np.arange(width) / width), {}
-    for name, layer in read_layers(VECTOR).items():
-        if name != "image":
-            power = 2 if name.endswith("_var") else 0 if name in ("albedo", "normal", "depth") else 1
-            many = np.tile(layer, (1, 1, -(-height // 23), -(-width // 29)))[:, :, :height, :width]
-            layers[name] = (many * brightness**power).astype(np.float32)
-    return layers
+    """The layers of ``capi.example`` as hosts read them, (1, C, H, W)."""
+    layers = {name: layer for name, layer in example(height, width).items() if "denoised" not in name}
+    return {name: np.ascontiguousarray(np.moveaxis(layer, -1, 0)[None]) for name, layer in layers.items()}
 
 
 def stack_of(layers) -> GradientStack:
@@ -101,15 +95,10 @@ def agree_but_for_rounding_in_oidn(image, expected):
 
 def compiled(source: str, folder: Path, *flags: str) -> list[str]:
     """The command of a C++ host, compiled with libngpt in a folder."""
-    compiler = shutil.which("g++") or shutil.which("clang++")
-    if compiler is None:
-        pytest.skip("neither g++ nor clang++ is installed")
-    prefix = built()
-    program = folder / Path(source).stem
-    command = [compiler, "-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", HOSTS / "cpp" / source, "-o", program]
-    command += [f"-I{prefix}/include", f"-L{prefix}/lib", f"-Wl,-rpath,{prefix}/lib", "-lngpt", *flags]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=500)
-    assert result.returncode == 0, result.stderr
+    prefix, program = built(), folder / Path(source).stem
+    strict = [tool("g++", "clang++"), "-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror"]
+    library = [f"-I{prefix}/include", f"-L{prefix}/lib", f"-Wl,-rpath,{prefix}/lib", "-lngpt"]
+    command(*strict, HOSTS / "cpp" / source, "-o", program, *library, *flags)
     return [str(program)]
 
 

@@ -121,9 +121,12 @@ def test_no_difference_is_believed_for_its_luck():
 
 def test_what_is_repaired_is_without_direct_light_and_distrusts_both_differences_of_a_lost_pixel():
     primal, zero = np.ones((5, 6, 3), np.float32), np.zeros((5, 6, 3), np.float32)
+    direct = zero.copy()
+    direct[2, 2] = 0.25
     primal[2, 3] = np.nan
-    stack = GradientStack.from_arrays(primal=primal, dx=zero, dy=zero).replace(direct=zero + np.float32(0.25))
-    found = repair(stack)
-    assert np.allclose(found.image, 0.75) and np.allclose(found.direct[2, 2], 0.25) and found.pixels == 1
+    found = repair(stack_of(primal, zero, zero, (primal, zero, zero)).replace(direct=direct))
+    assert np.allclose(found.image[2, 2], 0.75) and np.allclose(found.direct[2, 2], 0.25) and found.pixels == 1
     lost = [{tuple(map(int, place)) for place in np.argwhere(~trusted)} for trusted in found.trusted]
     assert lost == [{(2, 2), (2, 3)}, {(1, 3), (2, 3)}] and found.gradients == 4
+    # The variance of light that the camera sees directly is none of the image's.
+    assert {tuple(map(int, place)) for place in np.argwhere(np.isnan(found.noise[..., 0]))} == {(2, 2), (2, 3)}

@@ -6,6 +6,7 @@ docs/embed/hosts.md, which publishes the differences that ``pytest -m slow -s -k
 """
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -139,8 +140,9 @@ def test_a_host_needs_no_light_kept_apart_and_tells_the_time_of_each_run(host, k
 
 
 @pytest.mark.parametrize("kind", [cpp_host, node_host])
-def test_a_host_says_what_is_wrong(host, kind, tmp_path):
-    layers, output = read_layers(VECTOR), tmp_path / "image.pfm"
+def test_a_host_says_what_is_wrong(host, kind, shot, tmp_path):
+    layers, output, alone = read_layers(VECTOR), tmp_path / "image.pfm", tmp_path / "alone.onnx"
+    shutil.copy(FAST, alone)
     few = written(tmp_path / "a", {name: layer for name, layer in layers.items() if name != "albedo"})
     other = written(tmp_path / "b", layers | {"depth": layers["depth"][..., 1:]})
     for status, message, *arguments in (
@@ -149,6 +151,7 @@ def test_a_host_says_what_is_wrong(host, kind, tmp_path):
         (2, "usage", FAST, VECTOR, output, 0, "many"),
         (1, "none.onnx", tmp_path / "none.onnx", VECTOR, output),
         (1, "statistics|ngpt.inputs", FAST.with_suffix(".statistics.onnx"), VECTOR, output),
+        (1, "alone.statistics.onnx", alone, shot[0], output, 27),
         (1, "albedo", FAST, few, output),
         (1, "depth", FAST, other, output),
     ):
@@ -165,24 +168,3 @@ def refused(call, status, message, *arguments):
 def test_a_host_with_oidn_says_what_is_wrong(host, tmp_path):
     refused(host(oidn_host), 2, "usage", WEIGHTS / "ngpt-combine.onnx")
     refused(host(oidn_host), 1, "reads no images of OIDN", FAST, VECTOR, tmp_path / "image.pfm")
-
-
-def test_what_export_writes_runs_in_node(host, tmp_path):
-    """A network of one's own, whole and in tiles. Without its statistics it runs whole, and tiles are refused."""
-    pytest.importorskip("onnxscript")
-    from networks import ALL, dense, untrained
-
-    from ngpt.network.weights import save_weights
-
-    save_weights(tmp_path / "mine.safetensors", untrained(dense(ALL)), {})
-    mine, output, call = tmp_path / "mine.onnx", tmp_path / "image.pfm", host(node_host)
-    assert main(["export", "--weights", str(tmp_path / "mine.safetensors"), "-o", str(mine)]) == 0
-    images = []
-    for tile in (0, 16, 0):
-        done = call(mine, VECTOR, output, tile)
-        assert done.returncode == 0, done.stderr
-        images.append(read_pfm(output))
-        agree(images[-1], images[0])
-        if tile:
-            mine.with_suffix(".statistics.onnx").unlink()
-    refused(call, 1, "mine.statistics.onnx", mine, VECTOR, output, 16)
