@@ -6,6 +6,8 @@ from ngpt.evaluation.frontier import Point, pareto
 from ngpt.evaluation.results import as_csv, summarised
 from ngpt.evaluation.tables import tables
 
+CLOCKS = ("render", "reconstruct", "total", "reconstruct wall")
+
 
 def method_entry(name: str) -> dict:
     kind = {"primal": "path", "oidn": "features"}.get(name, "gradients")
@@ -32,12 +34,7 @@ def make_results(errors: dict[str, list[float]], noise: float = 1e-6) -> dict:
         for method, values in errors.items():
             for seed, value in enumerate(values):
                 cell = {"scene": scene, "spp": 16, "method": method, "seed": seed, "spp used": 20, "absent": None}
-                cell["seconds"] = {
-                    "render": 2.0,
-                    "reconstruct": seed + 1.0,
-                    "total": seed + 3.0,
-                    "reconstruct wall": 0.5,
-                }
+                cell["seconds"] = dict(zip(CLOCKS, (2.0, seed + 1.0, seed + 3.0, 0.5), strict=True))
                 cell["metrics"] = {"relMSE": value * factor, "PSNR": 10.0 * factor}
                 results["cells"].append(cell)
     results["summary"] = summarised(results)
@@ -54,12 +51,7 @@ def test_medians_and_means():
     rows = {(row["scene"], row["method"]): row for row in results["summary"]}
     assert rows["a", "l1"]["error"] == 0.02 and rows["a", "l1"]["seeds"] == 3
     assert rows["a", "l1"]["metrics"]["relMSE"] == pytest.approx({"median": 0.02, "low": 0.015, "high": 0.055})
-    assert rows["a", "l1"]["seconds"] == {
-        "render": 2.0,
-        "reconstruct": 2.0,
-        "total": 4.0,
-        "reconstruct wall": 0.5,
-    }
+    assert rows["a", "l1"]["seconds"] == dict(zip(CLOCKS, (2.0, 2.0, 4.0, 0.5), strict=True))
     # Geometric for errors, arithmetic for decibels.
     assert rows[None, "l1"]["error"] == pytest.approx(0.2)
     assert rows[None, "l1"]["metrics"]["PSNR"]["median"] == pytest.approx(505)

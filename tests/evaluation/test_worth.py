@@ -22,6 +22,9 @@ methods = ["ours", "ours-worse", "primal", "theirs-worse"]
 metrics = ["relMSE"]
 primary = "relMSE"
 
+[groups]
+rooms = ["room"]
+
 [variants.ours]
 method = "primal"
 stack = "gradients"
@@ -60,15 +63,10 @@ def write_room(folder, rng):
     write_halves(folder, rng, 0.05)
 
 
-@pytest.fixture
-def room(tmp_path, rng):
+def test_stacks_of_known_worth(tmp_path, rng):
     write_room(tmp_path / "room", rng)
-    return tmp_path, CONFIG.format(folder=tmp_path / "room")
-
-
-def test_stacks_of_known_worth(room):
-    folder, text = room
-    results = evaluated(read(text + '\n[groups]\nrooms = ["room"]\n', folder), folder / "out", "the command")
+    config, out = read(CONFIG.format(folder=tmp_path / "room"), tmp_path), tmp_path / "out"
+    results = evaluated(config, out, "the command")
     best = [row for row in results["worth"]["rows"] if row["best"]]
     assert [(row["spp"], row["method"], row["rival"]) for row in best] == [(n, "ours", "primal") for n in (4, 16, 64)]
     assert [row["W"] for row in best] == pytest.approx([WORTH] * 3, rel=0.15)
@@ -80,14 +78,14 @@ def test_stacks_of_known_worth(room):
     assert all(row["W/C"] == pytest.approx(row["W"], rel=0.05) for row in best)
     # At equal time, which without costs are equal samples, nearly all blocks are better.
     assert all(row["blocks"] > 0.5 for row in best)
-    with open(folder / "out" / "worth.csv", newline="") as file:
+    with open(out / "worth.csv", newline="") as file:
         lines = list(csv.DictReader(file))
     assert [float(line["W"]) for line in lines if line["best"] == "True"] == [row["W"] for row in best]
-    page = (folder / "out" / "worth.md").read_text()
+    page = (out / "worth.md").read_text()
     assert f"| room | 16 | ours | primal | {best[1]['W']:.2f} |" in page and "the command" in page
     assert f"| rooms (1) | 64 | ~{best[2]['W']:.2f} | 1.00 |" in page
-    ElementTree.parse(folder / "out" / results["plots"]["worth"]["room"])
-    report = write_evaluation_report(folder / "out", folder / "report.html").read_text()
+    ElementTree.parse(out / results["plots"]["worth"]["room"])
+    report = write_evaluation_report(out, tmp_path / "report.html").read_text()
     assert "Worth of gradients, scene by scene" in report and "worth: room" in report
 
 
@@ -141,16 +139,15 @@ def test_blocks_sum_the_error_and_halves_take_its_noise_off(rng):
     assert block_size(100) == 8 and block_size(1280) == 32
 
 
-def test_means_over_scenes_are_geometric_and_carry_marks(room):
-    folder, text = room
-    results = evaluated(read(text, folder), folder / "out")
+def test_means_over_scenes_are_geometric_and_carry_marks():
+    results = of_known_costs({"ours": (0, 1.0), "primal": (0, 1.0)})
     results["settings"]["groups"] = {"rooms": ["b", "c"]}
     row = {"spp": 4, "method": "ours", "sampler": "gpt", "best": True, "error": 1.0, "rival": "primal", "C": 2.0}
     rows = [row | {"scene": s, "W": w, "W/C": w / 2, "mark": m} for s, w, m in (("a", 1.0, ""), ("b", 4.0, ">"))]
-    one, best = [mean for mean in _means(results, rows) if mean["method"] is None]
+    results["worth"] = {"rows": rows, "means": _means(results, rows)}
+    one, best = [mean for mean in results["worth"]["means"] if mean["method"] is None]
     assert (one["group"], one["scenes"], one["W"]) == ("rooms", 1, pytest.approx(4.0))
     assert (best["group"], best["scenes"], best["mark"]) == ("all", 2, ">")
     assert (best["W"], best["C"], best["W/C"]) == pytest.approx((2.0, 2.0, 1.0))
-    results["worth"] = {"rows": rows, "means": _means(results, rows)}
     table = next(iter(worth_tables(results).values()))
     assert table[2][:5] == ["all (2)", "4", ">2.00", "2.00", ">1.00"]
