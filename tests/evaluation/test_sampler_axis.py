@@ -12,29 +12,38 @@ from ngpt.evaluation.config import Config, read_config
 from ngpt.evaluation.stacks import SceneStacks
 from ngpt.report.evaluation import write_evaluation_report
 
+VARIANTS = {
+    "wcv-replayed": {"method": "wcv", "sampler": "gpt-basic"},
+    "raw": {"method": "primal", "stack": "gradients", "sampler": "gpt"},
+    "photons": {"method": "primal", "sampler": "ppm"},
+}
 
-def columns(**entries):
-    config = Config(scenes=("diffuse",), **entries)
-    return {column.name: (column.method, column.render.name) for column in config.columns()}
 
-
-def test_methods_appear_once_for_each_sampler_of_their_kind_of_stack():
-    methods = ("primal", "wcv", "oidn")
-    # One sampler: names and stacks are those of old.
-    assert columns(methods=methods) == {
-        "primal": ("primal", "path"),
-        "wcv": ("wcv", "gradients"),
-        "oidn": ("oidn", "features"),
-    }
-    assert columns(methods=methods, samplers=("gpt-basic",))["wcv"] == ("wcv", "gradients gpt-basic")
-    assert columns(methods=methods, samplers=("auto", "gpt-basic"), rivals=("primal", "ppm")) == {
-        "primal (primal)": ("primal", "path"),
-        "primal (ppm)": ("primal", "features ppm"),
-        "wcv (auto)": ("wcv", "gradients"),
-        "wcv (gpt-basic)": ("wcv", "gradients gpt-basic"),
-        "oidn (primal)": ("oidn", "features"),
-        "oidn (ppm)": ("oidn", "features ppm"),
-    }
+@pytest.mark.parametrize(
+    ("entries", "expected"),
+    [
+        # One sampler: names and stacks are those of old.
+        ({}, "primal: path; wcv: gradients; oidn: features"),
+        ({"samplers": ("gpt-basic",)}, "primal: path; wcv: gradients gpt-basic; oidn: features"),
+        (
+            {"samplers": ("auto", "gpt-basic"), "rivals": ("primal", "ppm")},
+            "primal (primal): path; primal (ppm): features ppm; wcv (auto): gradients; "
+            "wcv (gpt-basic): gradients gpt-basic; oidn (primal): features; oidn (ppm): features ppm",
+        ),
+        # A variant names its own sampler.
+        (
+            {"methods": ("wcv", *VARIANTS), "samplers": ("gpt", "toy"), "variants": VARIANTS},
+            "wcv (gpt): gradients gpt; wcv (toy): gradients toy; wcv-replayed: gradients gpt-basic; "
+            "raw: gradients gpt; photons: features ppm",
+        ),
+    ],
+)
+def test_methods_appear_once_for_each_sampler_of_their_kind_of_stack(entries, expected):
+    config = Config(**{"scenes": ("diffuse",), "methods": ("primal", "wcv", "oidn")} | entries)
+    columns = config.columns()
+    assert "; ".join(f"{column.name}: {column.render.name}" for column in columns) == expected
+    for column in columns:
+        assert column.method == VARIANTS.get(column.name, {"method": column.name.split(" (")[0]})["method"]
 
 
 def test_tables_of_samplers_are_their_options(tmp_path):
@@ -163,18 +172,3 @@ def test_two_samplers_at_equal_time(renderer, tmp_path):
 def test_the_tiny_configuration_has_a_column_for_each_method():
     columns = read_config(Path(__file__).parents[2] / "configs" / "eval-tiny.toml").columns()
     assert {column.name: column.render.name for column in columns}["primal-gpt"] == "gradients" and len(columns) == 9
-
-
-def test_a_variant_names_its_own_sampler():
-    variants = {
-        "wcv-replayed": {"method": "wcv", "sampler": "gpt-basic"},
-        "raw": {"method": "primal", "stack": "gradients", "sampler": "gpt"},
-        "photons": {"method": "primal", "sampler": "ppm"},
-    }
-    assert columns(methods=("wcv", *variants), samplers=("gpt", "toy"), variants=variants) == {
-        "wcv (gpt)": ("wcv", "gradients gpt"),
-        "wcv (toy)": ("wcv", "gradients toy"),
-        "wcv-replayed": ("wcv", "gradients gpt-basic"),
-        "raw": ("primal", "gradients gpt"),
-        "photons": ("primal", "features ppm"),
-    }
