@@ -168,6 +168,7 @@ def result(network, layers, memory=0, image=None, progress=None) -> np.ndarray:
 
 def example(height=23, width=29) -> dict[str, np.ndarray]:
     """Layers (H, W, C) of every kind; larger ones are the vector's again and again, brighter to the right."""
+    pytest.importorskip("onnx")
     from ngpt.export.vector import example_layers
 
     brightness, layers = np.exp2(4 * np.arange(width) / width), {}

@@ -5,6 +5,8 @@ node_modules that NODE_PATH names, or beside the host; the host with OIDN wants 
 docs/embed/hosts.md, which publishes the differences that ``pytest -m slow -s -k pixels`` prints.
 """
 
+import hashlib
+import json
 import re
 import shutil
 from pathlib import Path
@@ -120,7 +122,13 @@ def test_ten_lines_of_python_give_the_pixels_of_denoise(of_python, shot, capsys,
 
 
 def test_the_vector_is_what_denoise_makes_of_all_that_goes_wrong():
-    layers = read_layers(VECTOR)
+    pytest.importorskip("onnx")
+    from ngpt.export.vector import example_layers
+
+    layers, example = read_layers(VECTOR), example_layers()
+    for name, entry in json.loads((VECTOR / "layers.json").read_text()).items():
+        assert hashlib.sha256((VECTOR / f"{name}.f32").read_bytes()).hexdigest() == entry["sha256"]
+        assert name == "image" or np.allclose(layers[name], example[name], equal_nan=True)
     image = layers.pop("image")
     result = reconstruct(stack_of(layers), "ngpt-fast")
     agree(image, result.image.transpose(2, 0, 1)[None])
