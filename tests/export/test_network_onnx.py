@@ -3,6 +3,7 @@
 import json
 from functools import cache
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -57,7 +58,9 @@ def weights(tmp_path_factory):
 
 @cache
 def exported(path):
-    return network_model(path, path.stem)
+    # How far a network sees is measured on one example: it takes most of the time.
+    with patch("ngpt.export.reach.EXAMPLES", 1):
+        return network_model(path, path.stem)
 
 
 # What others have parts of
