@@ -65,10 +65,14 @@ def test_the_tiles_are_those_of_python(primal):
     # What two thirds of the image take
     memory = 2 * 200 * 900 * python.bytes // (3 * 2**20)
     layers, fractions = those(primal, example(200, 900)), []
-    tiled = result(primal, layers, memory, progress=lambda fraction: fractions.append(fraction) or 0)
+    result(primal, layers, memory, progress=lambda fraction: fractions.append(fraction) or 0)
     assert len(set(fractions)) == len(python.plan(200, 900, memory)[0]) + 1 > 2
     assert (fractions[0], fractions[-1]) == (0, 1) and fractions == sorted(fractions)
-    agree(tiled, result(primal, layers))
+
+
+def test_tiles_agree_with_the_whole(fast):
+    layers = those(fast, example(23, 700))
+    agree(result(fast, layers, 30), result(fast, layers))
 
 
 # --- where pixels lie ------------------------------------------------------------------------------------------------
