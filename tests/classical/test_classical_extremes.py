@@ -99,6 +99,9 @@ def test_every_alpha_keeps_the_mean_of_l2_and_the_largest_the_primal(alpha):
     assert np.allclose(results[0].mean((0, 1), np.float64), data[0].mean((0, 1), np.float64), rtol=1e-6)
     if alpha == 1e6:
         assert np.allclose(results, data[0], atol=1e-4)
+    if alpha == 1e-6:  # differences are the projected gradients, whatever α is
+        double = [layer.astype(np.float64) for layer in data]
+        assert np.allclose(l2(*double, alpha), l2(*double, 1e-5), atol=1e-6)
 
 
 def test_alpha_may_be_derived():

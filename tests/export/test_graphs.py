@@ -16,7 +16,10 @@ from ngpt.classical.leastsquares import robust_mean
 from ngpt.denoisers import caustic as numpy_caustic
 from ngpt.export.builder import FLOAT, Graph, choose, op, repeat
 from ngpt.export.graphs import caustic, transfer, variances
+from ngpt.export.graphs.model import _OperatorsOfHeads
 from ngpt.network import transfer as torch_transfer
+from ngpt.network.heads import Direct, Kernels, Mixture, Pyramid, Residual
+from ngpt.network.poisson import GRADIENTS, Poisson
 from ngpt.network.shipped import WEIGHTS
 
 
@@ -81,6 +84,37 @@ def test_means_of_an_image_survive_a_runtime_that_adds_one_number_after_another(
     graph.output("mean", op.Reshape(variances.robust_mean(x, x * 0.0 + 1.0), [-1]), ("one",))
     (mean,) = ReferenceEvaluator(graph.model({}), new_ops=[ReduceSum]).run(None, {"x": values})
     assert np.allclose(mean, 0.1, rtol=1e-4)
+
+
+HEADS = [
+    Direct(),
+    Residual(("base",)),
+    Mixture(("primal", "base")),
+    Kernels(("primal",), 1),
+    Kernels(("primal", "base"), 5),
+    Poisson(("base",), Residual(("base",)), 1),
+    Poisson(("primal",), Kernels(("primal",), 3), 1),
+    Poisson(("primal", "base"), Mixture(("primal", "base")), 3),
+    Poisson(("primal",), Pyramid(("primal",), 3, 3, True), 2),
+    Poisson(("primal", "base"), Pyramid(("primal", "base"), 3, 2, True), 2),
+]
+
+
+@pytest.mark.parametrize("head", HEADS, ids=repr)
+def test_heads_are_the_same_as_graphs(head):
+    torch.manual_seed(0)
+    sides, sweeps = (16 + 2 * head.radius, 24 + 2 * head.radius), isinstance(head, Poisson)
+    prediction = 2 * torch.randn(2, head.outputs, 16, 24)
+    if sweeps:
+        gradients = [torch.randn(2, 3, *sides), torch.randn(2, 3, *sides), *torch.rand(2, 2, 1, *sides)]
+        gradients[2][..., head.radius + 3, :] = 0
+        images = [0.1 + 3 * torch.rand(2, 3, *sides) for _ in head.inner.reads] + gradients
+        assert head.reads[-4:] == GRADIENTS
+    else:
+        images = [10 ** torch.randn(2, 3, *sides) for _ in head.start]
+    expected = head.forward(prediction, images).numpy()
+    made = evaluate(lambda first, *others: head.graph(_OperatorsOfHeads(), first, list(others)), prediction, *images)
+    assert np.allclose(made, expected, rtol=1e-4 if sweeps else 1e-5, atol=1e-5 if sweeps else 1e-6)
 
 
 def test_expressions():
