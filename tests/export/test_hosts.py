@@ -73,19 +73,19 @@ def host(toolchain, tmp_path_factory):
 
 @pytest.fixture(scope="module", params=["wide", *(pytest.param(name, marks=pytest.mark.slow) for name in SCENES)])
 def shot(request, tmp_path_factory):
-    """A folder of layers, their stack, and where tiles are cut: MiB of ngpt-fast, of others; pixels in Node.
+    """A folder of layers, their stack, and where a host cuts tiles: MiB in C++, in Node pixels.
 
     Either all that goes wrong, so wide that tiles do not see all of it, or a stack of ``ngpt demo``.
     """
     folder = tmp_path_factory.mktemp(request.param)
     if request.param == "wide":
         layers = repeated(23, 440)
-        return written(folder / "raw", layers), stack_of(layers), 27, 40
+        return written(folder / "raw", layers), stack_of(layers), {cpp_host: 27, node_host: 90, oidn_host: 40}
     request.getfixturevalue("renderer")
     stack = folder / "stack.exr"
     assert main(["render", request.param, "--spp", "16", "--size", "240x160", "-o", str(stack), "--quiet"]) == 0
     assert main(["unpack", str(stack), str(folder / "raw"), "--quiet"]) == 0
-    return folder / "raw", ngpt.read(stack), 120, 90
+    return folder / "raw", ngpt.read(stack), {cpp_host: 120, node_host: 120, oidn_host: 90}
 
 
 def tell(capsys, request, image, expected, check=agree):
@@ -107,17 +107,16 @@ def tell(capsys, request, image, expected, check=agree):
     ],
 )
 def test_a_host_gives_the_pixels_of_denoise(host, shot, kind, method, tiled, capsys, request, tmp_path):
-    folder, stack, fast, other = shot
-    # In Node pixels, no multiple of the alignment: the host must make one of it.
-    tile = (fast if method == "ngpt-fast" else other) if tiled else 0
-    result = host(kind)(WEIGHTS / f"{method}.onnx", folder, tmp_path / "image.pfm", tile)
+    folder, stack, tiles = shot
+    # 90 pixels are no multiple of the alignment: the host must make one of it.
+    result = host(kind)(WEIGHTS / f"{method}.onnx", folder, tmp_path / "image.pfm", tiles[kind] if tiled else 0)
     assert result.returncode == 0, result.stderr
     check = agree_but_for_rounding_in_oidn if method == "ngpt-combine" else agree
     tell(capsys, request, read_pfm(tmp_path / "image.pfm"), denoised(stack, method), check)
 
 
 def test_ten_lines_of_python_give_the_pixels_of_denoise(of_python, shot, capsys, request):
-    folder, stack, *_ = shot
+    folder, stack, _ = shot
     tell(capsys, request, of_python(FAST, read_layers(folder)), denoised(stack))
 
 
