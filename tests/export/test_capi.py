@@ -70,9 +70,11 @@ def test_the_tiles_are_those_of_python(primal):
     assert (fractions[0], fractions[-1]) == (0, 1) and fractions == sorted(fractions)
 
 
-def test_tiles_agree_with_the_whole(fast):
+def test_tiles_agree_with_the_whole_and_may_be_written_where_a_layer_is(fast):
     layers = those(fast, example(23, 700))
-    agree(result(fast, layers, 30), result(fast, layers))
+    whole, tiled = result(fast, layers), result(fast, layers, 30)
+    agree(tiled, whole)
+    np.testing.assert_array_equal(result(fast, layers, 30, image=layers["primal"]), tiled)
 
 
 # --- where pixels lie ------------------------------------------------------------------------------------------------
@@ -124,9 +126,3 @@ def test_halves(primal):
     image = result(primal, others | {"primal": halves}, image=np.zeros(halves.shape, np.float16))
     with np.errstate(over="ignore"):
         np.testing.assert_array_equal(image, expected.astype(np.float16))
-
-
-def test_the_output_may_lie_where_a_layer_is(fast):
-    layers = those(fast, example(23, 700))
-    expected = result(fast, layers, 30)
-    np.testing.assert_array_equal(result(fast, layers, 30, image=layers["primal"]), expected)
