@@ -57,6 +57,18 @@ def thin_wall():
     return scene
 
 
+def door():
+    """A dark room with light from the next one under a door, and little of its own."""
+    return _place(
+        (0.3, 0.9, 1.3),
+        (0, 0.4, -0.4),
+        **_walls(1.2, 2.2, -2, 1.5),
+        door=_box([0, 1.14, -0.5], [2.4, 2.2, 0.04], 0, _grey()),
+        lamp=_light([0, 0.5, -1.99], [0, 0, 1], (2.2, 0.9), (30, 27, 24)),
+        night=_light([0, 2.19, 0.5], [0, -1, 0], (0.5, 0.5), (0.08, 0.09, 0.1)),
+    )
+
+
 def shade():
     """A lamp inside a tube that is open above and below."""
     bulb = _sphere([0, 1.0, 0], 0.06, _diffuse(0, 0, 0))
@@ -67,6 +79,17 @@ def shade():
         **_walls(1.2, 2.2, -1.2, 1.7),
         bulb=bulb | {"emitter": {"type": "area", "radiance": _rgb(60, 50, 40)}},
         tube=tube | {"to_world": mi.ScalarTransform4f(), "bsdf": _grey(0.7)},
+    )
+
+
+def corner_box():
+    """A box in a corner with a gap of 2 cm to both walls."""
+    return _place(
+        (0.6, 1.3, 1.0),
+        (-0.9, 0.4, -0.9),
+        **_walls(1.2, 2.2, -1.2, 1.5),
+        lamp=_light([0.3, 2.19, 0.2], [0, -1, 0], (0.7, 0.7), (8, 8, 8)),
+        box=_box([-0.88, 0.35, -0.88], [0.6, 0.7, 0.6], 0, _grey(0.7)),
     )
 
 

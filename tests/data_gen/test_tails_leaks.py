@@ -6,7 +6,7 @@ from functools import cache
 import mitsuba as mi
 import numpy as np
 import pytest
-from tails_scenes import SIZE, contact, shade, sheet, shelf, slit, thin_wall, varnish
+from tails_scenes import SIZE, contact, corner_box, door, shade, sheet, shelf, slit, thin_wall, varnish
 from unbiased import REFERENCES, load
 
 from data_gen.render import render_stack
@@ -67,7 +67,9 @@ def bias(shared, paths):
 MOST = {
     shelf: (0.012, 0.004),  # 0.0055, -0.0013
     thin_wall: (0.600, 0.004),  # 0.305, -0.0007
+    door: (0.060, 0.020),  # 0.020, -0.002
     shade: (0.060, 0.030),  # -, -0.006
+    corner_box: (0.005, 0.003),  # 0.0005, -0.0001
     sheet: (0.006, 0.004),  # 0.002, 0.0002
     contact: (0.006, 0.006),  # 0.0023, -0.0028
     slit: (0.150, 0.150),  # 0.075, -0.073
