@@ -17,8 +17,8 @@ BLOCK = 4
 
 
 @cache
-def whole(description, size=SIZE, spp=256, seeds=6):
-    """Images by whole paths, more samples together than those that they are held against."""
+def whole(description, size=SIZE, spp=512, seeds=6):
+    """Images by whole paths, of several times the samples of those that they are held against."""
     return images(load(mi, description, size), "paths", spp, range(REFERENCES, REFERENCES + seeds))
 
 
