@@ -35,7 +35,7 @@ RETURNS = 1e-3
 
 
 # Asked of each event but the first: whether a chain would have ended there, whatever the event.
-Ends = Callable[[mi.SurfaceInteraction3f], mi.Bool]
+Ends = Callable[["mi.SurfaceInteraction3f"], "mi.Bool"]
 
 
 def nowhere(si: mi.SurfaceInteraction3f) -> mi.Bool:

@@ -1,12 +1,13 @@
 """Materials with diffuse lobes and others, for the sampler ``split``."""
 
+import mitsuba as mi
 import numpy as np
+
+from data_gen.scenes.builtin import _camera, _diffuse, _light, _rgb, _sphere, _wall
 
 
 def coats(specular=1.0):
     """Materials with diffuse lobes and others; with ``specular`` 0 the others are black, the diffuse ones the same."""
-    from data_gen.scenes.builtin import _diffuse, _rgb
-
     satin = {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": _rgb(0.6, 0.3, 0.1), "nonlinear": True}
     satin |= {"specular_reflectance": specular}
     gloss = {"type": "plastic", "diffuse_reflectance": _rgb(0.2, 0.5, 0.3), "specular_reflectance": specular}
@@ -21,7 +22,6 @@ def coats(specular=1.0):
 
 def shelf(materials, max_depth=5, more=None):
     """Balls of these materials on a floor under a large lamp."""
-    from data_gen.scenes.builtin import _camera, _diffuse, _light, _sphere, _wall
 
     def scene():
         places = zip((-1.05, -0.35, 0.35, 1.05), materials.items(), strict=False)
@@ -45,10 +45,6 @@ def principled(**values):
 
 def everything():
     """All that light may meet first: coats, mirrors, glass, metal, principled materials, bumps."""
-    import mitsuba as mi
-
-    from data_gen.scenes.builtin import _sphere
-
     relief = mi.Bitmap(np.random.default_rng(3).random((8, 8), np.float32))
     bump = {"type": "bitmap", "raw": True, "bitmap": relief}
     first = {**coats(), "paint": principled(metallic=0.2, clearcoat=0.5)}

@@ -8,26 +8,21 @@ import functools
 import tempfile
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 from media_scenes import density
 
-
-def transform():
-    import mitsuba as mi
-
-    return mi.ScalarTransform4f()
+from data_gen.scenes.builtin import _box, _camera, _diffuse, _light, _rgb, _sphere, _transform, _wall
 
 
 def bitmap(height, width, seed, low=0.0, high=1.0, channels=3):
     """Random texels, without interpolation between them."""
-    import mitsuba as mi
-
     texels = np.random.default_rng(seed).uniform(low, high, (height, width, channels)).astype(np.float32)
     return {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True, "filter_type": "nearest"}
 
 
 def smooth(texture, scale=1.0):
-    return texture | {"filter_type": "bilinear", "to_uv": transform().scale([scale, scale, 1])}
+    return texture | {"filter_type": "bilinear", "to_uv": _transform().scale([scale, scale, 1])}
 
 
 def two(bsdf):
@@ -36,8 +31,6 @@ def two(bsdf):
 
 def stage(depth=8, integrator="path", origin=(0.2, 1.1, 3.2), target=(0, 0.5, 0), fov=50, **things):
     """A floor, a wall at the back and a lamp above, which ``things`` may replace."""
-    from data_gen.scenes.builtin import _camera, _diffuse, _light, _rgb, _wall
-
     return {
         "type": "scene",
         "integrator": {"type": integrator, "max_depth": depth, "rr_depth": 4},
@@ -70,17 +63,12 @@ def coarse_ball(center, radius, rings, bsdf, **more):
     head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     vertices = "".join("{:.6f} {:.6f} {:.6f} {:.6f} {:.6f} {:.6f}\n".format(*v) for v in np.hstack([n, n]))
     text = head + vertices + "".join("3 {} {} {}\n".format(*f) for f in faces)
-    to_world = transform().translate(list(center)).scale(radius)
+    to_world = _transform().translate(list(center)).scale(radius)
     return {"type": "ply", "filename": written("ball.ply", text), "to_world": to_world, "bsdf": bsdf, **more}
-
-
-# ------------------------------ Materials -----------------------------
 
 
 def panes():
     """Thin, rough and clear dielectrics, and a clear ball of air in a ball of glass."""
-    from data_gen.scenes.builtin import _sphere, _wall
-
     water = {"type": "dielectric", "int_ior": 1.33}
     bubble = {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.33}
     return stage(
@@ -94,8 +82,6 @@ def panes():
 
 def principled():
     """Of glass, of cloth, lacquered, of metal that is brushed; and a thin leaf."""
-    from data_gen.scenes.builtin import _box, _rgb, _sphere, _wall
-
     glass = {"type": "principled", "base_color": _rgb(0.9, 0.95, 0.9), "roughness": 0.3, "spec_trans": 0.8, "eta": 1.4}
     cloth = {"type": "principled", "base_color": _rgb(0.5, 0.1, 0.2), "sheen": 1.0, "sheen_tint": 0.5, "flatness": 0.5}
     metal = {"type": "principled", "base_color": _rgb(0.9, 0.6, 0.3), "metallic": 1.0, "roughness": 0.35}
@@ -110,8 +96,6 @@ def principled():
 
 def bumps():
     """Bump and normal maps on a floor at a grazing angle, a mask, and a blend of gloss and matt."""
-    from data_gen.scenes.builtin import _diffuse, _rgb, _sphere, _wall
-
     gloss = {"type": "roughplastic", "alpha": 0.15, "diffuse_reflectance": _rgb(0.3, 0.4, 0.5), "nonlinear": True}
     bumpy = {"type": "bumpmap", "arbitrary": smooth(bitmap(8, 8, 1, channels=1), 2), "scale": 0.6, "bsdf": gloss}
     tilted = {
@@ -137,8 +121,6 @@ def bumps():
 
 def tilts(side, seed):
     """Normals up to 30 degrees beside the surface's, as a normal map holds them."""
-    import mitsuba as mi
-
     n = np.random.default_rng(seed).uniform(-0.4, 0.4, (side, side, 3))
     n[..., 2] = 1
     n = (n / np.linalg.norm(n, axis=-1, keepdims=True) + 1) / 2
@@ -147,7 +129,6 @@ def tilts(side, seed):
 
 def brushed():
     """Anisotropic metals of both distributions, textured roughness, and plastics."""
-    from data_gen.scenes.builtin import _rgb, _sphere, _wall
 
     def metal(material, distribution, **alpha):
         return {"type": "roughconductor", "material": material, "distribution": distribution, **alpha}
@@ -161,9 +142,6 @@ def brushed():
         plastic=_sphere([0.75, 0.3, 0.7], 0.3, {"type": "plastic", "diffuse_reflectance": _rgb(0.6, 0.1, 0.1)}),
         mirror=_sphere([0.1, 0.2, 1.0], 0.2, {"type": "conductor", "material": "Ag"}),
     )
-
-
-# ------------------------------- Shapes -------------------------------
 
 
 def hair():
@@ -185,10 +163,6 @@ def hair():
 
 def solids():
     """A surface in a grid of signed distances, instances, a disc and a ball that is turned inside out."""
-    import mitsuba as mi
-
-    from data_gen.scenes.builtin import _box, _diffuse, _rgb, _sphere
-
     axis = np.linspace(-1, 1, 12)
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
     torus = np.sqrt((np.sqrt(x**2 + z**2) - 0.55) ** 2 + y**2) - 0.28
@@ -206,15 +180,15 @@ def solids():
         f"copy{i}": {
             "type": "instance",
             "group": {"type": "ref", "id": "group"},
-            "to_world": transform().translate(at).rotate([0, 1, 0], angle).scale(size),
+            "to_world": _transform().translate(at).rotate([0, 1, 0], angle).scale(size),
         }
         for i, (at, angle, size) in enumerate(places)
     }
-    at = transform().translate([-0.95, 0.1, 0.0]).scale([0.9, 0.9, 0.9])
+    at = _transform().translate([-0.95, 0.1, 0.0]).scale([0.9, 0.9, 0.9])
     return {"type": "scene", "group": group | {"id": "group"}} | stage(
         torus={"type": "sdfgrid", "grid": mi.TensorXf(torus[..., None]), "to_world": at, "normals": "smooth"}
         | {"bsdf": two({"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": _rgb(0.2, 0.4, 0.6)})},
-        disc={"type": "disk", "to_world": transform().translate([0.2, 0.6, -0.6]).rotate([1, 0.3, 0], -20).scale(0.5)}
+        disc={"type": "disk", "to_world": _transform().translate([0.2, 0.6, -0.6]).rotate([1, 0.3, 0], -20).scale(0.5)}
         | {"bsdf": two({"type": "roughconductor", "material": "Al", "alpha": 0.2})},
         bowl=_sphere([0.35, 0.3, 0.3], 0.22, two(_diffuse(0.6, 0.6, 0.2))) | {"flip_normals": True},
         **copies,
@@ -223,8 +197,6 @@ def solids():
 
 def facets():
     """Coarse meshes with smooth normals, seen at grazing angles, by a camera close to the floor."""
-    from data_gen.scenes.builtin import _diffuse, _rgb
-
     return stage(
         origin=(0.1, 0.12, 2.4),
         target=(0, 0.35, 0),
@@ -241,16 +213,9 @@ def facets():
     )
 
 
-# -------------------------------- Lamps -------------------------------
-
-
 def lamps():
     """Textured and mesh area lamps, a spot with a texture, a point, a direction and an image of a sky, together."""
-    import mitsuba as mi
-
-    from data_gen.scenes.builtin import _diffuse, _rgb, _sphere, _wall
-
-    toward = transform().look_at([1.5, 2, 2], [0.2, 0.2, 0], [0, 1, 0])
+    toward = _transform().look_at([1.5, 2, 2], [0.2, 0.2, 0], [0, 1, 0])
     sky = np.random.default_rng(4).random((8, 16, 3)) ** 3 * 1.5
     picture = {"emitter": {"type": "area", "radiance": bitmap(3, 5, 5, 0, 6)}}
     return stage(
@@ -260,7 +225,7 @@ def lamps():
         ),
         tube={"type": "cylinder", "p0": [-1.4, 0.3, 0.4], "p1": [-1.2, 1.2, 0.2], "radius": 0.06}
         | {"emitter": {"type": "area", "radiance": _rgb(4, 3, 3)}},
-        disc={"type": "disk", "to_world": transform().look_at([-0.5, 1.7, 0.9], [-0.3, 0, 0], [0, 0, 1]).scale(0.2)}
+        disc={"type": "disk", "to_world": _transform().look_at([-0.5, 1.7, 0.9], [-0.3, 0, 0], [0, 0, 1]).scale(0.2)}
         | {"emitter": {"type": "area", "radiance": _rgb(6, 6, 9)}},
         point={"type": "point", "position": [-0.8, 1.8, 1.5], "intensity": _rgb(1, 1.5, 2)},
         spot={"type": "spot", "to_world": toward, "intensity": _rgb(12, 9, 6), "cutoff_angle": 24, "beam_width": 6}
@@ -269,7 +234,7 @@ def lamps():
         sky={
             "type": "envmap",
             "bitmap": mi.Bitmap(sky.astype(np.float32)),
-            "to_world": transform().rotate([0, 1, 0], 40),
+            "to_world": _transform().rotate([0, 1, 0], 40),
         },
         ball=_sphere(
             [-0.4, 0.45, 0.1], 0.45, {"type": "roughconductor", "material": "Au", "alpha_u": 0.3, "alpha_v": 0.15}
@@ -277,12 +242,8 @@ def lamps():
     )
 
 
-# -------------------------------- Media -------------------------------
-
-
 def boxes():
     """Coloured fogs in boxes that stand on the floor and touch each other, one of them with a ball of milk inside."""
-    from data_gen.scenes.builtin import _box, _diffuse, _rgb, _sphere
 
     def fog(albedo, sigma_t, **phase):
         return {"type": "homogeneous", "albedo": _rgb(*albedo), "sigma_t": _rgb(*sigma_t), "scale": 3.0, **phase}
@@ -304,11 +265,9 @@ def boxes():
 
 def cellar():
     """The camera in mist, with a cloud of a grid before it and a coloured liquid in frosted glass, under a spot."""
-    from data_gen.scenes.builtin import _box, _rgb, _sphere
-
     mist = {"type": "homogeneous", "id": "mist", "albedo": 0.85, "sigma_t": 0.12}
     air = {"exterior": {"type": "ref", "id": "mist"}}
-    placed = {"to_world": transform().translate([0.0, 0.05, -0.4]).scale(0.9)}
+    placed = {"to_world": _transform().translate([0.0, 0.05, -0.4]).scale(0.9)}
     smoke = {
         "type": "heterogeneous",
         "albedo": 0.9,
@@ -316,7 +275,7 @@ def cellar():
         "scale": 3.0,
     }
     liquid = {"type": "homogeneous", "albedo": _rgb(0.2, 0.6, 0.9), "sigma_t": _rgb(1.0, 0.5, 0.2), "scale": 3.0}
-    toward = transform().look_at([1.4, 2, 1.4], [0.2, 0.3, 0], [0, 1, 0])
+    toward = _transform().look_at([1.4, 2, 1.4], [0.2, 0.3, 0], [0, 1, 0])
     scene = stage(
         6,
         "volpath",

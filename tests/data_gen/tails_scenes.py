@@ -1,55 +1,42 @@
-"""Rooms in which light could leak through what is thinner than a cell of the cache, each a dictionary for Mitsuba.
+"""Rooms in which light could leak through what is thinner than a cell of the cache, each a dictionary for Mitsuba."""
 
-The box ``weak`` of a scene is the part of its image, (top, bottom, left, right) in pixels of ``SIZE``, into which light
-would leak, or out of which.
-"""
+import mitsuba as mi
+
+from data_gen.scenes.builtin import _box, _camera, _diffuse, _light, _rgb, _room, _sphere, _wall
 
 SIZE = (32, 24)
-
-
-def _both(*value):
-    from data_gen.scenes.builtin import _diffuse
-
-    return {"type": "twosided", "nested": _diffuse(*value)}
+OPEN = {"origin": [0, 1.25, 3.9], "target": [0, 1.1, 0], "fov": 50}
 
 
 def _grey(value=0.6):
-    return _both(value, value, value)
+    return {"type": "twosided", "nested": _diffuse(value, value, value)}
 
 
-def _place(origin, target, fov=60, depth=8, **things):
+def _place(origin, target, fov=60, **things):
     """A scene of ``things`` seen from there."""
-    from data_gen.scenes.builtin import _camera
-
-    integrator = {"type": "path", "max_depth": depth, "rr_depth": 5}
+    integrator = {"type": "path", "max_depth": 8, "rr_depth": 5}
     return {"type": "scene", "integrator": integrator, "sensor": _camera(list(origin), list(target), fov), **things}
 
 
-def _walls(low, high, bsdf=None):
-    """Six walls of a closed room between two corners, seen from inside."""
-    from data_gen.scenes.builtin import _wall
-
-    (x0, y0, z0), (x1, y1, z1) = low, high
-    x, y, z = (x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2
-    bsdf = bsdf or _grey()
+def _walls(x, height, back, front, grey=0.6):
+    """Six walls of a closed room from -x to x and from ``back`` to ``front``, seen from inside."""
+    y, z, deep, bsdf = height / 2, (back + front) / 2, front - back, _grey(grey)
     return {
-        "floor": _wall([x, y0, z], [0, 1, 0], (x1 - x0, z1 - z0), bsdf),
-        "ceiling": _wall([x, y1, z], [0, -1, 0], (x1 - x0, z1 - z0), bsdf),
-        "left": _wall([x0, y, z], [1, 0, 0], (z1 - z0, y1 - y0), bsdf),
-        "right": _wall([x1, y, z], [-1, 0, 0], (z1 - z0, y1 - y0), bsdf),
-        "back": _wall([x, y, z0], [0, 0, 1], (x1 - x0, y1 - y0), bsdf),
-        "front": _wall([x, y, z1], [0, 0, -1], (x1 - x0, y1 - y0), bsdf),
+        "floor": _wall([0, 0, z], [0, 1, 0], (2 * x, deep), bsdf),
+        "ceiling": _wall([0, height, z], [0, -1, 0], (2 * x, deep), bsdf),
+        "left": _wall([-x, y, z], [1, 0, 0], (deep, height), bsdf),
+        "right": _wall([x, y, z], [-1, 0, 0], (deep, height), bsdf),
+        "back": _wall([0, y, back], [0, 0, 1], (2 * x, height), bsdf),
+        "front": _wall([0, y, front], [0, 0, -1], (2 * x, height), bsdf),
     }
 
 
 def shelf():
     """A board of 5 mm on a wall, bright above and dark below."""
-    from data_gen.scenes.builtin import _box, _light
-
     return _place(
         (0, 1.0, 1.4),
         (0, 1.0, -1.5),
-        **_walls((-1.5, 0, -1.5), (1.5, 2.4, 1.5)),
+        **_walls(1.5, 2.4, -1.5, 1.5),
         lamp=_light([0, 2.39, -0.9], [0, -1, 0], (0.8, 0.5), (10, 9, 8)),
         board=_box([0, 1.1, -1.25], [2.0, 0.005, 0.5], 0, _grey()),
         below=_box([0, 0.6, -1.25], [2.0, 0.005, 0.5], 0, _grey()),
@@ -58,13 +45,10 @@ def shelf():
 
 def thin_wall():
     """A sheet without thickness between a bright room and one with a hundredth of its light; both are seen."""
-    from data_gen.scenes.builtin import _light, _wall
-
     scene = _place(
         (0, 1.2, 3.6),
         (0, 1.2, 0),
-        fov=60,
-        **_walls((-1.5, 0, -1.5), (1.5, 2.4, 1.5), _grey(0.5)),
+        **_walls(1.5, 2.4, -1.5, 1.5, 0.5),
         middle=_wall([0, 1.2, 0], [1, 0, 0], (3, 2.4), _grey(0.5)),
         lamp=_light([-0.8, 2.39, -0.3], [0, -1, 0], (0.6, 0.6), (20, 18, 16)),
         night=_light([0.8, 2.39, -0.3], [0, -1, 0], (0.6, 0.6), (0.16, 0.18, 0.2)),
@@ -75,12 +59,10 @@ def thin_wall():
 
 def door():
     """A dark room with light from the next one under a door, and little of its own."""
-    from data_gen.scenes.builtin import _box, _light
-
     return _place(
         (0.3, 0.9, 1.3),
         (0, 0.4, -0.4),
-        **_walls((-1.2, 0, -2), (1.2, 2.2, 1.5)),
+        **_walls(1.2, 2.2, -2, 1.5),
         door=_box([0, 1.14, -0.5], [2.4, 2.2, 0.04], 0, _grey()),
         lamp=_light([0, 0.5, -1.99], [0, 0, 1], (2.2, 0.9), (30, 27, 24)),
         night=_light([0, 2.19, 0.5], [0, -1, 0], (0.5, 0.5), (0.08, 0.09, 0.1)),
@@ -89,35 +71,23 @@ def door():
 
 def shade():
     """A lamp inside a tube that is open above and below."""
-    import mitsuba as mi
-
-    from data_gen.scenes.builtin import _diffuse, _rgb
-
-    emitter = {"type": "area", "radiance": _rgb(60, 50, 40)}
+    bulb = _sphere([0, 1.0, 0], 0.06, _diffuse(0, 0, 0))
+    tube = {"type": "cylinder", "p0": [0, 0.8, 0], "p1": [0, 1.2, 0], "radius": 0.22}
     return _place(
         (0, 1.1, 1.6),
         (0, 0.9, 0),
-        **_walls((-1.2, 0, -1.2), (1.2, 2.2, 1.7)),
-        bulb={"type": "sphere", "center": [0, 1.0, 0], "radius": 0.06, "bsdf": _diffuse(0, 0, 0), "emitter": emitter},
-        tube={
-            "type": "cylinder",
-            "p0": [0, 0.8, 0],
-            "p1": [0, 1.2, 0],
-            "radius": 0.22,
-            "to_world": mi.ScalarTransform4f(),
-            "bsdf": _grey(0.7),
-        },
+        **_walls(1.2, 2.2, -1.2, 1.7),
+        bulb=bulb | {"emitter": {"type": "area", "radiance": _rgb(60, 50, 40)}},
+        tube=tube | {"to_world": mi.ScalarTransform4f(), "bsdf": _grey(0.7)},
     )
 
 
 def corner_box():
     """A box in a corner with a gap of 2 cm to both walls."""
-    from data_gen.scenes.builtin import _box, _light
-
     return _place(
         (0.6, 1.3, 1.0),
         (-0.9, 0.4, -0.9),
-        **_walls((-1.2, 0, -1.2), (1.2, 2.2, 1.5)),
+        **_walls(1.2, 2.2, -1.2, 1.5),
         lamp=_light([0.3, 2.19, 0.2], [0, -1, 0], (0.7, 0.7), (8, 8, 8)),
         box=_box([-0.88, 0.35, -0.88], [0.6, 0.7, 0.6], 0, _grey(0.7)),
     )
@@ -125,12 +95,10 @@ def corner_box():
 
 def sheet():
     """Two sheets whose backs are black, one seen from its front and one from its back."""
-    from data_gen.scenes.builtin import _diffuse, _light, _wall
-
     return _place(
         (0, 1.1, 1.6),
         (0, 1.0, -1.2),
-        **_walls((-1.2, 0, -1.2), (1.2, 2.2, 1.7)),
+        **_walls(1.2, 2.2, -1.2, 1.7),
         lamp=_light([0, 2.19, 0.2], [0, -1, 0], (0.8, 0.8), (8, 8, 8)),
         facing=_wall([-0.6, 0.9, -1.1], [0, 0, 1], (0.8, 1.2), _diffuse(0.7, 0.7, 0.7)),
         averted=_wall([0.6, 0.9, -1.1], [0, 0, -1], (0.8, 1.2), _diffuse(0.7, 0.7, 0.7)),
@@ -139,13 +107,11 @@ def sheet():
 
 def contact():
     """A box 5 mm above the floor, and a ball that touches it."""
-    from data_gen.scenes.builtin import _box, _light, _sphere
-
     return _place(
         (0, 0.7, 1.2),
         (0, 0.15, -0.2),
         fov=50,
-        **_walls((-1.2, 0, -1.2), (1.2, 2.2, 1.3)),
+        **_walls(1.2, 2.2, -1.2, 1.3),
         lamp=_light([0.3, 2.19, 0.2], [0, -1, 0], (1.2, 1.2), (4, 4, 4)),
         box=_box([-0.3, 0.205, -0.2], [0.4, 0.4, 0.4], 20, _grey()),
         ball=_sphere([0.35, 0.2, 0], 0.2, _grey()),
@@ -154,12 +120,10 @@ def contact():
 
 def slit():
     """A bright lamp behind a slit in its case: a stripe of light on the wall, which few paths find."""
-    from data_gen.scenes.builtin import _box, _light
-
     return _place(
         (0, 1.1, 1.6),
         (0, 1.0, -1.2),
-        **_walls((-1.2, 0, -1.2), (1.2, 2.2, 1.7)),
+        **_walls(1.2, 2.2, -1.2, 1.7),
         lamp=_light([0.7, 2.15, 0.5], [0, -1, 0], (0.2, 0.6), (400, 380, 350)),
         near=_box([0.44, 1.99, 0.5], [0.48, 0.02, 1.0], 0, _grey()),
         far=_box([0.96, 1.99, 0.5], [0.48, 0.02, 1.0], 0, _grey()),
@@ -167,41 +131,18 @@ def slit():
     )
 
 
-SCENES = {
-    "shelf": shelf,
-    "thin wall": thin_wall,
-    "door": door,
-    "shade": shade,
-    "corner box": corner_box,
-    "sheet": sheet,
-    "contact": contact,
-    "slit": slit,
-}
-
-
 def bulb():
     """A room whose only lamp is inside a ball of glass: all of its light comes over rough surfaces and then glass."""
-    from data_gen.scenes.builtin import _diffuse, _room, _sphere
-
-    return _place(
-        (0, 1.25, 3.9),
-        (0, 1.1, 0),
-        fov=50,
-        **_room(1.5, _diffuse(0.6, 0.6, 0.6)),
-        lamp=_sphere([0, 1.2, 0], 0.5, _diffuse(0, 0, 0)) | {"emitter": {"type": "area", "radiance": 3.0}},
-        glass=_sphere([0, 1.2, 0], 0.6, {"type": "dielectric"}),
-    )
+    lamp = _sphere([0, 1.2, 0], 0.5, _diffuse(0, 0, 0)) | {"emitter": {"type": "area", "radiance": 3.0}}
+    glass = _sphere([0, 1.2, 0], 0.6, {"type": "dielectric"})
+    return _place(**OPEN, **_room(1.5, _diffuse(0.6, 0.6, 0.6)), lamp=lamp, glass=glass)
 
 
 def mirrors():
     """A room with a mirror on the wall, and a small ball that mirrors before it."""
-    from data_gen.scenes.builtin import _diffuse, _light, _room, _sphere, _wall
-
     mirror = {"type": "twosided", "nested": {"type": "conductor", "material": "none"}}
     return _place(
-        (0, 1.25, 3.9),
-        (0, 1.1, 0),
-        fov=50,
+        **OPEN,
         **_room(1.5, _diffuse(0.7, 0.6, 0.5)),
         lamp=_light([0, 2.3, 0], [0, -1, 0], (1.6, 1.6), (3, 3, 3)),
         pane=_wall([-1.4, 1.2, 0], [1, 0, 0], (1.8, 1.6), mirror),
@@ -211,13 +152,11 @@ def mirrors():
 
 def varnish():
     """A room whose floor is dark varnish, which sends the light of a window in one wall to the wall across."""
-    from data_gen.scenes.builtin import _light, _wall
-
     wood = {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": {"type": "rgb", "value": 0.02}}
     return _place(
         (0, 1.2, 1.4),
         (0, 0.9, -1.5),
         fov=90,
-        **_walls((-1.5, 0, -1.5), (1.5, 2.4, 1.5), _grey(0.3)) | {"floor": _wall([0, 0, 0], [0, 1, 0], (3, 3), wood)},
+        **_walls(1.5, 2.4, -1.5, 1.5, 0.3) | {"floor": _wall([0, 0, 0], [0, 1, 0], (3, 3), wood)},
         window=_light([-1.49, 0.6, 0], [1, 0, 0], (1.5, 0.8), (6, 7, 8)),
     )

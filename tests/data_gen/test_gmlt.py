@@ -1,14 +1,17 @@
-"""Metropolis chains over the random numbers of paths: their mutations, what they count, and what they find.
-
-The laws of samplers are in test_samplers.py.
-"""
+"""Metropolis chains over the random numbers of paths: their mutations, what they count, and what they find."""
 
 from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from unbiased import load, render_references
 
+from data_gen.film import GradientFilm
+from data_gen.paths.camera import CameraSamples
+from data_gen.render import render_stack
+from data_gen.scenes.load import load_scene
 from ngpt.testing import z_test
 
 SIZE = (16, 12)
@@ -22,36 +25,38 @@ def chains(renderer):
     return chains
 
 
-def test_small_steps_go_either_way_and_around(renderer):
-    from data_gen.samplers.studies.gmlt.mutation import LARGEST, SMALLEST, small_step
+@pytest.fixture
+def mutation(renderer):
+    from data_gen.samplers.studies.gmlt import mutation
 
-    mi, rng = renderer, np.random.default_rng(0)
+    return mutation
+
+
+def test_small_steps_go_either_way_and_around(mutation):
+    rng, small, large = np.random.default_rng(0), mutation.SMALLEST, mutation.LARGEST
     x = rng.random(100_000, np.float32)
-    y = np.array(small_step(mi.Float(x), mi.Float(rng.random(x.size, np.float32))), np.float64)
+    y = np.array(mutation.small_step(mi.Float(x), mi.Float(rng.random(x.size, np.float32))), np.float64)
     assert np.all((y >= 0) & (y < 1))
     step = (y - x + 0.5) % 1 - 0.5
-    assert np.all((np.abs(step) > SMALLEST * 0.999) & (np.abs(step) < LARGEST * 1.001))
+    assert np.all((np.abs(step) > small * 0.999) & (np.abs(step) < large * 1.001))
     # As many of each length to either side, and no drift: the density back is that of the way there.
-    edges = np.geomspace(SMALLEST, LARGEST, 9)
-    there, back = (np.histogram(sign * step, edges)[0] for sign in (1, -1))
+    there, back = (np.histogram(sign * step, np.geomspace(small, large, 9))[0] for sign in (1, -1))
     assert np.all(np.abs(there - back) < 5 * np.sqrt(there + back))
     # Uniform numbers stay uniform.
     counts = np.histogram(y, 50, (0, 1))[0]
     assert np.square(counts - 2000).sum() / 2000 < 100
     # Around both ends, and what rounds to 1 is 0.
-    ends = np.array(small_step(mi.Float([0.0, 1 - 2**-24, 1e-9]), mi.Float([0.1, 0.9, 0.49999])))
+    ends = np.array(mutation.small_step(mi.Float([0.0, 1 - 2**-24, 1e-9]), mi.Float([0.1, 0.9, 0.49999])))
     assert ends[0] > 0.98 and ends[1] < 0.02 and 0 <= ends[2] < 1
 
 
-def test_acceptance_balances_every_pair_of_states(renderer):
+def test_acceptance_balances_every_pair_of_states(mutation):
     """f(x) a(x -> y) = f(y) a(y -> x); from and to what has no value as well."""
-    from data_gen.samplers.studies.gmlt.mutation import acceptance
-
     f = np.array([1e-20, 1e-3, 0.5, 0.5, 2, 7, 1e6], np.float32)
-    x, y = (renderer.Float(a.ravel()) for a in np.meshgrid(f, f))
-    there, back = np.array(x * acceptance(x, y)), np.array(y * acceptance(y, x))
-    assert np.allclose(there, back, rtol=1e-6) and np.all(np.array(acceptance(x, y)) <= 1)
-    assert np.array(acceptance(renderer.Float(1), renderer.Float(0)))[0] == 0
+    x, y = (mi.Float(a.ravel()) for a in np.meshgrid(f, f))
+    there, back = mutation.acceptance(x, y), mutation.acceptance(y, x)
+    assert np.allclose(x * there, y * back, rtol=1e-6) and dr.all(there <= 1)
+    assert mutation.acceptance(mi.Float(1), mi.Float(0))[0] == 0
 
 
 class Steps:
@@ -60,9 +65,6 @@ class Steps:
     VALUES = np.array([1, 2, 4, 0], np.float32)
 
     def trace(self, camera, random):
-        import drjit as dr
-        import mitsuba as mi
-
         place = mi.UInt32(camera.position.x / camera.size.x * 4)
         value = dr.gather(mi.Float, mi.Float(self.VALUES), place)
         return {"primal": mi.Color3f(value)}, mi.Color3f(0), {}
@@ -71,12 +73,6 @@ class Steps:
 @pytest.mark.parametrize("large", [0.0, 0.3, 1.0])
 def test_a_chain_visits_paths_in_proportion_to_their_values(renderer, monkeypatch, chains, large):
     """By large steps and small ones, each alone and together. What it counts, proposed states too, is that."""
-    import drjit as dr
-
-    from data_gen.film import GradientFilm
-    from data_gen.paths.camera import CameraSamples
-
-    mi = renderer
     monkeypatch.setattr(chains, "LARGE_STEPS", large)
     scene = load(mi, "diffuse", (4, 1))
     camera, film = CameraSamples(scene.sensors()[0], 3, 4096), GradientFilm(4, 1, batches=True)
@@ -96,25 +92,20 @@ def test_a_chain_visits_paths_in_proportion_to_their_values(renderer, monkeypatc
     assert np.array(rate).mean() > 0.4
 
 
-def test_numbers_that_do_not_change_make_the_same_path(renderer, monkeypatch, chains):
+def test_numbers_that_do_not_change_make_the_same_path(monkeypatch, chains, mutation):
     """What a chain remembers of a candidate is the candidate, and what it accepted is what it remembers."""
-    import drjit as dr
-
-    from data_gen.render import render_stack
-    from data_gen.samplers.studies.gmlt import mutation
-
-    counts = dr.zeros(renderer.UInt32, 2)
+    counts = dr.zeros(mi.UInt32, 2)
     acceptance = chains.acceptance
 
     def counted(f, proposed):
         for i, which in enumerate((dr.abs(f - proposed) <= 1e-4 * f, f >= 0)):
-            dr.scatter_add(counts, renderer.UInt32(1), renderer.UInt32(i), which)
+            dr.scatter_add(counts, mi.UInt32(1), mi.UInt32(i), which)
         return acceptance(f, proposed)
 
     monkeypatch.setattr(mutation, "small_step", lambda x, u: x)
     monkeypatch.setattr(chains, "acceptance", counted)
     monkeypatch.setattr(chains, "LARGE_STEPS", 0.3)
-    render_stack(load(renderer, "glossy", SIZE), 8, 1, "gmlt")
+    render_stack(load(mi, "glossy", SIZE), 8, 1, "gmlt")
     same, steps = np.array(counts, np.float64)
     assert steps >= 3 * 8 * SIZE[0] * SIZE[1]
     # Large steps lead to paths of other values, but for some that end with those of a candidate
@@ -123,7 +114,6 @@ def test_numbers_that_do_not_change_make_the_same_path(renderer, monkeypatch, ch
 
 def test_chains_accept_enough(renderer, monkeypatch):
     """A floor: chains that never move would pass every test of the mean."""
-    from data_gen.render import render_stack
     from data_gen.samplers.studies.gmlt import integrator
 
     rates, run = [], integrator.run
@@ -133,16 +123,13 @@ def test_chains_accept_enough(renderer, monkeypatch):
         return rates[-1]
 
     monkeypatch.setattr(integrator, "run", noted)
-    render_stack(load(renderer, "diffuse", SIZE), 8, 0, "gmlt")
+    render_stack(load(mi, "diffuse", SIZE), 8, 0, "gmlt")
     assert 0.6 < np.array(rates[0]).mean() < 0.98
 
 
 @pytest.mark.slow
 def test_light_through_a_door_ajar(renderer):
     """The mean where chains do most of the work, and few candidates find any light."""
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
-
     ajar = Path(__file__).parents[2] / "bench" / "scenes" / "ajar" / "scene.xml"
     scene = load_scene(str(ajar), (16, 16), {"wall": "2.6"})  # 30 cm
     references = render_references(renderer, scene, 24, 2048)

@@ -1,14 +1,17 @@
-"""The shift "manifold" of ``gpt`` is unbiased, the light it follows leaves the layer, and all else stays."""
+"""The shift "manifold" of ``gpt``: the light that it follows leaves the layer ``caustic``, and all else stays."""
 
+import drjit as dr
 import numpy as np
 from data_gen_scenes import caustics
 from unbiased import load, render_ours
 
+from data_gen.paths.manifold import follow
+from data_gen.render import render_stack
+from data_gen.scenes.builtin import _light
+
 
 def test_light_moves_from_the_layer_to_the_gradients(renderer):
     """The same paths: the image is the same, and the light in it; most of the layer's has a copy now."""
-    from data_gen.render import render_stack
-
     scene = load(renderer, caustics, (32, 32))
     layer, followed = (render_stack(scene, 64, 3, "gpt", shift=shift) for shift in ("replay", "manifold"))
     assert np.allclose(layer["primal"], followed["primal"], rtol=1e-5, atol=1e-6)
@@ -19,15 +22,9 @@ def test_light_moves_from_the_layer_to_the_gradients(renderer):
 
 def test_less_noise_than_replay(renderer):
     """A small lamp in a curved mirror, wide enough for a pixel: replay misses it, walks do not."""
-    from data_gen.render import render_stack
-    from data_gen.scenes.builtin import _light
-
-    def small_lamp():
-        scene = caustics()
-        del scene["glass"]
-        return scene | {"lamp": _light([0.2, 2.6, -0.2], [0, -1, 0], (0.4, 0.4), (60, 60, 60))}
-
-    scene = load(renderer, small_lamp, (48, 48))
+    description = caustics() | {"lamp": _light([0.2, 2.6, -0.2], [0, -1, 0], (0.4, 0.4), (60, 60, 60))}
+    del description["glass"]
+    scene = load(renderer, description, (48, 48))
     plain, layer, followed = (
         render_stack(scene, 128, 3, "gpt", **options) for options in ({"caustic": False}, {}, {"shift": "manifold"})
     )
@@ -39,7 +36,6 @@ def test_less_noise_than_replay(renderer):
 
 def test_the_second_kernel_finds_what_the_first_has_recorded(renderer, monkeypatch):
     """Where all walks are refused, the samples are -2 b: those of a lane say again what its primal holds."""
-    from data_gen.paths.manifold import follow
     from data_gen.samplers.gpt import integrator, manifold_shift
 
     light = {}
@@ -75,9 +71,7 @@ def test_the_second_kernel_finds_what_the_first_has_recorded(renderer, monkeypat
 
 
 def test_scenes_without_mirrors_have_the_same_kernels(renderer):
-    import drjit as dr
-
-    from data_gen.render import render_stack
+    scene = load(renderer, "diffuse", (8, 8))
 
     def kernels(**options):
         render_stack(scene, 1, 0, "gpt", **options)
@@ -86,5 +80,4 @@ def test_scenes_without_mirrors_have_the_same_kernels(renderer):
             render_stack(scene, 1, 0, "gpt", **options)
             return [kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel]
 
-    scene = load(renderer, "diffuse", (8, 8))
     assert kernels() and kernels() == kernels(shift="manifold")

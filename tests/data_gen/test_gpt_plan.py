@@ -1,24 +1,23 @@
 """What the kernel contains is decided by the scene, and changes nothing but its cost."""
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from data_gen_scenes import plenty, polished
 from unbiased import load
 
-from ngpt.testing import z_test
+from data_gen.paths.lights import Lights, emission, replay_light, sample_light, shadowed, shared_emission
+from data_gen.paths.vertex import seen_from
+from data_gen.paths.walk import Limits
+from data_gen.samplers import SAMPLERS
+from data_gen.samplers.gpt.plan import make_plan
+
+FAILURES = "diagnostics.shiftFailures"
 
 
-def make_plan(scene, *args, hide_emitters=False, **options):
-    from data_gen.paths.walk import Limits
-    from data_gen.samplers.gpt import plan
-
-    return plan.make_plan(scene, *(args or [Limits(8, hide_emitters=hide_emitters)]), **options)
-
-
-def render(scene, spp=16, size=None, **options):
+def render(scene, spp=16, **options):
     """Layers of our integrator with these parameters, and the rate of failed shifts if that is asked for."""
-    from data_gen.samplers import SAMPLERS
-
     integrator = SAMPLERS["gpt"].integrator(scene)
     for name, value in options.items():
         setattr(integrator, name, value)
@@ -26,45 +25,30 @@ def render(scene, spp=16, size=None, **options):
     return film.develop() | {k: v for k, v in film.diagnose().items() if k == FAILURES}
 
 
-FAILURES = "diagnostics.shiftFailures"
+# Whether shifts replay, and whether emitters answer the same numbers alike everywhere: a point light is neither far
+# away nor a surface.
+PLANS = {
+    "diffuse": (False, True),
+    "glossy": (True, True),
+    "environment": (True, True),
+    "lens": (False, False),
+    plenty: (True, False),
+}
 
 
-def test_plans(renderer):
-    plans = {name: make_plan(load(renderer, name, (4, 4))) for name in ("diffuse", "glossy", "environment", "lens")}
-    assert [name for name, plan in plans.items() if plan.replays] == ["glossy", "environment"]
-    assert [name for name, plan in plans.items() if plan.lights.shared] == ["diffuse", "glossy", "environment"]
-    assert not plans["glossy"].half_vectors and not plans["environment"].hides
+@pytest.mark.parametrize("scene", PLANS)
+def test_plans(renderer, scene):
+    plan = make_plan(load(renderer, scene, (4, 4)), Limits())
+    assert (plan.replays, plan.lights.shared) == PLANS[scene]
+    assert not plan.half_vectors and not plan.hides and not plan.space.media
+
+
+def test_plans_by_option_and_roughness(renderer):
+    hiding, by_half_vectors = Limits(hide_emitters=True), {"shift": "half-vector"}
     scene = load(renderer, "environment", (4, 4))
-    assert make_plan(scene, shift="half-vector").half_vectors and make_plan(scene, hide_emitters=True).hides
-    assert not make_plan(load(renderer, "diffuse", (4, 4)), shift="half-vector", hide_emitters=True).half_vectors
-    assert make_plan(load(renderer, lambda: polished(0.01), (4, 4))).replays
-    assert not make_plan(load(renderer, lambda: polished(0.3), (4, 4))).replays
-    # A point light is neither far away nor a surface; without any light there is nothing to share.
-    assert not make_plan(load(renderer, plenty, (4, 4))).lights.shared
-
-
-@pytest.mark.parametrize(("name", "flag"), [("diffuse", "replays"), ("glossy", "shared"), ("environment", "shared")])
-def test_the_general_kernel_renders_the_same(renderer, name, flag, monkeypatch):
-    """Code that a scene does not need, put in by force."""
-    from data_gen.samplers.gpt import integrator as gpt
-
-    scene = load(renderer, name, (32, 32))
-    lean = render(scene)
-
-    def general(*args, **options):
-        plan = make_plan(*args, **options)
-        if flag == "replays":
-            plan.replays = True
-        else:
-            plan.lights.shared = False
-        return plan
-
-    monkeypatch.setattr(gpt, "make_plan", general)
-    full = render(scene)
-    for layer in ("primal", "dx", "dy"):
-        # Paths are the same but for rounding, which now and then decides whether something is hit.
-        off = np.abs(lean[layer] - full[layer]) > 1e-3 * np.abs(full["primal"]).mean()
-        assert off.mean() < 0.01, layer
+    assert make_plan(scene, hiding).hides and make_plan(scene, Limits(), **by_half_vectors).half_vectors
+    assert not make_plan(load(renderer, "diffuse", (4, 4)), hiding, **by_half_vectors).half_vectors
+    assert [make_plan(load(renderer, polished(α), (4, 4)), Limits()).replays for α in (0.01, 0.3)] == [True, False]
 
 
 LAMPS = {
@@ -83,12 +67,7 @@ LAMPS = {
 @pytest.mark.parametrize("name", LAMPS)
 def test_shared_emitters_are_what_sampling_would_find(renderer, name):
     """Taken over from another vertex, an emitter has the direction, density and weight that it has here."""
-    import drjit as dr
-
-    from data_gen.paths.lights import Lights, emission, replay_light, sample_light, shadowed, shared_emission
-    from data_gen.paths.vertex import seen_from
-
-    mi, lamp = renderer, dict(LAMPS[name])
+    lamp = dict(LAMPS[name])
     if name == "envmap":
         lamp["bitmap"] = mi.Bitmap(np.random.default_rng(1).random((8, 16, 3)).astype(np.float32))
     block = {"type": "sphere", "center": [0, 0, 2.5], "radius": 0.4}
@@ -139,57 +118,32 @@ def mostly(condition):
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["glossy", plenty])
 def test_the_primal_of_base_and_offset_paths_has_less_noise(renderer, scene):
-    from data_gen.samplers import SAMPLERS
-
     scene = load(renderer, scene, (32, 32))
-    integrator = SAMPLERS["gpt"].integrator(scene)
-    integrator.reuse = True
-    stacks = [integrator.render_film(scene, scene.sensors()[0], 0, 64).develop()]
-    base = render(scene, spp=64)
-    assert np.array_equal(base["dx"], stacks[0]["dx"])
+    base, reused = render(scene, 64), render(scene, 64, reuse=True)
+    assert np.array_equal(base["dx"], reused["dx"])
     dark = base["direct"].sum(axis=-1) == 0
     # The median: means are those of a few fireflies.
-    assert np.median(stacks[0]["primal_var"][dark] / base["primal_var"][dark]) < 0.65
+    assert np.median(reused["primal_var"][dark] / base["primal_var"][dark]) < 0.65
 
 
-def test_the_primal_of_base_and_offset_paths_does_not_depend_on_passes(renderer):
-    """Neighbours' samples lie a block apart, not a pass."""
+def test_the_primal_of_base_and_offset_paths_is_of_neighbours(renderer):
+    """Their samples lie a block apart, not a pass; without neighbours it is that of the base paths."""
     scene = load(renderer, "diffuse", (16, 16))
-    many, few = render(scene, spp=70, reuse=True), render(scene, spp=16, reuse=True)
-    assert (
-        np.abs(many["primal"] - render(scene, spp=70)["primal"]).mean() < np.abs(few["primal"] - many["primal"]).mean()
+    many, few, base = (
+        render(scene, spp, reuse=reuse)["primal"] for spp, reuse in ((70, True), (16, True), (70, False))
     )
-
-
-def test_the_primal_of_base_and_offset_paths_of_a_single_pixel(renderer):
-    """Without neighbours it is that of the base paths."""
-    scene = load(renderer, "diffuse", (1, 1))
-    base, reused = render(scene), render(scene, reuse=True)
-    assert np.allclose(base["primal"], reused["primal"], rtol=1e-5)
+    assert np.abs(many - base).mean() < np.abs(few - many).mean()
+    pixel = load(renderer, "diffuse", (1, 1))
+    assert np.allclose(render(pixel)["primal"], render(pixel, reuse=True)["primal"], rtol=1e-5)
 
 
 def test_failed_shifts_are_counted_when_asked(renderer):
-    scene = load(renderer, "glossy", (32, 32))
-    plain, counted = render(scene), render(scene, diagnostics=True)
-    assert FAILURES not in plain
-    failures = counted[FAILURES]
+    """Mirrors sampled at joined vertices are what fails most: glossier scenes fail more often than matte ones."""
+    glossy, diffuse = (load(renderer, name, (32, 32)) for name in ("glossy", "diffuse"))
+    plain, counted = render(glossy), render(glossy, diagnostics=True)
+    failures = counted.pop(FAILURES)
     assert failures.shape == (32, 32) and failures.min() >= 0 and 0.01 < failures.mean() < 0.5 and failures.max() <= 1
+    assert render(diffuse, diagnostics=True)[FAILURES].mean() < failures.mean()
+    assert plain.keys() == counted.keys()
     for name in plain:
         assert np.array_equal(plain[name], counted[name]), name
-    # Mirrors sampled at joined vertices are what fails most: glossier scenes fail more often than matte ones.
-    assert render(load(renderer, "diffuse", (32, 32)), diagnostics=True)[FAILURES].mean() < failures.mean()
-
-
-def test_shift_modes_agree(renderer):
-    """Both shifts of one scene have the same mean gradients, with nothing connectable at all."""
-    scene = load(renderer, lambda: polished(0.2), (24, 24))
-
-    def batches(shift):
-        from data_gen.samplers import SAMPLERS
-
-        integrator = SAMPLERS["gpt"].integrator(scene)
-        integrator.shift, integrator.roughness_threshold = shift, 10.0
-        return [integrator.render_film(scene, scene.sensors()[0], seed, 64).develop()["dx"] for seed in range(16)]
-
-    result = z_test(np.stack(batches("replay")), np.stack(batches("half-vector")))
-    assert result.passed, result

@@ -5,10 +5,23 @@ it, then its offset path is made the base path and shifted back.
 """
 
 from dataclasses import replace
+from functools import cache
+from itertools import product
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from unbiased import load
+
+from data_gen.paths.caustic import ends_late
+from data_gen.paths.shift import copy_half_vector, reconnects
+from data_gen.paths.space import straight
+from data_gen.paths.vertex import DELTA, SMOOTH, evaluate, seen_from
+from data_gen.paths.walk import Limits
+from data_gen.samplers.gpt.base_path import base_step, begin
+from data_gen.samplers.gpt.offset_path import start, step_apart, step_joined
+from data_gen.samplers.gpt.plan import make_plan
 
 MATERIALS = {
     "diffuse": {"type": "diffuse"},
@@ -39,8 +52,6 @@ LEVEL = 0.9998
 
 def museum():
     """A ball of each material, close to each other, in the open; below them a floor."""
-    import mitsuba as mi
-
     waves = np.sin(np.linspace(0, 12, 32, dtype=np.float32)) * np.ones((32, 1), np.float32)
     MATERIALS["bumps"]["arbitrary"] = {"type": "bitmap", "bitmap": mi.Bitmap(waves[..., None]), "raw": True}
     spheres = {
@@ -59,14 +70,7 @@ def museum():
 class Steps:
     """Random steps of base paths, and their shifts from random vertices: ``there`` and ``back`` again."""
 
-    def __init__(self, mi, shift, threshold=0.05, caustic=True):
-        import drjit as dr
-
-        from data_gen.paths.walk import Limits
-        from data_gen.samplers.gpt import offset_path
-        from data_gen.samplers.gpt.plan import make_plan
-
-        self.mi, self.dr = mi, dr
+    def __init__(self, shift, threshold=0.05, caustic=True):
         self.scene = load(mi, museum())
         self.plan = make_plan(self.scene, Limits(rr_depth=1000), threshold, shift, caustic=caustic)
         assert self.plan.replays
@@ -75,55 +79,43 @@ class Steps:
         x, y = self.vertices(), self.vertices()
         self.u = self.random.clone()
         self.step = self.base_step(self.scene.ray_intersect(x))
-        self.there = offset_path.step_apart(self.scene, self.plan, self.step, self.offset_at(y))
+        self.there = step_apart(self.scene, self.plan, self.step, self.offset_at(y))
         self.y = self.hits(self.offset_at(y))
-        self.reverse = self.reverse_step()
-        self.back = offset_path.step_apart(self.scene, self.plan, self.reverse, self.offset_at(x))
-        dr.eval(self.step, self.there, self.reverse, self.back)
+        reverse = self.reverse_step()
+        self.back = step_apart(self.scene, self.plan, reverse, self.offset_at(x))
+        dr.eval(self.step, self.there, reverse, self.back)
 
     def vertices(self):
         """Rays from random places to where they hit."""
-        mi = self.mi
-        origin = mi.Point3f(self.random.next_1d() * 14 - 4, self.random.next_1d() * 14 - 4, self.random.next_1d() * 5)
-        aim = mi.Point3f(self.random.next_1d() * 8 - 1, self.random.next_1d() * 8 - 1, self.random.next_1d() - 0.5)
-        return mi.Ray3f(origin, self.dr.normalize(aim - origin))
+        u = [self.random.next_1d() for _ in range(6)]
+        origin = mi.Point3f(u[0] * 14 - 4, u[1] * 14 - 4, u[2] * 5)
+        return mi.Ray3f(origin, dr.normalize(mi.Point3f(u[3] * 8 - 1, u[4] * 8 - 1, u[5] - 0.5) - origin))
 
     def base_step(self, x):
-        from data_gen.samplers.gpt.base_path import base_step, begin
-
-        path = begin(self.plan, x, None, None, self.mi.Spectrum(1))
-        path.β = self.mi.Spectrum(1)
+        path = begin(self.plan, x, None, None, mi.Spectrum(1))
+        path.β = mi.Spectrum(1)
         return base_step(self.scene, self.plan, self.u.clone(), path, [])[0]
 
     def offset_at(self, ray):
         """An offset path that has come along ``ray``."""
-        from data_gen.paths.space import straight
-        from data_gen.samplers.gpt.base_path import begin
-        from data_gen.samplers.gpt.offset_path import start
-
-        one = self.mi.Spectrum(1)
-        base = begin(self.plan, self.dr.zeros(self.mi.SurfaceInteraction3f), None, None, one)
-        return start(self.plan, base, straight(ray, self.scene.ray_intersect_preliminary(ray)), one, self.mi.Bool(True))
+        one = mi.Spectrum(1)
+        base = begin(self.plan, dr.zeros(mi.SurfaceInteraction3f), None, None, one)
+        return start(self.plan, base, straight(ray, self.scene.ray_intersect_preliminary(ray)), one, mi.Bool(True))
 
     def hits(self, offset):
         return offset.hit.compute_surface_interaction(offset.ray)
 
     def reverse_step(self):
         """The step of the offset path, as if it had been the base path's."""
-        from data_gen.paths.caustic import ends_late
-        from data_gen.paths.shift import reconnects
-        from data_gen.paths.vertex import SMOOTH, evaluate, seen_from
-
-        mi, dr, y, step, there = self.mi, self.dr, self.y, self.step, self.there
-        bsdf = y.bsdf()
+        y, step, there, bsdf = self.y, self.step, self.there, self.y.bsdf()
         y_connectable = self.plan.materials.connectable(bsdf)
         self.joins = reconnects(step.kind, step.x_connectable, step.x1_connectable, y_connectable)
-        self.copies = ~self.joins & (step.kind == SMOOTH) & mi.Bool(self.plan.half_vectors)
+        copies = ~self.joins & (step.kind == SMOOTH) & mi.Bool(self.plan.half_vectors)
         # A replay is the offset vertex's own event for the same numbers.
         own = self.base_step(y)
         wo = y.to_local(there.ray.d)
         f, p = evaluate(bsdf, y, wo)
-        given = self.joins | self.copies
+        given = self.joins | copies
         x1 = dr.select(self.joins, seen_from(step.x1, there.ray.d), self.hits(there))
         x1.t = dr.select(self.joins & step.x1.is_valid(), dr.norm(step.x1.p - y.p), x1.t)
         self.f_p = dr.select(given, f / p, own.f_p)
@@ -147,84 +139,78 @@ class Steps:
         index = np.full(LANES, -1)
         for shape in self.scene.shapes():
             name = shape.id().replace("_", " ")
-            here = np.array(si.shape == self.mi.ShapePtr(shape))
+            here = np.array(si.shape == mi.ShapePtr(shape))
             index[here] = list(MATERIALS).index(name) if name in MATERIALS else len(MATERIALS)
         return index
+
+    def round_trips(self):
+        """Which steps have a shifted one, and which of those come back to where they began, with r(T) r(T^-1) = 1."""
+        step, there, back = self.step, self.there, self.back
+        taken = step.x.is_valid() & self.y.is_valid() & step.goes_on & (there.r > 0)
+        # Back at the shared vertex, or at the base path's own next vertex
+        reaches = step.x1.is_valid()
+        near = dr.norm(self.hits(back).p - step.x1.p) < 1e-2
+        undone = dr.select(self.joins, back.joined | ~reaches, dr.select(reaches, back.apart & near, ~back.apart))
+        undone &= self.joins | (dr.dot(back.ray.d, step.x.to_world(step.wo)) > 0.999)
+        undone &= dr.abs(there.r * back.r - 1) < 0.01
+        # Both paths' throughputs must have been changed by the same Jacobian as r.
+        undone &= dr.all(dr.abs(there.β - there.r * self.f_p) <= 0.01 * dr.max(dr.abs(there.β)) + 1e-6)
+        return np.array(taken), np.array(undone)
+
+
+@pytest.fixture(scope="module")
+def steps(renderer):
+    return cache(Steps)
 
 
 @pytest.mark.parametrize("shift", ["replay", "half-vector"])
 @pytest.mark.parametrize(("threshold", "caustic"), [(0.05, True), (0.05, False), (10.0, True)])
-def test_the_shift_of_the_shift_is_the_path(renderer, shift, threshold, caustic):
-    steps = Steps(renderer, shift, threshold, caustic)
-    taken, undone, _ = round_trips(steps)
+def test_the_shift_of_the_shift_is_the_path(steps, shift, threshold, caustic):
+    steps = steps(shift, threshold, caustic)
+    taken, undone = steps.round_trips()
     assert taken.sum() > 0.1 * LANES
     assert undone[taken].mean() > LEVEL
     # No pair of materials hides behind the others.
     x, y = steps.materials(steps.step.x), steps.materials(steps.y)
-    kinds = len(MATERIALS)
-    for pair in range(kinds * kinds):
-        here = taken & (x == pair // kinds) & (y == pair % kinds)
-        assert not here.any() or undone[here].mean() > 0.97, f"{list(MATERIALS)[pair // kinds]} to {pair % kinds}"
-    for i, name in enumerate(MATERIALS):
-        assert (taken & (x == i) & (y == i)).sum() > 10, f"{name} is never shifted to itself"
+    for (i, one), (j, other) in product(enumerate(MATERIALS), repeat=2):
+        here = taken & (x == i) & (y == j)
+        assert not here.any() or undone[here].mean() > 0.97, f"{one} to {other}"
+        assert i != j or here.sum() > 10, f"{one} is never shifted to itself"
 
 
-def round_trips(steps):
-    """Which steps have a shifted one, which of those come back to where they began, and the products r(T) r(T^-1)."""
-    dr, step, there, back = steps.dr, steps.step, steps.there, steps.back
-    valid = step.x.is_valid() & steps.y.is_valid() & step.goes_on
-    taken = valid & (there.r > 0)
-    # Back at the shared vertex, or at the base path's own next vertex
-    original = step.x1
-    reaches = original.is_valid()
-    x1 = steps.hits(back)
-    near = dr.norm(x1.p - original.p) < 1e-2
-    same = dr.select(steps.joins, back.joined | ~reaches, dr.select(reaches, back.apart & near, ~back.apart))
-    same &= steps.joins | (dr.dot(back.ray.d, step.x.to_world(step.wo)) > 0.999)
-    r = there.r * back.r
-    undone = same & (dr.abs(r - 1) < 0.01)
-    # Both paths' throughputs must have been changed by the same Jacobian as r.
-    undone &= dr.all(dr.abs(there.β - there.r * steps.f_p) <= 0.01 * dr.max(dr.abs(there.β)) + 1e-6)
-    return np.array(taken), np.array(undone), np.array(r)
-
-
-def test_paths_whose_light_will_be_caustic_are_rejected_from_both_sides(renderer, monkeypatch):
-    from data_gen.samplers.gpt import offset_path
-
-    steps = Steps(renderer, "replay")
+def test_paths_whose_light_will_be_caustic_are_rejected(steps):
+    steps = steps("replay", 0.05, True)
     ends = np.array(steps.step.ends_late & steps.step.goes_on)
     assert ends.sum() > 100 and not np.array(steps.there.r > 0)[ends].any()
-    # A mutant that looks at shifted copies alone
-    step_apart = offset_path.step_apart
-    never = renderer.Bool(False)
-    monkeypatch.setattr(
-        offset_path,
-        "step_apart",
-        lambda scene, plan, step, y: step_apart(scene, plan, replace(step, ends_late=never), y),
-    )
-    taken, undone, _ = round_trips(Steps(renderer, "replay"))
-    assert undone[taken].mean() < LEVEL
 
 
-def directions(mi, dr, n, seed, above=None):
-    """Random directions, in either half space or one."""
-    from mitsuba import warp
+def test_a_mirror_sampled_at_the_joined_vertex_rejects_the_shift(steps):
+    """Lacquer mirrors as well: an offset path that has just joined it must not follow the mirrored base path."""
+    steps = steps("replay", 0.05, True)
+    step = steps.step
+    offset = steps.offset_at(mi.Ray3f(mi.Point3f(0), mi.Vector3f(dr.normalize(step.x.p - mi.Point3f(3, 3, 20)))))
+    offset.joined, offset.apart = mi.Bool(True), mi.Bool(False)
+    settled = step_joined(step, offset)
+    lacquer = mi.Mask((steps.materials(step.x) == list(MATERIALS).index("plastic")).tolist())
+    mirrored = lacquer & step.goes_on & (step.kind == DELTA)
+    assert dr.count(mirrored)[0] > 100
+    assert dr.all(~mirrored | (settled.failed & dr.all(settled.a == -2 * step.β1)))
+    assert dr.count(lacquer & (step.kind == SMOOTH) & ~settled.failed)[0] > 100
 
+
+def directions(n, seed, above):
+    """Random directions in a half space."""
     random = mi.PCG32(n, initseq=seed)
-    d = warp.square_to_uniform_sphere(mi.Point2f(random.next_float32(), random.next_float32()))
-    return d if above is None else mi.Vector3f(d.x, d.y, dr.mulsign(dr.abs(d.z), mi.Float(1 if above else -1)))
+    d = mi.warp.square_to_uniform_sphere(mi.Point2f(random.next_float32(), random.next_float32()))
+    return mi.Vector3f(d.x, d.y, dr.mulsign(dr.abs(d.z), mi.Float(1 if above else -1)))
 
 
 @pytest.mark.parametrize(("above", "η"), [(True, 1.0), (False, 1.0), (False, 1.5), (False, 1 / 1.5)])
 def test_half_vector_copy_is_an_involution_with_its_jacobian(renderer, above, η):
     """Reflection, transmission through a thin sheet, and refraction into and out of glass."""
-    import drjit as dr
-
-    from data_gen.paths.shift import copy_half_vector
-
-    mi, n = renderer, 1 << 14
-    wi, wi_offset = directions(mi, dr, n, 1, True), directions(mi, dr, n, 2, True)
-    wo, η = directions(mi, dr, n, 3, above), mi.Float(η)
+    n = 1 << 14
+    wi, wi_offset = directions(n, 1, True), directions(n, 2, True)
+    wo, η = directions(n, 3, above), mi.Float(η)
     there, J, exists = copy_half_vector(wi, wo, η, wi_offset, True)
     back, J_back, exists_back = copy_half_vector(wi_offset, there, η, wi, True)
     assert dr.count(exists)[0] > n / 20
@@ -244,22 +230,3 @@ def test_half_vector_copy_is_an_involution_with_its_jacobian(renderer, above, η
     assert dr.count(off)[0] < 0.01 * n
     # Another material refracts by another index.
     assert not dr.any(copy_half_vector(wi, wo, η, wi_offset, False)[2]) or above
-
-
-def test_a_mirror_sampled_at_the_joined_vertex_rejects_the_shift(renderer):
-    """Lacquer mirrors as well: an offset path that has just joined it must not follow the mirrored base path."""
-    import drjit as dr
-
-    from data_gen.paths.vertex import DELTA, SMOOTH
-    from data_gen.samplers.gpt.offset_path import step_joined
-
-    steps = Steps(renderer, "replay")
-    other = steps.dr.normalize(steps.step.x.p - renderer.Point3f(3, 3, 20))
-    offset = steps.offset_at(renderer.Ray3f(renderer.Point3f(0), renderer.Vector3f(other)))
-    offset.joined, offset.apart = renderer.Bool(True), renderer.Bool(False)
-    settled = step_joined(steps.step, offset)
-    lacquer = renderer.Mask(list((steps.materials(steps.step.x) == list(MATERIALS).index("plastic")).tolist()))
-    mirrored = lacquer & steps.step.goes_on & (steps.step.kind == DELTA)
-    assert dr.count(mirrored)[0] > 100
-    assert dr.all(~mirrored | (settled.failed & dr.all(settled.a == -2 * steps.step.β1)))
-    assert dr.count(lacquer & (steps.step.kind == SMOOTH) & ~settled.failed)[0] > 100

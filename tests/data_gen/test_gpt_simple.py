@@ -1,10 +1,15 @@
 """The teaching twin of ``gpt`` is right for what it renders, and refuses the rest."""
 
+import drjit as dr
 import numpy as np
 import pytest
 from data_gen_scenes import courtyard, polished
 from unbiased import load
 
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.lights import emission, sample_light
+from data_gen.paths.mis import mis_weight
+from data_gen.paths.vertex import evaluate
 from data_gen.samplers import find
 
 
@@ -22,9 +27,6 @@ class Pairs:
     """The first two steps of base paths, shifted to a neighbouring pixel; and the same offset paths shifted back."""
 
     def __init__(self, mi, scene):
-        import drjit as dr
-
-        from data_gen.paths.camera import CameraSamples
         from data_gen.samplers.teaching.gpt_simple import base_step, start, step_apart, step_joined
 
         self.mi, self.scene = mi, scene
@@ -48,11 +50,6 @@ class Pairs:
 
     def step(self, x, β, other, wo, x1):
         """A step as if base path sampling had gone along ``wo`` to ``x1``; the emitter's numbers are of ``other``."""
-        import drjit as dr
-
-        from data_gen.paths.lights import emission, sample_light
-        from data_gen.paths.mis import mis_weight
-        from data_gen.paths.vertex import evaluate
         from data_gen.samplers.teaching.gpt_simple import Step, reflected
 
         light = sample_light(self.scene, x, other.u_light, x.is_valid())

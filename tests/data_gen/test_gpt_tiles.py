@@ -1,12 +1,15 @@
-"""Paths that are shared in tiles: who shares with whom, by which weights, and what it brings.
+"""Paths that are shared in tiles: who shares with whom, by which weights, and what it brings."""
 
-The laws that all samplers share are in ``test_samplers``; the budget of z-tests is theirs.
-"""
+from functools import cache
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from unbiased import load
 
+from data_gen.paths.camera import CameraSamples
+from data_gen.render import render_stack
 from data_gen.samplers import find
 
 SIZE = (8, 6)
@@ -16,9 +19,6 @@ class Tile:
     """All connections of one sample per pixel, as NumPy arrays by lane, and the geometry they come from."""
 
     def __init__(self, mi, side):
-        import drjit as dr
-
-        from data_gen.paths.camera import CameraSamples
         from data_gen.samplers.studies import gpt_tiles
 
         scene = load(mi, "diffuse", SIZE)
@@ -41,9 +41,14 @@ class Tile:
         dr.eval()
 
 
+@pytest.fixture(scope="module")
+def tiles(renderer):
+    return cache(lambda side: Tile(renderer, side))
+
+
 @pytest.mark.parametrize("side", [2, 4])
-def test_links_lead_back_and_a_tile_is_the_same_for_all_in_it(renderer, side):
-    tile = Tile(renderer, side)
+def test_links_lead_back_and_a_tile_is_the_same_for_all_in_it(tiles, side):
+    tile = tiles(side)
     here = np.arange(tile.lanes.shape[1])
     members = []
     for lanes, active in zip(tile.lanes, tile.active, strict=True):
@@ -63,36 +68,28 @@ def test_links_lead_back_and_a_tile_is_the_same_for_all_in_it(renderer, side):
         assert sorted(together) == [False, False, True, True]
 
 
-def test_denominators_are_sums_of_densities(renderer):
+def test_denominators_are_sums_of_densities(tiles):
     """By brute force in double precision, of densities in area at s, which know nothing of any Jacobian."""
-    tile = Tile(renderer, 2)
-    compared = 0
+    tile, compared = tiles(2), 0
+
+    def density(k, j):
+        """Of s_j by cosine sampling at x_k."""
+        to = tile.s[j] - tile.x[k]
+        distance = np.linalg.norm(to)
+        cos, cos_s = (abs(np.dot(normal, to)) / distance for normal in (tile.n[k], tile.n_s[j]))
+        return cos * cos_s / np.pi / distance**2
+
     for j in np.flatnonzero(tile.shared):
-        kernel = brute = 0.0
-        for m, (k, active) in enumerate(zip(tile.lanes[:, j], tile.active[:, j], strict=True)):
-            if not active:
-                continue
-            kernel += tile.q1[m, k]
-            if tile.q1[m, k] > 0:
-                brute += area_density(tile, k, j)
-        kernel, brute = kernel / tile.q1[0, j], brute / area_density(tile, j, j)
-        assert kernel == pytest.approx(brute, rel=0.02)
+        members = [(tile.q1[m, k], k) for m, k in enumerate(tile.lanes[:, j]) if tile.active[m, j]]
+        kernel = sum(q for q, _ in members) / tile.q1[0, j]
+        assert kernel == pytest.approx(sum(density(k, j) for q, k in members if q > 0) / density(j, j), rel=0.02)
         compared += kernel > 1.5
     assert compared > 0.5 * tile.shared.sum()
 
 
-def area_density(tile, k, j):
-    """Of s_j by cosine sampling at x_k."""
-    to = tile.s[j] - tile.x[k]
-    distance = np.linalg.norm(to)
-    cos, cos_s = (abs(np.dot(normal, to)) / distance for normal in (tile.n[k], tile.n_s[j]))
-    return cos * cos_s / np.pi / distance**2
-
-
 def test_weights_of_a_path_add_up_to_one(renderer):
     """If C = q everywhere, then each suffix brings 1 to its tile, shared out over its pixels."""
-    mi = renderer
-    tile = Tile(mi, 2)
+    tile = Tile(renderer, 2)
     for connection in tile.connections:
         connection.C1, connection.C2 = mi.Color3f(connection.q1), mi.Color3f(connection.q2)
     expected = (tile.q1[0] > 0).sum() + (tile.q2[0] > 0).sum()
@@ -102,8 +99,6 @@ def test_weights_of_a_path_add_up_to_one(renderer):
 @pytest.mark.slow
 def test_variance_gain(renderer):
     """Over ``gpt`` at equal samples, median of pixels. Measured: 2.3 of the primal, 1.15 and 1.2 of differences."""
-    from data_gen.render import render_stack
-
     scene = load(renderer, "diffuse", (32, 32))
     ours, theirs = (render_stack(scene, 64, sampler=name, unbiased=True) for name in ("gpt-tiles", "gpt"))
     unlit = theirs["direct"].sum(axis=-1) == 0

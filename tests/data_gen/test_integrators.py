@@ -1,9 +1,15 @@
 """Scenes whose integrators our samplers do not follow by name: rendered as by Mitsuba, or refused in a line."""
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
 import data_gen
+from data_gen.inspect import inspect_scene
+from data_gen.paths.walk import Limits
+from data_gen.samplers import choose
+from data_gen.scenes.facts import scene_facts
+from data_gen.scenes.integrators import followed, plugin_name
 from ngpt.errors import NgptError
 
 SCENE = """<scene version="3.0.0">{integrator}
@@ -17,33 +23,31 @@ SCENE = """<scene version="3.0.0">{integrator}
 <shape type="rectangle"><transform name="to_world"><scale value="2"/></transform></shape>
 <shape type="cube"><transform name="to_world"><scale value="0.5"/></transform></shape>
 </scene>"""
-PROJECTIVE = '<integrator type="{}_projective"><boolean name="hide_emitters" value="true"/></integrator>'
-HIDES = '<boolean name="hide_emitters" value="true"/>'
-# What is in the scene, the integrator whose image it is, and the sampler that "auto" takes for it
+# The scene's integrator, the integrator whose image it is, and the sampler that "auto" takes for it
 CASES = {
-    "none": ("", "path", "gpt"),
-    "prb": ('<integrator type="prb"/>', "path", "gpt"),
-    "prb, hiding": (f'<integrator type="prb">{HIDES}</integrator>', "path", "gpt"),
-    "prb_basic": ('<integrator type="prb_basic"/>', "path", "gpt"),
-    "prb_projective": ('<integrator type="prb_projective"/>', "path", "gpt"),
-    "prb_projective, hiding": (
-        f'<integrator type="prb_projective">{HIDES}</integrator>',
-        "prb_projective",
-        "gpt-basic",
-    ),
-    "direct_projective": ('<integrator type="direct_projective"/>', "path", "gpt"),
-    "direct_projective, hiding": (PROJECTIVE.format("direct"), "direct_projective", "gpt-basic"),
-    "prbvolpath": ('<integrator type="prbvolpath"/>', "volpath", "gpt"),
-    "direct": ('<integrator type="direct"/>', "direct", "gpt-basic"),
-    "aov": (
-        '<integrator type="aov"><string name="aovs" value="z:depth"/><integrator type="moment" name="inner">'
-        '<integrator type="prb" name="inmost"><integer name="max_depth" value="2"/></integrator>'
-        "</integrator></integrator>",
-        "path",
-        "gpt",
-    ),
-    "volprim_rf_basic": ('<integrator type="volprim_rf_basic"/>', "volprim_rf_basic", "gpt-basic"),
+    "none": ("path", "gpt"),
+    "prb": ("path", "gpt"),
+    "prb, hiding": ("path", "gpt"),
+    "prb_basic": ("path", "gpt"),
+    "prb_projective": ("path", "gpt"),
+    "prb_projective, hiding": ("prb_projective", "gpt-basic"),
+    "direct_projective": ("path", "gpt"),
+    "direct_projective, hiding": ("direct_projective", "gpt-basic"),
+    "prbvolpath": ("volpath", "gpt"),
+    "direct": ("direct", "gpt-basic"),
+    "aov": ("path", "gpt"),
+    "volprim_rf_basic": ("volprim_rf_basic", "gpt-basic"),
 }
+AOV = '<integrator type="aov"><string name="aovs" value="z:depth"/>{}</integrator>'
+DEPTH_2 = '<integrator type="prb" name="inmost"><integer name="max_depth" value="2"/></integrator>'
+
+
+def integrator(case):
+    name, _, hiding = case.partition(", ")
+    if name == "aov":
+        return AOV.format(f'<integrator type="moment" name="inner">{DEPTH_2}</integrator>')
+    hides = '<boolean name="hide_emitters" value="true"/>' if hiding else ""
+    return "" if name == "none" else f'<integrator type="{name}">{hides}</integrator>'
 
 
 @pytest.fixture
@@ -58,12 +62,8 @@ def scene_file(renderer, tmp_path):
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_loaded_scene_and_its_file_are_told_apart_alike(scene_file, case):
-    from data_gen.inspect import inspect_scene
-    from data_gen.samplers import choose
-    from data_gen.scenes.facts import scene_facts
-
-    integrator, followed, sampler = CASES[case]
-    file = scene_file(integrator)
+    followed, sampler = CASES[case]
+    file = scene_file(integrator(case))
     facts, told = scene_facts(data_gen.load_scene(file)), inspect_scene(file)
     assert facts.integrator == followed and choose(facts)[0] == sampler == told["sampler"]
     outer = case.split(",")[0]
@@ -80,7 +80,7 @@ def test_a_loaded_scene_and_its_file_are_told_apart_alike(scene_file, case):
     ],
 )
 def test_the_image_is_the_one_that_mitsuba_renders(renderer, scene_file, case):
-    file = scene_file(CASES[case][0])
+    file = scene_file(integrator(case))
     scene = renderer.load_file(file)
     theirs = [np.array(renderer.render(scene, spp=64, seed=100 + i))[..., :3] for i in range(6)]
     for sampler in ("auto", "primal"):
@@ -93,9 +93,6 @@ def test_the_image_is_the_one_that_mitsuba_renders(renderer, scene_file, case):
 
 
 def test_depths_and_what_hides_are_taken_over(renderer):
-    from data_gen.paths.walk import Limits
-    from data_gen.scenes.integrators import followed, plugin_name
-
     given = {"max_depth": 4, "rr_depth": 3, "hide_emitters": True}
     for name, same in {"prb": "path", "prb_basic": "path", "prbvolpath": "volpath"}.items():
         found = followed(renderer.load_dict({"type": name, **given}))
@@ -106,7 +103,6 @@ def test_depths_and_what_hides_are_taken_over(renderer):
 
 def test_an_integrator_of_ones_own_is_called_as_mitsuba_calls_it(renderer):
     """As ``ADIntegrator.render`` does: with keywords. The integrator may leave some of them to ``**kwargs``."""
-    mi = renderer
 
     class Grey(mi.ad.integrators.common.ADIntegrator):
         def sample(self, mode, scene, sampler, ray, active, **kwargs):
@@ -121,29 +117,24 @@ def test_an_integrator_of_ones_own_is_called_as_mitsuba_calls_it(renderer):
     mi.register_integrator("broken", lambda props: Broken(props))
     camera = {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 3}}
     parts = {"type": "scene", "sensor": camera, "shape": {"type": "sphere"}}
+    grey, broken = (mi.load_dict({**parts, "integrator": {"type": name}}) for name in ("grey", "broken"))
     for sampler in ("auto", "primal", "gpt-basic"):
-        stack, _ = data_gen.render_scene(mi.load_dict({**parts, "integrator": {"type": "grey"}}), 2, sampler=sampler)
-        assert np.all(stack["primal"] == 0.25), sampler
+        assert np.all(data_gen.render_scene(grey, 2, sampler=sampler).stack["primal"] == 0.25), sampler
         with pytest.raises(NgptError, match=r"integrator 'Broken' fails .*KeyError: 'no such thing'"):
-            data_gen.render_scene(mi.load_dict({**parts, "integrator": {"type": "broken"}}), 2, sampler=sampler)
+            data_gen.render_scene(broken, 2, sampler=sampler)
     with pytest.raises(NgptError, match="the integrator is 'Grey', and 'gpt' knows only 'path'"):
-        data_gen.render_scene(mi.load_dict({**parts, "integrator": {"type": "grey"}}), 2, sampler="gpt")
+        data_gen.render_scene(grey, 2, sampler="gpt")
 
 
 @pytest.mark.parametrize(
-    ("integrator", "message"),
+    ("inside", "message"),
     [
         ('<integrator type="ptracer"/>', "integrator 'ptracer' does not trace paths from the camera"),
-        (
-            '<integrator type="aov"><string name="aovs" value="z:depth"/></integrator>',
-            "integrator 'aov' has no other in it, so it renders no colour; put a 'path'",
-        ),
+        (AOV.format(""), "integrator 'aov' has no other in it, so it renders no colour; put a 'path'"),
     ],
 )
-def test_what_has_no_image_for_a_stack_is_refused_by_all_alike(scene_file, integrator, message):
-    from data_gen.inspect import inspect_scene
-
-    file = scene_file(integrator)
+def test_what_has_no_image_for_a_stack_is_refused_by_all_alike(scene_file, inside, message):
+    file = scene_file(inside)
     for sampler in ("auto", "gpt", "primal", "gpt-basic", "bdpt"):
         with pytest.raises(NgptError, match=message):
             data_gen.render_scene(file, 1, sampler=sampler)

@@ -1,7 +1,14 @@
 """Chains of mirrors and glass: closed forms, derivatives against finite differences, and the way back."""
 
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
+
+from data_gen.paths import manifold
+from data_gen.paths.manifold import MAX_EVENTS, REFLECT, REFRACT, Target, add_event, event, follow, shoot, walk
 
 LANES = 4096
 
@@ -9,18 +16,13 @@ LANES = 4096
 class Chains:
     """Random chains from a floor through an object to where they arrive, and vertices beside those on the floor."""
 
-    def __init__(self, mi, thing, distance=0.005, far=False, lanes=LANES):
-        import drjit as dr
-
-        from data_gen.paths import manifold
-
-        self.mi, self.dr = mi, dr
+    def __init__(self, thing, distance=0.005, far=False):
         floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(4), "bsdf": {"type": "diffuse"}}
         top = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]).scale(8)
         lamp = {"type": "rectangle", "to_world": top, "emitter": {"type": "area"}, "bsdf": {"type": "diffuse"}}
         shapes = {"floor": floor, "thing": thing} | ({} if far else {"lamp": lamp})
         self.scene = mi.load_dict({"type": "scene", **shapes})
-        random = mi.PCG32(lanes)
+        random = mi.PCG32(LANES)
         u = [mi.Float(random.next_float32()) for _ in range(8)]
         at = mi.Point2f(u[0] * 2 - 1, u[1] * 2 - 1)
         self.z = self.on_floor(at)
@@ -29,18 +31,14 @@ class Chains:
         self.ω = dr.normalize(aim - self.z.p)
         self.events, self.target, self.found = self.record(far)
         dr.eval(self.events, self.target, self.found)
-        self.base = manifold.shoot(self.scene, self.z, self.ω, self.events, self.target, self.found)
+        self.base = self.shoot(self.z, self.ω, active=self.found)
         dr.eval(self.base)
 
     def on_floor(self, at):
-        ray = self.mi.Ray3f(self.mi.Point3f(at.x, at.y, 0.05), self.mi.Vector3f(0, 0, -1))
-        return self.scene.ray_intersect(ray)
+        return self.scene.ray_intersect(mi.Ray3f(mi.Point3f(at.x, at.y, 0.05), mi.Vector3f(0, 0, -1)))
 
     def record(self, far):
         """The events that sampling meets, and the first vertex that is not specular, or the escape."""
-        from data_gen.paths.manifold import Target, add_event, event
-
-        mi, dr = self.mi, self.dr
         random = mi.PCG32(LANES, 7)
         ray, events, open_ = self.z.spawn_ray(self.ω), mi.UInt32(0), mi.Bool(True)
         target = Target(dr.zeros(mi.Point3f), mi.Vector3f(0, 0, 1), mi.Bool(far))
@@ -61,42 +59,26 @@ class Chains:
             ray = si.spawn_ray(si.to_world(sample.wo))
         return events, target, found
 
-    def shoot(self, z, ω, target=None, active=True):
-        from data_gen.paths.manifold import shoot
-
-        return shoot(self.scene, z, ω, self.events, target or self.target, active)
+    def shoot(self, z, ω, active=True):
+        return shoot(self.scene, z, ω, self.events, self.target, active)
 
     def walk(self, z, ω, target=None, active=True):
-        from data_gen.paths.manifold import walk
-
         return walk(self.scene, z, ω, self.events, target or self.target, active)
 
     def follow(self):
-        from data_gen.paths.manifold import follow
-
-        ω1, shot, J, found = follow(
+        copy = follow(
             self.scene, self.z, self.ω, self.base, self.z1, self.events, target=self.target, active=self.found
         )
-        self.dr.eval(ω1, shot, J, found)
-        return ω1, shot, J, found
+        dr.eval(copy)
+        return copy
 
 
-def sphere(bsdf, **more):
-    return {"type": "sphere", "center": [0, 0, 1.1], "radius": 0.6, "bsdf": bsdf, **more}
-
-
-def mirror_plane():
-    import mitsuba as mi
-
-    to_world = mi.ScalarTransform4f().look_at([0, 0, 1.5], [0, 0, 0], [0, 1, 0]).scale(3)
-    return {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "conductor", "material": "none"}}
+def sphere(bsdf, radius=0.6):
+    return {"type": "sphere", "center": [0, 0, 1.1], "radius": radius, "bsdf": bsdf}
 
 
 def mesh(bsdf):
     """A ball of triangles with vertex normals."""
-    import mitsuba as mi
-    import numpy as np
-
     n = 48
     v, u = np.meshgrid(np.linspace(0, np.pi, n), np.linspace(0, 2 * np.pi, 2 * n), indexing="ij")
     normals = np.stack([np.sin(v) * np.cos(u), np.sin(v) * np.sin(u), np.cos(v)], -1).reshape(-1, 3)
@@ -118,21 +100,19 @@ GLASS = {"type": "dielectric"}
 
 
 def test_events_of_a_chain(renderer):
-    from data_gen.paths.manifold import MAX_EVENTS, add_event
-
-    events = renderer.UInt32(0)
-    codes = [2, 1, 3, 1, 1, 2]
+    events, codes = mi.UInt32(0), [2, 1, 3, 1, 1, 2]
     for code in codes:
-        events, fits = add_event(events, renderer.UInt32(code))
+        events, fits = add_event(events, mi.UInt32(code))
         assert fits[0]
-    assert len(codes) == MAX_EVENTS and not add_event(events, renderer.UInt32(1))[1][0]
+    assert len(codes) == MAX_EVENTS and not add_event(events, mi.UInt32(1))[1][0]
     assert [int(events[0]) >> 2 * i & 3 for i in range(7)] == [*codes, 0]
 
 
 def test_plane_mirror_has_a_closed_form(renderer):
     """The mirror image of the target is where the walk aims, and det B = d² / cos."""
-    dr, mi = pytest.importorskip("drjit"), renderer
-    chains = Chains(mi, mirror_plane(), distance=0.3)
+    to_world = mi.ScalarTransform4f().look_at([0, 0, 1.5], [0, 0, 0], [0, 1, 0]).scale(3)
+    mirror = {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "conductor", "material": "none"}}
+    chains = Chains(mirror, distance=0.3)
     ω1, shot, J, found = chains.follow()
     found = np.array(found)
     assert found.mean() > 0.9
@@ -140,20 +120,16 @@ def test_plane_mirror_has_a_closed_form(renderer):
     to0, to1 = image - chains.z.p, image - chains.z1.p
     # The normal of the target is vertical, before and behind the mirror.
     det0, det1 = (dr.squared_norm(to) / dr.abs(dr.normalize(to).z) for to in (to0, to1))
-    error = np.array(dr.norm(ω1 - dr.normalize(to1)))
-    assert error[found].max() < 1e-3
+    assert np.array(dr.norm(ω1 - dr.normalize(to1)))[found].max() < 1e-3
     assert np.abs(np.array(dr.abs(shot.det) / det1) - 1)[found].max() < 1e-2
     assert np.abs(np.array(J * det1 / det0) - 1)[found].max() < 1e-2
 
 
 def test_ball_lens_has_a_closed_form(renderer):
     """On the axis: the ray matrix of a ball."""
-    from data_gen.paths.manifold import REFRACT, Target, shoot
-
     n, R, a, b = 1.5, 0.6, 0.5, 2.3
-    mi = renderer
     glass = sphere({"type": "dielectric", "int_ior": n, "ext_ior": 1.0})
-    chains = Chains(mi, glass)
+    chains = Chains(glass)
     target = Target(mi.Point3f(0, 0, 1.1 + R + b), mi.Vector3f(0, 0, -1), mi.Bool(False))
     # A little beside the axis, where the sphere has a pole without derivatives
     z = chains.on_floor(mi.Point2f(0.01, 0.005))
@@ -167,96 +143,83 @@ def test_ball_lens_has_a_closed_form(renderer):
 
 # The share of chains that are followed: measured are .86, 1, .85, 1, 1, .96; the rest begin beside a focus, where two
 # solutions meet and vanish.
-@pytest.mark.parametrize(
-    ("thing", "share", "far"),
-    [
-        (lambda: sphere(GLASS), 0.85, False),
-        (lambda: sphere({"type": "conductor"}), 0.98, False),
-        (lambda: mesh(GLASS), 0.82, False),
-        (lambda: sphere({"type": "plastic"}), 0.98, False),
-        (lambda: sphere({"type": "thindielectric"}), 0.98, False),
-        (lambda: sphere(GLASS), 0.85, True),
-    ],
-    ids=["glass", "mirror", "mesh", "plastic", "pane", "sky"],
-)
-class TestFollow:
-    def test_arrives_and_returns(self, renderer, thing, share, far):
-        import drjit as dr
-
-        chains = Chains(renderer, thing(), far=far)
-        base = np.array(chains.found & chains.base.good)
-        assert base.sum() > 250
-        _, shot, _, found = chains.follow()
-        found = np.array(found)
-        assert found[base].mean() >= share
-        back, _, _ = chains.walk(chains.z, dr.normalize(shot.first - chains.z.p))
-        assert np.array(dr.norm(back - chains.ω))[found].max() < 1e-3
-        assert (np.array(dr.norm(shot.miss) / shot.reach)[found] < 1.001e-4).all()
-
-    def test_jacobian_is_that_of_the_shift(self, renderer, thing, share, far, monkeypatch):
-        """Against finite differences: ω turns a little, x_c moves with it, and ω' after it."""
-        import drjit as dr
-
-        from data_gen.paths import manifold
-
-        monkeypatch.setattr(manifold, "TOLERANCE", 1e-6)
-        chains = Chains(renderer, thing(), far=far)
-        ω1, _, J, found = chains.follow()
-        turns, h = renderer.Frame3f(chains.ω), 4e-4
-        moved = []
-        for axis in (turns.s, turns.t):
-            pair = []
-            for sign in (1, -1):
-                shot = chains.shoot(chains.z, dr.normalize(chains.ω + sign * h * axis), active=found)
-                plane = renderer.Frame3f(chains.target.n)
-                shift = plane.s * shot.miss.x + plane.t * shot.miss.y
-                n = dr.normalize(chains.target.n + shift) if far else chains.target.n
-                target = manifold.Target(chains.target.p + shift, n, chains.target.far)
-                to, _, arrives = chains.walk(chains.z1, ω1, target, found & shot.good)
-                found &= arrives & shot.good
-                pair.append(to)
-            moved.append((pair[0] - pair[1]) / (2 * h))
-        dr.eval(moved, found)
-        found = np.array(found)
-        ratio = np.array(dr.norm(dr.cross(*moved)) / J)[found]
-        assert found.sum() > 200
-        assert abs(np.median(ratio) - 1) < 0.01
-        assert (np.abs(ratio - 1) < 0.05).mean() > 0.9
-
-    def test_changed_places_give_the_inverse(self, renderer, thing, share, far):
-        from data_gen.paths.manifold import follow
-
-        chains = Chains(renderer, thing(), far=far)
-        ω1, shot, J, found = chains.follow()
-        target = {"target": chains.target, "active": found}
-        ω, _, J1, returned = follow(chains.scene, chains.z1, ω1, shot, chains.z, chains.events, **target)
-        found, returned = np.array(found), np.array(returned)
-        assert returned[found].mean() > 0.99
-        product = np.array(J * J1)[found & returned]
-        assert (np.abs(product - 1) < 0.02).mean() > 0.98 and np.abs(np.median(product) - 1) < 1e-3
-        assert np.array(chains.dr.norm(ω - chains.ω))[found & returned].max() < 1.5e-3
+THINGS = {
+    "glass": (lambda: sphere(GLASS), 0.85),
+    "mirror": (lambda: sphere({"type": "conductor"}), 0.98),
+    "mesh": (lambda: mesh(GLASS), 0.82),
+    "plastic": (lambda: sphere({"type": "plastic"}), 0.98),
+    "pane": (lambda: sphere({"type": "thindielectric"}), 0.98),
+    "sky": (lambda: sphere(GLASS), 0.85),
+}
 
 
-def test_without_the_way_back_the_shift_is_no_involution(renderer, monkeypatch):
+@pytest.fixture(scope="module")
+def chains(renderer):
+    return cache(lambda name: Chains(THINGS[name][0](), far=name == "sky"))
+
+
+@pytest.mark.parametrize("name", THINGS)
+def test_chains_arrive_and_return_with_the_inverse_jacobian(chains, name):
+    chains = chains(name)
+    base = np.array(chains.found & chains.base.good)
+    assert base.sum() > 250
+    ω1, shot, J, exists = chains.follow()
+    found = np.array(exists)
+    assert found[base].mean() >= THINGS[name][1]
+    back, _, _ = chains.walk(chains.z, dr.normalize(shot.first - chains.z.p))
+    assert np.array(dr.norm(back - chains.ω))[found].max() < 1e-3
+    assert (np.array(dr.norm(shot.miss) / shot.reach)[found] < 1.001e-4).all()
+    # The two vertices change places.
+    target = {"target": chains.target, "active": exists}
+    ω, _, J1, returned = follow(chains.scene, chains.z1, ω1, shot, chains.z, chains.events, **target)
+    both = found & np.array(returned)
+    assert both.sum() > 0.99 * found.sum()
+    product = np.array(J * J1)[both]
+    assert (np.abs(product - 1) < 0.02).mean() > 0.98 and np.abs(np.median(product) - 1) < 1e-3
+    assert np.array(dr.norm(ω - chains.ω))[both].max() < 1.5e-3
+
+
+@pytest.mark.parametrize("name", THINGS)
+def test_jacobian_is_that_of_the_shift(chains, name, monkeypatch):
+    """Against finite differences: ω turns a little, x_c moves with it, and ω' after it."""
+    monkeypatch.setattr(manifold, "TOLERANCE", 1e-6)
+    chains = chains(name)
+    ω1, _, J, found = chains.follow()
+    turns, plane, h = mi.Frame3f(chains.ω), mi.Frame3f(chains.target.n), 4e-4
+    moved = []
+    for axis in (turns.s, turns.t):
+        pair = []
+        for sign in (1, -1):
+            shot = chains.shoot(chains.z, dr.normalize(chains.ω + sign * h * axis), found)
+            shift = plane.s * shot.miss.x + plane.t * shot.miss.y
+            n = dr.normalize(chains.target.n + shift) if name == "sky" else chains.target.n
+            target = Target(chains.target.p + shift, n, chains.target.far)
+            to, _, arrives = chains.walk(chains.z1, ω1, target, found & shot.good)
+            found &= arrives & shot.good
+            pair.append(to)
+        moved.append((pair[0] - pair[1]) / (2 * h))
+    dr.eval(moved, found)
+    ratio = np.array(dr.norm(dr.cross(*moved)) / J)[np.array(found)]
+    assert len(ratio) > 200
+    assert abs(np.median(ratio) - 1) < 0.01
+    assert (np.abs(ratio - 1) < 0.05).mean() > 0.9
+
+
+def test_walks_that_arrive_by_another_way_are_left_out(renderer, monkeypatch):
     """Some walks arrive by another of several ways: what they would leave out comes back to somewhere else."""
-    import drjit as dr
-
-    from data_gen.paths import manifold
-
-    chains = Chains(renderer, sphere(GLASS), distance=0.05)
+    chains = Chains(sphere(GLASS), distance=0.05)
     shares = []
     for returns in (manifold.RETURNS, np.inf):
         monkeypatch.setattr(manifold, "RETURNS", returns)
         _, shot, _, found = chains.follow()
         back, _, _ = chains.walk(chains.z, dr.normalize(shot.first - chains.z.p))
-        lost = np.array(dr.norm(back - chains.ω))[np.array(found)] > 1e-3
-        shares.append(lost.mean())
+        shares.append((np.array(dr.norm(back - chains.ω))[np.array(found)] > 1e-3).mean())
     assert shares[0] == 0 and shares[1] > 0.002
 
 
 def test_a_walk_begins_at_the_first_event_of_the_other(renderer):
     """The same direction from a vertex further away than a small mirror is large would miss it."""
-    chains = Chains(renderer, sphere({"type": "conductor"}) | {"radius": 0.2}, distance=0.25)
+    chains = Chains(sphere({"type": "conductor"}, radius=0.2), distance=0.25)
     *_, found = chains.follow()
     base = np.array(chains.found & chains.base.good)
     *_, arrives = chains.walk(chains.z1, chains.ω)
@@ -265,13 +228,11 @@ def test_a_walk_begins_at_the_first_event_of_the_other(renderer):
 
 def test_what_is_not_followed(renderer):
     """Another number of events, a chain that cannot be taken, and a surface whose bumps turn rays."""
-    from data_gen.paths.manifold import REFLECT
-
-    chains = Chains(renderer, sphere(GLASS))
-    chains.events = chains.mi.UInt32(REFLECT) | chains.dr.opaque(renderer.UInt32, REFLECT << 2)
+    chains = Chains(sphere(GLASS))
+    chains.events = mi.UInt32(REFLECT) | dr.opaque(mi.UInt32, REFLECT << 2)
     assert not np.array(chains.shoot(chains.z, chains.ω).good).any()
     waves = np.sin(np.linspace(0, 60, 256, dtype=np.float32)) * np.ones((32, 1), np.float32)
-    texture = {"type": "bitmap", "bitmap": renderer.Bitmap(waves[..., None]), "raw": True}
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(waves[..., None]), "raw": True}
     bumps = {"type": "bumpmap", "arbitrary": texture, "scale": 0.05, "bsdf": {"type": "conductor"}}
-    chains = Chains(renderer, sphere(bumps))
+    chains = Chains(sphere(bumps))
     assert np.array(chains.base.good & chains.found).mean() < 0.1

@@ -6,6 +6,7 @@ from data_gen_scenes import lamp_alone, leaf
 from references import references
 from unbiased import load, render_ours, right_integrator
 
+from data_gen.scenes.load import reference_integrator
 from ngpt.errors import NgptError
 from ngpt.testing import z_test
 
@@ -23,7 +24,6 @@ def test_light_on_what_has_holes_is_not_lost(renderer):
 def test_elsewhere_it_is_the_integrator_itself(renderer, more):
     """With an environment, and without holes: the very same numbers as ``path`` gives."""
     from data_gen.samplers.common import radiance
-    from data_gen.scenes.load import reference_integrator
 
     scene = load(renderer, lambda: leaf() | more, (16, 16))
     integrator = reference_integrator(scene)
@@ -54,7 +54,7 @@ def test_elsewhere_it_is_the_integrator_itself(renderer, more):
 def test_lamps_seen_directly_are_seen_by_four_rays_a_sample(renderer, sampler):
     """A lamp of radiance 2 over parts of pixels: one ray a sample would have variance m (2 - m) / spp."""
     spp = 16
-    stacks = render_ours(load(renderer, lamp_alone, (16, 16)), sampler, batches=48, spp=spp)
+    stacks = render_ours(load(renderer, lamp_alone, (16, 16)), sampler, batches=24, spp=spp)
     direct = np.stack([stack["direct"][..., 0] for stack in stacks]).astype(np.float64)
     np.testing.assert_allclose([stack["primal"] for stack in stacks], [stack["direct"] for stack in stacks], atol=1e-6)
     m = direct.mean(axis=0)

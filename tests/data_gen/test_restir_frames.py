@@ -1,9 +1,13 @@
 """The sampler ``restir``: frames of a shot, resumed or not, and what it refuses."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import ngpt
+from data_gen.frames.camera_path import CameraPath, Key, look_at
 from data_gen.samplers import FRAME_SAMPLERS, find
 from data_gen.scenes.facts import Facts
 from ngpt.cli import main
@@ -15,19 +19,14 @@ KEYS = [
 ]
 
 
-def shot(size=(16, 12), **options):
-    from data_gen.frames.camera_path import CameraPath, Key, look_at
-    from data_gen.frames.shot import Shot
+def rendered(frames=range(3), spp=2, seed=7, size=(16, 12), describe=None, update=None, **options):
+    """Stacks by their frames of a shot of the built-in scene, or of what ``describe`` (frame) says."""
+    from data_gen.frames.shot import Shot, render_shot
 
     views = [(np.array([key["origin"], key["target"], (0, 1, 0)], float), key["frame"]) for key in KEYS]
     path = CameraPath([Key(frame, look_at(*look), look) for look, frame in views])
-    return Shot(options.pop("describe", lambda frame: ("diffuse", {})), size, path, **options)
-
-
-def rendered(frames=range(3), spp=2, seed=7, size=(16, 12), **options):
-    from data_gen.frames.shot import render_shot
-
-    return dict(render_shot(shot(size), frames, spp, seed, sampler="restir", **options))
+    shot = Shot(describe or (lambda frame: ("diffuse", {})), size, path, update=update)
+    return dict(render_shot(shot, frames, spp, seed, sampler="restir", **options))
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +44,7 @@ def test_frames_have_all_layers(frames):
 
 
 def test_one_chain_has_no_variance(renderer):
-    stack = rendered(range(2), spp=1)[1]
-    assert not [name for name in stack.names if name.endswith("_var")]
+    assert not [name for name in rendered(range(2), spp=1)[1].names if name.endswith("_var")]
 
 
 def test_a_shot_is_gone_on_with_after_the_frames_before(frames):
@@ -58,8 +56,6 @@ def test_a_shot_is_gone_on_with_after_the_frames_before(frames):
 
 
 def test_a_gap_is_bridged_by_so_many_frames_and_no_more(renderer, monkeypatch):
-    from dataclasses import replace
-
     monkeypatch.setitem(FRAME_SAMPLERS, "restir", replace(FRAME_SAMPLERS["restir"], warm_up=1))
     found = rendered(range(5), skip=lambda frame: frame in (1, 2, 3))
     confidence = {frame: stack.attributes["ngpt:confidence"] for frame, stack in found.items()}
@@ -68,7 +64,7 @@ def test_a_gap_is_bridged_by_so_many_frames_and_no_more(renderer, monkeypatch):
 
 def test_variances_are_those_over_seeds(renderer):
     """Of the mean over chains; and differences are not half of themselves."""
-    found = [rendered(range(2), spp=8, seed=seed)[1] for seed in range(12)]
+    found = [rendered(range(2), spp=16, seed=seed)[1] for seed in range(6)]
     for name in ("dx", "dy"):
         over_seeds = np.var([stack[name] for stack in found], axis=0, ddof=1).mean()
         within = np.mean([stack[f"{name}_var"] for stack in found])
@@ -96,17 +92,13 @@ def test_single_images_are_refused_and_why(renderer, tmp_path, capsys):
     ],
 )
 def test_what_cannot_be_rendered_is_refused(renderer, options, message):
-    from data_gen.frames.shot import render_shot
-
     with pytest.raises(NgptError, match=message):
-        next(render_shot(shot((32, 24)), range(3), 4, sampler="restir", **options))
+        rendered(spp=4, size=(32, 24), **options)
 
 
 def test_a_change_that_changes_nothing_gives_the_same_frames(renderer, frames):
     """Two scenes in turn, and all records carried from one to the other."""
-    from data_gen.frames.shot import render_shot
-
-    changing = dict(render_shot(shot(update=lambda params, frame: None), range(3), 2, 7, sampler="restir"))
+    changing = rendered(update=lambda params, frame: None)
     for name in ("primal", "dx", "dy", "motion"):
         same = np.isclose(changing[2][name], frames[2][name], rtol=1e-3, atol=1e-5, equal_nan=True).all(axis=-1)
         assert same.mean() > 0.95, name
@@ -125,15 +117,11 @@ SCENE = """<scene version="3.0.0"><default name="power" value="1"/>
 
 def test_a_scene_that_is_loaded_anew_in_each_frame_keeps_its_history(renderer, tmp_path):
     """Frames resumed are the same bits, and light that doubles is followed at once."""
-    from data_gen.frames.shot import render_shot
-
-    file = tmp_path / "scene.xml"
+    file, powers = tmp_path / "scene.xml", ("1", "1", "2")
     file.write_text(SCENE)
-    powers = ("1", "1", "2")
 
     def found(**options):
-        scene = shot(describe=lambda frame: (str(file), {"power": powers[frame]}))
-        return dict(render_shot(scene, range(3), 8, sampler="restir", **options))
+        return rendered(spp=8, seed=0, describe=lambda frame: (str(file), {"power": powers[frame]}), **options)
 
     stacks = found()
     assert stacks[2].attributes["ngpt:confidence"] > 2
@@ -150,8 +138,6 @@ def test_media_are_refused():
 
 
 def test_the_command_renders_a_shot(renderer, tmp_path):
-    import json
-
     path = tmp_path / "path.json"
     path.write_text(json.dumps({"keys": KEYS}))
     command = ["render", "diffuse", "--frames", "0:2", "--camera", str(path), "--sampler", "restir", "--size", "16x12"]

@@ -1,7 +1,10 @@
 """Reservoirs: weights sum to one, and W is unbiased, in NumPy over paths that can be counted."""
 
+import mitsuba as mi
 import numpy as np
 import pytest
+
+from data_gen.samplers.restir.reservoir import choose, difference, part, weigh, weight_of
 
 # Of five paths: light in two pixels, of which the second does not have the last; densities of either's candidates.
 LIGHT = np.array([[0.2, 1.5, 0.7, 0.05, 2.0], [0.4, 1.0, 0.1, 0.6, 0.0]])
@@ -11,58 +14,33 @@ JACOBIAN = np.array([0.5, 2.0, 1.0, 1.25, 1.0])
 DRAWS = 400
 
 
-def gray(mi, values):
-    return mi.Spectrum(mi.Float(np.asarray(values, np.float32)))
-
-
-def all_outcomes(mi, M, both=False):
-    """Every candidate of the first pixel with every one of the second, of all random numbers: what is kept.
-
-    The paths of the second pixel are J(x) shorter than the first's: what has density p there has p / |J|. With
-    ``both``, there is a third reservoir, like the second. Returns the estimates, the number and p̂ of the path that was
-    kept, W, and the probability of each outcome.
-    """
-    from data_gen.samplers.restir.reservoir import choose, weigh, weight_of
-
-    a, b, c, u = (
-        n.ravel()
-        for n in np.meshgrid(np.arange(5), np.arange(4), np.arange(4 if both else 1), (np.arange(DRAWS) + 0.5) / DRAWS)
-    )
-    here, there = LIGHT
-    probability = FOUND[0][a] * FOUND[1][b] * (FOUND[1][c] if both else 1) / DRAWS
-    floats = [
-        [M[0] * here[a], (1 + both) * M[1] * there[a] * JACOBIAN[a], here[a], 1 / FOUND[0][a]],
-        # In the measure of the second pixel, |J| of the way back is 1 / J.
-        *(
-            [
-                M[1] * there[x],
-                (M[0] * here[x] + both * M[1] * there[x] * JACOBIAN[x]) / JACOBIAN[x],
-                here[x] / JACOBIAN[x],
-                JACOBIAN[x] / FOUND[1][x],
-            ]
-            for x in ((b, c) if both else (b,))
-        ),
-    ]
-    weights = [weigh(*(mi.Float(np.asarray(v, np.float32)) for v in row))[1] for row in floats]
-    chosen, total = choose(weights, mi.Float(u))
-    kept = np.choose(np.array(chosen), [a, b, c])
-    W = np.array(weight_of(total, gray(mi, here[kept])))
-    return here[kept] * W, kept, W, probability
-
-
 @pytest.mark.parametrize("both", [False, True])
 @pytest.mark.parametrize("M", [(1, 1), (1, 7), (5, 0.5)])
 def test_what_is_kept_of_all_that_is_offered_is_unbiased(renderer, M, both):
-    """E[value W] is the integral, here the sum over the first pixel's paths."""
-    estimate, _, _, probability = all_outcomes(renderer, M, both)
+    """E[value W] is the integral, here the sum over the first pixel's paths.
+
+    Every candidate of the first pixel with every one of the second, of all random numbers. The paths of the second
+    pixel are J(x) shorter than the first's: what has density p there has p / |J|. With ``both``, there is a third
+    reservoir, like the second.
+    """
+    numbers = np.arange(5), np.arange(4), np.arange(4 if both else 1), (np.arange(DRAWS) + 0.5) / DRAWS
+    a, b, c, u = (n.ravel() for n in np.meshgrid(*numbers))
+    (here, there), (p, q) = LIGHT, FOUND
+    offers = [[M[0] * here[a], (1 + both) * M[1] * there[a] * JACOBIAN[a], here[a], 1 / p[a]]]
+    for x in (b, c) if both else (b,):
+        # In the measure of the second pixel, |J| of the way back is 1 / J.
+        J = JACOBIAN[x]
+        offers.append([M[1] * there[x], (M[0] * here[x] + both * M[1] * there[x] * J) / J, here[x] / J, J / q[x]])
+    chosen, total = choose([weigh(*(mi.Float(v) for v in offer))[1] for offer in offers], mi.Float(u))
+    kept = here[np.choose(np.array(chosen), [a, b, c])]
+    estimate = kept * np.array(weight_of(total, mi.Spectrum(mi.Float(kept))))
+    probability = p[a] * q[b] * (q[c] if both else 1) / DRAWS
     assert np.sum(probability) == pytest.approx(1)
-    assert np.sum(probability * estimate) == pytest.approx(LIGHT[0].sum(), rel=3e-3)
+    assert np.sum(probability * estimate) == pytest.approx(here.sum(), rel=3e-3)
 
 
 def test_a_path_is_kept_in_proportion_to_its_weight(renderer, rng):
-    from data_gen.samplers.restir.reservoir import choose
-
-    mi, weights = renderer, [0.5, 0.0, 1.5, 2.0, 0.0]
+    weights = [0.5, 0.0, 1.5, 2.0, 0.0]
     u = (np.arange(1000) + 0.5) / 1000
     chosen, total = choose([mi.Float(w) for w in weights], mi.Float(u))
     assert np.allclose(np.array(total), 4)
@@ -71,21 +49,15 @@ def test_a_path_is_kept_in_proportion_to_its_weight(renderer, rng):
 
 def test_of_nothing_comes_nothing(renderer):
     """Paths without light, or with weights that are not finite, add nothing."""
-    from data_gen.samplers.restir.reservoir import choose, weigh, weight_of
-
-    mi = renderer
     for W in (0.0, np.inf, np.nan):
         nothing = weigh(mi.Float(9), mi.Float(0), mi.Float(2), mi.Float(W))[1]
         chosen, total = choose([nothing, mi.Float(3)], mi.Float(0.0))
         assert (np.array(chosen), np.array(total)) == (1, 3)
-    assert np.array(weight_of(mi.Float(1), gray(mi, [0.0]))) == 0
+    assert np.array(weight_of(mi.Float(1), mi.Spectrum(0))) == 0
 
 
 def test_a_difference_counts_each_path_once(renderer, rng):
     """From both sides of a pair, a path's weights add up to "second - first"."""
-    from data_gen.samplers.restir.reservoir import difference
-
-    mi = renderer
     a, b = (rng.exponential(size=(3, 40)).astype(np.float32) for _ in range(2))
     b[:, :10] = 0
     a[:, 10:15] = 0
@@ -97,9 +69,7 @@ def test_a_difference_counts_each_path_once(renderer, rng):
 
 
 def test_a_difference_is_its_positive_less_its_negative_part(renderer, rng):
-    from data_gen.samplers.restir.reservoir import part
-
     values = rng.normal(size=(3, 30)).astype(np.float32)
-    parts = [np.array(part(renderer.Spectrum(values), sign)) for sign in (1, -1)]
+    parts = [np.array(part(mi.Spectrum(values), sign)) for sign in (1, -1)]
     assert all((p >= 0).all() for p in parts)
     assert np.array_equal(parts[0] - parts[1], values)

@@ -1,9 +1,20 @@
 """A toy shows what it takes to add a sampler; the laws of all are in ``laws``."""
 
+import drjit as dr
+import mitsuba as mi
 import pytest
 from unbiased import load, same
 
+import ngpt
+from data_gen.dataset.config import read_config
+from data_gen.dataset.crops import render_input
+from data_gen.film import SHIFTS
+from data_gen.inspect import inspect_scene
+from data_gen.paths.features import features
+from data_gen.render import render_stack
 from data_gen.samplers import SAMPLERS, Option, Sampler, choose, find, register
+from data_gen.scenes.facts import Facts
+from ngpt.cli import main
 from ngpt.errors import NgptError
 
 
@@ -17,12 +28,6 @@ class Toy:
         self.scene, self.estimate, self.share = scene, radiance(scene, scene.integrator()), share
 
     def __call__(self, camera, film):
-        import drjit as dr
-        import mitsuba as mi
-
-        from data_gen.film import SHIFTS
-        from data_gen.paths.features import features
-
         def radiance(shift=(0, 0)):
             ray, importance, inside = camera.rays(shift)
             L = self.estimate(camera.random.clone(), ray, None, inside) * importance
@@ -62,14 +67,6 @@ def toy():
 
 
 def test_a_toy_is_found_by_all_that_ask(renderer, capsys, tmp_path):
-    import ngpt
-    from data_gen.dataset.config import read_config
-    from data_gen.dataset.crops import render_input
-    from data_gen.inspect import inspect_scene
-    from data_gen.render import render_stack
-    from data_gen.scenes.facts import Facts
-    from ngpt.cli import main
-
     with pytest.raises(SystemExit):
         main(["render", "--help"])
     assert "toy" in capsys.readouterr().out
@@ -77,7 +74,7 @@ def test_a_toy_is_found_by_all_that_ask(renderer, capsys, tmp_path):
     assert main(["info", "toy"]) == 0
     assert "of each value that is splatted (a number from 0 to 1; default 0.5)" in capsys.readouterr().out
     # gpt, to which media are invisible where 'path' renders them, leaves this scene to the next in rank.
-    assert choose(Facts("path", ("air",))) == ("toy", find_reason("gpt", Facts("path", ("air",))))
+    assert choose(Facts("path", ("air",))) == ("toy", SAMPLERS["gpt"].refuses(Facts("path", ("air",))))
     assert choose(Facts("volpath", ("air",)))[0] == "gpt"
     assert choose(Facts("path", ()))[0] == "gpt"
     assert choose(Facts("spectral", ()))[0] == "gpt-basic"
@@ -103,40 +100,3 @@ def test_a_toy_is_found_by_all_that_ask(renderer, capsys, tmp_path):
     by_config = render_input(read_config(tmp_path / "data.toml"), scene, 4, 0, False)
     assert by_config.attributes["ngpt:samplerOptions"] == "share=0.25"
     same(by_config, by_python)
-
-
-def test_a_toy_is_compared_at_equal_time(renderer, tmp_path, monkeypatch):
-    from data_gen import service
-    from data_gen.choosing import costs
-    from ngpt.evaluation.config import Config
-    from ngpt.evaluation.run import evaluate
-    from ngpt.system.console import Console
-
-    config = Config(
-        scenes=("diffuse",),
-        size=(16, 12),
-        spp=(64,),
-        seeds=1,
-        methods=("wcv",),
-        metrics=("relMSE",),
-        primary="relMSE",
-        samplers=("auto", "toy"),
-        reference_spp=256,
-        timing_spp=16,
-        timing_repeats=1,
-    )
-
-    def timed(scene, options, spp, seed, clock):
-        """A sample of the toy takes 3 s, one of the others 2 s."""
-        return costs.render_stack(scene, spp, seed, **options), spp * (3.0 if options["sampler"] == "toy" else 2.0)
-
-    monkeypatch.setattr(costs, "timed", timed)
-    rows = {cell["method"]: cell for cell in evaluate(config, tmp_path, Console(quiet=True), "", service)["cells"]}
-    assert rows.keys() == {"wcv (auto)", "wcv (toy)"} and not any(row["absent"] for row in rows.values())
-    # The toy, whose samples cost more, gets fewer in the time, by whole batches.
-    assert rows["wcv (auto)"]["spp used"] == 64
-    assert abs(rows["wcv (toy)"]["spp used"] - 64 * 2 / 3) <= TOY.batch / 2
-
-
-def find_reason(name, facts):
-    return SAMPLERS[name].refuses(facts)

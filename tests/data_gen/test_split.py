@@ -3,6 +3,7 @@
 The budget of z-tests is fixed: 16 stacks against 16 references, a level of 1 % for a scene as a whole.
 """
 
+import drjit as dr
 import numpy as np
 import pytest
 from references import references
@@ -10,8 +11,11 @@ from split_scenes import coats, everything, principled, shelf, without_gloss
 from unbiased import assert_unbiased, load, render_ours
 
 import ngpt
+from data_gen.paths.lobes import Lobes
+from data_gen.render import render_stack
 from ngpt.cli import main
 from ngpt.layers import LAYERS
+from ngpt.merging import merge
 from ngpt.testing import z_test
 
 PARTS = ("diffuse", "specular")
@@ -39,12 +43,9 @@ def test_what_is_not_has_no_diffuse_light(renderer):
         "frosted": {"type": "roughdielectric", "alpha": 0.2},
         "gold": principled(metallic=1.0),
     }
-
-    def without_floor():
-        scene = shelf(bare)()
-        return scene | {"floor": scene["floor"] | {"bsdf": {"type": "roughconductor", "alpha": 0.3}}}
-
-    (stack,) = render_ours(load(renderer, without_floor, (24, 24)), "split", batches=1, spp=16)
+    scene = shelf(bare)()
+    scene["floor"]["bsdf"] = {"type": "roughconductor", "alpha": 0.3}
+    (stack,) = render_ours(load(renderer, scene, (24, 24)), "split", batches=1, spp=16)
     assert stack["specular"].any() and not stack["diffuse"].any() and not stack["diffuse_var"].any()
 
 
@@ -59,47 +60,8 @@ def test_diffuse_light_is_that_of_the_same_materials_without_gloss(renderer):
     assert not z_test(np.stack([stack["diffuse"] + stack["specular"] for stack in stacks]), expected).passed
 
 
-def by_lobe(mi, scene, seed, spp):
-    """Diffuse light by sampling that lobe alone at the first vertex, and Mitsuba's ``path`` from there on."""
-    import drjit as dr
-
-    from data_gen.paths.camera import CameraSamples
-
-    camera = CameraSamples(scene.sensors()[0], seed, spp)
-    ray, _, _ = camera.rays()
-    si = scene.ray_intersect(mi.Ray3f(ray))
-    only = mi.BSDFContext()
-    only.type_mask = int(mi.BSDFFlags.Diffuse)
-    diffuse = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Diffuse)
-    u = camera.random.next_1d(), camera.random.next_2d()
-    sample, weight = si.bsdf().sample(only, si, *u, diffuse)
-    found = diffuse & (sample.pdf > 0)
-    path = mi.load_dict({"type": "path", "max_depth": 4, "rr_depth": 3})
-    L = weight * path.sample(scene, camera.random, si.spawn_ray(si.to_world(sample.wo)), None, found)[0]
-    light = np.array(dr.select(found, mi.Color3f(L), 0)).T.reshape(-1, spp, 3).mean(axis=1)
-    width, height = (int(n) for n in camera.size)
-    return light.reshape(height, width, 3)
-
-
-@pytest.mark.slow
-def test_diffuse_light_is_that_of_diffuse_lobes(renderer):
-    """Light that comes over further surfaces too."""
-    coated = {name: bsdf for name, bsdf in coats().items() if name != "hole"}
-    scene = load(renderer, shelf(coated), (24, 24))
-    stacks = render_ours(scene, "split", spp=64)
-    lobes = np.stack([by_lobe(renderer, scene, 500 + i, 256) for i in range(16)])
-    result = z_test(np.stack([stack["diffuse"] for stack in stacks]), lobes)
-    assert result.passed, result
-    # All light is another image by far.
-    assert not z_test(np.stack([stack["primal"] - stack["direct"] for stack in stacks]), lobes).passed
-
-
 def shares(mi, description, n=2000):
     """The share of diffuse lobes at random pairs of directions, f of them alone, of the others alone, of all."""
-    import drjit as dr
-
-    from data_gen.paths.lobes import Lobes
-
     scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle", "bsdf": description}})
     rng = np.random.default_rng(0)
     ray = mi.Ray3f(mi.Point3f(0.1, 0.2, 1), dr.normalize(mi.Vector3f(rng.uniform(-0.1, 0.1, (3, n))) - [0, 0, 1]))
@@ -108,11 +70,10 @@ def shares(mi, description, n=2000):
     si.wi = dr.normalize(mi.Vector3f(wi[0], wi[1], abs(wi[2])))
     wo = dr.normalize(mi.Vector3f(wo))
     masks = int(mi.BSDFFlags.Diffuse), ~int(mi.BSDFFlags.Diffuse) & 0xFFFFFFFF, 0xFFFFFFFF
-    evaluated = []
-    for mask in masks:
-        context = mi.BSDFContext()
+    contexts = [mi.BSDFContext() for _ in masks]
+    for context, mask in zip(contexts, masks, strict=True):
         context.type_mask = mask
-        evaluated.append(np.nan_to_num(np.array(si.bsdf().eval(context, si, wo))))
+    evaluated = [np.nan_to_num(np.array(si.bsdf().eval(context, si, wo))) for context in contexts]
     share = Lobes(scene).diffuse(si, wo, mi.Bool(True))
     cosines = np.array(wo.z), np.array(si.wi.z)
     return np.array(share), *evaluated, cosines
@@ -153,31 +114,20 @@ def test_the_diffuse_part_of_principled_materials_is_lamberts(renderer, metallic
         np.testing.assert_allclose(share * f, expected, rtol=1e-3, atol=1e-6)
 
 
-@pytest.fixture
-def stacks(renderer):
-    from data_gen.render import render_stack
-
-    return [render_stack(load(renderer, "glossy", (12, 8)), 8, seed, "split") for seed in (1, 2)]
-
-
-def test_files_hold_the_parts(stacks, tmp_path, capsys):
+def test_files_and_merged_stacks_hold_the_parts(renderer, tmp_path, capsys):
+    stacks = [render_stack(load(renderer, "glossy", (12, 8)), 8, seed, "split") for seed in (1, 2)]
     path = tmp_path / "stack.exr"
     ngpt.write(path, stacks[0])
-    read = ngpt.read(path)
-    assert read.names == stacks[0].names and set(PARTS) < set(read.names)
-    for name in (*PARTS, *(f"{name}_var" for name in PARTS)):
-        np.testing.assert_allclose(read[name], stacks[0][name], rtol=1e-3, atol=1e-4)
-        assert read[name].dtype == np.float32 and LAYERS[name].float_on_disk == name.endswith("_var")
+    read, merged = ngpt.read(path), merge(stacks)
     assert main(["info", str(path)]) == 0
     told = capsys.readouterr().out
-    assert all(name in told for name in ("diffuse", "specular", "diffuse_var"))
-
-
-def test_merged_stacks_have_merged_parts(stacks):
-    from ngpt.merging import merge
-
-    merged = merge(stacks)
-    for name in PARTS:
-        np.testing.assert_allclose(merged[name], (stacks[0][name] + stacks[1][name]) / 2, rtol=1e-5, atol=1e-6)
-        # About half of that of either
-        assert 0.3 < merged[f"{name}_var"].mean() / np.mean([stack[f"{name}_var"] for stack in stacks]) < 0.7
+    assert read.names == stacks[0].names
+    for name in (*PARTS, *(f"{name}_var" for name in PARTS)):
+        one, other = (stack[name] for stack in stacks)
+        np.testing.assert_allclose(read[name], one, rtol=1e-3, atol=1e-4)
+        assert name in told and read[name].dtype == np.float32
+        assert LAYERS[name].float_on_disk == name.endswith("_var")
+        if name in PARTS:
+            np.testing.assert_allclose(merged[name], (one + other) / 2, rtol=1e-5, atol=1e-6)
+        else:  # about half of that of either
+            assert 0.3 < merged[name].mean() / np.mean([one, other]) < 0.7

@@ -6,13 +6,14 @@ What a sampler leaves to others it refuses by name.
 """
 
 import time
+from collections import Counter
 
 import numpy as np
 import pytest
 from references import references
 from reliability import record
 from stress_scenes import SCENES
-from unbiased import DISTANCES, gradient_tests, light_of_gradients, load, render_ours
+from unbiased import DISTANCES, failed_shifts, gradient_tests, light_of_gradients, load, render_ours
 
 from data_gen.samplers import SAMPLERS
 from ngpt.errors import NgptError
@@ -29,23 +30,21 @@ FLOOR = 1.2
 FAILURES = 0.4
 
 
-def samples(name):
-    """Few where a pass has few: those take long to start."""
-    return 16 if SAMPLERS[name].batch else 128
-
-
 def judged(mi, scene, name):
-    """What is wrong in that scene, "" if nothing; the largest z and where; and the worth of the gradients, or None."""
+    """What is wrong in that scene; the largest z and where; and the worth of the gradients, or None."""
     theirs, failures, largest, worth = references(mi, scene, SIZE), [], (0.0, ""), None
-    for pixels in DISTANCES[: 1 + SAMPLERS[name].gradients]:
-        stacks = render_ours(load(mi, scene, SIZE), name, SEEDS, samples(name), pixels)
+    gradients, loaded = SAMPLERS[name].gradients, load(mi, scene, SIZE)
+    # Few samples where a pass has few: those take long to start.
+    spp = 16 if SAMPLERS[name].batch else 128
+    for pixels in DISTANCES[: 1 + gradients]:
+        stacks = render_ours(loaded, name, SEEDS, spp, pixels)
         for layer, result in gradient_tests(stacks, theirs, level=LEVEL, pixels=pixels):
             if pixels == 1 or layer != "primal":
                 where = layer if layer == "primal" else f"{layer} over {pixels}"
                 largest = max(largest, (float(np.abs(result.z).max()), where))
                 failures += [] if result.passed else [f"{where}: {result}"]
-        if pixels == 1 and SAMPLERS[name].gradients:
-            worth, failed = gain(stacks), failed_shifts(mi, scene, name)
+        if pixels == 1 and gradients:
+            worth, failed = gain(stacks), failed_shifts(loaded, name)
             failures += [f"gradients gain {worth:.2f}"] if worth < FLOOR else []
             failures += [f"{failed:.0%} of the shifts fail"] if failed > FAILURES else []
     return "; ".join(failures), largest, worth
@@ -58,32 +57,21 @@ def gain(stacks):
     return pixels / sum(np.var([stack[layer] for stack in stacks], axis=0, ddof=1).sum() for layer in ("dx", "dy"))
 
 
-def failed_shifts(mi, scene, name):
-    """Their share, 0 if the sampler does not count them."""
-    if not SAMPLERS[name].diagnoses:
-        return 0.0
-    from data_gen.render import render_stack
-    from ngpt.io.exr import pass_through
-
-    stack = render_stack(load(mi, scene, SIZE), 16, 0, name, diagnostics=True)
-    return float(pass_through(stack)["diagnostics.shiftFailures"].mean())
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("name", NAMES)
 def test_ten_stress_scenes(renderer, name):
-    clock, found, wrong, outcomes = time.monotonic(), {}, [], {}
+    clock, found, wrong, outcomes = time.monotonic(), {}, [], Counter()
     for scene in SCENES:
         try:
             failure, (z, where), worth = judged(renderer, scene, name)
         except NgptError as refusal:
             assert name in str(refusal), refusal
-            outcomes["refused by name"] = outcomes.get("refused by name", 0) + 1
+            outcomes["refused by name"] += 1
             continue
         if failure:
             wrong.append(f"{scene.__name__}: {failure}")
-        outcomes["the means of Mitsuba"] = outcomes.get("the means of Mitsuba", 0) + 1
+        outcomes["the means of Mitsuba"] += 1
         found[scene.__name__] = f"{z:.1f} {where}" + ("" if worth is None else f", gain {worth:.2g}")
         print(name, scene.__name__, found[scene.__name__], failure, flush=True)
     assert not wrong, "\n".join(wrong)

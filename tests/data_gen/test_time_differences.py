@@ -1,8 +1,11 @@
 """Differences in time from paired samples: their mean, how little they vary, and where they are not known."""
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
+from data_gen.frames.motion import motion_vectors
+from data_gen.render import render_stack
 from ngpt.testing import z_test
 
 SIZE = (24, 16)
@@ -10,8 +13,6 @@ SIZE = (24, 16)
 
 def moving(scene, camera=0.0, **moved):
     """A shot of a built-in scene whose camera goes to the right, and whose shapes go somewhere, by so much a frame."""
-    import mitsuba as mi
-
     from data_gen.frames.shot import Shot
 
     start = {}
@@ -26,24 +27,24 @@ def moving(scene, camera=0.0, **moved):
     return Shot(lambda frame: (scene, {}), SIZE, update=update)
 
 
-def estimates(shot, count, pairs):
-    """dt of frame 1 with ``count`` seeds, the same of samples that are no pairs, its variances, the frame's light."""
-    from data_gen.frames.motion import motion_vectors
-    from data_gen.frames.time_differences import difference, light
+class Estimates:
+    """dt of frame 1 with ``count`` seeds, its variances, the frame's light, and the same dt of samples in no pairs."""
 
-    seeds = range(count)
-    before = shot.snapshot(0)
-    now = shot.snapshot(1)
-    motion = motion_vectors(shot.at(1), now, before)
-    here = [light(shot.at(1), seed, pairs) for seed in seeds]
-    shot.at(0)
-    there = [light(shot.at(0), seed, pairs, motion) for seed in seeds]
-    other = [light(shot.at(0), 1000 + seed, pairs, motion) for seed in seeds]
-    alone = [light(shot.at(1), 2000 + seed, pairs) for seed in seeds]
-    paired = [difference(a, b) for a, b in zip(here, there, strict=True)]
-    apart = [difference(a, b)[0] for a, b in zip(alone, other, strict=True)]
-    values = [np.average([m for _, m in one], axis=0, weights=[n for n, _ in one]) for one in here]
-    return np.stack([mean for mean, _ in paired]), np.stack(apart), np.stack([v for _, v in paired]), np.stack(values)
+    def __init__(self, shot, count, pairs, unpaired=False):
+        from data_gen.frames.time_differences import difference, light
+
+        before, now = shot.snapshot(0), shot.snapshot(1)
+        motion = motion_vectors(shot.at(1), now, before)
+        here = [light(shot.at(1), seed, pairs) for seed in range(count)]
+        alone = [light(shot.at(1), 2000 + seed, pairs) for seed in range(count * unpaired)]
+        shot.at(0)
+        there = [light(shot.at(0), seed, pairs, motion) for seed in range(count)]
+        other = [light(shot.at(0), 1000 + seed, pairs, motion) for seed in range(count * unpaired)]
+        paired = [difference(a, b) for a, b in zip(here, there, strict=True)]
+        self.dt, self.variances = (np.stack(each) for each in zip(*paired, strict=True))
+        self.apart = np.array([difference(a, b)[0] for a, b in zip(alone, other, strict=True)])
+        values = [np.average([m for _, m in one], axis=0, weights=[n for n, _ in one]) for one in here]
+        self.light = np.stack(values)
 
 
 @pytest.mark.parametrize(
@@ -56,10 +57,10 @@ def estimates(shot, count, pairs):
 )
 def test_the_mean_is_the_difference_of_the_frames(renderer, monkeypatch, scene, camera, moved):
     monkeypatch.setattr("data_gen.frames.time_differences.BATCHES", 2)
-    paired, apart, _, _ = estimates(moving(scene, camera, **moved), 16, 16)
-    known = np.isfinite(paired[0]).all(axis=-1)
+    found = Estimates(moving(scene, camera, **moved), 16, 16, unpaired=True)
+    known = np.isfinite(found.dt[0]).all(axis=-1)
     assert known.mean() > 0.85
-    paired, apart = (np.where(known[..., None], each, 0) for each in (paired, apart))
+    paired, apart = (np.where(known[..., None], each, 0) for each in (found.dt, found.apart))
     result = z_test(paired, apart, block=4)
     assert result.passed, str(result)
     if "lamp" in moved:  # It could have failed: the difference is large, and the other sign of it is found out.
@@ -68,19 +69,15 @@ def test_the_mean_is_the_difference_of_the_frames(renderer, monkeypatch, scene, 
 
 def test_of_a_camera_at_rest_it_is_that_of_the_pixels(renderer, monkeypatch):
     monkeypatch.setattr("data_gen.frames.time_differences.BATCHES", 2)
-    from data_gen.render import render_stack
-
     shot = moving("diffuse", lamp=(0.3, 0, 0))
-    paired, _, _, _ = estimates(shot, 16, 16)
+    paired = Estimates(shot, 16, 16).dt
 
     def frames(frame, seed):
         layers = render_stack(shot.at(frame), 64, seed, "gpt-basic", points="independent").layers
         return layers["primal"] - layers["direct"]
 
-    later = [frames(1, seed) for seed in range(8)]
-    earlier = [frames(0, 100 + seed) for seed in range(8)]
-    truth = np.stack([a - b for a, b in zip(later, earlier, strict=True)])
-    assert z_test(paired, truth, block=4).passed
+    later, earlier = (np.stack([frames(i, seed) for seed in range(8 * i, 8 * i + 8)]) for i in (1, 0))
+    assert z_test(paired, later - earlier, block=4).passed
 
 
 @pytest.mark.parametrize(
@@ -92,18 +89,19 @@ def test_of_a_camera_at_rest_it_is_that_of_the_pixels(renderer, monkeypatch):
         ("glossy", 0.0, {"gold": (0.03, 0, 0)}, 0.5),
     ],
 )
-def test_slow_changes_have_little_noise(renderer, scene, camera, moved, most):
-    paired, _, variances, values = estimates(moving(scene, camera, **moved), 12, 8)
-    noise, of_light = np.nanvar(paired, axis=0), np.nanvar(values, axis=0)
+def test_slow_changes_have_little_noise(renderer, monkeypatch, scene, camera, moved, most):
+    monkeypatch.setattr("data_gen.frames.time_differences.BATCHES", 4)
+    found = Estimates(moving(scene, camera, **moved), 12, 8)
+    noise, of_light = np.nanvar(found.dt, axis=0), np.nanvar(found.light, axis=0)
     # Of typical pixels: the mean is that of a few.
     ratio = np.nanmean(np.sqrt(noise)) ** 2 / np.nanmean(np.sqrt(of_light)) ** 2
     assert ratio < most
-    assert np.nanmean(variances) == pytest.approx(np.nanmean(noise), rel=0.5)
+    assert np.nanmean(found.variances) == pytest.approx(np.nanmean(noise), rel=0.5)
 
 
 def test_where_nothing_changes_it_is_zero(renderer):
-    paired, _, variances, _ = estimates(moving("diffuse"), 1, 5)
-    assert not paired.any() and not variances.any()
+    found = Estimates(moving("diffuse"), 1, 5)
+    assert not found.dt.any() and not found.variances.any()
 
 
 def test_it_is_not_known_where_motion_is_not_or_leads_off_the_film(renderer):

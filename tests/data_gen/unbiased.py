@@ -123,6 +123,17 @@ def light_of_gradients(stack):
     return stack["primal"] - light_apart(stack)
 
 
+def failed_shifts(scene, name, spp=16):
+    """The share of shifts that fail, 0 if the sampler does not count them."""
+    from data_gen.render import render_stack
+    from data_gen.samplers import SAMPLERS
+    from ngpt.io.exr import pass_through
+
+    if not SAMPLERS[name].diagnoses:
+        return 0.0
+    return float(pass_through(render_stack(scene, spp, 0, name, diagnostics=True))["diagnostics.shiftFailures"].mean())
+
+
 def assert_unbiased(stacks, references, level=0.01, pixels=1, about=""):
     """By ``gradient_tests``; black images agree all too well."""
     assert references.mean() > 0.01

@@ -5,6 +5,7 @@ from data_gen_scenes import fog
 from unbiased import load
 
 from data_gen.samplers import SAMPLERS
+from data_gen.scenes.facts import scene_facts
 
 QUICK = ("diffuse", "glossy", fog)
 
@@ -27,8 +28,6 @@ def cases(dear=lambda entry: entry.batch, of=lambda entry: True):
 
 def quick(mi, name):
     """The first quick scene that the sampler can render."""
-    from data_gen.scenes.facts import scene_facts
-
     for description in QUICK:
         if not SAMPLERS[name].refuses(scene_facts(load(mi, description, (4, 4)))):
             return description

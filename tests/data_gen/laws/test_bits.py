@@ -1,5 +1,6 @@
 """The same seed gives the same bits, whatever the passes and the memory; and a render stays within its memory."""
 
+import drjit as dr
 import numpy as np
 import pytest
 from data_gen_scenes import caustics
@@ -7,6 +8,8 @@ from media_scenes import wisps
 from registered import cases, quick, scene_for, slow
 from unbiased import load, same
 
+from data_gen import passes
+from data_gen.render import render_stack
 from data_gen.samplers import SAMPLERS
 
 PHOTONS_IN_GRIDS = ("vpm", "gvpm", "bre", "beams")
@@ -23,16 +26,12 @@ MORE = [
 
 def split_passes(monkeypatch, lanes=1):
     """Passes are as short as they can be."""
-    from data_gen import passes
-
     monkeypatch.setattr(passes, "FIRST_LANES", lanes)
     monkeypatch.setattr(passes, "PASS_SECONDS", 1e-9)
 
 
 @pytest.mark.parametrize(("name", "full"), cases())
 def test_the_same_seed_gives_the_same_bits_whatever_the_passes(renderer, monkeypatch, name, full):
-    from data_gen.render import render_stack
-
     batch, size = SAMPLERS[name].batch, (7, 5)
     scene = scene_for(renderer, name, size)
     spp = 3 * batch + 1 if not full else 20 if batch == 1 else 150
@@ -50,8 +49,6 @@ def test_the_same_seed_gives_the_same_bits_whatever_the_passes(renderer, monkeyp
 
 @pytest.mark.parametrize(("name", "scene", "spp", "options"), MORE)
 def test_options_give_the_same_bits_whatever_the_passes(renderer, monkeypatch, name, scene, spp, options):
-    from data_gen.render import render_stack
-
     scene, calls = load(renderer, scene, (16, 12)), []
     whole = render_stack(scene, spp, 5, name, **options)
     split_passes(monkeypatch)
@@ -62,10 +59,6 @@ def test_options_give_the_same_bits_whatever_the_passes(renderer, monkeypatch, n
 
 @pytest.mark.parametrize(("name", "full"), cases())
 def test_memory_stays_within_its_budget(renderer, name, full):
-    import drjit as dr
-
-    from data_gen.render import render_stack
-
     batch, scene, calls = SAMPLERS[name].batch, load(renderer, quick(renderer, name), (64, 48)), []
     spp = 5 * batch if not full else 8 if batch == 1 else 100
     # Photons with copies along rays, and whole paths that are recorded as one function, need more for any pass at all.

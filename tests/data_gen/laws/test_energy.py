@@ -7,8 +7,10 @@ from media_scenes import haze
 from registered import slow
 from unbiased import load, render_ours
 
+from data_gen.render import render_stack
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.builtin import diffuse
+from data_gen.scenes.facts import Facts
 from ngpt.testing import z_test
 
 
@@ -29,14 +31,10 @@ NAMES = [name for name, entry in SAMPLERS.items() if entry.standing != "study"]
 
 def in_media(name):
     """Whether the sampler renders scenes with media alone."""
-    from data_gen.scenes.facts import Facts
-
     return bool(SAMPLERS[name].refuses(Facts("path", ())))
 
 
 def render(mi, name, scene, batches=1):
-    from data_gen.render import render_stack
-
     return render_stack(load(mi, scene, (8, 8)), batches * (SAMPLERS[name].batch or 4), 0, name)
 
 

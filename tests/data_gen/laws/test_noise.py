@@ -8,10 +8,13 @@ import pytest
 from data_gen_scenes import glass
 from media_scenes import haze
 from registered import cases, quick, scene_for
-from unbiased import load, render_ours
+from unbiased import failed_shifts, load, render_ours
 
 from data_gen.budget import Budget
+from data_gen.passes import render_passes
 from data_gen.samplers import SAMPLERS
+from ngpt.evaluation.gradientmap import variances_of_differences
+from ngpt.stack import GradientStack
 from ngpt.testing import z_test
 
 # What gradients must gain on a quick scene, in the mean and in the median pixel. Those of gpt-basic are 5.0 and 6.8.
@@ -23,8 +26,6 @@ FAILURES = 0.25
 @pytest.mark.parametrize(("name", "full"), cases(dear=lambda entry: True))
 def test_variances_are_those_over_seeds(renderer, name, full):
     """The law that every weight of a reconstruction rests on; of nets of points, see ``test_points``."""
-    from data_gen.passes import render_passes
-
     scene, entry = scene_for(renderer, name, (24, 16)), SAMPLERS[name]
     # Where a sample is a pass, few of them: passes of one sample take long to start.
     spp = (6 if entry.batch == 1 else 16) if full else 3 * entry.batch or 16
@@ -55,19 +56,11 @@ def test_variances_without_and_of_the_layer_caustic_are_those_over_seeds(rendere
         assert np.mean([stack[name] for stack in stacks]) == pytest.approx(found, rel=0.15), name
 
 
-def failed_shifts(scene, name, spp):
-    from data_gen.render import render_stack
-    from ngpt.io.exr import pass_through
-
-    return pass_through(render_stack(scene, spp, 0, name, diagnostics=True))["diagnostics.shiftFailures"].mean()
-
-
 @pytest.mark.parametrize(("name", "full"), cases(of=lambda entry: entry.gradients))
 def test_gradients_have_less_noise_than_pixels(renderer, name, full):
     for layer, found in zip(("dx", "dy"), gains(renderer, name, full), strict=True):
         assert all(np.greater(found, FLOORS)), f"{layer}: {found}"
-    if SAMPLERS[name].diagnoses:
-        assert failed_shifts(scene_for(renderer, name, (32, 24)), name, 16 if full else 4) < FAILURES
+    assert failed_shifts(scene_for(renderer, name, (32, 24)), name, 16 if full else 4) < FAILURES
 
 
 def test_gradients_have_less_noise_than_pixels_in_media(renderer):
@@ -76,14 +69,11 @@ def test_gradients_have_less_noise_than_pixels_in_media(renderer):
     layers = render_ours(scene, "gpt", 1, 48)[0]
     noise = layers["primal_var"][:, 1:] + layers["primal_var"][:, :-1]
     assert noise.sum() / layers["dx_var"][:, :-1].sum() > 8
-    assert failed_shifts(scene, "gpt", 16) < 0.1
+    assert failed_shifts(scene, "gpt") < 0.1
 
 
 def gains(renderer, name, full):
     """Variance of differences of independent pixels over that of dx and dy: in the mean, and in the median pixel."""
-    from ngpt.evaluation.gradientmap import variances_of_differences
-    from ngpt.stack import GradientStack
-
     spp = (16 if SAMPLERS[name].batch == 1 else 256) if full else 8 * SAMPLERS[name].batch or 64
     # In a ball there are few photons, and often none.
     options = {"points": "independent"} | ({"photons": 8} if name == "gvpm" else {})

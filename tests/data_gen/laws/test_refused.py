@@ -7,6 +7,9 @@ from data_gen_scenes import fog, hidden_lamp, polished
 from unbiased import load
 
 from data_gen.adaptive import Adaptive
+from data_gen.render import render_stack
+from data_gen.samplers import find
+from data_gen.scenes.facts import Facts
 from ngpt.errors import NgptError
 
 FLAT = {"sensor": {"type": "orthographic"}}
@@ -60,8 +63,6 @@ TABLE = [
 
 @pytest.mark.parametrize(("sampler", "scene", "options", "message"), TABLE)
 def test_refused(renderer, sampler, scene, options, message):
-    from data_gen.render import render_stack
-
     with pytest.raises(NgptError, match=message) as refusal:
         render_stack(load(renderer, scene, (8, 8)), 64 if options else 1, sampler=sampler, **options)
     assert sampler in str(refusal.value)
@@ -73,17 +74,12 @@ def test_plugins_refuse_too(renderer):
 
 
 def test_where_there_are_no_media_points_on_surfaces_do():
-    from data_gen.samplers import find
-    from data_gen.scenes.facts import Facts
-
     with pytest.raises(NgptError, match="there are no media, and 'ppm' has the same image"):
         find("vpm", Facts("volpath", ()))
 
 
 @pytest.mark.parametrize(("sampler", "option", "memory"), [("ppm", "photons", 400), ("vcm", "joined_depth", 50)])
 def test_maps_larger_than_memory_are_refused_with_what_fits(renderer, sampler, option, memory):
-    from data_gen.render import render_stack
-
     scene = load(renderer, "diffuse", (128, 128))
     with pytest.raises(NgptError, match=rf"pass --memory \d+, or .* or no more than -O {option}=\d+") as caught:
         render_stack(scene, 1, 0, sampler, memory=memory, **{option: 64})

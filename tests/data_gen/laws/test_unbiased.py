@@ -18,6 +18,8 @@ from registered import quick, slow
 from unbiased import DISTANCES, FAR, assert_unbiased, load, render_ours, render_references, sum_of_squares
 
 from data_gen.samplers import SAMPLERS
+from data_gen.scenes.facts import scene_facts
+from data_gen.scenes.load import load_scene
 from ngpt.errors import NgptError
 
 # In media images are of 16 x 16 pixels, and differences go over four.
@@ -57,26 +59,35 @@ class Case:
         return of("limited")(int(depth)) if depth else of(name)
 
 
-def registered(study):
+def registered(study, pixels=DISTANCES):
     """Every sampler but those that say they are biased, which are held to what they converge to: alike everywhere, and
     where there are holes and no environment, where Mitsuba's ``path`` loses light (docs/use/rendering.md)."""
     names = [name for name, entry in SAMPLERS.items() if not entry.biased and (entry.standing == "study") == study]
-    return [*(Case(name, "quick") for name in names), *(Case(name, "leaf", (FAR,)) for name in names)]
+    return [*(Case(name, "quick", pixels) for name in names), *(Case(name, "leaf", (FAR,)) for name in names)]
 
 
+def moved(place, options=None, spp=32):
+    return Case("gpt", f"moved {place}", (1,), options or {}, (24, 24), spp, place=place)
+
+
+UNCONNECTABLE = {"roughness_threshold": 10.0}
 QUICK = [
-    *registered(study=False),
-    Case("gpt", "glass"),
+    # Over eight pixels, which see all that one does and more; that users have differences over one, ``gpt`` shows.
+    Case("gpt", "quick", (1,)),
+    *registered(False, (FAR,)),
+    Case("gpt", "glass", (FAR,)),
     Case("gpt", "lens", (FAR,)),
     Case("gpt", "hidden_lamp", (FAR,)),
     # All that is not a mirror is connectable: paths reconnect where they hardly can.
     Case("gpt", "plenty", (1,), {"roughness_threshold": 0.0}),
-    Case("gpt", "caustics", options={"shift": "manifold"}),
-    *(Case("gpt", f"moved {place}", (1,), size=(24, 24), place=place) for place in PLACES),
+    Case("gpt", "caustics", (FAR,), {"shift": "manifold"}),
+    # And either shift where nothing is.
+    moved(PLACES[0], {"shift": "half-vector"} | UNCONNECTABLE, spp=64),
+    *(moved(place) for place in (PLACES[0], PLACES[-1])),
     Case("gpt", "panels", (FAR,), size=(24, 24)),
     *(Case("gpt", scene, (WIDE,), size=SMALL, spp=48) for scene in ("haze", "colours by mis", "before_the_sky")),
     Case("gpt-basic", "within_fog", (1,), size=SMALL, spp=48),
-    Case("gpt-simple", "courtyard"),
+    Case("gpt-simple", "courtyard", (FAR,)),
     # Paths end at a step that is written out.
     Case("gpt-simple", "courtyard to 2", (1,), size=SMALL, spp=64),
     Case("gpt-simple", "courtyard to 3", (1,), size=SMALL, spp=64),
@@ -86,9 +97,11 @@ QUICK = [
 ]
 LONG = {"spp": 256}
 SLOW = [
-    *registered(study=True),
+    *registered(True),
+    *registered(False),
     *(Case("gpt", scene, **LONG) for scene in (*BUILTIN, "glass", "hidden_lamp", "plenty")),
-    Case("gpt", "plenty", options={"roughness_threshold": 10.0}),
+    Case("gpt", "plenty", options=UNCONNECTABLE),
+    *(moved(place) for place in PLACES),
     *(Case("gpt", scene, options={"shift": "manifold"}) for scene in ("under_the_sky", "glass")),
     *(
         Case("gpt", scene, options={"shift": "half-vector", "roughness_threshold": 0.35})
@@ -142,9 +155,6 @@ LEVEL = 1 - 0.99 ** (1 / (9 * max(1, len(FILES))))
 @pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}-{path.stem}")
 def test_unbiased_in_files(renderer, path, sampler):
     """NGPT_SCENES=folder with */*.xml in it. Gradients of ``gbdpt`` against ``bdpt``, which finds the same light."""
-    from data_gen.scenes.facts import scene_facts
-    from data_gen.scenes.load import load_scene
-
     scene = load_scene(str(path), (32, 24))
     if sampler != "auto" and (reason := SAMPLERS[sampler].refuses(scene_facts(scene))):
         pytest.skip(reason)

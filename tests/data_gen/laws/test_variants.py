@@ -7,6 +7,8 @@ from references import references
 from registered import slow
 from unbiased import assert_unbiased, load, render_ours
 
+from data_gen.backend import use_variant
+from data_gen.render import render_stack
 from ngpt.errors import NgptError
 
 SPECTRAL, MONO = "llvm_ad_spectral", "llvm_ad_mono"
@@ -23,8 +25,6 @@ CASES = [
 @pytest.fixture
 def variant():
     """What changes to a variant; the usual one afterwards."""
-    from data_gen.backend import use_variant
-
     yield use_variant
     use_variant()
 
@@ -39,8 +39,6 @@ def test_unbiased(renderer, variant, name, sampler, scene, size, pixels):
 
 
 def test_photons_follow_no_spectra(renderer, variant):
-    from data_gen.render import render_stack
-
     variant(SPECTRAL)
     for sampler in ("ppm", "vcm"):
         with pytest.raises(NgptError, match=f"'{sampler}'.*as variant 'llvm_ad_rgb' allows; use --sampler gpt"):
@@ -50,8 +48,6 @@ def test_photons_follow_no_spectra(renderer, variant):
 
 
 def test_polarised_light_is_declined(renderer, variant):
-    from data_gen.render import render_stack
-
     variant("llvm_ad_spectral_polarized")
     scene = load(renderer, "diffuse", (4, 4))
     with pytest.raises(NgptError, match="polarised"):
