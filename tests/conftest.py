@@ -6,7 +6,7 @@ import signal
 
 import numpy as np
 import pytest
-from browser import Session, browser_command
+from browser import Browser, Session
 from skips import allowed
 
 from ngpt.classical.gradients import forward_differences
@@ -110,17 +110,19 @@ def handlers_of_signals_stay():
 
 @pytest.fixture(scope="session")
 def chromium(tmp_path_factory):
-    """The command of a headless browser; tests of pages skip where there is none."""
-    return browser_command(tmp_path_factory.mktemp("profile"))
+    """A headless browser; tests of pages skip where there is none."""
+    started = Browser(tmp_path_factory.mktemp("chromium"))
+    yield started
+    started.close()
 
 
 @pytest.fixture
-def browser(chromium, tmp_path):
+def browser(chromium):
     """Opens a page at an address; in the end it is closed, and must have had nothing to complain of."""
     sessions = []
 
     def open_page(url):
-        sessions.append(Session(tmp_path / f"profile{len(sessions)}", url))
+        sessions.append(Session(chromium, url))
         return sessions[-1]
 
     yield open_page

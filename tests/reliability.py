@@ -4,12 +4,17 @@ import json
 import os
 import platform
 import re
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
-_PACKAGES = ("ngpt-recon", "numpy", "OpenEXR", "onnxruntime", "safetensors", "torch", "mitsuba", "hypothesis")
+# Module -> package, of what bad inputs go through.
+_PACKAGES = {
+    name: name for name in ("numpy", "OpenEXR", "onnxruntime", "safetensors", "torch", "mitsuba", "hypothesis")
+}
+_PACKAGES |= {"ngpt": "ngpt-recon"}
 
 
 def at_length(*values):
@@ -17,35 +22,19 @@ def at_length(*values):
     return pytest.param(*values, marks=[pytest.mark.slow, pytest.mark.timeout(7200)])
 
 
-def record(campaign: str, tried: int, outcomes: dict[str, int], **more) -> Path | None:
+def record(campaign: str, tried: int, outcomes: dict[str, int], **more) -> None:
     """Writes one campaign's JSON into the folder that the environment variable NGPT_RELIABILITY names, if it does.
 
     ``campaign``  what was done, as a reader of the page should see it; also the file's name
     ``tried``     how many times
     ``outcomes``  how often each thing came out; they add up to ``tried``
     ``more``      ``worst`` (name -> value), ``seconds``, and whatever else belongs to it
-
-    Returns the file, or None if the variable is not set. A campaign that runs again replaces what it left before.
     """
-    if sum(outcomes.values()) != tried:
-        raise ValueError(f"{campaign}: outcomes {outcomes} do not add up to {tried}")
-    folder = os.environ.get("NGPT_RELIABILITY")
-    if not folder:
-        return None
-    report = {"campaign": campaign, "tried": tried, "outcomes": outcomes, "worst": {}, "seconds": None}
-    report |= more | {"versions": versions()}
-    path = Path(folder) / f"{re.sub('[^a-z0-9]+', '-', campaign.lower()).strip('-')}.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(report, indent=2) + "\n")
-    return path
-
-
-def versions() -> dict[str, str]:
-    """Of Python and of the packages that bad inputs go through, those that are installed."""
-    found = {"python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
+    assert sum(outcomes.values()) == tried, f"{campaign}: outcomes {outcomes} do not add up to {tried}"
+    if folder := os.environ.get("NGPT_RELIABILITY"):
+        versions = {package: version(package) for module, package in _PACKAGES.items() if find_spec(module)}
+        report = {"campaign": campaign, "tried": tried, "outcomes": outcomes, "worst": {}, "seconds": None}
+        report |= more | {"versions": {"python": platform.python_version()} | versions}
+        path = Path(folder) / f"{re.sub('[^a-z0-9]+', '-', campaign.lower()).strip('-')}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(report, indent=2) + "\n")

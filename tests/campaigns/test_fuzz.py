@@ -3,14 +3,13 @@
 A failure names inputs by number: `python tests/campaigns/fuzz/campaign.py TARGET --replay NUMBER` does it again.
 """
 
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from fuzz.campaign import run
+from processes import ENVIRONMENT, ROOT, complete
 from reliability import at_length, record
 
 # Target: what it is to a reader, inputs here, inputs in the slow campaign, what it needs beyond the base.
@@ -44,16 +43,12 @@ def test_broken_inputs_are_refused_or_handled(target, first, count):
     record(text, count, dict(report.outcomes), worst=report.worst, seconds=round(report.seconds, 1))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("target", ["header", "json", "toml"])
+@pytest.mark.parametrize("target", [at_length("header"), at_length("json"), at_length("toml")])
 def test_bytes_that_reach_new_lines(target, tmp_path):
     """A minute of libFuzzer for each of the parsers in Python."""
     pytest.importorskip("atheris")
-    program = Path(__file__).parent / "fuzz" / "coverage_guided.py"
-    path = os.pathsep.join(map(str, [program.parents[3], program.parents[2]]))
-    command = [sys.executable, str(program), target, "-max_total_time=60"]
-    environment = os.environ | {"PYTHONPATH": path}
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    command = [sys.executable, Path(__file__).parent / "fuzz" / "coverage_guided.py", target, "-max_total_time=60"]
+    done = complete(command, cwd=tmp_path, env=ENVIRONMENT | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"})
     assert done.returncode == 0, done.stderr[-2000:]
     runs = int(re.search(r"Done (\d+) runs", done.stderr)[1])
     record(f"Coverage-guided bytes: {target}", runs, {"named error or accepted": runs}, seconds=60)

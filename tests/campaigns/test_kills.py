@@ -6,32 +6,29 @@ import time
 
 import numpy as np
 import pytest
-from processes import (
-    RENDERS,
-    complete,
-    ended,
-    make_render,
-    make_work,
-    start,
-    temporary_files,
-)
+from processes import RENDERS, complete, ended, make_work, start, temporary_files
 from reliability import at_length, record
 
 
-def kill_campaign(job, folder, kills):
-    """Kills runs that continue each other, at moments spread over a whole run and, every other time, while they write.
+@pytest.mark.parametrize(
+    ("kind", "kills"),
+    [
+        ("denoise", 4),
+        *(at_length(kind, 100) for kind in ("denoise", "data_gen", "train")),
+        *(at_length(kind, 6) for kind in RENDERS),
+    ],
+)
+def test_kills(tmp_path, kind, kills):
+    """Runs that continue each other are killed at moments spread over a whole run and, every other time, as they write.
 
     After ten kills, or when one is faster than its killer, what was made is compared, and the next starts from nothing.
     """
-    rng, clock = np.random.default_rng(1), time.monotonic()
-    whole = folder / "whole"
+    job, rng, clock = make_work(kind, tmp_path), np.random.default_rng(1), time.monotonic()
+    whole, out = tmp_path / "whole", tmp_path / "killed"
     undisturbed = complete(job.arguments(whole))
     assert undisturbed.returncode == 0, undisturbed.stderr
     expected, duration = job.results(whole), time.monotonic() - clock
-    outcomes = {"only whole files to be seen": 0}
-    compared = done = most = 0
-    since = 0  # kills since the last run that ended
-    out = folder / "killed"
+    compared = done = most = since = 0  # since: kills after the last run that ended
     while done < kills or since:
         if done < kills and since < 10:
             target = out if done % 2 else None
@@ -49,26 +46,12 @@ def kill_campaign(job, folder, kills):
             shutil.rmtree(out)
         else:
             done, since = done + 1, since + 1
-            outcomes["only whole files to be seen"] += 1
             most = max(most, len(temporary_files(out)))
-    return record(
+    record(
         f"SIGKILL at random moments of {job.name}",
         done,
-        outcomes,
+        {"only whole files to be seen": done},
         worst={"temporary files left by one kill": most, "left after the next whole run": 0},
         compared=f"{compared} runs were continued to their end: bit for bit as one left alone",
         seconds=round(time.monotonic() - clock),
     )
-
-
-@pytest.mark.parametrize(
-    ("kind", "kills"), [("denoise", 4), *(at_length(kind, 100) for kind in ("denoise", "data_gen", "train"))]
-)
-def test_kills(tmp_path, kind, kills):
-    kill_campaign(make_work(kind, tmp_path), tmp_path, kills)
-
-
-@pytest.mark.parametrize("what", map(at_length, RENDERS))
-def test_kills_of_renders_of_several_passes(tmp_path, what):
-    """The same command again leaves the bits of one that was left alone, and nothing else."""
-    kill_campaign(make_render(what, tmp_path), tmp_path, 6)

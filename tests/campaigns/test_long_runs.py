@@ -1,13 +1,12 @@
 """Long runs: as much memory and time for the last file, crop or step as for the first."""
 
 import os
-import subprocess
 import sys
 
 import numpy as np
 import pytest
 from full_stack import full_stack
-from processes import ENVIRONMENT, ROOT, make_work
+from processes import complete, make_work
 from reliability import at_length, record
 
 import ngpt
@@ -24,62 +23,53 @@ def note():
     resident = int(open("/proc/self/statm").read().split()[1]) * 4096 / 2**20
     # Not standard output by its usual name, which is another while a file is read in another thread.
     print("note", time.process_time(), resident, flush=True, file=sys.__stdout__)
+def noted(one):
+    def call(*arguments, **options):
+        try: return one(*arguments, **options)
+        finally: note()
+    return call
 """
-
 DENOISE = """
-import sys, ngpt.cli.denoise as verb
+import ngpt.cli.denoise as verb
 from ngpt.cli import main
-one = verb.write_frame
-def noted(*arguments, **options):
-    try: return one(*arguments, **options)
-    finally: note()
-verb.write_frame = noted
+verb.write_frame = noted(verb.write_frame)
 sys.exit(main(["denoise", sys.argv[1], "-o", sys.argv[2], "-q"]))
 """
-
 GENERATE = """
-import sys
 from dataclasses import replace
 from pathlib import Path
-from data_gen.dataset import jobs
+from data_gen.dataset import crops, jobs
 from data_gen.dataset.config import read_config
 config = replace(
     read_config(Path("configs/data-tiny.toml")), size=16, spp=(2, 2), inputs=1, reference_spp=4, crops_per_shard=8,
     scenes=int(sys.argv[2]), crops=int(sys.argv[3]),
 )
-from data_gen.dataset import crops
-one = crops.make_crop
-def noted(*arguments):
-    try: return one(*arguments)
-    finally: note()
-crops.make_crop = noted
+crops.make_crop = noted(crops.make_crop)
 jobs.generate(config, Path(sys.argv[1]), jobs.Serial())
 """
-
 TRAIN = """
-import runpy, sys
+import runpy
 from ngpt.training.trainer import Trainer
 step, count = Trainer._train, 0
-def noted(self, batch):
+def one_of_ten(self, batch):
     global count
     count += 1
     if count % 10 == 0: note()
     return step(self, batch)
-Trainer._train = noted
+Trainer._train = one_of_ten
 sys.exit(runpy.run_path("train.py")["main"](sys.argv[1:]))
 """
 
 
 def notes_of(code, *arguments):
     """Processor seconds and MiB, after each of what a process does many of."""
-    command = [sys.executable, "-c", NOTE + code, *map(str, arguments)]
-    run = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, cwd=ROOT, check=False)
+    run = complete([sys.executable, "-c", NOTE + code, *arguments], timeout=7000)
     assert run.returncode == 0, run.stderr
     lines = [line.split() for line in run.stdout.splitlines() if line.startswith("note ")]
     return np.array([[float(seconds), float(mebibytes)] for _, seconds, mebibytes in lines])
 
 
-def judge(campaign, notes, each=1, slower=SLOWER):
+def judge(campaign, notes, each=1):
     """Fails if the second half gains memory, or the last quarter is slow."""
     count = len(notes)
     half, quarter = notes[count // 2 :], count // 4
@@ -92,7 +82,7 @@ def judge(campaign, notes, each=1, slower=SLOWER):
         "median time, last quarter by second": round(ratio, 2),
     }
     record(campaign, count * each, {"done": count * each}, worst=worst, seconds=round(float(np.ptp(notes[:, 0]))))
-    assert slope < MIB and ratio < slower, worst
+    assert slope < MIB and ratio < SLOWER, worst
 
 
 @pytest.mark.parametrize("count", [40, at_length(1000)])
@@ -108,20 +98,17 @@ def test_many_stacks_in_one_call(tmp_path, count):
     judge("Stacks in one call of ngpt denoise", notes)
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(7200)
-def test_many_small_crops(tmp_path):
+@pytest.mark.parametrize("scenes", [at_length(10)])
+def test_many_small_crops(tmp_path, scenes):
     """A day's generation in small: what a process hoards, it hoards by scenes and crops, not by pixels."""
     pytest.importorskip("mitsuba")
-    scenes, crops = 10, 40
-    notes = notes_of(GENERATE, tmp_path / "out", scenes, crops)
-    assert len(notes) >= 0.9 * scenes * crops, "views that show nothing may fail"
+    notes = notes_of(GENERATE, tmp_path / "out", scenes, 40)
+    assert len(notes) >= 0.9 * scenes * 40, "views that show nothing may fail"
     judge("Small crops in one process of data_gen", notes)
 
 
 @pytest.mark.parametrize("steps", [150, at_length(5000)])
 def test_many_training_steps(tmp_path, steps):
-    job = make_work("train", tmp_path)
     changes = {"run.steps": steps, "run.save": steps // 4, "run.validate": steps // 4, "run.log": 50}
-    arguments = job.arguments(tmp_path / "out", **changes)[2:]
+    arguments = make_work("train", tmp_path).arguments(tmp_path / "out", **changes)[2:]
     judge("Training steps of a tiny network", notes_of(TRAIN, *arguments), each=10)

@@ -110,18 +110,8 @@ def test_arguments_that_cover_more(toolchain, networks, tmp_path):
         pytest.skip("clang has no libFuzzer")
     made = Sanitized(flags, tmp_path, toolchain, f"-DCMAKE_CXX_COMPILER={tool('clang++')}")
     program, prefix = tmp_path / "fuzzer", made.prefix
-    options = [
-        "-DLIBFUZZER",
-        "-x",
-        "c",
-        HERE / "front.c",
-        "-x",
-        "none",
-        "-o",
-        program,
-        f"-I{prefix}/include",
-        f"-L{prefix}/lib",
-    ]
+    options = ["-DLIBFUZZER", "-x", "c", HERE / "front.c", "-x", "none", "-o", program]
+    options += [f"-I{prefix}/include", f"-L{prefix}/lib"]
     flags = ADDRESS.replace("address", "fuzzer,address").split()
     command(tool("clang++"), *flags, *options, f"-Wl,-rpath,{prefix}/lib", "-lngpt")
     environment = os.environ | {"FRONT_NETWORKS": "\n".join(map(str, networks))}

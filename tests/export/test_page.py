@@ -167,7 +167,7 @@ def page(chromium, tmp_path_factory):
 
     runtime, folder = node_modules("onnxruntime-web", "web"), tmp_path_factory.mktemp("page")
     example = write_stack(folder / "example.exr", read_layers(VECTOR))
-    session = Page(folder / "profile", build(folder / "page.html", runtime, example).as_uri())
+    session = Page(chromium, build(folder / "page.html", runtime, example).as_uri())
     yield session
     session.close()
 

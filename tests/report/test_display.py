@@ -4,7 +4,6 @@ import io
 
 import numpy as np
 import pytest
-from errormap import error_map
 
 from ngpt.report import display
 from ngpt.report.png import encode_png
@@ -50,16 +49,6 @@ def test_auto_exposure_brings_the_average_to_middle_grey():
     stops = display.auto_exposure(image)
     for gain in (2.0**-10, 2.0**10):
         assert display.auto_exposure(gain * image) == pytest.approx(stops - np.log2(gain))
-
-
-def test_error_map_runs_from_one_percent_to_all():
-    reference = constant(0.18, 0.18, 0.18).astype(np.float64)  # whose automatic exposure is 0
-    root = np.sqrt(0.18**2 + display.ERROR_EPSILON)
-    table = display.heat_table()
-    for error, index in ((0.0, 0), (0.01, 0), (0.1, 128), (1.0, 255), (50.0, 255), (np.inf, 255)):
-        colour = error_map(reference + error * root, reference)[0, 0]
-        assert np.abs(colour.astype(int) - table[index]).max() <= 3, error
-    assert tuple(error_map(reference * np.nan, reference)[0, 0]) == display.MAGENTA
 
 
 def test_heat_table_grows_lighter_all_the_way():

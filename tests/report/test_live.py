@@ -4,11 +4,11 @@ import http.client
 import json
 import socket
 import threading
-import time
 from contextlib import suppress
 
 import numpy as np
 import pytest
+from processes import wait_for
 
 from ngpt.report import live
 from ngpt.report.live import LivePage
@@ -90,13 +90,14 @@ def test_many_and_slow_connections_take_little_and_keep_nobody_out(page, monkeyp
         assert threading.active_count() <= before + live.MOST and len(page.server._open) <= live.MOST
         # Nor does it help to send a little now and then: there is a time for all of a request.
         monkeypatch.setattr(live, "_LONGEST", 0.2)
-        end = time.monotonic() + 20
-        while page.server._open and time.monotonic() < end:
+
+        def all_ended():
             for connection in slow:
                 with suppress(OSError):
                     connection.sendall(b"X-A: b\r\n")
-            time.sleep(0.05)
-        assert not page.server._open
+            return not page.server._open
+
+        assert wait_for(all_ended, 20)
     finally:
         for connection in slow:
             connection.close()
@@ -107,7 +108,7 @@ def test_a_browser_sees_newer_images_and_ends_the_render(page, browser):
     del first.layers["samples"]
     page.show(preview(first), "the first")
     session = browser(page.url)
-    names = session.ask("page.scenes[0].pictures.join()").split(",")
+    names = session.ask("page.scenes[0].pictures")
     assert names[0] == "noisy" and len(names) == 2
     value = "+document.querySelectorAll('#value-a td')[1].textContent"
     assert session.ask(value) == pytest.approx(0.25, rel=1)
@@ -120,9 +121,7 @@ def test_a_browser_sees_newer_images_and_ends_the_render(page, browser):
     session.settle()
     page.tell("32 of 64")
     page.show(preview(stack(8.0, 1)), "the second")
-    end = time.monotonic() + 20
-    while session.ask("page.live") < 2 and time.monotonic() < end:
-        time.sleep(0.05)
+    assert session.wait_for("page.live === 2")
     session.settle()
     assert session.ask("document.querySelector('.caption').textContent") == "the second"
     assert session.ask(maps) == "stops,std. error,samples"
@@ -132,9 +131,7 @@ def test_a_browser_sees_newer_images_and_ends_the_render(page, browser):
     session.resize(420, 860)
     assert session.ask("document.documentElement.scrollWidth") == 420
     session.ask("enough.click()")
-    while not page.enough and time.monotonic() < end:
-        time.sleep(0.05)
-    assert page.enough
+    assert wait_for(lambda: page.enough, 20)
     page.close("ended: it is written")
     assert session.ask("told.textContent") == "ended: it is written" and session.ask("enough.hidden") is True
 
@@ -144,10 +141,7 @@ def test_a_browser_says_when_the_render_was_killed(page, browser):
     session = browser(page.url)
     page.server.shutdown()
     page.server.server_close()
-    end = time.monotonic() + 20
-    while session.ask("told.textContent") != "the render is gone" and time.monotonic() < end:
-        time.sleep(0.05)
-    assert session.ask("told.textContent") == "the render is gone"
+    assert session.wait_for("told.textContent === 'the render is gone'")
     assert session.ask("document.documentElement.dataset.error ?? null") is None
     session.complaints.clear()  # of addresses that do not answer
 

@@ -105,10 +105,3 @@ def test_training_on_ones_own_scenes(renderer, tmp_path, monkeypatch):
     made, shown = run(DOCS / "train" / "own-scenes.ipynb", tmp_path, monkeypatch)
     assert [value for value in shown if isinstance(value, int)] == [0, 0, 0, 0]
     assert made["image"].shape == (64, 96, 3) and np.isfinite(made["image"]).all()
-
-
-@pytest.mark.parametrize("notebook", sorted(DOCS.rglob("*.ipynb")), ids=lambda path: path.stem)
-def test_links_of_notebooks_lead_somewhere(notebook):
-    text = "".join(line for cell in json.loads(notebook.read_text())["cells"] for line in cell["source"])
-    links = re.findall(r"\]\(([^)]+)\)", text)
-    assert links and [link for link in links if not (notebook.parent / link).exists()] == []

@@ -1,8 +1,9 @@
 """The report page: its text, and what a real browser makes of it."""
 
+import base64
+import io
 import json
 import re
-import subprocess
 import time
 from html.parser import HTMLParser
 from urllib.parse import quote, urlencode
@@ -28,6 +29,13 @@ def constant(colour) -> np.ndarray:
     return np.full((HEIGHT, WIDTH, 3), colour, dtype=np.float32)
 
 
+def shown(name, stops=0.0) -> np.ndarray:
+    """How a colour looks at the exposure of the flat scene, and so many stops more."""
+    return display.to_srgb8(constant(COLOURS[name]), display.auto_exposure(constant(COLOURS["reference"])) + stops)[
+        0, 0
+    ]
+
+
 def flat_scene(name="flat") -> Scene:
     entries = [
         Entry("primal", constant(COLOURS["primal"]), None, {"relMSE": 0.5, "PSNR": 10.0}),
@@ -40,19 +48,22 @@ def noise_scene(name="noise") -> Scene:
     """Every kind of number a renderer has ever made."""
     image = np.random.default_rng(0).gamma(1.0, 1.0, (20, 30, 3)).astype(np.float32)
     image[0, :6] = [[np.nan] * 3, [np.inf] * 3, [-np.inf] * 3, [-2.5] * 3, [1e12] * 3, [1e-30] * 3]
-    layers = {
-        "dx": image,
-        "dy": np.zeros_like(image),
-        "albedo": np.clip(image, 0, 1),
-        "normal": image - 1,
-        "depth": image[:, :, :1],
-        "primal_var": image,
-    }
+    layers = {"dx": image, "dy": np.zeros_like(image), "albedo": np.clip(image, 0, 1), "normal": image - 1}
+    layers |= {"depth": image[:, :, :1], "primal_var": image}
     return Scene(name, "", None, [Entry("primal", image, 0.0, {"relMSE": np.nan, "FLIP": np.inf})], layers)
 
 
-def written(tmp_path, *scenes, title="A report", **facts):
-    return write_report(tmp_path / "report.html", title, list(scenes), **FACTS | facts)
+def plain_scene(height=24, width=36, maps=()) -> Scene:
+    image = np.random.default_rng(0).gamma(1.0, 1.0, (height, width, 3)).astype(np.float32)
+    entries = [
+        Entry(name, image * k, None, {"relMSE": 0.1 * k}, {m: np.full((height, width), 0.5) for m in maps})
+        for k, name in ((1, "a picture with a rather long name"), (2, "other"))
+    ]
+    return Scene(f"{width}x{height}", "a caption", image, entries)
+
+
+def written(folder, *scenes, title="A report", **facts):
+    return write_report(folder / "report.html", title, list(scenes), **FACTS | facts)
 
 
 class Page(HTMLParser):
@@ -62,6 +73,7 @@ class Page(HTMLParser):
         super().__init__()
         self.tags, self.text, self.inside = [], "", ""
         self.feed(text)
+        self.figures = [attrs["data-name"] for tag, attrs in self.tags if tag == "figure"]
 
     def handle_starttag(self, tag, attrs):
         self.tags.append((tag, dict(attrs)))
@@ -78,26 +90,27 @@ class Page(HTMLParser):
 # --- the text --------------------------------------------------------------------------------------------------------
 
 
-def test_the_page_holds_every_scene_method_and_fact(tmp_path):
-    path = written(tmp_path, flat_scene(), noise_scene())
-    text = path.read_text()
+@pytest.fixture(scope="module")
+def both(tmp_path_factory):
+    """A page of both scenes."""
+    return written(tmp_path_factory.mktemp("both"), flat_scene(), noise_scene())
+
+
+def test_the_page_holds_every_scene_method_and_fact(both):
+    text = both.read_text()
     page = Page(text)
-    names = [attrs["data-name"] for tag, attrs in page.tags if tag == "figure"]
     layers = ["dx", "dy", "albedo", "normal", "depth", "primal_var"]
-    assert names == ["primal", "l1", "reference", "dx", "primal", *layers]
+    assert page.figures == ["primal", "l1", "reference", "dx", "primal", *layers]
     for word in ("A report", "two colours", "ngpt demo --spp 16", "CPU", "relMSE 0.05", "0.25 s"):
         assert word in page.text
     assert "nan" not in page.text and "{{" not in text
-
-
-def test_the_table_marks_the_best_and_compares_to_primal(tmp_path):
-    text = written(tmp_path, flat_scene()).read_text()
+    # The table marks the best and compares to primal.
     assert re.findall(r'class="best"><span>([^<]*)', text) == ["0.05", "14"]
     assert "<small>&times;0.1</small>" in text and "<small>+4.00</small>" in text
 
 
-def test_nothing_comes_from_outside(tmp_path):
-    text = written(tmp_path, flat_scene(), noise_scene()).read_text()
+def test_nothing_comes_from_outside(both):
+    text = both.read_text()
     assert not re.search(r"https?:|//[a-z]+\.|@import|url\(|\bfetch\(|XMLHttp|<link|<iframe", text)
     for tag, attrs in Page(text).tags:
         assert not any(key.startswith("on") or key in ("style", "href") for key in attrs), tag
@@ -114,13 +127,11 @@ def test_names_are_only_names(tmp_path):
     page = Page(path.read_text())
     assert page.text.count(HOSTILE) >= 8
     assert all(attrs["src"].startswith("data:") for tag, attrs in page.tags if tag == "img")
-    figures = [attrs["data-name"] for tag, attrs in page.tags if tag == "figure"]
-    assert figures == ["primal", HOSTILE, "reference", "dx"]
+    assert page.figures == ["primal", HOSTILE, "reference", "dx"]
 
 
 def test_a_page_that_would_be_too_big_stores_its_noise_coarser(tmp_path, monkeypatch):
-    rng = np.random.default_rng(0)
-    noise, smooth = rng.gamma(1.0, 1.0, (300, 400, 3)), np.ones((300, 400, 3))
+    noise, smooth = np.random.default_rng(0).gamma(1.0, 1.0, (300, 400, 3)), np.ones((300, 400, 3))
     scene = Scene("s", "", None, [Entry("primal", noise), Entry("l1", smooth)])
     limit = 600_000  # at full precision the page takes over 800 kB
     monkeypatch.setattr("ngpt.report.page.PAGE_LIMIT", limit)
@@ -130,40 +141,40 @@ def test_a_page_that_would_be_too_big_stores_its_noise_coarser(tmp_path, monkeyp
     assert steps[0] < 64 and steps[1] == pixelcodec.LADDER[0]
 
 
-def test_the_same_input_gives_the_same_bytes(tmp_path):
-    first = written(tmp_path, flat_scene(), noise_scene()).read_bytes()
-    again = write_report(tmp_path / "again.html", "A report", [flat_scene(), noise_scene()], **FACTS)
-    assert again.read_bytes() == first
-
-
-def test_no_overwriting_and_no_half_files(tmp_path):
-    path = written(tmp_path, flat_scene())
-    before = path.read_bytes()
+def test_the_same_input_gives_the_same_bytes_and_nothing_is_overwritten(both, tmp_path):
+    path = written(tmp_path, flat_scene(), noise_scene())
+    assert path.read_bytes() == both.read_bytes()
     with pytest.raises(NgptError, match="exists already"):
         written(tmp_path, noise_scene())
-    assert path.read_bytes() == before
+    assert path.read_bytes() == both.read_bytes()
     written(tmp_path, noise_scene(), overwrite=True)
-    assert path.read_bytes() != before
-    assert list(tmp_path.iterdir()) == [path]
+    assert path.read_bytes() != both.read_bytes() and list(tmp_path.iterdir()) == [path]
 
 
-def test_what_cannot_be_shown_is_refused(tmp_path):
-    def refused(scenes, message):
-        with pytest.raises(NgptError, match=message):
-            written(tmp_path, *scenes)
-        assert not list(tmp_path.iterdir())
+def changed(change) -> list[Scene]:
+    scene = flat_scene()
+    change(scene)
+    return [scene]
 
-    refused([], "at least one scene")
-    refused([Scene("s", "", None, [])], "no entry")
-    scene = flat_scene()
-    scene.entries[1].image = scene.entries[1].image[:-1]
-    refused([scene], r"'l1' is \(31, 96, 3\), expected \(32, 96, 3\)")
-    scene = flat_scene()
-    scene.entries[1].name = "reference"
-    refused([scene], "two pictures named 'reference'")
-    scene = flat_scene()
-    scene.layers["depth"] = np.zeros((4, 4))
-    refused([scene], "layer 'depth'")
+
+@pytest.mark.parametrize(
+    ("scenes", "message"),
+    [
+        ([], "at least one scene"),
+        ([Scene("s", "", None, [])], "no entry"),
+        (
+            changed(lambda scene: setattr(scene.entries[1], "image", scene.entries[1].image[:-1])),
+            r"'l1' is \(31, 96, 3\), expected \(32, 96, 3\)",
+        ),
+        (changed(lambda scene: setattr(scene.entries[1], "name", "reference")), "two pictures named 'reference'"),
+        (changed(lambda scene: scene.layers.update(depth=np.zeros((4, 4)))), "layer 'depth'"),
+        (changed(lambda scene: scene.entries[0].maps.update(FLIP=np.zeros((4, 4)))), "map 'FLIP' of 'primal'"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(tmp_path, scenes, message):
+    with pytest.raises(NgptError, match=message):
+        written(tmp_path, *scenes)
+    assert not list(tmp_path.iterdir())
 
 
 # --- the browser -----------------------------------------------------------------------------------------------------
@@ -173,57 +184,56 @@ def address(path, **view) -> str:
     return f"file://{quote(str(path))}#{urlencode(view)}"
 
 
-def browse(chromium, path, *, picture=None, **view) -> str:
-    """Opens the page at a view and returns the DOM; with ``picture``, writes a screenshot there instead."""
-    output = f"--screenshot={picture}" if picture else "--dump-dom"
-    command = [*chromium, "--virtual-time-budget=5000", output, address(path, **view)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert result.returncode == 0, result.stderr
-    return result.stdout
-
-
-def opened(chromium, path, **view) -> str:
-    """The DOM of a page that has shown the view and has met no error."""
-    dom = browse(chromium, path, **view)
-    assert not re.search(r'data-error="([^"]*)', dom), re.search(r'data-error="([^"]*)', dom).group(1)
-    assert '<html lang="en" data-ready="true"' in dom
-    return dom
-
-
-def cells(dom: str, row: str) -> list[str]:
+def cells(session, row: str) -> list[str]:
     """The texts of one row of the readout, which starts at the centre of the picture."""
-    inner = re.search(rf'<tr id="{row}">(.*?)</tr>', dom).group(1)
-    return re.findall(r"<td[^>]*>([^<]*)</td>", inner)
+    return session.ask(f"[...$('{row}').querySelectorAll('td')].map(cell => cell.textContent)")
 
 
-def test_the_script_decodes_what_was_written(chromium, tmp_path):
-    dom = opened(chromium, written(tmp_path, flat_scene(), noise_scene()))
-    assert dom.count('role="tab"') == 2
+def press(session, group, value):
+    session.ask(f"document.querySelector('#{group} button[value=\"{value}\"]').click()")
+
+
+def colour(session, canvas) -> list[int]:
+    return session.ask(f"[...$('{canvas}').getContext('2d').getImageData(9, 9, 1, 1).data].slice(0, 3)")
+
+
+def unbroken(session) -> bool:
+    return session.ask("document.documentElement.dataset.error ?? null") is None
+
+
+def test_the_script_decodes_what_was_written(browser, both):
+    session = browser(address(both, map="error"))
+    assert session.ask("document.querySelectorAll('[role=tab]').length") == 2
+    assert session.ask("document.documentElement.lang") == "en" and unbroken(session)
     # Both methods are off by 1/16, 0 and 1/32.
     epsilon = display.ERROR_EPSILON * (0.0625 / 0.18) ** 2
-    error = 100 * np.sqrt((2**-8 + 2**-10) / 3 / (2**-8 + epsilon))
+    error = np.sqrt((2**-8 + 2**-10) / 3 / (2**-8 + epsilon))
     for row, name in (("value-a", "primal"), ("value-b", "l1"), ("value-reference", "reference")):
-        *colour, shown = cells(dom, row)
-        assert [float(value) for value in colour] == pytest.approx(COLOURS[name], rel=4e-3)  # TOE counts in the dark
-        assert shown == "" if name == "reference" else float(shown[:-2]) == pytest.approx(error, rel=0.02)
+        *values, told = cells(session, row)
+        assert [float(value) for value in values] == pytest.approx(COLOURS[name], rel=4e-3)  # TOE counts in the dark
+        assert told == "" if name == "reference" else float(told[:-2]) == pytest.approx(100 * error, rel=0.02)
+    # The map of errors is logarithmic over its range: black is 1 %, pale yellow all.
+    low, high = np.log10(display.ERROR_RANGE)
+    place = round(255 * (np.log10(error**2) - low) / (high - low))
+    assert np.abs(np.subtract(colour(session, "canvas-a"), display.heat_table()[place])).max() <= 3
 
 
-def test_hostile_names_and_numbers_do_not_break_the_script(chromium, tmp_path):
+def test_hostile_names_and_numbers_do_not_break_the_script(browser, tmp_path):
     noise = noise_scene(HOSTILE)
     noise.entries.append(Entry(HOSTILE, np.full((20, 30, 3), 1e12)))
-    dom = opened(chromium, written(tmp_path, flat_scene(), noise), scene=1, a=HOSTILE, b="dx", exposure=-4, zoom=4)
-    assert "owned" not in re.search(r"<title>(.*?)</title>", dom).group(1)
-    assert [float(cell) for cell in cells(dom, "value-a")[:3]] == pytest.approx([1e12] * 3, rel=2e-3)
-    assert cells(dom, "value-b") == ["display colours"]
+    path = written(tmp_path, flat_scene(), noise)
+    session = browser(address(path, scene=1, a=HOSTILE, b="dx", exposure=-4, zoom=4))
+    assert "owned" not in session.ask("document.title") and unbroken(session)
+    assert [float(cell) for cell in cells(session, "value-a")[:3]] == pytest.approx([1e12] * 3, rel=2e-3)
+    assert cells(session, "value-b") == ["display colours"]
 
 
-def test_a_screenshot_shows_a_left_and_b_right_at_the_exposure_asked(chromium, tmp_path):
+def test_a_screenshot_shows_a_left_and_b_right_at_the_exposure_asked(browser, tmp_path):
     imageio = pytest.importorskip("imageio.v3")
-    path = written(tmp_path, flat_scene())
-    browse(chromium, path, picture=tmp_path / "shot.png", a="primal", b="l1", exposure=-2, split=30)
-    shot = imageio.imread(tmp_path / "shot.png")[:, :, :3].astype(int)
-    stops = display.auto_exposure(constant(COLOURS["reference"])) - 2
-    left, right = (where(shot, display.to_srgb8(constant(COLOURS[name]), stops)[0, 0]) for name in ("primal", "l1"))
+    session = browser(address(written(tmp_path, flat_scene()), a="primal", b="l1", exposure=-2, split=30))
+    picture = base64.b64decode(session.call("Page.captureScreenshot", format="png")["data"])
+    pixels = imageio.imread(io.BytesIO(picture), extension=".png")[:, :, :3].astype(int)
+    left, right = (np.abs(pixels - shown(name, -2).astype(int)).max(axis=2) <= 1 for name in ("primal", "l1"))
     row = (left | right).sum(axis=1).argmax()  # the stage is wider than all the thumbnails together
     a, b = np.flatnonzero(left[row]), np.flatnonzero(right[row])
     assert a.max() < b.min()
@@ -232,76 +242,58 @@ def test_a_screenshot_shows_a_left_and_b_right_at_the_exposure_asked(chromium, t
     assert b.max() + 1 - a.min() == WIDTH * 11  # the largest whole factor that fits into the stage's 1150 pixels
 
 
-def test_mouse_and_keyboard_drive_the_page(browser, tmp_path):
-    session = browser(address(written(tmp_path, flat_scene(), noise_scene()), zoom="fit"))
+def test_mouse_and_keyboard_drive_the_page(browser, both):
+    session = browser(address(both, zoom="fit"))
     left, top, width, height = session.ask(
         "(({x, y, width, height}) => [x, y, width, height])($('frame').getBoundingClientRect())"
     )
-    session.mouse("mousePressed", left + 0.5 * width, top + 0.5 * height)
-    session.mouse("mouseMoved", left + 0.25 * width, top + 0.5 * height)
-    session.mouse("mouseReleased", left + 0.25 * width, top + 0.5 * height)
+    middle = top + 0.5 * height
+    session.drag((left + 0.5 * width, middle), (left + 0.25 * width, middle))
     assert float(session.view()["split"]) == pytest.approx(25, abs=0.1)
     assert session.ask("$('where').textContent") == "x 24, y 16"
     session.key("ArrowRight")  # the drag left the focus on the border
     assert float(session.view()["split"]) == pytest.approx(26, abs=0.1)
     session.key("End")
     assert session.view()["split"] == session.ask("$('wipe').getAttribute('aria-valuenow')") == "100"
-
     session.ask("document.querySelector('#scene-0 figure[data-name=reference] button.a').click()")
-    session.ask("document.querySelector('#exposures button[value=\"2\"]').click()")
-    session.ask("document.querySelector('#maps button[value=error]').click()")
-    session.ask("document.querySelector('#zooms button[value=\"4\"]').click()")
+    for group, value in (("exposures", 2), ("maps", "error"), ("zooms", 4)):
+        press(session, group, value)
     expected = {"a": "reference", "b": "l1", "exposure": "2", "map": "error", "zoom": "4"}
-    assert session.view().items() >= expected.items()
-    assert session.ask("$('legend').hidden") is False
-
+    assert session.view().items() >= expected.items() and session.ask("$('legend').hidden") is False
     # The other scene has neither an 'l1' nor a reference: the page falls back, it does not fail.
     session.ask("document.querySelectorAll('[role=tab]')[1].click()")
-    expected = {"scene": "1", "a": "primal", "b": "primal", "map": ""}
-    assert session.view().items() >= expected.items()
+    assert session.view().items() >= {"scene": "1", "a": "primal", "b": "primal", "map": ""}.items()
     assert session.ask("[...$('maps').children].filter(b => !b.disabled).map(b => b.value).join()") == "stops"
     session.ask("location.hash = '#scene=0&a=nonsense&exposure=nonsense&split=-7&zoom=toString'")
-    assert session.ask("getComputedStyle($('scene-0')).display") != "none"
-    assert session.ask("document.documentElement.dataset.error ?? null") is None
+    assert session.wait_for("getComputedStyle($('scene-0')).display !== 'none'") and unbroken(session)
 
 
-def test_panes_zoom_and_pan_together_and_keys_drive_them(browser, tmp_path):
-    session = browser(address(written(tmp_path, flat_scene(), noise_scene()), layout="all"))
-    assert session.ask("document.querySelectorAll('#panes canvas').length") == 3
-    first = "c.getContext('2d').getImageData(9, 9, 1, 1).data[0]"
-    drawn = f"[...document.querySelectorAll('#panes canvas')].map(c => {first})"
-    stops = display.auto_exposure(constant(COLOURS["reference"]))
-    expected = [display.to_srgb8(constant(colour), stops)[0, 0, 0] for colour in COLOURS.values()]
-    assert session.ask(drawn) == pytest.approx(expected, abs=1)
-    session.ask("document.querySelector('#zooms button[value=\"8\"]').click()")
+def test_panes_zoom_and_pan_together_and_keys_drive_them(browser, both):
+    session = browser(address(both, layout="all"))
+    first = (
+        "[...document.querySelectorAll('#panes canvas')].map(c => c.getContext('2d').getImageData(9, 9, 1, 1).data[0])"
+    )
+    assert session.ask(first) == pytest.approx([shown(name)[0] for name in COLOURS], abs=1)
+    press(session, "zooms", 8)
     assert session.ask("[...document.querySelectorAll('#panes canvas')].every(c => c.offsetWidth === 8 * 96)")
     session.ask("document.querySelector('#panes .view').scrollTo(33, 20)")
-    time.sleep(0.3)
     places = "[...document.querySelectorAll('#panes .view')].map(v => [v.scrollLeft, v.scrollTop]).join(' ')"
-    assert session.ask(places) == "33,20 33,20 33,20"
+    assert session.wait_for(f"{places} === '33,20 33,20 33,20'")
     session.ask("document.activeElement.blur()")
     for key in ("l", "0", "d", "v", "v", "ArrowRight", "x", "."):
         session.key(key)
-    expected = {"zoom": "fit", "map": "signed", "layout": "wipe", "a": "reference", "b": "primal"}
-    assert session.view().items() >= (expected | {"exposure": "0.5"}).items()
+    expected = {"zoom": "fit", "map": "signed", "layout": "wipe", "a": "reference", "b": "primal", "exposure": "0.5"}
+    assert session.view().items() >= expected.items()
     session.key("?")
-    assert session.ask("$('help').open") is True
-    assert session.ask("document.documentElement.dataset.error ?? null") is None
-
-
-def where(shot: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    return np.abs(shot - colour.astype(int)).max(axis=2) <= 1
+    assert session.ask("$('help').open") is True and unbroken(session)
 
 
 def test_the_frames_of_a_shot_are_played_at_one_exposure(browser, tmp_path):
+    change = {"change": np.zeros((6, 8))}
     frames = [
-        Scene(
-            f"{i:04}", "", None, [Entry("shot", np.full((6, 8, 3), 0.1 * (i + 1)), maps={"change": np.zeros((6, 8))})]
-        )
-        for i in range(3)
+        Scene(f"{i:04}", "", None, [Entry("shot", np.full((6, 8, 3), 0.1 * (i + 1)), maps=change)]) for i in range(3)
     ]
-    page = write_report(tmp_path / "p.html", "t", frames, command="", footer={}, shot=True)
-    session = browser(page.as_uri())
+    session = browser(written(tmp_path, *frames, shot=True).as_uri())
     assert session.ask("$('tabs').hidden") is True and session.ask("$('player').hidden") is False
     assert session.ask("$('frame-name').textContent") == "0000, 1 of 3"
     middle = """(() => {
@@ -321,12 +313,78 @@ def test_the_frames_of_a_shot_are_played_at_one_exposure(browser, tmp_path):
         "new MutationObserver(() => seen.add($('at-frame').value)).observe($('frame-name'), {childList: true});"
     )
     session.ask("$('play').click()")
-    end = time.monotonic() + 20
-    while session.ask("seen.size") < 3 and time.monotonic() < end:
-        time.sleep(0.05)
-    assert session.ask("seen.size") == 3 and session.ask("$('play').textContent") == "pause"
+    assert session.wait_for("seen.size === 3") and session.ask("$('play').textContent") == "pause"
     session.ask("$('play').click()")
     stopped = session.view()["scene"]
     assert session.ask("$('play').textContent") == "play"
     time.sleep(0.3)
     assert session.view()["scene"] == stopped
+
+
+# --- what a reader sees ----------------------------------------------------------------------------------------------
+
+# The contrast of WCAG 2 between an element's own text and what is behind it; here every background covers.
+CONTRAST = """(() => {
+  const light = text => {
+    const [r, g, b] = text.match(/[\\d.]+/g).slice(0, 3).map(x => +x / 255)
+      .map(x => x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4);
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  };
+  const behind = node => {
+    const colour = node ? getComputedStyle(node).backgroundColor : "rgb(25, 25, 25)";
+    return /, 0\\)$|transparent/.test(colour) ? behind(node.parentElement) : colour;
+  };
+  window.contrast = node => {
+    const [low, high] = [light(getComputedStyle(node).color), light(behind(node))].sort((a, b) => a - b);
+    return (high + 0.05) / (low + 0.05);
+  };
+})()"""
+
+
+def test_all_text_can_be_read_and_so_can_buttons_under_the_mouse(browser, tmp_path):
+    session = browser(address(written(tmp_path, plain_scene(maps=("FLIP",)), plain_scene()), map="FLIP"))
+    session.ask(CONTRAST)
+    texts = (
+        "[...document.body.querySelectorAll('*')].filter(n => n.checkVisibility() && !n.disabled && "
+        "[...n.childNodes].some(c => c.nodeType === 3 && c.data.trim()))"
+    )
+    found = session.ask(f"{texts}.map(n => [contrast(n), n.outerHTML.slice(0, 80)])")
+    assert len(found) > 40
+    assert [text for text in found if text[0] < 4.5] == []
+    for group in ("tabs", "exposures", "zooms", "layouts", "maps"):
+        buttons = f"[...document.querySelectorAll('#{group} button:enabled:not([hidden])')]"
+        for index in range(session.ask(f"{buttons}.length")):
+            middle = "(b => [b.x + b.width / 2, b.y + b.height / 2])"
+            session.mouse("mouseMoved", *session.ask(f"{middle}({buttons}[{index}].getBoundingClientRect())"))
+            assert session.ask(f"{buttons}[{index}].matches(':hover')") is True
+            assert session.ask(f"contrast({buttons}[{index}])") >= 4.5, (group, index)
+
+
+@pytest.mark.parametrize("shape", [(720, 1280), (90, 60)])
+def test_the_picture_and_its_controls_fit_into_the_window(browser, tmp_path, shape):
+    session = browser(address(written(tmp_path, plain_scene(*shape)), map="error"))
+    for layout, picture in (("wipe", "#canvas-a"), ("two", "#panes canvas"), ("all", "#panes canvas")):
+        press(session, "layouts", layout)
+        for width, height in ((1366, 768), (1366, 640), (1920, 1080)):
+            session.resize(width, height)
+            top, bottom = session.ask("(b => [b.top, b.bottom])($('viewer').getBoundingClientRect())")
+            assert top >= 0 and bottom <= height, (layout, width, height)
+            box = f"document.querySelector('{picture}').getBoundingClientRect()"
+            across, down = session.ask(f"(b => [b.width, b.height])({box})")
+            assert min(across, down) >= 100 and across / down == pytest.approx(shape[1] / shape[0], rel=0.02)
+
+
+def test_stored_maps_show_in_the_colours_of_their_scale(browser, tmp_path):
+    path = written(tmp_path, plain_scene(maps=("FLIP",)), plain_scene())
+    session = browser(address(path, b="reference", map="FLIP"))
+    assert colour(session, "canvas-a") == display.heat_table()[128].tolist()
+    assert colour(session, "canvas-b") == display.heat_table()[0].tolist()  # the reference equals itself
+    assert session.ask("$('legend').hidden") is False
+    # The other scene has no such map.
+    session.ask("document.querySelectorAll('[role=tab]')[1].click()")
+    assert session.view()["map"] == ""
+    disabled = session.ask("[...$('maps').children].map(button => [button.value, button.disabled])")
+    assert disabled == [["error", False], ["signed", False], ["stops", False], ["FLIP", True]]
+    for expected in ("error", "signed", "stops", "", "error"):
+        session.key("m")
+        assert session.view()["map"] == expected

@@ -43,7 +43,7 @@ def settings(path: Path) -> None:
 
 
 TARGETS = {
-    "header": (header, "a.exr", [data[:2000] for _, data in seeds()]),
+    "header": (header, "a.exr", [data[:2000] for data in seeds()]),
     "json": (lambda path: read_manifest(path.parent), "manifest.json", [to_json(_dataset()[0])]),
     "toml": (settings, "a.toml", [(CONFIGS / f"{name}.toml").read_bytes() for name in ("fast", "paper")]),
 }

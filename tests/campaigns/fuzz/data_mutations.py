@@ -5,9 +5,8 @@ import random
 import struct
 from typing import Any
 
-from exr_mutations import bytes_flipped, bytes_inserted, bytes_removed, file_cut_off
+from exr_mutations import RAW
 
-RAW = (bytes_flipped, bytes_flipped, file_cut_off, bytes_inserted, bytes_removed)
 DEPTH = 100_000
 
 
@@ -16,20 +15,7 @@ class Nested:
 
 
 VALUES = (None, True, False, -1, 0, 1, 3, 2**31, 2**63, -(2**63), 10**400, 0.5, -1.5, 1e308, float("nan"), float("inf"))
-VALUES += (
-    "",
-    "x",
-    "x" * 5000,
-    "a\nb",
-    "\ud800",
-    "../../../etc/passwd",
-    "/etc/passwd",
-    "..",
-    "F32",
-    "F64",
-    "I64",
-    "BF16",
-)
+VALUES += ("", "x", "x" * 5000, "a\nb", "\ud800", "../../../etc/passwd", "/etc/passwd", "..", "F32", "I64", "BF16")
 VALUES += ([], {}, [0], [1, 2], [-1], [1e9], ["x"], {"x": 1}, [[]], [None], [2**40] * 3, list(range(1000)), Nested)
 
 

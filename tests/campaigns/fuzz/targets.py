@@ -4,11 +4,8 @@ A target returns where the input is accepted and handled, raises NgptError where
 failure. Number -1 is a whole input.
 """
 
-import os
 import random
-import signal
 import struct
-import time
 import tomllib
 import zlib
 from collections.abc import Callable
@@ -21,7 +18,6 @@ from exr_mutations import mutate, seeds
 from full_stack import full_stack
 
 import ngpt
-from ngpt.errors import NgptError
 from ngpt.io.exr import read, write
 from ngpt.methods import reconstruct
 from ngpt.network.shipped import WEIGHTS
@@ -32,7 +28,7 @@ CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 def exr(number: int, folder: Path) -> None:
     """What `ngpt denoise` does with a file: reads, reconstructs, writes; what is written can be read again."""
     path, result = folder / "stack.exr", folder / "result.exr"
-    path.write_bytes(seeds()[0][1] if number < 0 else mutate(number)[1])
+    path.write_bytes(seeds()[0] if number < 0 else mutate(number))
     stack = read(path)
     method = "l2" if "dx" in stack and "dy" in stack else "primal"
     image = reconstruct(stack, method).image
@@ -290,25 +286,6 @@ def _onnx_changed(rng: random.Random, data: bytes) -> bytes:
     return model.SerializeToString()
 
 
-def probe(number: int, folder: Path) -> None:
-    """Does what campaigns are to notice."""
-    match number:
-        case 1:
-            os.kill(os.getpid(), signal.SIGSEGV)
-        case 3:
-            time.sleep(60)
-        case 4:
-            np.ones(600 * 2**17)  # 600 MiB
-        case 5:
-            np.empty(8 * 2**30, np.uint8)
-        case 6:
-            raise KeyError("x")
-        case 7:
-            raise NgptError("something is wrong")
-        case 8:
-            raise NgptError(f"{folder}: is refused")
-
-
 TARGETS: dict[str, Callable[[int, Path], None]] = {
-    target.__name__: target for target in (exr, foreign, manifest, shard, weights, checkpoint, settings, network, probe)
+    target.__name__: target for target in (exr, foreign, manifest, shard, weights, checkpoint, settings, network)
 }
