@@ -2,26 +2,13 @@
 
 import os
 import signal
-import subprocess
 import sys
 
 import pytest
-from processes import (
-    ROOT,
-    SIGNALS,
-    complete,
-    half_written,
-    make_work,
-    one_error,
-    shell,
-    start,
-    timeless,
-)
+from processes import NGPT, SIGNALS, complete, half_written, make_work, one_error, shell, start, timeless
 
 import ngpt
-from ngpt.system.console import run_command
-
-NGPT = (sys.executable, "-m", "ngpt")
+from ngpt.system.console import print_line, run_command
 
 
 def test_sigterm_leaves_the_samples_done_so_far(tmp_path):
@@ -50,6 +37,21 @@ def test_the_status_is_told_wherever_it_comes(name, tmp_path):
     assert (run.returncode, run.stderr) == (128 + SIGNALS[name], "ngpt: error: interrupted\n")
 
 
+def test_an_interrupt_during_import_is_one_line():
+    """The slowest part of a short command, and outside of what a command can see of itself."""
+    code = (
+        "import sys\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, *rest):\n"
+        "        if name == 'numpy': raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "from ngpt.cli import main\n"
+        "sys.exit(main(['info', '--aliases']))"
+    )
+    run = complete([sys.executable, "-c", code])
+    assert (run.returncode, run.stderr) == (130, "ngpt: error: interrupted\n")
+
+
 def test_a_second_sigterm_discards_them():
     from data_gen.session import stop_on_ctrl_c
 
@@ -60,9 +62,35 @@ def test_a_second_sigterm_discards_them():
             os.kill(os.getpid(), signal.SIGTERM)
         return 0
 
-    before = [signal.getsignal(number) for number in SIGNALS.values()]
+    # That the handlers are those of before is seen in conftest.
     assert run_command(run) == 143
-    assert [signal.getsignal(number) for number in SIGNALS.values()] == before
+
+
+def test_handlers_of_others_stay(capfd):
+    """A host that has one of its own for SIGTERM, and runs a command within itself."""
+    got = []
+    before = signal.signal(signal.SIGTERM, lambda *_: got.append(1))
+    try:
+        assert run_command(lambda: os.kill(os.getpid(), signal.SIGTERM) or 0) == 0 and got == [1]
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_a_handler_prints_amid_a_line(tmp_path):
+    """Where a signal comes while a line is printed, its handler cannot enter the same buffer: it ended the render."""
+
+    class Entered:
+        encoding = "utf-8"
+
+        def __init__(self, file):
+            self.fileno = file.fileno
+
+        def write(self, text):
+            raise RuntimeError("reentrant call inside <_io.BufferedWriter name=3>")
+
+    with open(tmp_path / "log", "wb") as file:
+        print_line("interrupted", Entered(file))
+    assert (tmp_path / "log").read_text() == "interrupted\n"
 
 
 @pytest.fixture(scope="module")
@@ -73,9 +101,7 @@ def stack(tmp_path_factory):
     return folder / "inputs" / "0.exr"
 
 
-@pytest.mark.parametrize(
-    "arguments", [["info", "--aliases"], ["info", "{stack}", "--json"], ["--help"], ["advise", "-h"]]
-)
+@pytest.mark.parametrize("arguments", [["info", "--aliases"], ["info", "{stack}", "--json"], ["advise", "-h"]])
 def test_a_reader_that_has_enough(arguments, stack):
     run = shell('"$@" | head -c 1', *NGPT, *(a.format(stack=stack) for a in arguments))
     assert run.stderr == "" and run.returncode in (0, 1, 141)
@@ -93,46 +119,3 @@ def test_files_do_not_take_the_place_of_a_closed_stream(tmp_path, stack):
 def test_results_that_cannot_be_printed_are_an_error(stack):
     run = shell('"$@" > /dev/full', *NGPT, "info", stack, "--json")
     assert run.returncode == 1 and one_error(run.stderr) and "No space left" in run.stderr
-
-
-def test_an_interrupt_during_import_is_one_line():
-    """The slowest part of a short command, and outside of what a command can see of itself."""
-    code = (
-        "import sys\n"
-        "class Finder:\n"
-        "    def find_spec(self, name, *rest):\n"
-        "        if name == 'numpy': raise KeyboardInterrupt\n"
-        "sys.meta_path.insert(0, Finder())\n"
-        "from ngpt.cli import main\n"
-        "sys.exit(main(['info', '--aliases']))"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
-    assert (run.returncode, run.stderr) == (130, "ngpt: error: interrupted\n")
-
-
-def test_a_handler_prints_amid_a_line(tmp_path):
-    """Where a signal comes while a line is printed, its handler cannot enter the same buffer: it ended the render."""
-    from ngpt.system.console import print_line
-
-    class Entered:
-        encoding = "utf-8"
-
-        def __init__(self, file):
-            self.fileno = file.fileno
-
-        def write(self, text):
-            raise RuntimeError("reentrant call inside <_io.BufferedWriter name=3>")
-
-    with open(tmp_path / "log", "wb") as file:
-        print_line("interrupted", Entered(file))
-    assert (tmp_path / "log").read_text() == "interrupted\n"
-
-
-def test_handlers_of_others_stay(capfd):
-    """A host that has one of its own for SIGTERM, and runs a command within itself."""
-    got = []
-    before = signal.signal(signal.SIGTERM, lambda *_: got.append(1))
-    try:
-        assert run_command(lambda: os.kill(os.getpid(), signal.SIGTERM) or 0) == 0 and got == [1]
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -4,36 +4,25 @@ import ast
 import os
 import pickle
 import struct
-import subprocess
 import sys
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
 from full_stack import full_stack
+from processes import ENVIRONMENT, ROOT, complete
 
 import ngpt
 from ngpt.errors import NgptError
 from ngpt.network.shipped import WEIGHTS
 
-ROOT = Path(__file__).resolve().parents[2]
-SOURCES = sorted(
-    path
-    for part in ("ngpt", "data_gen", "export", "bench", "scripts", "train.py", "eval.py")
-    for path in ([ROOT / part] if part.endswith(".py") else (ROOT / part).rglob("*.py"))
-)
+ROOMS = ("ngpt", "data_gen", "export", "bench", "scripts")
+SOURCES = [ROOT / "train.py", ROOT / "eval.py", *(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))]
 MODULES = {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "yaml", "pickletools"}
 # Names called on anything, whatever it was imported as.
-CALLS = {
-    "torch.load",
-    "torch.jit.load",
-    "torch.export.load",
-    "torch.package",
-    "torch.hub.load",
-    "hub.load_state_dict_from_url",
-}
-CALLS |= {"eval", "exec", "compile", "__import__", "np.load", "numpy.load", "pd.read_pickle"}
+CALLS = {"torch.load", "torch.jit.load", "torch.export.load", "torch.package", "torch.hub.load"}
+CALLS |= {"hub.load_state_dict_from_url", "np.load", "numpy.load", "pd.read_pickle"}
+CALLS |= {"eval", "exec", "compile", "__import__"}
 # The one exception: a file whose checksum is torchvision's own, by the reader that takes nothing but tensors.
 ALLOWED = {("ngpt/measure/distances/backbones.py", "torch.load")}
 
@@ -60,8 +49,12 @@ def offences(source, name):
 
 def test_nothing_in_the_project_unpickles_or_evaluates():
     assert len(SOURCES) > 100
-    found = {path.relative_to(ROOT).as_posix(): path.read_text() for path in SOURCES}
-    assert {name: list(offences(text, name)) for name, text in found.items() if list(offences(text, name))} == {}
+    found = {name: list(offences((ROOT / name).read_text(), name)) for name in map(_relative, SOURCES)}
+    assert {name: places for name, places in found.items() if places} == {}
+
+
+def _relative(path):
+    return path.relative_to(ROOT).as_posix()
 
 
 class Payload:
@@ -72,23 +65,19 @@ class Payload:
 def hostile(folder):
     """Pickles under every name that is read, plain, zipped as PyTorch does it, and inside of arrays."""
     data = pickle.dumps({"x": Payload()})
-    files = [folder / name for name in ("a.exr", "a.safetensors", "a.onnx", "a.toml", "a.pth")]
-    for path in files:
-        path.write_bytes(data)
+    np.save(folder / "array.npy", np.array([Payload()], object), allow_pickle=True)
+    (folder / "set" / "shards").mkdir(parents=True)
+    contents = dict.fromkeys(("a.exr", "a.safetensors", "a.onnx", "a.toml", "a.pth", "set/manifest.json"), data)
+    contents["magic.exr"] = b"\x76\x2f\x31\x01" + data
+    contents["length.safetensors"] = struct.pack("<Q", len(data)) + data
+    contents["npy.exr"] = (folder / "array.npy").read_bytes()
+    contents["set/shards/a.safetensors"] = data
+    for name, content in contents.items():
+        (folder / name).write_bytes(content)
     with zipfile.ZipFile(folder / "zip.safetensors", "w") as archive:
         archive.writestr("archive/data.pkl", data)
         archive.writestr("archive/version", "3")
-    (folder / "magic.exr").write_bytes(b"\x76\x2f\x31\x01" + data)
-    (folder / "length.safetensors").write_bytes(struct.pack("<Q", len(data)) + data)
-    np.save(folder / "array.npy", np.array([Payload()], object), allow_pickle=True)
-    (folder / "npy.exr").write_bytes((folder / "array.npy").read_bytes())
-    for name in ("set", "set/shards"):
-        (folder / name).mkdir()
-    (folder / "set" / "manifest.json").write_bytes(data)
-    (folder / "set" / "shards" / "a.safetensors").write_bytes(data)
-    return sorted(
-        path for path in folder.rglob("*") if path.suffix in (".exr", ".safetensors", ".onnx", ".toml", ".pth")
-    )
+    return sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix not in (".npy", ".json"))
 
 
 READ_ALL = """
@@ -134,42 +123,44 @@ def test_hostile_files_run_nothing(tmp_path, monkeypatch):
     pytest.importorskip("torch")
     marker = tmp_path / "code was run"
     monkeypatch.setenv("NGPT_PAYLOAD", str(marker))
-    (tmp_path / "in").mkdir()
     files = hostile(tmp_path / "in")
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
-    done = subprocess.run([sys.executable, "-c", READ_ALL, *files], env=environment, capture_output=True, text=True)
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    known = ENVIRONMENT | {"PYTHONPATH": path, "NGPT_PAYLOAD": str(marker)}
+    done = complete([sys.executable, "-c", READ_ALL, *files], env=known)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.splitlines()[-1] == f"{len(files)} []" and not marker.exists()
     pickle.loads((tmp_path / "in" / "a.exr").read_bytes())
     assert marker.exists(), "the payload works"
 
 
-# ONNX files that users give
+# --- ONNX files that users give --------------------------------------------------------------------------------------
 
 
-def with_external_data(path, location):
-    """The shipped network with its largest tensor in another file; that tensor's bytes."""
-    onnx = pytest.importorskip("onnx")
-    model = onnx.load_from_string((WEIGHTS / "ngpt-fast.onnx").read_bytes())
-    tensor = max(model.graph.initializer, key=lambda t: len(t.raw_data))
-    data = tensor.raw_data
-    tensor.ClearField("raw_data")
-    tensor.data_location = onnx.TensorProto.EXTERNAL
-    for key, value in (("location", location), ("offset", "0"), ("length", str(len(data)))):
-        tensor.external_data.add(key=key, value=value)
+def refused(path, model, message):
     path.write_bytes(model.SerializeToString())
-    return data
+    with pytest.raises(NgptError, match=rf"a\.onnx: {message}"):
+        ngpt.denoise(full_stack(8, 8), "ngpt-fast", weights=str(path))
+
+
+@pytest.fixture
+def model():
+    return pytest.importorskip("onnx").load_from_string((WEIGHTS / "ngpt-fast.onnx").read_bytes())
 
 
 @pytest.mark.parametrize("location", ["{parent}/secret.bin", "../secret.bin", "link.bin", "missing.bin"])
-def test_networks_that_refer_to_other_files_are_refused(tmp_path, location):
+def test_networks_that_refer_to_other_files_are_refused(tmp_path, model, location):
+    """With the largest tensor there."""
     folder = tmp_path / "in"
     folder.mkdir()
-    path = folder / "a.onnx"
-    (tmp_path / "secret.bin").write_bytes(with_external_data(path, location.format(parent=tmp_path)))
+    tensor = max(model.graph.initializer, key=lambda t: len(t.raw_data))
+    (tmp_path / "secret.bin").write_bytes(tensor.raw_data)
     (folder / "link.bin").symlink_to("../secret.bin")
-    with pytest.raises(NgptError, match=r"a\.onnx: ONNX Runtime cannot load it"):
-        ngpt.denoise(full_stack(8, 8), "ngpt-fast", weights=str(path))
+    place = {"location": location.format(parent=tmp_path), "offset": "0", "length": str(len(tensor.raw_data))}
+    tensor.ClearField("raw_data")
+    tensor.data_location = tensor.EXTERNAL
+    for key, value in place.items():
+        tensor.external_data.add(key=key, value=value)
+    refused(folder / "a.onnx", model, "ONNX Runtime cannot load it")
 
 
 @pytest.mark.parametrize(
@@ -186,14 +177,7 @@ def test_networks_that_refer_to_other_files_are_refused(tmp_path, location):
         ("ngpt.emission", "true", "a network of colour alone, as earlier versions had"),
     ],
 )
-def test_networks_whose_metadata_lie_are_refused(tmp_path, key, value, message):
-    onnx = pytest.importorskip("onnx")
-    model = onnx.load_from_string((WEIGHTS / "ngpt-fast.onnx").read_bytes())
-    entry = next((entry for entry in model.metadata_props if entry.key == key), None) or model.metadata_props.add(
-        key=key
-    )
-    entry.value = value
-    path = tmp_path / "a.onnx"
-    path.write_bytes(model.SerializeToString())
-    with pytest.raises(NgptError, match=rf"a\.onnx: .*{message}"):
-        ngpt.denoise(full_stack(8, 8), "ngpt-fast", weights=str(path))
+def test_networks_whose_metadata_lie_are_refused(tmp_path, model, key, value, message):
+    entries = [entry for entry in model.metadata_props if entry.key == key] or [model.metadata_props.add(key=key)]
+    entries[0].value = value
+    refused(tmp_path / "a.onnx", model, f".*{message}")

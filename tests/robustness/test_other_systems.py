@@ -36,51 +36,44 @@ except NgptError as error:
 
 @pytest.fixture
 def python(tmp_path):
-    """The beginning of a command, and its environment: Python on the lesser system, each guessed encoding an error."""
+    """Starts Python on the lesser system, each guessed encoding an error."""
     place = tmp_path / "lesser"
     place.mkdir()
     shutil.copy(ROOT / "tests" / "lesser_system.py", place / "sitecustomize.py")
     command = [sys.executable, "-X", "warn_default_encoding", "-W", "error::EncodingWarning"]
-    path = os.pathsep.join([str(place), ENVIRONMENT["PYTHONPATH"]])
     # A pipe there has the letters of one language.
-    return command, ENVIRONMENT | {"PYTHONPATH": path, "PYTHONIOENCODING": "cp1252"}
+    known = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(place), str(ROOT)]), "PYTHONIOENCODING": "cp1252"}
+    streams = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    return lambda *words: subprocess.Popen([*command, *map(str, words)], env=known, encoding="cp1252", **streams)
 
 
-def run(python, *arguments):
-    command, environment = python
-    return subprocess.run(
-        [*command, *map(str, arguments)], env=environment, capture_output=True, encoding="cp1252", timeout=120
-    )
+def ended(process, given=""):
+    output, errors = process.communicate(given, timeout=120)
+    return SimpleNamespace(returncode=process.returncode, stdout=output, stderr=errors)
 
 
 def unguarded(source: str) -> set[str]:
     """Modules of POSIX that a file imports outside of a ``try`` that goes on without them."""
     tree = ast.parse(source)
-    spared = {
-        id(node)
+    guarded = [
+        statement
         for block in ast.walk(tree)
         if isinstance(block, ast.Try) and any("ImportError" in ast.unparse(h.type or block) for h in block.handlers)
         for statement in block.body
-        for node in ast.walk(statement)
-    }
+    ]
+    spared = {node for statement in guarded for node in ast.walk(statement)}
     found = set()
-    for node in ast.walk(tree):
-        if id(node) not in spared:
-            if isinstance(node, ast.Import):
-                found |= {alias.name for alias in node.names}
-            elif isinstance(node, ast.ImportFrom):
-                found.add(node.module or "")
+    for node in set(ast.walk(tree)) - spared:
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add(node.module or "")
     return found & POSIX
 
 
 def test_modules_of_posix_are_imported_where_they_may_be_missing():
-    wrong = {
-        str(path): names
-        for room in ("ngpt", "data_gen")
-        for path in (ROOT / room).rglob("*.py")
-        if (names := unguarded(path.read_text(encoding="utf-8")))
-    }
-    assert not wrong
+    sources = [path for room in ("ngpt", "data_gen") for path in (ROOT / room).rglob("*.py")]
+    assert {path: found for path in sources if (found := unguarded(path.read_text(encoding="utf-8")))} == {}
     assert unguarded("import os, fcntl") == unguarded("def f():\n    from fcntl import flock") == {"fcntl"}
     assert not unguarded("try:\n    import fcntl\nexcept ImportError:\n    fcntl = None")
 
@@ -89,35 +82,31 @@ def test_modules_of_posix_are_imported_where_they_may_be_missing():
 def test_the_same_image(tmp_path, python, options):
     source, out = tmp_path / "noisy.exr", tmp_path / "clean.exr"
     ngpt.write(source, full_stack(40, 56))
-    done = run(python, "-m", "ngpt", "denoise", source, "-o", out, *options)
+    command = ["-m", "ngpt", "denoise", source, "-o", out, *options]
+    done = ended(python(*command))
     assert done.returncode == 0, done.stderr
     expected = ngpt.denoise(ngpt.read(source), options[1])
     np.testing.assert_allclose(ngpt.read_image(out), expected, rtol=1e-4, atol=1e-5)
     assert temporary_files(tmp_path) == []
-    again = run(python, "-m", "ngpt", "denoise", source, "-o", out, *options)
+    again = ended(python(*command))
     assert again.returncode == 1 and "exists already" in again.stderr and one_error(again.stderr)
 
 
 def test_letters_that_the_terminal_lacks(tmp_path, python):
-    source = tmp_path / "a.exr"
     stack = full_stack(8, 8)
     stack.attributes["scene"] = "Ωmega"
-    ngpt.write(source, stack)
-    done = run(python, "-m", "ngpt", "info", source)
+    ngpt.write(tmp_path / "a.exr", stack)
+    done = ended(python("-m", "ngpt", "info", tmp_path / "a.exr"))
     assert done.returncode == 0 and "\\u03a9mega" in done.stdout, done.stderr
 
 
 def test_a_folder_belongs_to_one_process_until_it_is_killed(tmp_path, python):
-    command, environment = python
-    arguments = [*command, "-c", LOCK, str(tmp_path)]
-    with subprocess.Popen(
-        arguments, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as holder:
+    with python("-c", LOCK, tmp_path) as holder:
         assert holder.stdout.readline() == "locked\n", holder.stderr.read()
-        assert "another process is writing there" in run(python, "-c", LOCK, tmp_path).stdout
+        assert "another process is writing there" in ended(python("-c", LOCK, tmp_path)).stdout
         holder.kill()
         holder.wait()
-        after = subprocess.run(arguments, env=environment, input="\n", capture_output=True, text=True, timeout=60)
+    after = ended(python("-c", LOCK, tmp_path), "\n")
     assert after.stdout == "locked\n" and after.stderr == "", after
 
 

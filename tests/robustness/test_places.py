@@ -1,4 +1,4 @@
-"""Full disks, folders that cannot be written, several writers: one line says so, and nothing half-written is left."""
+"""Folders and disks that others use too: one line says so, and nothing half-written is left."""
 
 import os
 import resource
@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from processes import complete, make_work, one_error, start
-from reliability import record
+from reliability import at_length, record
 
 from ngpt.errors import NgptError
 from ngpt.system.files import atomic_output
@@ -15,17 +15,13 @@ from ngpt.system.files import atomic_output
 
 def test_files_that_may_not_grow(tmp_path):
     """As where nothing can be mounted: a limit on the size of files is met by the same code."""
-    job = make_work("denoise", tmp_path)
-
-    def limit():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))
-
-    run = complete(job.arguments(tmp_path / "out"), preexec_fn=limit)
+    job, limit = make_work("denoise", tmp_path), (resource.RLIMIT_FSIZE, (8192, 8192))
+    run = complete(job.arguments(tmp_path / "out"), preexec_fn=lambda: resource.setrlimit(*limit))
     assert run.returncode == 1 and one_error(run.stderr), run.stderr
     assert os.listdir(tmp_path / "out") == []
 
 
-@pytest.mark.parametrize("writers", [8, pytest.param(64, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("writers", [8, at_length(64)])
 def test_of_many_writers_of_one_file_one_wins(tmp_path, writers):
     path, rounds = tmp_path / "a.txt", 5 * writers
 
@@ -48,7 +44,7 @@ def test_of_many_writers_of_one_file_one_wins(tmp_path, writers):
     record("Writers of one file at the same time", tried, outcomes)
 
 
-@pytest.mark.parametrize("kind", ["eval", pytest.param("train", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["eval", at_length("train")])
 def test_a_folder_that_another_run_writes_to_is_refused(tmp_path, kind):
     job, out = make_work(kind, tmp_path), tmp_path / "out"
     out.mkdir()
@@ -58,8 +54,7 @@ def test_a_folder_that_another_run_writes_to_is_refused(tmp_path, kind):
         other.stdout.readline()
         run = complete(job.arguments(out))
         assert run.returncode == 1 and "another process is writing there" in run.stderr and one_error(run.stderr)
-        other.stdin.write("\n")
-        other.stdin.close()
+        other.communicate("\n")
     assert complete(job.arguments(out)).returncode == 0
 
 

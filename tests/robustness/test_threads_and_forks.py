@@ -2,6 +2,7 @@
 
 import os
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from threading import get_ident
@@ -56,13 +57,30 @@ WORK = {name: lambda i, name=name: ngpt.denoise(stack(i), name) for name in USAB
 WORK |= {"Denoiser": by_denoiser, "Temporal": over_time, "metrics": measured}
 
 
+@needs_forks
+@no_warning_of_forks
 @pytest.mark.parametrize("name", WORK)
-def test_threads_get_the_bits_of_one_thread(name):
+def test_threads_and_children_get_the_bits_of_one_thread(name):
+    """A child that is forked after all this use works as its parent does, and the parent goes on after it."""
     work = WORK[name]
     expected = [work(i) for i in range(THREADS)]
     with ThreadPoolExecutor(THREADS) as pool:
         for found in (list(pool.map(work, range(THREADS))) for _ in range(ROUNDS)):
             assert all(np.array_equal(one, other) for one, other in zip(found, expected, strict=True))
+    assert in_a_child(work) == expected[0].tobytes()
+    assert np.array_equal(work(0), expected[0])
+
+
+def test_callers_of_the_pool_in_many_threads_do_not_wait_for_each_other():
+    results = []
+    callers = [threading.Thread(target=lambda: results.append(map_parts(abs, range(50)))) for _ in range(20)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join(20)
+    assert results == 20 * [list(range(50))]
+    with pytest.raises(ZeroDivisionError):
+        map_parts(lambda n: 1 // n, [1, 0, 1])
 
 
 def test_readers_in_threads_leave_stdout_and_stderr_to_the_program(tmp_path):
@@ -74,13 +92,16 @@ def test_readers_in_threads_leave_stdout_and_stderr_to_the_program(tmp_path):
     assert (sys.stdout, os.fstat(2).st_ino) == before
 
 
-@needs_forks
-@no_warning_of_forks
-@pytest.mark.parametrize("name", WORK)
-def test_a_child_that_is_forked_after_use_works_as_its_parent_does(name):
-    expected = WORK[name](0)
-    assert in_a_child(WORK[name]) == expected.tobytes()
-    assert np.array_equal(WORK[name](0), expected)  # and the parent after that
+def test_writers_in_threads_leave_the_mask_of_new_files_as_it_is(tmp_path, monkeypatch):
+    real, before = os.umask, os.umask(0o027)
+    monkeypatch.setattr(os, "umask", lambda mask: (real(mask), time.sleep(0.005))[0])
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(lambda i: ngpt.write(tmp_path / f"{i}.exr", stack(0)), range(12)))
+    finally:
+        after = real(before)
+    assert after == 0o027
+    assert {path.stat().st_mode & 0o777 for path in tmp_path.iterdir()} == {0o640}
 
 
 @needs_forks
@@ -122,12 +143,11 @@ def test_a_fork_while_other_threads_work_leaves_a_child_that_works(tmp_path):
 @needs_forks
 @no_warning_of_forks
 def test_what_owns_threads_is_made_anew_in_parent_and_child():
-    made = until_fork(2)(lambda key: np.array([os.getpid(), key]))
+    made = until_fork(2)(lambda key: np.array([os.getpid(), key, *map_parts(abs, [-1])]))
     first = made(1)
     assert made(1) is first
-    assert map_parts(abs, [-1]) == [1]
     child = np.frombuffer(in_a_child(made, 1), first.dtype)
-    assert child[0] != os.getpid() and child[1] == 1
+    assert child[0] != os.getpid() and child[1:].tolist() == [1, 1]
     assert made(1) is not first
 
 
@@ -142,11 +162,13 @@ def test_a_limit_of_threads_holds_for_everything_that_has_some(limit, monkeypatc
     limit(1)
     assert len({get_ident() for _ in range(9)} | set(map_parts(lambda _: get_ident(), range(64)))) == 2
     assert run_onnx.Network(WEIGHTS / "ngpt-fast.onnx").session.get_session_options().intra_op_num_threads == 1
-    workers = []
-    real = scipy.fft.dctn
-    monkeypatch.setattr(
-        scipy.fft, "dctn", lambda *args, **given: workers.append(given["workers"]) or real(*args, **given)
-    )
+    workers, real = [], scipy.fft.dctn
+
+    def noted(*args, **given):
+        workers.append(given["workers"])
+        return real(*args, **given)
+
+    monkeypatch.setattr(scipy.fft, "dctn", noted)
     ngpt.denoise(stack(0), "l2")
     assert workers and set(workers) == {1}
     limit(processors() + 5)
@@ -163,15 +185,3 @@ def test_a_limit_of_threads_holds_for_oidn(limit):
     assert np.allclose(ngpt.denoise(stack(0), "oidn"), free, rtol=1e-5, atol=1e-6)
     device = oidn_filters._devices["auto", 1]
     assert device.type.name != "CPU" or device.num_threads == 1
-
-
-def test_writers_in_threads_leave_the_mask_of_new_files_as_it_is(tmp_path, monkeypatch):
-    real, before = os.umask, os.umask(0o027)
-    monkeypatch.setattr(os, "umask", lambda mask: (real(mask), time.sleep(0.005))[0])
-    try:
-        with ThreadPoolExecutor(4) as pool:
-            list(pool.map(lambda i: ngpt.write(tmp_path / f"{i}.exr", stack(0)), range(12)))
-    finally:
-        after = real(before)
-    assert after == 0o027
-    assert {path.stat().st_mode & 0o777 for path in tmp_path.iterdir()} == {0o640}

@@ -1,5 +1,6 @@
 """Files appear complete or not at all, and nothing is overwritten by accident."""
 
+import json
 import os
 import subprocess
 import sys
@@ -8,40 +9,37 @@ import pytest
 
 from ngpt.errors import NgptError
 from ngpt.system.files import atomic_output, exclusive, save
+from ngpt.system.writing import write_json, write_text
+
+
+def hours_of_work(path, overwrite=False):
+    with atomic_output(path, overwrite) as temporary:
+        temporary.write_text("hours")
 
 
 def test_appears_only_when_the_block_succeeds(tmp_path):
-    path = tmp_path / "a.txt"
-    with atomic_output(path) as temporary:
-        temporary.write_text("done")
-        assert not path.exists() and temporary.suffix == ".txt"
-    assert path.read_text() == "done"
-    assert path.stat().st_mode & 0o777 == 0o666 & ~_umask()
-    assert os.listdir(tmp_path) == ["a.txt"]
-
-
-def _umask():
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-def test_a_failure_leaves_nothing(tmp_path):
-    with pytest.raises(ZeroDivisionError), atomic_output(tmp_path / "a.txt") as temporary:
+    path, before = tmp_path / "a.txt", os.umask(0o027)
+    try:
+        with atomic_output(path) as temporary:
+            temporary.write_text("done")
+            assert not path.exists() and temporary.suffix == ".txt"
+    finally:
+        os.umask(before)
+    assert path.read_text() == "done" and path.stat().st_mode & 0o777 == 0o640
+    with pytest.raises(ZeroDivisionError), atomic_output(tmp_path / "b.txt") as temporary:
         temporary.write_text("half")
         raise ZeroDivisionError
-    assert os.listdir(tmp_path) == []
+    assert os.listdir(tmp_path) == ["a.txt"]
 
 
 def test_overwrites_only_when_told(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("old")
-    with pytest.raises(NgptError, match="--force"), atomic_output(path):
-        pass
+    with pytest.raises(NgptError, match="--force"):
+        hours_of_work(path)
     assert path.read_text() == "old"
-    with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_text("new")
-    assert path.read_text() == "new"
+    hours_of_work(path, overwrite=True)
+    assert path.read_text() == "hours"
 
 
 def test_a_file_that_another_writer_finished_meanwhile_is_kept(tmp_path):
@@ -52,16 +50,28 @@ def test_a_file_that_another_writer_finished_meanwhile_is_kept(tmp_path):
     assert path.read_text() == "theirs" and os.listdir(tmp_path) == ["a.txt"]
 
 
+def test_what_cannot_be_written_as_json_leaves_what_is_there(tmp_path):
+    path = tmp_path / "a.json"
+    write_json(path, {"x²": 1})
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(path, {"x": float("nan")})
+    write_text(tmp_path / "a.md", "σ²\n")
+    assert json.loads(path.read_text()) == {"x²": 1} and (tmp_path / "a.md").read_text(encoding="utf-8") == "σ²\n"
+    assert sorted(os.listdir(tmp_path)) == ["a.json", "a.md"]
+
+
 @pytest.mark.parametrize("name", ["missing/a.txt", "."])
 def test_places_that_cannot_be_written(tmp_path, name):
-    with pytest.raises(NgptError, match=r"does not exist|is a directory"), atomic_output(tmp_path / name):
-        pass
+    with pytest.raises(NgptError, match=r"does not exist|is a directory"):
+        hours_of_work(tmp_path / name)
 
 
 def test_a_folder_belongs_to_one_writer_at_a_time(tmp_path):
     with exclusive(tmp_path), pytest.raises(NgptError, match="another process is writing there"), exclusive(tmp_path):
         pass
     with exclusive(tmp_path):
+        pass
+    with pytest.raises(NgptError, match="nowhere: cannot be written: No such file"), exclusive(tmp_path / "nowhere"):
         pass
 
 
@@ -76,16 +86,10 @@ def test_what_killed_writers_left_is_swept_away_and_nothing_else(tmp_path):
     command = [sys.executable, "-c", code, tmp_path / "theirs.txt"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as living:
         name = living.stdout.readline().strip()
-        with atomic_output(tmp_path / "ours.txt") as temporary:
-            temporary.write_text("done")
+        hours_of_work(tmp_path / "ours.txt")
         assert sorted(os.listdir(tmp_path)) == sorted([".hidden", ".ngpt-mine.exr", name, "ours.txt"])
         living.communicate("\n")
     assert sorted(os.listdir(tmp_path)) == [".hidden", ".ngpt-mine.exr", "ours.txt", "theirs.txt"]
-
-
-def test_a_folder_that_cannot_be_locked_is_named(tmp_path):
-    with pytest.raises(NgptError, match="nowhere: cannot be written: No such file"), exclusive(tmp_path / "nowhere"):
-        pass
 
 
 @pytest.fixture
@@ -99,15 +103,9 @@ def places(tmp_path, monkeypatch):
     return found
 
 
-def hours_of_work(path, overwrite):
-    with atomic_output(path, overwrite) as temporary:
-        temporary.write_text("hours")
-
-
 def test_what_cannot_be_written_is_kept_elsewhere_and_the_message_says_where(places):
     asked, working, _ = places
     save(asked / "a.txt", hours_of_work)
-    assert os.listdir(asked) == ["a.txt"]
     for name in ("a.kept.txt", "a.kept-2.txt"):  # the name is taken, and nothing is overwritten
         with pytest.raises(NgptError, match=rf"exists already.*; what was made is kept in {asked / name}$"):
             save(asked / "a.txt", hours_of_work)
@@ -129,10 +127,9 @@ def test_a_working_directory_that_is_full_or_gone_leaves_the_folder_for_temporar
 
     def on_full_disks(path, overwrite):
         with atomic_output(path, overwrite) as unfinished:
-            if path.parent not in free:
-                unfinished.write_text("ho")
-                raise OSError(28, "No space left on device")
             unfinished.write_text("hours")
+            if path.parent not in free:
+                raise OSError(28, "No space left on device")
 
     with pytest.raises(NgptError, match=rf"a.txt: .*No space left.*; what was made is kept in {temporary / 'a.kept'}"):
         save(asked / "a.txt", on_full_disks)

@@ -16,6 +16,11 @@ def same(value):
     return value
 
 
+def stages(stage, work):
+    """Reading, computing and writing, one of them with ``work`` to do."""
+    return [work if k == stage else same for k in range(3)]
+
+
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
 def test_results_come_in_order(count):
     found = list(overlapped(ITEMS[:count], lambda i: i + 1, lambda i: 10 * i, lambda i: str(i)))
@@ -39,51 +44,51 @@ def test_the_three_stages_run_at_once():
 
 
 def test_at_most_three_are_held():
-    lock, held, most = threading.Lock(), 0, []
+    lock, held, most = threading.Lock(), set(), []
 
     def read(i):
-        nonlocal held
         with lock:
-            held += 1
-            most.append(held)
+            held.add(i)
+            most.append(len(held))
         return i
 
     def write(i):
-        nonlocal held
         time.sleep(0.01)
         with lock:
-            held -= 1
+            held.remove(i)
         return i
 
     assert list(overlapped(ITEMS, read, same, write)) == ITEMS
     assert max(most) <= 3
 
 
+@pytest.mark.parametrize("error", [NgptError("three"), MemoryError()])
 @pytest.mark.parametrize("stage", range(3))
-def test_what_fails_is_told_in_its_turn_and_the_others_go_on(stage):
-    def fail(i):
-        if i == 3:
-            raise NgptError("three")
-        return i
-
-    found = list(overlapped(ITEMS, *(fail if k == stage else same for k in range(3))))
-    assert str(found[3]) == "three" and isinstance(found[3], NgptError)
-    assert [f for f in found if not isinstance(f, NgptError)] == [0, 1, 2, 4, 5, 6]
-
-
-@pytest.mark.parametrize("stage", range(3))
-def test_another_error_is_raised_after_what_came_before_it(stage):
-    def fail(i):
-        if i == 3:
-            raise MemoryError
-        return i
-
+def test_what_fails_is_told_in_its_turn_and_another_error_is_raised_after_what_came_before(stage, error):
     found, written = [], []
-    stages = [fail if k == stage else same for k in range(3)]
-    with pytest.raises(MemoryError):
-        for value in overlapped(ITEMS, stages[0], stages[1], lambda i: stages[2](i) + bool(written.append(i))):
+
+    def fail(i):
+        if i == 3:
+            raise error
+        return i
+
+    first, second, third = stages(stage, fail)
+
+    def write(i):
+        written.append(third(i))
+        return i
+
+    def run():
+        for value in overlapped(ITEMS, first, second, write):
             found.append(value)
-    assert found == [0, 1, 2] and set(written) - {3} == {0, 1, 2}
+
+    if isinstance(error, NgptError):
+        run()
+        assert found == [0, 1, 2, error, 4, 5, 6]
+    else:
+        with pytest.raises(MemoryError):
+            run()
+        assert found == [0, 1, 2] and set(written) - {3} == {0, 1, 2}
 
 
 @pytest.mark.parametrize("end", ["interrupt", "close"])
