@@ -1,148 +1,107 @@
-"""The window on a GPU: split of its time, what it does next, report and parcel; and all of it at a hundredth."""
+"""The window on a GPU: what it does in which order, what becomes of programs that fail, and all of it in small."""
 
 import json
-from pathlib import Path
 
-import numpy as np
 import pytest
 
-from ngpt.system.writing import write_json
-from scripts.gpu import __main__ as conductor
-from scripts.gpu import parcel
-from scripts.gpu.recipe import Clock, Recipe, Run, read_recipe
+from scripts import gpu
 
-ROOT = Path(__file__).parents[1]
-RUNS = (Run("a", "tiny", 0.75, ("run.batch=2",)), Run("b", "tiny", 0.25))
-RECIPE = Recipe("cuda_ad_rgb", "cuda", 1.0, 0.2, 0.1, "data-tiny", ("made-00001",), RUNS)
+MANIFEST = {"format": "ngpt-dataset", "version": 1, "config": {}, "planned": 1}
 
 
-class Program:
-    """In place of a program: notes how it was called, and lets the window's time pass."""
-
-    def __init__(self, now, took, statuses, arguments, log, nice=0):
-        self.now, self.took, self.arguments, self.log = now, took, arguments, log
-        self.seconds, self.running, self.given = 0.0, True, None
-        self.status = statuses.get(log.stem, 0)
-        if "scripts.gpu.checks" in arguments and not self.status:
-            name, file = arguments[2], Path(arguments[-1])
-            write_json(file, {"check": name, "status": "passed", "detail": {}, "seconds": 1.0})
-
-    def wait(self, seconds):
-        self.given = seconds
-        self.seconds = min(self.took.get(self.log.stem, 1.0), seconds)
-        self.now[0] += self.seconds
-        self.running = self.took.get(self.log.stem, 1.0) > seconds
-        return not self.running
-
-    def end(self, grace=0):
-        self.running = False
-
-    def last_words(self, lines=3):
-        return "its last words"
+def crops_in(folder, *scenes):
+    (folder / "shards").mkdir(parents=True)
+    crop = {"spp": [2], "seconds": {}}
+    shards = [
+        {"file": f"shards/{i}.safetensors", "sha256": "", "bytes": 1, "scene": scene, "crops": [crop], "failures": []}
+        for i, scene in enumerate(scenes)
+    ]
+    (folder / "manifest.json").write_text(json.dumps(MANIFEST | {"shards": shards}))
+    return folder
 
 
 @pytest.fixture
 def window(tmp_path, monkeypatch):
-    """Makes windows of a minute whose programs take so many seconds, and end with these statuses (by their logs)."""
-    monkeypatch.setattr(conductor, "names", lambda: ["machine", "renderer gpt"])
-    monkeypatch.setattr(conductor, "processors", lambda: 1)
-    now: list[float] = [0.0]
+    """Runs a window in which programs only note how they are called; what they leave is up to ``does``."""
+    monkeypatch.setattr(gpu, "names", lambda: ["renderer gpt", "arrays"])
+    (tmp_path / "work" / "checks").mkdir(parents=True)
 
-    def make(took=(), statuses=(), data=("set",), minutes=10.0):
-        programs: list[Program] = []
+    def run(*data, does=lambda log: None):
+        called = {}
 
-        def start(arguments, log, nice=0):
-            programs.append(Program(now, dict(took), dict(statuses), arguments, log, nice))
-            return programs[-1]
+        def run_for(seconds, log, *arguments):
+            called[log.stem] = seconds, list(map(str, arguments))
+            does(log)
+            return 1.0, 0, "its last words"
 
-        monkeypatch.setattr(conductor, "Work", start)
-        made = conductor.Window(RECIPE, "window", [tmp_path / d for d in data], tmp_path / "work", minutes)
-        made.clock = Clock(minutes, now=lambda: now[0])
-        made.run()
-        return {program.log.stem: program for program in programs}, made
+        monkeypatch.setattr(gpu, "run_for", run_for)
+        gpu.window(gpu.LARGE, list(data), tmp_path / "work", 10)
+        return called
 
-    return make
+    return run
 
 
-def test_recipes_are_whole():
-    for name in ("window", "rehearsal"):
-        recipe = read_recipe(name)
-        assert [run.name for run in recipe.runs] == ["paper", "large"]
+def test_checks_come_first_then_crops_then_trainings_on_all_there_is(window, tmp_path):
+    own = tmp_path / "work" / "data"
+    sets = crops_in(tmp_path / "set", "room", "made-00000-x")
+    called = window(sets, does=lambda log: crops_in(own, "made-3") if log.stem == "crops" else None)
+    assert list(called) == ["check-renderer-gpt", "check-arrays", "crops", "run-paper", "run-large"]
+    assert called["crops"][0] == pytest.approx(90) and "cuda_ad_rgb" in called["crops"][1]
+    assert called["run-paper"][0] == pytest.approx(0.65 * 580, rel=0.01)
+    assert called["run-large"][0] == pytest.approx(580, rel=0.01)  # nothing has taken its time here
+    for run in ("run-paper", "run-large"):
+        words = called[run][1]
+        assert f"data.folders={json.dumps([str(sets), str(own)])}" in words
+        assert 'data.validation=["made-00000"]' in words
+    # A check is made once, and its record says what came out.
+    assert json.loads((tmp_path / "work" / "checks" / "arrays.json").read_text())["status"] == "failed"
+    assert list(window(sets)) == ["run-paper", "run-large"], "a renderer that failed makes no crops"
 
 
-@pytest.fixture
-def trained(tmp_path):
-    """A working folder with a checkpoint of the smallest network, after one step, and shards of 40 kB."""
-    torch = pytest.importorskip("torch")
-    from ngpt.network.model import Reconstructor
-    from ngpt.network.weights import write_tensors
-    from ngpt.training.settings import read_settings
-
-    work = tmp_path / "work"
-    (work / "runs" / "a").mkdir(parents=True)
-    settings = read_settings(ROOT / "configs" / "tiny.toml")
-    torch.manual_seed(0)
-    state = Reconstructor(settings.model).state_dict()
-    tensors = {f"model/{name}": t for name, t in state.items()} | {
-        f"average/{name}": t.clone() for name, t in state.items()
-    }
-    tensors |= {f"{m}/{name}": 1e-9 * torch.rand_like(t) for m in ("adam1", "adam2") for name, t in state.items()}
-    header = {"kind": "checkpoint", "step": 7, "seconds": 3.0, "version": "0", "settings": settings.to_dict()}
-    write_tensors(work / "runs" / "a" / "checkpoint.safetensors", tensors, header)
-    shards = work / "data" / "shards"
-    shards.mkdir(parents=True)
-    entries = []
-    for number in range(4):
-        (shards / f"made-{number}.safetensors").write_bytes(bytes(40_000))
-        file, crop = f"shards/made-{number}.safetensors", {"spp": [2], "seconds": {}}
-        entries.append({"file": file, "sha256": "", "bytes": 40_000, "scene": "m", "crops": [crop], "failures": []})
-    manifest = {"format": "ngpt-dataset", "version": 1, "config": {}, "planned": 4, "shards": entries}
-    write_json(work / "data" / "manifest.json", manifest)
-    return work, tensors
+def test_without_crops_nothing_is_trained(window, tmp_path):
+    assert list(window()) == ["check-renderer-gpt", "check-arrays", "crops"]
+    assert "paper |  | 0.0 | no crops" in gpu.write_report(tmp_path / "work")
 
 
-def test_a_parcel_holds_what_fits_and_opens_again(trained, tmp_path):
-    from ngpt.network.weights import load_weights, read_tensors
+def test_a_program_has_its_seconds_and_may_save_what_it_has(tmp_path):
+    log = tmp_path / "logs" / "a.txt"
+    assert gpu.run_for(60, log, "-c", "print('so far'); raise SystemExit(3)")[1:] == (3, "so far")
+    code = "import signal, time\ndef end(*_): print('saved', flush=True); raise SystemExit\n"
+    code += "signal.signal(signal.SIGTERM, end)\nprint('begun', flush=True)\ntime.sleep(60)"
+    seconds, status, told = gpu.run_for(2, log, "-c", code)
+    assert status is None and told.endswith("saved") and seconds < 30
 
-    work, tensors = trained
-    out, again = tmp_path / "out", tmp_path / "again"
-    out.mkdir()
-    left_out = parcel.pack(work, out, piece=0.1, most=0.5)
-    pieces = sorted(path.name for path in out.iterdir())
-    assert len(pieces) > 2 and max((out / p).stat().st_size for p in pieces) <= 0.1 * 2**20
-    # Checkpoints come first, and shards as far as there is room.
-    assert left_out and all(name.startswith("data/shards/") for name in left_out) and len(left_out) < 4
-    assert parcel.unpack(out, again)
-    found, header = read_tensors(again / "runs" / "a" / "checkpoint.safetensors")
-    assert header["step"] == 7 and found.keys() == tensors.keys()
-    for name, tensor in tensors.items():
-        assert found[name].dtype == tensor.dtype
-        assert np.allclose(found[name], tensor, rtol=1 / 200, atol=0 if name.startswith("adam") else 1e-7), name
-    assert load_weights(again / "runs" / "a" / "weights.safetensors")[1]["training"]["step"] == 7
-    listed = json.loads((again / "data" / "manifest.json").read_text())["shards"]
-    assert len(listed) == 4 - len(left_out)
+
+@pytest.mark.parametrize(
+    ("found", "status"),
+    [
+        (lambda scale: {"a": (0.1, 0.2)}, "passed"),
+        (lambda scale: {"a": (0.1, 0.2), "b": (0.3, 0.2)}, "failed"),
+        (lambda scale: {"a": (float("nan"), 0.2)}, "failed"),
+        (lambda scale: __import__("no_such_module"), "not available"),
+        (lambda scale: 1 / 0, "failed"),
+    ],
+)
+def test_what_a_check_finds_is_judged(monkeypatch, found, status):
+    monkeypatch.setitem(gpu.CHECKS_MADE, "arrays", found)
+    assert gpu.check("arrays", gpu.SMALL)["status"] == status
+
+
+@pytest.mark.parametrize("name", ["arrays", "networks", "training float32"])
+def test_checks_pass_where_there_is_nothing_to_find(name, one_thread):
+    record = gpu.check(name, gpu.SMALL)
+    assert record["status"] == "passed", record
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_the_rehearsal_checks_renders_trains_and_goes_on_elsewhere(renderer, tmp_path, monkeypatch):
-    """All of it at a hundredth of the scale, the second window on what the first one left."""
-    pytest.importorskip("torch")
+def test_the_rehearsal_checks_renders_trains_and_goes_on(renderer, tmp_path, monkeypatch):
     # Threads that wait for each other are slow where other processes want the cores as well.
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    first, second = tmp_path / "first", tmp_path / "second"
-    for number, (work, more) in enumerate(((first, ()), (second, ("--from", str(tmp_path / "out0"))))):
-        out = tmp_path / f"out{number}"
-        call = ["--recipe", "rehearsal", "--work", str(work), "--out", str(out), "--minutes", "5", *more]
-        assert conductor.main(call) == 0
-        assert sum(path.stat().st_size for path in out.iterdir()) < 60 * 2**20
-    before, after = (json.loads((tmp_path / f"out{i}" / "report.json").read_text()) for i in range(2))
-    assert {check["status"] for check in before["checks"]} <= {"passed", "out of time"}
-    assert {check["status"] for check in after["checks"]} == {"passed"}
-    assert len(after["checks"]) == len(conductor.names()) and len(after["windows"]) == 2
-    assert before["crops"] == after["crops"] == {"llvm_ad_rgb": 4}
-    for name in ("paper", "large"):
-        steps = [report["runs"][name]["checkpoint at step"] for report in (before, after)]
-        assert 0 < steps[0] < steps[1], name
-        assert (second / "runs" / name / "weights.safetensors").is_file()
-    assert after["runs"]["large"]["scores"]
+    trained = []
+    for _ in range(2):
+        assert gpu.main(["--small", "--work", str(tmp_path), "--minutes", "5"]) == 0
+        trained.append(gpu.steps(tmp_path))
+    checks = [json.loads(path.read_text()) for path in tmp_path.glob("checks/*.json")]
+    assert 0 < trained[0] < trained[1] and {check["status"] for check in checks} == {"passed"}, checks
+    assert "steps/s" in (tmp_path / "report.md").read_text()

@@ -1,8 +1,11 @@
 """The real parsers of the verbs, for command lines that pages and scripts hold."""
 
+from functools import cache
+
 from ngpt.cli import _filled, _Parser, all_verbs
 
 
+@cache
 def parser_of(verb):
     """The real parser of a verb, which refuses a line by leaving with status 2."""
     verbs = all_verbs()

@@ -3,6 +3,7 @@
 import ast
 import os
 import pickle
+import re
 import struct
 import sys
 import zipfile
@@ -49,12 +50,14 @@ def offences(source, name):
 
 def test_nothing_in_the_project_unpickles_or_evaluates():
     assert len(SOURCES) > 100
-    found = {name: list(offences((ROOT / name).read_text(), name)) for name in map(_relative, SOURCES)}
+    texts = {path.relative_to(ROOT).as_posix(): path.read_text() for path in SOURCES}
+    # Only what has one of the words is taken apart.
+    words = {call.split(".")[-1] for call in CALLS} | MODULES | {"allow_pickle", "hub"}
+    named = re.compile(rf"\b(?:{'|'.join(words)})\b")
+    found = {name: list(offences(text, name)) for name, text in texts.items() if named.search(text)}
     assert {name: places for name, places in found.items() if places} == {}
-
-
-def _relative(path):
-    return path.relative_to(ROOT).as_posix()
+    wrong = "import torch\nx = torch.load(f)\nimport pickle as p"
+    assert sorted(offences(wrong, "a.py")) == ["2: torch.load", "3: import pickle"]
 
 
 class Payload:
@@ -65,8 +68,8 @@ class Payload:
 def hostile(folder):
     """Pickles under every name that is read, plain, zipped as PyTorch does it, and inside of arrays."""
     data = pickle.dumps({"x": Payload()})
-    np.save(folder / "array.npy", np.array([Payload()], object), allow_pickle=True)
     (folder / "set" / "shards").mkdir(parents=True)
+    np.save(folder / "array.npy", np.array([Payload()], object), allow_pickle=True)
     contents = dict.fromkeys(("a.exr", "a.safetensors", "a.onnx", "a.toml", "a.pth", "set/manifest.json"), data)
     contents["magic.exr"] = b"\x76\x2f\x31\x01" + data
     contents["length.safetensors"] = struct.pack("<Q", len(data)) + data

@@ -55,7 +55,6 @@ def test_a_folder_that_another_run_writes_to_is_refused(tmp_path, kind):
         run = complete(job.arguments(out))
         assert run.returncode == 1 and "another process is writing there" in run.stderr and one_error(run.stderr)
         other.communicate("\n")
-    assert complete(job.arguments(out)).returncode == 0
 
 
 @pytest.mark.slow

@@ -25,8 +25,8 @@ from ngpt.system.forks import until_fork
 from ngpt.system.limits import processors
 from ngpt.system.threads import map_parts
 
-THREADS, ROUNDS = 6, 2
-SIZES = [(24, 32), (24, 32), (32, 24), (24, 40), (24, 32), (40, 24)]
+THREADS, ROUNDS = 4, 2
+SIZES = [(24, 32), (24, 32), (32, 24), (24, 40)]
 USABLE = [name for name, method in METHODS.items() if not method.missing()]
 
 
