@@ -2,7 +2,7 @@
 
 PY = .venv/bin/python
 
-.PHONY: demo quick test test-slow campaigns check docs wheel release bench setup-demo setup-dev setup-test setup-quick setup-docs
+.PHONY: demo quick test test-slow campaigns check docs wheel try-wheel bench setup-demo setup-dev setup-test setup-quick setup-docs
 
 demo: setup-demo
 	$(PY) -m ngpt demo -o demo --force
@@ -39,9 +39,9 @@ docs: setup-docs
 wheel: setup-dev
 	$(PY) -m hatchling build -t wheel -d dist
 
-# The files of a release, each extra tried in a fresh environment (some 10 minutes).
-release: setup-dev
-	$(PY) -m scripts.release -o dist
+# The same, and each extra of it tried in a fresh environment (some 10 minutes).
+try-wheel: setup-dev
+	$(PY) -m scripts.wheel -o dist
 
 bench: setup-dev
 	$(PY) -m bench.sampler -o bench/results/sampler.json

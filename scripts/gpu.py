@@ -212,6 +212,12 @@ def networks(scale) -> dict[str, tuple[float, float]]:
     return found
 
 
+class Crop(SimpleNamespace):
+    """A training set's crop, made of nothing."""
+
+    __hash__ = object.__hash__  # by which trainings keep them
+
+
 def training(scale, precision: str) -> dict[str, tuple[float, float]]:
     """The losses of three steps of a small network."""
     from ngpt.training.distributed import Processes
@@ -224,7 +230,7 @@ def training(scale, precision: str) -> dict[str, tuple[float, float]]:
     black = np.zeros((48, 48, 3), np.float32)
     crop = {"scene": "made", "spp": (4,), "inputs": 1, "paired": False, "reference_halves": ()}
     crop |= {"reference_direct": black, "reference_caustic": black}
-    data = [SimpleNamespace(**crop, stack=lambda k, s=s: s, reference=s["albedo"]) for s in stacks]
+    data = [Crop(**crop, stack=lambda k, s=s: s, reference=s["albedo"]) for s in stacks]
     changes = ["run.steps=3", "run.log=1", f"run.precision='{precision}'", "data.crop=48", "loss.kind='l1'"]
     settings = read_settings(configs.find_config("tiny", configs.TRAINING), changes)
     for place in (device, "cpu"):

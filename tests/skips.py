@@ -6,7 +6,7 @@
 import re
 
 ALLOWED = {
-    r"no GPU for PyTorch": "the GPU window makes the same check (docs/train/gpu.md)",
+    r"no GPU for PyTorch": "scripts/gpu.py makes the same check (docs/train/gpu.md)",
     r"this build of ONNX Runtime sends no telemetry": "what is to be switched off is not there",
     r"root may read anything": "a file without permissions is only closed to others",
     r"it refuses holes": "a sampler says which scenes it cannot render",

@@ -26,11 +26,14 @@ def window(tmp_path, monkeypatch):
     monkeypatch.setattr(gpu, "names", lambda: ["renderer gpt", "arrays"])
     (tmp_path / "work" / "checks").mkdir(parents=True)
 
-    def run(*data, does=lambda log: None):
+    def run(*data, passes=(), does=lambda log: None):
         called = {}
 
         def run_for(seconds, log, *arguments):
             called[log.stem] = seconds, list(map(str, arguments))
+            if log.stem in passes:
+                record = tmp_path / "work" / "checks" / f"{log.stem.removeprefix('check-')}.json"
+                record.write_text('{"check": "renderer gpt", "status": "passed", "seconds": 1, "told": ""}')
             does(log)
             return 1.0, 0, "its last words"
 
@@ -44,7 +47,8 @@ def window(tmp_path, monkeypatch):
 def test_checks_come_first_then_crops_then_trainings_on_all_there_is(window, tmp_path):
     own = tmp_path / "work" / "data"
     sets = crops_in(tmp_path / "set", "room", "made-00000-x")
-    called = window(sets, does=lambda log: crops_in(own, "made-3") if log.stem == "crops" else None)
+    passes = ["check-renderer-gpt"]
+    called = window(sets, passes=passes, does=lambda log: crops_in(own, "made-3") if log.stem == "crops" else None)
     assert list(called) == ["check-renderer-gpt", "check-arrays", "crops", "run-paper", "run-large"]
     assert called["crops"][0] == pytest.approx(90) and "cuda_ad_rgb" in called["crops"][1]
     assert called["run-paper"][0] == pytest.approx(0.65 * 580, rel=0.01)
@@ -53,13 +57,13 @@ def test_checks_come_first_then_crops_then_trainings_on_all_there_is(window, tmp
         words = called[run][1]
         assert f"data.folders={json.dumps([str(sets), str(own)])}" in words
         assert 'data.validation=["made-00000"]' in words
-    # A check is made once, and its record says what came out.
+    # A check is made once; where it leaves no record it has failed.
     assert json.loads((tmp_path / "work" / "checks" / "arrays.json").read_text())["status"] == "failed"
-    assert list(window(sets)) == ["run-paper", "run-large"], "a renderer that failed makes no crops"
+    assert list(window(sets)) == ["crops", "run-paper", "run-large"]
 
 
-def test_without_crops_nothing_is_trained(window, tmp_path):
-    assert list(window()) == ["check-renderer-gpt", "check-arrays", "crops"]
+def test_without_crops_nothing_is_trained_and_wrong_ones_are_not_made(window, tmp_path):
+    assert list(window()) == ["check-renderer-gpt", "check-arrays"]
     assert "paper |  | 0.0 | no crops" in gpu.write_report(tmp_path / "work")
 
 

@@ -1,4 +1,4 @@
-"""``ngpt render --live`` and ``--view``: who looks on while a render goes on, and how little that may cost."""
+"""``ngpt render --live``: who looks on while a render goes on, and how little that may cost."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
+from ngpt.errors import NgptError, stop_if_interrupted
 from ngpt.report.live import LivePage
 from ngpt.report.preview import preview
-from ngpt.report.tev import Tev
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 
@@ -21,13 +20,13 @@ _LOAD, _PIXEL = 0.1, 3e-6
 
 
 class Onlookers:
-    """The page and the viewer of a render, if there are any; without them it costs nothing.
+    """The page of a render, if there is one; without it, looking on costs nothing.
 
     ``data_gen.render_scene`` calls ``newest`` after each pass, and ``progress`` with the progress.
     """
 
-    def __init__(self, page: LivePage | None, viewer: Tev | None, say: Callable[[str], None], unit: str):
-        self.page, self.viewer, self.say, self.unit = page, viewer, say, unit
+    def __init__(self, page: LivePage | None, say: Callable[[str], None], unit: str):
+        self.page, self.say, self.unit = page, say, unit
         self.line, self.shown, self.failed = "ended without an image", False, False
         self.start, self.spent, self.expected, self.left = time.perf_counter(), 0.0, 0.0, 0.0
 
@@ -74,9 +73,6 @@ class Onlookers:
 
     def close(self) -> None:
         with self._harmless():
-            if self.viewer is not None:
-                self.viewer.close()
-        with self._harmless():
             if self.page is not None:
                 self.page.close(self.line)
 
@@ -92,7 +88,7 @@ class Onlookers:
             self.failed = True
 
     def _watched(self) -> bool:
-        return self.viewer is not None or (self.page is not None and self.page.watched)
+        return self.page is not None and self.page.watched
 
     def _affordable(self, gone: float) -> bool:
         if not self.shown:
@@ -102,31 +98,19 @@ class Onlookers:
 
     def _show(self, stack: GradientStack) -> None:
         shown = preview(stack)
-        if self.page is not None and self.page.watched:
+        if self.page is not None:
             spp, seconds = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
             size = f"{stack.width}x{stack.height}"
             self.page.show(shown, f"{size}, {spp} samples per pixel, {seconds:.3g} s")
-        if self.viewer is not None:
-            try:
-                self.viewer.show(shown.images)
-            except NgptError as error:
-                self.say(f"{error}; the render goes on")
-                self.viewer = None
 
 
-def onlookers(live: bool, view: str | None, scene: str, command: str, console: Console, unit: str) -> Onlookers:
-    """The page and viewer that were asked for; a line names each one that is not available, and the render goes on."""
-    page = viewer = None
-    try:
-        viewer = Tev(view, scene) if view else None
-    except WrongUse:
-        raise
-    except NgptError as error:
-        console.error(f"{error}; the render goes on")
+def onlookers(live: bool, scene: str, command: str, console: Console, unit: str) -> Onlookers:
+    """The page, if it was asked for; a line says why there is none, and the render goes on."""
+    page = None
     try:
         page = LivePage(f"{scene}, live", command) if live else None
     except (NgptError, RuntimeError, MemoryError) as error:  # no thread can be had for it
         console.error(f"{error}; the render goes on")
     if page is not None:
         console.say(f"live: {page.url}")
-    return Onlookers(page, viewer, console.say, unit)
+    return Onlookers(page, console.say, unit)

@@ -126,7 +126,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
         console.say(f"{args.scene}: sampler '{plan.sampler}'{how}: {plan.reason}")
 
     unit = "s" if args.time else "spp"
-    looking = onlookers(args.live, args.view, args.scene, args.command, console, unit)
+    looking = onlookers(args.live, args.scene, args.command, console, unit)
     with (
         closing(looking),
         console.progress(f"render {args.scene}", unit, begins=KERNELS) as progress,
@@ -192,8 +192,8 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
 
 def shot(args: argparse.Namespace, denoising: Denoising | None, console: Console) -> int:
     """A stack for each frame, or its image."""
-    if args.live or args.view:
-        raise WrongUse("--live and --view are for single images; leave them out with --frames")
+    if args.live:
+        raise WrongUse("--live is for single images; leave it out with --frames")
     if args.adaptive or args.error is not None or args.method is not None:
         raise WrongUse("--adaptive, --error and --for are for single images; leave them out with --frames")
     if args.threads and args.cluster:

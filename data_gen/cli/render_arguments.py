@@ -96,7 +96,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="a page on 127.0.0.1 that shows the render as it goes",
     )
-    parser.add_argument("--view", metavar="HOST:PORT", help="send the same to tev (its own: 127.0.0.1:14158)")
     parser.add_argument("--variant", help="Mitsuba variant: llvm_ad_rgb (default), cuda_ad_rgb")
     parser.add_argument(
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"

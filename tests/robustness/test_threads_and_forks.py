@@ -94,10 +94,10 @@ def test_readers_in_threads_leave_stdout_and_stderr_to_the_program(tmp_path):
 
 def test_writers_in_threads_leave_the_mask_of_new_files_as_it_is(tmp_path, monkeypatch):
     real, before = os.umask, os.umask(0o027)
-    monkeypatch.setattr(os, "umask", lambda mask: (real(mask), time.sleep(0.005))[0])
+    monkeypatch.setattr(os, "umask", lambda mask: (real(mask), time.sleep(0.05))[0])
     try:
         with ThreadPoolExecutor(4) as pool:
-            list(pool.map(lambda i: ngpt.write(tmp_path / f"{i}.exr", stack(0)), range(12)))
+            list(pool.map(lambda i: ngpt.write(tmp_path / f"{i}.exr", stack(0)), range(8)))
     finally:
         after = real(before)
     assert after == 0o027

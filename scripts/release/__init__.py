@@ -1,1 +1,0 @@
-"""What makes a release: the files, what is tried of them, and the rules of versions."""
