@@ -17,7 +17,6 @@ ALLOWED = {
     r"the compiler has no ": "sanitizers that a compiler comes without",
     r"clang has no libFuzzer": "the same",
     r"could not import 'atheris'": "it has no wheel for every Python",
-    r"Python with renderers|: lacks \w+; see tests/renderers": "Blender and LuxCore take 1 GB",
 }
 
 

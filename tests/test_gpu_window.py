@@ -64,7 +64,7 @@ def test_checks_come_first_then_crops_then_trainings_on_all_there_is(window, tmp
 
 def test_without_crops_nothing_is_trained_and_wrong_ones_are_not_made(window, tmp_path):
     assert list(window()) == ["check-renderer-gpt", "check-arrays"]
-    assert "paper |  | 0.0 | no crops" in gpu.write_report(tmp_path / "work")
+    assert "| paper |  | 0 | no crops |" in gpu.write_report(tmp_path / "work")
 
 
 def test_a_program_has_its_seconds_and_may_save_what_it_has(tmp_path):
