@@ -100,7 +100,9 @@ def window(scale: SimpleNamespace, data: list[Path], work: Path, minutes: float)
     else:
         command = ["-m", "data_gen", "--config", scale.dataset, "--out", work / "data", "--variant", scale.variant]
         command += ["--workers", max(1, processors() - 2)]
-        seconds, status, told = run_for(60 * minutes * CROPS, work / "logs" / "crops.txt", *command)
+        # Without other sets to learn from, half of what is left.
+        seconds = 60 * minutes * CROPS if data else left() / 2
+        seconds, status, told = run_for(seconds, work / "logs" / "crops.txt", *command)
         note("crops", seconds, status, f"{len(crops(work / 'data'))} in all: {told}")
     folders = [str(folder) for folder in (*data, work / "data") if crops(folder)]
     apart = [APART] if any(not scene.startswith(APART) for folder in folders for scene in crops(Path(folder))) else []

@@ -4,12 +4,15 @@ A target returns where the input is accepted and handled, raises NgptError where
 failure. Number -1 is a whole input.
 """
 
+import io
 import random
 import struct
+import tempfile
 import tomllib
 import zlib
 from collections.abc import Callable
 from functools import cache
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -40,8 +43,6 @@ def exr(number: int, folder: Path) -> None:
 @cache
 def _foreign() -> list[tuple[str, bytes]]:
     """Whole files of other formats than OpenEXR."""
-    import io
-
     import tifffile
     from PIL import Image
 
@@ -49,18 +50,14 @@ def _foreign() -> list[tuple[str, bytes]]:
     light, codes = rng.random((9, 12, 4)).astype(np.float32), rng.integers(0, 256, (9, 12, 4), np.uint8)
     hdr = b"#?RADIANCE\nEXPOSURE=2\nFORMAT=32-bit_rle_rgbe\n\n-Y 9 +X 12\n"
     runs = b"\2\2\0\x0c" + b"".join(b"\4" + bytes(4) + b"\x88" + bytes([130]) for _ in range(4))
-    found = [
-        ("a.pfm", b"PF\n12 9\n-1.0\n" + light[..., :3].tobytes()),
-        ("a.hdr", hdr + 9 * runs),
-        ("a.hdr", hdr + codes.tobytes()),
-        ("a.hdr", hdr + 9 * (b"\1\2\3\x80" + b"\1\1\1\x0b")),
-    ]
-    palette = Image.fromarray(codes[..., :3]).quantize(7)
+    found = [("a.pfm", b"PF\n12 9\n-1.0\n" + light[..., :3].tobytes())]
+    found += [("a.hdr", hdr + body) for body in (9 * runs, codes.tobytes(), 9 * (b"\1\2\3\x80" + b"\1\1\1\x0b"))]
+    rgb = Image.fromarray(codes[..., :3])
     for kind, image, options in (
         ("png", Image.fromarray(codes), {}),
         ("png", Image.fromarray(codes[..., 0]), {}),
-        ("png", palette, {"transparency": b"\0\x80"}),
-        ("jpeg", Image.fromarray(codes[..., :3]), {}),
+        ("png", rgb.quantize(7), {"transparency": b"\0\x80"}),
+        ("jpeg", rgb, {}),
     ):
         image.save(file := io.BytesIO(), kind, **options)
         found.append((f"a.{kind}", file.getvalue()))
@@ -105,9 +102,7 @@ def foreign(number: int, folder: Path) -> None:
 @cache
 def _dataset() -> tuple[dict, bytes]:
     """A manifest and the shard it lists."""
-    import tempfile
-
-    from ngpt.training.dataset import FORMAT, VERSION, checksum
+    from ngpt.training.dataset import FORMAT, VERSION
     from ngpt.training.shards import CropData, write_shard
 
     stack = full_stack(8, 8)
@@ -117,52 +112,43 @@ def _dataset() -> tuple[dict, bytes]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "shard"
         write_shard(path, [crop, crop], told)
-        data, digest = path.read_bytes(), checksum(path)
-    entry = {"file": "shards/a-000.safetensors", "sha256": digest, "bytes": len(data)} | told
+        data = path.read_bytes()
+    entry = {"file": "shards/a-000.safetensors", "sha256": sha256(data).hexdigest(), "bytes": len(data)} | told
     return {"format": FORMAT, "version": VERSION, "config": {}, "planned": 2, "shards": [entry]}, data
 
 
-def _read_all(folder: Path) -> None:
+def _read_dataset(folder: Path, manifest: bytes, shard: bytes) -> None:
     """What training and `ngpt info` do with a dataset."""
     from ngpt.training.dataset import Dataset, problems, summary
 
-    data = Dataset(folder)
-    for crop in data:
+    (folder / "shards").mkdir(exist_ok=True)
+    (folder / "shards" / "a-000.safetensors").write_bytes(shard)
+    (folder / "manifest.json").write_bytes(manifest)
+    for crop in Dataset(folder):
         for k in range(crop.inputs):
             assert reconstruct(crop.stack(k), "primal").image.shape == crop.reference.shape
     assert problems(folder) == summary(folder)["problems"]
 
 
 def manifest(number: int, folder: Path) -> None:
-    value, shard = _dataset()
-    (folder / "shards").mkdir(exist_ok=True)
-    (folder / "shards" / "a-000.safetensors").write_bytes(shard)
+    (value, shard), rng = _dataset(), random.Random(number)
     data = to_json(value)
     if number >= 0:
-        rng = random.Random(number)
         data = to_json(value_changed(rng, value)) if rng.random() < 0.8 else bytes_changed(rng, data)
-    (folder / "manifest.json").write_bytes(data)
-    _read_all(folder)
+    _read_dataset(folder, data, shard)
 
 
 def shard(number: int, folder: Path) -> None:
     """With the checksum of the broken shard in the manifest, so that it is not refused for that alone."""
-    from ngpt.training.dataset import checksum
-
     value, data = _dataset()
-    (folder / "shards").mkdir(exist_ok=True)
-    path = folder / "shards" / "a-000.safetensors"
-    path.write_bytes(data if number < 0 else safetensors_changed(random.Random(number), data))
-    entry = value["shards"][0] | {"sha256": checksum(path), "bytes": path.stat().st_size}
-    (folder / "manifest.json").write_bytes(to_json(value | {"shards": [entry]}))
-    _read_all(folder)
+    data = data if number < 0 else safetensors_changed(random.Random(number), data)
+    entry = value["shards"][0] | {"sha256": sha256(data).hexdigest(), "bytes": len(data)}
+    _read_dataset(folder, to_json(value | {"shards": [entry]}), data)
 
 
 @cache
 def _weights() -> tuple[bytes, bytes]:
     """Of a tiny network, and the checkpoint of its training after one step."""
-    import tempfile
-
     with tempfile.TemporaryDirectory() as folder:
         run = _trainer(Path(folder))
         run.run()
@@ -177,14 +163,12 @@ SETTINGS = {
 
 
 class _Crop:
-    scene, inputs, spp, paired = "a", 1, (4,), False
+    scene, inputs, spp, paired, reference_halves = "a", 1, (4,), False, ()
+    reference = full_stack(16, 16)["primal"]
+    reference_direct = reference_caustic = np.zeros_like(reference)
 
     def stack(self, k: int) -> ngpt.GradientStack:
         return full_stack(16, 16)
-
-    reference = property(lambda self: self.stack(0)["primal"])
-    reference_halves = ()
-    reference_direct = reference_caustic = property(lambda self: np.zeros((16, 16, 3), np.float32))
 
 
 def _trainer(folder: Path):
