@@ -12,7 +12,7 @@ import tomllib
 from pathlib import Path
 
 TREE = Path(__file__).parents[1]
-COPIED = ("ngpt", "data_gen", "tests", "configs", "export", "pyproject.toml")
+COPIED = ("ngpt", "data_gen", "tests", "configs", "export", "train.py", "eval.py", "pyproject.toml")
 
 
 def killed(mutant: dict, copy: Path) -> bool:

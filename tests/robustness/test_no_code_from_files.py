@@ -56,8 +56,6 @@ def test_nothing_in_the_project_unpickles_or_evaluates():
     named = re.compile(rf"\b(?:{'|'.join(words)})\b")
     found = {name: list(offences(text, name)) for name, text in texts.items() if named.search(text)}
     assert {name: places for name, places in found.items() if places} == {}
-    wrong = "import torch\nx = torch.load(f)\nimport pickle as p"
-    assert sorted(offences(wrong, "a.py")) == ["2: torch.load", "3: import pickle"]
 
 
 class Payload:
