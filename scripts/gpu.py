@@ -143,7 +143,7 @@ def write_report(work: Path) -> str:
         took = timed[-1]["seconds"] - timed[0]["seconds"] if timed else 0
         rate = f"{(timed[-1]['step'] - timed[0]['step']) / took:.2f} steps/s" if took else ""
         scores = [f"{key} {value:.5f}" for key, value in entries[-1].items() if key.startswith("relMSE")]
-        rows.append((run.parent.name, f"step {entries[-1]['step']}", took, ", ".join([rate, *scores])))
+        rows.append((run.parent.name, f"step {entries[-1]['step']}", round(took, 1), ", ".join([rate, *scores])))
     cells = [[str(cell).replace("|", "/").replace("\n", " ") for cell in row] for row in rows]
     text = "\n".join(f"| {' | '.join(row)} |" for row in [["part", "", "seconds", ""], ["---"] * 4, *cells])
     write_text(work / "report.md", f"# Windows on a GPU\n\n{text}\n")
