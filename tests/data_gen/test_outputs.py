@@ -175,7 +175,6 @@ def test_a_render_goes_on_and_its_image_is_made_anew(renderer, command, kept):
         ("-o {frame}.exr --frames 0:2 --cluster tcp://nowhere:1 --shard 0/2", "leave --shard out"),
         ("-q -o {frame}.exr --frames 0:2 --dt 1", "use --dt 2"),
         ("-o a.exr --dt 2", "--dt belongs to a shot"),
-        ("-o a.exr --view nonsense:", "nonsense"),
         ("-o {frame}.exr --frames 0:2 --live", "--live"),
         ("-o {frame}.exr --frames 0:1 --sampler gpt -O history=4", "has no option 'history'"),
     ],
