@@ -175,18 +175,6 @@ def half_written(folder: Path) -> list[Path]:
     return [path for path in visible(folder) if path.suffix != ".jsonl" and not whole(path)]  # logs grow
 
 
-def timeless(path: Path) -> bytes:
-    """A result file but for the seconds it took, which are in its header."""
-    data, name = bytearray(path.read_bytes()), b"ngpt:reconstructSeconds\0"
-    assert data.count(name) == 1, f"{path}: does not say how long it took"
-    # Name, type, and the size of the value, each string ended by a zero [OpenEXR's file layout].
-    size = data.index(b"\0", data.index(name) + len(name)) + 1
-    start = size + 4
-    stop = start + int.from_bytes(data[size:start], "little")
-    data[start:stop] = bytes(stop - start)
-    return bytes(data)
-
-
 # --- work -----------------------------------------------------------------------------------------------------------
 
 

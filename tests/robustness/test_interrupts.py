@@ -5,7 +5,7 @@ import signal
 import sys
 
 import pytest
-from processes import NGPT, SIGNALS, complete, half_written, make_work, one_error, shell, start, timeless
+from processes import NGPT, SIGNALS, complete, content, half_written, make_work, one_error, shell, start
 
 import ngpt
 from ngpt.system.console import print_line, run_command
@@ -113,7 +113,7 @@ def test_files_do_not_take_the_place_of_a_closed_stream(tmp_path, stack):
     run = shell('"$@" >&- 2>&-', *NGPT, "denoise", stack, "-o", out, "-m", "l2", "--json")
     assert run.returncode == 0 and half_written(tmp_path) == []
     assert complete([*NGPT, "denoise", stack, "-o", tmp_path / "p.exr", "-m", "l2"]).returncode == 0
-    assert timeless(out) == timeless(tmp_path / "p.exr")
+    assert content(out) == content(tmp_path / "p.exr")
 
 
 def test_results_that_cannot_be_printed_are_an_error(stack):
