@@ -101,12 +101,15 @@ class Session:
         assert self.wait_for("location.hash === '#' + new URLSearchParams(state)"), "the address tells of another view"
         return dict(parse_qsl(self.ask("location.hash.slice(1)"), keep_blank_values=True))
 
-    def mouse(self, kind, x, y, **more):
-        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
+    def mouse(self, kind, x, y):
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+
+    def hover(self, x, y):
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
 
     def drag(self, start, end):
         for kind, place in (("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)):
-            self.mouse(kind, *place, button="left", buttons=1, clickCount=1)
+            self.mouse(kind, *place)
 
     def _size(self, width, height):
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)

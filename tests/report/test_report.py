@@ -355,7 +355,7 @@ def test_all_text_can_be_read_and_so_can_buttons_under_the_mouse(browser, tmp_pa
         buttons = f"[...document.querySelectorAll('#{group} button:enabled:not([hidden])')]"
         for index in range(session.ask(f"{buttons}.length")):
             middle = "(b => [b.x + b.width / 2, b.y + b.height / 2])"
-            session.mouse("mouseMoved", *session.ask(f"{middle}({buttons}[{index}].getBoundingClientRect())"))
+            session.hover(*session.ask(f"{middle}({buttons}[{index}].getBoundingClientRect())"))
             assert session.ask(f"{buttons}[{index}].matches(':hover')") is True
             assert session.ask(f"contrast({buttons}[{index}])") >= 4.5, (group, index)
 
