@@ -37,6 +37,8 @@ def pytest_make_collect_report(collector):
 # A fixture -> the marker of all tests that stand on it.
 MARKERS = {"renderer": "renders", "chromium": "browser", "toolchain": "hosts", "one_thread": "trains"}
 MARKERS |= {"wheel": "processes"}
+# A folder -> the marker of all tests in it.
+FOLDERS = {"campaigns": "processes", "export": "exports", "evaluation": "evaluates"}
 # Names that a test calls where it starts programs.
 PROGRAMS = {"subprocess", "complete", "start", "shell", "in_a_child", "in_a_process", "imported_by", "run_python"}
 PROGRAMS |= {"on_terminal", "read_exr_isolated"}
@@ -47,7 +49,8 @@ def pytest_collection_modifyitems(items):
     for item in items:
         found = {MARKERS[fixture] for fixture in MARKERS.keys() & set(item.fixturenames)}
         code = getattr(getattr(item, "function", None), "__code__", None)
-        if "campaigns" in item.path.parts or (code and PROGRAMS & set(code.co_names)):
+        found |= {FOLDERS[folder] for folder in FOLDERS.keys() & set(item.path.parts)}
+        if code and PROGRAMS & set(code.co_names):
             found.add("processes")
         if not found and not item.get_closest_marker("slow"):
             found.add("quick")
