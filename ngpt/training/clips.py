@@ -5,13 +5,16 @@ The loss is in ``ngpt.training.temporal``.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from safetensors.numpy import load_file, save_file
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save
 
 from ngpt.errors import NgptError
 from ngpt.methods import reconstruct
@@ -65,19 +68,19 @@ def clips(folders: Sequence[str | Path], methods: Sequence[str], kept: Path) -> 
             for k in range(crops[0].inputs):
                 stacks = [crop.stack(k) for crop in crops]
                 for method in methods:
-                    # Not by its number in the set, which may have grown since.
-                    file = f"{crops[0].shard.path.stem}-{crops[0].index}-{k}-{method}.safetensors"
-                    yield Clip(crops[0].scene, stacks, list(_results(stacks, method, kept / file)), light, halves)
+                    yield Clip(crops[0].scene, stacks, list(_results(stacks, method, kept)), light, halves)
 
 
-def _results(stacks: Sequence[GradientStack], method: str, kept: Path) -> np.ndarray:
-    """The results of a method frame by frame, as they were kept, or made and kept."""
-    if kept.is_file():
+def _results(stacks: Sequence[GradientStack], method: str, folder: Path) -> np.ndarray:
+    """The results of a method frame by frame, as they are kept in ``folder``, or made and kept."""
+    # By what they are of: numbers of shots change as a set grows, and names are those of other sets as well.
+    digest = hashlib.sha256(b"".join(stack["primal"].tobytes() for stack in stacks)).hexdigest()
+    kept = make_folder(folder) / f"{digest[:24]}-{method}.safetensors"
+    with suppress(OSError, SafetensorError, KeyError):
         return load_file(kept)["results"]
     results = np.stack([reconstruct(stack, method).image for stack in stacks])
-    make_folder(kept.parent)
     with atomic_output(kept, overwrite=True) as temporary:
-        save_file({"results": results}, temporary)
+        temporary.write_bytes(save({"results": results}))
     return results
 
 

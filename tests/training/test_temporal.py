@@ -156,19 +156,23 @@ def shot(rng, frames):
 
 
 def test_results_are_kept_by_what_they_are_of(tmp_path, rng, monkeypatch):
-    """Not by numbers of shots, which change as a set grows."""
-    made = []
+    """Not by numbers or names of shots: sets grow, and names are those of other sets as well."""
+    made, results = [], tmp_path / "results"
 
     def reconstruct(stack, method):
         made.append(stack)
         return SimpleNamespace(image=np.full((2, 2, 3), len(made), np.float32))
 
     monkeypatch.setattr(module, "reconstruct", reconstruct)
-    crops = {scene: shot(rng, 2) for scene in "ba"}
-    for number, scenes in enumerate(("b", "ab")):
-        write_set(tmp_path / str(number), {scene: crops[scene] for scene in scenes}, [0, 1] * len(scenes))
-        found = list(module.clips([tmp_path / str(number)], ["primal"], tmp_path / "results"))
-    assert len(made) == 8 and [clip.results[0].max() for clip in found] == [5, 7, 1, 3]
+    one, two, three = (shot(rng, 2) for _ in range(3))
+    sets = [{"b": one}, {"a": two, "b": one}, {"b": three}]
+    for number, (shots, first) in enumerate(zip(sets, ([1], [3, 1], [5]), strict=True)):
+        write_set(tmp_path / str(number), shots, [0, 1] * len(shots))
+        found = module.clips([tmp_path / str(number)], ["primal"], results)
+        assert [clip.results[0].max() for clip in found] == first
+    for path in results.iterdir():
+        path.write_bytes(b"damaged")
+    assert [clip.results[0].max() for clip in module.clips([tmp_path / "0"], ["primal"], results)] == [7]
 
 
 @pytest.mark.parametrize("frames", [(), (0, 0)], ids=["images", "frames that no other follows"])
