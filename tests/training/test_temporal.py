@@ -166,13 +166,13 @@ def test_results_are_kept_by_what_they_are_of(tmp_path, rng, monkeypatch):
     monkeypatch.setattr(module, "reconstruct", reconstruct)
     one, two, three = (shot(rng, 2) for _ in range(3))
     sets = [{"b": one}, {"a": two, "b": one}, {"b": three}]
-    for number, (shots, first) in enumerate(zip(sets, ([1], [3, 1], [5]), strict=True)):
+    for number, (shots, first) in enumerate(zip(sets, ([1, 3], [5, 7, 1, 3], [9, 11]), strict=True)):
         write_set(tmp_path / str(number), shots, [0, 1] * len(shots))
         found = module.clips([tmp_path / str(number)], ["primal"], results)
         assert [clip.results[0].max() for clip in found] == first
     for path in results.iterdir():
         path.write_bytes(b"damaged")
-    assert [clip.results[0].max() for clip in module.clips([tmp_path / "0"], ["primal"], results)] == [7]
+    assert [clip.results[0].max() for clip in module.clips([tmp_path / "0"], ["primal"], results)] == [13, 15]
 
 
 @pytest.mark.parametrize("frames", [(), (0, 0)], ids=["images", "frames that no other follows"])
