@@ -25,8 +25,9 @@ from ngpt.network.weights import load_weights
 from ngpt.repair import repair
 from ngpt.system import configs
 from ngpt.training.cost import per_pixel
+from ngpt.training.crops import open_crops
 from ngpt.training.examples import judges_of
-from ngpt.training.folders import open_crops
+from ngpt.training.images import Images
 from ngpt.training.loss import make_loss
 from ngpt.training.settings import Settings, read_settings
 from ngpt.training.split import split
@@ -49,7 +50,7 @@ FEW = 16  # samples; fewer are apart from as many or more
 def train(settings: Settings, crops: Sequence[Any], held_out: Sequence[Any], out: Path) -> None:
     """Trains to the last step of the run in ``out``, or continues it."""
     out.mkdir(parents=True, exist_ok=True)
-    trainer = Trainer(settings, crops, held_out, make_loss(settings.loss), out)
+    trainer = Trainer(settings, Images(settings, crops, held_out, make_loss(settings.loss)), out)
     if trainer.checkpoint.exists():
         trainer.resume()
     if trainer.step < settings.run.steps and not trainer.run():

@@ -223,6 +223,7 @@ class Crop(SimpleNamespace):
 def training(scale, precision: str) -> dict[str, tuple[float, float]]:
     """The losses of three steps of a small network."""
     from ngpt.training.distributed import Processes
+    from ngpt.training.images import Images
     from ngpt.training.loss import make_loss
     from ngpt.training.settings import read_settings
     from ngpt.training.trainer import Trainer
@@ -239,8 +240,8 @@ def training(scale, precision: str) -> dict[str, tuple[float, float]]:
         with tempfile.TemporaryDirectory() as folder:
             taken = Processes()
             taken.device = type(device)(place)
-            parts = (settings, data, [], make_loss(settings.loss), Path(folder))
-            Trainer(*parts, processes=taken, say=lambda text: None).run()
+            task = Images(settings, data, [], make_loss(settings.loss))
+            Trainer(settings, task, Path(folder), taken, say=lambda text: None).run()
             losses.append([entry["loss"] for entry in entries_of(Path(folder) / "log.jsonl")])
     return {precision: (difference(*losses), 0.02 if precision == "float32" else 0.2)}
 

@@ -13,7 +13,6 @@ ALLOWED = {
     r"E-LPIPS needs its fitted weights": "its authors' weights may not be shipped",
     r"this machine may have room for them": "images of 16 TiB",
     r"strace may not trace here": "some containers forbid it",
-    r"oidnDenoise, of an OIDN release, is not in PATH": "no registry has that program",
     r"the compiler has no ": "sanitizers that a compiler comes without",
     r"clang has no libFuzzer": "the same",
     r"could not import 'atheris'": "it has no wheel for every Python",

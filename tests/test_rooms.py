@@ -33,9 +33,7 @@ ngpt.report
 ngpt.measure
 ngpt.sequence.flicker
 ngpt.training
-ngpt.sequence.train
 ngpt.export
-ngpt.sequence.export
 ngpt.evaluation
 ngpt.cli
 data_gen.llvm data_gen.scenes.grids data_gen.budget

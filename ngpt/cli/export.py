@@ -57,7 +57,7 @@ def write(args: argparse.Namespace) -> list[Path]:
 
         models = {args.output: l2_model(args.alpha)}
     elif kind_of(args.weights) == "temporal":
-        from ngpt.sequence.export import temporal_model
+        from ngpt.export.temporal import temporal_model
 
         if args.vector:
             raise NgptError(f"{args.weights}: blends frames; leave --vector out")

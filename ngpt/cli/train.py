@@ -2,7 +2,10 @@
 
 import argparse
 import json
+from collections.abc import Callable
 from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
 
 from ngpt.cli.arguments import add_config, config_of, write_template
 from ngpt.errors import NgptError, WrongUse
@@ -28,16 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> int:
     config = config_of(args, configs.TRAINING)
     # Here and not above: a mistyped option is said at once, not after the seconds that torch takes to come in.
-    from ngpt.system.parts import find_renderer
     from ngpt.training.cost import cost
     from ngpt.training.distributed import Processes
-    from ngpt.training.examples import Mixture
-    from ngpt.training.folders import open_crops
-    from ngpt.training.loss import make_loss
     from ngpt.training.run_record import write_record
     from ngpt.training.run_summary import PAGE
     from ngpt.training.settings import read_settings
-    from ngpt.training.split import split
     from ngpt.training.trainer import Trainer, show
 
     settings = read_settings(config, args.set)
@@ -54,19 +52,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
         raise WrongUse("--out is missing: the folder for checkpoint, weights and log")
     out = make_folder(args.out)
     say = (lambda text: None) if console.quiet else show
-    loss = make_loss(settings.loss)
     processes = Processes()
     with ExitStack() as stack:
         if processes.rank == 0:
             stack.enter_context(exclusive(out))
-        on_disk = [folder for folder in settings.data.folders if not folder.endswith(".toml")]
-        found = [crop for folder in on_disk for crop in open_crops(folder)]
-        crops, held_out, told = split(found, settings.data.validation, settings.data.validation_share)
-        if told and processes.rank == 0:
-            say(told)
-        made = [configs.find_config(f, configs.DATASET) for f in settings.data.folders if f.endswith(".toml")]
-        streams = [stack.enter_context(find_renderer().stream(config, settings.data.kept)) for config in made]
-        trainer = Trainer(settings, Mixture(crops, *streams), held_out, loss, out, processes, say=say)
+        trainer = Trainer(settings, _task(settings, out, stack, processes, say), out, processes, say=say)
         if trainer.checkpoint.exists():
             trainer.resume()
             if trainer.step >= settings.run.steps:
@@ -86,3 +76,29 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if processes.rank == 0:
         say(f"{out / PAGE}: open it in a browser")
     return 0 if finished or not trainer.signal else 128 + trainer.signal
+
+
+def _task(settings: Any, out: Path, stack: ExitStack, processes: Any, say: Callable[[str], None]) -> Any:
+    """What the settings say to train, on the data in their folders; ``stack`` closes those that are being rendered."""
+    from ngpt.system.parts import find_renderer
+    from ngpt.training.clips import clips
+    from ngpt.training.crops import Mixture, open_crops
+    from ngpt.training.images import Images
+    from ngpt.training.loss import make_loss
+    from ngpt.training.split import split
+    from ngpt.training.temporal import Blending
+
+    loss = make_loss(settings.loss)
+    on_disk = [folder for folder in settings.data.folders if not folder.endswith(".toml")]
+    if settings.temporal:
+        found = list(clips(on_disk, settings.temporal.methods, out / "results"))
+    else:
+        found = [crop for folder in on_disk for crop in open_crops(folder)]
+    training, held_out, told = split(found, settings.data.validation, settings.data.validation_share)
+    if told and processes.rank == 0:
+        say(told)
+    if settings.temporal:
+        return Blending(settings, training, held_out)
+    made = [configs.find_config(f, configs.DATASET) for f in settings.data.folders if f.endswith(".toml")]
+    streams = [stack.enter_context(find_renderer().stream(config, settings.data.kept)) for config in made]
+    return Images(settings, Mixture(training, *streams), held_out, loss)

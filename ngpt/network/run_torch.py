@@ -12,6 +12,7 @@ from torch import Tensor
 from ngpt.errors import NgptError
 from ngpt.network import features, inputs, padding, tiles
 from ngpt.network.config import ModelConfig
+from ngpt.network.device import default_device
 from ngpt.network.model import Reconstructor
 from ngpt.network.transfer import signed_exp
 from ngpt.network.weights import load_weights
@@ -91,7 +92,7 @@ def _model(path: str, _modified: int, device: str) -> Reconstructor:
     model, _ = load_weights(path)
     in_children(one_thread)
     if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+        device = str(default_device())
     try:
         return model.to(device)
     except (RuntimeError, AssertionError) as error:

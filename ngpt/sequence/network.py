@@ -8,7 +8,7 @@ is the result of the rules. The network corrects the rules by no more than C: wh
 change of all light, it stands. Changes of light have coarse scales, and moving reflections fine ones; noise that is
 left in x has both. Whatever the network says, y lies between x and h at each scale, and a surface that comes into sight
 takes nothing from what hid it. The network was trained on frames of moving shots, with histories that it made itself
-(``ngpt.sequence.train``).
+(``ngpt.training.temporal``).
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def _signed_log(x: np.ndarray) -> np.ndarray:
 
 
 class Network:
-    """The network of a file (``ngpt.sequence.export``), as ``Corrections``.
+    """The network of a file (``ngpt.export.temporal``), as ``Corrections``.
 
     Raises NgptError for a file that is no such network, or one of other inputs.
     """

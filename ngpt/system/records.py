@@ -5,6 +5,7 @@ import tomllib
 from collections.abc import Callable
 from dataclasses import MISSING, Field, fields, is_dataclass
 from pathlib import Path
+from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from ngpt.errors import NgptError, did_you_mean
@@ -115,6 +116,8 @@ class _OtherType(Exception):
 def _converted(value: Any, hint: Any, where: str) -> Any:
     """``value`` as the annotation has it."""
     kinds = get_args(hint)
+    if get_origin(hint) is UnionType:  # a table that may be left out
+        return _converted(value, kinds[0], where)
     if is_dataclass(hint):
         return from_table(hint, value, where)  # type: ignore[arg-type]
     if hint is Any:

@@ -29,27 +29,29 @@ def entries(kind: type) -> list[tuple[tuple[str, ...], str]]:
     return found
 
 
-def template(text: str, tables: Mapping[str, type], others: Mapping[str, Mapping[str, tuple[str, Any]]] = {}) -> str:
+def template(
+    text: str, tables: Mapping[str, type | None], others: Mapping[str, Mapping[str, tuple[str, Any]]] = {}
+) -> str:
     """A configuration, with a comment for every parameter that it leaves at its default: what it means, and what that
     is. What is set by it stays as it is.
 
-    ``tables``  dataclasses of the tables, by name; "" is the top
+    ``tables``  dataclasses of the tables, by name; "" is the top, None a table that goes without comments
     ``others``  further parameters of a table by name: meaning and default
     """
     given = tomllib.loads(text)
     heads = [match.start() for match in re.finditer(_HEAD, text, re.M)]
     sections = [text[start:end] for start, end in zip([0, *heads], [*heads, len(text)], strict=True)]
     present = [match[1] if (match := re.match(_HEAD, section, re.M)) else "" for section in sections]
-    for table in tables:
-        if table not in present:
+    for table, kind in tables.items():
+        if kind and table not in present:
             sections.append(f"[{table}]\n")
             present.append(table)
     lines = []
     for table, section in zip(present, sections, strict=True):
         rest = ""
-        if table in tables:
+        if kind := tables.get(table):
             values = given.get(table, {}) if table else given
-            rest = _commented(tables[table], {*values, *tables}, others.get(table, {}))
+            rest = _commented(kind, {*values, *tables}, others.get(table, {}))
         lines.append(f"{section.rstrip()}\n{rest}\n")
     return "\n".join(line.rstrip("\n") + "\n" for line in lines)
 

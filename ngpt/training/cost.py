@@ -3,15 +3,30 @@
 from typing import Any
 
 import torch
+from torch import nn
 
 from ngpt.network import features, padding
 from ngpt.network.model import Reconstructor, parameters
 from ngpt.network.unet import Convolution, LastConvolution
+from ngpt.sequence.network import INPUTS
+from ngpt.training import temporal
 from ngpt.training.settings import Settings
+
+
+def network_of(settings: Settings) -> tuple[nn.Module, int]:
+    """The network that a run trains, and the channels that it reads."""
+    if settings.model is None:
+        return temporal.network(), len(INPUTS)
+    return Reconstructor(settings.model).network, features.channels(settings.model.inputs)
 
 
 def per_pixel(model: Reconstructor) -> tuple[float, float]:
     """For each pixel of the (padded) image: multiplications, and numbers that go in and out of convolutions."""
+    return counted(model.network, features.channels(model.config.inputs))
+
+
+def counted(model: Any, channels: int) -> tuple[float, float]:
+    """``per_pixel`` of a network that reads so many channels."""
     size, macs, numbers = 8 * model.alignment, 0, 0
 
     def count(module: Any, args: tuple, output: torch.Tensor) -> None:
@@ -29,7 +44,7 @@ def per_pixel(model: Reconstructor) -> tuple[float, float]:
     hooks = [m.register_forward_hook(count) for m in model.modules() if isinstance(m, kinds) and m not in last]
     with torch.no_grad():
         device = next(model.parameters()).device
-        model.network(torch.zeros(1, features.channels(model.config.inputs), size, size, device=device))
+        model(torch.zeros(1, channels, size, size, device=device))
     for hook in hooks:
         hook.remove()
     return macs / size**2, numbers / size**2
@@ -37,8 +52,8 @@ def per_pixel(model: Reconstructor) -> tuple[float, float]:
 
 def cost(settings: Settings) -> str:
     """A few lines on parameters, multiplications and memory; nothing is trained."""
-    model, run = Reconstructor(settings.model), settings.run
-    macs, numbers = per_pixel(model)
+    (model, channels), run = network_of(settings), settings.run
+    macs, numbers = counted(model, channels)
     pixels = run.batch * (settings.data.crop + 2 * padding.MARGIN) ** 2
     # Backward costs twice as much as forward.
     step = 3 * macs * pixels
@@ -48,8 +63,15 @@ def cost(settings: Settings) -> str:
     lines = {
         "parameters": f"{parameters(model):,}",
         "cost per pixel": f"{macs / 1e3:,.1f} thousand multiplications, {macs * 1280 * 720 / 1e9:,.1f} G at 1280x720",
-        "cost per step": f"{step / 1e9:,.0f} G multiplications, forward and backward, batch {run.batch}",
-        "whole run": f"{step * run.steps / 1e15:,.2f} P multiplications, {run.steps:,} steps",
-        "memory": f"about {(activations + states) / 2**30:.2f} GiB while training",
     }
+    # Frames of shots are as large as their set has them.
+    lines |= (
+        {}
+        if settings.temporal
+        else {
+            "cost per step": f"{step / 1e9:,.0f} G multiplications, forward and backward, batch {run.batch}",
+            "whole run": f"{step * run.steps / 1e15:,.2f} P multiplications, {run.steps:,} steps",
+            "memory": f"about {(activations + states) / 2**30:.2f} GiB while training",
+        }
+    )
     return "\n".join(f"{name:<16}{value}" for name, value in lines.items())

@@ -1,9 +1,9 @@
-"""Training examples from crops: datasets on disk, folders of stacks with references, or anything alike."""
+"""Training examples from crops (``ngpt.training.crops``)."""
 
 import copy
 from collections import OrderedDict
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,54 +16,12 @@ from ngpt.network.run_torch import layers_of
 from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
 from ngpt.training.augment import Augmentation, Layers, quieter, rarer
+from ngpt.training.crops import Crop
 
 # What the names of layers begin with that judge one half of a pair.
 OTHER = "other/"
 # Padding varies by up to this around ``padding.MARGIN``, so that networks do not learn where borders are.
 JITTER = 7
-
-
-class Crop(Protocol):
-    """One view with a reference and several inputs, from ``ngpt.training.dataset`` or ``StackFolder``.
-
-    Of a crop without a reference, only ``paired`` and its two stacks are used.
-    """
-
-    scene: str
-    inputs: int
-    spp: tuple[int, ...]
-    paired: bool
-
-    def stack(self, k: int) -> GradientStack: ...
-
-    @property
-    def reference(self) -> np.ndarray: ...
-
-    @property
-    def reference_direct(self) -> np.ndarray: ...
-
-    @property
-    def reference_caustic(self) -> np.ndarray: ...
-
-    @property
-    def reference_halves(self) -> tuple[np.ndarray, ...]: ...
-
-
-class Mixture(Sequence[Any]):
-    """Several sequences of crops as one; they may grow while they are read, as streams do."""
-
-    def __init__(self, *parts: Any):
-        self.parts = parts
-
-    def __len__(self) -> int:
-        return sum(len(part) for part in self.parts)
-
-    def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        for part in self.parts:
-            if index < len(part):
-                return part[index]
-            index -= len(part)
-        raise IndexError(index)
 
 
 class Examples(TorchDataset):

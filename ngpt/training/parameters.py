@@ -5,24 +5,33 @@ in the first sentence of its file.
 """
 
 import re
+import tomllib
 from dataclasses import MISSING, Field, fields
 from inspect import cleandoc
 from typing import get_type_hints
 
 from ngpt.network.config import ModelConfig
-from ngpt.network.model import Reconstructor, parameters
+from ngpt.network.model import parameters
 from ngpt.system import configs
 from ngpt.system.records import described
 from ngpt.system.templates import entries, template, toml
 from ngpt.training.augment import Augmentation
-from ngpt.training.cost import per_pixel
+from ngpt.training.cost import counted, network_of
 from ngpt.training.loss import TERMS, LossSettings
-from ngpt.training.settings import DataSettings, OptimizerSettings, RunSettings, Settings, read_settings
+from ngpt.training.settings import (
+    DataSettings,
+    OptimizerSettings,
+    RunSettings,
+    Settings,
+    TemporalSettings,
+    read_settings,
+)
 
 # The tables of a configuration and what reads them; "" is its top.
 TABLES: dict[str, type] = {
     "": Settings,
     "model": ModelConfig,
+    "temporal": TemporalSettings,
     "data": DataSettings,
     "augmentation": Augmentation,
     "loss": LossSettings,
@@ -45,12 +54,18 @@ def parameter_tables() -> str:
     return "\n".join(lines)
 
 
+def tables_of(text: str) -> dict[str, type | None]:
+    """The tables that a configuration may have; None for those of the other kind of network."""
+    other = ("temporal",) if "model" in tomllib.loads(text) else ("model", "loss", "augmentation")
+    return TABLES | dict.fromkeys(other)
+
+
 def training_template(text: str) -> str:
     """``ngpt.system.templates.template`` of a configuration, with the weights of other packages' terms."""
     others = {
         name: f"weight of another package's term: {cleandoc(TERMS[name].__doc__ or name)}" for name in TERMS.load()
     }
-    return template(text, TABLES, {"loss": {name: (meaning, 0.0) for name, meaning in others.items()}})
+    return template(text, tables_of(text), {"loss": {name: (meaning, 0.0) for name, meaning in others.items()}})
 
 
 def _default(field: Field) -> str:
@@ -66,8 +81,8 @@ def configuration_table() -> str:
 
 def configuration_row(name: str) -> str:
     path = configs.find_config(name, configs.TRAINING)
-    model = Reconstructor(read_settings(path).model)
-    cost, _ = per_pixel(model)
+    model, channels = network_of(read_settings(path))
+    cost, _ = counted(model, channels)
     return f"| `{name}` | {purpose(path.read_text())} | {parameters(model):,} | {cost / 1e3:.0f} |"
 
 

@@ -160,10 +160,11 @@ def _state(run: Run) -> str:
 
 def _plots(runs: list[Run]) -> dict[str, str]:
     """Curves over the steps: for one run, curves of all its numbers; for several runs, one line for each run."""
+    plots: dict[str, str] = {}
     if len(runs) == 1:
-        run = runs[0]
-        error = {"network": run.line("relMSE"), "base": run.line("relMSE base"), "input": run.line("relMSE primal")}
-        plots = {"relMSE of the views held out": curves("steps", error)}
+        for title, name in (("relMSE of the views held out", "relMSE"), ("flicker of the shots held out", "flicker")):
+            lines = {"network": name, "base": f"{name} base", "input": f"{name} primal"}
+            plots[title] = curves("steps", {whose: runs[0].line(entry) for whose, entry in lines.items()})
     else:
         plots = {"relMSE of the views held out": curves("steps", {run.name: run.line("relMSE") for run in runs})}
         unit, seconds = ("hours", 3600.0) if any(run.last("seconds") >= 3600 for run in runs) else ("minutes", 60.0)

@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
-from ngpt.network.model import Reconstructor, parameters
+from ngpt.network.model import parameters
 from ngpt.system import configs
 from ngpt.system.limits import processors
 from ngpt.system.machine import metadata
@@ -17,7 +18,7 @@ from ngpt.training.settings import Settings, published, read_settings
 from ngpt.training.settings_text import difference, flat
 
 
-def write_record(out: Path, settings: Settings, config: Path, model: Reconstructor, device: torch.device) -> None:
+def write_record(out: Path, settings: Settings, config: Path, model: nn.Module, device: torch.device) -> None:
     """Writes the record into the folder ``out``; a run that goes on keeps its ``id``. Folders are named, not where they
     lie. ``base`` is the configuration ``config``, or where that is a file of the user's own, the nearest that comes
     with ngpt."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ngpt.errors import NgptError, WrongUse
+from ngpt.methods import METHODS, unknown_method
 from ngpt.network.config import ModelConfig
 from ngpt.network.features import PARTS
 from ngpt.system.records import from_table, read_toml
@@ -90,14 +91,29 @@ class RunSettings:
 
 
 @dataclass(frozen=True)
+class TemporalSettings:
+    """The network that blends frames (``ngpt.training.temporal``), in place of one that makes images.
+
+    ``methods``  the methods whose results it learns to blend
+    ``round``    steps until the shots are played anew, with histories by the network as it is then
+    ``clips``    shots of one method that are played in a round, drawn at random
+    """
+
+    methods: tuple[str, ...] = ("ngpt-fast", "ngpt-combine", "oidn", "wcv")
+    round: int = 400
+    clips: int = 120
+
+
+@dataclass(frozen=True)
 class Settings:
-    """All of a run. ``loss`` is for ``ngpt.training.loss.make_loss``.
+    """All of a run. ``loss`` is for ``ngpt.training.loss.make_loss``. Of ``model`` and ``temporal`` there is one.
 
     ``initial``  weights to start from, with the same [model]: a file, or a network that comes with ngpt, by its name;
                  "" starts from chance
     """
 
-    model: ModelConfig
+    model: ModelConfig | None = None
+    temporal: TemporalSettings | None = None
     data: DataSettings = field(default_factory=DataSettings)
     augmentation: Augmentation = field(default_factory=Augmentation)
     loss: dict[str, Any] = field(default_factory=dict)
@@ -107,7 +123,7 @@ class Settings:
 
     def to_dict(self) -> dict[str, Any]:
         """What JSON holds, and ``from_dict`` reads."""
-        return dataclasses.asdict(self)
+        return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
 
 
 def read_settings(path: str | Path, changes: list[str] = ()) -> Settings:  # type: ignore[assignment]
@@ -150,7 +166,11 @@ def _check(settings: Settings, path: str) -> None:
     ):
         if value not in allowed:
             raise NgptError(f"{path}: {name} = '{value}': choose one of: {', '.join(allowed)}")
-    parts = [name for name in PARTS if name in settings.model.layers]
+    if (settings.model is None) == (settings.temporal is None):
+        raise NgptError(f"{path}: needs [model], for a network that makes images, or [temporal], and not both")
+    if settings.temporal is not None:
+        _check_temporal(settings, settings.temporal, path)
+    parts = [name for name in PARTS if settings.model is not None and name in settings.model.layers]
     made = [name for name in ("quieter", "rarer") if getattr(settings.augmentation, name)]
     if parts and made:
         raise NgptError(
@@ -168,6 +188,21 @@ def _check(settings: Settings, path: str) -> None:
         )
     if not 0 <= settings.optimizer.ema < 1:
         raise NgptError(f"{path}: optimizer.ema = {settings.optimizer.ema}: must be at least 0 and below 1")
+
+
+def _check_temporal(settings: Settings, table: TemporalSettings, path: str) -> None:
+    for name in ("round", "clips"):
+        if getattr(table, name) < 1:
+            raise NgptError(f"{path}: temporal.{name} = {getattr(table, name)}: must be at least 1")
+    if not table.methods:
+        raise NgptError(f"{path}: temporal.methods = []: give one at least")
+    for method in table.methods:
+        if method not in METHODS:
+            raise NgptError(f"{path}: temporal.methods: {unknown_method(method)}")
+    if settings.loss or settings.augmentation != Augmentation():
+        raise NgptError(f"{path}: [loss] and [augmentation] are for networks that make images; leave them out")
+    if streams := [folder for folder in settings.data.folders if folder.endswith(".toml")]:
+        raise NgptError(f"{path}: data.folders: {streams[0]}: shots are not rendered meanwhile; make the set before")
 
 
 def _change(values: dict[str, Any], change: str) -> None:

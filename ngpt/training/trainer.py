@@ -11,37 +11,29 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader
 
 from ngpt.errors import NgptError
-from ngpt.network import padding, weights
-from ngpt.network.model import Reconstructor, parameters
-from ngpt.network.transfer import signed_exp
-from ngpt.system import files, limits
+from ngpt.network import weights
+from ngpt.network.model import parameters
+from ngpt.system import files
 from ngpt.system.console import print_line
 from ngpt.system.files import atomic_output
 from ngpt.system.records import check
 from ngpt.training.distributed import Processes
-from ngpt.training.examples import JITTER, OTHER, Examples, collated
 from ngpt.training.loggers import Logger, Meter, loggers
 from ngpt.training.run_page import write_run
 from ngpt.training.run_summary import CHECKPOINT, LOG, WEIGHTS
 from ngpt.training.schedule import learning_rate, update_average, warmup_of
 from ngpt.training.settings import Settings, changed, from_dict, published
-from ngpt.training.validation import validate, views
+from ngpt.training.task import Task
 from ngpt.version import __version__
-
-Loss = Callable[..., tuple[Tensor, dict[str, Tensor]]]
-
-# Logarithms beyond this are cut before exp: 4.9e8 times the typical radiance, far above anything one wants to learn.
-LIMIT = 20.0
 
 
 def show(text: str) -> None:
@@ -52,51 +44,29 @@ def show(text: str) -> None:
 class Trainer:
     """One run in the folder ``out``, new or continued.
 
-    ``crops`` and ``held_out`` are for training and validation. ``loss`` takes scene-linear prediction and target
-    (N, 3, H, W) and a generator of the step's random numbers. If there are pairs, it also takes what judges them, and
-    the target covers only the other examples, None if there are none. Files in ``out``: ``checkpoint.safetensors``,
-    ``weights.safetensors`` (for inference), ``best.safetensors`` (the weights with the least validation error),
-    ``log.jsonl``, ``log.csv``, ``run.html``, ``tensorboard/``, ``validation-STEP.png``. If crops are rendered
-    meanwhile, as in a stream, no two runs are alike.
+    ``task`` is what it trains. Files in ``out``: ``checkpoint.safetensors``, ``weights.safetensors`` (for inference),
+    ``best.safetensors`` (the weights with the least validation error), ``log.jsonl``, ``log.csv``, ``run.html``,
+    ``tensorboard/``, ``validation-STEP.png``.
     """
 
     def __init__(
         self,
         settings: Settings,
-        crops: Sequence[Any],
-        held_out: Sequence[Any],
-        loss: Loss,
+        task: Task,
         out: str | Path,
         processes: Processes | None = None,
         say: Callable[[str], None] = show,
     ):
-        if not len(crops):
-            raise NgptError("no crops to train on: data.folders is empty, or data.validation holds out every scene")
-        self.settings, self.loss, self.out, self.say = settings, loss, Path(out), say
+        self.settings, self.task, self.out, self.say = settings, task, Path(out), say
         self.processes = processes or Processes()
         self.device = self.processes.device
         torch.manual_seed(settings.run.seed)
-        self.model = Reconstructor(settings.model).to(self.device)
+        self.model = task.network().to(self.device)
         if settings.initial:
-            self._start_from(settings.initial)
+            self.model.load_state_dict(task.load(settings.initial).state_dict())
         self.average = copy.deepcopy(self.model) if settings.optimizer.ema else self.model
         self.optimizer = torch.optim.Adam(self.model.parameters(), betas=settings.optimizer.betas, eps=1e-8)
         self.step, self.seconds = 0, 0.0
-        self.held_out = views(held_out, settings.run.views)
-        self.examples = Examples(
-            crops,
-            settings.model,
-            settings.augmentation,
-            settings.data.crop,
-            settings.run.seed,
-            settings.data.cache << 20,
-            settings.data.pairs,
-        )
-        if (settings.data.crop + 2 * padding.MARGIN) % self.model.alignment:
-            raise NgptError(
-                f"data.crop = {settings.data.crop}: crop + {2 * padding.MARGIN} must be divisible by "
-                f"{self.model.alignment}, the network's coarsest pixel"
-            )
         if settings.run.batch % self.processes.count:
             raise NgptError(
                 f"run.batch = {settings.run.batch}: must be a multiple of the {self.processes.count} processes"
@@ -139,6 +109,8 @@ class Trainer:
             first, second = (parts[moment][name].to(self.device) for moment in ("adam1", "adam2"))
             step = torch.tensor(float(self.step))
             self.optimizer.state[p] = {"step": step, "exp_avg": first, "exp_avg_sq": second}
+        if "task" in parts:
+            self.task.restore(parts["task"], str(self.checkpoint))
         for change in changed(before, self.settings):
             self.say(f"changed since the checkpoint: {change}")
         # What was logged after the checkpoint will be logged again.
@@ -152,7 +124,8 @@ class Trainer:
         NgptError when the loss or its gradient is not finite any more; the batch is saved then.
         """
         run, start, before = self.settings.run, time.monotonic(), self.seconds
-        batches, meter = self._batches(), Meter(self.step, self.device)
+        batches = self.task.batches(self.model, self.step, self.processes)
+        meter = Meter(self.step, self.device)
         if self.processes.rank == 0:
             self._loggers = loggers(self.out, self.step + 1, self.settings)
         previous = {s: signal.signal(s, self._interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
@@ -167,7 +140,7 @@ class Trainer:
                 if self.step % run.log == 0 or last:
                     with self._saved():
                         self._log(entry | {"seconds": round(self.seconds, 1)} | meter.read(self.step))
-                if (self.step % run.validate == 0 or last) and self.held_out:
+                if self.step % run.validate == 0 or last:
                     with self._saved():
                         self.validate()
                 if self.step % run.save == 0 and not last:
@@ -199,6 +172,7 @@ class Trainer:
         tensors = {f"model/{name}": t for name, t in self.model.state_dict().items()}
         if self.average is not self.model:
             tensors |= {f"average/{name}": t for name, t in self.average.state_dict().items()}
+        tensors |= {f"task/{name}": t for name, t in self.task.state().items()}
         for name, p in self.model.named_parameters():
             state = self.optimizer.state.get(p) or {"exp_avg": torch.zeros_like(p), "exp_avg_sq": torch.zeros_like(p)}
             tensors |= {f"adam1/{name}": state["exp_avg"], f"adam2/{name}": state["exp_avg_sq"]}
@@ -221,18 +195,18 @@ class Trainer:
             "torch": torch.__version__,
             "settings": published(self.settings),
         }
-        weights.save_weights(self.out / name, self.average, provenance, overwrite=True)
+        self.task.save(self.out / name, self.average, provenance)
 
     def validate(self) -> None:
-        """Logs the scores of the averaged weights on the views held out, draws some, and keeps the best weights."""
+        """Logs the scores of the averaged weights on what was set aside, draws some, and keeps the best weights."""
         if self.processes.rank == 0:
-            picture = self.out / f"validation-{self.step:07d}.png"
-            scores = validate(self.average, self.held_out, picture, self.settings.run.precision)
-            self._log({"relMSE": scores.network, "relMSE primal": scores.primal, "relMSE base": scores.base})
-            if scores.network < self.best:
-                self.best = scores.network
-                self._save_weights("best.safetensors")
-            write_run(self.out)
+            scores = self.task.validate(self.average, self.out / f"validation-{self.step:07d}.png")
+            if scores:
+                self._log(scores)
+                if scores["relMSE"] < self.best:
+                    self.best = scores["relMSE"]
+                    self._save_weights("best.safetensors")
+                write_run(self.out)
         self.model.train()
 
     def _train(self, batch: dict[str, Tensor]) -> dict[str, float]:
@@ -240,23 +214,15 @@ class Trainer:
         self.model.train()
         run, settings = self.settings.run, self.settings.optimizer
         batch = {name: layer.to(self.device, non_blocking=True) for name, layer in batch.items()}
-        target = batch.pop("target", None)
-        other = {name.removeprefix(OTHER): batch.pop(name) for name in list(batch) if name.startswith(OTHER)}
         generator = torch.Generator(self.device)
         generator.manual_seed(weights.random_state(run.seed, self.step * self.processes.count + self.processes.rank))
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=run.precision == "bfloat16"):
-            logarithm = self.model.predict(batch)
-        edge = padding.MARGIN + JITTER
-        prediction = signed_exp(logarithm[..., edge:-edge, edge:-edge].clamp(-LIMIT, LIMIT))
-        total, parts = self.loss(prediction, target, generator, *([other] if other else []))
+        total, parts = self.task.loss(self.model, batch, generator)
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         self.processes.average_gradients(self.model)
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip or math.inf)
         if not torch.isfinite(total) or not torch.isfinite(norm):
-            judges = {f"{OTHER}{name}": layer for name, layer in other.items()}
-            judges |= {} if target is None else {"target": target}
-            self._give_up(batch | judges, float(total.detach()), float(norm))
+            self._give_up(batch, float(total.detach()), float(norm))
         rate = learning_rate(settings, self.step, run.steps)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
@@ -266,29 +232,6 @@ class Trainer:
         values = {"loss": float(total.detach()), "gradient norm": float(norm), "learning rate": rate}
         return values | {f"loss {name}": float(part.detach()) for name, part in parts.items()}
 
-    def _batches(self) -> Iterator[dict[str, Tensor]]:
-        """The batches of this process, from the current step on."""
-        run, processes = self.settings.run, self.processes
-        size = run.batch // processes.count
-        first = self.step * run.batch
-        indices = (
-            [first + i * run.batch + processes.rank * size + j for j in range(size)]
-            for i in range(run.steps - self.step)
-        )
-        workers = min(self.settings.data.workers, limits.processors())
-        try:
-            yield from DataLoader(
-                self.examples,
-                batch_sampler=indices,  # type: ignore[arg-type]
-                collate_fn=collated,
-                num_workers=workers,
-                persistent_workers=bool(workers),
-                pin_memory=self.device.type == "cuda",
-            )
-        except NgptError as error:
-            # A worker's error comes with the worker's traceback before it.
-            raise NgptError(str(error).rpartition("NgptError: ")[2]) from None
-
     def _give_up(self, batch: dict[str, Tensor], total: float, norm: float) -> None:
         path = self.out / f"bad-batch-{self.step:07d}.safetensors"
         weights.write_tensors(path, batch, {"kind": "batch", "step": self.step}, overwrite=True)
@@ -296,12 +239,6 @@ class Trainer:
             f"step {self.step}: the loss is {total:.3g} and its gradient's norm {norm:.3g}; the batch is in {path}, "
             f"the weights before it in {self.checkpoint}; lower the learning rate, set optimizer.clip, or use float32"
         )
-
-    def _start_from(self, path: str) -> None:
-        model, _ = weights.load_weights(path)
-        if model.config != self.settings.model:
-            raise NgptError(f"{path}: is another [model] than the run's: {model.config}")
-        self.model.load_state_dict(model.state_dict())
 
     def _interrupt(self, number: int = signal.SIGINT, *_: Any) -> None:
         self.say("stopping after this step; run the same command again to continue")

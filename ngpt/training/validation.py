@@ -25,6 +25,35 @@ from ngpt.training.examples import judges_of
 _PICTURES = 6
 
 
+class Pictures:
+    """Rows of input, result and reference of some of ``count`` results, in one picture."""
+
+    def __init__(self, count: int):
+        self.shown = {int(i * count / _PICTURES) for i in range(_PICTURES)} if count else set()
+        self._rows: list[np.ndarray] = []
+        self._told: list[dict[str, Any]] = []
+
+    def add(self, images: Sequence[np.ndarray], scene: str, spp: int, primal: float, network: float) -> None:
+        """A row of input, result and reference (H, W, 3); ``primal`` and ``network`` are errors of the first two."""
+        stops = auto_exposure(images[-1])
+        self._rows.append(np.hstack([to_srgb8(image, stops) for image in images]))
+        errors = {"relMSE primal": float(primal), "relMSE": float(network)}
+        finite = {name: error for name, error in errors.items() if math.isfinite(error)}
+        self._told.append({"scene": scene, "spp": spp, **finite})
+
+    def write(self, picture: str | Path) -> None:
+        """Writes a PNG, and beside it what its rows are, as JSON: the size of one picture, scenes, samples, errors."""
+        if not self._rows:
+            return
+        # Folders of stacks may hold views of different sizes; those that do not fit are left out.
+        fit = [i for i, row in enumerate(self._rows) if row.shape == self._rows[0].shape]
+        rows = [self._rows[i] for i in fit]
+        with atomic_output(picture, overwrite=True) as temporary:
+            temporary.write_bytes(encode_png(np.ascontiguousarray(np.vstack(rows))))
+        size = [rows[0].shape[1] // 3, rows[0].shape[0]]
+        write_json(Path(picture).with_suffix(".json"), {"size": size, "views": [self._told[i] for i in fit]})
+
+
 @dataclass(frozen=True)
 class Scores:
     """Geometric means, over the views, of the trimmed relMSE; with direct emission if the network reads it.
@@ -42,9 +71,13 @@ class Scores:
 
 def views(crops: Sequence[Any], count: int) -> list[tuple[Any, int]]:
     """At most ``count`` of all (crop, input), evenly spread."""
-    every = [(crop, k) for crop in crops for k in range(crop.inputs)]
+    return spread([(crop, k) for crop in crops for k in range(crop.inputs)], count)
+
+
+def spread(every: Sequence[Any], count: int) -> list[Any]:
+    """At most ``count`` of them, evenly spread."""
     if len(every) <= count:
-        return every
+        return list(every)
     return [every[int(i * len(every) / count)] for i in range(count)]
 
 
@@ -52,12 +85,10 @@ def views(crops: Sequence[Any], count: int) -> list[tuple[Any, int]]:
 def validate(
     model: Reconstructor, views: Sequence[tuple[Any, int]], picture: str | Path = "", precision: str = "float32"
 ) -> Scores:
-    """Scores over views (crop, input); with ``picture``, rows of input, result and reference of some, as a PNG, and
-    beside it what they are, as JSON: the size of one picture, and of each row scene, samples and errors."""
+    """Scores over views (crop, input); with ``picture``, some of them are drawn into that file (``Pictures``)."""
     model.eval()
     device = next(model.parameters()).device
-    primal, base, network, rows, told = [], [], [], [], []
-    shown = {int(i * len(views) / _PICTURES) for i in range(_PICTURES)}
+    primal, base, network, pictures = [], [], [], Pictures(len(views) if picture else 0)
     for index, (crop, k) in enumerate(views):
         data = repair(crop.stack(k), model.config.reads_gradients)
         halves = judges_of(crop, model.config)
@@ -70,20 +101,9 @@ def validate(
         network.append(relmse_trimmed(image, *halves))
         if model.config.base:
             base.append(relmse_trimmed(base_image(data, model.config.base), *halves))
-        if picture and index in shown:
-            stops = auto_exposure(reference)
-            rows.append(np.hstack([to_srgb8(i, stops) for i in (given, image, reference)]))
-            errors = {"relMSE primal": float(primal[-1]), "relMSE": float(network[-1])}
-            finite = {name: error for name, error in errors.items() if math.isfinite(error)}
-            told.append({"scene": crop.scene, "spp": int(crop.spp[k]), **finite})
-    if picture and rows:
-        # Folders of stacks may hold views of different sizes; those that do not fit are left out.
-        fit = [i for i, row in enumerate(rows) if row.shape == rows[0].shape]
-        rows, told = [rows[i] for i in fit], [told[i] for i in fit]
-        with atomic_output(picture, overwrite=True) as temporary:
-            temporary.write_bytes(encode_png(np.ascontiguousarray(np.vstack(rows))))
-        size = [rows[0].shape[1] // 3, rows[0].shape[0]]
-        write_json(Path(picture).with_suffix(".json"), {"size": size, "views": told})
+        if index in pictures.shown:
+            pictures.add((given, image, reference), crop.scene, int(crop.spp[k]), primal[-1], network[-1])
+    pictures.write(picture)
     return Scores(_mean(primal), _mean(base), _mean(network))
 
 

@@ -15,7 +15,7 @@ from data_gen.dataset.config import read_config as read_data
 from ngpt.evaluation.config import Config as EvaluationConfig
 from ngpt.evaluation.config import read_config as read_evaluation
 from ngpt.training.loss import make_loss
-from ngpt.training.parameters import TABLES
+from ngpt.training.parameters import TABLES, tables_of
 from ngpt.training.settings import read_settings
 
 KINDS = {"train": configs.TRAINING, "dataset": configs.DATASET, "evaluate": configs.EVALUATION}
@@ -24,13 +24,13 @@ ON_A_BASE = {("evaluate", "eval-640")}
 ALL = [(verb, name) for verb, kind in KINDS.items() for name in configs.names(kind) if (verb, name) not in ON_A_BASE]
 
 
-def keys(verb: str) -> set[str]:
+def keys(verb: str, text: str) -> set[str]:
     """All that can be set: "table.key"."""
     if verb == "train":
         return {
             f"{table}.{field.name}"
-            for table, kind in TABLES.items()
-            for field in fields(kind)
+            for table, kind in tables_of(text).items()
+            for field in (fields(kind) if kind else ())
             if table or field.name not in TABLES
         }
     kind = DataConfig if verb == "dataset" else EvaluationConfig
@@ -57,7 +57,7 @@ def test_it_is_the_configuration_and_offers_all_that_could_be_set(verb, name, tm
     read, text = READERS[verb], path.read_text()
     given = read(configs.find_config(name, KINDS[verb]))
     assert read(path) == given
-    assert keys(verb) <= found(verb, text)
+    assert keys(verb, text) <= found(verb, text)
     offered.write_text(re.sub(r"^# (\w+ = .*)$", r"\1", text, flags=re.M))
     assert offered.read_text() != text
     everything = read(offered)

@@ -19,7 +19,7 @@ from ngpt.cli import main
 from ngpt.export.halves import POINTS
 from ngpt.network.weights import load_weights, read_tensors, save_weights, write_tensors
 from ngpt.sequence.network import INPUTS
-from ngpt.sequence.train import WIDTHS, network
+from ngpt.training.temporal import WIDTHS, network
 
 CONFIG = dense(("primal", "base", "primal_se", "dx_se"), "wcv", start=("primal", "base"))
 STEPS = 1000

@@ -1,4 +1,4 @@
-"""Shared by the tests of the network."""
+"""All tests of the network run on one thread."""
 
 import pytest
 

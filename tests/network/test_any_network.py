@@ -1,10 +1,11 @@
-"""What all networks must do, of every kind and with every head: any size, any exposure, any light, and tiles."""
+"""What all networks must do, of every kind and with every head: any size, exposure and light, tiles, files, slopes."""
 
 import pytest
 import torch
 from networks import NETWORKS, brighter, layers_for, untrained
 
 from ngpt.network.run_torch import reconstruct
+from ngpt.network.weights import load_weights, save_weights
 
 every_network = pytest.mark.parametrize("name", NETWORKS)
 
@@ -44,3 +45,22 @@ def test_tiles_do_not_show(name):
     layers = layers_for(model.config, 24, 2 * tile)
     whole = made(model, layers)
     assert torch.allclose(reconstruct(model, layers, tile=tile), whole, rtol=1e-4, atol=1e-5)
+
+
+@every_network
+def test_a_file_gives_the_network_back_and_every_weight_has_a_slope(name, tmp_path):
+    """Of each output of the last convolution: what heads make of a prediction reaches training."""
+    # Closer to a beginning: far from it, codes of OIDN's shape are beyond what floats hold.
+    model = untrained(NETWORKS[name], 0.02)
+    layers = layers_for(model.config, 32, 32)
+    save_weights(tmp_path / "w.safetensors", model, {})
+    again, _ = load_weights(tmp_path / "w.safetensors")
+    assert again.config == model.config and torch.equal(made(again, layers), made(model, layers))
+    model.train()(layers).square().mean().backward()
+    slopes = [parameter.grad for parameter in model.parameters()]
+    assert all(torch.isfinite(slope).all() for slope in slopes)
+    # Of OIDN's activations some have no slope at random weights.
+    assert model.config.network == "oidn" or all(slope.abs().max() > 0 for slope in slopes)
+    if model.config.sweeps:
+        rows = model.network.head.convolution.weight.grad[model.config.head.inner.outputs :]
+        assert rows.flatten(1).abs().amax(1).min() > 0

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +9,12 @@ import pytest
 from full_stack import full_layers, full_stack
 
 from ngpt.errors import NgptError
-from ngpt.methods import METHODS, reconstruct
+from ngpt.methods import reconstruct
 from ngpt.network.run_onnx import Cancelled, Network
 from ngpt.network.shipped import WEIGHTS
-from ngpt.stack import GradientStack
 
 FAST = WEIGHTS / "ngpt-fast.onnx"
+SIZE = (333, 497)
 
 
 @pytest.fixture(scope="module")
@@ -24,33 +23,38 @@ def network():
 
 
 @pytest.fixture(scope="module")
-def image():
+def image(network):
     """Layers, with the base, of an image that takes many tiles, and the whole of it."""
-    layers = full_layers(333, 497)
+    layers = full_layers(*SIZE)
     layers["base"] = layers["primal"] * 0.9
-    return layers, Network(FAST).reconstruct(layers)
+    return layers, network.reconstruct(layers)
 
 
-def least(network, size=(333, 497)):
-    """MiB of the smallest tile of an image of that size."""
-    with pytest.raises(NgptError) as caught:
-        network.plan(*size, 3)
-    return int(str(caught.value).split("takes ")[1].split()[0])
+@pytest.fixture(scope="module")
+def least(network):
+    """MiB of the smallest tile of that image, as the message says it."""
+    with pytest.raises(NgptError, match=r"smallest tile takes (\d+) MiB, and 3 MiB are allowed") as caught:
+        network.plan(*SIZE, 3)
+    found = int(str(caught.value).split("takes ")[1].split()[0])
+    assert network.plan(*SIZE, found)[0]
+    return found
 
 
 # The smallest tiles are mostly overlap, and take long.
 SMALLEST = [pytest.param(1, 1, marks=pytest.mark.slow), pytest.param(1.3, 2, marks=pytest.mark.slow)]
 
 
-@pytest.mark.parametrize(("tiles", "batch"), [(1.7, 1), (1.3, 1), (1.3, 3), *SMALLEST])
-def test_tiles_do_not_show(network, image, tiles, batch):
+@pytest.mark.parametrize(("tiles", "batch"), [(1.7, 1), (1.3, 3), *SMALLEST])
+def test_tiles_do_not_show_and_tell_how_far_they_are(network, image, least, tiles, batch):
     """In memory for so many of the smallest tiles."""
     layers, whole = image
-    memory = int(tiles * batch * least(network))
-    tiles, size = network.plan(333, 497, memory, batch)
+    memory, calls = int(tiles * batch * least), []
+    tiles, size = network.plan(*SIZE, memory, batch)
     assert len(tiles) > 1 and size[0] * size[1] * network.bytes * batch <= memory * 2**20
-    tiled = network.reconstruct(layers, memory=memory, batch=batch)
+    tiled = network.reconstruct(layers, memory=memory, batch=batch, progress=lambda *call: calls.append(call))
     assert np.abs(tiled - whole).max() <= 1e-5 * whole.max()
+    assert calls[0] == (0, len(tiles)) and calls[-1] == (len(tiles), len(tiles)) and calls == sorted(calls)
+    assert batch > 1 or len(calls) == len(tiles) + 1
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 900), (1080, 1920), (333, 1001), (4320, 8192)])
@@ -67,98 +71,86 @@ def test_plans_cover_every_pixel_once_with_all_it_needs(network, size, memory):
     assert (count == 1).all()
 
 
-def test_progress_and_stop(network, image):
-    layers, _ = image
-    calls, memory = [], int(1.7 * least(network))
-    network.reconstruct(layers, memory=memory, progress=lambda *call: calls.append(call))
-    total = calls[0][1]
-    assert total > 3 and calls == [(i, total) for i in range(total + 1)]
+def test_it_stops_when_asked_to(network, image, least):
     seen = []
-    with pytest.raises(Cancelled, match=f"2 of {total}"):
-        network.reconstruct(layers, memory=memory, progress=lambda *call: seen.append(call), stop=lambda: len(seen) > 2)
+    with pytest.raises(Cancelled, match="2 of "):
+        network.reconstruct(
+            image[0], memory=int(1.7 * least), progress=lambda *call: seen.append(call), stop=lambda: len(seen) > 2
+        )
 
 
-def test_memory_that_does_not_hold_a_tile_is_refused_with_what_would(network, image):
-    with pytest.raises(NgptError, match=r"smallest tile takes (\d+) MiB, and 3 MiB are allowed") as caught:
-        network.plan(333, 497, 3)
-    assert str(least(network)) in str(caught.value) and network.plan(333, 497, least(network))[0]
-
-
-@pytest.mark.parametrize("bound", [pytest.param(220, marks=pytest.mark.slow), 400])
-def test_memory_stays_within_the_bound(bound):
-    """In a process of its own, by the largest size it ever had."""
-    code = f"""
-import sys
-from dataclasses import replace
-from pathlib import Path
-sys.path.insert(0, "tests")
-from full_stack import full_layers
-from ngpt.network.run_onnx import Network
-layers = full_layers(700, 900)
+BOUNDED = """
+layers = full_layers(500, 650)
 layers["base"] = layers["primal"]
-network = Network({str(FAST)!r})
-network.reconstruct({{name: layer[:8, :8] for name, layer in layers.items()}})
-def megabytes(field):
-    return int(dict(line.split(":") for line in open("/proc/self/status"))[field].split()[0]) / 1024
-before = megabytes("VmRSS")
-open("/proc/self/clear_refs", "w").write("5")  # forgets the peak so far
-network.reconstruct(layers, memory={bound})
-print(megabytes("VmHWM") - before)
+network = Network(FAST)
+network.reconstruct({name: layer[:8, :8] for name, layer in layers.items()})
+begin()
+network.reconstruct(layers, memory=BOUND)
 """
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
-    result_image = 700 * 900 * 3 * 4 / 2**20
-    assert float(result.stdout) <= bound + result_image
-
-
-@pytest.mark.slow
-def test_8192x4320_pixels_in_4_gib():
-    """Beside the stack itself, which takes 3.4 GiB: repair, base, tiles and the result."""
-    code = """
+# Beside the stack itself, which takes 3.4 GiB: repair, base, tiles and the result.
+LARGE = """
+layers = {name: np.tile(layer, (8, 8, 1)) for name, layer in full_layers(540, 1024).items()}
+layers["dx"][:, -1] = layers["dy"][-1] = 0
+stack = GradientStack(layers)
+del layers
+begin()
+image = reconstruct(stack, "ngpt-fast").image
+assert image.shape == (4320, 8192, 3) and np.isfinite(image).all()
+"""
+MEASURED = """
 import sys
-from dataclasses import replace
-from pathlib import Path
 sys.path.insert(0, "tests")
 import numpy as np
 from full_stack import full_layers
 from ngpt.methods import reconstruct
+from ngpt.network.run_onnx import Network
 from ngpt.stack import GradientStack
-small = full_layers(540, 1024)
-layers = {name: np.tile(layer, (8, 8, 1)) for name, layer in small.items()}
-layers["dx"][:, -1] = layers["dy"][-1] = 0
-stack = GradientStack(layers)
-del layers
 def mebibytes(field):
     return int(dict(line.split(":") for line in open("/proc/self/status"))[field].split()[0]) / 1024
-before = mebibytes("VmRSS")
-open("/proc/self/clear_refs", "w").write("5")
-image = reconstruct(stack, "ngpt-fast").image
-assert image.shape == (4320, 8192, 3) and np.isfinite(image).all()
+def begin():
+    global before
+    before = mebibytes("VmRSS")
+    open("/proc/self/clear_refs", "w").write("5")  # forgets the peak so far
+{program}
 print(mebibytes("VmHWM") - before)
 """
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
-    assert float(result.stdout) <= 4096, result.stdout
 
 
 @pytest.mark.parametrize(
-    ("device", "message"),
-    [("tensorrt", "device 'tensorrt': this build of ONNX Runtime has only: cpu"), ("abacus", "device 'abacus' is unk")],
+    ("program", "most"),
+    [
+        pytest.param(BOUNDED.replace("BOUND", "220"), 220 + 500 * 650 * 3 * 4 / 2**20, marks=pytest.mark.slow),
+        pytest.param(BOUNDED.replace("BOUND", "400"), 400 + 500 * 650 * 3 * 4 / 2**20),
+        pytest.param(LARGE, 4096, marks=pytest.mark.slow),
+    ],
+    ids=["220 MiB", "400 MiB", "8192x4320 in 4 GiB"],
 )
-def test_devices_that_are_not_there_are_named_not_replaced(device, message):
+def test_memory_stays_within_the_bound(program, most):
+    """In a process of its own, by the largest size it ever had; the result is beside the bound of a network."""
+    code = MEASURED.format(program=program.replace("FAST", repr(str(FAST))))
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert float(result.stdout) <= most
+
+
+@pytest.mark.parametrize(
+    ("file", "device", "message"),
+    [
+        (FAST, "tensorrt", "device 'tensorrt': this build of ONNX Runtime has only: cpu"),
+        (FAST, "abacus", "device 'abacus' is unk"),
+        (Path("none.onnx"), "cpu", "no such file"),
+        (WEIGHTS / "ngpt-fast.statistics.onnx", "cpu", r"statistics\.onnx: lacks the metadata"),
+    ],
+)
+def test_devices_and_files_that_are_not_there_are_named_not_replaced(file, device, message):
     with pytest.raises(NgptError, match=message):
-        Network(FAST, device)
+        Network(file, device)
 
 
-def test_bad_files(tmp_path):
-    with pytest.raises(NgptError, match="no such file"):
-        Network(tmp_path / "none.onnx")
-    damaged = tmp_path / "damaged.onnx"
-    damaged.write_bytes(FAST.read_bytes()[:5000])
+def test_a_damaged_file_is_named(tmp_path):
+    (tmp_path / "damaged.onnx").write_bytes(FAST.read_bytes()[:5000])
     with pytest.raises(NgptError, match=r"damaged\.onnx: ONNX Runtime cannot load it"):
-        Network(damaged)
-    with pytest.raises(NgptError, match=r"statistics\.onnx: lacks the metadata"):
-        Network(WEIGHTS / "ngpt-fast.statistics.onnx")
+        Network(tmp_path / "damaged.onnx")
 
 
 def test_the_method_takes_files_of_both_kinds():
@@ -167,19 +159,3 @@ def test_the_method_takes_files_of_both_kinds():
     twin = Path(__file__).parents[2] / "export" / "weights" / "ngpt-fast.safetensors"
     images = [reconstruct(stack, "ngpt-fast", weights=str(path)).image for path in (FAST, twin)]
     assert np.allclose(*images, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("oidn", [True, False])
-def test_auto_takes_the_best_network_there_is(monkeypatch, oidn):
-    if oidn and METHODS["oidn"].missing():
-        pytest.skip(METHODS["oidn"].missing())
-    if not oidn:
-        for name in ("ngpt-combine", "ngpt-primal", "oidn"):
-            monkeypatch.setitem(METHODS, name, replace(METHODS[name], missing=lambda: "OIDN is not installed"))
-    stack = full_stack(20, 30)
-    first = "ngpt-combine" if oidn else "ngpt-fast"
-    assert reconstruct(stack).method == first
-    assert reconstruct(stack, memory=300).method == first
-    bare = {name: layer for name, layer in stack.layers.items() if not name.startswith(("dx", "dy"))}
-    assert reconstruct(GradientStack(bare)).method == ("oidn" if oidn else "nfor")
-    assert reconstruct(GradientStack({"primal": stack["primal"]})).method == ("oidn" if oidn else "nfor")

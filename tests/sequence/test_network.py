@@ -67,11 +67,14 @@ def test_strips_agree_with_the_whole(rng, monkeypatch):
     assert whole.shape == (90, 21, BANDS) and np.allclose(network(inputs), whole, atol=1e-5)
 
 
-def test_other_files_are_refused(tmp_path):
-    pytest.importorskip("onnxruntime")
+@pytest.mark.parametrize("file", ["ngpt-fast.onnx", "none.onnx", "torn.onnx"])
+def test_other_files_are_refused(tmp_path, file):
+    onnx = pytest.importorskip("onnx")
     from ngpt.network.shipped import WEIGHTS
 
-    with pytest.raises(NgptError, match="is no network that blends frames"):
-        Network(WEIGHTS / "ngpt-fast.onnx")
-    with pytest.raises(NgptError, match="no such file"):
-        Network(tmp_path / "none.onnx")
+    torn = onnx.load(module.WEIGHTS)
+    next(entry for entry in torn.metadata_props if entry.key == "ngpt.alignment").value = "much"
+    onnx.save(torn, tmp_path / "torn.onnx")
+    messages = {"ngpt-fast.onnx": "is no network that blends frames", "none.onnx": "no such file"}
+    with pytest.raises(NgptError, match=messages.get(file, "torn.onnx: its metadata .* no whole number")):
+        Network((WEIGHTS if file.startswith("ngpt") else tmp_path) / file)

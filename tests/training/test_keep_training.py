@@ -1,6 +1,5 @@
 """Training that goes on wherever it was, and stands still while someone measures."""
 
-import json
 import os
 import signal
 import subprocess
@@ -10,10 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from ngpt.network.weights import load_weights
 from ngpt.training.settings import read_settings
 from scripts import keep_training
 
 ROOT = Path(__file__).parents[2]
+HERE = {"cwd": ROOT, "env": os.environ | {"PYTHONPATH": str(ROOT)}}
 
 
 @pytest.mark.parametrize("network", ["combine", "fast"])
@@ -23,8 +24,6 @@ def test_it_starts_from_the_weights_in_the_repository(tmp_path, network):
     changes = [words[i + 1] for i, word in enumerate(words) if word == "--set"]
     settings = read_settings(ROOT / "configs" / f"{network}.toml", changes)
     assert settings.run.steps == 7 and all(Path(folder).is_file() for folder in settings.data.folders)
-    from ngpt.network.weights import load_weights
-
     assert load_weights(settings.initial)[0].config == settings.model
     assert settings.data.kept == str(tmp_path / "references") and words[words.index("--out") + 1].startswith(
         str(tmp_path)
@@ -62,27 +61,10 @@ def test_it_stands_still_while_the_file_is_there(tmp_path):
         return marks.exists() and marks.stat().st_size > before
 
     words = [sys.executable, "-c", KEEP, COUNT, str(marks), str(busy)]
-    with subprocess.Popen(words, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}) as process:
+    with subprocess.Popen(words, **HERE) as process:
         until(grows)
         busy.touch()
         until(lambda: not grows())
         # Ended while it stands still, it wakes up to save.
         process.send_signal(signal.SIGTERM)
         assert process.wait(30) == 7
-
-
-@pytest.mark.slow
-def test_a_clone_trains_and_goes_on(renderer, tmp_path):
-    sets = {"views": "inputs = 2\nreference_spp = 4", "pairs": "inputs = 2\nreference_spp = 0"}
-    for name, text in sets.items():
-        (tmp_path / f"{name}.toml").write_text(f"size = 32\nspp = [2, 4]\nscenes = 2\ncrops = 2\n{text}\n")
-    folders = json.dumps([str(tmp_path / f"{name}.toml") for name in sets])
-    for steps in (2, 4):
-        changes = (f"data.folders={folders}", f"run.steps={steps}", "data.crop=32", "run.log=1", "optimizer.ema=0")
-        options = [word for change in changes for word in ("--set", change)]
-        words = [sys.executable, "-m", "scripts.keep_training", "tiny", "--state", str(tmp_path / "state"), *options]
-        subprocess.run(words, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True, timeout=600)
-    log = [json.loads(line) for line in (tmp_path / "state" / "tiny" / "log.jsonl").read_text().splitlines()]
-    assert [entry["step"] for entry in log if "loss" in entry] == [1, 2, 3, 4]
-    assert (tmp_path / "state" / "tiny" / "weights.safetensors").is_file()
-    assert list((tmp_path / "state" / "references").rglob("*.safetensors"))

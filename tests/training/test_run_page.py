@@ -4,62 +4,57 @@ import csv
 import json
 import re
 import sys
+from shutil import copytree
 from types import SimpleNamespace
 from urllib.parse import quote
 
 import pytest
-from crops import SyntheticCrop
+from crops import SyntheticCrop, trainer
 
 from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.network import weights
 from ngpt.system import configs
-from ngpt.training import trainer as trainers
+from ngpt.training import images
 from ngpt.training.run_record import write_record
-from ngpt.training.settings import from_dict
-from ngpt.training.trainer import Trainer
 from ngpt.training.validation import Scores
 
 CROPS = [SyntheticCrop(f"<scene> {i}", i) for i in range(4)]
 MODEL = {"network": "dense", "channels": [4], "units": [1], "inputs": ["primal"]}
-
-
-def loss(prediction, target, generator):
-    value = (prediction - target).abs().mean()
-    return value, {"l1": value}
+RUN = {"batch": 1, "log": 1, "save": 2, "validate": 2}
 
 
 def made(out, steps=6, rate=1e-2, wandb=""):
     """A run of a few steps, with a validation after each second."""
-    out.mkdir(exist_ok=True)
-    run = {"steps": steps, "batch": 1, "log": 1, "save": 2, "validate": 2, "wandb": wandb}
-    values = {"model": MODEL, "data": {"crop": 32}, "optimizer": {"learning_rate": rate, "warmup": 1}, "run": run}
-    settings = from_dict(values, "test")
-    (out / "settings.json").write_text(json.dumps(settings.to_dict()))
-    trainer = Trainer(settings, CROPS[:2], CROPS[2:], loss, out, say=lambda text: None)
-    write_record(out, settings, configs.FOLDER / "tiny.toml", trainer.model, trainer.device)
-    return trainer
+    optimizer = {"learning_rate": rate, "warmup": 1}
+    changes = {"model": MODEL, "optimizer": optimizer, "run": RUN | {"steps": steps, "wandb": wandb}}
+    run = trainer(out, CROPS[:2], CROPS[2:], augmentation={}, **changes)
+    (out / "settings.json").write_text(json.dumps(run.settings.to_dict()))
+    write_record(out, run.settings, configs.FOLDER / "tiny.toml", run.model, run.device)
+    return run
 
 
-def test_a_run_writes_its_page_while_it_goes_on(tmp_path):
-    run = made(tmp_path / "mine")
-    seen = []
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A folder with a finished run, "mine", and what its page held at each step."""
+    folder, seen = tmp_path_factory.mktemp("runs"), []
+    page = folder / "mine" / "run.html"
+    assert made(folder / "mine").run(lambda done, total: seen.append(page.read_text() if page.exists() else ""))
+    return folder, seen
 
-    def progress(done, total):
-        file = tmp_path / "mine" / "run.html"
-        seen.append(file.read_text() if file.exists() else "")
 
-    assert run.run(progress)
+def test_a_run_writes_its_page_while_it_goes_on(finished):
+    folder, seen = finished[0] / "mine", finished[1]
     assert not seen[1] and "4 steps to go" in seen[3] and 'http-equiv="refresh"' in seen[3]
-    text = (tmp_path / "mine" / "run.html").read_text()
+    text = (folder / "run.html").read_text()
     assert "Finished" in text and 'http-equiv="refresh"' not in text
     # Of what crops are called nothing is markup, nothing is fetched, nothing runs.
     assert "&lt;scene&gt; 3, 32 spp" in text and "<scene>" not in text
     assert "<script" not in text and not re.findall(r"(?:src|href)=\"(?!data:)|url\((?!data:)", text)
     for told in ("what differs from tiny", "optimizer.learning_rate", "memory, MiB", "steps a second", "AMD|Intel|cpu"):
         assert re.search(told, text), told
-    rows = list(csv.DictReader((tmp_path / "mine" / "log.csv").open()))
-    log = [json.loads(line) for line in (tmp_path / "mine" / "log.jsonl").read_text().splitlines()]
+    rows = list(csv.DictReader((folder / "log.csv").open()))
+    log = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
     assert len(rows) == len(log) == 9
     for row, entry in zip(rows, log, strict=True):
         assert {name: float(value) for name, value in row.items() if value} == entry
@@ -68,7 +63,7 @@ def test_a_run_writes_its_page_while_it_goes_on(tmp_path):
 
 def test_the_best_weights_are_kept_and_outlive_a_stop(tmp_path, monkeypatch):
     errors = iter([0.5, 0.2, 0.3, 0.25, 0.1])
-    monkeypatch.setattr(trainers, "validate", lambda *_: Scores(1.0, float("nan"), next(errors)))
+    monkeypatch.setattr(images, "validate", lambda *_: Scores(1.0, float("nan"), next(errors)))
 
     def best():
         return weights.load_weights(tmp_path / "best.safetensors")[1]["training"]["step"]
@@ -86,10 +81,10 @@ def test_the_best_weights_are_kept_and_outlive_a_stop(tmp_path, monkeypatch):
     assert best() == 10
 
 
-def test_runs_are_compared(tmp_path, capsys, monkeypatch):
+def test_runs_are_compared(finished, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name, rate in (("slow", 1e-4), ("fast", 1e-2)):
-        made(tmp_path / name, rate=rate).run()
+    copytree(finished[0] / "mine", tmp_path / "fast")
+    made(tmp_path / "slow", rate=1e-4).run()
     assert main(["report", "slow", "fast", "-o", "both.html"]) == 0
     text = (tmp_path / "both.html").read_text()
     assert ".plot img { filter: invert" in text  # charts are made for white paper, and the page is dark
@@ -107,9 +102,8 @@ def test_runs_are_compared(tmp_path, capsys, monkeypatch):
     assert main(["report", "fast", "--ref", "slow", "-o", "x.html"]) == 2
 
 
-def test_the_page_fits_a_telephone_and_no_rule_is_broken(browser, tmp_path):
-    made(tmp_path / "mine").run()
-    session = browser(f"file://{quote(str(tmp_path / 'mine' / 'run.html'))}")
+def test_the_page_fits_a_telephone_and_no_rule_is_broken(browser, finished):
+    session = browser(f"file://{quote(str(finished[0] / 'mine' / 'run.html'))}")
     session.call("Emulation.setDeviceMetricsOverride", width=420, height=900, deviceScaleFactor=1, mobile=False)
     width = session.ask("document.documentElement.scrollWidth")
     strip = session.ask("(s => [s.clientWidth, s.clientHeight])(document.querySelector('.strip'))")

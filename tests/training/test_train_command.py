@@ -7,14 +7,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from crops import view
 
 import ngpt
+from bench.ablations import VARIANTS
+from ngpt.cli import main
+from ngpt.system import configs
 from ngpt.system.templates import entries
 from ngpt.training.parameters import TABLES, configuration_row, purpose
 from ngpt.training.settings import read_settings
 
 CONFIGS = sorted(path for path in Path("configs").glob("*.toml") if not path.name.startswith(("data-", "eval-")))
+# Those that make images; ``temporal`` learns from shots.
+OF_IMAGES = [path for path in CONFIGS if read_settings(path).model]
 TRAINING = Path("docs/train/training.md")
+
+
+def sets(**changes):
+    """``table_key=value`` as words of the command."""
+    return [word for name, value in changes.items() for word in ("--set", f"{name.replace('_', '.', 1)}={value!r}")]
 
 
 @pytest.fixture
@@ -50,54 +61,32 @@ def test_a_dry_run_says_what_it_would_cost(train):
 
 
 def test_views_of_ones_own_train_a_network(train, tmp_path):
-    from crops import SyntheticCrop
-
     for i in range(3):
-        crop = SyntheticCrop("", i)
-        view = tmp_path / "views" / f"view{i}"
-        view.mkdir(parents=True)
-        ngpt.write(view / "reference.exr", crop.reference)
-        ngpt.write(view / "few.exr", crop.stack(0))
-    changes = {
-        "data.folders": [str(tmp_path / "views")],
-        "data.validation": ["view2"],
-        "data.crop": 32,
-        "model.channels": [4, 4, 4, 4],
-        "model.units": [1, 1, 1, 1],
-        "run.steps": 2,
-        "run.batch": 1,
-        "run.precision": "float32",
-        "optimizer.warmup": 1,
-        "run.log": 1,
-    }
-    arguments = [word for name, value in changes.items() for word in ("--set", f"{name}={value!r}")]
-    out = tmp_path / "run"
-    status, output, errors = train("--config", "configs/fast.toml", "--out", str(out), *arguments)
+        crop = view(tmp_path / "views" / f"view{i}", i)
+    out, small = tmp_path / "run", [str(tmp_path / "views")]
+    words = ["--config", "configs/fast.toml", "--out", str(out)]
+    words += sets(data_folders=small, data_validation=["view2"], data_crop=32, model_channels=[4] * 4)
+    words += sets(model_units=[1] * 4, run_batch=1, run_precision="float32", optimizer_warmup=1, run_log=1)
+    status, output, errors = train(*words, *sets(run_steps=2))
     assert status == 0, errors
     assert "finished at step 2" in output and "relMSE" in output
     # No terminal here: plain lines, beside the log and not in it.
     assert errors.startswith("train: 0/2 steps\n") and "train: 2/2 steps, " in errors and " steps/s" in errors
-    _, output, errors = train("--config", "configs/fast.toml", "--out", str(out), *arguments, "--set", "run.steps=3")
+    _, output, errors = train(*words, *sets(run_steps=3))
     assert "at step 2 of 3" in output and "finished at step 3" in output
     assert errors.startswith("train: 2/3 steps\n") and "train: 3/3 steps, " in errors
     # By name, and without a word.
-    quietly = train("--config", "fast", "--out", str(out), *arguments, "--set", "run.steps=4", "-q")
-    assert quietly == (0, "", "")
-    image = ngpt.denoise(SyntheticCrop("", 2).stack(0), "ngpt-fast", weights=str(out / "weights.safetensors"))
+    words[1] = "fast"
+    assert train(*words, *sets(run_steps=4), "-q") == (0, "", "")
+    image = ngpt.denoise(crop.stack(0), "ngpt-fast", weights=str(out / "weights.safetensors"))
     assert image.shape == (32, 32, 3)
 
 
 def test_an_error_of_a_process_that_prepares_examples_is_one_line(train, tmp_path):
     """Crops smaller than examples, which its first example finds."""
-    from crops import SyntheticCrop
-
-    crop = SyntheticCrop("", 0)
-    (tmp_path / "views" / "mine").mkdir(parents=True)
-    ngpt.write(tmp_path / "views" / "mine" / "reference.exr", crop.reference)
-    ngpt.write(tmp_path / "views" / "mine" / "few.exr", crop.stack(0))
-    changes = {"data.folders": [str(tmp_path / "views")], "data.workers": 1, "run.batch": 1}
-    arguments = [word for name, value in changes.items() for word in ("--set", f"{name}={value!r}")]
-    status, _, errors = train("--config", "tiny", "--out", str(tmp_path / "run"), *arguments)
+    view(tmp_path / "views" / "mine")
+    changes = sets(data_folders=[str(tmp_path / "views")], data_workers=1, run_batch=1)
+    status, _, errors = train("--config", "tiny", "--out", str(tmp_path / "run"), *changes)
     assert status == 1
     assert errors.splitlines()[-1] == (
         "train.py: error: a crop is 32x32, smaller than the 64 pixels of an example; --set data.crop=32"
@@ -106,21 +95,11 @@ def test_an_error_of_a_process_that_prepares_examples_is_one_line(train, tmp_pat
 
 def test_the_shipped_network_is_fine_tuned_in_one_command(tmp_path, monkeypatch, capsys):
     """Wherever it is called: the weights that it starts from are found by their name."""
-    from crops import SyntheticCrop
-
-    from ngpt.cli import main
-
     monkeypatch.chdir(tmp_path)
-
-    crop = SyntheticCrop("", 0)
-    (tmp_path / "views" / "mine").mkdir(parents=True)
-    ngpt.write(tmp_path / "views" / "mine" / "reference.exr", crop.reference)
-    ngpt.write(tmp_path / "views" / "mine" / "few.exr", crop.stack(0))
-    changes = {"data.folders": [str(tmp_path / "views")], "data.crop": 32, "run.steps": 1, "run.batch": 1}
-    arguments = [word for name, value in changes.items() for word in ("--set", f"{name}={value!r}")]
-    out = tmp_path / "run"
-    assert main(["train", "--config", "fine-tune", "--out", str(out), *arguments]) == 0, capsys.readouterr().err
-    ours = ngpt.denoise(crop.stack(0), "ngpt-fast", weights=str(out / "weights.safetensors"))
+    crop = view(tmp_path / "views" / "mine")
+    changes = sets(data_folders=[str(tmp_path / "views")], data_crop=32, run_steps=1, run_batch=1)
+    assert main(["train", "--config", "fine-tune", "--out", "run", *changes]) == 0, capsys.readouterr().err
+    ours = ngpt.denoise(crop.stack(0), "ngpt-fast", weights="run/weights.safetensors")
     # One step at a low rate: close to what it started from, and not the same.
     change = np.abs(ours - ngpt.denoise(crop.stack(0), "ngpt-fast"))
     assert 0 < change.mean() < 0.05
@@ -128,15 +107,8 @@ def test_the_shipped_network_is_fine_tuned_in_one_command(tmp_path, monkeypatch,
 
 @pytest.mark.slow
 def test_a_network_trains_on_crops_that_are_being_rendered(renderer, train, tmp_path):
-    changes = {
-        "data.folders": ["configs/data-tiny.toml"],
-        "data.crop": 32,
-        "run.steps": 3,
-        "run.batch": 2,
-        "run.log": 1,
-    }
-    arguments = [word for name, value in changes.items() for word in ("--set", f"{name}={value!r}")]
-    status, output, errors = train("--config", "configs/tiny.toml", "--out", str(tmp_path / "run"), *arguments)
+    changes = sets(data_folders=["configs/data-tiny.toml"], data_crop=32, run_steps=3, run_batch=2, run_log=1)
+    status, output, errors = train("--config", "configs/tiny.toml", "--out", str(tmp_path / "run"), *changes)
     assert status == 0, errors
     assert "finished at step 3" in output
 
@@ -160,8 +132,6 @@ reference_method = "primal"
 @pytest.fixture(scope="module")
 def smallest_set(renderer, tmp_path_factory):
     """A folder with the set "data" that the first command of docs/train/training.md makes."""
-    from ngpt.cli import main
-
     folder = tmp_path_factory.mktemp("smallest")
     assert FIRST_COMMANDS[0] == "dataset --config data-tiny --out data"
     assert main([*FIRST_COMMANDS[0].split()[:-1], str(folder / "data"), "-q"]) == 0
@@ -170,8 +140,6 @@ def smallest_set(renderer, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def split_set(renderer, tmp_path_factory):
-    from ngpt.cli import main
-
     folder = tmp_path_factory.mktemp("split")
     (folder / "data-split.toml").write_text(SPLIT)
     assert main(["dataset", "--config", str(folder / "data-split.toml"), "--out", str(folder / "data"), "-q"]) == 0
@@ -181,17 +149,35 @@ def split_set(renderer, tmp_path_factory):
 def on_its_set(path: Path):
     """A configuration with the set that has the layers it reads. To render split light takes a minute more."""
     split = '"diffuse"' in path.read_text() or read_settings(path).model.network == "kpcn"
-    marks = pytest.mark.slow if split else ()
+    # The large ones are others' twins: by their size nothing is tested but patience.
+    marks = pytest.mark.slow if split or path.stem in ("paper", "large", "small") else ()
     return pytest.param(path, "split_set" if split else "smallest_set", id=path.stem, marks=marks)
 
 
-@pytest.mark.parametrize(("path", "kind"), [on_its_set(path) for path in CONFIGS])
+@pytest.mark.parametrize(("path", "kind"), [on_its_set(path) for path in OF_IMAGES])
 def test_every_configuration_trains_on_a_set_of_our_own_generator(path, kind, train, request, tmp_path, one_thread):
     """With no more changed of it than its size; one of the two scenes is set aside, and it is said."""
     folder = request.getfixturevalue(kind)
-    changes = {"data.folders": [str(folder / "data")], "data.crop": 48, "data.workers": 0}
-    changes |= {"run.steps": 2, "run.batch": 1, "run.views": 1}
-    arguments = [word for name, value in changes.items() for word in ("--set", f"{name}={value!r}")]
-    status, output, errors = train("--config", path.stem, "--out", str(tmp_path / "run"), *arguments)
+    changes = sets(data_folders=[str(folder / "data")], data_crop=48, data_workers=0, run_steps=2)
+    changes += sets(run_batch=1, run_views=1)
+    status, output, errors = train("--config", path.stem, "--out", str(tmp_path / "run"), *changes)
     assert status == 0, errors
     assert "validation: 1 of 2 scenes set aside" in output and "finished at step 2" in output and "relMSE" in output
+
+
+def test_ablations_differ_from_the_papers_network_in_what_they_are_named_for():
+    found = {
+        name: read_settings(configs.find_config("ablations", configs.TRAINING), VARIANTS[name]) for name in VARIANTS
+    }
+    assert len({str(settings) for settings in found.values()}) == len(VARIANTS)
+    assert not found["no gradients"].model.reads_gradients and found["l1 alone"].loss["kind"] == "l1"
+    others = {str((one.run, one.optimizer, one.augmentation)) for one in found.values()}
+    assert len(others) == 1 and found["bilinear"].model.pooling == "bilinear"
+
+
+def test_kpcn_has_the_papers_size():
+    from ngpt.network.model import Reconstructor, parameters
+
+    model = Reconstructor(read_settings(configs.find_config("kpcn", configs.TRAINING)).model)
+    # Nine layers of 100 channels: seven hidden ones of 250,000 weights in each network.
+    assert 3.5e6 < parameters(model) < 4e6 and model.config.head.outputs == 2 * 441

@@ -62,8 +62,8 @@ def _weights(image: Tensor) -> Tensor:
     return weights / weights.sum()
 
 
-def ssim_parts(a: Tensor, b: Tensor, stride: int = _STRIDE) -> tuple[Tensor, Tensor]:
-    """Luminance and contrast-structure of SSIM in windows of 7x7 pixels, every ``stride``, range 1 [Wang et al. 2004].
+def ssim_parts(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Luminance and contrast-structure of SSIM in windows of 7x7 pixels, every third, range 1 [Wang et al. 2004].
 
     Smaller images are one window. The images' common mean is taken off before squaring: in float32, E[x²] - E[x]² of
     bright flat images would be mostly rounding.
@@ -71,7 +71,7 @@ def ssim_parts(a: Tensor, b: Tensor, stride: int = _STRIDE) -> tuple[Tensor, Ten
     window = min(_WINDOW, a.shape[-2]), min(_WINDOW, a.shape[-1])
     center = (a.mean((-2, -1), keepdim=True) + b.mean((-2, -1), keepdim=True)).detach() / 2
     x, y = a - center, b - center
-    ex, ey, exx, eyy, exy = (avg_pool2d(image, window, stride) for image in (x, y, x * x, y * y, x * y))
+    ex, ey, exx, eyy, exy = (avg_pool2d(image, window, _STRIDE) for image in (x, y, x * x, y * y, x * y))
     mean_a, mean_b = ex + center, ey + center
     # Rounding may leave a variance slightly below 0.
     var_a, var_b, covariance = (exx - ex * ex).clamp(min=0), (eyy - ey * ey).clamp(min=0), exy - ex * ey

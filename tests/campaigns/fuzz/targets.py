@@ -174,6 +174,7 @@ class _Crop:
 def _trainer(folder: Path):
     import torch
 
+    from ngpt.training.images import Images
     from ngpt.training.settings import from_dict
     from ngpt.training.trainer import Trainer
 
@@ -183,7 +184,8 @@ def _trainer(folder: Path):
         value = (prediction - target).abs().mean()
         return value, {"l1": value}
 
-    return Trainer(from_dict(SETTINGS, "test"), [_Crop()], [], loss, folder, say=lambda text: None)
+    settings = from_dict(SETTINGS, "test")
+    return Trainer(settings, Images(settings, [_Crop()], [], loss), folder, say=lambda text: None)
 
 
 def weights(number: int, folder: Path) -> None:

@@ -1,8 +1,8 @@
-"""The data for training: training sets, and folders of stacks with references."""
+"""The data for training: crops of training sets, of folders of stacks with references, and mixtures of them."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -11,6 +11,49 @@ from ngpt.errors import NgptError
 from ngpt.io.frames import natural
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
+
+
+class Crop(Protocol):
+    """One view with a reference and several inputs, from ``ngpt.training.dataset`` or ``StackFolder``.
+
+    Of a crop without a reference, only ``paired`` and its two stacks are used.
+    """
+
+    scene: str
+    inputs: int
+    spp: tuple[int, ...]
+    paired: bool
+
+    def stack(self, k: int) -> GradientStack: ...
+
+    @property
+    def reference(self) -> np.ndarray: ...
+
+    @property
+    def reference_direct(self) -> np.ndarray: ...
+
+    @property
+    def reference_caustic(self) -> np.ndarray: ...
+
+    @property
+    def reference_halves(self) -> tuple[np.ndarray, ...]: ...
+
+
+class Mixture(Sequence[Any]):
+    """Several sequences of crops as one; they may grow while they are read, as streams do."""
+
+    def __init__(self, *parts: Any):
+        self.parts = parts
+
+    def __len__(self) -> int:
+        return sum(len(part) for part in self.parts)
+
+    def __getitem__(self, index):  # type: ignore[no-untyped-def]
+        for part in self.parts:
+            if index < len(part):
+                return part[index]
+            index -= len(part)
+        raise IndexError(index)
 
 
 def read(path: str) -> GradientStack:

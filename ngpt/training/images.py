@@ -1,0 +1,103 @@
+"""The task of the trainer that teaches networks to reconstruct images (``ngpt.network``), on single crops."""
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from ngpt.errors import NgptError
+from ngpt.network import padding, weights
+from ngpt.network.model import Reconstructor
+from ngpt.network.transfer import signed_exp
+from ngpt.system import limits
+from ngpt.training.distributed import Processes
+from ngpt.training.examples import JITTER, OTHER, Examples, collated
+from ngpt.training.settings import Settings
+from ngpt.training.task import Task
+from ngpt.training.validation import validate, views
+
+Loss = Callable[..., tuple[Tensor, dict[str, Tensor]]]
+
+# Logarithms beyond this are cut before exp: 4.9e8 times the typical radiance, far above anything one wants to learn.
+LIMIT = 20.0
+
+
+class Images(Task):
+    """Learns from ``crops`` and is measured by ``held_out``.
+
+    ``loss`` takes scene-linear prediction and target (N, 3, H, W) and a generator of the step's random numbers. If
+    there are pairs, it also takes what judges them, and the target covers only the other examples, None if there are
+    none. If crops are rendered meanwhile, as in a stream, no two runs are alike.
+    """
+
+    def __init__(self, settings: Settings, crops: Sequence[Any], held_out: Sequence[Any], loss: Loss):
+        if settings.model is None:
+            raise NgptError("a network that makes images needs the table [model]")
+        if not len(crops):
+            raise NgptError("no crops to train on: data.folders is empty, or data.validation holds out every scene")
+        self.settings, self.config, self._loss = settings, settings.model, loss
+        self.held_out = views(held_out, settings.run.views)
+        data = settings.data
+        self.examples = Examples(
+            crops, self.config, settings.augmentation, data.crop, settings.run.seed, data.cache << 20, data.pairs
+        )
+
+    def network(self) -> nn.Module:
+        made, crop = Reconstructor(self.config), self.settings.data.crop
+        if (crop + 2 * padding.MARGIN) % made.alignment:
+            raise NgptError(
+                f"data.crop = {crop}: crop + {2 * padding.MARGIN} must be divisible by {made.alignment}, the network's "
+                "coarsest pixel"
+            )
+        return made
+
+    def batches(self, model: nn.Module, step: int, processes: Processes) -> Iterator[dict[str, Tensor]]:
+        run = self.settings.run
+        size, first = run.batch // processes.count, step * run.batch
+        indices = (
+            [first + i * run.batch + processes.rank * size + j for j in range(size)] for i in range(run.steps - step)
+        )
+        workers = min(self.settings.data.workers, limits.processors())
+        try:
+            yield from DataLoader(
+                self.examples,
+                batch_sampler=indices,  # type: ignore[arg-type]
+                collate_fn=collated,
+                num_workers=workers,
+                persistent_workers=bool(workers),
+                pin_memory=processes.device.type == "cuda",
+            )
+        except NgptError as error:
+            # A worker's error comes with the worker's traceback before it.
+            raise NgptError(str(error).rpartition("NgptError: ")[2]) from None
+
+    def loss(
+        self, model: nn.Module, batch: dict[str, Tensor], generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        layers = dict(batch)
+        target = layers.pop("target", None)
+        other = {name.removeprefix(OTHER): layers.pop(name) for name in batch if name.startswith(OTHER)}
+        bfloat16 = self.settings.run.precision == "bfloat16"
+        with torch.autocast(generator.device.type, torch.bfloat16, enabled=bfloat16):
+            logarithm = model.predict(layers)  # type: ignore[operator]
+        edge = padding.MARGIN + JITTER
+        prediction = signed_exp(logarithm[..., edge:-edge, edge:-edge].clamp(-LIMIT, LIMIT))
+        return self._loss(prediction, target, generator, *([other] if other else []))
+
+    def validate(self, model: nn.Module, picture: Path) -> dict[str, float]:
+        if not self.held_out:
+            return {}
+        found = validate(model, self.held_out, picture, self.settings.run.precision)  # type: ignore[arg-type]
+        return {"relMSE": found.network, "relMSE primal": found.primal, "relMSE base": found.base}
+
+    def save(self, path: Path, model: nn.Module, provenance: dict[str, Any]) -> None:
+        weights.save_weights(path, model, provenance, overwrite=True)  # type: ignore[arg-type]
+
+    def load(self, path: str) -> nn.Module:
+        model, _ = weights.load_weights(path)
+        if model.config != self.config:
+            raise NgptError(f"{path}: is another [model] than the run's: {model.config}")
+        return model

@@ -1,0 +1,211 @@
+"""The task of the trainer that teaches the network that blends frames (``ngpt.sequence.network``), on shots.
+
+A frame's history is made by the network itself: in each round the current network plays the shots, and it learns from
+the resulting histories until the next round [Ross et al. 2011, "A reduction of imitation learning and structured
+prediction to no-regret online learning"]. Results frame by frame come from several methods, so it learns to work with
+any. The loss of a frame is
+
+    E |y - r|² / E_x + FLICKER E |(y - r) - W (y' - r')|² / F_x
+
+relative to the reference r, where W looks up values along motion and ' marks the frame before. E_x and F_x are the same
+errors of x, so all shots count alike. The noise of a reference is independent of y, and adds the same constant whatever
+the network does. Added to the loss is the square of how much darker or brighter y is than x, in the mean of a batch:
+otherwise the easiest way to remove specks would be to lose their light. The effect of y on later frames is left out:
+among filters that know their own variance, the one with the least error now is also the best for later.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ngpt.errors import NgptError
+from ngpt.measure.images import middle
+from ngpt.network import weights
+from ngpt.network.unet import PlainUNet
+from ngpt.sequence.network import BANDS, INPUTS, LARGEST, MOST, Corrections
+from ngpt.training.clips import Clip, blended, errors, play, relit, robust
+from ngpt.training.distributed import Processes
+from ngpt.training.settings import Settings
+from ngpt.training.task import Task
+from ngpt.training.validation import Pictures, spread
+
+WIDTHS = (16, 24, 32)
+FLICKER = 1.0
+ENERGY = 300.0
+LEAST = 3e-4
+# Frames that may be behind the first of a shot, in training: shots are short, and histories are not.
+LENGTHS = (1, 1, 4, 12)
+# The share of clips whose light is made to change, more often and more than in the shots themselves.
+RELIT = 0.4
+# What the header of a file of weights says that it holds.
+KIND = "temporal"
+
+
+class Blending(Task):
+    """Learns to blend the frames of ``clips``, and is measured by ``held_out``.
+
+    Everything random is a function of the seed and the number of the round or step. Beside them a batch depends on
+    the weights by which its round was played: these are the ``state`` of the task.
+    """
+
+    def __init__(self, settings: Settings, clips: Sequence[Clip], held_out: Sequence[Clip]):
+        if settings.temporal is None:
+            raise NgptError("a network that blends frames needs the table [temporal]")
+        if not clips:
+            raise NgptError("no shots to train on: data.folders is empty, or data.validation holds out every scene")
+        self.settings, self.clips, self.table = settings, clips, settings.temporal
+        self.held_out = spread(held_out, settings.run.views)
+        self._player: dict[str, Tensor] = {}
+        # Scores of ``held_out`` frame by frame and by the rules, which stay the same: (2, clips, 2).
+        self._fixed: np.ndarray | None = None
+
+    def network(self) -> nn.Module:
+        return network()
+
+    def state(self) -> dict[str, Tensor]:
+        return self._player
+
+    def restore(self, state: dict[str, Tensor], path: str) -> None:
+        weights.check_fit(network().state_dict(), state, path)
+        self._player = state
+
+    def batches(self, model: nn.Module, step: int, processes: Processes) -> Iterator[dict[str, Tensor]]:
+        size = self.settings.run.batch // processes.count
+        mine = slice(processes.rank * size, (processes.rank + 1) * size)
+        frames: list[dict[str, np.ndarray]] = []
+        while True:
+            number, place = divmod(step, self.table.round)
+            if place == 0 or not frames:
+                if place == 0:
+                    self._player = copy.deepcopy(model.state_dict())
+                frames = self._played(model, number)
+            rng = np.random.default_rng((self.settings.run.seed, 1, step))
+            picked = rng.integers(len(frames), size=self.settings.run.batch)[mine]
+            # Motion is in the arrays no more: they may be turned as they are.
+            turns = rng.integers(2, size=(self.settings.run.batch, 3)).astype(bool)[mine]
+            chosen = [(frames[i], turn) for i, turn in zip(picked, turns, strict=True)]
+            batch = {name: [turned(frame[name], *turn) for frame, turn in chosen] for name in frames[0]}
+            yield {name: torch.from_numpy(np.stack(layers)) for name, layers in batch.items()}
+            step += 1
+
+    def _played(self, model: nn.Module, number: int) -> list[dict[str, np.ndarray]]:
+        """The frames of a round, with the histories that the network made at its beginning."""
+        rng = np.random.default_rng((self.settings.run.seed, 0, number))
+        player = copy.deepcopy(model)
+        player.load_state_dict(self._player)
+        corrections = as_corrections(player.eval())
+        chosen = rng.choice(len(self.clips), min(self.table.clips, len(self.clips)), replace=False)
+        longs = 1 / np.sqrt(rng.choice(LENGTHS, len(chosen)))
+        played = [relit(self.clips[i], rng) if rng.random() < RELIT else self.clips[i] for i in chosen]
+        frames = [f for c, long in zip(played, longs, strict=True) for f in play(c, corrections, float(long))]
+        if not frames:
+            raise NgptError("no frame of these shots has a history to blend: they lack the layer 'motion'")
+        return frames
+
+    def loss(
+        self, model: nn.Module, batch: dict[str, Tensor], generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        device = batch["inputs"].device.type
+        with torch.autocast(device, torch.bfloat16, enabled=self.settings.run.precision == "bfloat16"):
+            corrections = model(batch["inputs"])
+        return loss(corrections.float(), batch)
+
+    def validate(self, model: nn.Module, picture: Path) -> dict[str, float]:
+        """Errors and flicker relative to the reference, free of its noise: geometric means over the clips.
+
+        "primal" is frame by frame, "base" by only the rules.
+        """
+        if not self.held_out:
+            return {}
+        if self._fixed is None:
+            alone = [errors(clip, clip.results) for clip in self.held_out]
+            rules = [errors(clip, blended(clip, None)) for clip in self.held_out]
+            self._fixed = np.array([alone, rules])
+        corrections, pictures, found = as_corrections(model.eval()), Pictures(len(self.held_out)), []
+        for index, clip in enumerate(self.held_out):
+            results, last = blended(clip, corrections), clip.stacks[-1]
+            found.append(errors(clip, results))
+            if index in pictures.shown:
+                images = [image - last["direct"] for image in (clip.results[-1], results[-1])]
+                relative = self._fixed[0, index, 0], found[-1][0]
+                images.append(middle(clip.halves[-1]))
+                pictures.add(images, clip.scene, int(last.number("ngpt:spp") or 0), *relative)
+        pictures.write(picture)
+        every = np.stack([found, *self._fixed])
+        # Without the noise of the reference an error may come out below 0, where there is next to none.
+        good = (np.isfinite(every) & (every > 0)).all(axis=(0, 2))
+        if not good.any():
+            return {}
+        means = np.exp(np.log(every[:, good]).mean(axis=1))
+        return {
+            f"{name}{of}": float(means[i, j])
+            for i, of in enumerate(("", " primal", " base"))
+            for j, name in enumerate(("relMSE", "flicker"))
+        }
+
+    def save(self, path: Path, model: nn.Module, provenance: dict[str, Any]) -> None:
+        header = {"kind": KIND, "inputs": list(INPUTS), "widths": list(WIDTHS), "training": provenance}
+        weights.write_tensors(path, model.state_dict(), header, overwrite=True)
+
+    def load(self, path: str) -> nn.Module:
+        return load(path)[0]
+
+
+def load(path: str | Path) -> tuple[PlainUNet, dict[str, Any]]:
+    """The network of a file that a run wrote, and the file's header; raises NgptError for others."""
+    tensors, header = weights.read_tensors(path)
+    if header.get("kind") != KIND or header.get("inputs") != list(INPUTS) or header.get("widths") != list(WIDTHS):
+        raise NgptError(f"{path}: holds no network that blends frames, or one of another version; train it anew")
+    model = network()
+    weights.fill(model, tensors, str(path))
+    return model.eval(), header
+
+
+def network() -> PlainUNet:
+    """It says nothing to begin with."""
+    return PlainUNet(len(INPUTS), WIDTHS, BANDS, zero=True)
+
+
+def loss(corrections: Tensor, batch: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+    """The loss of frames (N, C, H, W) from ``play`` and its parts; 1 + FLICKER where nothing is won."""
+    shares = MOST * torch.sigmoid(batch["prior"] + LARGEST * torch.tanh(corrections / LARGEST))
+    shares = batch["trust"] * torch.minimum(shares, batch["first"])
+    bands = batch["bands"].unflatten(1, (BANDS, 3))
+    taken = (shares[:, :, None] * bands).sum(1)
+    error = batch["alone"] + taken
+    errors = robust(error.square() * batch["weight"]).mean((1, 2, 3))
+    changes = (batch["seen"] * robust((error - batch["before"]).square() * batch["weight"])).mean((1, 2, 3))
+    of_x, of_changes = batch["errors"].flatten(), batch["changes"].flatten()
+    # Where light changes in earnest, or there is next to none, it is not the specks that count.
+    darker = (taken.mean((1, 2, 3)) / (batch["level"].flatten() + 1e-20)).clamp(-0.05, 0.05).mean()
+    # What is nearly free of noise is nothing to learn from.
+    parts = {"error": (errors / (of_x + LEAST)).mean(), "flicker": (changes / (of_changes + LEAST)).mean()}
+    parts["light"] = darker.square()
+    return parts["error"] + FLICKER * parts["flicker"] + ENERGY * parts["light"], parts
+
+
+def as_corrections(model: Any) -> Corrections:
+    """What ``ngpt.sequence.history.Temporal`` takes, of a network in PyTorch."""
+
+    @torch.inference_mode()
+    def corrections(inputs: np.ndarray) -> np.ndarray:
+        height, width = inputs.shape[:2]
+        a, device = model.alignment, next(model.parameters()).device
+        padded = np.pad(inputs, [(0, -height % a), (0, -width % a), (0, 0)], mode="edge")
+        made = model(torch.from_numpy(np.moveaxis(padded, -1, 0)[None].copy()).to(device))[0]
+        return np.moveaxis(made.cpu().numpy(), 0, -1)[:height, :width]
+
+    return corrections
+
+
+def turned(layer: np.ndarray, across: bool, down: bool, transposed: bool) -> np.ndarray:
+    layer = layer[:, ::-1] if down else layer
+    layer = layer[..., ::-1] if across else layer
+    return np.ascontiguousarray(layer.transpose(0, 2, 1) if transposed else layer)
