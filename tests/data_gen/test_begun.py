@@ -249,7 +249,10 @@ def test_light_that_overflows_ends_no_render_that_somebody_looks_at(renderer, co
         def close(self, line):
             raise OSError("gone")
 
-    monkeypatch.setattr(onlook, "onlookers", lambda *args: onlook.Onlookers(Page(), None, args[4].say, "spp"))
+    def looking(live, scene, command, console, unit):
+        return onlook.Onlookers(Page(), console.say, unit)
+
+    monkeypatch.setattr(onlook, "onlookers", looking)
     told = [line for line in command(f"{words} --live").splitlines() if "the render goes on" in line]
     assert len(told) == 1 and told[0].startswith("no image for who looks on: ")
     Path("it.exr").unlink()
