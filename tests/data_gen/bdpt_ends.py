@@ -36,11 +36,11 @@ def without_hole():
     return scene
 
 
-def plan_of(scene, longest=8, **more):
+def plan_of(scene, longest=8, roughness=0.05, **more):
     """That of ``gbdpt``, for paths of at most so many edges, whose roulette lets all of them live."""
     from data_gen.samplers.gbdpt.base_path import Plan
 
-    lights, materials, integrator = LightEnds(scene), Materials(scene, 0.05), SAMPLERS["gbdpt"].integrator(scene)
+    lights, materials, integrator = LightEnds(scene), Materials(scene, roughness), SAMPLERS["gbdpt"].integrator(scene)
     ways = {"first_hit": integrator.first_hit, "hidden": integrator.hidden_from_camera}
     return Plan(scene, lights, materials, limits=Limits(longest, 100), longest=longest, **ways, **more)
 
@@ -187,9 +187,9 @@ class Copies(Ends):
     ``steps`` and ``offsets`` are those of the base paths at each of their vertices.
     """
 
-    def __init__(self, scene, shift, η=0.0, length=4):
-        self.shift, self.materials = shift, Materials(scene, 0.05)
-        self.plan = plan_of(scene, 12, **({"η": mi.Float(η)} if η else {}))
+    def __init__(self, scene, shift, η=0.0, length=4, roughness=0.05):
+        self.shift, self.plan = shift, plan_of(scene, 12, roughness, **({"η": mi.Float(η)} if η else {}))
+        self.materials = self.plan.materials
         super().__init__(scene, η, self.materials.connectable, 64, length)
         self.copy = copy(self)
         self.copy.from_camera = self.copied
@@ -266,6 +266,7 @@ def check_copies_to_the_camera(copies, s):
     own = copies.densities([moved, *copies.from_light[: s - 1][::-1]], 0)
     compare_copies(path.C, found, copies.brute(0, s), own, s + 1, good)
     before, good, start, p = path.before.si, good & (dr.max(C) > 0), path.start, path.p
+    allowed = good & copies.materials.connectable(x.bsdf())
     if s == 1:
         start, ratio, _ = copies.lights.redirected(scene, start, x)
         start.β /= ratio
@@ -273,7 +274,7 @@ def check_copies_to_the_camera(copies, s):
         p = before.bsdf().pdf(context(IMPORTANCE), before, before.to_local(dr.normalize(x.p - before.p)))
     d = start.ray.d if s == 1 else dr.normalize(x.p - before.p)
     back = replace(path, y=moved.vertex, d=d, uv=uv, start=start, p=p)
-    C_back, r_back, others = shifted(copies.plan, copies.eye, back, path.uv, good)
+    C_back, r_back, others = shifted(copies.plan, copies.eye, back, path.uv, allowed)
     close(others, path.others, check_back(good, path.C, r, C_back, r_back))
 
 
@@ -302,10 +303,10 @@ def close(ours, theirs, good, median=1e-3, most=0.03):
     assert np.median(error) < median and np.quantile(error, 0.97) < most, (np.median(error), np.quantile(error, 0.97))
 
 
-def check_back(good, C, r, C_back, r_back, **tolerance):
+def check_back(good, C, r, C_back, r_back, least=0.99, **tolerance):
     """Copies of copies are the paths, whose C (or β) is f / p, and r r' = 1; returned is where they are."""
     back = np.array(good & (dr.max(C_back) > 0))
-    assert back.sum() > max(100, 0.97 * np.array(good).sum()), (back.sum(), np.array(good).sum())
+    assert back.sum() > max(100, least * np.array(good).sum()), (back.sum(), np.array(good).sum())
     close(r * r_back, 1, back, **tolerance)
     close(C_back * r, C, back & (np.array(C) > 0).any(axis=0), **tolerance)
     return back

@@ -86,6 +86,13 @@ def test_going_straight_to_a_vertex_and_back(copies):
     check_going_straight_and_back(copies)
 
 
+def test_there_is_no_way_to_what_is_too_smooth_nor_back(renderer):
+    """To the ball: copies there would have no copies."""
+    copies = Copies(load(renderer, corner, (24, 24)), (3, 2), roughness=0.31)
+    check_going_straight_and_back(copies)
+    check_copies_to_the_camera(copies, 1)
+
+
 # ------------------------- Roulette -------------------------
 
 
