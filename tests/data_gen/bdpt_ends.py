@@ -1,7 +1,7 @@
 """Paths from both ends of a scene, their copies, and the densities of all ways to find them, in float64."""
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -36,11 +36,11 @@ def without_hole():
     return scene
 
 
-def plan_of(scene, longest=8, **more):
+def plan_of(scene, longest=8, roughness=0.05, **more):
     """That of ``gbdpt``, for paths of at most so many edges, whose roulette lets all of them live."""
     from data_gen.samplers.gbdpt.base_path import Plan
 
-    lights, materials, integrator = LightEnds(scene), Materials(scene, 0.05), SAMPLERS["gbdpt"].integrator(scene)
+    lights, materials, integrator = LightEnds(scene), Materials(scene, roughness), SAMPLERS["gbdpt"].integrator(scene)
     ways = {"first_hit": integrator.first_hit, "hidden": integrator.hidden_from_camera}
     return Plan(scene, lights, materials, limits=Limits(longest, 100), longest=longest, **ways, **more)
 
@@ -187,9 +187,9 @@ class Copies(Ends):
     ``steps`` and ``offsets`` are those of the base paths at each of their vertices.
     """
 
-    def __init__(self, scene, shift, η=0.0, length=4):
-        self.shift, self.materials = shift, Materials(scene, 0.05)
-        self.plan = plan_of(scene, 12, **({"η": mi.Float(η)} if η else {}))
+    def __init__(self, scene, shift, η=0.0, length=4, roughness=0.05):
+        self.shift, self.plan = shift, plan_of(scene, 12, roughness, **({"η": mi.Float(η)} if η else {}))
+        self.materials = self.plan.materials
         super().__init__(scene, η, self.materials.connectable, 64, length)
         self.copy = copy(self)
         self.copy.from_camera = self.copied
@@ -235,6 +235,81 @@ class Copies(Ends):
         g1, edge = connection(self.scene, own.vertex, own.bsdf, y.vertex, good, seen=offset.joined)
         found = offset.β * g1, offset.r, mis.others_connected(own.vertex.end, y.vertex.end, edge)
         return z.vertex.β * g, found, self.brute(t, s), self.copy.brute(t, s), s + 1, good
+
+    def splatted(self, s):
+        """Light paths of ``s`` vertices beside their light's own that end at the camera, where both are connectable."""
+        from data_gen.samplers.gbdpt.light_shift import Splatted
+
+        y, before, connectable = self.from_light[s - 1], self.from_light[max(s - 2, 0)], self.materials.connectable
+        good = y.there & connectable(y.bsdf)
+        good &= s == 1 or (~before.sharp & connectable(before.bsdf))
+        nothing_between = lambda si, to, active: self.scene.ray_test(si.spawn_ray_to(to.p), active)  # noqa: E731
+        C, others, uv = to_camera(self.eye, self.lens, y.vertex, y.bsdf, good, nothing_between)
+        path = {"first": dr.opaque(mi.Bool, s == 1), "start": self.start, "before": before.vertex}
+        path |= {"p": before.sample.pdf, "survival": mi.Float(1), "events": mi.UInt32(0), "allowed": mi.Bool(good)}
+        path = Splatted(y.vertex, y.d, uv, self.lens, C, others, **path)
+        # All have the same kernels.
+        dr.eval(path)
+        return path
+
+
+def check_copies_to_the_camera(copies, s):
+    """Light paths of ``s`` vertices, seen by another pixel: by brute force; and the copy's copy is the path."""
+    from data_gen.samplers.gbdpt.light_shift import shifted
+
+    path, y, scene = copies.splatted(s), copies.from_light[s - 1], copies.scene
+    uv = path.uv + mi.Vector2f(*copies.shift)
+    good = path.allowed & copies.eye.shows(uv) & (dr.max(path.C) > 0)
+    found = C, r, _ = shifted(copies.plan, copies.eye, path, uv, good)
+    x = scene.ray_intersect(copies.eye.ray(uv, copies.lens), good)
+    moved = replace(y, vertex=replace(y.vertex, si=x), bsdf=x.bsdf())
+    own = copies.densities([moved, *copies.from_light[: s - 1][::-1]], 0)
+    compare_copies(path.C, found, copies.brute(0, s), own, s + 1, good)
+    before, good, start, p = path.before.si, good & (dr.max(C) > 0), path.start, path.p
+    allowed = good & copies.materials.connectable(x.bsdf())
+    if s == 1:
+        start, ratio, _ = copies.lights.redirected(scene, start, x)
+        start.β /= ratio
+    else:
+        p = before.bsdf().pdf(context(IMPORTANCE), before, before.to_local(dr.normalize(x.p - before.p)))
+    d = start.ray.d if s == 1 else dr.normalize(x.p - before.p)
+    back = replace(path, y=moved.vertex, d=d, uv=uv, start=start, p=p)
+    C_back, r_back, others = shifted(copies.plan, copies.eye, back, path.uv, allowed)
+    close(others, path.others, check_back(good, path.C, r, C_back, r_back))
+
+
+def check_going_straight_and_back(copies):
+    """Camera paths that join their base paths at the second vertex: the copy's copy is the path."""
+    from data_gen.samplers.gbdpt.offset_path import step_own
+
+    step, offset, there = copies.steps[0], copies.offsets[0], copies.offsets[1]
+    x, y, d = copies.from_camera[0].vertex, copies.copied[0], there.ray.d
+    wo, (ray, *_) = y.si.to_local(d), copies.camera.rays()
+    hit = copies.scene.ray_intersect_preliminary(mi.Ray3f(ray))
+    p = y.bsdf.pdf(context(RADIANCE), y.si, wo)
+    connectable = copies.materials.connectable(y.bsdf)
+    reverse = replace(step, z=y.vertex, wo=wo, d=d, p=p, connectable=connectable)
+    base = replace(offset, ray=mi.Ray3f(ray), hit=hit, β=x.β, r=mi.Float(1), end=x.end)
+    found = step_own(copies.plan, reverse, base)
+    good = check_back(there.joined & (dr.max(there.β) > 0), step.β1, there.r, found.β, found.r)
+    close(found.end.vcm, step.end1.vcm, good)
+    close(found.end.vc, step.end1.vc, good)
+
+
+@np.errstate(divide="ignore", invalid="ignore")
+def close(ours, theirs, good, median=1e-3, most=0.03):
+    error = np.abs(np.array(ours, np.float64) / np.array(theirs, np.float64) - 1)
+    error = error[..., np.array(good)]
+    assert np.median(error) < median and np.quantile(error, 0.97) < most, (np.median(error), np.quantile(error, 0.97))
+
+
+def check_back(good, C, r, C_back, r_back, least=0.99, **tolerance):
+    """Copies of copies are the paths, whose C (or β) is f / p, and r r' = 1; returned is where they are."""
+    back = np.array(good & (dr.max(C_back) > 0))
+    assert back.sum() > max(100, least * np.array(good).sum()), (back.sum(), np.array(good).sum())
+    close(r * r_back, 1, back, **tolerance)
+    close(C_back * r, C, back & (np.array(C) > 0).any(axis=0), **tolerance)
+    return back
 
 
 @np.errstate(divide="ignore", invalid="ignore")

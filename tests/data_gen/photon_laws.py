@@ -37,14 +37,14 @@ def joined(one, other):
     return type(one)(**values)
 
 
-def passes(scene, n, pixels=1, sampler="gpm", **options):
-    """The layers of ``n`` first passes, each of another seed: what ``render_ours`` has, prepared once."""
+def passes(scene, n, pixels=1, sampler="gpm", net=0, **options):
+    """The layers of ``n`` first passes, each of another seed, prepared once; with a ``net`` of 1 those of renders."""
     sample, sensor = find(sampler).made(scene, **options), scene.sensors()[0]
     stacks = []
     with far_shifts(pixels), recording():
         for seed in range(n):
             film = GradientFilm(*(int(n) for n in sensor.film().crop_size()), batches=True)
-            sample(CameraSamples(sensor, seed, 1), film)
+            sample(CameraSamples(sensor, seed, 1, net=net), film)
             film.end_pass(1)
             stacks.append(film.develop())
     return stacks

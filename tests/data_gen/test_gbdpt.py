@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bdpt_ends import Copies, compare_copies, plan_of
+from bdpt_ends import Copies, check_copies_to_the_camera, check_going_straight_and_back, compare_copies, plan_of
 from bdpt_scenes import SCENES, corner
 from renders import dr, mi
 from unbiased import FAR, load, render_ours
@@ -17,7 +17,7 @@ from data_gen.samplers import SAMPLERS
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.light_path import Seen, light_path
 from data_gen.samplers.bdpt.strategies import to_camera
-from data_gen.samplers.bdpt.vertex import Vertex, cosine
+from data_gen.samplers.bdpt.vertex import cosine
 from data_gen.scenes.builtin import _wall
 
 
@@ -78,29 +78,19 @@ def test_copies_of_paths_joined_to_light_paths(copies, t, s):
 
 
 @pytest.mark.parametrize("s", [1, 2, 3])
-def test_copies_of_light_paths_to_the_camera(copies, s):
-    """Of ``s`` vertices beside their light's own."""
-    from data_gen.samplers.gbdpt.light_shift import Splatted, shifted
+def test_copies_of_light_paths_to_the_camera_and_back(copies, s):
+    check_copies_to_the_camera(copies, s)
 
-    scene, eye = copies.scene, copies.eye
-    y, before = copies.from_light[s - 1], copies.from_light[max(s - 2, 0)]
-    good = y.there & copies.materials.connectable(y.bsdf)
-    for met in copies.from_light[: s - 1]:
-        good &= ~met.sharp
-    nothing_between = lambda si, to, active: scene.ray_test(si.spawn_ray_to(to.p), active)  # noqa: E731
-    C, others, uv = to_camera(eye, copies.lens, y.vertex, y.bsdf, good, nothing_between)
-    path = {"first": dr.opaque(mi.Bool, s == 1), "start": copies.start, "before": before.vertex, "p": before.sample.pdf}
-    path |= {"survival": mi.Float(1), "events": mi.UInt32(0), "allowed": mi.Bool(good)}
-    path = Splatted(y.vertex, y.d, uv, copies.lens, C, others, **path)
-    # All have the same kernels.
-    dr.eval(path)
-    uv = path.uv + mi.Vector2f(*copies.shift)
-    good = path.allowed & eye.shows(uv) & (dr.max(C) > 0)
-    found = shifted(copies.plan, eye, path, uv, good)
-    x = scene.ray_intersect(eye.ray(uv, copies.lens), good)
-    moved = replace(y, vertex=Vertex(x, y.vertex.β, y.vertex.end, y.vertex.depth), bsdf=x.bsdf())
-    own = copies.densities([moved, *copies.from_light[: s - 1][::-1]], 0)
-    compare_copies(C, found, copies.brute(0, s), own, s + 1, good)
+
+def test_going_straight_to_a_vertex_and_back(copies):
+    check_going_straight_and_back(copies)
+
+
+def test_there_is_no_way_to_what_is_too_smooth_nor_back(renderer):
+    """To the ball: copies there would have no copies."""
+    copies = Copies(load(renderer, corner, (24, 24)), (3, 2), roughness=0.31)
+    check_going_straight_and_back(copies)
+    check_copies_to_the_camera(copies, 1)
 
 
 # ------------------------- Roulette -------------------------

@@ -8,10 +8,14 @@ from lamps_scenes import lamps, lit_by
 from photon_laws import world_of
 from references import references
 from renders import dr, mi
-from unbiased import differences, load, render_ours
+from unbiased import differences, far_shifts, load, render_ours
 
+from data_gen.film import SHIFTS, GradientFilm
+from data_gen.film.statistics import statistics
+from data_gen.paths.camera import CameraSamples
 from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.streams import sample_streams
+from data_gen.samplers import find
 from data_gen.samplers.photons.map.edges import spread
 from data_gen.scenes.builtin import _camera, _diffuse
 
@@ -135,6 +139,16 @@ def test_no_light_is_lost_along_edges(renderer, sampler):
     if sampler == "gpm":
         slopes = np.mean([stack["dx"] for stack in stacks], axis=(0, 1, 3)) / (0.5 / np.pi)
         assert np.abs(slopes).max() < 0.15, slopes
+
+
+def test_shifts_by_nothing_find_no_difference(renderer):
+    """Along edges either: the copy of a path through its own pixel is the path. In layers both directions cancel."""
+    scene, film = load(renderer, open_square, (16, 16)), GradientFilm(16, 16, batches=True)
+    with far_shifts(0):
+        find("gpm").made(scene, radius=4.0)(CameraSamples(scene.sensors()[0], 0, 1), film)
+        film.end_pass(1)
+    means = {name: statistics(film.moments[name], 1, 1)[1] for name in ("primal", *SHIFTS)}
+    assert means.pop("primal").mean() > 0.1 and not any(mean.any() for mean in means.values())
 
 
 # ------------------------- As the radius goes to 0 -------------------------

@@ -4,7 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bdpt_ends import Copies, Ends, check_weights, compare, compare_copies, plan_of, without_hole
+from bdpt_ends import (
+    Copies,
+    Ends,
+    check_copies_to_the_camera,
+    check_going_straight_and_back,
+    check_weights,
+    compare,
+    compare_copies,
+    plan_of,
+    without_hole,
+)
 from bdpt_scenes import SCENES
 from renders import dr, mi
 from scipy.spatial import cKDTree
@@ -95,6 +105,15 @@ def test_weights_of_copies_count_merging(copies, t, s):
     much = densities[t + s + 2 :].sum(axis=0) > 0.05 * densities.sum(axis=0)
     assert much.sum() > {(2, 2): 10, (5, 1): 30}.get((t, s), -1)
     assert not much.any() or np.quantile(errors[:, much], 0.9, axis=1).max() < 0.02
+
+
+@pytest.mark.parametrize("s", [1, 2])
+def test_copies_of_light_paths_to_the_camera_and_back(copies, s):
+    check_copies_to_the_camera(copies, s)
+
+
+def test_going_straight_to_a_vertex_and_back(copies):
+    check_going_straight_and_back(copies)
 
 
 class Beside:
