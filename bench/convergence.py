@@ -17,8 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.claims import blocks
-from bench.common import metadata, save, write_page
+from bench.common import blocks, metadata, save, write_page
 from ngpt.evaluation.config import scene_name
 from ngpt.system.files import atomic_output
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.claims import blocks
+from bench.common import blocks
 from ngpt.evaluation.config import scene_name
 
 # By place where the pilot promises less than so much of the variance, and the option that goes with it

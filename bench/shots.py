@@ -18,6 +18,7 @@ all other rows are then of stacks without, at ``--spp-without``, for pairs take 
 import argparse
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -132,14 +133,9 @@ def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path)
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(DEFAULT_VARIANT)
-    from data_gen.frames.shot import Shot, render_shot
+    from data_gen.frames.shot import render_shot
 
-    size = tuple(map(int, args.size.split("x")))
-    name = str(args.folder / scene / "scene.xml") if args.folder and (args.folder / scene).is_dir() else scene
-    speed = SPEEDS.get(shot)
-    path = None if speed is None else sideways(Shot(lambda frame: (name, {}), size).at(0), speed)
-    update = mover(*MOVES[scene, shot]) if speed is None else None
-    rests = speed == 0
+    rests = SPEEDS.get(shot) == 0
     stacks: dict = {"in": {"spp": args.spp, "seed": 1, "sampler": "gpt", "dt": args.pairs}}
     if args.pairs:
         stacks["without"] = {"spp": args.spp_without, "seed": 3, "sampler": "gpt"}
@@ -157,10 +153,22 @@ def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path)
         frames = range(1 if rests and kind == "ref" else args.frames)
         target = {frame: folder / kind / f"{frame:04d}.exr" for frame in frames}
         missing = [frame for frame, file in target.items() if not file.exists()]
-        moving = Shot(lambda frame: (name, {}), size, path, update)
+        moving = shot_of(args.folder, scene, shot, args.size)
         for frame, stack in render_shot(moving, frames, skip=lambda f, m=missing: f not in m, **options):
             ngpt.write(target[frame], stack)
     return ("without" if args.pairs else "in"), "in", "ref"
+
+
+def shot_of(folder: Path | None, scene: str, shot: str, size: str) -> Any:
+    """A scene, of the folder or built in, with what moves in that shot."""
+    from data_gen.frames.shot import Shot
+
+    pixels = tuple(map(int, size.split("x")))
+    name = str(folder / scene / "scene.xml") if folder and (folder / scene).is_dir() else scene
+    if shot not in SPEEDS:
+        return Shot(lambda frame: (name, {}), pixels, update=mover(*MOVES[scene, shot]))
+    path = sideways(Shot(lambda frame: (name, {}), pixels).at(0), SPEEDS[shot])
+    return Shot(lambda frame: (name, {}), pixels, path)
 
 
 def mover(shape: str, way: tuple[float, float, float]):
