@@ -70,7 +70,7 @@ def main() -> None:
                 continue
             kinds = render_stacks(args, scene, shot, folder)
             stacks, paired, references, plain = (
-                [ngpt.read(f) for f in shot_files(str(folder / k))] for k in (*kinds, "plain")
+                [ngpt.read(f) for f in shot_files(str(folder / kind))] if kind else [] for kind in kinds
             )
             found = []
             for method in args.methods:
@@ -125,10 +125,9 @@ def line(row: dict) -> str:
     return f"| {row['scene']} | {row['shot']} | {row['method']} | {row['relMSE']:.5f} | {row['flicker']:.5f} |"
 
 
-def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path) -> tuple[str, str, str]:
-    """Renders stacks, stacks with pairs (without ``--pairs``: the same) and references; returns the folder names.
-
-    Existing files are kept.
+def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path) -> tuple[str, str, str, str]:
+    """Renders stacks, stacks with pairs (without ``--pairs``: the same), references, and with ``--plain`` stacks
+    without gradients; returns the folder names, "" for none. Existing files are kept.
     """
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
@@ -156,7 +155,7 @@ def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path)
         moving = shot_of(args.folder, scene, shot, args.size)
         for frame, stack in render_shot(moving, frames, skip=lambda f, m=missing: f not in m, **options):
             ngpt.write(target[frame], stack)
-    return ("without" if args.pairs else "in"), "in", "ref"
+    return ("without" if args.pairs else "in"), "in", "ref", "plain" if args.plain else ""
 
 
 def shot_of(folder: Path | None, scene: str, shot: str, size: str) -> Any:
