@@ -24,8 +24,8 @@ import statistics
 import time
 from pathlib import Path
 
-from bench.common import metadata, save, summary
-from bench.pipelines import Kept, mean_log
+from bench.common import mean, metadata, save, summary
+from bench.pipelines import Kept
 from ngpt.evaluation.config import scene_name
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS, reconstruct
@@ -143,13 +143,13 @@ def table(result: dict) -> str:
             for m in methods:
                 row = entry["methods"].get(m, {"expected": {}})
                 if "even" in row:
-                    found[m].append(mean_log(row["adaptive"]) / mean_log(row["even"]))
+                    found[m].append(mean(row["adaptive"]) / mean(row["even"]))
                 ratios.append(f"{found[m][-1]:.2f}" if "even" in row else "")
-                over = (math.sqrt(mean_log(e) / mean_log(row[name])) for name, e in row["expected"].items())
+                over = (math.sqrt(mean(e) / mean(row[name])) for name, e in row["expected"].items())
                 told.append(", ".join(f"{ratio:.2f}" for ratio in over))
             lines.append(f"| {scene} | " + " | ".join(ratios) + " |")
             foretold.append(f"| {scene} | " + " | ".join(told) + " |")
-        lines.append("| mean | " + " | ".join(f"{mean_log(found[m]):.2f}" for m in methods) + " |")
+        lines.append("| mean | " + " | ".join(f"{mean(found[m]):.2f}" for m in methods) + " |")
         lines.append("| seconds over even | " + " | ".join(price(result["costs"], m) for m in methods) + " |")
         parts += ["\n".join(lines), "\n".join(foretold)]
     return "\n\n".join(parts)

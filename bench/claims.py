@@ -22,17 +22,11 @@ from typing import Any
 
 import numpy as np
 
+from bench.common import blocks
 from ngpt.evaluation.config import scene_name
 
 LAYERS = ("primal", "caustic", "dx", "dy")
 SEEDS = 10
-
-
-def blocks(image: np.ndarray, side: int = 8) -> np.ndarray:
-    """Means over blocks of (..., H, W, C)."""
-    *n, h, w, c = image.shape
-    image = image[..., : h // side * side, : w // side * side, :]
-    return image.reshape(*n, h // side, side, w // side, side, c).mean(axis=(-4, -2))
 
 
 def ratio(real: np.ndarray, claimed: np.ndarray, quiet: float) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 import ngpt
-from bench.shots import SPEEDS, sideways
+from bench.shots import SPEEDS, shot_of
 from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.sequence.history import Temporal
 
@@ -41,11 +41,9 @@ def frames(args: argparse.Namespace) -> Iterator[np.ndarray]:
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(DEFAULT_VARIANT)
-    from data_gen.frames.shot import Shot, render_shot
+    from data_gen.frames.shot import render_shot
 
-    size = tuple(map(int, args.size.split("x")))
-    path = sideways(Shot(lambda frame: (args.scene, {}), size).at(0), SPEEDS[args.shot])
-    shot = Shot(lambda frame: (args.scene, {}), size, path)
+    shot = shot_of(None, args.scene, args.shot, args.size)
     kinds = []
     for sampler, spp in (("gpt", args.spp), ("primal", args.plain)):
         files = [args.cache / sampler / f"{frame:04d}.exr" for frame in range(args.frames)]

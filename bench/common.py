@@ -1,11 +1,13 @@
-"""What every benchmark records: versions, threads, medians and spread, so that a result can be judged later."""
+"""What benchmarks share: versions, medians and spread, by which a result can be judged later; renders that are kept."""
 
-import argparse
+import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+
+import numpy as np
 
 import ngpt
 from ngpt.evaluation.config import scene_name
@@ -52,14 +54,46 @@ def write_page(page: Path, text: str, marks: tuple[str, str]) -> None:
     page.write_text(f"{before}{marks[0]}\n\n{text}\n\n{marks[1]}{after}")
 
 
-def cached(scene: str, spp: int, sampler: str, seed: int, args: argparse.Namespace) -> GradientStack:
-    """A rendered stack, from the cache if it is there."""
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
+def mean(values: Iterable[float]) -> float:
+    """The geometric one."""
+    return math.exp(statistics.mean(map(math.log, values)))
 
-    width, height = args.size
-    path = args.cache / f"{scene_name(scene)}-{sampler}-{spp}-{width}x{height}.exr"
+
+def blocks(image: np.ndarray, side: int = 8) -> np.ndarray:
+    """Means over blocks of (..., H, W, C)."""
+    *n, h, w, c = image.shape
+    image = image[..., : h // side * side, : w // side * side, :]
+    return image.reshape(*n, h // side, side, w // side, side, c).mean(axis=(-4, -2))
+
+
+def kept(path: Path, make: Callable[[], GradientStack], names: dict[str, str] | None = None) -> GradientStack:
+    """The stack of a file, read by these ``names`` of layers; where there is no such file, it is made and written."""
     if not path.exists():
         print(f"rendering {path.name}", flush=True)
-        ngpt.write(path, render_stack(load_scene(scene, (width, height)), spp, seed, sampler))
-    return ngpt.read(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        ngpt.write(path, make())
+    return ngpt.read(path, names)
+
+
+def rendered(
+    folder: Path,
+    size: Sequence[int],
+    scene: str,
+    spp: int,
+    sampler: str,
+    seed: int,
+    names: dict[str, str] | None = None,
+) -> GradientStack:
+    """A stack of a scene, from the folder if it is there."""
+
+    def make() -> GradientStack:
+        from data_gen.backend import use_variant
+
+        use_variant()
+        from data_gen.render import render_stack
+        from data_gen.scenes.load import load_scene
+
+        return render_stack(load_scene(scene, (width, height)), spp, seed, sampler)
+
+    width, height = size
+    return kept(folder / f"{scene_name(scene)}-{sampler}-{spp}-{seed}-{width}x{height}.exr", make, names)

@@ -20,8 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.claims import blocks
-from bench.common import metadata, save
+from bench.common import blocks, metadata, save
 from bench.tails import REFERENCE_SEED, TAILS
 from ngpt.evaluation.config import scene_name
 from ngpt.measure.metrics import relmse_trimmed

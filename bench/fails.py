@@ -58,9 +58,8 @@ def place(image: np.ndarray, other: np.ndarray, reference: np.ndarray) -> tuple[
     errors = [relative_squared_error(one, reference).mean(axis=-1) for one in (image, other)]
     # Capped, so that a place with many bad pixels wins over a single firefly.
     excess = np.minimum(errors[0], 1) - np.minimum(errors[1], 1)
-    sums = np.cumsum(np.cumsum(np.pad(excess, ((1, 0), (1, 0))), axis=0), axis=1)
-    windows = sums[CROP:, CROP:] - sums[:-CROP, CROP:] - sums[CROP:, :-CROP] + sums[:-CROP, :-CROP]
-    y, x = np.unravel_index(np.argmax(windows), windows.shape)
+    sums = panels.windows(excess, CROP, CROP)
+    y, x = np.unravel_index(np.argmax(sums), sums.shape)
     return int(x), int(y)
 
 

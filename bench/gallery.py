@@ -23,7 +23,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import ngpt
 from bench import panels
-from bench.common import metadata, save, write_page
+from bench.common import kept, metadata, save, write_page
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.stack import GradientStack
@@ -71,7 +71,6 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(320, 180), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--cache", type=Path, required=True, help="folder for what is rendered")
     args = parser.parse_args()
-    args.cache.mkdir(parents=True, exist_ok=True)
     if args.wipe:
         row = next(row for row in SCENES_SHOWN if name_of(row) == args.wipe)
         stack = rendered(args, row, row.sampler, row.spp, 0, unbiased=False)
@@ -132,16 +131,17 @@ def images(args: argparse.Namespace, row: Shown) -> tuple[list[np.ndarray], dict
 def rendered(args: argparse.Namespace, row: Shown, sampler: str, spp: int, seed: int, unbiased: bool) -> GradientStack:
     """A stack, from the cache if it is there; the attribute gallery:seconds is processor time, kernels included."""
     file = args.cache / f"{name_of(row)}-{sampler}-{spp}-{seed}-{args.size[0]}x{args.size[1]}.exr"
-    if not file.exists():
+
+    def make() -> GradientStack:
         import data_gen
 
-        print(f"rendering {file.name}", flush=True)
         path = args.folder / row.scene if (args.folder / row.scene).exists() else row.scene
         start = time.process_time()
         stack, _ = data_gen.render_scene(path, spp, seed, sampler, size=tuple(args.size), unbiased=unbiased)
         stack.attributes["gallery:seconds"] = time.process_time() - start
-        ngpt.write(file, stack)
-    return ngpt.read(file)
+        return stack
+
+    return kept(file, make)
 
 
 def table(found: dict[str, Any]) -> str:

@@ -28,9 +28,8 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
 
-import ngpt
 from bench import panels
-from bench.common import metadata, save, summary
+from bench.common import kept, metadata, rendered, save, summary
 from ngpt.evaluation.config import scene_name
 from ngpt.measure.flip import flip
 from ngpt.measure.metrics import relative_squared_error, relmse, relmse_trimmed
@@ -69,8 +68,8 @@ def main() -> None:
     use_variant()
     cost = costs(args)
     equal = round(args.spp * cost["auto"]["median"] / cost["primal"]["median"])
-    gradients, path = rendered(args, "auto", args.spp, 0), rendered(args, "primal", equal, 0)
-    parts = [rendered(args, "primal", args.reference_spp, REFERENCE_SEED + i) for i in range(args.references)]
+    gradients, path = of_scene(args, "auto", args.spp, 0), of_scene(args, "primal", equal, 0)
+    parts = [of_scene(args, "primal", args.reference_spp, REFERENCE_SEED + i) for i in range(args.references)]
     halves = [np.mean([part["primal"] for part in parts[i::2]], axis=0) for i in (0, 1)]
     apart = path.replace(primal=path["primal"] - path["direct"], direct=np.zeros_like(path["direct"]))
     inputs = {"path tracing": (path, "primal"), "OIDN": (path, "oidn"), "ngpt": (gradients, args.method)}
@@ -130,37 +129,30 @@ def costs(args: argparse.Namespace) -> dict[str, dict[str, float]]:
     return json.loads(file.read_text())
 
 
-def rendered(args: argparse.Namespace, sampler: str, spp: int, seed: int) -> GradientStack:
-    """A stack, from the cache if it is there."""
-    width, height = args.size
-    file = args.cache / f"{scene_name(args.scene)}-{sampler}-{spp}-{seed}-{width}x{height}.exr"
-    if not file.exists():
-        from data_gen.render import render_stack
-        from data_gen.scenes.load import load_scene
-
-        print(f"rendering {file.name}", flush=True)
-        ngpt.write(file, render_stack(load_scene(args.scene, (width, height)), spp, seed, sampler))
+def of_scene(args: argparse.Namespace, sampler: str, spp: int, seed: int) -> GradientStack:
     # Without gradients beside it the reader takes the name "direct" for direct light.
-    return ngpt.read(file, {"direct": "direct"} if sampler == "primal" else None)
+    names = {"direct": "direct"} if sampler == "primal" else None
+    return rendered(args.cache, args.size, args.scene, spp, sampler, seed, names)
 
 
 def reference_crop(args: argparse.Namespace, box: tuple[int, int, int, int]) -> np.ndarray:
     """The box (left, top, width, height) of the reference with --crop-spp samples, from the cache if it is there."""
     left, top, width, height = box
     file = args.cache / f"{scene_name(args.scene)}-crop-{args.crop_spp}-{left}-{top}-{width}x{height}.exr"
-    if not file.exists():
+
+    def make() -> GradientStack:
         import mitsuba as mi
 
         from data_gen.render import render_stack
         from data_gen.scenes.load import load_scene
 
-        print(f"rendering {file.name}", flush=True)
         scene = load_scene(args.scene, tuple(args.size))
         film = mi.traverse(scene.sensors()[0])
         film["film.crop_size"], film["film.crop_offset"] = [width, height], [left, top]
         film.update()
-        ngpt.write(file, render_stack(scene, args.crop_spp, REFERENCE_SEED, "primal", with_features=False))
-    crop = ngpt.read(file)
+        return render_stack(scene, args.crop_spp, REFERENCE_SEED, "primal", with_features=False)
+
+    crop = kept(file, make)
     return settled(crop["primal"], crop["primal_var"])
 
 
@@ -175,13 +167,9 @@ def extremes(gain: np.ndarray, judged: np.ndarray, width: int, height: int) -> l
 
     Only windows whose pixels are all ``judged`` count.
     """
-
-    def windows(values: np.ndarray) -> np.ndarray:
-        sums = np.pad(values, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
-        return sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
-
     # Bounded, so that a place with many pixels that differ wins over a single firefly.
-    means = np.where(windows((~judged).astype(float)) > 0, np.nan, windows(np.clip(gain, -1, 1)))
+    means = panels.windows(np.clip(gain, -1, 1), width, height)
+    means[panels.windows((~judged).astype(float), width, height) > 0] = np.nan
     y, x = np.unravel_index(np.nanargmax(means), means.shape)
     means[max(0, y - height) : y + height, max(0, x - width) : x + width] = np.nan
     other_y, other_x = np.unravel_index(np.nanargmin(means), means.shape)

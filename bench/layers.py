@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import ngpt
-from bench.common import cached, metadata
+from bench.common import mean, metadata, rendered
 from ngpt.evaluation.config import scene_name
 from ngpt.io.exr import read
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
@@ -98,13 +98,8 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=["diffuse", "glossy", "environment", "lens"])
     parser.add_argument("--size", type=int, nargs=2, default=SIZE, metavar=("WIDTH", "HEIGHT"))
     args = parser.parse_args()
-
-    from data_gen.backend import use_variant
-
-    use_variant()
-    args.cache.mkdir(parents=True, exist_ok=True)
-    truth = {s: cached(s, REFERENCE_SPP, "primal", 1, args)["primal"] for s in args.scenes}
-    stacks = {n: [(cached(s, n, "auto", 0, args), truth[s]) for s in args.scenes] for n in SPP}
+    truth = {s: rendered(args.cache, args.size, s, REFERENCE_SPP, "primal", 1)["primal"] for s in args.scenes}
+    stacks = {n: [(rendered(args.cache, args.size, s, n, "auto", 0), truth[s]) for s in args.scenes] for n in SPP}
     rows = [
         {"method": method, "layers": layers, "error": [error_of(stacks[n], method, layers) for n in SPP]}
         for method, layers in sorted({("primal", ("primal",)), *cases()}, key=lambda case: (len(case[1]), case))
@@ -174,10 +169,6 @@ def measured(files: Sequence[tuple[GradientStack, np.ndarray]], oidn: bool) -> t
 
     method = choose(files[0][0], lambda name: not METHODS[name].missing() and (oidn or name not in NEED_OIDN))
     return method, error(method), error("oidn") if oidn else None, error("primal")
-
-
-def mean(values) -> float:
-    return float(np.exp(np.mean(np.log(list(values)))))
 
 
 def by_layers(rows: list[dict]) -> str:

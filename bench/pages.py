@@ -17,8 +17,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from bench.common import save, write_page
-from bench.tables import RIVALS, heading, mean
+from bench.common import mean, save, write_page
+from bench.tables import RIVALS, heading
 from ngpt.evaluation.curves import error_at
 from ngpt.evaluation.wholetime import ratio
 from ngpt.evaluation.worth import marked

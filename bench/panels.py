@@ -31,6 +31,12 @@ def framed(image: np.ndarray, boxes: Sequence[tuple[int, int, int, int]], colour
     return np.asarray(canvas)
 
 
+def windows(values: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Sums of (H, W) over all windows of so many pixels, by their corner."""
+    sums = np.pad(values, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+    return sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+
+
 def columns(headings: Sequence[Sequence[str]], tiles: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
     """(H, W, 3) uint8: column i has the lines ``headings[i]``, the first one larger, above ``tiles[i]``.
 

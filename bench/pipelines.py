@@ -27,9 +27,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from bench.common import metadata, save
+from bench import common
+from bench.common import mean, metadata, save
 from ngpt.evaluation.config import scene_name
-from ngpt.io.exr import read, write
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.merging import merge
 from ngpt.methods import reconstruct
@@ -78,10 +78,7 @@ class Kept:
         folder.mkdir(parents=True, exist_ok=True)
 
     def stack(self, name: str, make: Callable[[], GradientStack]) -> GradientStack:
-        path = self.folder / f"{name}.exr"
-        if not path.exists():
-            write(path, make())
-        return read(path)
+        return common.kept(self.folder / f"{name}.exr", make)
 
     def numbers(self, name: str, make: Callable[[], dict]) -> dict:
         path = self.folder / f"{name}.json"
@@ -268,7 +265,7 @@ def promises(result: dict) -> list[str]:
     for (network, n), ratios in found.items():
         deciles = statistics.quantiles(ratios, n=10)
         ends = ", ".join(f"{deciles[i]:.2f}" for i in (0, 4, 8))
-        lines.append(f"{'networks' if network else 'others'} at {n}: {ends}; {mean_log(ratios):.2f} in the mean")
+        lines.append(f"{'networks' if network else 'others'} at {n}: {ends}; {mean(ratios):.2f} in the mean")
     return ["true error over what was expected", *lines]
 
 
@@ -295,20 +292,16 @@ def table(result: dict) -> list[str]:
             lines.append(f"| {scene} | {cell['spp']} | `{cell['choice']}` | {ratios[cell['choice']]:.2f} | `{least}` |")
     for apart, title in ((False, "chosen on"), (True, "apart")):
         if rows := regrets[apart]:
-            lines.append(f"{title}: {mean_log(rows):.3f} in the mean, {max(rows):.2f} at worst, {len(rows)} cells")
+            lines.append(f"{title}: {mean(rows):.3f} in the mean, {max(rows):.2f} at worst, {len(rows)} cells")
             by_auto = autos[apart]
-            lines.append(f"  sampler auto, of samplers alone: {mean_log(by_auto):.3f}, {max(by_auto):.2f}")
+            lines.append(f"  sampler auto, of samplers alone: {mean(by_auto):.3f}, {max(by_auto):.2f}")
             whole_rows = {n: r for n, r in fixed[apart].items() if len(r) == len(rows)}
-            whole = {n: mean_log(r) for n, r in whole_rows.items()}
+            whole = {n: mean(r) for n, r in whole_rows.items()}
             for name in sorted(whole, key=lambda n: whole[n])[:8]:
                 ahead = sum(r < 0.98 * ours for r, ours in zip(whole_rows[name], rows, strict=True))
                 worst = max(whole_rows[name])
                 lines.append(f"  always {name}: {whole[name]:.3f}, {worst:.2f}; ahead by 2 % in {ahead} cells")
     return lines
-
-
-def mean_log(values: list[float]) -> float:
-    return math.exp(statistics.mean(math.log(v) for v in values))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ import numpy as np
 
 import ngpt
 from bench.common import metadata, save
-from bench.shots import MOVES, SPEEDS, measured, mover, sideways
+from bench.shots import SPEEDS, measured, shot_of
 from ngpt.sequence.history import Temporal
 
 RIVALS = {
@@ -68,18 +68,6 @@ def main() -> None:
             save(args.out / "restir.json", result)
 
 
-def shot_of(args: argparse.Namespace, scene: str, shot: str, size: str):
-    """The scene with what moves in that shot."""
-    from data_gen.frames.shot import Shot
-
-    pixels = tuple(map(int, size.split("x")))
-    name = str(args.folder / scene / "scene.xml") if args.folder and (args.folder / scene).is_dir() else scene
-    if shot not in SPEEDS:
-        return Shot(lambda frame: (name, {}), pixels, update=mover(*MOVES[scene, shot]))
-    path = sideways(Shot(lambda frame: (name, {}), pixels).at(0), SPEEDS[shot])
-    return Shot(lambda frame: (name, {}), pixels, path)
-
-
 def costs(args: argparse.Namespace, scene: str, shot: str) -> dict[str, dict[str, float]]:
     """Wall-clock and processor time of a frame in units of a gpt sample, and how many kernels it launches."""
     import drjit as dr
@@ -88,7 +76,7 @@ def costs(args: argparse.Namespace, scene: str, shot: str) -> dict[str, dict[str
     from data_gen.passes import render_passes
     from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
 
-    moving = shot_of(args, scene, shot, args.cost_size)
+    moving = shot_of(args.folder, scene, shot, args.cost_size)
     changes = shot not in SPEEDS
     turns = [moving, moving.twin()] if changes else [moving]
     loaded = moving.at(0)
@@ -137,7 +125,7 @@ def compare(args: argparse.Namespace, scene: str, shot: str, cost: dict) -> dict
     """Noise of a frame, and errors of reconstructions at equal processor time."""
     from data_gen.frames.shot import render_shot
 
-    camera = shot_of(args, scene, shot, args.size)
+    camera = shot_of(args.folder, scene, shot, args.size)
     reference = {"sampler": "primal", "with_features": False}
     wanted = range(args.skip, args.frames)
     references = [

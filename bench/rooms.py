@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 
 import ngpt
-from bench.common import metadata, save
+from bench.common import metadata, rendered, save
 from ngpt.evaluation.config import scene_name
-from ngpt.io.exr import read
 from ngpt.measure.flip import flip
 from ngpt.measure.images import middle
 from ngpt.measure.metrics import relmse_trimmed
@@ -37,35 +36,20 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path("out/rooms"), help="folder of renders")
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/rooms.json"))
     args = parser.parse_args()
-    args.cache.mkdir(parents=True, exist_ok=True)
     given = [(START, args.start), *(arm.split("=", 1) for arm in args.weights)]
     rows = json.loads(args.output.read_text())["rows"] if args.output.exists() else []
     for scene in args.scenes:
-        halves = tuple(rendered(args, scene, "primal", args.reference, seed)["primal"] for seed in (1000, 1001))
+        halves = tuple(
+            rendered(args.cache, args.size, scene, args.reference, "primal", seed)["primal"] for seed in (1000, 1001)
+        )
         for spp in args.spp:
-            stack = rendered(args, scene, "gpt", spp, 1)
+            stack = rendered(args.cache, args.size, scene, spp, "gpt", 1)
             for arm, path in given:
                 about = {"room": scene_name(scene), "spp": spp, "arm": arm, "weights": Path(path).as_posix()}
                 if not any(about.items() <= row.items() for row in rows):
                     rows.append(about | judged(ngpt.denoise(stack, "ngpt", weights=str(path)), halves))
                     save(args.output, {"metadata": metadata("torch", "mitsuba"), "size": args.size, "rows": rows})
     print(table(rows, args.spp))
-
-
-def rendered(args: argparse.Namespace, scene: str, sampler: str, spp: int, seed: int):
-    """A stack, from the cache if it is there."""
-    width, height = args.size
-    path = args.cache / f"{scene_name(scene)}-{sampler}-{spp}-{seed}-{width}x{height}.exr"
-    if not path.exists():
-        from data_gen.backend import use_variant
-        from data_gen.render import render_stack
-
-        use_variant()
-        from data_gen.scenes.load import load_scene
-
-        print(f"rendering {path.name}", flush=True)
-        ngpt.write(path, render_stack(load_scene(scene, (width, height)), spp, seed, sampler))
-    return read(path)
 
 
 def judged(image: np.ndarray, halves: tuple[np.ndarray, ...]) -> dict[str, float]:

@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 
 import ngpt
-from bench.common import metadata, save, summary
+from bench.common import kept, metadata, save, summary
 from ngpt.evaluation.config import scene_name
 from ngpt.evaluation.gradientmap import variances_of_differences, write_map
 from ngpt.evaluation.references import reference_noise
@@ -71,7 +71,6 @@ def run(args: argparse.Namespace) -> None:
     use_variant()
     from data_gen.scenes.builtin import SCENES
 
-    args.cache.mkdir(parents=True, exist_ok=True)
     files = [str(path) for path in sorted(args.folder.glob("*/scene.xml"))] if args.folder else []
     scenes = args.scenes or [*SCENES, *files]
     setup = {"size": list(args.size), "spp": args.spp, "timing spp": args.timing_spp, "repeats": args.repeats}
@@ -174,10 +173,7 @@ def cached_reference(scene, name: str, size: tuple[int, int], args: argparse.Nam
     from data_gen.render import render_stack
 
     file = args.cache / f"{name}-reference-{size[0]}x{size[1]}-{args.reference_seconds:g}s.exr"
-    if not file.exists():
-        stack = render_stack(scene, None, REFERENCE_SEED, "primal", seconds=args.reference_seconds)
-        ngpt.write(file, stack)
-    return ngpt.read(file)
+    return kept(file, lambda: render_stack(scene, None, REFERENCE_SEED, "primal", seconds=args.reference_seconds))
 
 
 def variance_ratios(stack: GradientStack) -> dict[str, float]:

@@ -18,6 +18,7 @@ all other rows are then of stacks without, at ``--spp-without``, for pairs take 
 import argparse
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -69,7 +70,7 @@ def main() -> None:
                 continue
             kinds = render_stacks(args, scene, shot, folder)
             stacks, paired, references, plain = (
-                [ngpt.read(f) for f in shot_files(str(folder / k))] for k in (*kinds, "plain")
+                [ngpt.read(f) for f in shot_files(str(folder / kind))] if kind else [] for kind in kinds
             )
             found = []
             for method in args.methods:
@@ -124,22 +125,16 @@ def line(row: dict) -> str:
     return f"| {row['scene']} | {row['shot']} | {row['method']} | {row['relMSE']:.5f} | {row['flicker']:.5f} |"
 
 
-def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path) -> tuple[str, str, str]:
-    """Renders stacks, stacks with pairs (without ``--pairs``: the same) and references; returns the folder names.
-
-    Existing files are kept.
+def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path) -> tuple[str, str, str, str]:
+    """Renders stacks, stacks with pairs (without ``--pairs``: the same), references, and with ``--plain`` stacks
+    without gradients; returns the folder names, "" for none. Existing files are kept.
     """
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(DEFAULT_VARIANT)
-    from data_gen.frames.shot import Shot, render_shot
+    from data_gen.frames.shot import render_shot
 
-    size = tuple(map(int, args.size.split("x")))
-    name = str(args.folder / scene / "scene.xml") if args.folder and (args.folder / scene).is_dir() else scene
-    speed = SPEEDS.get(shot)
-    path = None if speed is None else sideways(Shot(lambda frame: (name, {}), size).at(0), speed)
-    update = mover(*MOVES[scene, shot]) if speed is None else None
-    rests = speed == 0
+    rests = SPEEDS.get(shot) == 0
     stacks: dict = {"in": {"spp": args.spp, "seed": 1, "sampler": "gpt", "dt": args.pairs}}
     if args.pairs:
         stacks["without"] = {"spp": args.spp_without, "seed": 3, "sampler": "gpt"}
@@ -157,10 +152,22 @@ def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path)
         frames = range(1 if rests and kind == "ref" else args.frames)
         target = {frame: folder / kind / f"{frame:04d}.exr" for frame in frames}
         missing = [frame for frame, file in target.items() if not file.exists()]
-        moving = Shot(lambda frame: (name, {}), size, path, update)
+        moving = shot_of(args.folder, scene, shot, args.size)
         for frame, stack in render_shot(moving, frames, skip=lambda f, m=missing: f not in m, **options):
             ngpt.write(target[frame], stack)
-    return ("without" if args.pairs else "in"), "in", "ref"
+    return ("without" if args.pairs else "in"), "in", "ref", "plain" if args.plain else ""
+
+
+def shot_of(folder: Path | None, scene: str, shot: str, size: str) -> Any:
+    """A scene, of the folder or built in, with what moves in that shot."""
+    from data_gen.frames.shot import Shot
+
+    pixels = tuple(map(int, size.split("x")))
+    name = str(folder / scene / "scene.xml") if folder and (folder / scene).is_dir() else scene
+    if shot not in SPEEDS:
+        return Shot(lambda frame: (name, {}), pixels, update=mover(*MOVES[scene, shot]))
+    path = sideways(Shot(lambda frame: (name, {}), pixels).at(0), SPEEDS[shot])
+    return Shot(lambda frame: (name, {}), pixels, path)
 
 
 def mover(shape: str, way: tuple[float, float, float]):

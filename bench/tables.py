@@ -15,13 +15,11 @@ the cost of a sample of each sampler. ``PAGES`` gives the page of each table, an
 
 import argparse
 import json
-import math
-import statistics
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bench.common import save, write_page
+from bench.common import mean, save, write_page
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "bench" / "results"
@@ -153,11 +151,6 @@ def short(value: float, digits: int = 3) -> str:
 
 def heading(first: str, *others: str) -> list[str]:
     return [f"| {first} | {' | '.join(others)} |", "|---" + "|--:" * len(others) + "|"]
-
-
-def mean(values: list[float]) -> float:
-    """The geometric one."""
-    return math.exp(statistics.mean(math.log(value) for value in values))
 
 
 if __name__ == "__main__":

@@ -32,8 +32,7 @@ from typing import Any
 import numpy as np
 
 import ngpt
-from bench.claims import blocks
-from bench.common import metadata, save
+from bench.common import blocks, metadata, save
 from ngpt.evaluation.averages import mean, median
 from ngpt.evaluation.config import scene_name
 from ngpt.evaluation.curves import error_at, joined

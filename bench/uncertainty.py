@@ -17,10 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.common import metadata, save
+from bench.common import kept, metadata, save
 from ngpt.api.uncertainty import FACTOR, FACTORS, reconstruct_with_error
 from ngpt.errors import NgptError
-from ngpt.io.exr import read, write
 from ngpt.merging import merge
 from ngpt.methods import METHODS
 from ngpt.stack import GradientStack
@@ -71,26 +70,24 @@ def main() -> None:
 
 def images(scene: str, spp: int, args: argparse.Namespace) -> list[GradientStack]:
     """The reference, the stack and, where they are wanted, its halves; rendered where they are not in the cache."""
-    name, found = Path(scene).name, []
+    name = Path(scene).name
     files = [(f"{name}-reference.exr", args.reference, "primal", spp)]
     if args.halves:
         files += [(f"{name}-{spp}-half{i}.exr", spp // 2, "auto", 2 * spp + i) for i in (0, 1)]
     else:
         files.append((f"{name}-{spp}.exr", spp, "auto", spp))
-    for file, count, sampler, seed in files:
-        path = args.cache / file
-        if not path.exists():
-            from data_gen.backend import use_variant
 
-            use_variant()
-            from data_gen.render import render_stack
-            from data_gen.scenes.load import load_scene
+    def make(count: int, sampler: str, seed: int) -> GradientStack:
+        from data_gen.backend import use_variant
 
-            at = Path(scene) / "scene.xml"
-            loaded = load_scene(str(at) if at.exists() else scene, tuple(args.size))
-            args.cache.mkdir(parents=True, exist_ok=True)
-            write(path, render_stack(loaded, count, seed, sampler))
-        found.append(read(path))
+        use_variant()
+        from data_gen.render import render_stack
+        from data_gen.scenes.load import load_scene
+
+        at = Path(scene) / "scene.xml"
+        return render_stack(load_scene(str(at) if at.exists() else scene, tuple(args.size)), count, seed, sampler)
+
+    found = [kept(args.cache / file, lambda how=how: make(*how)) for file, *how in files]
     return [found[0], merge(found[1:]), *found[1:]] if args.halves else found
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 import ngpt
 from bench import panels
+from bench.common import kept
 from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.stack import GradientStack
 
@@ -35,7 +36,6 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, required=True, help="folder for what is rendered")
     parser.add_argument("--picture", type=Path, default=Path("docs/images/which-sampler.jpg"))
     args = parser.parse_args()
-    args.cache.mkdir(parents=True, exist_ok=True)
     rows = [row(args, *case) for case in CASES]
     lines = [["Path tracing"], ["Path tracing, OIDN"], ["The sampler of this row, denoised"]]
     panels.save(args.picture, panels.columns(lines, [list(tiles) for tiles in zip(*rows, strict=True)]))
@@ -53,14 +53,15 @@ def rendered(args: argparse.Namespace, scene: str, sampler: str) -> GradientStac
     """A stack, from the cache if it is there."""
     name = Path(scene).parent.name or scene
     file = args.cache / f"{name}-{sampler}-{args.seconds:g}s.exr"
-    if not file.exists():
+
+    def make() -> GradientStack:
         import data_gen
 
         path = args.folder / scene if (args.folder / scene).exists() else scene
-        stack, _ = data_gen.render_scene(path, sampler=sampler, seconds=args.seconds, size=tuple(args.size))
-        ngpt.write(file, stack)
+        return data_gen.render_scene(path, sampler=sampler, seconds=args.seconds, size=tuple(args.size))[0]
+
     # Without gradients beside it the reader takes the name "direct" for direct light.
-    return ngpt.read(file, {"direct": "direct"} if sampler in ("primal", "vcm") else None)
+    return kept(file, make, {"direct": "direct"} if sampler in ("primal", "vcm") else None)
 
 
 if __name__ == "__main__":

@@ -131,7 +131,9 @@ class Sampler(Entry):
     ``tried``       whether the pilot of "auto" compares it with others, where it can render the scene. True for
                     samplers that were seen to be chosen where they are best (``data_gen.choosing.plans``)
     ``compiles``    seconds that a core takes to compile its kernels, of most scenes; given where ``tried`` is true
-    ``finds``       what light it finds that paths from the camera hardly find: of ``FINDS``
+    ``finds``       what light it finds that paths from the camera hardly find: "caustics" (seen in mirrors or through
+                    glass after glass has focussed it on something rough), "hidden lamps" (hidden from what they light),
+                    "grids" (light in media whose density varies, by photons)
     ``diagnoses``   whether it counts failed shifts, which ``--diagnostics`` writes: ``make`` takes ``diagnostics=True``
     ``batch``       0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass
                     has so many, and variances are over passes
@@ -178,11 +180,6 @@ class Sampler(Entry):
     def even(self) -> bool:
         """Whether all pixels must have as many samples."""
         return bool(self.batch) or self.together
-
-
-# What samplers find: light that is seen in mirrors or through glass after glass has focussed it on something rough;
-# lamps that are hidden from what they light; and light in media whose density varies, by photons
-FINDS = ("caustics", "hidden lamps", "grids")
 
 
 @dataclass(frozen=True)

@@ -17,17 +17,6 @@ def forward_differences(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.moveaxis(dx, (-2, -1), (0, 1)), np.moveaxis(dy, (-2, -1), (0, 1))
 
 
-def adjoint_differences(dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
-    """The adjoint of ``forward_differences``, i.e. the negative divergence, (H, W, ...).
-
-    The last column of dx and the last row of dy stand for no difference and are ignored. With it,
-    ``(forward_differences(I) * (dx, dy)).sum() == (I * adjoint_differences(dx, dy)).sum()``.
-    """
-    x, y = (np.moveaxis(np.array(d), (0, 1), (-2, -1)) for d in (dx, dy))
-    x[..., -1], y[..., -1, :] = 0, 0
-    return np.moveaxis(adjoint(x, y), (-2, -1), (0, 1))
-
-
 def differences(planes: np.ndarray, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
     """dx and dy of rows first .. last - 1 of (..., H, W) planes."""
     here, below = planes[..., first:last, :], planes[..., first + 1 : last + 1, :]
@@ -41,7 +30,11 @@ def differences(planes: np.ndarray, first: int, last: int) -> tuple[np.ndarray, 
 
 
 def adjoint(dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
-    """The adjoint of ``differences``, (..., rows, W); the unused column of dx and row of dy must be 0."""
+    """The adjoint of ``differences``, i.e. the negative divergence, (..., rows, W).
+
+    The unused column of dx and row of dy must be 0. With it,
+    ``(differences(I) * (dx, dy)).sum() == (I * adjoint(dx, dy)).sum()``.
+    """
     total = -dx
     total -= dy
     total[..., 1:] += dx[..., :-1]

@@ -22,8 +22,6 @@ from ngpt.network.unet import Convolution
 from ngpt.network.weights import load_weights
 from ngpt.version import __version__
 
-PRECISIONS = ("float32", "float16")
-
 
 def network_model(weights: str | Path, name: str, precision: str = "float32") -> onnx.ModelProto:
     """The graph of the weights in that file; ``name`` is what its metadata call it.

@@ -128,12 +128,3 @@ def empty(lanes: int) -> Record:
         *(mi.UInt32, mi.Point2f, mi.Vector3f, mi.Spectrum, mi.Float, mi.Float),
     )
     return Record(*(dr.zeros(kind, lanes) for kind in types))
-
-
-def record_bytes(record: Record) -> int:
-    """What a record takes in memory."""
-
-    def words(value) -> int:
-        return sum(words(part) for part in value) if dr.depth_v(value) > 1 else 1
-
-    return 4 * sum(words(getattr(record, f.name)) for f in fields(Record))
