@@ -196,6 +196,7 @@ def test_one_command_trains_it_and_goes_on(tmp_path, rng, capsys):
     for steps, said in ((3, "validation: 1 of 2 scenes set aside"), (5, "at step 3 of 5")):
         assert main([*words, "--set", f"run.steps={steps}"]) == 0, capsys.readouterr().err
         assert said in (output := capsys.readouterr().out) and f"finished at step {steps}" in output
+        assert "results frame by frame, by wcv" in output
     assert [entry["step"] for entry in log_of(tmp_path / "run") if "loss" in entry] == [1, 2, 3, 4, 5]
     assert "Finished" in (tmp_path / "run" / "run.html").read_text()
     assert main(["info", out]) == 0 and "validations: 2" in capsys.readouterr().out
