@@ -33,7 +33,7 @@ from ngpt.training.run_summary import entries_of, summary
 ROOT = Path(__file__).parents[1]
 # Of each training: its share, and changes of its configuration. How long it will be need not be known: the learning
 # rate stays what it is once it has warmed up, and weights are averages over a thousand steps.
-ENDLESS = ["run.steps=10000000", "run.log=50", "run.save=500", "run.validate=500", "optimizer.warmup=500"]
+ENDLESS = ["run.steps=10000000", "run.log=50", "run.save=200", "run.validate=500", "optimizer.warmup=500"]
 ENDLESS += ["optimizer.flat=10000000"]
 PAPER = ["run.precision='bfloat16'", "optimizer.clip=1.0", "optimizer.ema=0.999"]
 RUNS = {"paper": (0.65, PAPER), "large": (0.35, ["data.workers=6", "optimizer.schedule='paper'"])}
@@ -58,12 +58,13 @@ def run_for(seconds: float, log: Path, *arguments: object) -> tuple[float, int |
         process = subprocess.Popen(words, stdout=out, stderr=out, process_group=0, env=known)
     status: int | None = None
     try:
-        status = process.wait(max(seconds, 1))
-    except subprocess.TimeoutExpired:
-        process.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(20)
-    finally:
+            status = process.wait(max(seconds, 1))
+    finally:  # also where this process is ended itself
+        if status is None:
+            process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(20)
         with contextlib.suppress(ProcessLookupError):  # what it started may outlive it
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
@@ -72,7 +73,7 @@ def run_for(seconds: float, log: Path, *arguments: object) -> tuple[float, int |
 
 
 def window(scale: SimpleNamespace, data: list[Path], work: Path, minutes: float) -> None:
-    """Notes each part at once, in ``work``/parts.jsonl: what ends this early finds it written."""
+    """Notes each part at once, in ``work``/parts.jsonl and report.md: what ends this early finds it written."""
     end = time.monotonic() + 60 * minutes - min(20, 6 * minutes)
 
     def left() -> float:
@@ -82,6 +83,7 @@ def window(scale: SimpleNamespace, data: list[Path], work: Path, minutes: float)
         told = f"status {status}: {told}" if status else told
         with open(work / "parts.jsonl", "a", encoding="utf-8") as file:
             print(json.dumps({"part": part, "seconds": round(seconds, 1), "told": told}), file=file)
+        write_report(work)
         print(f"{part}: {seconds:.0f} s: {told}", flush=True)
 
     note("machine", 0, 0, json.dumps(metadata("torch", "mitsuba", "drjit", "onnxruntime-gpu")))
@@ -94,16 +96,16 @@ def window(scale: SimpleNamespace, data: list[Path], work: Path, minutes: float)
             seconds, status, told = run_for(left() - last, work / "logs" / f"check-{path.stem}.txt", *command)
             if status is not None and not path.exists():
                 write_json(path, {"check": name, "status": "failed", "seconds": round(seconds), "told": told})
+    # Wrong crops would be worse than none: where the GPU has not been found to render well, processors do.
     gpu = work / "checks" / "renderer-gpt.json"
-    if gpu.exists() and json.loads(gpu.read_text())["status"] == "failed":
-        note("crops", 0, 0, "none: wrong ones would be worse")
-    else:
-        command = ["-m", "data_gen", "--config", scale.dataset, "--out", work / "data", "--variant", scale.variant]
-        command += ["--workers", max(1, processors() - 2)]
-        # Without other sets to learn from, half of what is left.
-        seconds = 60 * minutes * CROPS if data else left() / 2
-        seconds, status, told = run_for(seconds, work / "logs" / "crops.txt", *command)
-        note("crops", seconds, status, f"{len(crops(work / 'data'))} in all: {told}")
+    passed = gpu.exists() and json.loads(gpu.read_text())["status"] == "passed"
+    variant = scale.variant if passed else SMALL.variant
+    command = ["-m", "data_gen", "--config", scale.dataset, "--out", work / "data", "--variant", variant]
+    command += ["--workers", max(1, processors() - 2)]
+    # Without other sets to learn from, half of what is left.
+    seconds = 60 * minutes * CROPS if data else left() / 2
+    seconds, status, told = run_for(seconds, work / "logs" / "crops.txt", *command)
+    note("crops", seconds, status, f"by {variant}, {len(crops(work / 'data'))} in all: {told}")
     folders = [str(folder) for folder in (*data, work / "data") if crops(folder)]
     apart = [APART] if any(not scene.startswith(APART) for folder in folders for scene in crops(Path(folder))) else []
     sets = [f"data.folders={json.dumps(folders)}", f"data.validation={json.dumps(apart)}"]
@@ -131,7 +133,7 @@ def steps(work: Path) -> int:
     return sum(summary(run)["checkpoint at step"] for run in runs)
 
 
-def write_report(work: Path) -> str:
+def write_report(work: Path) -> None:
     """``work``/report.md: the checks, the parts of all windows, and the last score and the speed of each run."""
     checks = [json.loads(path.read_text()) for path in sorted(work.glob("checks/*.json"))]
     rows = [(check["check"], check["status"], check["seconds"], check["told"]) for check in checks]
@@ -147,7 +149,6 @@ def write_report(work: Path) -> str:
     cells = [[str(cell).replace("|", "/").replace("\n", " ") for cell in row] for row in rows]
     text = "\n".join(f"| {' | '.join(row)} |" for row in [["part", "", "seconds", ""], ["---"] * 4, *cells])
     write_text(work / "report.md", f"# Windows on a GPU\n\n{text}\n")
-    return text
 
 
 # --- checks: by name the largest difference, relative to the largest value, and what is allowed -----------------------
@@ -323,17 +324,26 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--small", action="store_true", help="on processors, at a hundredth of the scale")
     parser.add_argument("--check", metavar="NAME", help="make one check, and nothing else")
     args = parser.parse_args(arguments)
+    if args.minutes is not None and not 0 < args.minutes < 1e6:
+        parser.error(f"--minutes {args.minutes:g}: give a number above 0")
+    if args.check is not None and args.check not in names():
+        parser.error(f"--check '{args.check}': there are {', '.join(names())}")
     scale, work = SMALL if args.small else LARGE, args.work.resolve()
+    try:
+        (work / "checks").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        parser.error(f"--work {args.work}: no folder can be made there: {error.strerror}")
     if args.check:
-        write_json(work / "checks" / f"{args.check.replace(' ', '-')}.json", check(args.check, scale))
-        return 0
+        record = check(args.check, scale)
+        write_json(work / "checks" / f"{args.check.replace(' ', '-')}.json", record)
+        print(f"{args.check}: {record['status']}: {record['told']}")
+        return int(record["status"] == "failed")
     if missing := [folder for folder in args.data if not (folder / "manifest.json").is_file()]:
         print(f"scripts.gpu: {missing[0]}: no training set there (manifest.json is missing)", file=sys.stderr)
         return 2
-    (work / "checks").mkdir(parents=True, exist_ok=True)
     before = steps(work)
     window(scale, [folder.resolve() for folder in args.data], work, args.minutes or scale.minutes)
-    print(write_report(work))
+    print((work / "report.md").read_text())
     if steps(work) <= before:
         print(f"scripts.gpu: nothing was trained: give it more time (--minutes) or training sets (--data); {work}/logs")
     return 0 if steps(work) > before else 1

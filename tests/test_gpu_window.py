@@ -1,6 +1,8 @@
 """The window on a GPU: what it does in which order, what becomes of programs that fail, and all of it in small."""
 
 import json
+import subprocess
+import time
 
 import pytest
 
@@ -62,9 +64,24 @@ def test_checks_come_first_then_crops_then_trainings_on_all_there_is(window, tmp
     assert list(window(sets)) == ["crops", "run-paper", "run-large"]
 
 
-def test_without_crops_nothing_is_trained_and_wrong_ones_are_not_made(window, tmp_path):
-    assert list(window()) == ["check-renderer-gpt", "check-arrays"]
-    assert "| paper |  | 0 | no crops |" in gpu.write_report(tmp_path / "work")
+def test_without_crops_nothing_is_trained(window, tmp_path):
+    assert list(window()) == ["check-renderer-gpt", "check-arrays", "crops"]
+    assert "| paper |  | 0 | no crops |" in (tmp_path / "work" / "report.md").read_text()
+
+
+def test_processors_render_where_the_gpu_has_not_passed(window):
+    assert "llvm_ad_rgb" in window()["crops"][1]
+
+
+def test_a_window_that_is_cut_has_a_report_of_what_it_did(window, tmp_path):
+    def cut(log):
+        if log.stem.startswith("run-"):
+            raise SystemExit(143)
+
+    with pytest.raises(SystemExit):
+        window(crops_in(tmp_path / "set", "room"), does=cut)
+    report = (tmp_path / "work" / "report.md").read_text()
+    assert "| arrays | failed |" in report and "| crops |" in report and "its last words" in report
 
 
 def test_a_program_has_its_seconds_and_may_save_what_it_has(tmp_path):
@@ -74,6 +91,48 @@ def test_a_program_has_its_seconds_and_may_save_what_it_has(tmp_path):
     code += "signal.signal(signal.SIGTERM, end)\nprint('begun', flush=True)\ntime.sleep(60)"
     seconds, status, told = gpu.run_for(2, log, "-c", code)
     assert status is None and told.endswith("saved") and seconds < 30
+
+
+def test_a_program_may_save_where_the_window_itself_is_cut(tmp_path, monkeypatch):
+    log, words = (
+        tmp_path / "a.txt",
+        "import signal, sys, time\nsignal.signal(signal.SIGTERM, lambda *_: sys.exit('saved'))\n",
+    )
+    wait = subprocess.Popen.wait
+
+    def cut(process, timeout=None):
+        if timeout == 60:
+            while "begun" not in log.read_text():
+                time.sleep(0.01)
+            raise SystemExit(143)
+        return wait(process, timeout)
+
+    monkeypatch.setattr(subprocess.Popen, "wait", cut)
+    with pytest.raises(SystemExit):
+        gpu.run_for(60, log, "-c", words + "print('begun', flush=True)\ntime.sleep(60)")
+    assert "saved" in log.read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["--check", "array"], "--check 'array': there are renderer gpt, arrays, networks"),
+        (["--minutes", "0"], "--minutes 0: give a number above 0"),
+        (["--minutes", "-1"], "--minutes -1: give a number above 0"),
+        (["--work", __file__], "no folder can be made there: "),
+    ],
+)
+def test_wrong_arguments_are_refused(tmp_path, capsys, words, complaint):
+    with pytest.raises(SystemExit, match="2"):
+        gpu.main(["--work", str(tmp_path / "work"), *words])
+    assert complaint in capsys.readouterr().err
+
+
+def test_one_check_says_what_it_found(tmp_path, capsys, monkeypatch):
+    for value, status in ((0.1, 0), (0.3, 1)):
+        monkeypatch.setitem(gpu.CHECKS_MADE, "arrays", lambda scale, value=value: {"a": (value, 0.2)})
+        assert gpu.main(["--small", "--work", str(tmp_path / "work"), "--check", "arrays"]) == status
+        assert f"a {value} of 0.2" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

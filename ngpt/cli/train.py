@@ -91,6 +91,9 @@ def _task(settings: Any, out: Path, stack: ExitStack, processes: Any, say: Calla
     loss = make_loss(settings.loss)
     on_disk = [folder for folder in settings.data.folders if not folder.endswith(".toml")]
     if settings.temporal:
+        if processes.rank == 0:
+            methods = ", ".join(settings.temporal.methods)
+            say(f"results frame by frame, by {methods}: those that are not in {out / 'results'} are made now")
         found = list(clips(on_disk, settings.temporal.methods, out / "results"))
     else:
         found = [crop for folder in on_disk for crop in open_crops(folder)]

@@ -60,6 +60,14 @@ class Blending(Task):
             raise NgptError("a network that blends frames needs the table [temporal]")
         if not clips:
             raise NgptError("no shots to train on: data.folders is empty, or data.validation holds out every scene")
+        sizes = sorted({reference.shape[:2] for clip in clips for reference in clip.references})
+        alignment = network().alignment
+        if len(sizes) > 1 or sizes[0][0] != sizes[0][1] or sizes[0][0] % alignment:
+            found = ", ".join(f"{width}x{height}" for height, width in sizes)
+            raise NgptError(
+                f"data.folders: the shots have {found} pixels; a batch needs squares of one size, a multiple of "
+                f"{alignment}: make sets with the same `size`"
+            )
         self.settings, self.clips, self.table = settings, clips, settings.temporal
         self.held_out = spread(held_out, settings.run.views)
         self._player: dict[str, Tensor] = {}

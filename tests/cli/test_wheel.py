@@ -1,4 +1,4 @@
-"""The wheel: what it holds and brings. `scripts/release` installs it with every extra and tries them."""
+"""The wheel: what it holds and brings. `scripts/wheel.py` installs it with every extra and tries them."""
 
 import os
 import re

@@ -23,15 +23,15 @@ from ngpt.training.trainer import Trainer
 SIZE = 16
 
 
-def clip_of(seed, frames=5, flash=0.0):
+def clip_of(seed, frames=5, flash=0.0, size=SIZE):
     """A smooth image at rest with noise; ``flash``: as much light more in every second frame."""
     rng = np.random.default_rng(seed)
-    y, x = np.mgrid[:SIZE, :SIZE] / SIZE
+    y, x = np.mgrid[:size, :size] / size
     image = np.stack([1.5 + np.sin(3 * x + c + seed) * np.cos(4 * y) for c in range(3)], axis=-1).astype(np.float32)
     stacks, references, halves = [], [], []
     for i in range(frames):
         truth = image * np.float32(1 + flash * (i % 2))
-        beside = {"direct": 0 * truth, "albedo": np.full(truth.shape, 0.5), "depth": np.full((SIZE, SIZE, 1), 3.0)}
+        beside = {"direct": 0 * truth, "albedo": np.full(truth.shape, 0.5), "depth": np.full((size, size, 1), 3.0)}
         stacks.append(frame_of(truth, beside, rng))
         pair = tuple(truth + np.float32(0.05 * rng.normal(size=truth.shape)) for _ in range(2))
         halves.append(pair)
@@ -151,6 +151,12 @@ def test_shots_without_motion_teach_nothing(tmp_path):
         trainer(tmp_path, [Clip("still", still, clip.results, clip.references, clip.halves)]).run()
 
 
+@pytest.mark.parametrize(("sizes", "found"), [((8, 12), "8x8, 12x12"), ((10,), "10x10")])
+def test_shots_that_make_no_batch_are_refused(tmp_path, sizes, found):
+    with pytest.raises(NgptError, match=f"have {found} pixels; a batch needs squares of one size, a multiple of 4"):
+        trainer(tmp_path, [clip_of(0, frames=2, size=size) for size in sizes])
+
+
 def shot(rng, frames):
     return [crop_data(rng, halves=True, motion=np.zeros((8, 8, 2), np.float32)) for _ in range(frames)]
 
@@ -190,6 +196,7 @@ def test_one_command_trains_it_and_goes_on(tmp_path, rng, capsys):
     for steps, said in ((3, "validation: 1 of 2 scenes set aside"), (5, "at step 3 of 5")):
         assert main([*words, "--set", f"run.steps={steps}"]) == 0, capsys.readouterr().err
         assert said in (output := capsys.readouterr().out) and f"finished at step {steps}" in output
+        assert "results frame by frame, by wcv" in output
     assert [entry["step"] for entry in log_of(tmp_path / "run") if "loss" in entry] == [1, 2, 3, 4, 5]
     assert "Finished" in (tmp_path / "run" / "run.html").read_text()
     assert main(["info", out]) == 0 and "validations: 2" in capsys.readouterr().out

@@ -2,6 +2,7 @@
 
 import re
 import runpy
+import subprocess
 from dataclasses import fields
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from crops import view
 
 import ngpt
 from bench.ablations import VARIANTS
+from data_gen.dataset.config import read_config
 from ngpt.cli import main
 from ngpt.system import configs
 from ngpt.system.templates import entries
@@ -173,6 +175,31 @@ def test_ablations_differ_from_the_papers_network_in_what_they_are_named_for():
     assert not found["no gradients"].model.reads_gradients and found["l1 alone"].loss["kind"] == "l1"
     others = {str((one.run, one.optimizer, one.augmentation)) for one in found.values()}
     assert len(others) == 1 and found["bilinear"].model.pooling == "bilinear"
+
+
+@pytest.mark.parametrize("model", ["fast", "combine", "primal", "temporal"])
+@pytest.mark.parametrize("files", [False, True], ids=["procedural", "scene files"])
+def test_models_are_made_anew_with_scene_files_and_without(model, files, tmp_path):
+    """The script calls a stand-in for Python, in a folder that has scene files or none."""
+    calls, python = tmp_path / "calls", tmp_path / "python"
+    python.write_text(f'#!/bin/sh\nfor word in "$@"; do printf "%s\\t" "$word"; done >> {calls}; echo >> {calls}\n')
+    python.chmod(0o755)
+    if files:
+        (tmp_path / "scenes" / "bathroom").mkdir(parents=True)
+        (tmp_path / "scenes" / "bathroom" / "scene.xml").touch()
+    command = ["bash", Path("scripts/train-model").resolve(), model, "out", "--set", "run.steps=5"]
+    subprocess.run(command, cwd=tmp_path, env={"PATH": "/usr/bin:/bin", "PYTHON": str(python)}, check=True)
+    *made, trained, small, whole = (line.split("\t")[:-1] for line in calls.read_text().splitlines())
+    sources = [read_config(line[line.index("--config") + 1]) for line in made]
+    assert any(source.files for source in sources) == files
+    changes = [trained[i + 1] for i, word in enumerate(trained) if word == "--set"]
+    settings = read_settings(trained[trained.index("--config") + 1], changes)
+    assert settings.run.steps == 5 and settings.data.folders == tuple(line[line.index("--out") + 1] for line in made)
+    for name in settings.data.validation:
+        scenes = [f"made-{i:05d}" for i in range(max(source.scenes for source in sources))]
+        scenes += [Path(table.pattern).parent.name for source in sources for table in source.files]
+        assert 0 < sum(scene.startswith(name) for scene in scenes) < len(scenes)
+    assert small[-1] in whole and whole[-1].endswith(".onnx")
 
 
 def test_kpcn_has_the_papers_size():
