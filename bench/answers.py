@@ -18,9 +18,9 @@ from PIL import Image
 import ngpt
 from bench.common import measure, metadata, save
 from ngpt.api import lightgroups
+from ngpt.image.display import auto_exposure, coloured, heat_table, to_srgb8
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.merging import merge
-from ngpt.report.display import auto_exposure, coloured, heat_table, to_srgb8
 from ngpt.stack import GradientStack
 from ngpt.system.records import read_json
 

@@ -15,7 +15,7 @@ from PIL import Image
 
 import ngpt
 from bench.shots import SPEEDS, shot_of
-from ngpt.report.display import auto_exposure, to_srgb8
+from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.sequence.history import Temporal
 
 

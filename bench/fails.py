@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from bench import panels
+from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.io.exr import read_image
 from ngpt.measure.metrics import relative_squared_error
-from ngpt.report.display import auto_exposure, to_srgb8
 
 CROP, SCALE = 48, 4  # pixels, and how many times as large they are shown
 

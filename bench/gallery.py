@@ -24,8 +24,8 @@ from PIL import Image, ImageDraw, ImageFont
 import ngpt
 from bench import panels
 from bench.common import kept, metadata, save, write_page
+from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.measure.metrics import relmse_trimmed
-from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.stack import GradientStack
 from ngpt.system.files import atomic_output
 

@@ -31,10 +31,10 @@ from scipy.ndimage import binary_dilation, median_filter
 from bench import panels
 from bench.common import kept, metadata, rendered, save, summary
 from ngpt.evaluation.config import scene_name
+from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.measure.flip import flip
 from ngpt.measure.metrics import relative_squared_error, relmse, relmse_trimmed
 from ngpt.methods import reconstruct
-from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.stack import GradientStack
 from ngpt.system.writing import write_json
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from bench import panels
+from ngpt.image.display import auto_exposure, signed_map, to_srgb8
 from ngpt.methods import reconstruct
-from ngpt.report.display import auto_exposure, signed_map, to_srgb8
 
 TILE = (392, 220)
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from bench import panels
+from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.methods import reconstruct
-from ngpt.report.display import auto_exposure, to_srgb8
 
 BEFORE = {"points": "independent", "lamps": "uniform"}
 

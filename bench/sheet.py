@@ -16,10 +16,10 @@ import numpy as np
 
 from bench import panels
 from ngpt.errors import NgptError
+from ngpt.image.display import to_srgb8
 from ngpt.io.exr import read_image
 from ngpt.measure.flip import flip
 from ngpt.measure.metrics import relmse_trimmed
-from ngpt.report.display import to_srgb8
 from ngpt.system.writing import write_json
 
 LETTERS = "ABCDEFGH"

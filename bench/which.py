@@ -16,7 +16,7 @@ import numpy as np
 import ngpt
 from bench import panels
 from bench.common import kept
-from ngpt.report.display import auto_exposure, to_srgb8
+from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.stack import GradientStack
 
 # Scene, the sampler that is for it, the method after it

@@ -14,10 +14,10 @@ from data_gen.begun import Asked, joined_or_kept, kept_apart, write_part
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
 from ngpt.cli.picture import check_image, seen
 from ngpt.errors import NgptError, WrongUse
+from ngpt.image.pictures import check_size
 from ngpt.io.openexr import read_header
 from ngpt.io.whole import finished
 from ngpt.methods import reconstruct, runnable
-from ngpt.report.pictures import check_size
 from ngpt.stack import GradientStack
 from ngpt.system.text import by_names
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ngpt.errors import NgptError, did_you_mean
+from ngpt.image.notebook import stack_html
 from ngpt.layers import LAYERS
-from ngpt.report.notebook import stack_html
 from ngpt.windows import Place
 
 

@@ -14,9 +14,7 @@ ROOT = Path(__file__).parents[1]
 FLOORS = """
 ngpt.errors ngpt.version
 ngpt.system ngpt.options
-ngpt.report.display ngpt.report.png
-ngpt.report.transforms ngpt.report.pictures
-ngpt.api.tensors ngpt.layers ngpt.windows ngpt.testing ngpt.sequence.warp ngpt.report.notebook
+ngpt.image ngpt.api.tensors ngpt.layers ngpt.windows ngpt.testing ngpt.sequence.warp
 ngpt.stack
 ngpt.renderer ngpt.repair ngpt.magnitude ngpt.coverage ngpt.io
 ngpt.merging

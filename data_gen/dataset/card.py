@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ngpt.report.display import auto_exposure, to_srgb8
-from ngpt.report.png import encode_png
+from ngpt.image.display import auto_exposure, to_srgb8
+from ngpt.image.png import encode_png
 from ngpt.system.console import Console
 from ngpt.system.files import atomic_output
 from ngpt.training.dataset import Crop, Dataset, summary

@@ -10,14 +10,14 @@ import numpy as np
 from ngpt.cli.picture import exposed, in_picture
 from ngpt.cli.reference import Errors
 from ngpt.errors import WrongUse
+from ngpt.image.pictures import write_picture
+from ngpt.image.transforms import shown
 from ngpt.io.exr import write
 from ngpt.io.foreign.pfm import write_pfm
 from ngpt.io.framenames import named, number_of, varies
 from ngpt.io.frames import RESULT_SUFFIX
 from ngpt.io.primaries import converted, to_rec709
 from ngpt.methods import METHODS, Result
-from ngpt.report.pictures import write_picture
-from ngpt.report.transforms import shown
 from ngpt.stack import GradientStack
 from ngpt.system.files import save
 from ngpt.version import __version__

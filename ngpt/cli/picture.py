@@ -9,12 +9,12 @@ import numpy as np
 from ngpt.cli.arguments import add_force, add_view, output_file
 from ngpt.cli.streams import standard_input
 from ngpt.errors import WrongUse
+from ngpt.image.display import auto_exposure
+from ngpt.image.pictures import PICTURES, SHOTS, check_kind, write_picture, write_shot
+from ngpt.image.transforms import TRANSFORMS, check_transform, shown
 from ngpt.io.exr import read_picture
 from ngpt.io.framenames import named, number_of, varies
 from ngpt.io.frames import is_shot, remarks, shot_files
-from ngpt.report.display import auto_exposure
-from ngpt.report.pictures import PICTURES, SHOTS, check_kind, write_picture, write_shot
-from ngpt.report.transforms import TRANSFORMS, check_transform, shown
 from ngpt.system.console import Console
 from ngpt.system.files import make_folder
 from ngpt.windows import Place, Window, put
@@ -136,7 +136,7 @@ def check_picture(target: Path, args: argparse.Namespace) -> None:
 
 
 def add_look(parser: argparse.ArgumentParser) -> None:
-    """Options of how a picture shows light; ``ngpt.report.transforms``."""
+    """Options of how a picture shows light; ``ngpt.image.transforms``."""
     parser.add_argument(
         "--transform",
         default="standard",

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from ngpt.report.display import colour_table, coloured
-from ngpt.report.png import encode_png
+from ngpt.image.display import colour_table, coloured
+from ngpt.image.png import encode_png
 from ngpt.stack import GradientStack
 from ngpt.system.files import atomic_output
 

@@ -16,11 +16,11 @@ from ngpt.evaluation.references import HALVES, Reference
 from ngpt.evaluation.renders import Render
 from ngpt.evaluation.results import write_results
 from ngpt.evaluation.stacks import USUAL, Costs, SceneStacks
+from ngpt.image.display import auto_exposure
 from ngpt.io.exr import write
 from ngpt.measure.metrics import METRICS
 from ngpt.methods import METHODS
 from ngpt.renderer import Renderer
-from ngpt.report.display import auto_exposure
 from ngpt.report.evaluation import FORMAT
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console

@@ -21,12 +21,12 @@ import numpy as np
 from ngpt.errors import NgptError
 from ngpt.evaluation.config import file_part
 from ngpt.evaluation.run import picture_path
+from ngpt.image.display import auto_exposure, to_srgb8
+from ngpt.image.png import encode_png
 from ngpt.io.exr import read_image
 from ngpt.measure.images import check_size, middle
 from ngpt.measure.metrics import EPSILON, squared_error, trimmed_mean
-from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.report.evaluation import FORMAT
-from ngpt.report.png import encode_png
 from ngpt.system.console import Console
 from ngpt.system.files import atomic_output
 from ngpt.system.writing import write_json, write_text

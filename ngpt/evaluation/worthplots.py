@@ -9,10 +9,10 @@ import numpy as np
 
 from ngpt.evaluation.frontier import COLORS, DASHES
 from ngpt.evaluation.gradientmap import COLOURS
+from ngpt.image.display import coloured
 from ngpt.io.exr import read_image
 from ngpt.measure.metrics import relative_squared_error
 from ngpt.report.axes import Axes
-from ngpt.report.display import coloured
 from ngpt.system.text import markup
 from ngpt.system.writing import write_text
 

@@ -1,1 +1,1 @@
-"""Pictures and pages: tone mapping, PNG, and the self-contained HTML report."""
+"""Pages to look at: the self-contained HTML report, and pages that a render keeps up to date."""

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ngpt.report import display
+from ngpt.image import display
+from ngpt.image.png import encode_palette_png, encode_png
 from ngpt.report.content import Overview, Scene, median
-from ngpt.report.png import encode_palette_png, encode_png
 from ngpt.system.text import markup
 
 THUMBNAIL_WIDTH = 240

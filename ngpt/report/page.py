@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from ngpt.errors import NgptError
-from ngpt.report import display, pixelcodec
+from ngpt.image import display
+from ngpt.report import pixelcodec
 from ngpt.report.content import REFERENCE, Overview, Scene
 from ngpt.report.markup import overview_html, section
 from ngpt.system.files import atomic_output

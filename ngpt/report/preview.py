@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ngpt.api.uncertainty import reconstruct_with_error
+from ngpt.image.display import ERROR_EPSILON, ERROR_RANGE, auto_exposure
 from ngpt.methods import METHODS, reconstruct
 from ngpt.report.content import Entry, Scene
-from ngpt.report.display import ERROR_EPSILON, ERROR_RANGE, auto_exposure
 from ngpt.stack import GradientStack
 
 _NOISY = "noisy"

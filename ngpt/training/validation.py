@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from ngpt.image.display import auto_exposure, to_srgb8
+from ngpt.image.png import encode_png
 from ngpt.measure.images import middle
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.network.inputs import base_image
 from ngpt.network.model import Reconstructor
 from ngpt.network.run_torch import layers_of
 from ngpt.repair import repair
-from ngpt.report.display import auto_exposure, to_srgb8
-from ngpt.report.png import encode_png
 from ngpt.system.files import atomic_output
 from ngpt.system.writing import write_json
 from ngpt.training.examples import judges_of

@@ -11,9 +11,9 @@ import pytest
 
 import ngpt
 from ngpt.errors import NgptError
+from ngpt.image import pictures, transforms
 from ngpt.io.exr import read_exr
 from ngpt.methods import METHODS
-from ngpt.report import pictures, transforms
 from ngpt.system.interrupts import Interrupt
 
 pytest.importorskip("mitsuba")

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from ngpt.errors import NgptError
-from ngpt.report import display, pixelcodec
+from ngpt.image import display
+from ngpt.report import pixelcodec
 from ngpt.report.content import Entry, Scene
 from ngpt.report.page import write_report
 

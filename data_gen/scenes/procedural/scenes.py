@@ -32,8 +32,8 @@ from data_gen.scenes.procedural.meshes import (
 from data_gen.scenes.procedural.stage import Stage
 from data_gen.scenes.procedural.textures import colour, sky, write_pfm
 from data_gen.scenes.procedural.variety import SHARES, add_sights, further_sights
-from ngpt.report.display import to_srgb8
-from ngpt.report.png import encode_png
+from ngpt.image.display import to_srgb8
+from ngpt.image.png import encode_png
 
 MAX_DEPTH = 12
 

@@ -74,7 +74,7 @@ function answered(data) {
 
 // --- showing ---------------------------------------------------------------------------------------------------------
 
-/** Stops that bring the log-average luminance of the lit pixels to middle grey, as ngpt.report.display does. */
+/** Stops that bring the log-average luminance of the lit pixels to middle grey, as ngpt.image.display does. */
 function automaticExposure({layers: {primal}}) {
   const n = primal.length / 3, lit = [];
   for (let i = 0; i < n; i++) {

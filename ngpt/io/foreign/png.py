@@ -1,6 +1,6 @@
 """PNG: all types of colour and depth, in rows or interlaced. Gamma and profiles are left out of account: it is sRGB.
 
-https://www.w3.org/TR/png-3/; ``ngpt.report.png`` is the encoder.
+https://www.w3.org/TR/png-3/; ``ngpt.image.png`` is the encoder.
 """
 
 import struct

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.errors import NgptError
-from ngpt.report.png import encode_png
+from ngpt.image.png import encode_png
 from ngpt.system.files import atomic_output
 from ngpt.system.install import package_command
 

@@ -5,8 +5,8 @@ import io
 import numpy as np
 import pytest
 
-from ngpt.report import display
-from ngpt.report.png import encode_png
+from ngpt.image import display
+from ngpt.image.png import encode_png
 
 
 def constant(*rgb: float) -> np.ndarray:

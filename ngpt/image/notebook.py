@@ -5,8 +5,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ngpt.report import display
-from ngpt.report.png import encode_png
+from ngpt.image import display
+from ngpt.image.png import encode_png
 from ngpt.system.text import markup
 
 WIDTH = 160  # pixels of the picture

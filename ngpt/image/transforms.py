@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.errors import NgptError
-from ngpt.report.display import encoded_srgb, to_display8
+from ngpt.image.display import encoded_srgb, to_display8
 from ngpt.system.install import package_command
 
 # AgX (Troy Sobotka) in the form of B. Wrensch, "Minimal AgX implementation" (iolite-engine.com, 2023): primaries drawn

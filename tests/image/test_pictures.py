@@ -10,11 +10,11 @@ import pytest
 
 from ngpt.cli import main
 from ngpt.errors import NgptError
+from ngpt.image import display
+from ngpt.image.pictures import _ffmpeg, write_shot
+from ngpt.image.transforms import TRANSFORMS, _aces, shown
 from ngpt.io.exr import write
 from ngpt.io.primaries import ACES_AP1, converted, to_rec709
-from ngpt.report import display
-from ngpt.report.pictures import _ffmpeg, write_shot
-from ngpt.report.transforms import TRANSFORMS, _aces, shown
 from ngpt.stack import GradientStack
 
 
@@ -169,9 +169,9 @@ def test_an_mp4_of_a_shot(tmp_path):
 def test_what_is_not_installed_is_named_in_one_line(tmp_path, frames, image, capfd, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "a.exr", image)
-    for module in ("report.pictures", "report.transforms"):
+    for module in ("image.pictures", "image.transforms"):
         monkeypatch.setattr(f"ngpt.{module}.find_spec", lambda name: None)
-    monkeypatch.setattr("ngpt.report.pictures.shutil.which", lambda name: None)
+    monkeypatch.setattr("ngpt.image.pictures.shutil.which", lambda name: None)
     _aces.cache_clear()
     assert main(["picture", *words.split()]) == 1
     told = capfd.readouterr().err
