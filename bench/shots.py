@@ -6,7 +6,7 @@
 Three shots move a scene's own camera sideways: ``static``, ``slow`` (half a pixel a frame, at the distance of what it
 sees in the median) and ``fast`` (8 pixels a frame, to and fro). ``object`` and ``light`` move a shape, ``MOVES``, where
 the scene is one of those. Stacks and references are rendered once and kept in
-OUT. relMSE is without the worst 0.1 % of the pixels, flicker is ``ngpt.sequence.flicker``; both are means over all
+OUT. relMSE is without the worst 0.1 % of the pixels, flicker is ``ngpt.measure.flicker``; both are means over all
 frames but the first. What the references' own noise adds to both, by their variances, is taken off. ``+ temporal`` is
 `ngpt denoise --temporal`, ``+ rules`` the same without its network.
 
@@ -25,9 +25,9 @@ import numpy as np
 import ngpt
 from bench.common import metadata, save
 from ngpt.io.frames import shot_files
+from ngpt.measure.flicker import flicker
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS
-from ngpt.sequence.flicker import flicker
 from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import shipped
 from ngpt.sequence.wcv_windows import reconstruct_shot

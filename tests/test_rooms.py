@@ -29,7 +29,6 @@ ngpt.api.arrays
 ngpt.sequence ngpt.api
 ngpt.report
 ngpt.measure
-ngpt.sequence.flicker
 ngpt.training
 ngpt.export
 ngpt.evaluation

@@ -13,12 +13,12 @@ from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_picture
 from ngpt.io.framenames import frames_named, varies
 from ngpt.io.frames import frame_name, is_shot, natural, remarks, shot_files
+from ngpt.measure.flicker import change_maps, flicker, flicker_maps
 from ngpt.measure.metrics import METRICS, exposure_mismatch
 from ngpt.measure.shown import available, judge
 from ngpt.report.content import REFERENCE, Entry, Overview, Scene
 from ngpt.report.layers import of_stack
 from ngpt.report.page import oversize, write_report
-from ngpt.sequence.flicker import change_maps, flicker, flicker_maps
 from ngpt.system.console import Console, tell
 from ngpt.system.files import atomic_output
 from ngpt.system.text import by_names

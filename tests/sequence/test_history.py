@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from shots import SIGMA, SIZE, frame_of, mse, part_of, view, without
 
-from ngpt.sequence.flicker import flicker
+from ngpt.measure.flicker import flicker
 from ngpt.sequence.history import LONGEST, Temporal
 from ngpt.stack import GradientStack
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from ngpt.measure.flicker import change_maps, flicker
 from ngpt.measure.metrics import relmse_trimmed
-from ngpt.sequence.flicker import change_maps, flicker
 
 REST = np.zeros((30, 40, 2))
 
