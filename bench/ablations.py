@@ -21,7 +21,7 @@ from ngpt.errors import NgptError
 from ngpt.measure.metrics import scores
 from ngpt.network.model import Reconstructor, parameters
 from ngpt.network.run_torch import layers_of
-from ngpt.network.weights import load_weights
+from ngpt.network.safetensors import load_weights
 from ngpt.repair import repair
 from ngpt.system import configs
 from ngpt.training.cost import per_pixel

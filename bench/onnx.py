@@ -111,7 +111,7 @@ def torch_calls(data) -> dict:
     except ModuleNotFoundError:
         return {}
     from ngpt.network.run_torch import layers_of
-    from ngpt.network.weights import load_weights
+    from ngpt.network.safetensors import load_weights
 
     model, _ = load_weights(TWIN)
     layers = {name: layer[None] for name, layer in layers_of(data, model.config).items()}

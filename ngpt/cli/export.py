@@ -79,6 +79,6 @@ def write(args: argparse.Namespace) -> list[Path]:
 
 
 def kind_of(weights: Path) -> str:
-    from ngpt.network.weights import read_tensors
+    from ngpt.network.safetensors import read_tensors
 
     return read_tensors(weights)[1].get("kind", "")

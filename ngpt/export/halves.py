@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.errors import NgptError
-from ngpt.network.weights import in_halves, read_tensors, write_tensors
+from ngpt.network.safetensors import in_halves, read_tensors, write_tensors
 from ngpt.training.run_summary import LOG, entries_of
 
 POINTS = 100

@@ -18,8 +18,8 @@ from ngpt.export.graphs.model import layers, optional, reconstruction, statistic
 from ngpt.export.reach import reach
 from ngpt.network import features
 from ngpt.network.model import Reconstructor
+from ngpt.network.safetensors import load_weights
 from ngpt.network.unet import Convolution
-from ngpt.network.weights import load_weights
 from ngpt.version import __version__
 
 

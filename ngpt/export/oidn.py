@@ -4,7 +4,7 @@ from pathlib import Path
 
 from ngpt.errors import NgptError
 from ngpt.network import tza
-from ngpt.network.weights import in_halves, load_weights
+from ngpt.network.safetensors import in_halves, load_weights
 
 
 def oidn_weights(weights: str | Path) -> bytes:

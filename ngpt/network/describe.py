@@ -68,7 +68,7 @@ def _safetensors(path: Path) -> dict[str, Any]:
     if find_spec("torch") is None or find_spec("safetensors") is None:
         raise NgptError(f"{path}: to read it needs PyTorch: {install_command('train')}")
     # torch takes seconds to come in.
-    from ngpt.network.weights import load_weights
+    from ngpt.network.safetensors import load_weights
 
     model, header = load_weights(path)
     config, training = model.config, header.get("training", {})

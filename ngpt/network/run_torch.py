@@ -14,8 +14,8 @@ from ngpt.network import features, inputs, padding, tiles
 from ngpt.network.config import ModelConfig
 from ngpt.network.device import default_device
 from ngpt.network.model import Reconstructor
+from ngpt.network.safetensors import load_weights
 from ngpt.network.transfer import signed_exp
-from ngpt.network.weights import load_weights
 from ngpt.repair import Repaired
 from ngpt.system.forks import in_children
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from ngpt.errors import NgptError
-from ngpt.network import padding, weights
+from ngpt.network import padding, safetensors
 from ngpt.network.model import Reconstructor
 from ngpt.network.transfer import signed_exp
 from ngpt.system import limits
@@ -94,10 +94,10 @@ class Images(Task):
         return {"relMSE": found.network, "relMSE primal": found.primal, "relMSE base": found.base}
 
     def save(self, path: Path, model: nn.Module, provenance: dict[str, Any]) -> None:
-        weights.save_weights(path, model, provenance, overwrite=True)  # type: ignore[arg-type]
+        safetensors.save_weights(path, model, provenance, overwrite=True)  # type: ignore[arg-type]
 
     def load(self, path: str) -> nn.Module:
-        model, _ = weights.load_weights(path)
+        model, _ = safetensors.load_weights(path)
         if model.config != self.config:
             raise NgptError(f"{path}: is another [model] than the run's: {model.config}")
         return model

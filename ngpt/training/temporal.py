@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from ngpt.errors import NgptError
 from ngpt.measure.images import middle
-from ngpt.network import weights
+from ngpt.network import safetensors
 from ngpt.network.unet import PlainUNet
 from ngpt.sequence.network import BANDS, INPUTS, LARGEST, MOST, Corrections
 from ngpt.training.clips import Clip, blended, errors, play, relit, robust
@@ -81,7 +81,7 @@ class Blending(Task):
         return self._player
 
     def restore(self, state: dict[str, Tensor], path: str) -> None:
-        weights.check_fit(network().state_dict(), state, path)
+        safetensors.check_fit(network().state_dict(), state, path)
         self._player = state
 
     def batches(self, model: nn.Module, step: int, processes: Processes) -> Iterator[dict[str, Tensor]]:
@@ -160,7 +160,7 @@ class Blending(Task):
 
     def save(self, path: Path, model: nn.Module, provenance: dict[str, Any]) -> None:
         header = {"kind": KIND, "inputs": list(INPUTS), "widths": list(WIDTHS), "training": provenance}
-        weights.write_tensors(path, model.state_dict(), header, overwrite=True)
+        safetensors.write_tensors(path, model.state_dict(), header, overwrite=True)
 
     def load(self, path: str) -> nn.Module:
         return load(path)[0]
@@ -168,11 +168,11 @@ class Blending(Task):
 
 def load(path: str | Path) -> tuple[PlainUNet, dict[str, Any]]:
     """The network of a file that a run wrote, and the file's header; raises NgptError for others."""
-    tensors, header = weights.read_tensors(path)
+    tensors, header = safetensors.read_tensors(path)
     if header.get("kind") != KIND or header.get("inputs") != list(INPUTS) or header.get("widths") != list(WIDTHS):
         raise NgptError(f"{path}: holds no network that blends frames, or one of another version; train it anew")
     model = network()
-    weights.fill(model, tensors, str(path))
+    safetensors.fill(model, tensors, str(path))
     return model.eval(), header
 
 

@@ -16,11 +16,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ngpt.errors import NgptError
-from ngpt.network import weights
+from ngpt.network import safetensors
 from ngpt.network.model import parameters
 from ngpt.system import files
 from ngpt.system.console import print_line
@@ -88,7 +89,7 @@ class Trainer:
     def resume(self) -> None:
         """Continues from the checkpoint in ``out``, and says which settings have changed since; raises NgptError if it
         belongs to another model."""
-        tensors, header = weights.read_tensors(self.checkpoint)
+        tensors, header = safetensors.read_tensors(self.checkpoint)
         if header.get("kind") != "checkpoint":
             raise NgptError(f"{self.checkpoint}: holds {header.get('kind')}, not a checkpoint")
         check(header, {"settings": dict, "step": int, "seconds": (int, float)}, f"{self.checkpoint}: its header")
@@ -99,11 +100,11 @@ class Trainer:
         for name, tensor in tensors.items():
             part, _, rest = name.partition("/")
             parts.setdefault(part, {})[rest] = tensor
-        weights.fill(self.model, parts["model"], str(self.checkpoint))
+        safetensors.fill(self.model, parts["model"], str(self.checkpoint))
         if self.average is not self.model:
-            weights.fill(self.average, parts.get("average", parts["model"]), str(self.checkpoint))
+            safetensors.fill(self.average, parts.get("average", parts["model"]), str(self.checkpoint))
         for moment in ("adam1", "adam2"):
-            weights.check_fit(dict(self.model.named_parameters()), parts[moment], str(self.checkpoint))
+            safetensors.check_fit(dict(self.model.named_parameters()), parts[moment], str(self.checkpoint))
         self.step, self.seconds = header["step"], header["seconds"]
         for name, p in self.model.named_parameters():
             first, second = (parts[moment][name].to(self.device) for moment in ("adam1", "adam2"))
@@ -179,7 +180,7 @@ class Trainer:
         header = {"kind": "checkpoint", "step": self.step, "seconds": self.seconds, "version": __version__}
         header["settings"] = self.settings.to_dict()
         files.save(
-            self.checkpoint, lambda path, over: weights.write_tensors(path, tensors, header, over), overwrite=True
+            self.checkpoint, lambda path, over: safetensors.write_tensors(path, tensors, header, over), overwrite=True
         )
         self._save_weights(WEIGHTS)
         write_run(self.out)
@@ -215,7 +216,7 @@ class Trainer:
         run, settings = self.settings.run, self.settings.optimizer
         batch = {name: layer.to(self.device, non_blocking=True) for name, layer in batch.items()}
         generator = torch.Generator(self.device)
-        generator.manual_seed(weights.random_state(run.seed, self.step * self.processes.count + self.processes.rank))
+        generator.manual_seed(_seed(run.seed, self.step * self.processes.count + self.processes.rank))
         total, parts = self.task.loss(self.model, batch, generator)
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
@@ -234,7 +235,7 @@ class Trainer:
 
     def _give_up(self, batch: dict[str, Tensor], total: float, norm: float) -> None:
         path = self.out / f"bad-batch-{self.step:07d}.safetensors"
-        weights.write_tensors(path, batch, {"kind": "batch", "step": self.step}, overwrite=True)
+        safetensors.write_tensors(path, batch, {"kind": "batch", "step": self.step}, overwrite=True)
         raise NgptError(
             f"step {self.step}: the loss is {total:.3g} and its gradient's norm {norm:.3g}; the batch is in {path}, "
             f"the weights before it in {self.checkpoint}; lower the learning rate, set optimizer.clip, or use float32"
@@ -260,6 +261,11 @@ class Trainer:
         self.say("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items()))
         for logger in self._loggers:
             logger.log(self.step, {name: value for name, value in values.items() if name != "step"})
+
+
+def _seed(seed: int, step: int) -> int:
+    """A seed for everything random that belongs to one training step."""
+    return int(np.random.SeedSequence((seed, step)).generate_state(1, np.uint64)[0] >> 1)
 
 
 def _keep_lines(path: Path, step: int) -> list[dict[str, float]]:

@@ -79,7 +79,7 @@ def test_what_it_brings_is_found(wheel, tmp_path):
         archive.extractall(site)
     code = (
         "from importlib.metadata import distributions; from ngpt.cli import all_verbs\n"
-        "from ngpt.network import weights as w; from ngpt.system.configs import DATASET, find_config\n"
+        "from ngpt.network import safetensors as w; from ngpt.system.configs import DATASET, find_config\n"
         f"(own,) = [d for d in distributions(path=[{str(site)!r}])]\n"
         "print(sorted((e.group, e.value) for e in own.entry_points), 'render' in all_verbs())\n"
         "w.load_weights('ngpt-fast'); print(w.shipped()['ngpt-fast'], find_config('data-tiny', DATASET), sep='\\n')\n"

@@ -17,7 +17,7 @@ from networks import dense, untrained
 import ngpt
 from ngpt.cli import main
 from ngpt.export.halves import POINTS
-from ngpt.network.weights import load_weights, read_tensors, save_weights, write_tensors
+from ngpt.network.safetensors import load_weights, read_tensors, save_weights, write_tensors
 from ngpt.sequence.network import INPUTS
 from ngpt.training.temporal import WIDTHS, network
 

@@ -28,8 +28,8 @@ from ngpt.network import inputs
 from ngpt.network.exposure import statistics
 from ngpt.network.features import exposure
 from ngpt.network.model import ModelConfig, Reconstructor
+from ngpt.network.safetensors import save_weights
 from ngpt.network.shipped import WEIGHTS
-from ngpt.network.weights import save_weights
 from ngpt.repair import repair
 
 ROOT = Path(__file__).parents[2]

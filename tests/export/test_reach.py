@@ -12,8 +12,8 @@ from ngpt.export import reach as module
 from ngpt.export.reach import reach
 from ngpt.network.model import Reconstructor
 from ngpt.network.run_onnx import Network
+from ngpt.network.safetensors import load_weights
 from ngpt.network.shipped import WEIGHTS
-from ngpt.network.weights import load_weights
 
 COMBINE = WEIGHTS / "ngpt-combine.onnx"
 

@@ -5,7 +5,7 @@ import torch
 from networks import NETWORKS, brighter, layers_for, untrained
 
 from ngpt.network.run_torch import reconstruct
-from ngpt.network.weights import load_weights, save_weights
+from ngpt.network.safetensors import load_weights, save_weights
 
 every_network = pytest.mark.parametrize("name", NETWORKS)
 

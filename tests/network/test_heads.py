@@ -12,8 +12,8 @@ from ngpt.errors import NgptError
 from ngpt.network.heads import Kernels, Mixture, Pyramid, Residual
 from ngpt.network.kpcn import EPSILON, SplitKernels
 from ngpt.network.model import ModelConfig, Reconstructor
+from ngpt.network.safetensors import save_weights
 from ngpt.network.transfer import signed_exp, signed_log
-from ngpt.network.weights import save_weights
 from ngpt.stack import GradientStack
 
 KPCN = ModelConfig("kpcn", (6,), (2,), SPLIT, kernel=5)

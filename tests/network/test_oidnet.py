@@ -15,7 +15,7 @@ from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.network import oidnet, tza
 from ngpt.network.model import ModelConfig, Reconstructor
-from ngpt.network.weights import save_weights
+from ngpt.network.safetensors import save_weights
 from ngpt.training.cost import per_pixel
 
 SMALL, DEFAULT = oidnet.SHAPES

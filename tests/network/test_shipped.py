@@ -9,7 +9,7 @@ import torch
 import ngpt
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS
-from ngpt.network.weights import load_weights
+from ngpt.network.safetensors import load_weights
 
 TWINS = Path(__file__).parents[2] / "export" / "weights"
 SHIPPED = [

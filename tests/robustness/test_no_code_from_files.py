@@ -96,7 +96,7 @@ from data_gen.dataset.config import read_config
 from ngpt.training.dataset import Dataset
 from ngpt.training.loss import make_loss
 from ngpt.training.settings import read_settings
-from ngpt.network.weights import load_weights, read_tensors
+from ngpt.network.safetensors import load_weights, read_tensors
 from ngpt.training.shards import Shard
 stack = full_stack(8, 8)
 readers = {

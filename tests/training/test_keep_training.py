@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ngpt.network.weights import load_weights
+from ngpt.network.safetensors import load_weights
 from ngpt.training.settings import read_settings
 from scripts import keep_training
 

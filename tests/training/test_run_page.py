@@ -13,7 +13,7 @@ from crops import SyntheticCrop, trainer
 
 from ngpt.cli import main
 from ngpt.errors import NgptError
-from ngpt.network import weights
+from ngpt.network import safetensors
 from ngpt.system import configs
 from ngpt.training import images
 from ngpt.training.run_record import write_record
@@ -66,7 +66,7 @@ def test_the_best_weights_are_kept_and_outlive_a_stop(tmp_path, monkeypatch):
     monkeypatch.setattr(images, "validate", lambda *_: Scores(1.0, float("nan"), next(errors)))
 
     def best():
-        return weights.load_weights(tmp_path / "best.safetensors")[1]["training"]["step"]
+        return safetensors.load_weights(tmp_path / "best.safetensors")[1]["training"]["step"]
 
     made(tmp_path, steps=6).run()
     assert best() == 4

@@ -11,7 +11,7 @@ from shots import frame_of, without
 
 from ngpt.cli import main
 from ngpt.errors import NgptError
-from ngpt.network import weights
+from ngpt.network import safetensors
 from ngpt.sequence.network import BANDS, INPUTS, Network
 from ngpt.training import clips as module
 from ngpt.training import temporal
@@ -113,7 +113,7 @@ def test_a_stopped_run_continues_bit_for_bit_amid_a_round(tmp_path):
     rest.resume()
     assert rest.step == 6
     rest.run()
-    one, other = (weights.read_tensors(run.checkpoint)[0] for run in (whole, rest))
+    one, other = (safetensors.read_tensors(run.checkpoint)[0] for run in (whole, rest))
     assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
     losses = [[entry.get("loss") for entry in log_of(run.out)] for run in (whole, rest)]
     assert losses[0] == losses[1]
@@ -122,7 +122,7 @@ def test_a_stopped_run_continues_bit_for_bit_amid_a_round(tmp_path):
 def test_it_starts_from_weights_and_those_of_other_kinds_are_refused(finished, tmp_path):
     path = str(finished / "weights.safetensors")
     started = trainer(tmp_path, initial=path).model.state_dict()
-    assert all(torch.equal(started[name], tensor) for name, tensor in weights.read_tensors(path)[0].items())
+    assert all(torch.equal(started[name], tensor) for name, tensor in safetensors.read_tensors(path)[0].items())
     assert trainer(tmp_path, initial="temporal").model.state_dict().keys() == started.keys()
     with pytest.raises(NgptError, match="ngpt-fast: holds no network that blends frames"):
         trainer(tmp_path, initial="ngpt-fast")

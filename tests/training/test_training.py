@@ -15,7 +15,7 @@ from crops import CROPS, SETTINGS, PairedCrop, SyntheticCrop, settings, trainer
 
 import ngpt
 from ngpt.errors import NgptError
-from ngpt.network import weights
+from ngpt.network import safetensors
 from ngpt.stack import GradientStack
 from ngpt.training import examples
 from ngpt.training.augment import Augmentation
@@ -93,7 +93,7 @@ def test_records_that_cannot_be_written_cost_no_step(tmp_path, monkeypatch):
     out, other = tmp_path / "run", tmp_path / "other"
     other.mkdir()
     monkeypatch.chdir(other)
-    run, write = trainer(out), weights.write_tensors
+    run, write = trainer(out), safetensors.write_tensors
 
     def full(path, *args):
         if path.parent == out:
@@ -104,7 +104,7 @@ def test_records_that_cannot_be_written_cost_no_step(tmp_path, monkeypatch):
         raise NgptError("log.jsonl: cannot be written: No space left on device")
 
     monkeypatch.setattr(run, "_log", log)
-    monkeypatch.setattr(weights, "write_tensors", full)
+    monkeypatch.setattr(safetensors, "write_tensors", full)
     with pytest.raises(NgptError, match=rf"checkpoint.safetensors: .*kept in {other / 'checkpoint.kept.safetensors'}$"):
         run.run()
     assert run.step == run.settings.run.log
@@ -119,7 +119,7 @@ def test_a_loss_that_is_not_finite_stops_it_and_keeps_the_batch(done):
     run = trainer(done, loss=lambda prediction, target, generator: (prediction.mean() * float("nan"), {}))
     with pytest.raises(NgptError, match=r"step 0: the loss is nan.*bad-batch"):
         run.run()
-    batch, header = weights.read_tensors(done / "bad-batch-0000000.safetensors")
+    batch, header = safetensors.read_tensors(done / "bad-batch-0000000.safetensors")
     assert header["kind"] == "batch" and batch["target"].shape == (2, 3, 18, 18)
     assert run.checkpoint.read_bytes() == before
 
@@ -292,9 +292,9 @@ def test_checkpoints_of_another_model_are_refused(done):
 
 def test_fine_tuning_starts_from_weights(done):
     path = str(done / "weights.safetensors")
-    tensors, header = weights.read_tensors(path)
+    tensors, header = safetensors.read_tensors(path)
     assert all(torch.equal(t, tensors[n]) for n, t in trainer(done, initial=path).model.state_dict().items())
-    weights.write_tensors(path, weights.in_halves(tensors, ""), header, overwrite=True)
+    safetensors.write_tensors(path, safetensors.in_halves(tensors, ""), header, overwrite=True)
     for name, tensor in trainer(done, initial=path).model.state_dict().items():
         assert tensor.dtype == torch.float32 and torch.equal(tensor, tensors[name].half().float())
     with pytest.raises(NgptError, match=r"another \[model\]"):
@@ -326,12 +326,12 @@ LARGE = {"channels": [1024] * 2, "units": [8, 8]}
 )
 def test_damaged_weights_are_explained(done, tensors, header, complaint):
     path = done / "weights.safetensors"
-    own, told = weights.read_tensors(path)
+    own, told = safetensors.read_tensors(path)
     changed = {name: tensor for name, tensor in (own | tensors).items() if tensor is not None}
     told |= header if header.keys() <= {"format", "kind"} else {"model": told["model"] | header}
-    weights.write_tensors(path, changed, told, overwrite=True)
+    safetensors.write_tensors(path, changed, told, overwrite=True)
     with pytest.raises(NgptError, match=complaint) as caught:
-        weights.load_weights(path)
+        safetensors.load_weights(path)
     assert str(path) in str(caught.value)
 
 
@@ -339,7 +339,7 @@ def test_weights_that_are_cut_or_not_there_are_explained(done):
     path = done / "weights.safetensors"
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(NgptError, match="not a readable safetensors file"):
-        weights.load_weights(path)
+        safetensors.load_weights(path)
     with pytest.raises(NgptError, match="no such file"):
         ngpt.denoise(CROPS[0].stack(0), "ngpt", weights=str(done / "nothing"))
 
@@ -356,11 +356,11 @@ def test_weights_that_are_cut_or_not_there_are_explained(done):
 )
 def test_checkpoints_that_do_not_fit_are_explained(done, moment, header, complaint):
     path = done / "checkpoint.safetensors"
-    tensors, told = weights.read_tensors(path)
+    tensors, told = safetensors.read_tensors(path)
     name = f"adam2/{BIAS}"
     tensors, told = tensors | {name: moment(tensors[name])}, told | header
     tensors, told = ({k: v for k, v in part.items() if v is not None} for part in (tensors, told))
-    weights.write_tensors(path, tensors, told, overwrite=True)
+    safetensors.write_tensors(path, tensors, told, overwrite=True)
     with pytest.raises(NgptError, match=complaint) as caught:
         trainer(done).resume()
     assert str(path) in str(caught.value)
@@ -380,7 +380,7 @@ def test_two_processes_do_what_one_does(tmp_path):
     two = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", one[1], str(tmp_path / "two"), HERE]
     for command in (one, two):
         subprocess.run(command, env=environment, check=True)
-    ours, theirs = (weights.read_tensors(tmp_path / name / "weights.safetensors")[0] for name in ("one", "two"))
+    ours, theirs = (safetensors.read_tensors(tmp_path / name / "weights.safetensors")[0] for name in ("one", "two"))
     assert all(torch.allclose(ours[name], theirs[name], rtol=1e-3, atol=1e-4) for name in ours)
 
 

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
@@ -132,8 +131,3 @@ def in_halves(tensors: Mapping[str, Tensor], path: str) -> dict[str, Tensor]:
             if (change > 2**-10 * tensor.float().flatten(1).norm(dim=1)).any():
                 raise NgptError(f"{path}: tensor '{name}' holds weights too small for 16 bits")
     return halves
-
-
-def random_state(seed: int, step: int) -> int:
-    """A seed for everything random that belongs to one training step."""
-    return int(np.random.SeedSequence((seed, step)).generate_state(1, np.uint64)[0] >> 1)
