@@ -10,6 +10,8 @@ from ngpt.errors import WrongUse
 
 # What a render may use, in MiB, beside the scene itself
 DEFAULT_MEMORY = 6144
+# Bytes that a lane takes in a pass: the most that any path tracer was seen to take, 200, and some more
+LANE_BYTES = 256
 
 # Called with (samples per pixel so far, spp), or, where there are seconds, with whole (seconds gone, seconds)
 Progress = Callable[[int, int], None]

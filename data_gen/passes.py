@@ -14,11 +14,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.budget import Budget, Watch
+from data_gen.budget import LANE_BYTES, Budget, Watch
 from data_gen.film import GradientFilm
 from data_gen.paths.camera import CameraSamples, bytes_of_rays
 from data_gen.paths.streams import ROUND, first_round
-from data_gen.samplers.registry import LANE_BYTES
 from ngpt.errors import NgptError
 from ngpt.system.limits import memory as machine_memory
 

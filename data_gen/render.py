@@ -15,10 +15,10 @@ from data_gen.adaptive import Adaptive, check_adaptive, render_adaptive
 from data_gen.begun import Unfinished
 from data_gen.budget import DEFAULT_MEMORY, Budget, Progress, Watch
 from data_gen.film import GradientFilm
-from data_gen.made import Made
 from data_gen.passes import render_passes, rounds_of
 from data_gen.samplers import SAMPLERS, choose, find
 from data_gen.samplers.registry import Entry, own
+from data_gen.samplers.reused import Made
 from data_gen.samplers.shared import why_not_shared
 from data_gen.scenes.cameras import place_of
 from data_gen.scenes.facts import scene_facts

@@ -10,12 +10,11 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen import passes
-from data_gen.budget import Budget
+from data_gen.budget import LANE_BYTES, Budget
 from data_gen.film import GradientFilm
 from data_gen.passes import PACKET, SamplePass, foretold, lanes_within, recording
 from data_gen.paths.camera import CameraSamples, bytes_of_rays
 from data_gen.paths.streams import first_round
-from data_gen.samplers.registry import LANE_BYTES
 
 # Samples of a pixel come in blocks of a packet of rays, so that no pixel's bits depend on which others are rendered.
 BLOCK = PACKET

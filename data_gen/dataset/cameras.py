@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.made import Made
+from data_gen.samplers.reused import Made
 from ngpt.errors import NgptError
 
 VIRTUAL_SIZE = (1280, 720)

@@ -42,7 +42,7 @@ def make_shard(config: Config, job: Job, folder: str, variant: str, again: Again
     import mitsuba as mi
 
     from data_gen.dataset.cameras import Surroundings
-    from data_gen.made import Made
+    from data_gen.samplers.reused import Made
     from data_gen.scenes.load import load_scene
 
     crops: list[CropData] = []

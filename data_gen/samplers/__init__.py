@@ -21,7 +21,6 @@ import data_gen.samplers.restir.about
 
 from data_gen.samplers.registry import (
     FRAME_SAMPLERS,
-    LANE_BYTES,
     SAMPLERS,
     FrameSampler,
     Option,

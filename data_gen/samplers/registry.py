@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from data_gen.budget import LANE_BYTES
 from ngpt.errors import NgptError, WrongUse, did_you_mean
 from ngpt.options import STANDINGS, Option, as_text, settings, unusual
 from ngpt.system.parts import Registry
@@ -20,9 +21,6 @@ if TYPE_CHECKING:
 
 # Why a scene of these facts cannot be rendered by the sampler of a name; "" where it can
 Rule = Callable[["Facts", str], str]
-
-# Bytes that a lane takes in a pass: the most that any path tracer was seen to take, 200, and some more
-LANE_BYTES = 256
 
 
 def _of_no_module(*args: Any, **options: Any) -> Any:

@@ -13,12 +13,12 @@ pytest.importorskip("mitsuba")
 from data_gen.adaptive import Adaptive
 from data_gen.dataset.cameras import View
 from data_gen.film import GradientFilm
-from data_gen.made import Made
 from data_gen.passes import recording
 from data_gen.paths import frozen
 from data_gen.paths.camera import CameraSamples
 from data_gen.render import render_stack
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
+from data_gen.samplers.reused import Made
 from data_gen.scenes import builtin
 from data_gen.session import render_frames, render_scene
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from data_gen.samplers.registry import LANE_BYTES, Sampler, register
+from data_gen.budget import LANE_BYTES
+from data_gen.samplers.registry import Sampler, register
 from data_gen.samplers.shared import BOTH_ENDS, CONNECTABLE, joined_depth
 
 if TYPE_CHECKING:
