@@ -83,7 +83,8 @@ def shot(request, tmp_path_factory):
         return written(folder / "raw", layers), stack_of(layers), {cpp_host: 27, node_host: 90, oidn_host: 40}
     request.getfixturevalue("renderer")
     stack = folder / "stack.exr"
-    assert main(["render", request.param, "--spp", "16", "--size", "240x160", "-o", str(stack), "--quiet"]) == 0
+    words = ["render", request.param, "--sampler", "gpt", "--spp", "16", "--size", "240x160"]
+    assert main([*words, "-o", str(stack), "--quiet"]) == 0
     assert main(["unpack", str(stack), str(folder / "raw"), "--quiet"]) == 0
     return folder / "raw", ngpt.read(stack), {cpp_host: 120, node_host: 120, oidn_host: 90}
 
