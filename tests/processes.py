@@ -276,7 +276,7 @@ def _render_of(inputs: Path, what: str) -> Work:
         return [*NGPT, "render", *scene, *words]
 
     def gives_its_bits_again(out):
-        """Of a timed render: whether its header does."""
+        """A timed render gives its bits again, by the options in its header."""
         for path in visible(out):
             told, again = ngpt.read(path).attributes, inputs / "again"
             options = [word for option in told["ngpt:samplerOptions"].split(", ") for word in ("-O", option)]

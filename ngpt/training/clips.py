@@ -73,7 +73,7 @@ def clips(folders: Sequence[str | Path], methods: Sequence[str], kept: Path) -> 
 
 def _results(stacks: Sequence[GradientStack], method: str, folder: Path) -> np.ndarray:
     """The results of a method frame by frame, as they are kept in ``folder``, or made and kept."""
-    # By what they are of: numbers of shots change as a set grows, and names are those of other sets as well.
+    # The name is a digest of the stacks: shots change their numbers as a set grows, and sets share names.
     digest = hashlib.sha256(b"".join(stack["primal"].tobytes() for stack in stacks)).hexdigest()
     kept = make_folder(folder) / f"{digest[:24]}-{method}.safetensors"
     with suppress(OSError, SafetensorError, KeyError):

@@ -64,14 +64,11 @@ def cost(settings: Settings) -> str:
         "parameters": f"{parameters(model):,}",
         "cost per pixel": f"{macs / 1e3:,.1f} thousand multiplications, {macs * 1280 * 720 / 1e9:,.1f} G at 1280x720",
     }
-    # Frames of shots are as large as their set has them.
-    lines |= (
-        {}
-        if settings.temporal
-        else {
+    # The training set decides how large the frames of shots are: their cost is not known here.
+    if not settings.temporal:
+        lines |= {
             "cost per step": f"{step / 1e9:,.0f} G multiplications, forward and backward, batch {run.batch}",
             "whole run": f"{step * run.steps / 1e15:,.2f} P multiplications, {run.steps:,} steps",
             "memory": f"about {(activations + states) / 2**30:.2f} GiB while training",
         }
-    )
     return "\n".join(f"{name:<16}{value}" for name, value in lines.items())

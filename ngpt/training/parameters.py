@@ -55,7 +55,7 @@ def parameter_tables() -> str:
 
 
 def tables_of(text: str) -> dict[str, type | None]:
-    """The tables that a configuration may have; None for those of the other kind of network."""
+    """The tables that a configuration may have; None for tables of the other kind of network."""
     other = ("temporal",) if "model" in tomllib.loads(text) else ("model", "loss", "augmentation")
     return TABLES | dict.fromkeys(other)
 

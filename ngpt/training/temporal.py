@@ -90,9 +90,9 @@ class Blending(Task):
         frames: list[dict[str, np.ndarray]] = []
         while True:
             number, place = divmod(step, self.table.round)
+            if place == 0:
+                self._player = copy.deepcopy(model.state_dict())
             if place == 0 or not frames:
-                if place == 0:
-                    self._player = copy.deepcopy(model.state_dict())
                 frames = self._played(model, number)
             rng = np.random.default_rng((self.settings.run.seed, 1, step))
             picked = rng.integers(len(frames), size=self.settings.run.batch)[mine]

@@ -118,7 +118,7 @@ QUICK = settings(
 )
 # Studies promise it of stacks as samplers make them.
 FOR_USE = ["auto", *(name for name, method in METHODS.items() if method.standing != "study")]
-# Nobody promises that of a network that is told no variance and has no base.
+# Networks that get neither variances nor a base promise nothing of the kind.
 BLIND = ("oidn",)
 SEEING = [name for name in FOR_USE[1:] if not METHODS[name].missing() and (METHODS[name].variant or name) not in BLIND]
 

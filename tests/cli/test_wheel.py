@@ -73,7 +73,7 @@ def test_it_is_light_without_extras_and_whole_with_train(metadata):
 
 
 def test_what_it_brings_is_found(wheel, tmp_path):
-    """Of the wheel and not of the checkout: verbs that render, configurations and weights by their names."""
+    """The wheel's own verbs that render, configurations and weights are found by name, not the checkout's."""
     site = tmp_path / "site"
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(site)

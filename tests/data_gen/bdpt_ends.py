@@ -37,7 +37,7 @@ def without_hole():
 
 
 def plan_of(scene, longest=8, roughness=0.05, **more):
-    """That of ``gbdpt``, for paths of at most so many edges, whose roulette lets all of them live."""
+    """The plan of ``gbdpt`` for paths of at most ``longest`` edges, with a roulette that ends none of them."""
     from data_gen.samplers.gbdpt.base_path import Plan
 
     lights, materials, integrator = LightEnds(scene), Materials(scene, roughness), SAMPLERS["gbdpt"].integrator(scene)
@@ -71,7 +71,7 @@ class Met:
 class Ends:
     """Paths from either end of a scene with one lamp, a rectangle, one path from each end a lane.
 
-    ``η`` is that of ``mis``, and photons are gathered at materials that are ``connectable``; None: nowhere.
+    ``η`` is the same as in ``mis``. Photons are gathered at materials that are ``connectable``; None: nowhere.
     """
 
     def __init__(self, scene, η=0.0, connectable=None, spp=16, length=4):
@@ -125,10 +125,11 @@ class Ends:
 
     @np.errstate(divide="ignore", invalid="ignore")
     def densities(self, path, t, lamp=None):
-        """(those of all strategies, f, that of the first vertex on the film) of a path joined behind ``t`` vertices.
+        """Densities of a path joined behind ``t`` vertices: (of all strategies, f, of the first vertex on the film).
 
-        By the number of vertices that come from the light, its own point included (or another point of it, ``lamp``);
-        behind them those that merge, at the first vertex that the camera sees, the second ...; all of them per area.
+        Strategies that join come first, by the number of vertices from the light, its own point included (or another
+        point on it, ``lamp``). Strategies that merge follow, by the vertex from the camera at which they do. All
+        densities are per area.
         """
         ends = [*((met.si.p, met.si.n) for met in path), lamp or (self.start.end.p, self.start.end.n)]
         points, normals = ([np.array(each, np.float64).T for each in some] for some in zip(*ends, strict=True))
@@ -184,7 +185,7 @@ class Ends:
 class Copies(Ends):
     """Paths of the camera and their copies through another pixel: ``copy`` has these instead.
 
-    ``steps`` and ``offsets`` are those of the base paths at each of their vertices.
+    ``steps`` and ``offsets`` are what the base paths have at each of their vertices.
     """
 
     def __init__(self, scene, shift, η=0.0, length=4, roughness=0.05):

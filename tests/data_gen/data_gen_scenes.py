@@ -134,6 +134,16 @@ def caustics():
     )
 
 
+def _lamps(side):
+    """A sky, a square lamp with sides of that length, a bulb and a point light."""
+    return {
+        "sky": {"type": "constant", "radiance": _rgb(0.3, 0.4, 0.5)},
+        "lamp": _light([0.3, 2.3, 0], [0, -1, 0], (side, side), (3, 3, 2.5)),
+        "bulb": _sphere([-1.1, 1.9, -0.6], 0.15, _diffuse(0, 0, 0)) | _area(6, 4, 2),
+        "point": {"type": "point", "position": [0.8, 2.0, 1.6], "intensity": _rgb(1.5, 1.5, 1.8)},
+    }
+
+
 def plenty():
     """One of everything: a lens, lamps of all kinds, textures, bumps, coats, holes, and glass with a rough surface."""
     tiles = {"type": "checkerboard", "to_uv": _transform().scale([3, 3, 1])}
@@ -149,10 +159,7 @@ def plenty():
         ROOM,
         3,
         **_room(1.5, coated),
-        sky={"type": "constant", "radiance": _rgb(0.3, 0.4, 0.5)},
-        lamp=_light([0.3, 2.3, 0], [0, -1, 0], (1.5, 1.5), (3, 3, 2.5)),
-        bulb=_sphere([-1.1, 1.9, -0.6], 0.15, _diffuse(0, 0, 0)) | _area(6, 4, 2),
-        point={"type": "point", "position": [0.8, 2.0, 1.6], "intensity": _rgb(1.5, 1.5, 1.8)},
+        **_lamps(1.5),
         principled=_sphere([-0.9, 0.5, -0.2], 0.5, painted),
         glass=_sphere([0.1, 0.4, 0.4], 0.4, {"type": "roughdielectric", "alpha": 0.15}),
         bumpy=_box([0.95, 0.5, -0.4], [0.6, 1.0, 0.6], 25, bumpy),
@@ -190,10 +197,7 @@ def courtyard():
         ROOM,
         5,
         **{name: wall for name, wall in _room(1.5, satin).items() if name != "ceiling"},
-        sky={"type": "constant", "radiance": _rgb(0.3, 0.4, 0.5)},
-        lamp=_light([0.3, 2.3, 0], [0, -1, 0], (1.0, 1.0), (3, 3, 2.5)),
-        bulb=_sphere([-1.1, 1.9, -0.6], 0.15, _diffuse(0, 0, 0)) | _area(6, 4, 2),
-        point={"type": "point", "position": [0.8, 2.0, 1.6], "intensity": _rgb(1.5, 1.5, 1.8)},
+        **_lamps(1.0),
         brushed=_sphere([-0.9, 0.5, -0.2], 0.5, {"type": "roughconductor", "material": "Cu", "alpha": 0.3}),
         frosted=_sphere([0.1, 0.4, 0.4], 0.4, {"type": "roughdielectric", "alpha": 0.3}),
         box=_box([0.95, 0.5, -0.4], [0.6, 1.0, 0.6], 25, _two(0.3, 0.5, 0.4)),

@@ -38,7 +38,7 @@ def joined(one, other):
 
 
 def passes(scene, n, pixels=1, sampler="gpm", net=0, **options):
-    """The layers of ``n`` first passes, each of another seed, prepared once; with a ``net`` of 1 those of renders."""
+    """The layers of ``n`` first passes, each with its own seed, prepared once; a ``net`` of 1 is what renders have."""
     sample, sensor = find(sampler).made(scene, **options), scene.sensors()[0]
     stacks = []
     with far_shifts(pixels), recording():

@@ -1,4 +1,4 @@
-"""What is particular to ``bdpt``: what is kept of light paths. Its weights are tested beside those of ``vcm``."""
+"""What is particular to ``bdpt``: what is kept of light paths. Its weights are tested with the weights of ``vcm``."""
 
 from typing import get_type_hints
 

@@ -83,7 +83,7 @@ def state(mi, scene):
 
 
 def test_what_is_seen_was_seen_there_and_the_scene_stays(renderer, around, monkeypatch):
-    """Colours of the frame before, along motion, are those of this one, but for edges."""
+    """Along motion, the frame before has the colours of this one, but for edges."""
     for share in ("CAMERA", "THING", "LIGHT"):
         monkeypatch.setattr(movement, share, 1.0)
     before = state(renderer, around.scene)
@@ -172,7 +172,7 @@ def test_sample_counts_are_stratified():
 
 
 def test_crops_keep_light_that_gradients_lack_apart():
-    """Made finite as the rest is; targets without it are those of networks that read gradients."""
+    """It is made finite as the rest is; networks that read gradients have targets without it."""
     stack = full_stack(20, 24)
     light = np.zeros_like(stack["primal"])
     light[::4, ::5] = 6

@@ -42,7 +42,7 @@ def test_nonfinite_samples_have_no_weight_and_are_counted(renderer, rng):
 
 
 def test_gradients_are_half_of_each_direction(renderer, rng):
-    """Forward from a pixel, and backward from the next one; their variances are those of the means."""
+    """Forward from a pixel, and backward from the next one; their variances are variances of the means."""
     target, names = film(4, 3), ("dx+", "dx-", "dy+", "dy-")
     fill(renderer, target, np.zeros((12, 8, 3)))
     samples = {name: rng.normal(size=(3, 4, 8)).astype(np.float32) for name in names}

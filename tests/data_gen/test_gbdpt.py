@@ -97,7 +97,7 @@ def test_there_is_no_way_to_what_is_too_smooth_nor_back(renderer):
 
 
 def test_roulette_leaves_differences_as_they_are(renderer, long_passes, monkeypatch):
-    """Few survive, of the same paths as without: so the noise is that of the roulette alone."""
+    """Few shifts survive, of the same paths as without a roulette: so all the noise comes from the roulette."""
     from data_gen.samplers.gbdpt import integrator, roulette
 
     scene = load(renderer, "diffuse", (16, 16))

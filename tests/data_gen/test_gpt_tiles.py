@@ -73,7 +73,7 @@ def test_denominators_are_sums_of_densities(tiles):
     tile, compared = tiles(2), 0
 
     def density(k, j):
-        """Of s_j by cosine sampling at x_k."""
+        """The density of s_j by cosine sampling at x_k."""
         to = tile.s[j] - tile.x[k]
         distance = np.linalg.norm(to)
         cos, cos_s = (abs(np.dot(normal, to)) / distance for normal in (tile.n[k], tile.n_s[j]))

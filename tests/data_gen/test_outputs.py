@@ -71,7 +71,7 @@ def test_the_image_is_that_of_two_commands(renderer, command, more, method):
 def test_a_method_goes_before_the_one_that_samples_are_shared_for(renderer, command):
     command(f"{GPT} --adaptive --for wcv --denoise l1 -o it.exr")
     assert header("it.exr")["ngpt:method"] == "l1" and header("it.exr")["ngpt:adaptive"] == "wcv"
-    # The error to reach is that of the image.
+    # The error to reach is the error of the image.
     assert "'wcv' is expected to have an error of" in command(f"{GPT} --error 0.9 --spp 32 --denoise wcv -o it.png")
 
 

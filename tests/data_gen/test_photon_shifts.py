@@ -145,7 +145,7 @@ def test_photons_are_mirrored_and_volumes_kept(rays):
 
 
 def test_jacobian_in_media_by_finite_differences(rays):
-    """Of directions and distances from the predecessor."""
+    """The Jacobian of directions and distances from the predecessor."""
     g, dr = rays, rays.dr
     to, to1 = g.b - g.a, beside(g, g.b, g.o, g.d, g.u, g.e) - g.a
     length, d = dr.norm(to), dr.normalize(to)

@@ -207,7 +207,7 @@ def test_the_medium_around_a_lamp_is_found(renderer):
 
 @pytest.mark.slow
 def test_what_is_lost_along_the_edges_of_grids_falls_like_the_radius(renderer):
-    """So twice the image of half the radius, less the image of the radius, is that of ``volpath``."""
+    """So twice the image of half the radius, less the image of the radius, is the image of ``volpath``."""
     scene = load(renderer, media_scenes.smoke, (16, 16))
     theirs = [image.mean() for image in references(renderer, media_scenes.smoke, (16, 16))]
     wide, narrow = (
@@ -223,7 +223,7 @@ def test_what_is_lost_along_the_edges_of_grids_falls_like_the_radius(renderer):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["vpm", "bre"])
 def test_lamps_and_skies_behind_grids_are_seen(renderer, name):
-    """Of paths of one edge, before any photon: the light that comes through, as ``volpath`` has it."""
+    """Paths of one edge, before any photon, carry the light that comes through, as ``volpath`` has it."""
     ours = render_ours(load(renderer, media_scenes.seen_through, (16, 16)), name, batches=8, spp=12)
     expected = references(renderer, media_scenes.seen_through, (16, 16))
     assert_unbiased([{"primal": stack["primal"]} for stack in ours], expected)

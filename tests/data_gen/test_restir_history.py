@@ -51,7 +51,7 @@ def test_the_third_frame_is_unbiased(shots, references, shot, name):
 @pytest.mark.parametrize("shot", SHOTS)
 @pytest.mark.parametrize("name", ["primal", "dx", "dy"])
 def test_history_is_worth_it(shots, shot, name):
-    """The variance of the last frame over that of the first, each beside that of its candidates."""
+    """The variance of the last frame over the variance of the first, each relative to its candidates."""
     variances, paths = (
         [np.sort(frame[layer].var(axis=0).mean(axis=-1).ravel())[:-10].mean() for frame in shots(*shot)]
         for layer in (name, "path")

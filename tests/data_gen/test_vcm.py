@@ -100,7 +100,7 @@ def test_weights_of_copies_count_merging(copies, t, s):
     """At their own vertices, at the one where they join, and behind mirrors and glass beyond that."""
     C, found, base, copy, strategy, good = copies.joined(t, s)
     errors, good = compare_copies(C, found, base, copy, strategy, good)
-    # Where merging counts little these weights are those of ``gbdpt``.
+    # Where merging counts little, ``gbdpt`` has the same weights.
     densities = np.stack([np.broadcast_to(p, good.shape)[good] for p in copy[0]])
     much = densities[t + s + 2 :].sum(axis=0) > 0.05 * densities.sum(axis=0)
     assert much.sum() > {(2, 2): 10, (5, 1): 30}.get((t, s), -1)

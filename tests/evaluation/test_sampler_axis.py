@@ -22,7 +22,7 @@ VARIANTS = {
 @pytest.mark.parametrize(
     ("entries", "expected"),
     [
-        # One sampler: names and stacks are those of old.
+        # One sampler: names and stacks are as they were before samplers were an axis.
         ({}, "primal: path; wcv: gradients; oidn: features"),
         ({"samplers": ("gpt-basic",)}, "primal: path; wcv: gradients gpt-basic; oidn: features"),
         (

@@ -49,7 +49,7 @@ def test_tiles_do_not_show(name):
 
 @every_network
 def test_a_file_gives_the_network_back_and_every_weight_has_a_slope(name, tmp_path):
-    """Of each output of the last convolution: what heads make of a prediction reaches training."""
+    """Each output of the last convolution has a slope: what heads make of a prediction reaches training."""
     # Closer to a beginning: far from it, codes of OIDN's shape are beyond what floats hold.
     model = untrained(NETWORKS[name], 0.02)
     layers = layers_for(model.config, 32, 32)

@@ -62,7 +62,7 @@ def test_a_second_sigterm_discards_them():
             os.kill(os.getpid(), signal.SIGTERM)
         return 0
 
-    # That the handlers are those of before is seen in conftest.
+    # A fixture of conftest checks that the handlers are the ones from before.
     assert run_command(run) == 143
 
 

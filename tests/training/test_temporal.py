@@ -162,7 +162,7 @@ def shot(rng, frames):
 
 
 def test_results_are_kept_by_what_they_are_of(tmp_path, rng, monkeypatch):
-    """Not by numbers or names of shots: sets grow, and names are those of other sets as well."""
+    """Not by numbers or names of shots: sets grow, and sets share names."""
     made, results = [], tmp_path / "results"
 
     def reconstruct(stack, method):

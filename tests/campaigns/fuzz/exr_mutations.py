@@ -93,7 +93,7 @@ def _named(rng: random.Random, exr: Exr, name: bytes | None = None) -> Attribute
 
 
 def _set(rng: random.Random, exr: Exr, name: bytes, kind: bytes, data: bytes) -> None:
-    """One more attribute, in the place of those of its name, or beside them."""
+    """Adds an attribute; in half of the cases it replaces all attributes of the same name."""
     part = rng.choice(exr.parts)
     if rng.random() < 0.5:
         part[:] = [each for each in part if each.name != name]

@@ -49,7 +49,7 @@ def test_scenes_without_lamps_are_black(renderer, name):
 
 @pytest.mark.parametrize("name", [name for name in SAMPLERS if name in NAMES or name in ("split", "gpt-tiles")])
 def test_paths_of_no_edge_and_of_one_have_no_gradients(renderer, name):
-    """Without edges there is no light, with one only that of lamps that are seen directly, not in mirrors."""
+    """Without edges there is no light; with one edge, only lamps that are seen directly, not in mirrors."""
     scene = glass()
     del scene["hole"], scene["rough"]
     # The text for teaching knows no mirrors.
