@@ -2,13 +2,10 @@
 
 import gc
 import logging
-import shlex
 from collections import Counter
 from functools import wraps
 
 import pytest
-
-from ngpt.cli import main
 
 
 class Recordings:
@@ -72,19 +69,11 @@ def kernels_are_recorded_once(request):
 
 
 @pytest.fixture
-def command(tmp_path, monkeypatch, capsys):
-    """Runs a command line in an empty folder, checks its exit status (0, or one of others), returns its errors."""
-    monkeypatch.chdir(tmp_path)
+def command(command):
+    """The fixture of the same name, but it returns the errors; ``command.output`` is what else was written."""
 
     def run(line, *status):
-        capsys.readouterr()
-        try:
-            found = main(shlex.split(line))
-        except SystemExit as stop:  # of the parser
-            found = stop.code
-        printed = capsys.readouterr()
-        assert found in (status or (0,)), printed.err
-        run.output = printed.out
-        return printed.err
+        run.output, errors = command(line, *status)
+        return errors
 
     return run
