@@ -1,5 +1,6 @@
 """The commands as processes of their own: small work for each, what it leaves, and ways to end it before its time."""
 
+import gc
 import json
 import multiprocessing
 import os
@@ -53,14 +54,20 @@ def shell(line, *arguments):
 
 
 def in_a_child(work, i=0, seconds=60):
-    """What ``work(i)`` returns in a forked child, as bytes; fails where the child takes longer."""
+    """What ``work(i)`` returns in a forked child, as bytes; fails where the child takes longer.
+
+    The child's collector leaves what earlier tests dropped: to destroy a session of ONNX Runtime that one of them had
+    made, the child would wait for ever for threads that it does not have.
+    """
     ours, theirs = multiprocessing.Pipe(duplex=False)
     child = multiprocessing.get_context("fork").Process(target=lambda: theirs.send_bytes(work(i).tobytes()))
-    child.start()
+    gc.freeze()
     try:
+        child.start()
         assert ours.poll(seconds), "the child hangs"
         return ours.recv_bytes()
     finally:
+        gc.unfreeze()
         child.kill()
         child.join()
 

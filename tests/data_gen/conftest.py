@@ -18,18 +18,6 @@ class Recordings:
         return sum(self.of.values())
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol():
-    """Scenes of earlier tests are not freed amid a kernel of this one: ``data_gen.passes.recording`` says why."""
-    gc.disable()
-    try:
-        return (yield)
-    finally:
-        gc.enable()
-        # What this test has left: each scene that is there is compiled into the next kernels.
-        gc.collect(1)
-
-
 @pytest.fixture
 def recordings(renderer, monkeypatch):
     from data_gen.paths.frozen import Frozen

@@ -137,7 +137,10 @@ def assert_copies_are_light_paths(world, paths, j, shift, least=0.0):
     to = dr.select(first, dr.select(beyond, moved.d, moved.p - start.ray.o), moved.p - a.spawn_ray(moved.d).o)
     fields = {field: dr.gather(type(value), value, j) for field, value in vars(photons).items()}
     fields |= {"p": moved.p, "n": moved.n, "d": moved.d, "β": moved.Φ, "t": dr.norm(to)}
-    fields |= {"density": dr.select(first, 0, density), "parent": dr.select(first, lane + n, parent)}
+    # A density of 0 marks the first photon of a path, whose parent is a light's start: no other copy may have it, even
+    # one that does not exist (its lane goes back with the others, masked).
+    density = dr.select(first, 0, dr.select(density > 0, density, 1))
+    fields |= {"density": density, "parent": dr.select(first, lane + n, parent)}
     more = joined(photons, fields)
     index = dr.arange(mi.UInt32, n + m)
 

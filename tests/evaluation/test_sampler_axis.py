@@ -138,8 +138,6 @@ def test_two_samplers_at_equal_time(renderer, tmp_path):
     used = {method: cells[method, 0]["spp used"] for method in names}
     assert used["wcv (gpt)"] == 8 and used["wcv (gpt-basic)"] == max(2, round(8 * ratio))
     assert used["primal (primal)"] == round(8 * costs["gradients"]["median"] / costs["path"]["median"]) > 8
-    errors = {row["method"]: row["error"] for row in results["summary"] if row["scene"] == "diffuse"}
-    assert errors["wcv (gpt)"] < errors["primal (primal)"]
     # What was measured and rendered before stays: the clock is the same, and so are the cells.
     assert {name: costs[name] for name in before["scenes"]["diffuse"]["cost"]} == before["scenes"]["diffuse"]["cost"]
     for old, new in (("primal", "primal (primal)"), ("wcv", "wcv (gpt)")):

@@ -114,7 +114,9 @@ def test_heads_are_the_same_as_graphs(head):
         images = [10 ** torch.randn(2, 3, *sides) for _ in head.start]
     expected = head.forward(prediction, images).numpy()
     made = evaluate(lambda first, *others: head.graph(_OperatorsOfHeads(), first, list(others)), prediction, *images)
-    assert np.allclose(made, expected, rtol=1e-4 if sweeps else 1e-5, atol=1e-5 if sweeps else 1e-6)
+    # Sweeps carry what a bright pixel is rounded by to its dark neighbours.
+    near = {"rtol": 1e-4, "atol": 1e-5 * np.abs(expected).max()} if sweeps else {"rtol": 1e-5, "atol": 1e-6}
+    assert np.allclose(made, expected, **near)
 
 
 def test_expressions():
