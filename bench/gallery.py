@@ -99,9 +99,8 @@ def name_of(row: Shown) -> str:
     return Path(row.scene).parent.name or row.scene
 
 
-def command(row: Shown) -> str:
-    sampler = "" if row.sampler == "auto" else f" --sampler {row.sampler}"
-    return f"ngpt render {row.scene} -o image.png --spp {row.spp}{sampler}"
+def options(row: Shown) -> str:
+    return f"--spp {row.spp}" + ("" if row.sampler == "auto" else f" --sampler {row.sampler}")
 
 
 def images(args: argparse.Namespace, row: Shown) -> tuple[list[np.ndarray], dict[str, Any]]:
@@ -116,7 +115,7 @@ def images(args: argparse.Namespace, row: Shown) -> tuple[list[np.ndarray], dict
         for i in (0, 1)
     ]
     facts = {
-        "command": command(row),
+        "options": options(row),
         "sampler": stack.attributes["ngpt:sampler"],
         "method": result.method,
         "CPU seconds": seconds,
@@ -146,13 +145,13 @@ def rendered(args: argparse.Namespace, row: Shown, sampler: str, spp: int, seed:
 
 def table(found: dict[str, Any]) -> str:
     lines = [
-        "| scene | command | sampler, method | seconds | error, noisy | result | by `oidn` | light |",
+        "| scene | options | sampler, method | seconds | error, noisy | result | by `oidn` | light |",
         "|---|---|---|--:|--:|--:|--:|--:|",
     ]
     for name, row in found["rows"].items():
         how = f"`{row['sampler']}`, `{row['method']}` | {row['CPU seconds']:.0f}"
         errors = " | ".join(f"{row[key]:.4f}" for key in ("noisy", "result", "oidn"))
-        lines.append(f"| [{name}](#{name}) | `{row['command']}` | {how} | {errors} | {row['light']:.2f} |")
+        lines.append(f"| [{name}](#{name}) | `{row['options']}` | {how} | {errors} | {row['light']:.2f} |")
     return "\n".join(lines)
 
 
