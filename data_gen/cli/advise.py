@@ -104,7 +104,9 @@ def rows_of(pipelines: list[Pipeline], seconds: float | None, error: float | Non
         least = min(p.takes(max(p.least, 2)) for p in pipelines)
         raise NgptError(f"nothing fits into {seconds:g} s: the cheapest takes {brief(least)} s")
     if not found:
-        raise NgptError(f"no method reaches an error of {error:g} with fewer than {LARGEST_SPP} samples; ask for more")
+        raise NgptError(
+            f"no method reaches an error of {error:g} with fewer than {LARGEST_SPP} samples; allow a larger error"
+        )
     found.sort(key=lambda row: row.error if seconds is not None else row.seconds)
     best: dict[tuple[str, str], Row] = {}
     for row in found:

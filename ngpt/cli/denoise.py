@@ -154,11 +154,11 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
     if args.halves:
         args.error = True
         if len(pairs) > 1:
-            raise WrongUse(f"--halves are of one stack, and {len(pairs)} are given; denoise them one by one")
+            raise WrongUse(f"--halves belong to one stack, and {len(pairs)} are given; denoise them one by one")
     if args.temporal:
         for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
             if given:
-                raise WrongUse(f"--temporal goes without {option}: history has no {option[2:]}; leave one out")
+                raise WrongUse(f"--temporal and {option} cannot be combined; leave one out")
     for _, target in pairs:
         if target.suffix.lower() != ".exr":
             check_picture(target, args)

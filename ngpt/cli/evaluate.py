@@ -34,7 +34,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         from ngpt.system.templates import template
 
         if base := read_toml(path).get("base"):
-            raise WrongUse(f"{path.stem} is {base} with other numbers: give --init that one")
+            raise WrongUse(f"{path.stem} only changes numbers of {base}; give that file to --config")
         return write_template(args, template(path.read_text(encoding="utf-8"), {"": Config}), "evaluate", console)
     if not args.out:
         raise WrongUse("--out is missing: the folder of the results")

@@ -40,7 +40,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if not args.weights and args.vector:
         raise WrongUse("--vector belongs to networks; leave it out for a classical method")
     if args.output.suffix in (".tza", ".safetensors") and (not args.weights or args.vector):
-        raise WrongUse(f"{args.output}: a file of this kind holds a network and no more; give it --weights alone")
+        raise WrongUse(f"{args.output}: {args.output.suffix} files hold only networks; give --weights, and no --vector")
     output_file(args.output, args)
     for path in write(args):
         console.say(f"{path}: {path.stat().st_size} bytes")
@@ -69,7 +69,9 @@ def write(args: argparse.Namespace) -> list[Path]:
         from ngpt.export.temporal import temporal_model
 
         if args.vector:
-            raise NgptError(f"{args.weights}: blends frames; leave --vector out")
+            raise NgptError(
+                f"{args.weights}: this network blends frames, and has no example to write; leave --vector out"
+            )
         models = {args.output: temporal_model(args.weights)}
     else:
         from ngpt.export.network import network_model, statistics_model

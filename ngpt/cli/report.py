@@ -237,7 +237,7 @@ def motion_of(paths: list[str], place: Place) -> np.ndarray | None:
 def shot_files_of(folder: str) -> list[Path]:
     """The frames of a shot; raises NgptError for a single file."""
     if not is_shot(folder):
-        raise NgptError(f"{folder}: is no folder, and others are; give folders of frames, or images alone")
+        raise NgptError(f"{folder}: is not a folder, but others are; give only folders of frames, or only images")
     return shot_files(folder)
 
 

@@ -41,7 +41,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     settings = read_settings(config, args.set)
     if args.init:
         if args.set:
-            raise NgptError("--init writes what can be set by hand then; leave --set out")
+            raise NgptError("--init and --set cannot be combined; change settings in the file that --init writes")
         from ngpt.training.parameters import training_template
 
         return write_template(args, training_template(config.read_text(encoding="utf-8")), "train", console)

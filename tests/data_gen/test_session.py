@@ -133,7 +133,7 @@ def test_what_is_no_scene_is_said_with_its_remedy(renderer):
             render_stack(given, 2)
     with pytest.raises(NgptError, match=r"load it: mi\.load_dict"):
         data_gen.render_scene(box)
-    with pytest.raises(NgptError, match="a shot is of a scene file or a built-in scene, and a dict is given"):
+    with pytest.raises(NgptError, match="a shot needs a scene file or a built-in scene, not a dict"):
         data_gen.render_frames(box, range(2))
 
 
