@@ -224,7 +224,7 @@ def test_refused(shelf, line, status, words, monkeypatch, capfd):
 RENDERS = [
     ("render nonsense.xml", 1, '"nonsense" not found'),
     ("render absent.xml", 1, "absent.xml: no such file"),
-    ("render diffuse --variant scalar_rgb", 2, "'scalar_rgb' is not one"),
+    ("render diffuse --variant scalar_rgb", 2, "'scalar_rgb' is no vectorised variant"),
     ("render diffuse --size 30000x30000", 1, "; render a smaller image"),
     ("render absent.xml --spp 9999999999", 2, "9999999999 samples per pixel"),
     ("render diffuse -o notes.exr/s.exr", 1, "notes.exr: cannot be made: "),

@@ -150,7 +150,7 @@ def adaptive(error=None, method="wcv", **options):
         ({"sampler": "gpt", "shift": "half-vektor"}, "takes replay, half-vector, manifold; did you mean 'half-vector'"),
         ({"sampler": "gpt", "reus": True}, "sampler 'gpt' has no option 'reus'; did you mean 'reuse'"),
         ({"sampler": "split", "reuse": True}, "'split' has no option 'reuse'; it has: points, lamps"),
-        (adaptive(spp=31), "31 samples per pixel are too few .* from 32 on"),
+        (adaptive(spp=31), "at least 32 samples per pixel, not 31"),
         (adaptive(sampler="bdpt"), "'bdpt' depend on each other.* use: gpt, gpt-basic, gpt-simple, primal"),
         (adaptive(reuse=True), "'reuse' and 'shift=manifold' need samples of all pixels"),
         (adaptive(0.0, spp=None), "an error of 0 is never reached"),

@@ -35,7 +35,7 @@ def test_a_file_a_name_and_a_scene_give_the_bits_of_the_command(renderer, comman
     again, plan = data_gen.render_scene(scene, 4, 3, "gpt", chosen=told.append)
     assert same(stack, again) and plan.sampler == "gpt" and len(told) == 1
     for asked in ({"size": SIZE}, {"sensor": 1}):
-        with pytest.raises(NgptError, match="has its size, parameters and sensor; load it with them"):
+        with pytest.raises(NgptError, match="of a loaded scene are fixed; give them to data_gen.load_scene"):
             data_gen.render_scene(scene, **asked)
 
 
@@ -49,7 +49,7 @@ def test_options_samples_that_differ_and_what_ends_a_render(renderer):
         "diffuse", 1 << 24, sampler="primal", size=SIZE, progress=lambda *at: passes.append(at), stop=lambda: True
     )
     assert passes[-1][0] == stack.attributes["ngpt:spp"] < 1 << 24
-    with pytest.raises(NgptError, match="--for says what"):
+    with pytest.raises(NgptError, match="--for needs --adaptive"):
         data_gen.render_scene("diffuse", 4, method="wcv")
 
 
