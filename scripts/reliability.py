@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -107,9 +108,17 @@ def worst_of(report: dict) -> dict:
     return report["worst"] | {what: value for what, value in report.items() if what not in known}
 
 
+def largest(worst: dict) -> dict:
+    """Of more than four measures the three that are largest, by the number that they begin with."""
+    if len(worst) <= 4:
+        return worst
+    order = sorted(worst, key=lambda what: float(re.match(r"[\d.]*", str(worst[what]))[0] or 0), reverse=True)
+    return {what: worst[what] for what in order[:3]}
+
+
 def row(report: dict) -> str:
     outcomes = [f"{count:,} {what}" for what, count in report["outcomes"].items() if count]
-    worst = [f"{what}: {value}" for what, value in worst_of(report).items()]
+    worst = [f"{what}: {value}" for what, value in largest(worst_of(report)).items()]
     seconds = "" if report["seconds"] is None else f"{report['seconds']:.0f}"
     cells = [report["campaign"], f"{report['tried']:,}", "; ".join(outcomes), "; ".join(worst), seconds]
     return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |\n"

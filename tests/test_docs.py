@@ -163,6 +163,8 @@ def test_campaigns_of_one_kind_share_a_row():
     first, second = kinds([*reports, report("Weights, mutated", 5, 0)])
     assert row(together(first)) == "| Kills at random moments of: a, b c | 9 | 7 done; 2 one line | files: 1 | 4 |\n"
     assert row(together(second)).startswith("| Weights, mutated | 6 |")
+    many = report("Scenes", 1, 0) | {"worst": {"a": "2.5 dx", "b": "1 dy", "c": "6.5 dx", "d": "0.2 dx", "e": "3 dx"}}
+    assert "| c: 6.5 dx; e: 3 dx; a: 2.5 dx |" in row(many)
 
 
 @pytest.fixture
