@@ -151,7 +151,7 @@ def adaptive(error=None, method="wcv", **options):
         ({"sampler": "gpt", "reus": True}, "sampler 'gpt' has no option 'reus'; did you mean 'reuse'"),
         ({"sampler": "split", "reuse": True}, "'split' has no option 'reuse'; it has: points, lamps"),
         (adaptive(spp=31), "at least 32 samples per pixel, not 31"),
-        (adaptive(sampler="bdpt"), "'bdpt' depend on each other.* use: gpt, gpt-basic, gpt-simple, primal"),
+        (adaptive(sampler="bdpt"), "'bdpt' depend on each other.* use one of: gpt, gpt-basic, gpt-simple, primal"),
         (adaptive(reuse=True), "'reuse' and 'shift=manifold' need samples of all pixels"),
         (adaptive(0.0, spp=None), "an error of 0 is never reached"),
         (adaptive(spp=None), "neither a number of samples"),

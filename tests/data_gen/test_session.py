@@ -128,7 +128,7 @@ def test_a_variant_is_chosen_by_a_render_alone():
 
 def test_what_is_no_scene_is_said_with_its_remedy(renderer):
     box = renderer.cornell_box()
-    for given, said in ((box, "load it: mi.load_dict"), ("diffuse", "data_gen.load_scene"), (3, "an int is given")):
+    for given, said in ((box, "load it: mi.load_dict"), ("diffuse", "data_gen.load_scene"), (3, "an int is not a scene")):
         with pytest.raises(NgptError, match=said):
             render_stack(given, 2)
     with pytest.raises(NgptError, match=r"load it: mi\.load_dict"):
