@@ -76,12 +76,10 @@ def check_adaptive(adaptive: Adaptive, sampler: Sampler, options: dict, spp: int
     if adaptive.error is not None and not 0 < adaptive.error < math.inf:
         raise WrongUse(f"an error of {adaptive.error:g} is never reached; give a positive number, such as 0.05")
     if spp is not None and spp < LEAST:
-        raise WrongUse(f"{spp} samples per pixel are too few to be shared out; from {LEAST} on they can be")
+        raise WrongUse(f"adaptive renders need at least {LEAST} samples per pixel, not {spp}")
     if sampler.even:
         able = ", ".join(name for name, other in SAMPLERS.items() if not other.even)
-        raise NgptError(
-            f"the samples of '{sampler.name}' depend on each other, so all pixels have as many; for others use: {able}"
-        )
+        raise NgptError(f"samples of '{sampler.name}' depend on each other and cannot be adaptive; use one of: {able}")
     if options.get("reuse") or options.get("shift") == "manifold":
         raise NgptError("options 'reuse' and 'shift=manifold' need samples of all pixels in each pass; leave them out")
 

@@ -33,8 +33,8 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
     jit_variants = [v for v in mi.variants() if not v.startswith("scalar")]
     if name not in jit_variants:
         raise WrongUse(
-            f"variant '{name}' is not one this Mitsuba can vectorise; {did_you_mean(name, jit_variants)}choose one of: "
-            f"{', '.join(jit_variants)}"
+            f"variant '{name}' is no vectorised variant of this Mitsuba; {did_you_mean(name, jit_variants)}"
+            f"choose one of: {', '.join(jit_variants)}"
         )
     if name.startswith("llvm"):
         use_llvm()

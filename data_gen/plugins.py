@@ -94,7 +94,7 @@ def make_classes() -> None:
     variant = mi.variant()
     if variant.startswith("scalar"):
         able = ", ".join(name for name in mi.variants() if not name.startswith("scalar"))
-        raise NgptError(f"variant '{variant}' is not one that our integrators can vectorise; choose one of: {able}")
+        raise NgptError(f"variant '{variant}' is not vectorised, as our integrators must be; choose one of: {able}")
     if variant == _made_for:
         return
     for module in _modules_with_classes():

@@ -180,7 +180,7 @@ def render_frames(
     cameras without a projection.
     """
     if dt == 1:
-        raise WrongUse("--dt 1: how much differences vary takes 2 pairs or more to tell; use --dt 2")
+        raise WrongUse("--dt 1: a variance needs at least 2 pairs; use --dt 2")
     parameters = dict(parameters or {})
 
     def describe(frame: int) -> tuple[str, dict[str, str]]:
@@ -188,8 +188,8 @@ def render_frames(
 
     if not isinstance(scene, str):
         raise NgptError(
-            f"a shot is of a scene file or a built-in scene, and a {type(scene).__name__} is given; give its name, or "
-            "make a data_gen.frames.shot.Shot of what changes"
+            f"a shot needs a scene file or a built-in scene, not a {type(scene).__name__}; give a name, or "
+            "describe the shot by data_gen.frames.shot.Shot"
         )
     describe(frames[0])
     _start(variant)
@@ -245,9 +245,7 @@ def _loaded(
         return load_scene(str(scene), size, dict(parameters or {}), sensor=sensor)
     check_scene(scene)
     if size is not None or parameters or sensor is not None:
-        raise NgptError(
-            "a scene that is loaded has its size, parameters and sensor; load it with them: data_gen.load_scene"
-        )
+        raise NgptError("size, parameters and sensor of a loaded scene are fixed; give them to data_gen.load_scene")
     return scene
 
 
@@ -257,8 +255,8 @@ def _sharing(adaptive: bool, error: float | None, method: str | None, by_itself:
         return _adaptive(error, method or "auto")
     if method is not None and not by_itself:
         raise WrongUse(
-            "--for says what --adaptive and --error go by; give one of them too, or let a pilot choose for it: "
-            "with --time, and without --sampler and --spp"
+            "--for needs --adaptive or --error; or give --time without --sampler and --spp, and a pilot chooses the "
+            "sampler for it"
         )
     return None
 

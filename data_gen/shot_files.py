@@ -188,7 +188,7 @@ def write_frames_on_cluster(
 ) -> Written:
     """``write_frames`` in parts, each on a worker of the Dask cluster whose scheduler is at ``address``."""
     if options.pop("shard", None):
-        raise WrongUse("--cluster shares the frames out by itself; leave --shard out")
+        raise WrongUse("--cluster distributes the frames itself; leave --shard out")
     for file in files.values():
         check_output(file, overwrite or skip_existing, may_skip=True)
     from data_gen.dataset.jobs import cluster

@@ -270,8 +270,8 @@ def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
             for other in seen.setdefault(seed, []):
                 if stack.place.data.common(other.place.data):
                     raise NgptError(
-                        f"{stack.path} and {other.path} were both rendered with seed {seed}: the same samples twice "
-                        "are no more than once; render one of them with another --seed"
+                        f"{stack.path} and {other.path} were both rendered with seed {seed}, so they hold the "
+                        "same samples; render one of them with another --seed"
                     )
             seen[seed].append(stack)
     for stack in stacks:

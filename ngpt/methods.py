@@ -132,31 +132,31 @@ _FEATURES = ("albedo", "normal", "depth")
 
 _OURS = {
     "primal": Method("the Monte Carlo estimate as it is", ("primal",), _primal, {}),
-    "l2": _classical("l2", "screened Poisson, least squares: unbiased, fast"),
-    "l1": _classical("l1", "screened Poisson, least norms: robust to outliers", "use"),
-    "cv": _classical("cv", "uniform control variates: close to l2, unbiased"),
-    "wcv": _classical("wcv", "control variates weighted by variance: the best of these", "use"),
+    "l2": _classical("l2", "screened Poisson with the L2 norm, unbiased and fast"),
+    "l1": _classical("l1", "screened Poisson with the L1 norm, robust to outliers", "use"),
+    "cv": _classical("cv", "uniform control variates, close to l2 and unbiased"),
+    "wcv": _classical("wcv", "control variates weighted by variance, the best without a network", "use"),
     "wl2": _classical("wl2", "least squares weighted by variance"),
     "ngpt-fast": _network(
-        "ngpt-fast", "small neural network, quick on a CPU", (*_GRADIENTS, *_FEATURES), estimates=ESTIMATED
+        "ngpt-fast", "small network with gradients, quick on a CPU", (*_GRADIENTS, *_FEATURES), estimates=ESTIMATED
     ),
     "ngpt-combine": _network(
         "ngpt-combine",
-        "OIDN's images and the gradients, weighed and corrected by a small network",
+        "small network that combines OIDN's images and the gradients",
         (*_GRADIENTS, *_FEATURES),
         also_missing=oidn.missing,
         estimates=ESTIMATED,
     ),
     "ngpt-primal": _network(
         "ngpt-primal",
-        "the same without gradients: OIDN's image, corrected by a small network that knows the noise",
+        "small network without gradients that corrects OIDN's image by the noise level",
         ("primal", *_FEATURES, "primal_var"),
         also_missing=oidn.missing,
     ),
     "ngpt": _network("ngpt", "neural network of the paper's size", (*_GRADIENTS, *_FEATURES), "niche"),
     # The methods below do not use gradients.
     "nlm": Method(
-        "peer: joint non-local means of scikit-image",
+        "joint non-local means of scikit-image",
         ("primal", "albedo", "normal", "primal_var"),
         nlm.nlm,
         {},
@@ -164,7 +164,7 @@ _OURS = {
         nlm.missing,
     ),
     "nfor": Method(
-        "peer: first-order regression on features, for machines without OIDN",
+        "first-order regression on albedo, normal and depth, for machines without OIDN",
         ("primal",),
         _nfor,
         {},
@@ -173,7 +173,7 @@ _OURS = {
         estimates=("primal_var",),
     ),
     "oidn": Method(
-        "peer: Intel Open Image Denoise, of colour alone, with albedo, or with albedo and normal",
+        "Intel Open Image Denoise; reads colour, and albedo and normal if there are any",
         ("primal",),
         oidn.oidn,
         oidn.OPTIONS,

@@ -144,7 +144,7 @@ def overlap(names: Sequence[str], places: Sequence[Place]) -> Overlap:
         windows.append(window)
         if (both := common.common(window)) is None:
             each = ", ".join(f"{name} is {place}" for name, place in zip(names, places, strict=True))
-            raise NgptError(f"{each}; these have no pixel in common: give images of one place")
+            raise NgptError(f"{each}; these have no pixel in common: give images of the same part of the picture")
         common = both
     return Overlap(windows, common)
 
@@ -158,8 +158,8 @@ def put(image: np.ndarray, window: Window, canvas: Window, outside: float = 0.0)
         return image
     if canvas.width * canvas.height > MOST:
         raise NgptError(
-            f"a picture of {canvas.width}x{canvas.height} pixels is to be filled, of which a file has {window}; "
-            f"{MOST >> 20} million are shown at most: set its display window"
+            f"the display window is {canvas.width}x{canvas.height} pixels, of which the file has {window}; "
+            f"at most {MOST >> 20} million pixels are shown: set a smaller display window"
         )
     filled = np.full((canvas.height, canvas.width, *image.shape[2:]), outside, image.dtype)
     if common := window.common(canvas):

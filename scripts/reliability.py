@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -21,22 +22,24 @@ sys.path.insert(0, str(ROOT))
 CAMPAIGNS = ("tests/campaigns", "tests/data_gen/test_stress.py")
 PAGE = ROOT / "docs" / "lab" / "RELIABILITY.md"
 
+# Campaigns of one kind share a row: what comes before one of these words is the kind
+KINDS = (" at random moments of ", " under ", " bytes: ")
+
 HEAD = """\
 # Reliability
 
-What was tried against ngpt, how many times, and what came out: {tried} trials in {campaigns} campaigns, {date}, those
-of `make campaigns`. Every outcome in the table is one that is allowed: a campaign in which anything else comes out (a
-crash, a hang, a traceback, a file half-written under its final name, memory that grows) fails its test, and has no row.
+`make campaigns` attacked ngpt {tried} times in {campaigns} campaigns, {date}. The table counts the outcomes, and all of
+them are allowed. A campaign fails its test, and has no row, if there is a crash, a hang, a traceback, memory that
+grows, or a half-written file under its final name.
 {failure}
 | campaign | tried | what came out | worst | seconds |
 |---|---|---|---|---|
 """
 
 TAIL = """
-What a killed process leaves: at most one hidden file for each that it was writing, named `.ngpt-XXXXXXXX.SUFFIX`.
-Nothing reads it, and the next process that writes into the folder removes it, once the lock on it shows that its writer
-is dead. In the system's folder for temporary files a killed `data_gen` may leave `ngpt-scene-*`, and a `train.py` that
-renders its own crops `ngpt-stream-*`: nothing reads them, and the system clears them away. The empty file `.lock`
+A killed process leaves at most one hidden file, `.ngpt-XXXXXXXX.SUFFIX`, for each file that it was writing. Nothing
+reads it, and the next process that writes into the folder removes it. In the system's temporary folder, a killed
+`data_gen` may leave `ngpt-scene-*`, and a `train.py` that renders its own crops `ngpt-stream-*`. The empty file `.lock`
 stays in folders of training sets, runs and evaluations; the lock itself ends with its process.
 
 Versions: {versions}.
@@ -62,14 +65,60 @@ def page(reports: list[dict], date: str, failed: bool) -> str:
         failure="\n**Of this run, some campaigns failed, and are missing here.**\n" if failed else "",
     )
     told = ", ".join(f"{name} {' and '.join(sorted(found))}" for name, found in sorted(versions.items()))
-    return head + "".join(row(report) for report in reports) + TAIL.format(versions=told)
+    return head + "".join(row(together(kind)) for kind in kinds(reports)) + TAIL.format(versions=told)
+
+
+def kinds(reports: list[dict]) -> list[list[dict]]:
+    """The reports, with those of one kind together; see ``KINDS``."""
+    found: dict[str, list[dict]] = {}
+    for report in reports:
+        kind = min((report["campaign"].partition(word)[0] for word in KINDS), key=len)
+        found.setdefault(kind, []).append(report)
+    return list(found.values())
+
+
+def together(reports: list[dict]) -> dict:
+    """One report of several of a kind: counts and seconds are added, of the worst numbers the largest counts."""
+    if len(reports) == 1:
+        return reports[0]
+    name = reports[0]["campaign"]
+    word = next(word for word in KINDS if word in name)
+    what = ", ".join(report["campaign"].partition(word)[2].replace(",", "") for report in reports)
+    total: dict = {"campaign": f"{name.partition(word)[0]}{word.rstrip(' :')}: {what}", "outcomes": {}, "worst": {}}
+    total["tried"] = sum(report["tried"] for report in reports)
+    total["seconds"] = sum(report["seconds"] or 0 for report in reports)
+    for report in reports:
+        for outcome, count in report["outcomes"].items():
+            total["outcomes"][outcome] = total["outcomes"].get(outcome, 0) + count
+        for measure, value in worst_of(report).items():
+            total["worst"][measure] = larger(total["worst"].get(measure, value), value)
+    return total
+
+
+def larger(one: float | str, other: float | str) -> float | str:
+    """The larger of two numbers, or two different texts after each other."""
+    if isinstance(one, str) or isinstance(other, str):
+        return one if str(other) in str(one) else f"{one}, {other}"
+    return max(one, other)
+
+
+def worst_of(report: dict) -> dict:
+    """The worst that was measured, and all else that a campaign recorded."""
+    known = {"campaign", "tried", "outcomes", "worst", "seconds", "versions"}
+    return report["worst"] | {what: value for what, value in report.items() if what not in known}
+
+
+def largest(worst: dict) -> dict:
+    """Of more than four measures the three that are largest, by the number that they begin with."""
+    if len(worst) <= 4:
+        return worst
+    order = sorted(worst, key=lambda what: float(re.match(r"[\d.]*", str(worst[what]))[0] or 0), reverse=True)
+    return {what: worst[what] for what in order[:3]}
 
 
 def row(report: dict) -> str:
     outcomes = [f"{count:,} {what}" for what, count in report["outcomes"].items() if count]
-    worst = [f"{what}: {value}" for what, value in report["worst"].items()]
-    known = {"campaign", "tried", "outcomes", "worst", "seconds", "versions"}
-    worst += [f"{what}: {value}" for what, value in report.items() if what not in known]
+    worst = [f"{what}: {value}" for what, value in largest(worst_of(report)).items()]
     seconds = "" if report["seconds"] is None else f"{report['seconds']:.0f}"
     cells = [report["campaign"], f"{report['tried']:,}", "; ".join(outcomes), "; ".join(worst), seconds]
     return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |\n"

@@ -293,8 +293,8 @@ def judge(default: str, times: dict[str, float]) -> tuple[str, str]:
     best = min(times, key=lambda name: times[name])
     if times[best] * _MARGIN > times[default]:
         best = default
-    others = [f"{brief(times[name] / times[best])} times as long by '{name}'" for name in times if name != best]
-    found = f"to a given error it takes {', '.join(others)}" if others else "there was time for no other"
+    others = [f"'{name}' takes {brief(times[name] / times[best])} times as long" for name in times if name != best]
+    found = f"to the same error, {', '.join(others)}" if others else "there was no time to try others"
     return best, f"chosen by a pilot: {found}"
 
 

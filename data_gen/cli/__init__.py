@@ -9,7 +9,7 @@ KERNELS = "compiling kernels ..."
 
 VERBS = {
     "render": Verb("render a scene to a gradient stack, or to a denoised image", ROOM, heading="rendering"),
-    "advise": Verb("say which method and how many samples to use, for a time or an error", ROOM, heading="rendering"),
+    "advise": Verb("find the sampler, method and number of samples for a time or an error", ROOM, heading="rendering"),
     "demo": Verb(
         "render built-in scenes, reconstruct with every method, and write a report to open in a browser",
         ROOM,

@@ -25,10 +25,12 @@ LARGEST_SPP = 1 << 20
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", metavar="SCENE", help="a Mitsuba 3 scene file, or a built-in scene")
     goal = parser.add_mutually_exclusive_group(required=True)
-    goal.add_argument("--seconds", type=duration, help="time for rendering and reconstruction")
-    goal.add_argument("--error", type=duration, metavar="ERROR", help="trimmed relMSE to reach")
+    goal.add_argument("--seconds", type=duration, help="time for rendering and denoising together")
+    goal.add_argument("--error", type=duration, metavar="ERROR", help="error to reach (trimmed relMSE)")
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the scene's own)")
-    parser.add_argument("--sensor", metavar="NAME|N", help="by id, or by number from 0 (default: the first)")
+    parser.add_argument(
+        "--sensor", metavar="NAME|N", help="sensor of the scene: its id, or its number from 0 (default: the first)"
+    )
     parser.add_argument("--variant", help="Mitsuba variant (default: llvm_ad_rgb; cuda_ad_rgb for an NVIDIA GPU)")
     parser.add_argument(
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
@@ -102,7 +104,9 @@ def rows_of(pipelines: list[Pipeline], seconds: float | None, error: float | Non
         least = min(p.takes(max(p.least, 2)) for p in pipelines)
         raise NgptError(f"nothing fits into {seconds:g} s: the cheapest takes {brief(least)} s")
     if not found:
-        raise NgptError(f"no method reaches an error of {error:g} with fewer than {LARGEST_SPP} samples; ask for more")
+        raise NgptError(
+            f"no method reaches an error of {error:g} with fewer than {LARGEST_SPP} samples; allow a larger error"
+        )
     found.sort(key=lambda row: row.error if seconds is not None else row.seconds)
     best: dict[tuple[str, str], Row] = {}
     for row in found:

@@ -13,18 +13,18 @@ from ngpt.training.dataset import Dataset
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "Run the same command again to continue a training set that was stopped."
+    parser.epilog = "The same command continues a training set that was stopped."
     add_config(parser, configs.DATASET, "what to render")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the training set")
     parser.add_argument("--shard", type=part, default=(0, 1), metavar="i/n", help="make only this part, for job arrays")
     parser.add_argument(
-        "--workers", type=int, default=1, help="processes (default: 1, which uses all cores by threads)"
+        "--workers", type=int, default=1, help="number of processes (default: 1, with a thread for each core)"
     )
-    parser.add_argument("--cluster", metavar="ADDRESS", help="scheduler of a Dask cluster to run on")
+    parser.add_argument("--cluster", metavar="ADDRESS", help="run on the Dask cluster of this scheduler")
     parser.add_argument(
         "--layout",
         choices=("oidn",),
-        help="when all of the set is made, write it once more as images: DIR/oidn/train and DIR/oidn/valid, for the "
+        help="also write the finished set as images to DIR/oidn/train and DIR/oidn/valid, for the "
         "training of Open Image Denoise",
     )
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: llvm_ad_rgb)")

@@ -26,14 +26,17 @@ LAYER_VIEWS = ("dx", "dy", "albedo", "normal", "depth")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("-o", "--output", default="demo", metavar="DIR", help="output folder (default: demo)")
     parser.add_argument(
-        "-o", "--output", default="demo", metavar="DIR", help="folder for all that is made (default: demo)"
-    )
-    parser.add_argument(
-        "--scene", action="append", metavar="NAME", help="built-in scene; may be repeated (default: all without media)"
+        "--scene",
+        action="append",
+        metavar="NAME",
+        help="built-in scene; may be repeated (default: all scenes without media)",
     )
     parser.add_argument("--spp", type=positive, default=16, help="paths per pixel of the stacks (default: 16)")
-    parser.add_argument("--reference-spp", type=positive, default=1024, help="of the references (default: 1024)")
+    parser.add_argument(
+        "--reference-spp", type=positive, default=1024, help="paths per pixel of the references (default: 1024)"
+    )
     parser.add_argument("--size", type=size, default=(240, 160), metavar="WxH", help="pixels (default: 240x160)")
     parser.add_argument("--variant", help="Mitsuba variant (default: llvm_ad_rgb)")
     add_force(parser)

@@ -122,7 +122,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
     def chosen(plan) -> None:
         if denoising is not None:
             denoising.check(plan.sampler, wanted)
-        how = f"{', samples shared out' if plan.shared else ''}, method '{plan.method}'" if plan.method else ""
+        how = f"{', adaptive samples' if plan.shared else ''}, method '{plan.method}'" if plan.method else ""
         console.say(f"{args.scene}: sampler '{plan.sampler}'{how}: {plan.reason}")
 
     unit = "s" if args.time else "spp"

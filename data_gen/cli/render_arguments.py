@@ -28,7 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o",
         "--output",
         metavar="FILE",
-        help=f"stack (default: SCENE.exr here; -: standard output), or as {' '.join(IMAGES[1:])} the denoised image",
+        help=f"file to write: the stack if it ends in .exr (default: SCENE.exr in this folder; -: standard output), "
+        f"the denoised image if it ends in {' '.join(IMAGES[1:])}",
     )
     parser.add_argument(
         "--denoise",
@@ -36,65 +37,73 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         const="auto",
         metavar="METHOD",
         choices=Names(METHODS),
-        help="write what `ngpt denoise` makes of the stack, which an .exr keeps (default: the method of --for, or of "
-        "the pilot, else auto)",
+        help="write the denoised image to the .exr, which keeps the stack as further layers (default method: of --for, "
+        "or of the pilot, else auto)",
     )
-    parser.add_argument("--keep", metavar="STACK", help="write the stack as well, beside a picture")
+    parser.add_argument("--keep", metavar="STACK", help="also write the stack, where the output is an image")
     add_look(parser)
-    parser.add_argument("--spp", type=positive, help=f"paths per pixel (default: {DEFAULT_SPP})")
+    parser.add_argument("--spp", type=positive, help=f"samples (paths) per pixel (default: {DEFAULT_SPP})")
     parser.add_argument(
         "--time",
         type=duration,
         metavar="SECONDS",
-        help="render for this long, kernel compilation included; with --spp: until the first is reached",
+        help="render for this long, with kernel compilation; with --spp, whichever is reached first",
     )
     parser.add_argument(
         "--adaptive",
         action="store_true",
-        help="more samples where the error of the result is large; --spp is then their mean",
+        help="take more samples where the error of the result is large; --spp is their mean",
     )
     parser.add_argument(
         "--error",
         type=float,
         metavar="E",
-        help="--adaptive, until the result is expected to have this relative error (0.05: 5 %%)",
+        help="as --adaptive, until the result is expected to have this relative error (0.05: 5 %%)",
     )
     parser.add_argument(
         "--for",
         dest="method",
         metavar="METHOD",
-        help="what --adaptive or --error go by (default: what `auto` takes; with --adaptive and gradients, wcv). With "
-        "--time alone: what a pilot chooses sampler and samples for, by the error it expects; with `auto` the method "
-        "too. --time then holds pilot, render and method",
+        help="the method that will denoise the render. With --time and without --spp: test renders choose the best "
+        "sampler for this method, and with `auto` also the method; --time covers tests, render and method. With "
+        "--adaptive or --error: samples go where this method leaves errors (default: wcv with --adaptive and "
+        "gradients, else auto)",
     )
-    parser.add_argument("--size", type=size, metavar="WxH", help="pixels of the film (default: the scene's own)")
-    parser.add_argument("--sensor", metavar="NAME|N", help="by id, or by number from 0 (default: the first)")
+    parser.add_argument(
+        "--size", type=size, metavar="WxH", help="size of the image in pixels (default: the scene's own)"
+    )
+    parser.add_argument(
+        "--sensor", metavar="NAME|N", help="sensor of the scene: its id, or its number from 0 (default: the first)"
+    )
     first = "; ".join(f"{name}: {entry.summary}" for name, entry in by_standing("use").items())
     others = ", ".join(by_standing("niche"))
     parser.add_argument(
         "--sampler",
         default="auto",
         metavar="NAME",
-        help=f"auto: by the scene and a pilot (default); {first}; for some scenes: {others}. See `ngpt info`",
+        help=f"auto: chosen for the scene, in long renders by test renders (default); {first}. For special cases: "
+        f"{others}. `ngpt info NAME` describes a sampler",
     )
     add_options(parser, "sampler", "SAMPLER")
     parser.add_argument("--seed", type=natural, default=0, help="the same seed gives the same stack (default: 0)")
-    parser.add_argument("--memory", type=positive, metavar="MIB", help="for paths and film (default: 6144)")
-    parser.add_argument("--threads", type=positive, metavar="N", help="that work at once (default: all processors)")
+    parser.add_argument(
+        "--memory", type=positive, metavar="MIB", help="memory limit for paths and film (default: 6144)"
+    )
+    parser.add_argument("--threads", type=positive, metavar="N", help="number of threads (default: all cores)")
     parser.add_argument(
         "--unbiased",
         action="store_true",
-        help="all paths on their own: noisier",
+        help="trace all paths to their end, without the shared cache of light: no bias, more noise",
     )
     parser.add_argument(
         "--diagnostics",
         action="store_true",
-        help="write rates of failed shifts and of lost values too",
+        help="also write the rates of failed shifts and of discarded values, as channels",
     )
     parser.add_argument(
         "--live",
         action="store_true",
-        help="a page on 127.0.0.1 that shows the render as it goes",
+        help="show the image while it is rendered, on a page of this machine (127.0.0.1)",
     )
     parser.add_argument("--variant", help="Mitsuba variant: llvm_ad_rgb (default), cuda_ad_rgb")
     parser.add_argument(
@@ -102,39 +111,39 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     shot = parser.add_argument_group(
         "shots",
-        "SCENE, the values of -D and the output may hold {frame}, {frame:04d} or {10 + frame * 3:.2f}. The output may "
-        "be a folder.",
+        "SCENE, the values of -D and the output may contain {frame}, {frame:04d} or {10 + frame * 3:.2f}. The output "
+        "may be a folder.",
     )
     shot.add_argument(
         "--frames",
         type=frames,
         metavar="FRAMES",
-        help="frames to render, a stack with motion vectors for each: 0:120 (120 is not in it), 0:120:2, 1,5,9; "
-        "as farms write them: 1-10 (10 is in it), 1-9x2",
+        help="frames to render, each to a stack with motion vectors: 0:120 (without 120), 0:120:2, 1,5,9; or as farms "
+        "write them: 1-10 (with 10), 1-9x2",
     )
     shot.add_argument(
         "--camera",
         metavar="PATH",
-        help="of the camera: key frames (.json), or a file with an animated one (.glb, .gltf)",
+        help="camera path: key frames (.json), or a file with an animated camera (.glb, .gltf)",
     )
     shot.add_argument(
         "--dt",
         type=positive,
         default=0,
         metavar="PAIRS",
-        help="differences to the frame before too, of so many pairs of paths a pixel (2 or more; a quarter of --spp "
-        "is enough), for `ngpt denoise --temporal -m wcv`",
+        help="also render differences to the frame before, for `ngpt denoise --temporal -m wcv`, by this many pairs of "
+        "paths per pixel (2 or more; a quarter of --spp is enough)",
     )
-    shot.add_argument("--fps", type=float, default=24.0, help="frames a second of a .glb or .gltf (default: 24)")
+    shot.add_argument("--fps", type=float, default=24.0, help="frames per second of a .glb or .gltf (default: 24)")
     shot.add_argument(
         "--shard", type=part, metavar="i/n", help="render only this part of the frames, for job arrays: 0/4 to 3/4"
     )
-    shot.add_argument("--cluster", metavar="ADDRESS", help="scheduler of a Dask cluster to render the frames on")
+    shot.add_argument("--cluster", metavar="ADDRESS", help="render the frames on the Dask cluster of this scheduler")
     existing = parser.add_mutually_exclusive_group()
     add_force(existing)
     existing.add_argument(
         "--skip-existing",
         action="store_true",
-        help="leave out what is finished, and go on with what is there in part",
+        help="skip finished images and continue unfinished ones",
     )
     add_json(parser)

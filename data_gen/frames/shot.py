@@ -147,8 +147,8 @@ def render_shot(
             if before is not None:
                 if (dt or remembers) and now.place.data.size != before.place.data.size:
                     raise NgptError(
-                        f"frame {frame} is {now.place.data} and frame {previous} {before.place.data}: differences to "
-                        "the frame before, and samplers that reuse it, need crop windows of one size; move them alone"
+                        f"frame {frame} is {now.place.data} and frame {previous} {before.place.data}: --dt and "
+                        "samplers that reuse frames need crop windows of one size; only move them"
                     )
                 what, shift = seen(scene), window_moved(now, before)
                 motion = motion_vectors(scene, now, before, what)

@@ -47,8 +47,8 @@ def check_camera(sensor: mi.Sensor) -> None:
     name = camera_name(sensor)
     if name == "batch":
         raise NgptError(
-            "camera 'batch': several cameras in one film have no normals and differences in common; "
-            "take its cameras out of it, and render each on its own, the first of the scene"
+            "camera 'batch': several cameras in one film cannot be rendered together; take its cameras out of it, "
+            "and render them one by one"
         )
     if name in ("radiancemeter", "distant"):
         scale = np.linalg.norm(np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)[:3, 2])

@@ -69,13 +69,13 @@ def check_scene(scene: object) -> mi.Scene:
         return scene
     kind = type(scene).__name__
     if isinstance(scene, dict):
-        raise NgptError("a dictionary describes a scene and is none; load it: mi.load_dict(scene)")
+        raise NgptError("a dictionary is not a loaded scene; load it: mi.load_dict(scene)")
     if isinstance(scene, str | Path):
         raise NgptError(f"'{scene}' is a scene's name; load it: data_gen.load_scene('{scene}')")
     if kind == "Scene":
         raise NgptError(f"the scene is of another variant than the current one, '{mi.variant()}'; load it again")
     article = "an" if kind[0] in "aeiou" else "a"
-    raise NgptError(f"{article} {kind} is given where a scene is wanted; give an mi.Scene")
+    raise NgptError(f"{article} {kind} is not a scene; give an mi.Scene")
 
 
 def complaint(error: Exception) -> str:

@@ -84,8 +84,8 @@ def _check_halves(stack: GradientStack, halves: tuple[GradientStack, GradientSta
     one, other = (set(str(half.attributes.get("ngpt:seed", "")).split()) for half in halves)
     if both := one & other:
         raise NgptError(
-            f"both halves were rendered with seed {min(both)}: the same samples twice differ in nothing; give two "
-            "stacks of different seeds"
+            f"both halves were rendered with seed {min(both)}, so they hold the same samples; give "
+            "two stacks of different seeds"
         )
 
 

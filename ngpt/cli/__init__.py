@@ -38,12 +38,12 @@ _GOES_ON = "interrupted; --skip-existing goes on with what is not done yet"
 
 VERBS = {
     "denoise": Verb("reconstruct images from gradient stacks or noisy renders", interrupted=_GOES_ON),
-    "info": Verb("say what a file holds, or what a scene requires"),
+    "info": Verb("describe a file, a scene, a method or a sampler"),
     "diff": Verb("compare two images"),
-    "report": Verb("make a page to compare images of any renderer in, with errors where there is a reference"),
-    "picture": Verb("make a PNG, JPEG or WebP of an image, or a film of a shot, by a view transform"),
-    "merge": Verb("merge stacks of one scene, rendered with different seeds, into one of all their samples"),
-    "unpack": Verb("write the layers of a stack as raw files, for hosts in other languages"),
+    "report": Verb("write a page that compares images of any renderer, with errors if there is a reference"),
+    "picture": Verb("convert an image to PNG, JPEG or WebP, or a shot to a film, by a view transform"),
+    "merge": Verb("merge stacks of one image, with different seeds or tiles, into one"),
+    "unpack": Verb("write the layers of a stack as raw files, for programs in other languages"),
     "train": Verb("train a network, or continue a run", extra="train", interrupted=CONTINUES, heading="networks"),
     "evaluate": Verb(
         "compare methods on the same scenes with the same clock",
@@ -51,7 +51,9 @@ VERBS = {
         interrupted="interrupted; the same command goes on from here",
         heading="networks",
     ),
-    "export": Verb("write a reconstruction as an ONNX file, or weights in 16 bits", extra="export", heading="networks"),
+    "export": Verb(
+        "convert a trained network to ONNX, to OIDN's format or to 16 bits", extra="export", heading="networks"
+    ),
 }
 
 
@@ -165,7 +167,7 @@ def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
         prints="ngpt.cli.completion.script",
         choices=("bash", "zsh", "fish"),
         metavar="SHELL",
-        help="print what makes a shell complete the words of ngpt: bash, zsh or fish",
+        help="print the completion script of a shell: bash, zsh or fish",
     )
     parser.add_argument(
         "--manual",
@@ -187,8 +189,8 @@ def _filled(parser: argparse.ArgumentParser, name: str, verb: Verb) -> argparse.
     parser.description = f"{verb.summary[0].upper()}{verb.summary[1:]}."
     parser.set_defaults(verb=name, parser=parser)
     loud = parser.add_mutually_exclusive_group()
-    loud.add_argument("-q", "--quiet", action="store_true", help="say nothing but errors")
-    loud.add_argument("-v", "--verbose", action="store_true", help="say what is read, chosen and run")
+    loud.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    loud.add_argument("-v", "--verbose", action="store_true", help="print what is read, chosen and run")
     import_module(f"{verb.room}.{name}").add_arguments(parser)
     return parser
 

@@ -23,7 +23,7 @@ FILES = ("albedo", "normal", "depth")
 
 
 def add_force(parser: argparse._ActionsContainer) -> None:
-    parser.add_argument("--force", action="store_true", help="overwrite files that exist")
+    parser.add_argument("--force", action="store_true", help="replace existing files")
 
 
 def add_options(parser: argparse._ActionsContainer, owner: str, name: str) -> None:
@@ -58,8 +58,8 @@ def add_config(parser: argparse.ArgumentParser, kind: str, what: str) -> None:
     parser.add_argument(
         "--init",
         metavar="FILE",
-        help=f"write the configuration (default: {configs.STARTS[kind]}) to this file, with all that could be set, and "
-        "stop there",
+        help=f"only write the configuration (default: {configs.STARTS[kind]}) to this file, with every setting and its "
+        "meaning",
     )
 
 
@@ -76,7 +76,7 @@ def write_template(args: argparse.Namespace, text: str, verb: str, console: Cons
     target = check_output(args.init)
     with atomic_output(target) as temporary:
         temporary.write_text(text, encoding="utf-8")
-    console.say(f"{target}: all that could be set; then: ngpt {verb} --config {target} --out DIR")
+    console.say(f"{target}: every setting; then: ngpt {verb} --config {target} --out DIR")
     return 0
 
 
@@ -101,13 +101,13 @@ def add_untrusted(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--untrusted",
         action="store_true",
-        help="files of strangers: decode them in a process of its own, so that none can crash this one",
+        help="decode files in a separate process, so that a damaged or hostile file cannot crash this one",
     )
 
 
 def add_files(parser: argparse.ArgumentParser) -> None:
     for layer in FILES:
-        parser.add_argument(f"--{layer}", metavar="FILE", help=f"{layer} of the one stack, from a file of its own")
+        parser.add_argument(f"--{layer}", metavar="FILE", help=f"read {layer} from this file (for one stack)")
 
 
 def given_files(args: argparse.Namespace) -> dict[str, str]:
@@ -122,13 +122,13 @@ def add_layers(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=assignment,
         metavar="NAME=LAYER",
-        help=f"read NAME ({', '.join(LAYERS)}) from this layer of the file, or from channels with signs and factors "
-        '("-velocity.R,velocity.G"); may be repeated',
+        help="read NAME from this layer of the file, or from channels with signs and factors "
+        f'("-velocity.R,velocity.G"); may be repeated. NAME: {", ".join(LAYERS)}',
     )
 
 
 def add_view(parser: argparse.ArgumentParser, default: str) -> None:
-    parser.add_argument("--view", metavar="NAME", help=f"a view of stereo files, such as left or right ({default})")
+    parser.add_argument("--view", metavar="NAME", help=f"view of a stereo file, such as left or right ({default})")
 
 
 def assignment(text: str) -> tuple[str, str]:

@@ -53,16 +53,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "stacks",
         nargs="+",
         metavar="STACK",
-        help="images (.exr .pfm .hdr .png .tif .jpg), folders of .exr, patterns, frames as shot.%%04d.exr, "
-        "shot.####.exr or 'shot.$F4.exr'; -: standard input",
+        help="images (.exr .pfm .hdr .png .tif .jpg), folders of .exr, patterns, or names of frames (shot.%%04d.exr, "
+        "shot.####.exr, 'shot.$F4.exr'); -: standard input",
     )
     parser.add_argument(
         "-o",
         "--output",
         metavar="OUT",
-        help=f"file for one stack, folder for several; folders are made (default: STACK{RESULT_SUFFIX}.exr beside "
-        "each); of one stack also .pfm, or a picture (.png .jpg .webp); of frames also clean.%%04d.exr; -: standard "
-        "output",
+        help=f"for one stack a file: .exr, .pfm or a picture (.png .jpg .webp); for several a folder, or names such as "
+        f"clean.%%04d.exr; -: standard output. Missing folders are created (default: STACK{RESULT_SUFFIX}.exr beside "
+        "each stack)",
     )
     first = "; ".join(f"{name}: {method.summary}" for name, method in by_standing("use").items())
     parser.add_argument(
@@ -71,63 +71,66 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="auto",
         metavar="NAME",
         choices=Names(METHODS),
-        help=f"auto: the best that layers and machine allow (default); {first}; for some stacks: "
-        f"{', '.join(by_standing('niche'))}. See `ngpt info`",
+        help=f"auto: a good method for the layers of the file and the installed packages (default); {first}. For "
+        f"special cases: {', '.join(by_standing('niche'))}. `ngpt info NAME` describes a method",
     )
-    parser.add_argument("--alpha", help="weight of the primal image in l2 and l1: a number, or auto")
-    parser.add_argument("--weights", metavar="FILE", help="a network of your own: .onnx, .safetensors, .tza")
+    parser.add_argument("--alpha", help="weight of the noisy image in l2 and l1: a number, or auto")
+    parser.add_argument("--weights", metavar="FILE", help="your own network: .onnx, .safetensors or .tza")
     parser.add_argument(
-        "--device", help="where networks run: cpu (default), cuda, tensorrt, openvino, directml, coreml"
+        "--device", help="device for networks: cpu (default), cuda, tensorrt, openvino, directml, coreml"
     )
     parser.add_argument(
-        "--memory", type=int, metavar="MIB", help=f"that networks may use (default: {MEMORY}); in tiles"
+        "--memory",
+        type=int,
+        metavar="MIB",
+        help=f"memory limit for networks; larger images are computed in tiles (default: {MEMORY})",
     )
-    parser.add_argument("--threads", type=int, metavar="N", help="that work at once (default: as many as processors)")
+    parser.add_argument("--threads", type=int, metavar="N", help="number of threads (default: all cores)")
     add_options(parser, "method", "METHOD")
     parser.add_argument(
         "--error",
         action="store_true",
-        help="write a layer 'error' too: the standard error of each pixel; twice the time",
+        help="also write the layer 'error', the standard error of each pixel; takes twice the time",
     )
     parser.add_argument(
         "--halves",
         nargs=2,
         metavar=("A", "B"),
-        help="as --error, which also goes by what differs between two stacks of half the samples each, such as those "
-        "that STACK was merged from: they show blotches; four times the time",
+        help="as --error, and compare the results of two stacks of half the samples each, such as the two that STACK "
+        "was merged from, which also detects blotches; takes four times the time",
     )
     names = ", ".join(f"{pattern} ({renderer})" for renderer, pattern in lightgroups.PATTERNS.items())
     parser.add_argument(
-        "--groups", action="store_true", help=f"denoise light groups too, so that they add up to the result: {names}"
+        "--groups", action="store_true", help=f"also denoise light groups, so that they add up to the result: {names}"
     )
     parser.add_argument(
         "--group",
         action="append",
         default=[],
         metavar="NAME",
-        help="a light group of another name, * for any letters; may be repeated",
+        help="also a light group of this name; * stands for any letters; may be repeated",
     )
     parser.add_argument(
         "--temporal",
         action="store_true",
-        help="the stacks are frames of one shot, in order, with motion vectors: less flicker by the frames before; "
-        "with -m wcv, and differences in time in all of them (`ngpt render --dt`), by those after too",
+        help="the stacks are the frames of one shot, with motion vectors: blend each frame with the frames before it, "
+        "for less flicker. With -m wcv and frames from `ngpt render --dt`: also with the frames after it",
     )
     parser.add_argument(
         "--ref",
         metavar="REF",
-        help="reference image: report the error in the pixels that both have, relMSE and trimmed: without the worst "
-        "0.1 %% of the pixels",
+        help="reference image: print the error in the pixels that both have, as relMSE and as trimmed relMSE, which "
+        "leaves out the worst 0.1 %% of the pixels",
     )
     add_files(parser)
     add_layers(parser)
-    add_view(parser, "default: all of them")
+    add_view(parser, "default: all views")
     add_look(parser)
     add_untrusted(parser)
     existing = parser.add_mutually_exclusive_group()
     add_force(existing)
     existing.add_argument(
-        "--skip-existing", action="store_true", help="leave stacks out whose results are there: goes on with a folder"
+        "--skip-existing", action="store_true", help="skip stacks whose results exist, to continue a folder"
     )
     add_json(parser)
 
@@ -151,11 +154,11 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
     if args.halves:
         args.error = True
         if len(pairs) > 1:
-            raise WrongUse(f"--halves are of one stack, and {len(pairs)} are given; denoise them one by one")
+            raise WrongUse(f"--halves belong to one stack, and {len(pairs)} are given; denoise them one by one")
     if args.temporal:
         for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
             if given:
-                raise WrongUse(f"--temporal goes without {option}: history has no {option[2:]}; leave one out")
+                raise WrongUse(f"--temporal and {option} cannot be combined; leave one out")
     for _, target in pairs:
         if target.suffix.lower() != ".exr":
             check_picture(target, args)

@@ -76,7 +76,9 @@ def windowed(
             try:
                 frames[number] = read(pair)
                 if frames[number].others:
-                    raise NgptError(f"{pair[0]}: has several views, and windows are of one; choose it with --view")
+                    raise NgptError(
+                        f"{pair[0]}: has several views, and --temporal -m wcv takes one; choose it with --view"
+                    )
             except NgptError as error:
                 told[number] = error
                 yield None

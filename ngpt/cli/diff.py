@@ -13,9 +13,11 @@ from ngpt.windows import overlap
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "Images are compared in the pixels that both have, by their data windows."
-    parser.add_argument("image", metavar="A", help="the image to judge: its root R G B, i.e. the result if it has one")
-    parser.add_argument("reference", metavar="B", help="the image to judge it by")
+    parser.epilog = "Images are compared in the pixels that both have, according to their data windows."
+    parser.add_argument(
+        "image", metavar="A", help="image to compare: its root R G B, which in a result file is the result"
+    )
+    parser.add_argument("reference", metavar="B", help="image to compare it with")
     parser.add_argument(
         "--tolerance",
         type=float,

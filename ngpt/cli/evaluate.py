@@ -12,13 +12,18 @@ from ngpt.system.console import Console
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
-        "Writes results.json, results.csv, results.md, plots, pictures and report.html into DIR. What is done is kept "
-        "in DIR/cache: an interrupted run goes on when it is started again, and only what changed is computed anew."
+        "Writes results.json, results.csv, results.md, plots, pictures and report.html into DIR. The same command "
+        "continues an interrupted run. After a change, only the results that depend on it are computed anew."
     )
     add_config(parser, configs.EVALUATION, "scenes, methods and metrics")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
-    parser.add_argument("--scenes", nargs="+", default=[], metavar="SCENE", help="further scenes, files or patterns")
-    parser.add_argument("--cache", type=Path, metavar="DIR", help="stacks and cells (default: OUT/cache)")
+    parser.add_argument("--scenes", nargs="+", default=[], metavar="SCENE", help="more scenes: files or patterns")
+    parser.add_argument(
+        "--cache",
+        type=Path,
+        metavar="DIR",
+        help="folder for stacks and measurements, to share between runs (default: OUT/cache)",
+    )
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
@@ -29,7 +34,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         from ngpt.system.templates import template
 
         if base := read_toml(path).get("base"):
-            raise WrongUse(f"{path.stem} is {base} with other numbers: give --init that one")
+            raise WrongUse(f"{path.stem} only changes numbers of {base}; give that file to --config")
         return write_template(args, template(path.read_text(encoding="utf-8"), {"": Config}), "evaluate", console)
     if not args.out:
         raise WrongUse("--out is missing: the folder of the results")

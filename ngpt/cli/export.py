@@ -12,13 +12,22 @@ from ngpt.system.files import atomic_output
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     source = parser.add_mutually_exclusive_group()
+    source.add_argument("--weights", type=Path, metavar="FILE.safetensors", help="network that `ngpt train` made")
     source.add_argument(
-        "--weights", type=Path, metavar="FILE.safetensors", help="a network, as `ngpt train` makes them"
+        "--method", choices=["l2"], help="a method instead of a network: l2 (default), screened Poisson"
     )
-    source.add_argument("--method", choices=["l2"], help="l2, the default: least-squares screened Poisson")
-    parser.add_argument("--alpha", type=float, default=DEFAULT_ALPHA, help=f"of l2; default: {DEFAULT_ALPHA}")
-    parser.add_argument("--precision", choices=["float32", "float16"], default="float32", help="of a network's body")
-    parser.add_argument("--vector", type=Path, metavar="FOLDER", help="also write an example of inputs and output")
+    parser.add_argument(
+        "--alpha", type=float, default=DEFAULT_ALPHA, help=f"weight of the noisy image in l2 (default: {DEFAULT_ALPHA})"
+    )
+    parser.add_argument(
+        "--precision",
+        choices=["float32", "float16"],
+        default="float32",
+        help="precision of the network; its output is always float32",
+    )
+    parser.add_argument(
+        "--vector", type=Path, metavar="FOLDER", help="also write an example of inputs and output to this folder"
+    )
     what = (
         "model to write: .onnx, and for a network beside it .statistics.onnx, which hosts need for tiles; "
         ".tza for OIDN; or .safetensors: weights in 16 bits"
@@ -31,7 +40,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if not args.weights and args.vector:
         raise WrongUse("--vector belongs to networks; leave it out for a classical method")
     if args.output.suffix in (".tza", ".safetensors") and (not args.weights or args.vector):
-        raise WrongUse(f"{args.output}: a file of this kind holds a network and no more; give it --weights alone")
+        raise WrongUse(f"{args.output}: {args.output.suffix} files hold only networks; give --weights, and no --vector")
     output_file(args.output, args)
     for path in write(args):
         console.say(f"{path}: {path.stat().st_size} bytes")
@@ -60,7 +69,9 @@ def write(args: argparse.Namespace) -> list[Path]:
         from ngpt.export.temporal import temporal_model
 
         if args.vector:
-            raise NgptError(f"{args.weights}: blends frames; leave --vector out")
+            raise NgptError(
+                f"{args.weights}: this network blends frames, and has no example to write; leave --vector out"
+            )
         models = {args.output: temporal_model(args.weights)}
     else:
         from ngpt.export.network import network_model, statistics_model

@@ -35,11 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "file",
         nargs="?",
         metavar="FILE",
-        help="an image (-: standard input), weights, a training set or run, a scene file or name, a sampler",
+        help="image (-: standard input), weights, training set, training run, scene, method or sampler",
     )
-    parser.add_argument(
-        "--aliases", action="store_true", help="print the layer names of other renderers that are known"
-    )
+    parser.add_argument("--aliases", action="store_true", help="print the names that other renderers give to layers")
     parser.add_argument(
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
     )

@@ -25,25 +25,25 @@ IMAGES = (".exr", ".pfm", *PICTURES)
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
-        "Of a stack the noisy image is shown, of a result the result. A picture has the pixels of the data window that "
-        "lie in the display window; frames of a folder have all of their display window, and one exposure."
+        "A picture shows the noisy image of a stack, and the clean image of a result. It has the pixels of the data "
+        "window that lie in the display window. Frames of a folder show their whole display window, with one exposure."
     )
     parser.add_argument(
         "image",
         metavar="IMAGE",
-        help="an image of any renderer (-: standard input); of frames a folder, a pattern, or shot.%%04d.exr",
+        help="image of any renderer (-: standard input), or frames: a folder, a pattern, or shot.%%04d.exr",
     )
     parser.add_argument(
         "-o",
         "--output",
         required=True,
         metavar="FILE",
-        help=f"picture to write ({' '.join(PICTURES)}); of frames a film ({' '.join(SHOTS)}), a folder for PNGs, or "
+        help=f"picture to write ({' '.join(PICTURES)}); for frames a film ({' '.join(SHOTS)}), a folder of PNGs, or "
         "names as pic.%%04d.png",
     )
     add_look(parser)
     add_view(parser, "default: the first")
-    parser.add_argument("--fps", type=frames_a_second, default=24.0, help="frames a second of a film (default: 24)")
+    parser.add_argument("--fps", type=frames_a_second, default=24.0, help="frames per second of a film (default: 24)")
     add_force(parser)
 
 
@@ -142,10 +142,14 @@ def add_look(parser: argparse.ArgumentParser) -> None:
         default="standard",
         choices=TRANSFORMS,
         metavar="NAME",
-        help="view transform of a picture: standard (sRGB, default), filmic (AgX), aces (needs OpenColorIO)",
+        help="view transform of the picture: standard (sRGB, default), filmic (AgX), aces (needs OpenColorIO)",
     )
     parser.add_argument(
-        "--exposure", type=stops, default=0.0, metavar="STOPS", help="of a picture: a number (default: 0), or auto"
+        "--exposure",
+        type=stops,
+        default=0.0,
+        metavar="STOPS",
+        help="exposure of the picture: a number (default: 0), or auto",
     )
 
 

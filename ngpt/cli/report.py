@@ -45,22 +45,22 @@ MEANINGS = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
-        "Of a stack the noisy image is shown, of a result the result. Pictures are named after their files. "
-        "Of one file alone all layers are shown. Images are compared in the pixels that all have, by their data "
-        "windows. Folders are shots: the page plays their display windows, and with a folder of references there is a "
-        "table of errors and flicker. Folders of training runs are compared: curves, pictures, settings that differ."
+        "The page shows the noisy image of a stack and the clean image of a result, or all layers if there is only one "
+        "file. Images are compared in the pixels that all of them have, according to their data windows. Folders are "
+        "shots: the page plays them, and with a folder of references it has a table of errors and flicker. For folders "
+        "of training runs, it compares curves, pictures and settings."
     )
     parser.add_argument(
         "images",
         nargs="+",
         metavar="IMAGE",
-        help="images of one place and size, of any renderer (-: standard input); shots: folders, patterns, "
-        "shot.%%04d.exr; training runs",
+        help="images of any renderer with the same resolution (-: standard input); or shots: folders, patterns, "
+        "shot.%%04d.exr; or folders of training runs",
     )
     parser.add_argument(
         "--ref",
         metavar="REF.exr",
-        help="what they should look like: adds errors, SSIM, FLIP, and maps; of folders a folder",
+        help="reference image, or for folders a folder of references: adds errors, SSIM, FLIP and maps",
     )
     parser.add_argument(
         "-o", "--output", default="report.html", metavar="PAGE.html", help="page to write (default: report.html)"
@@ -237,7 +237,7 @@ def motion_of(paths: list[str], place: Place) -> np.ndarray | None:
 def shot_files_of(folder: str) -> list[Path]:
     """The frames of a shot; raises NgptError for a single file."""
     if not is_shot(folder):
-        raise NgptError(f"{folder}: is no folder, and others are; give folders of frames, or images alone")
+        raise NgptError(f"{folder}: is not a folder, but others are; give only folders of frames, or only images")
     return shot_files(folder)
 
 

@@ -17,15 +17,15 @@ from ngpt.training.run_summary import SETTINGS, WEIGHTS
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
-        "Run the same command again to continue a run that was stopped. Several GPUs: "
+        "The same command continues a run that was stopped. Several GPUs: "
         "torchrun --nproc-per-node N train.py ..., or torchrun --nproc-per-node N -m ngpt train ..."
     )
     add_config(parser, configs.TRAINING, "settings")
-    parser.add_argument("--out", help="folder of the run: checkpoint, weights, log; made if it is not there")
+    parser.add_argument("--out", help="folder of the run: checkpoint, weights, log")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="change a setting, for example run.steps=1000"
     )
-    parser.add_argument("--dry-run", action="store_true", help="print size and cost of the network, and do not train")
+    parser.add_argument("--dry-run", action="store_true", help="only print size and cost of the network")
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     settings = read_settings(config, args.set)
     if args.init:
         if args.set:
-            raise NgptError("--init writes what can be set by hand then; leave --set out")
+            raise NgptError("--init and --set cannot be combined; change settings in the file that --init writes")
         from ngpt.training.parameters import training_template
 
         return write_template(args, training_template(config.read_text(encoding="utf-8")), "train", console)

@@ -12,7 +12,7 @@ from ngpt.system.console import Console
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("stack", metavar="STACK", help="image of any renderer; -: standard input")
-    parser.add_argument("folder", metavar="FOLDER", type=Path, help="folder for NAME.f32 and layers.json")
+    parser.add_argument("folder", metavar="FOLDER", type=Path, help="folder to write NAME.f32 and layers.json to")
     add_files(parser)
     add_layers(parser)
     add_view(parser, "default: the first")

@@ -108,7 +108,7 @@ def read_reference(files: Sequence[str | Path]) -> Reference:
     if len(stacks) == 2:
         check_size(stacks[0]["primal"], stacks[1]["primal"])
         if np.array_equal(stacks[0]["primal"], stacks[1]["primal"]):
-            raise NgptError(f"{names[0]} and {names[1]}: the same image twice; halves need seeds of their own")
+            raise NgptError(f"{names[0]} and {names[1]}: are the same image; render the halves with different seeds")
     return Reference(stacks, names)
 
 

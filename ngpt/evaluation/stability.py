@@ -42,7 +42,7 @@ def flicker_and_bias(images: np.ndarray, *halves: np.ndarray, share: float = 0.0
     mean. Raises NgptError for fewer than two images, and for another size.
     """
     if len(images) < 2:
-        raise NgptError(f"{len(images)} image: stability needs those of at least 2 seeds")
+        raise NgptError(f"stability needs images of at least 2 seeds; there is {len(images)}")
     for half in halves:
         check_size(images[0], half)
     reference = middle(tuple(half.astype(np.float64) for half in halves))

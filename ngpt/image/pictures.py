@@ -31,7 +31,9 @@ def check_kind(path: Path, kinds: tuple[str, ...]) -> None:
     """Raises NgptError for files that are not of these kinds, or that cannot be made on this machine."""
     kind = path.suffix.lower()
     if kind not in kinds:
-        raise NgptError(f"{path}: is of no kind that is made here; let the name end in one of {' '.join(kinds)}")
+        raise NgptError(
+            f"{path}: pictures of this kind cannot be written; let the name end in one of {' '.join(kinds)}"
+        )
     if kind not in (".png", ".mp4") and find_spec("PIL") is None:
         raise NgptError(f"{path}: JPEG and WebP need Pillow: {package_command('pillow')}")
     if kind == ".mp4":

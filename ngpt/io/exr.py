@@ -178,10 +178,10 @@ def _views_in(path: str | os.PathLike) -> tuple[list[View], list[dict[str, str]]
 def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: ExrPart, isolated: bool) -> np.ndarray:
     """Layer ``name`` (H, W, C) of a file of its own, of the size and place of ``main``, the part that holds primal."""
     if name not in LAYERS or name == "primal":
-        raise NgptError(f"{file}: layer '{name}' cannot come from a file of its own")
+        raise NgptError(f"{file}: layer '{name}' cannot be read from a separate file")
     parts = (read_exr_isolated(file) if isolated else read_file(file)).parts
     if name != "albedo" and (kind := parts[0].header.get(FROM, "")).endswith(ENCODED):
-        raise NgptError(f"{file}: {name} is no light, and this is {kind}; save it as .exr or .pfm")
+        raise NgptError(f"{file}: {name} is not a colour to display, and this is {kind}; save it as .exr or .pfm")
     found = resolve_alone([(part.name, list(part.channels)) for part in parts], name, str(file))
     layer = gather(parts[found.part], found.channels)
     if layer.shape[:2] != (stack.height, stack.width):

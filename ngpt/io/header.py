@@ -112,7 +112,7 @@ def read_headers(file: BinaryIO, path: str) -> list[PartHeader]:
     except (struct.error, IndexError):
         raise NgptError(f"{path}: damaged or incomplete (its header ends early); render or copy it again") from None
     except _Excess as excess:
-        raise NgptError(f"{path}: {excess}; if it is no forgery, save it in pieces") from None
+        raise NgptError(f"{path}: {excess}; if you trust the file, save it in pieces") from None
     check_size(parts, os.fstat(file.fileno()).st_size, path)
     return parts
 
@@ -228,13 +228,13 @@ def check_size(parts: list[PartHeader], length: int, path: str) -> None:
         if width * height > MAX_PIXELS:
             raise NgptError(
                 f"{path}: {part.label} is {width}x{height} pixels, and {MAX_PIXELS >> 20} million are read at most; "
-                "if it is no forgery, render or save it in pieces"
+                "if you trust the file, render or save it in pieces"
             )
     channels = sum(len(part.channels) for part in parts)
     if channels > MAX_CHANNELS:
         raise NgptError(
             f"{path}: has {channels} channels in {len(parts)} parts, and {MAX_CHANNELS} are read at most; "
-            "keep those that are needed"
+            "remove those that are not needed"
         )
     if any(part.deep for part in parts):
         return

@@ -86,7 +86,7 @@ class ModelConfig:
         defaults = {field.name: field.default for field in fields(self) if field.default is not MISSING}
         others = [name for name in self.kind.goes_without if getattr(self, name) != defaults[name]]
         if others:
-            raise NgptError(f"network '{self.network}' goes without {', '.join(others)}: leave it out")
+            raise NgptError(f"network '{self.network}' cannot be combined with {', '.join(others)}; leave it out")
 
     @property
     def kind(self) -> "Kind":

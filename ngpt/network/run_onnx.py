@@ -80,7 +80,7 @@ class Network:
         self.inputs = tuple(name for name in names if name not in _APART)
         optional = metadata.get("ngpt.optional", "direct").split(", ")
         if metadata.get("ngpt.emission") == "true" or not set(optional) <= set(_APART):
-            raise NgptError(f"{path}: a network of colour alone, as earlier versions had; use one of today")
+            raise NgptError(f"{path}: this network reads only colour, as in earlier versions of ngpt; use a newer one")
         self._check()
 
     @property
@@ -102,8 +102,8 @@ class Network:
         self.types, self.output = floats(self.session, self.path)
         if not graph <= own <= graph | optional:
             raise NgptError(
-                f"{self.path}: its inputs are {', '.join(sorted(graph | optional))}, its metadata tell of "
-                f"{', '.join(sorted(own))}; export it anew"
+                f"{self.path}: its inputs are {', '.join(sorted(graph | optional))}, but its metadata list "
+                f"{', '.join(sorted(own))}; export it again"
             )
 
     def reconstruct(
@@ -203,7 +203,9 @@ class Network:
             raise NgptError(f"network {self.path}: ONNX Runtime cannot run it: {one_line(error)}") from error
         expected = (len(feed["primal"]), 3, *feed["primal"].shape[2:])
         if result.shape != expected:
-            raise NgptError(f"network {self.path}: gives {result.shape} where {expected} is due; export it anew")
+            raise NgptError(
+                f"network {self.path}: its output has shape {result.shape} instead of {expected}; export it again"
+            )
         return result
 
 

@@ -79,7 +79,7 @@ def _check_address_space() -> None:
     limit = address_space()
     if limit is not None and limit < FEWEST_MIB << 20:
         raise NgptError(
-            f"the address space is limited to {limit >> 20} MiB (ulimit -v); {FEWEST_MIB} are the least that works"
+            f"the address space is limited to {limit >> 20} MiB (ulimit -v); ngpt needs at least {FEWEST_MIB}"
         )
 
 

@@ -41,7 +41,7 @@ def _call(parser: Callable[[str], Any], text: str, where: str) -> Any:
     try:
         return parser(text)
     except RecursionError:
-        raise NgptError(f"{where}: cannot be read: brackets within brackets within brackets, too many") from None
+        raise NgptError(f"{where}: cannot be read: its brackets are nested too deeply") from None
     except ValueError as error:
         raise NgptError(f"{where}: cannot be read: {error}") from error
 

@@ -115,7 +115,7 @@ class StackCrop:
         if not all(self._caustic):
             raise NgptError(
                 f"{self._stacks[self._caustic.index(False)]}: has no layer 'caustic', but other stacks of {self.scene} "
-                "have: their gradients hold nothing of that light, so they have no target in common; render all alike"
+                "have one, so their gradients belong to different images; render all of them alike"
             )
         stacks = [read(str(path)) for path in self._stacks]
         shares = np.divide(self.spp, sum(self.spp)) if all(self.spp) else np.full(len(stacks), 1 / len(stacks))

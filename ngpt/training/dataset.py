@@ -75,7 +75,7 @@ class Crop:
         Frames of shots have the layer ``motion`` too, NaN where it is not known: everywhere in the first.
         """
         if not 0 <= k < self.inputs:
-            raise NgptError(f"{self.shard.path}: input {k} of a crop that has {self.inputs}, 0 .. {self.inputs - 1}")
+            raise NgptError(f"{self.shard.path}: there is no input {k}; the crop has inputs 0 .. {self.inputs - 1}")
         names = [name for name in self.shard.names if name in OF_INPUTS]
         layers = {name: self.shard.input(name, self.index, k) for name in names}
         layers["primal"] = layers.pop("indirect") + layers["direct"] + layers.get("caustic", 0)

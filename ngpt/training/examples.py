@@ -147,7 +147,9 @@ def other_half(data: Repaired, other: GradientStack) -> dict[str, np.ndarray]:
     if data.variances is None or theirs.dx is None:
         raise NgptError(f"{other.path}: one half lacks gradients or their variances, without which pairs teach nothing")
     if np.array_equal(data.image, theirs.image):
-        raise NgptError(f"{other.path}: both halves are the same, so noise would be learnt; render them by other seeds")
+        raise NgptError(
+            f"{other.path}: both halves are the same, so noise would be learnt; render them with different seeds"
+        )
     known = [np.isfinite(variance).all(axis=-1) for variance in data.variances]
     errors = (np.sqrt(np.where(k[..., None], v, 0)) for k, v in zip(known, data.variances, strict=True))
     # Where lamps are seen, the variance of the light beside them is not known.

@@ -99,5 +99,5 @@ class Images(Task):
     def load(self, path: str) -> nn.Module:
         model, _ = safetensors.load_weights(path)
         if model.config != self.config:
-            raise NgptError(f"{path}: is another [model] than the run's: {model.config}")
+            raise NgptError(f"{path}: its network differs from [model] of the run: {model.config}")
         return model

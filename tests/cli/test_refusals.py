@@ -132,10 +132,10 @@ ROWS = [
     ("denoise plain.exr --normal depth.exr", 1, "depth.exr: no layer with channels X Y Z for 'normal'"),
     ("denoise plain.exr --depth nowhere.exr", 1, "nowhere.exr: not found"),
     ("denoise plain.exr plain2.exr --albedo small.exr", 2, "--albedo belongs to one stack, and 2 are given"),
-    ("denoise noisy.exr other.exr -o out/ --halves noisy.exr other.exr", 2, "--halves are of one stack"),
+    ("denoise noisy.exr other.exr -o out/ --halves noisy.exr other.exr", 2, "--halves belong to one stack"),
     ("denoise noisy.exr -o out/a.pfm -m primal --error", 2, "--error makes layers, and out/a.pfm can have none"),
-    ("denoise shot -o out/shot --temporal --error", 2, "--temporal goes without --error"),
-    ("denoise shot -o out/shot --temporal --group 'fog*'", 2, "--temporal goes without --groups"),
+    ("denoise shot -o out/shot --temporal --error", 2, "--temporal and --error cannot be combined"),
+    ("denoise shot -o out/shot --temporal --group 'fog*'", 2, "--temporal and --groups cannot be combined"),
     ("denoise -", 1, "standard input has no name to go by"),
     ("denoise - noisy.exr -o out/", 1, "'-' is one stack, and 2 are given"),
     ("denoise noisy.exr noisy.exr -o -", 1, "'-' is one result, and 2 stacks are given"),
@@ -174,7 +174,7 @@ ROWS = [
     ("report -q plain.exr -o page.html", 1, "exists already; pass --force"),
     ("report -q plain.exr -o out/page", 2, "let it end in .html"),
     ("report -q left.exr right.exr -o out/p.html", 1, "left.exr is 5x4 at (0, 0) of 10x4, right.exr is 5x4 at (5, 0)"),
-    ("report -q shot plain.exr -o out/p.html", 1, "plain.exr: is no folder, and others are"),
+    ("report -q shot plain.exr -o out/p.html", 1, "plain.exr: is not a folder, but others are"),
     ("picture plain.exr -o out/a.gif", 1, "one of .png .jpg"),
     ("picture plain.exr -o page.html/a.png", 1, "page.html: cannot be made: "),
     ("picture shot -o out/a.png", 1, "one of .webp .mp4"),
@@ -205,7 +205,11 @@ ROWS = [
     ("train --config tiny --init notes.exr", 1, "notes.exr: exists already; pass --force"),
     ("dataset --config nowhere --out out/x", 1, "nowhere: cannot be read: no such file; configurations that come with"),
     ("evaluate --config eval-mian --out x", 1, "did you mean 'eval-main'?"),
-    ("evaluate --config eval-640 --init out/a.toml", 2, "eval-640 is eval-main.toml with other numbers: give --init"),
+    (
+        "evaluate --config eval-640 --init out/a.toml",
+        2,
+        "eval-640 only changes numbers of eval-main.toml; give that file to --config",
+    ),
 ]
 
 
@@ -220,7 +224,7 @@ def test_refused(shelf, line, status, words, monkeypatch, capfd):
 RENDERS = [
     ("render nonsense.xml", 1, '"nonsense" not found'),
     ("render absent.xml", 1, "absent.xml: no such file"),
-    ("render diffuse --variant scalar_rgb", 2, "'scalar_rgb' is not one"),
+    ("render diffuse --variant scalar_rgb", 2, "'scalar_rgb' is no vectorised variant"),
     ("render diffuse --size 30000x30000", 1, "; render a smaller image"),
     ("render absent.xml --spp 9999999999", 2, "9999999999 samples per pixel"),
     ("render diffuse -o notes.exr/s.exr", 1, "notes.exr: cannot be made: "),

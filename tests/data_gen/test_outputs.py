@@ -167,7 +167,7 @@ def test_a_render_goes_on_and_its_image_is_made_anew(renderer, command, kept):
         ("-o {frame}.tga --frames 0:2", "stacks are OpenEXR"),
         ("-o - --frames 0:2", "standard output is one file for several frames"),
         ("-o - --json", "--json also wants standard output"),
-        ("-o a.exr --for wcv", "--for says what --adaptive and --error go by"),
+        ("-o a.exr --for wcv", "--for needs --adaptive or --error"),
         ("-o {frame}.exr --error 0.1 --frames 0:2", "--adaptive, --error and --for are for single images"),
         ("-o a.exr --camera x.json", "--frames"),
         ("-o a.exr -D a={frame}", "changes from frame to frame"),

@@ -35,7 +35,7 @@ def test_a_file_a_name_and_a_scene_give_the_bits_of_the_command(renderer, comman
     again, plan = data_gen.render_scene(scene, 4, 3, "gpt", chosen=told.append)
     assert same(stack, again) and plan.sampler == "gpt" and len(told) == 1
     for asked in ({"size": SIZE}, {"sensor": 1}):
-        with pytest.raises(NgptError, match="has its size, parameters and sensor; load it with them"):
+        with pytest.raises(NgptError, match=r"of a loaded scene are fixed; give them to data_gen\.load_scene"):
             data_gen.render_scene(scene, **asked)
 
 
@@ -49,7 +49,7 @@ def test_options_samples_that_differ_and_what_ends_a_render(renderer):
         "diffuse", 1 << 24, sampler="primal", size=SIZE, progress=lambda *at: passes.append(at), stop=lambda: True
     )
     assert passes[-1][0] == stack.attributes["ngpt:spp"] < 1 << 24
-    with pytest.raises(NgptError, match="--for says what"):
+    with pytest.raises(NgptError, match="--for needs --adaptive"):
         data_gen.render_scene("diffuse", 4, method="wcv")
 
 
@@ -128,12 +128,12 @@ def test_a_variant_is_chosen_by_a_render_alone():
 
 def test_what_is_no_scene_is_said_with_its_remedy(renderer):
     box = renderer.cornell_box()
-    for given, said in ((box, "load it: mi.load_dict"), ("diffuse", "data_gen.load_scene"), (3, "an int is given")):
+    for given, said in ((box, "load it: mi.load_dict"), ("diffuse", "data_gen.load_scene"), (3, "int is not a scene")):
         with pytest.raises(NgptError, match=said):
             render_stack(given, 2)
     with pytest.raises(NgptError, match=r"load it: mi\.load_dict"):
         data_gen.render_scene(box)
-    with pytest.raises(NgptError, match="a shot is of a scene file or a built-in scene, and a dict is given"):
+    with pytest.raises(NgptError, match="a shot needs a scene file or a built-in scene, not a dict"):
         data_gen.render_frames(box, range(2))
 
 

@@ -90,7 +90,7 @@ def test_crop_windows_of_other_sizes_move_too(renderer, tmp_path):
     assert [stack.width for stack in stacks.values()] == [6, 7]
     assert all(np.abs(stack["motion"]).max() < 1e-3 for stack in stacks.values())
     for options in ({"dt": 2}, {"sampler": "restir"}):
-        with pytest.raises(NgptError, match=r"frame 0 is 6x8 at \(3, 2\) and frame -1 5x8 at \(4, 2\): differences"):
+        with pytest.raises(NgptError, match=r"frame 0 is 6x8 at \(3, 2\) and frame -1 5x8 at \(4, 2\): --dt"):
             rendered(cropped(tmp_path, "{3 - frame}", "{6 + frame}"), range(2), **options)
 
 

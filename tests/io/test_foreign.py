@@ -196,7 +196,7 @@ def test_the_habits_of_oidn_denoise(tmp_path, command):
     assert read("color_denoised.exr")["albedo"].shape == image.shape
     (tmp_path / "n.png").write_bytes(png(np.full((12, 16, 3), 128), 2))
     told = command("denoise color.pfm --normal n.png -o x.exr", 1).err
-    assert "n.png: normal is no light, and this is PNG, 8 bits of sRGB" in told
+    assert "n.png: normal is not a colour to display, and this is PNG, 8 bits of sRGB" in told
     command("denoise color.pfm n.png -m primal -o all/")
     assert {path.name for path in (tmp_path / "all").iterdir()} == {"color.exr", "n.exr"}
 

@@ -43,8 +43,8 @@ ROWS = [
     (BY_PARTS, {"kernel": 23}, "must be an odd number from 3 to 21"),
     (BY_PARTS, {"channels": (4, 4), "units": (1, 1)}, "'kpcn' has one level"),
     (BY_PARTS, {"units": ()}, "give a positive number, up to 32, for each of 1 levels"),
-    (BY_PARTS, {"start": ("primal",)}, "network 'kpcn' goes without start"),
-    (BY_PARTS, {"sweeps": 2, "quiet": 1.0}, "network 'kpcn' goes without quiet, sweeps"),
+    (BY_PARTS, {"start": ("primal",)}, "network 'kpcn' cannot be combined with start"),
+    (BY_PARTS, {"sweeps": 2, "quiet": 1.0}, "network 'kpcn' cannot be combined with quiet, sweeps"),
     (DRAWN, {"sweeps": -1}, "sweeps = -1"),
     (DRAWN, {"sweeps": 65}, "whole number up to 64"),
     (DRAWN, {"sweeps": True}, "sweeps = True"),
@@ -54,7 +54,7 @@ ROWS = [
     (OIDN, {"units": (1,)}, "has none"),
     (OIDN, {"inputs": ("primal", "albedo", "normal")}, "must be base, albedo, normal"),
     (OIDN, {"base": "oidn"}, "choose one of"),
-    (OIDN, {"quiet": 0.03, "kernel": 3}, "goes without quiet, kernel"),
+    (OIDN, {"quiet": 0.03, "kernel": 3}, "cannot be combined with quiet, kernel"),
 ]  # fmt: skip
 
 

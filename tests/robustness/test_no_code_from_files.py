@@ -172,10 +172,10 @@ def test_networks_that_refer_to_other_files_are_refused(tmp_path, model, locatio
         ("ngpt.overlap with base", "1000000000", "its overlap is 1000000000"),
         ("ngpt.bytes per pixel", "0", "0 bytes per pixel"),
         ("ngpt.base", "../x", r"base '\.\./x'"),
-        ("ngpt.inputs", "primal, secret", "its metadata tell of base, primal, secret, statistics"),
+        ("ngpt.inputs", "primal, secret", "but its metadata list base, primal, secret, statistics"),
         ("ngpt.alignment", "many", "lacks the metadata"),
-        ("ngpt.optional", "direct, albedo", "a network of colour alone, as earlier versions had"),
-        ("ngpt.emission", "true", "a network of colour alone, as earlier versions had"),
+        ("ngpt.optional", "direct, albedo", "this network reads only colour, as in earlier versions"),
+        ("ngpt.emission", "true", "this network reads only colour, as in earlier versions"),
     ],
 )
 def test_networks_whose_metadata_lie_are_refused(tmp_path, model, key, value, message):

@@ -190,7 +190,7 @@ def test_manifests_that_cannot_be_used_are_refused(folder, change, message):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [(None, "no training set"), ("[" * 100_000, "brackets within brackets"), ("{", "cannot be read")],
+    [(None, "no training set"), ("[" * 100_000, "its brackets are nested"), ("{", "cannot be read")],
 )
 def test_manifests_that_are_none(tmp_path, text, message):
     if text is not None:
@@ -249,7 +249,7 @@ def test_shards_with_other_tensors_are_refused(shots, name, change, message):
 def test_a_record_that_cannot_be_read_is_refused(folder):
     shard = folder / "shards" / "a.safetensors"
     save_file(load_file(shard), shard, {"ngpt": "[" * 100_000})
-    with pytest.raises(NgptError, match="its record: cannot be read: brackets within brackets"):
+    with pytest.raises(NgptError, match="its record: cannot be read: its brackets are nested"):
         Shard(shard)
 
 

@@ -30,7 +30,7 @@ def _notes(facts: Facts) -> list[str]:
 register(
     Sampler(
         "gpt",
-        "gradients by shifted paths that join their base path (surfaces and media; the sampler to use)",
+        "gradients by shifted paths that join their base path (surfaces and media)",
         "data_gen.samplers.gpt.integrator",
         standing="use",
         refusals=(polarised, _unseen_media),

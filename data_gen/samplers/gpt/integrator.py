@@ -97,7 +97,7 @@ class GPT(GradientIntegrator):
         self.volumes, self.shared = props.get("volumes", False), self.options["tails"] == "shared"
         self.follows = "volpath" if self.volumes else "path"
         if self.shift == "manifold" and (self.reuse or not self.caustic):
-            raise NgptError("gpt: shift 'manifold' needs the layer 'caustic', and goes without 'reuse'")
+            raise NgptError("gpt: shift 'manifold' needs the layer 'caustic', and cannot be combined with 'reuse'")
 
     @classmethod
     def parameters(cls, scene: mi.Scene) -> dict[str, Any]:

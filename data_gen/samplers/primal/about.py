@@ -6,7 +6,7 @@ from data_gen.samplers.shared import TAILS
 register(
     Sampler(
         "primal",
-        "the scene's own integrator without gradients (references, primal denoisers)",
+        "the scene's own integrator, without gradients (rooms, references)",
         "data_gen.samplers.primal.sampler",
         standing="use",
         options={"features": Option(True, "albedo, normal, depth and emission seen directly"), "tails": TAILS},

@@ -27,6 +27,6 @@ def check(plan: Plan) -> None:
     if not mi.is_rgb or mi.is_polarized:
         raise NgptError(f"restir: records hold RGB, and the variant is '{mi.variant()}'; use 'llvm_ad_rgb'")
     if plan.limits.hide_emitters:
-        raise NgptError("restir: emitters that hide from the camera are not known; leave out hide_emitters")
+        raise NgptError("restir: hidden emitters are not supported; leave out hide_emitters")
     if plan.space.media:
-        raise NgptError("restir: media are not known; leave out volumes")
+        raise NgptError("restir: media are not supported; use --sampler gpt")

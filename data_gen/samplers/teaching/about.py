@@ -35,7 +35,7 @@ register(
 register(
     Sampler(
         "gpt-simple",
-        "gradients by reconnection alone (surfaces that scatter widely; the code to read before that of gpt)",
+        "gradients by reconnection only (surfaces that scatter widely; code to read before gpt)",
         "data_gen.samplers.teaching.gpt_simple",
         refusals=(*SURFACES, hidden_emitters, _mirrors),
         notes=lambda facts: [

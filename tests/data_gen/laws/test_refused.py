@@ -49,7 +49,7 @@ TABLE = [
     ("gpt-simple", hidden_lamp, {}, "hides emitters; use --sampler gpt"),
     ("gpt-tiles", fog, {}, "'gpt-tiles' knows only 'path'"),
     ("gpt-tiles", hidden_lamp, {}, "hides emitters; use --sampler gpt"),
-    ("gpt-tiles", "diffuse", {"adaptive": Adaptive()}, "'gpt-tiles' depend on each other, so all pixels have as many"),
+    ("gpt-tiles", "diffuse", {"adaptive": Adaptive()}, "'gpt-tiles' depend on each other and cannot be adaptive"),
     ("split", fog, {}, "'split' knows only 'path'"),
     ("split", hidden_lamp, {}, "hides emitters; use --sampler gpt"),
     ("gbeams", media_scenes.smoke, {}, r"density varies.* use --sampler gpt, .*vpm \(no gradients\), or gvpm"),
