@@ -1,16 +1,9 @@
 """Samples where they pay: after a few samples everywhere, more of them where the result's error is large.
 
-The error is measured on the image that the chosen method reconstructs, not on the stack: it is the standard error of
-``ngpt.api.uncertainty``. A render proceeds in steps, and each step may double the samples. Before each step the method
-runs twice on the samples so far. If a pixel has the error q, relative to its light, after n samples, one sample would
-leave the error s = q sqrt(n). For a given sum of n, the mean of s² / n is least where n is proportional to s. Each step
-brings the counts as near to this as it can. Every pixel gets at least a quarter of its even share, so that light which
-the first samples missed can still be found.
-
-The samples that decide the counts stay in the means. So a pixel whose first samples were too dark by chance might get
-too few further samples, and its expected value would be too dark. Two things keep this bias small: errors are means
-over about 9x9 pixels, where a pixel's own samples have little weight; and they are relative to the light there, so
-noise that darkens a pixel lowers both. docs/use/adaptive.md has measurements.
+Before each step the method that is to reconstruct the image runs twice, which tells the standard error of its result
+(``ngpt.api.uncertainty``). docs/use/adaptive.md says how the samples of a step follow from it. The samples that decide
+the counts stay in the means, so a pixel whose first samples were too dark by chance might get too few. Two things keep
+this bias small: errors are means over about 9x9 pixels, and relative to the light there.
 """
 
 from __future__ import annotations
@@ -45,24 +38,22 @@ _MARGIN, _SMALLEST = 1.05, 0.125
 _TRIM = 0.001
 # This share of the changes is cut to the next smaller one: else all pixels around a firefly get its samples.
 _CUT = 0.03
-# Standard errors are right for two values in three. The few that are far off make the mean square larger than so; that
-# of l1, whose standard errors count the light that it leaves out, is smaller. By python -m bench.adaptive, six scenes.
-_TAILS = {"l1": 0.75}
-_TAIL = 1.25
+# Standard errors are right for two values in three. The few that are far off make the mean square larger; that of l1,
+# whose standard errors count the light that it leaves out, is smaller. By python -m bench.adaptive, six scenes.
+_TAILS, _TAIL = {"l1": 0.75}, 1.25
 # Pixels, the side of the part of an image that tells how long the method takes
 _PART = 96
 
 
 @dataclass(frozen=True)
 class Adaptive:
-    """How samples are shared out: for which ``method`` of reconstruction, and up to which ``error``.
+    """How samples are shared out.
 
     The ``error`` is relative: the root of the mean of (x - r)² / (r² + 1e-3) over all but the worst 0.1 % of the
-    pixels, for the result x of the method and the converged image r, as far as standard errors foretell it. None: as
-    far as samples or time go.
+    pixels, for the result x of the ``method`` and the converged image r, as far as standard errors foretell it.
     """
 
-    error: float | None = None
+    error: float | None = None  # that ends the render; None: as far as samples or time go
     method: str = "auto"
 
     def chosen_by(self, stack: GradientStack) -> str:
@@ -157,10 +148,10 @@ def render_adaptive(
 
 @dataclass(frozen=True)
 class Assessment:
-    """What a method makes of a stack: the standard error of each pixel relative to its light, (pixels), and in all."""
+    """What a method makes of a stack."""
 
-    relative: np.ndarray
-    error: float
+    relative: np.ndarray  # the standard error of each pixel relative to its light, (pixels)
+    error: float  # in all
     method: str
 
 
@@ -182,8 +173,7 @@ def assess(stack: GradientStack, method: str) -> Assessment:
 
 
 def seconds_to_assess(stack: GradientStack, method: str) -> float:
-    """What ``assess`` is expected to take, from what it takes for a part in the middle of the image; 0 where the image
-    is not much larger than that."""
+    """What ``assess`` is expected to take, from a part in the middle of the image; 0 where that is most of it."""
     if stack.width * stack.height < 4 * _PART**2:
         return 0.0
     seconds = 0.0

@@ -1,8 +1,7 @@
 """Renders that were begun: whether a file has all that is asked for, and what is left to render of it.
 
-The rest gets its own seed, made from the requested seed and the number of existing parts. So its samples differ from
-the samples in the file and are independent of them: means and variances are merged exactly as for stacks with different
-seeds (``ngpt.merging``). What ends a part does not depend on its samples.
+The rest gets its own seed, made from the requested seed and the number of existing parts. So its samples are
+independent of those in the file, and parts are merged exactly as stacks with different seeds are (``ngpt.merging``).
 """
 
 from __future__ import annotations

@@ -25,11 +25,11 @@ _LENSES = ("dielectric", "roughdielectric")
 
 
 def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
-    """Counts a scene's plugins by kind and says how it would be sampled.
+    """Counts a scene's plugins by kind and says how it would be sampled; arguments are as in ``load_scene``.
 
-    ``name`` and ``parameters`` are as in ``load_scene``. Returns {"plugins": {kind: {plugin: count}},
-    "sensors": a line for each, "size": (width, height) or None where the scene leaves it to Mitsuba, "media": names,
-    "lens": whether there is depth of field, "shutter": seconds it is open, "sampler": name, "plan": lines of text}.
+    Returns {"plugins": {kind: {plugin: count}}, "sensors": a line for each, "size": (width, height) or None where the
+    scene leaves it to Mitsuba, "media": names, "lens": whether there is depth of field, "shutter": seconds it is open,
+    "sampler": name, "plan": lines of text}.
     """
     config = mi.parser.ParserConfig(mi.variant())
     try:
@@ -80,7 +80,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
             f"{sampler}: {SAMPLERS[sampler].summary}",
             f"because {reason}",
             *(["in a room it is 'primal': rays tell, once the scene is loaded"] * (sampler == "gpt" and not media)),
-            *([unable] if unable else SAMPLERS[sampler].notes(facts)),
+            *([unable] if unable else SAMPLERS[sampler].notes_on(facts)),
             *([f"integrator '{integrator}': the image of '{followed}' is rendered"] * (integrator != followed)),
             *_contents(plugins, facts),
             *_camera(lens, shutter),

@@ -6,14 +6,8 @@ other samplers, whose noise has zero mean (``data_gen.choosing.trials``), so blu
 error at the number of samples that fit into the time is extrapolated by a power law. Its exponent comes partly from the
 pilot, which compares one stack to two, and partly from what is usual for this kind of method.
 
-The image of a biased sampler (photons) is judged like a reconstruction, and no biased sampler judges others. Where the
-biased sampler finds most of the light, the samplers that judge it are noisy: twice the standard error is added to the
-error they give.
-
-Samples are even, or adaptive (``data_gen.adaptive``) where this is expected to pay for itself. The gain is computed
-from the pilot's expected errors, pixel by pixel, as if these were exact.
-
-Not handled: light that no sampler has found in the pilot.
+No biased sampler (photons) judges others. Where one finds most of the light, the samplers that judge it are noisy:
+twice the standard error is added to the error they give. Light that no sampler has found in the pilot is not handled.
 """
 
 from __future__ import annotations
@@ -54,27 +48,18 @@ REALISED, FROM = 2.0, 2 * LEAST
 
 @dataclass(frozen=True)
 class Pipeline:
-    """A sampler and a method, as a pilot saw them.
-
-    ``spp``       samples per pixel at which the ``error`` (trimmed relMSE) was measured
-    ``step``      the exponent of the error as a power of the samples, as the pilot measured it
-    ``seconds``   seconds for one sample per pixel of the whole image
-    ``after``     seconds of the method
-    ``adaptive``  expected error of adaptive samples relative to even ones; 1: samples are even
-    ``choosing``  seconds of the method each time that samples are distributed
-    ``doubt``     standard error of a biased sampler's error, by which the error is raised; otherwise 0
-    """
+    """A sampler and a method, as a pilot saw them."""
 
     sampler: str
     method: str
-    spp: int
-    error: float
-    step: float
-    seconds: float
-    after: float
-    adaptive: float = 1.0
-    choosing: float = 0.0
-    doubt: float = 0.0
+    spp: int  # samples per pixel at which the ``error`` was measured
+    error: float  # trimmed relMSE
+    step: float  # the exponent of the error as a power of the samples, as the pilot measured it
+    seconds: float  # for one sample per pixel of the whole image
+    after: float  # seconds of the method
+    adaptive: float = 1.0  # expected error of adaptive samples relative to even ones; 1: samples are even
+    choosing: float = 0.0  # seconds of the method each time that samples are distributed
+    doubt: float = 0.0  # standard error of a biased sampler's error, by which the error is raised; otherwise 0
 
     @property
     def shared(self) -> bool:

@@ -45,14 +45,22 @@ SEED = 0x9E3779B9
 
 @dataclass(frozen=True)
 class Trial:
-    """Four stacks of as many samples by one sampler, and the seconds of one sample of the whole image.
+    """What a pilot has seen of a sampler."""
 
-    ``processor``  the same in processor seconds of all cores together; 0 if not known, or where a graphics card renders
-    """
-
-    stacks: list[GradientStack]
-    seconds: float
+    stacks: list[GradientStack]  # four of as many samples
+    seconds: float  # of one sample of the whole image
+    # The same in processor seconds of all cores together; 0 if not known, or where a graphics card renders
     processor: float = 0.0
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """How trials go on, and who hears of it."""
+
+    clock: Callable[[], float] = time.perf_counter
+    said: Callable[[str], None] = lambda line: None  # called with what is tried
+    stop: Callable[[], bool] = lambda: False  # whether to end there
+    unbiased: bool = False  # as in ``data_gen.render.render_stack``
 
 
 def candidates(scene: mi.Scene, biased: bool = False) -> list[str]:
@@ -73,19 +81,15 @@ def try_all(
     samplers: Sequence[str],
     budget: Callable[[dict[str, Trial]], float] = lambda trials: math.inf,
     first: float = math.inf,
-    *,
-    clock: Callable[[], float] = time.perf_counter,
-    said: Callable[[str], None] = lambda line: None,
-    stop: Callable[[], bool] = lambda: False,
-    unbiased: bool = False,
+    pilot: Pilot = Pilot(),
 ) -> dict[str, Trial]:
     """Trials of the samplers that can render the scene, by name.
 
-    Together they may take as many seconds of the ``clock`` as the ``budget`` returns when called with the trials so
-    far. A trial that would not fit into the remaining time, by its time to compile and to render, is left out. The
-    ``first`` has a budget of its own, and is always compiled. ``said`` is called with what is tried; ``stop`` says
-    whether to end there. ``unbiased`` goes to ``data_gen.render.render_stack``.
+    Together they may take as many seconds of the clock as the ``budget`` returns when called with the trials so far. A
+    trial that would not fit into the remaining time, by its time to compile and to render, is left out. The ``first``
+    has a budget of its own, and is always compiled.
     """
+    clock, stop = pilot.clock, pilot.stop
     start, slow = clock(), 1.0
     trials: dict[str, Trial] = {}
     for i, name in enumerate(samplers):
@@ -93,9 +97,9 @@ def try_all(
         compiles = SAMPLERS[name].compiles
         if i and slow * compiles > rest:
             continue
-        said(f"pilot: trying '{name}'; to compile its kernels may take {slow * compiles:.0f} s")
+        pilot.said(f"pilot: trying '{name}'; to compile its kernels may take {slow * compiles:.0f} s")
         begins = clock()
-        trial, compiled = try_out(scene, name, clock, rest, stop, unbiased=unbiased)
+        trial, compiled = try_out(scene, name, clock, rest, stop, unbiased=pilot.unbiased)
         if stop():
             break
         # A scene of many materials, or a busy machine, slows down the next one as well. Where kernels are kept from
@@ -172,16 +176,11 @@ def try_out(
 
 @dataclass(frozen=True)
 class Witnesses:
-    """The primals of trials, which judge the images of each sampler.
+    """The primals of trials, which judge the images of each sampler."""
 
-    ``primals``  four of each sampler, by name
-    ``noise``    noise of a single primal, by name of sampler
-    ``scale``    what errors are relative to: an image from all samplers, where samplers with little noise count most
-    """
-
-    primals: dict[str, list[np.ndarray]]
-    noise: dict[str, float]
-    scale: np.ndarray
+    primals: dict[str, list[np.ndarray]]  # four of each sampler, by name
+    noise: dict[str, float]  # of a single primal, by name of sampler
+    scale: np.ndarray  # what errors are relative to: an image from all samplers, those with little noise count most
 
     @classmethod
     def of(cls, trials: dict[str, Trial]) -> Witnesses:

@@ -32,20 +32,15 @@ RADIANCE = (".radiance.value", ".intensity.value", ".irradiance.value")
 
 @dataclass
 class Movement:
-    """What changes from frame to frame; without anything but a view, nothing does.
-
-    ``way``, ``turn``  of the camera, and of its target beside it, world units a frame
-    ``shape``, ``shift``  the parameter that places a shape, and its way a frame
-    ``light``, ``gain``   the parameter of a light, and its factor a frame
-    """
+    """What changes from frame to frame; without anything but a view, nothing does."""
 
     view: View
-    way: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    shape: str = ""
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    light: str = ""
-    gain: float = 1.0
+    way: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the camera, world units a frame
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of its target beside it
+    shape: str = ""  # the parameter that places a shape,
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # and its way a frame
+    light: str = ""  # the parameter of a light,
+    gain: float = 1.0  # and its factor a frame
     _start: dict = field(default_factory=dict, repr=False)
 
     def view_at(self, frame: int) -> View:

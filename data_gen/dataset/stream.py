@@ -3,11 +3,8 @@
     with Stream(config, executor) as data:
         for step in ...:
             crop = data[rng.integers(len(data))]
-
-Scenes never run out: after the scenes of the configuration come others of their kind, and further views of scene files.
-
-With ``kept``, a folder, the references of the configuration are made once and stored there in compressed form. They are
-used repeatedly with new inputs, so no noise is ever seen twice. New inputs take a third of the time.
+After the scenes of the configuration come others of their kind, and further views of scene files. With ``kept``, a
+folder, its references are made once and stored there in compressed form, and used repeatedly with new inputs.
 """
 
 from __future__ import annotations

@@ -31,16 +31,11 @@ _OFF_RAY = 1e-3
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What motion needs of a scene in one frame.
+    """What motion needs of a scene in one frame."""
 
-    ``shapes``  in the order of ``scene.shapes()``
-    ``film``    (4, 4): homogeneous points of the world to (x, y, -, 1) in pixels, the last positive in front
-    ``place``   where the pixels lie
-    """
-
-    shapes: tuple[Geometry, ...]
-    film: np.ndarray
-    place: Place
+    shapes: tuple[Geometry, ...]  # in the order of ``scene.shapes()``
+    film: np.ndarray  # (4, 4): homogeneous points of the world to (x, y, -, 1) in pixels, the last positive in front
+    place: Place  # where the pixels lie
 
 
 def snapshot(scene: mi.Scene, shapes: tuple[Geometry, ...] | None = None) -> Snapshot:
@@ -82,19 +77,13 @@ class _Middle:
 
 @dataclass(frozen=True)
 class Seen:
-    """What the rays through the centres of all pixels meet, row by row; arrays of N pixels.
+    """What the rays through the centres of all N pixels meet, row by row."""
 
-    ``points``      (N, 4) homogeneous, in the world: where it seems to be; directions where rays escape
-    ``straight``    whether it is there: no mirror and no lens on the way
-    ``shape``       its number in ``scene.shapes()``, -1 where rays escape
-    ``primitive``   the triangle, ``barycentric`` (N, 2) the weights of its second and third vertex
-    """
-
-    points: np.ndarray
-    straight: np.ndarray
-    shape: np.ndarray
-    primitive: np.ndarray
-    barycentric: np.ndarray
+    points: np.ndarray  # (N, 4) homogeneous, in the world: where it seems to be; directions where rays escape
+    straight: np.ndarray  # whether it is there: no mirror and no lens on the way
+    shape: np.ndarray  # its number in ``scene.shapes()``, -1 where rays escape
+    primitive: np.ndarray  # the triangle
+    barycentric: np.ndarray  # (N, 2) the weights of its second and third vertex
 
 
 def seen(scene: mi.Scene) -> Seen:
@@ -137,10 +126,9 @@ def depth(scene: mi.Scene, now: Snapshot, what: Seen) -> np.ndarray:
 def motion_vectors(scene: mi.Scene, now: Snapshot, before: Snapshot, what: Seen | None = None) -> np.ndarray:
     """(H, W, 2) float32: pixels from each pixel to where what it shows was in the frame ``before``; x right, y down.
 
-    It leads from pixel to pixel of the two arrays. Where crop windows move from frame to frame, the motion in the whole
-    picture is the sum of it and ``window_moved``.
-    ``now`` is the snapshot of ``scene``, ``what`` its ``seen(scene)`` if that is known. NaN where motion is not known:
-    behind the camera of before, or on a shape that was not there. Raises NgptError for a camera without a projection.
+    It leads from pixel to pixel of the two arrays; the motion in the whole picture is the sum of it and
+    ``window_moved``. ``now`` is the snapshot of ``scene``, ``what`` its ``seen(scene)`` if that is known. NaN where
+    motion is not known: behind the camera of before, or on a shape that was not there.
     """
     what = seen(scene) if what is None else what
     moved = what.points.copy()

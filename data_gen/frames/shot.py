@@ -108,18 +108,17 @@ def render_shot(
 
     Stacks have the layer ``motion`` to the previous frame in ``frames``. For the first frame, it is the motion to the
     frame that a shot of the same step would have before it, or all NaN if there is none. Motion refers to the whole
-    picture; crop windows may show another part of it in each frame. Attributes: ``ngpt:frame``, ``ngpt:previousFrame``.
-    Each frame has its own seed, so its bits do not depend on which other frames are rendered. ``options`` are as in
-    ``render_stack``. Raises NgptError as ``render_stack`` does, and for cameras without a projection.
+    picture; crop windows may show another part of it in each frame. Each frame has its own seed, so its bits do not
+    depend on which other frames are rendered. ``options`` and errors are as in ``render_stack``; cameras without a
+    projection raise NgptError.
 
-    A ``sampler`` of ``data_gen.samplers.FRAME_SAMPLERS`` reuses the previous frames. If frames are skipped, up to
-    ``warm_up`` of them are rendered nevertheless, but not yielded. Such a sampler uses ``seed`` for all frames. If more
-    than the camera changes, it needs the scene of the previous frame: two scenes are in memory, in turn.
+    A ``sampler`` of ``data_gen.samplers.FRAME_SAMPLERS`` reuses the previous frames, up to ``warm_up`` of them where
+    frames are skipped, and uses ``seed`` for all frames. If more than the camera changes, it needs the scene of the
+    previous frame: two scenes are in memory, in turn.
 
-    With ``dt`` pairs of samples per pixel, 2 or more, stacks have ``dt`` and ``dt_var``. These use separate samples
-    (``data_gen.frames.time_differences``) by Mitsuba's integrator, without features. Each pair is two paths, one of
-    them in the scene of the previous frame: where parameters change, scenes are loaded twice per frame. The time for
-    this is included in ``ngpt:seconds``.
+    With ``dt`` pairs of samples per pixel, 2 or more, stacks have ``dt`` and ``dt_var``, of separate samples
+    (``data_gen.frames.time_differences``) by Mitsuba's integrator. Where parameters change, scenes are loaded twice per
+    frame then. The time for this is included in ``ngpt:seconds``.
     """
     before: Snapshot | None = None
     last = None

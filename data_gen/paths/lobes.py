@@ -21,15 +21,12 @@ _HEARS = -1.0
 class Lobes:
     """The share of diffuse lobes (``BSDFFlags.Diffuse``, reflection and transmission) in what a material scatters.
 
-    Materials evaluate only some of their lobes if ``BSDFContext.type_mask`` asks for it, and materials that hold others
-    (``twosided``, ``mask``, ``bumpmap``, ``normalmap``, ``blendbsdf``) pass the mask on. Principled materials ignore
-    it. For these, and for materials that hold one, the diffuse part is approximated by Lambert's law,
-
-        s ρ |cos θ| / π,   s = (1 - metallic) (1 - spec_trans)
-
-    where ρ is the reflectance, ``eval_diffuse_reflectance()``; it is clamped to all that the material scatters.
-    Textured parameters count with their mean, and several such materials in one with the mean of their s. Mitsuba does
-    not list materials inside shape groups: all that principled materials scatter there counts as diffuse.
+    Materials evaluate only some of their lobes if ``BSDFContext.type_mask`` asks for it, and hand the mask on to those
+    inside. Principled materials ignore it. For these, and for materials that hold one, the diffuse part is approximated
+    by Lambert's law, s ρ |cos θ| / π with s = (1 - metallic) (1 - spec_trans) and the reflectance
+    ρ = ``eval_diffuse_reflectance()``; it is clamped to all that the material scatters. Textured parameters count with
+    their mean, and several such materials in one with the mean of their s. Mitsuba does not list materials inside shape
+    groups: all that principled materials scatter there counts as diffuse.
     """
 
     def __init__(self, scene: mi.Scene):

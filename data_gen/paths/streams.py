@@ -2,8 +2,6 @@
 
 There are two kinds of ``points``. "independent" points come from a random number generator for each sample. "sobol"
 points, the default, come from Owen-scrambled Sobol sequences, with a new pair of dimensions for each pair of numbers.
-Samples of a pixel and of neighbouring pixels are then well spread, which lowers the errors of pixels and of blocks of
-pixels. Each single point is uniform, so all estimates stay unbiased; but samples are no longer independent.
 
 - A pair of dimensions is the first two of Sobol's sequence, with a new scrambling of the order of the points and of
   both coordinates. [Burley 2020, "Practical Hash-based Owen Scrambling"]
@@ -171,20 +169,17 @@ def _sobol_class(variant: str) -> type:
             return mi.Point2f(_unit(x), _unit(y))
 
         def next_key(self):
-            """Any 32 bits, from which more random numbers are made than would be drawn whether used or not."""
             bits = mixed(self._scramble() ^ mixed(self.index + 0x967A889B))
             self.dimension = self.dimension + 1
             return bits
 
         def skip(self, count):
-            """Leaves out so many numbers of each lane, UInt32."""
             self.dimension = self.dimension + count
 
         def clone(self):
             return Points(self.state)
 
         def at(self, lanes):
-            """The streams of only these lanes."""
             return Points([dr.gather(mi.UInt32, each, lanes) for each in self.state])
 
         def schedule_state(self):

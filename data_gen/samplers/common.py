@@ -65,17 +65,14 @@ class GradientIntegrator(mi.SamplingIntegrator):
     ``render()`` returns a tensor (height, width, channels) whose channels ``aov_names()`` lists, in the order of the
     layers of a stack. The film's reconstruction filter is not used, since a gradient is a difference of box-filtered
     pixels. Derived classes implement ``begin()``.
-
-    ``follows``  Mitsuba's integrator whose image is rendered
-    ``name``     of the sampler, whose ``entry`` in the registry says which options there are, and what it refuses
-    ``options``  all of them, as given or by default
-    ``nested``   whether another integrator traces the paths, so that there are no ``limits``
     """
 
-    follows, nested = "path", False
+    follows = "path"  # Mitsuba's integrator whose image is rendered
+    nested = False  # whether another integrator traces the paths, so that there are no ``limits``
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
+        # Of the sampler, whose ``entry`` in the registry says which options there are, and what it refuses
         self.name = by_plugin(props.plugin_name()).name
         self.options = self.entry.settings({name: props[name] for name in self.entry.options if name in props})
         # Whether the film counts failed shifts, where the sampler ``diagnoses`` them

@@ -38,12 +38,23 @@ def no_media(facts: Facts, name: str) -> str:
     return "" if facts.media else "there are no media, and 'ppm' has the same image"
 
 
+def unrendered_media(facts: Facts, name: str) -> str:
+    if facts.integrator not in ("path", *VOLUMETRIC):
+        return f"the integrator is '{facts.integrator}', and '{name}' knows only 'path', 'volpath' and 'volpathmis'"
+    unseen = ", ".join(facts.media) if facts.integrator == "path" else ""
+    return f"there are media ({unseen}), which the integrator 'path' does not render" if unseen else ""
+
+
 def varying_media(facts: Facts, name: str) -> str:
     return f"there are media whose density varies, which '{name}' does not render" if facts.grids else ""
 
 
 def hidden_emitters(facts: Facts, name: str) -> str:
     return "its integrator hides emitters" if facts.hides else ""
+
+
+def mirrors(facts: Facts, name: str) -> str:
+    return "there are mirrors or clear glass, at which paths cannot be reconnected" if facts.mirrors else ""
 
 
 def unreachable_camera(facts: Facts, name: str) -> str:
@@ -107,12 +118,4 @@ def first_radius(default: float) -> Option:
     return Option(default, meaning, range=(1e-6, 1e6))
 
 
-def notes_on_photons(facts: Facts) -> list[str]:
-    how = "found by photons; blurred, less with every sample"
-    return [f"transport: Mitsuba's '{facts.integrator}', {how}", *notes_on_mirrors(facts)]
-
-
-def notes_on_mirrors(facts: Facts) -> list[str]:
-    """The note of photon samplers."""
-    line = "mirrors or clear glass: followed from the camera and from the lights, caustics seen in them too"
-    return [line] if facts.mirrors else []
+IN_MIRRORS = "followed from the camera and from the lights, caustics seen in them too"

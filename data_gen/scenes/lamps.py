@@ -1,9 +1,9 @@
 """How often each lamp of a scene is chosen, by what it brings to what the camera sees.
 
 Mitsuba chooses all lamps alike, unless a scene gives them ``sampling_weight``. The best weights are in proportion to
-the root of the mean square of what a lamp brings to a vertex, which a short pilot measures: at the first vertices of
-camera paths, each lamp is sampled in turn. So all kinds of lamps, the sun and an environment are measured in the same
-way, and lamps behind walls count for little.
+The best weights are in proportion to the root of the mean square of what a lamp brings to a vertex, which a short pilot
+measures: at the first vertices of camera paths, each lamp is sampled in turn. So all kinds of lamps, the sun and an
+environment are measured in the same way, and lamps behind walls count for little.
 """
 
 from __future__ import annotations
@@ -101,8 +101,7 @@ def promised(scene: mi.Scene, weights: np.ndarray) -> tuple[float, Table | None]
 def _pilot(scene: mi.Scene, paths: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Samples of lamps at the first vertices of camera paths: each one's number, what it brings, and the vertex (N, 3).
 
-    What it brings counts as it does beside BSDF sampling, by the weight of multiple importance sampling. So lamps that
-    are large, or close, count for less.
+    What it brings counts by its weight beside BSDF sampling: lamps that are large, or close, count for less.
     """
     n = len(scene.emitters())
     lane = dr.arange(mi.UInt32, paths)

@@ -33,8 +33,7 @@ def load_scene(
     ``size`` is (width, height) in pixels and replaces the scene's film size; a crop window stays the same part of
     it. ``parameters`` sets the file's ``<default>`` values. Meshes of one material are ``merged`` into one, which
     renders the same and starts much sooner; where they are to move, or to be found by name, they must not be.
-    ``sensor``, a number or an id, is the only one that the scene then has. Raises NgptError with the file and Mitsuba's
-    own complaint when it cannot.
+    ``sensor``, a number or an id, is the only one that the scene then has. Raises NgptError with Mitsuba's complaint.
     """
     parameters = parameters or {}
     try:

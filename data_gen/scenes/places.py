@@ -1,12 +1,9 @@
 """How often each lamp of a scene is chosen, by place: with many lamps, most light up little of the scene.
 
 The scene is cut into cells. In each cell, lamps are chosen by the mean square of their light at vertices there, which
-a pilot measures (``data_gen.scenes.lamps``). A cell with few samples of the pilot relies on the larger cells around it:
-the mean of each cell also includes some virtual samples with the mean of its parent.
-
-Any probabilities give correct images, as long as none is 0 where a lamp has light. The probability of a sample depends
-only on its vertex. A shifted path keeps its lamp, and knows the probability of choosing it both where the path comes
-from and where it goes to.
+a pilot measures (``data_gen.scenes.lamps``). The mean of each cell also includes some virtual samples with the mean of
+its parent. Any probabilities give correct images, as long as none is 0 where a lamp has light. A shifted path keeps its
+lamp, and knows the probability of choosing it both where the path comes from and where it goes to.
 """
 
 from __future__ import annotations

@@ -9,9 +9,8 @@ from unbiased import load
 pytest.importorskip("mitsuba")
 
 from data_gen.choosing import plans, trials
-from data_gen.choosing.enclosed import enclosed
 from data_gen.choosing.pipelines import Pipeline, usual_fall
-from data_gen.choosing.plans import best_of, judge, simple, times_to_the_end
+from data_gen.choosing.plans import best_of, enclosed, judge, simple, times_to_the_end
 from data_gen.choosing.trials import Witnesses, candidates
 from data_gen.render import render_stack
 from data_gen.samplers import SAMPLERS, Sampler

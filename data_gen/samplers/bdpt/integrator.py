@@ -62,15 +62,9 @@ class Splatter:
 class BDPT(GradientIntegrator):
     """Bidirectional path tracing, for surfaces; no gradients.
 
-    Plugin ``bdpt``. Parameters, the first three as for Mitsuba's ``path``:
-
-    ``max_depth``      default -1: no limit
-    ``rr_depth``       5
-    ``hide_emitters``  false
-    ``joined_depth``   10, the number of edges up to which paths are found from both ends
-
-    Not handled: media, polarised variants, cameras that are neither perspective nor thin lenses, emitters other than
-    areas, points, spots and those infinitely far away. Rendering raises NgptError for them.
+    Plugin ``bdpt``, with the parameters of Mitsuba's ``path`` and ``joined_depth``. Not handled: media, polarised
+    variants, cameras that are neither perspective nor thin lenses, emitters other than areas, points, spots and those
+    infinitely far away. Rendering raises NgptError for them.
     """
 
     plan_class = Plan

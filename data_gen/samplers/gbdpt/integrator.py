@@ -59,11 +59,7 @@ from data_gen.samplers.gbdpt.roulette import Rater, Worth, survivors, thresholds
 class GBDPT(BDPT):
     """Gradient-domain bidirectional path tracing, for surfaces.
 
-    Plugin ``gbdpt``. Parameters: as for ``bdpt``, and
-
-    ``roughness_threshold``  0.05, the microfacet roughness above which materials are connectable
-
-    Not handled: what ``bdpt`` does not handle.
+    Plugin ``gbdpt``, with the parameters of ``bdpt`` and ``roughness_threshold``. Not handled: as there.
     """
 
     plan_class = Plan

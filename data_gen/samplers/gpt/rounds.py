@@ -59,16 +59,14 @@ class SharedTails:
         return self.cache is not None
 
     def end_of_round(self, sample: int) -> int | None:
-        """The sample before which a pass must end that begins with this ``sample``; None: there is no limit."""
         return schedule.end_of_round(sample) if self.cache else None
 
     def begin(self, sensor: mi.Sensor, seed: int, sample: int, spp: int | None) -> None:
-        """Feeds the cache if this ``sample`` begins a round.
-
-        It is called before each pass. ``spp`` counts all samples, if known.
-        """
+        """Feeds the cache if this ``sample`` begins a round."""
         if sample == 0:
-            self.cache, self.fed = self.empty() if self.plan.matt.any else None, 0
+            # The light of the layer ``caustic`` is kept apart, where there is such a layer.
+            empty = Cache(schedule.fineness(0), 2 if self.plan.caustic else 1) if self.plan.matt.any else None
+            self.cache, self.fed = empty, 0
         if self.cache is None:
             return
         pixels = int(dr.prod(mi.ScalarVector2u(sensor.film().crop_size())))
@@ -85,10 +83,6 @@ class SharedTails:
                 self.cache.settle(fineness)
         if fineness != self.cache.fineness:
             self.cache.settle(fineness)
-
-    def empty(self) -> Cache:
-        """A cache that keeps the light of the layer ``caustic`` apart, where there is such a layer."""
-        return Cache(schedule.fineness(0), 2 if self.plan.caustic else 1)
 
     def feed(self, sensor: mi.Sensor, seed: int, pixels: int, n: int) -> float:
         """Has so many paths feed the cache; returns the share of them that come by a place to end."""

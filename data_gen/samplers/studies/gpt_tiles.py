@@ -56,16 +56,10 @@ _LANE_BYTES, _CONNECTION_BYTES = 272, 32
 class GPTTiles(GradientIntegrator):
     """Gradient-domain path tracing with path reuse in tiles, for surfaces.
 
-    Plugin ``gpt_tiles``. Parameters, the first two as for Mitsuba's ``path``:
-
-    ``max_depth``            default -1: no limit
-    ``rr_depth``             5, and from the third vertex on at the earliest
-    ``tile``                 2, pixels along a side of a tile; or 4
-    ``roughness_threshold``  0.05, the microfacet roughness above which materials are connectable
-
-    The noise of pixels of a tile is correlated, for they share their paths; variances are of each pixel over its
-    samples, and do not say so. Not handled: media (they are not seen), hidden emitters, polarised and spectral
-    variants; for the last three rendering raises NgptError, as for other sides of a tile.
+    Plugin ``gpt_tiles``, with ``max_depth`` and ``rr_depth`` (from the third vertex on at the earliest) of Mitsuba's
+    ``path``, ``tile`` and ``roughness_threshold``. The noise of pixels of a tile is correlated, for they share their
+    paths; variances are of each pixel over its samples, and do not say so. Not handled: media (they are not seen),
+    hidden emitters, polarised and spectral variants; for the last three rendering raises NgptError.
     """
 
     def __init__(self, props: mi.Properties):
@@ -123,12 +117,8 @@ class Tiles:
 
     def trace(self, camera: CameraSamples) -> tuple[mi.Spectrum, Paths]:
         """The layer ``direct``, and the path of each pixel: its first vertex, its suffix, and what it is worth here."""
-        scene, materials, random, limit = (
-            self.scene,
-            self.materials,
-            camera.random.clone(),
-            self.integrator.limits.max_depth,
-        )
+        scene, materials, random = self.scene, self.materials, camera.random.clone()
+        limit = self.integrator.limits.max_depth
         ray, importance, _ = camera.rays()
         ray = mi.Ray3f(ray)
         hit = scene.ray_intersect_preliminary(ray, coherent=True)

@@ -1,16 +1,14 @@
 """A path tracer whose light is in two layers, by the lobe of its first scattering event: diffuse and specular.
 
 Kernel-predicting networks denoise the two apart [Bako et al. 2017, "Kernel-Predicting Convolutional Networks for
-Denoising Monte Carlo Renderings", section 5.1]: what diffuse lobes scatter is smooth but for the texture of the albedo,
-by which it is divided, and the rest has a large range. Light that reaches the camera in several lobes of one vertex is
-shared between the layers in proportion to them, f_diffuse / f (``data_gen.paths.lobes``), by whichever technique it was
-found: that has less noise than to go by the lobe which was sampled, and the same mean. The rest, mirrors, glass, gloss,
-and emission seen through holes, is specular. Neither layer holds emission that the camera sees directly:
+Denoising Monte Carlo Renderings", section 5.1]. Light that reaches the camera in several lobes of one vertex is shared
+between the layers in proportion to them, f_diffuse / f (``Lobes``), by whichever technique it was found: that has less
+noise than to go by the lobe which was sampled, and the same mean. The rest, mirrors, glass, gloss, and emission seen
+through holes, is specular. Neither layer holds emission that the camera sees directly:
 
     primal = direct + diffuse + specular
 
-Holes (null events) are no scattering. Paths are sampled as by Mitsuba's ``path``: emitter and BSDF sampling combined by
-the power heuristic, roulette by throughput. Steps are taken as in ``gpt_simple``.
+Holes (null events) are no scattering. Paths are sampled as by Mitsuba's ``path``, steps taken as in ``gpt_simple``.
 """
 
 from __future__ import annotations

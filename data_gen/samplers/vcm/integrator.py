@@ -55,19 +55,9 @@ SAMPLE_BYTES = 1536
 class VCM(BDPT):
     """Vertex connection and merging, for surfaces; no gradients.
 
-    Plugin ``vcm``. Parameters, the first three as for Mitsuba's ``path``:
-
-    ``max_depth``            default -1: no limit
-    ``rr_depth``             5
-    ``hide_emitters``        false
-    ``joined_depth``         17, the number of edges up to which paths are found from both ends
-    ``radius``               2, of the first pass, in pixels where the camera sees something (the median)
-    ``roughness_threshold``  0.05, the microfacet roughness above which photons are gathered at a material
-
-    Biased, and consistent, as ``ppm``, but only where light comes through glass or by mirrors.
-
-    Not handled: media, polarised and spectral variants, cameras that are neither perspective nor thin lenses, emitters
-    other than areas, points, spots and those infinitely far away. Rendering raises NgptError for them.
+    Plugin ``vcm``, with the parameters of Mitsuba's ``path`` and the options of its entry. Biased, and consistent, as
+    ``ppm``, but only where light comes through glass or by mirrors. Not handled: media, polarised and spectral
+    variants, and what ``bdpt`` does not handle. Rendering raises NgptError for them.
     """
 
     # What becomes of light paths that end at the camera

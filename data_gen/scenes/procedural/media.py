@@ -111,12 +111,8 @@ def liquid(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
     return media
 
 
-KINDS: dict[str, Callable[[Stage, np.random.Generator, Path], Media]] = {
-    "fog": fog,
-    "beams": beams,
-    "smoke": smoke,
-    "liquid": liquid,
-}
+Maker = Callable[[Stage, np.random.Generator, Path], Media]
+KINDS: dict[str, Maker] = {made.__name__: made for made in (fog, beams, smoke, liquid)}
 
 
 def some_media(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:

@@ -100,15 +100,7 @@ def blots(rng: np.random.Generator) -> np.ndarray:
 
 PATTERNS: dict[str, Callable[[np.random.Generator], np.ndarray]] = {
     "noise": lambda rng: noise(rng, rng.uniform(0.4, 1.8)),
-    "marble": marble,
-    "wood": wood,
-    "bricks": bricks,
-    "checks": checks,
-    "stripes": stripes,
-    "weave": weave,
-    "dots": dots,
-    "text": text,
-    "blots": blots,
+    **{make.__name__: make for make in (marble, wood, bricks, checks, stripes, weave, dots, text, blots)},
 }
 
 

@@ -236,13 +236,5 @@ def picture(rng: np.random.Generator, width: float, height: float) -> list[Part]
 
 
 LARGE: dict[str, Callable[[np.random.Generator], list[Part]]] = {
-    "table": table,
-    "chair": chair,
-    "sofa": sofa,
-    "shelf": shelf,
-    "plant": plant,
-    "stairs": stairs,
-    "screen": screen,
-    "column": column,
-    "sculpture": sculpture,
+    make.__name__: make for make in (table, chair, sofa, shelf, plant, stairs, screen, column, sculpture)
 }

@@ -56,19 +56,14 @@ class Paths:
 
 @dataclass
 class State:
-    """A chain: its numbers, the path of these, and what that path has to splat yet.
-
-    ``f``         its value
-    ``weight``    how many steps the chain is expected to have been there, since it came
-    ``accepted``  mutations so far
-    """
+    """A chain: its numbers, the path of these, and what that path has to splat yet."""
 
     vector: dr.Local
     pixel: mi.UInt32
     layers: dict
-    f: mi.Float
-    weight: mi.Float
-    accepted: mi.UInt32
+    f: mi.Float  # its value
+    weight: mi.Float  # how many steps the chain is expected to have been there, since it came
+    accepted: mi.UInt32  # mutations so far
 
 
 def run(

@@ -37,16 +37,11 @@ def acceptance(f: mi.Float, proposed: mi.Float) -> mi.Float:
 
 @dataclass
 class Proposal:
-    """The numbers of a mutation, one after the other; instead of a sampler.
+    """The numbers of a mutation, one after the other; instead of a sampler."""
 
-    ``vector``  the numbers of the chain's state, a ``dr.Local``
-    ``random``  one number for each of them
-    ``large``   all numbers are new, independent of the state's
-    """
-
-    vector: dr.Local
-    random: mi.PCG32
-    large: mi.Bool
+    vector: dr.Local  # the numbers of the chain's state
+    random: mi.PCG32  # one number for each of them
+    large: mi.Bool  # all numbers are new, independent of the state's
     count: mi.UInt32
 
     def next_1d(self, active=True) -> mi.Float:
