@@ -24,7 +24,7 @@ from data_gen.scenes.cameras import place_of
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import check_scene
-from data_gen.tails.schedule import LEAST_MIB, MIB, enough
+from data_gen.tails.cache import LEAST_MIB, MIB, enough
 from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
 from ngpt.io.exr import with_channels
 from ngpt.merging import UNFINISHED

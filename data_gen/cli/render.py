@@ -10,8 +10,8 @@ from typing import Any
 from data_gen.backend import DEFAULT_VARIANT
 from data_gen.begun import Asked, Unfinished, begun_stack, scene_name
 from data_gen.cli import KERNELS
-from data_gen.cli.frames import targets
 from data_gen.cli.render_arguments import add_arguments as add_arguments
+from data_gen.cli.render_arguments import targets
 from data_gen.frames.pattern import filled, varies
 from data_gen.outputs import Denoising, Output
 from data_gen.samplers import check_options

@@ -1,8 +1,10 @@
 """The arguments of ``ngpt render``."""
 
 import argparse
+import re
+from pathlib import Path
 
-from data_gen.cli.frames import frames
+from data_gen.frames.pattern import filled, varies
 from data_gen.samplers import by_standing
 from data_gen.session import DEFAULT_SPP
 from ngpt.cli.arguments import (
@@ -18,7 +20,9 @@ from ngpt.cli.arguments import (
     size,
 )
 from ngpt.cli.picture import IMAGES, add_look
+from ngpt.errors import WrongUse
 from ngpt.methods import METHODS
+from ngpt.system.files import make_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -147,3 +151,63 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="skip finished images and continue unfinished ones",
     )
     add_json(parser)
+
+
+# More than anyone renders; a typing error must not fill the memory.
+_MOST = 1_000_000
+
+
+def frames(text: str) -> list[int]:
+    """``0:120`` (120 is not in it), ``0:120:2``, ``7``, or several of them with commas between; in order.
+
+    And as farms write them, with the last one in it: ``1-10``, ``1-9x2``, ``1-9:2``.
+    """
+    numbers: dict[int, None] = {}
+    for some in text.split(","):
+        try:
+            values = _of_a_farm(some) or [int(number) for number in some.split(":")]
+        except ValueError:
+            values = []
+        if len(values) not in (1, 2, 3):
+            raise argparse.ArgumentTypeError(
+                f"'{some}' is no frame; write 7, 0:120 (120 is not in it), 0:120:2, or 0-119 (119 is in it)"
+            )
+        found = range(values[0], values[0] + 1) if len(values) == 1 else range(*values) if 0 not in values[2:] else ()
+        if not found or len(found) > _MOST:
+            raise argparse.ArgumentTypeError(f"'{some}' are {len(found)} frames; write START:END or START:END:STEP")
+        numbers.update(dict.fromkeys(found))
+    return list(numbers)
+
+
+def _of_a_farm(some: str) -> list[int]:
+    """First, end and step of ``1-10``, whose end is in it; [] for anything else."""
+    match = re.fullmatch(r"(-?\d+)-(-?\d+)(?:[x:](-?\d+))?", some)
+    if not match:
+        return []
+    step = int(match[3] or 1)
+    return [int(match[1]), int(match[2]) + (1 if step > 0 else -1), step]
+
+
+def targets(output: str | None, scene: str, numbers: list[int]) -> dict[int, Path]:
+    """Frame -> file. ``output`` is a pattern (``shot.{frame:04d}.exr``), or a folder, which is made if it is not there.
+
+    Raises WrongUse for a name that is one file for several frames.
+    """
+    stem = re.sub(r"[._-]*\{[^{}]*\}", "", Path(scene).stem) or "frame"
+    pattern = output if output is not None else f"{stem}.{{frame:04d}}.exr"
+    if not varies(pattern):
+        folder = Path(pattern)
+        if folder.suffix.lower() in IMAGES and not folder.is_dir():
+            if len(numbers) > 1:
+                named = f"{folder.with_suffix('')}.{{frame:04d}}{folder.suffix}"
+                raise WrongUse(f"{folder}: is one file for {len(numbers)} frames; write -o '{named}', or a folder")
+            return {numbers[0]: folder}
+        pattern = str(make_folder(folder) / f"{stem}.{{frame:04d}}.exr")
+    found = {number: Path(filled(pattern, number)) for number in numbers}
+    seen: dict[Path, int] = {}
+    for number, path in found.items():
+        if (other := seen.setdefault(path, number)) != number:
+            raise WrongUse(f"{path}: would be frame {other} and frame {number}; write {{frame:04d}} in the name")
+    for path in found.values():
+        make_folder(path.parent)
+    return found

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from data_gen.paths.vertex import Materials
 from ngpt.errors import NgptError
 
 # An emitter is an area, a point (spots are points that fill a cone), or infinitely far away.
@@ -245,3 +247,13 @@ def _somewhere(position: mi.Point3f, time, wavelengths) -> mi.Interaction3f:
     it = dr.zeros(mi.Interaction3f, dr.width(position))
     it.t, it.p, it.time, it.wavelengths = 0, position, time, wavelengths
     return it
+
+
+@dataclass
+class World:
+    """It does not change in a render. Functions that are ``frozen`` take it as one argument."""
+
+    scene: mi.Scene
+    lights: LightEnds
+    materials: Materials | None = None  # for samplers that ask nothing of them
+    fog: Any = None  # ``photons.map.fog.Fog``: the media, for samplers that gather photons there

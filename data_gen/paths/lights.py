@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.camera import QUARTERS, CameraSamples
+from data_gen.scenes.lamps import Chosen, Places
 from data_gen.scenes.load import path_depths
-from data_gen.scenes.places import Chosen, Places
 
 # Shapes that Mitsuba samples uniformly by area, besides meshes; for spheres it samples the visible part.
 _UNIFORM_SHAPES = ("Rectangle", "Disk", "Cylinder")

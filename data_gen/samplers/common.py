@@ -23,9 +23,8 @@ from data_gen.samplers.registry import SAMPLERS, Sampler, by_plugin, find
 from data_gen.scenes.cameras import check_camera
 from data_gen.scenes.facts import Facts, scene_facts
 from data_gen.scenes.integrators import own_estimate
-from data_gen.scenes.lamps import weighed
+from data_gen.scenes.lamps import Places, weighed
 from data_gen.scenes.load import path_depths, reference_integrator
-from data_gen.scenes.places import Places
 from ngpt.layers import LAYERS
 from ngpt.options import written
 

@@ -27,15 +27,14 @@ def chains(renderer):
 
 @pytest.fixture
 def mutation(renderer):
-    from data_gen.samplers.studies.gmlt import mutation
 
     return mutation
 
 
 def test_small_steps_go_either_way_and_around(mutation):
-    rng, small, large = np.random.default_rng(0), mutation.SMALLEST, mutation.LARGEST
+    rng, small, large = np.random.default_rng(0), chains.SMALLEST, chains.LARGEST
     x = rng.random(100_000, np.float32)
-    y = np.array(mutation.small_step(mi.Float(x), mi.Float(rng.random(x.size, np.float32))), np.float64)
+    y = np.array(chains.small_step(mi.Float(x), mi.Float(rng.random(x.size, np.float32))), np.float64)
     assert np.all((y >= 0) & (y < 1))
     step = (y - x + 0.5) % 1 - 0.5
     assert np.all((np.abs(step) > small * 0.999) & (np.abs(step) < large * 1.001))
@@ -46,7 +45,7 @@ def test_small_steps_go_either_way_and_around(mutation):
     counts = np.histogram(y, 50, (0, 1))[0]
     assert np.square(counts - 2000).sum() / 2000 < 100
     # Around both ends, and what rounds to 1 is 0.
-    ends = np.array(mutation.small_step(mi.Float([0.0, 1 - 2**-24, 1e-9]), mi.Float([0.1, 0.9, 0.49999])))
+    ends = np.array(chains.small_step(mi.Float([0.0, 1 - 2**-24, 1e-9]), mi.Float([0.1, 0.9, 0.49999])))
     assert ends[0] > 0.98 and ends[1] < 0.02 and 0 <= ends[2] < 1
 
 
@@ -54,9 +53,9 @@ def test_acceptance_balances_every_pair_of_states(mutation):
     """f(x) a(x -> y) = f(y) a(y -> x); from and to what has no value as well."""
     f = np.array([1e-20, 1e-3, 0.5, 0.5, 2, 7, 1e6], np.float32)
     x, y = (mi.Float(a.ravel()) for a in np.meshgrid(f, f))
-    there, back = mutation.acceptance(x, y), mutation.acceptance(y, x)
+    there, back = chains.acceptance(x, y), chains.acceptance(y, x)
     assert np.allclose(x * there, y * back, rtol=1e-6) and dr.all(there <= 1)
-    assert mutation.acceptance(mi.Float(1), mi.Float(0))[0] == 0
+    assert chains.acceptance(mi.Float(1), mi.Float(0))[0] == 0
 
 
 class Steps:

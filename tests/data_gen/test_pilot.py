@@ -167,5 +167,5 @@ def test_seeds_of_trials_do_not_depend_on_other_samplers(monkeypatch):
     before = {name: trials.seed_of(name) for name in SAMPLERS}
     seeds = {seed + i for seed in before.values() for i in range(8)}
     assert len(seeds) == 8 * len(before) and max(seeds) < 2**64
-    monkeypatch.setattr(trials, "SAMPLERS", {"first": Sampler("first", "of another package"), **SAMPLERS})
+    monkeypatch.setattr(trials, "SAMPLERS", {"first": Sampler("first", "of another package", "first"), **SAMPLERS})
     assert {name: trials.seed_of(name) for name in before} == before

@@ -11,8 +11,8 @@ from split_scenes import coats, everything, principled, shelf, without_gloss
 from unbiased import assert_unbiased, load, render_ours
 
 import ngpt
-from data_gen.paths.lobes import Lobes
 from data_gen.render import render_stack
+from data_gen.samplers.studies.split import Lobes
 from ngpt.cli import main
 from ngpt.layers import LAYERS
 from ngpt.merging import merge

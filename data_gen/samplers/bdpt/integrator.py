@@ -34,9 +34,8 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.eye import Sight
 from data_gen.paths.features import features
 from data_gen.paths.frozen import Frozen
-from data_gen.paths.light_ends import LightEnds
+from data_gen.paths.light_ends import LightEnds, World
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.world import World
 from data_gen.samplers.bdpt.camera_path import camera_path
 from data_gen.samplers.bdpt.light_path import Seen, light_path
 from data_gen.samplers.bdpt.plan import Plan

@@ -10,9 +10,8 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.eye import Sight
-from data_gen.paths.light_ends import LightRay
+from data_gen.paths.light_ends import LightRay, World
 from data_gen.paths.walk import roulette
-from data_gen.paths.world import World
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.plan import Plan
 from data_gen.samplers.bdpt.strategies import to_camera

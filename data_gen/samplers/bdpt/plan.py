@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.light_ends import World
 from data_gen.paths.walk import Limits
-from data_gen.paths.world import World
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Partial
 

@@ -10,7 +10,7 @@ from data_gen.paths.lights import Lights
 from data_gen.paths.space import Filled, Space
 from data_gen.paths.vertex import Materials
 from data_gen.paths.walk import Limits
-from data_gen.scenes.places import Places
+from data_gen.scenes.lamps import Places
 from data_gen.tails.matt import Matt
 from ngpt.errors import NgptError
 

@@ -15,9 +15,8 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.frozen import Frozen
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.gpt.tails import feed
-from data_gen.tails import schedule
-from data_gen.tails.cache import Cache, Known, joined
-from data_gen.tails.cells import Place
+from data_gen.tails import cache as tails
+from data_gen.tails.cache import Cache, Known, Place, joined
 
 # Paths that feed the cache have random numbers of their own: "TAILS".
 _SEED = 0x5441494C53
@@ -59,19 +58,19 @@ class SharedTails:
         return self.cache is not None
 
     def end_of_round(self, sample: int) -> int | None:
-        return schedule.end_of_round(sample) if self.cache else None
+        return tails.end_of_round(sample) if self.cache else None
 
     def begin(self, sensor: mi.Sensor, seed: int, sample: int, spp: int | None) -> None:
         """Feeds the cache if this ``sample`` begins a round."""
         if sample == 0:
             # The light of the layer ``caustic`` is kept apart, where there is such a layer.
-            empty = Cache(schedule.fineness(0), 2 if self.plan.caustic else 1) if self.plan.matt.any else None
+            empty = Cache(tails.fineness(0), 2 if self.plan.caustic else 1) if self.plan.matt.any else None
             self.cache, self.fed = empty, 0
         if self.cache is None:
             return
         pixels = int(dr.prod(mi.ScalarVector2u(sensor.film().crop_size())))
-        wanted = max(round(schedule.paths_before(sample, spp) * pixels), schedule.FEWEST)
-        fineness = schedule.fineness(sample)
+        wanted = max(round(tails.paths_before(sample, spp) * pixels), tails.FEWEST)
+        fineness = tails.fineness(sample)
         for part in (round(_FIRST_PART * wanted), wanted) if sample == 0 else (wanted,):
             while self.fed < part:
                 first = self.fed == 0

@@ -29,9 +29,7 @@ from data_gen.paths.mis import gradient_weight
 from data_gen.paths.walk import UNLIMITED
 from data_gen.samplers.gpt.base_path import Path, base_step, begin
 from data_gen.samplers.gpt.plan import Plan
-from data_gen.tails.cache import Known
-from data_gen.tails.cells import Place, Trail, place_of
-from data_gen.tails.schedule import NEAR
+from data_gen.tails.cache import NEAR, Known, Place, Trail, place_of
 
 # Records that a path may have
 RECORDS = 3

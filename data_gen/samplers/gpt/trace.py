@@ -13,7 +13,7 @@ from data_gen.samplers.gpt.manifold_shift import Chain
 from data_gen.samplers.gpt.offset_path import Offset, next_steps, start
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.gpt.tails import end
-from data_gen.tails.cells import Trail
+from data_gen.tails.cache import Trail
 
 
 @dataclass

@@ -12,7 +12,7 @@ from data_gen.film import GradientFilm
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.frozen import Frozen
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 
 
 @dataclass

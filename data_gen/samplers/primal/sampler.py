@@ -20,8 +20,8 @@ from data_gen.samplers.gpt.trace import trace
 from data_gen.samplers.registry import SAMPLERS
 from data_gen.samplers.shared import VOLUMETRIC
 from data_gen.scenes.facts import integrator_name
+from data_gen.scenes.lamps import Places
 from data_gen.scenes.load import reference_integrator
-from data_gen.scenes.places import Places
 from data_gen.tails.cache import Known
 
 

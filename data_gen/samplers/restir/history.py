@@ -39,15 +39,12 @@ import numpy as np
 from data_gen.passes import recording
 from data_gen.paths.camera import CameraSamples
 from data_gen.samplers.restir.carry import Carry
-from data_gen.samplers.restir.evaluate import evaluate_record
-from data_gen.samplers.restir.footprint import CORNERS, pair_motions
+from data_gen.samplers.restir.evaluate import Request, Requests, evaluate_record, evaluate_some
 from data_gen.samplers.restir.layout import RESERVOIRS, STEPS, Layout, across, step
 from data_gen.samplers.restir.merging import Evaluated, Merging, differences
-from data_gen.samplers.restir.pose import Pose
 from data_gen.samplers.restir.record import Record
-from data_gen.samplers.restir.requests import Request, Requests, evaluate_some
-from data_gen.samplers.restir.reservoir import Reservoir, confidence_after
-from data_gen.samplers.restir.stage import Stage, check
+from data_gen.samplers.restir.reservoir import CORNERS, Reservoir, confidence_after, pair_motions
+from data_gen.samplers.restir.stage import Pose, Stage, check
 from data_gen.samplers.restir.walk import Candidate, choices, walk
 
 

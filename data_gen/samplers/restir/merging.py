@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.samplers.restir.footprint import CORNERS
+from data_gen.samplers.restir.evaluate import Requests
 from data_gen.samplers.restir.layout import STEPS, Layout, step
 from data_gen.samplers.restir.record import gather, select
-from data_gen.samplers.restir.requests import Requests
-from data_gen.samplers.restir.reservoir import Reservoir, choose, difference, part, weigh, weight_of
+from data_gen.samplers.restir.reservoir import CORNERS, Reservoir, choose, difference, part, weigh, weight_of
 from data_gen.samplers.restir.walk import Candidate
 
 

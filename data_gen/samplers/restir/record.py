@@ -2,7 +2,7 @@ r"""A path in 80 bytes: all that is needed to find its counterpart in another pi
 
 A path is a prefix, a vertex *rc* where copies of the path reconnect to it, and what comes behind. The prefix is not
 stored but replayed: its random numbers belong to a pixel and a sample. rc is the first vertex that is joined to its
-predecessor: a smooth event between two connectable vertices, see ``data_gen.samplers.restir.events``. Each part has a
+predecessor: a smooth event between two connectable vertices, see ``data_gen.samplers.restir.walk``. Each part has a
 measure of its own, so that a shift has one Jacobian and not one at each vertex:
 
 | part | measure | Jacobian of a shift |

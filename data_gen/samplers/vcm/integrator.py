@@ -10,7 +10,7 @@ all light, and each path counts for each of them by the balance heuristic: by ho
 
 A pass has one camera sample and one light path for each pixel. Light paths are traced once: their vertices are
 connected to the camera (splats), kept in a map, connected to the camera path of the same sample (one of them,
-``bdpt.choice``), and gathered at all camera paths, within the radius, where materials scatter widely. The radius
+``bdpt.camera_path``), and gathered at all camera paths, within the radius, where materials scatter widely. The radius
 shrinks from pass to pass as in ``ppm``.
 
 Photons are gathered only where light comes from mirrors, clear glass or holes. The papers gather all; but where it
@@ -36,15 +36,13 @@ from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.eye import Sight
 from data_gen.paths.features import features
-from data_gen.paths.light_ends import LightEnds
+from data_gen.paths.light_ends import LightEnds, World
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials
-from data_gen.paths.world import World
 from data_gen.samplers.bdpt.camera_path import camera_path
 from data_gen.samplers.bdpt.integrator import BDPT, Splatter
 from data_gen.samplers.bdpt.light_path import light_path
-from data_gen.samplers.photons.map.edges import number_of
-from data_gen.samplers.photons.map.radius import pixel_width, shrunk
+from data_gen.samplers.photons.map.radius import number_of, pixel_width, shrunk
 from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.vcm.merging import VERTEX_BYTES, Keeper, Map, Merging, Photons, eta
 

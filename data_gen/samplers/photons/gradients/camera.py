@@ -17,10 +17,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.light_ends import World
 from data_gen.paths.mis import gradient_weight
 from data_gen.paths.vertex import SMOOTH, Materials, event_kind
 from data_gen.paths.walk import Sky, brightest, roulette
-from data_gen.paths.world import World
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.photons.passes import Start
 

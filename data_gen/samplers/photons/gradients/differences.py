@@ -11,12 +11,11 @@ import mitsuba as mi
 
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.light_ends import World
 from data_gen.paths.mis import gradient_weight
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.world import World
 from data_gen.samplers.photons.gradients.camera import Level
-from data_gen.samplers.photons.gradients.near import Near
-from data_gen.samplers.photons.gradients.pairs import Pairs, pieces
+from data_gen.samplers.photons.gradients.pairs import Near, Pairs, pieces
 from data_gen.samplers.photons.passes import Begun, Passes
 
 # Levels are joined until they have so many paths for each camera sample.

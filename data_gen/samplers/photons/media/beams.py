@@ -32,7 +32,7 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import collisions, media
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.trace import EDGE_BYTES, VERTICES_PER_PATH

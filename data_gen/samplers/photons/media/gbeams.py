@@ -22,15 +22,14 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera_in_media import PathsByPieces, Piece
 from data_gen.samplers.photons.gradients.copies import LightPaths, let_through, redirected
 from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, Gathered
 from data_gen.samplers.photons.integrator import Traced
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.photon import Photon
-from data_gen.samplers.photons.map.vertices import at
+from data_gen.samplers.photons.map.vertices import Photon, at
 from data_gen.samplers.photons.media.beams import BEAM_BYTES, PART_BYTES, AlongBeams, nearest, parts_of
 from data_gen.samplers.photons.media.gbre import PATHS_BYTES, Beside, beside_of, inside_of
 from data_gen.samplers.photons.passes import Passes

@@ -26,7 +26,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera_in_media import PathsByPieces, Piece
 from data_gen.samplers.photons.gradients.copies import LightPaths, copy_in_medium
@@ -34,8 +34,7 @@ from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, G
 from data_gen.samplers.photons.gradients.pairs import Rays
 from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.photon import Photon, photon_of
-from data_gen.samplers.photons.map.vertices import in_media
+from data_gen.samplers.photons.map.vertices import Photon, in_media, photon_of
 from data_gen.samplers.photons.media.bre import BALL, seen_along
 from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.photons.surfaces.gpm import GPM, OnSurfaces

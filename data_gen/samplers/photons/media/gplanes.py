@@ -25,14 +25,14 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera_in_media import Piece
 from data_gen.samplers.photons.gradients.differences import Gathered
 from data_gen.samplers.photons.integrator import Traced
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.photon import Photon
 from data_gen.samplers.photons.map.trace import VERTICES_PER_PATH
+from data_gen.samplers.photons.map.vertices import Photon
 from data_gen.samplers.photons.media.bre import seen_along
 from data_gen.samplers.photons.media.gbeams import GBEAMS
 from data_gen.samplers.photons.media.gbre import Beside, beside_of, inside_of

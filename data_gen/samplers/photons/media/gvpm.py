@@ -25,7 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera_segments import Flight, PathsBySegments
 from data_gen.samplers.photons.gradients.copies import LightPaths
@@ -34,8 +34,7 @@ from data_gen.samplers.photons.gradients.pairs import Points
 from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.photon import Photon
-from data_gen.samplers.photons.map.vertices import in_media
+from data_gen.samplers.photons.map.vertices import Photon, in_media
 from data_gen.samplers.photons.media.bre import seen_along
 from data_gen.samplers.photons.media.gbre import PATHS_BYTES, InMedia
 from data_gen.samplers.photons.passes import Passes

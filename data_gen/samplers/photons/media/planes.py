@@ -33,7 +33,7 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import media, segments
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.integrator import Traced
 from data_gen.samplers.photons.map.trace import VERTICES_PER_PATH
 from data_gen.samplers.photons.media.beams import BEAMS

@@ -28,16 +28,15 @@ import numpy as np
 
 from data_gen.film import GradientFilm
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.gradients.camera import CameraPaths, Path
 from data_gen.samplers.photons.gradients.copies import LightPaths, copy
 from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen, gradient_pass
 from data_gen.samplers.photons.gradients.pairs import Points
 from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
-from data_gen.samplers.photons.map.edges import number_of, spread
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.photon import Photon, is_near, light, photon_of
-from data_gen.samplers.photons.map.vertices import on_surfaces
+from data_gen.samplers.photons.map.radius import number_of, spread
+from data_gen.samplers.photons.map.vertices import Photon, is_near, light, on_surfaces, photon_of
 from data_gen.samplers.photons.passes import Passes
 
 # Bytes of a camera sample beside that: levels of five paths with their rays, hits and throughputs, and as many sums

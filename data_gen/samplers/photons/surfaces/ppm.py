@@ -31,17 +31,16 @@ import numpy as np
 from data_gen.film import GradientFilm
 from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.light_ends import World
 from data_gen.paths.segments import next_surface
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.paths.walk import Sky, roulette
-from data_gen.paths.world import World
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
-from data_gen.samplers.photons.map.edges import number_of, spread
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.photon import faces, light, photon_of
-from data_gen.samplers.photons.map.vertices import on_surfaces
+from data_gen.samplers.photons.map.radius import number_of, spread
+from data_gen.samplers.photons.map.vertices import faces, light, on_surfaces, photon_of
 from data_gen.samplers.photons.passes import Begun, Passes, Start
 
 
