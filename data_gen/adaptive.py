@@ -1,9 +1,9 @@
 """Samples where they pay: after a few samples everywhere, more of them where the result's error is large.
 
 Before each step the method that is to reconstruct the image runs twice, which tells the standard error of its result
-(``ngpt.api.uncertainty``). docs/use/adaptive.md says how the samples of a step follow from it. The samples that decide
-the counts stay in the means, so a pixel whose first samples were too dark by chance might get too few. Two things keep
-this bias small: errors are means over about 9x9 pixels, and relative to the light there.
+(``ngpt.api.uncertainty``); docs/use/adaptive.md says how the samples of a step follow from it. The samples that decide
+the counts stay in the means, so a pixel whose first samples were too dark by chance might get too few: errors that are
+means over about 9x9 pixels, relative to the light there, keep this bias small.
 """
 
 from __future__ import annotations
@@ -82,13 +82,7 @@ def check_adaptive(adaptive: Adaptive, sampler: Sampler, options: dict, spp: int
 
 
 def render_adaptive(
-    sample: SamplePass,
-    sensor: mi.Sensor,
-    seed: int,
-    adaptive: Adaptive,
-    budget: Budget,
-    watch: Watch,
-    **how: Any,
+    sample: SamplePass, sensor: mi.Sensor, seed: int, adaptive: Adaptive, budget: Budget, watch: Watch, **how: Any
 ) -> tuple[GradientFilm, dict]:
     """The film, and attributes that say what its samples were chosen for.
 
@@ -98,8 +92,8 @@ def render_adaptive(
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     pixels = width * height
-    spp, seconds, stop = budget.spp, budget.seconds, watch.stop
-    start, total = time.perf_counter(), spp or LEAST
+    spp, seconds, stop, start = budget.spp, budget.seconds, watch.stop, time.perf_counter()
+    total = spp or LEAST
 
     def report() -> None:
         if seconds is not None:
@@ -154,8 +148,6 @@ def render_adaptive(
 
 @dataclass(frozen=True)
 class Assessment:
-    """What a method makes of a stack."""
-
     relative: np.ndarray  # the standard error of each pixel relative to its light, (pixels)
     error: float  # in all
     method: str
@@ -163,8 +155,7 @@ class Assessment:
 
 def assess(stack: GradientStack, method: str) -> Assessment:
     """The expected error of what a method would make of the stack."""
-    result = reconstruct(stack, method)
-    again = reconstruct(noisier(stack), method)
+    result, again = reconstruct(stack, method), reconstruct(noisier(stack), method)
     light = ndimage.uniform_filter(np.nan_to_num(result.image).astype(np.float64), (3, 3, 1))
     unit = np.sqrt(np.square(light) + EPSILON)
     # Made relative before averaging over neighbours: the error of a lamp's edge must not count for the dark beside it.
@@ -292,9 +283,8 @@ class UnevenRender:
         within = np.arange(len(some)) - np.repeat(starts, blocks)
         first = mi.UInt32(np.repeat(self.film.samples_each[pixels], blocks) + BLOCK * within)
         with recording():
-            self.sample(
-                CameraSamples(self.sensor, self.seed, BLOCK, first, BLOCK, mi.UInt32(some), net=self.net), self.film
-            )
+            camera = CameraSamples(self.sensor, self.seed, BLOCK, first, BLOCK, mi.UInt32(some), net=self.net)
+            self.sample(camera, self.film)
             self.film.end_pass(BLOCK, some)
         dr.sync_thread()
         self.blocks_left -= len(some)

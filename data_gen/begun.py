@@ -96,7 +96,7 @@ class Rest:
 
 @dataclass(frozen=True)
 class Asked:
-    """What is asked for; ``spp``, ``seconds`` and ``error`` end a render, whichever is reached first."""
+    """What is asked for; of ``spp``, ``seconds`` and ``error`` the one reached first ends a render."""
 
     scene: str
     seed: int
@@ -169,9 +169,8 @@ class Asked:
         named = _options(str(attributes.get(OPTIONS, "")))
         options = named - _EITHER
         # What the file's sampler is called with if any will do; one from another package may be missing here.
-        entry = FRAME_SAMPLERS.get(self.sampler) or (
-            SAMPLERS.get(sampler) if self.sampler in ("auto", sampler) else None
-        )
+        own = SAMPLERS.get(sampler) if self.sampler in ("auto", sampler) else None
+        entry = FRAME_SAMPLERS.get(self.sampler) or own
         wanted = _options(entry.unusual(entry.settings(self.options))) - _EITHER if entry else options
         unbiased = self.unbiased or self.options.get("tails") == "paths"
         theirs_shared, ours_shared = self._sharing(attributes, len(seeds))
@@ -228,25 +227,22 @@ def rendered(read: GradientStack) -> GradientStack:
     return with_channels(stack, further) if further else stack
 
 
-def joined(begun: GradientStack, rest: GradientStack) -> GradientStack:
-    """Merges both parts; the attributes that say how the render ended come from ``rest``."""
-    whole = merge([begun, rest])
-    whole.attributes |= {name: rest.attributes[name] for name in (UNFINISHED, TIME) if name in rest.attributes}
+def joined_or_kept(path: Path, rest: GradientStack, begun: GradientStack) -> GradientStack:
+    """Both parts merged; the attributes that say how the render ended come from ``rest``.
+
+    Where that fails, the rest is written beside ``path``, and NgptError says so.
+    """
+    try:
+        whole = merge([begun, rest])
+    except NgptError as error:
+        raise kept_apart(str(error), rest, path.with_name(f"{path.stem}.rest.exr"), "was rendered now") from error
+    last = (UNFINISHED, TIME, "ngpt:adaptive")
+    whole.attributes |= {name: rest.attributes[name] for name in last if name in rest.attributes}
     # Errors fall with the root of the samples.
     errors = [n for stack in (begun, rest) if (n := _number(stack.attributes, "ngpt:error"))]
     if errors:
         whole.attributes["ngpt:error"] = 1 / math.sqrt(sum(n**-2 for n in errors))
-    if "ngpt:adaptive" in rest.attributes:
-        whole.attributes["ngpt:adaptive"] = rest.attributes["ngpt:adaptive"]
     return whole
-
-
-def joined_or_kept(path: Path, rest: GradientStack, begun: GradientStack) -> GradientStack:
-    """``joined``; where that fails, the rest is written beside ``path``, and NgptError says so."""
-    try:
-        return joined(begun, rest)
-    except NgptError as error:
-        raise kept_apart(str(error), rest, path.with_name(f"{path.stem}.rest.exr"), "was rendered now") from error
 
 
 def kept_apart(why: str, stack: GradientStack, path: Path, what: str = "was rendered") -> NgptError:
@@ -285,6 +281,5 @@ def _colours(variant: str) -> str:
 
 
 def _number(attributes: Mapping[str, Any], name: str) -> float:
-    """An attribute that is a number, else 0."""
     value = attributes.get(name)
     return float(value) if isinstance(value, int | float | np.number) and math.isfinite(value) else 0.0

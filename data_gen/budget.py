@@ -39,8 +39,6 @@ class Budget:
 
 @dataclass(frozen=True)
 class Watch:
-    """Callbacks during a render."""
-
     progress: Progress = lambda done, total: None  # called before the first pass and after each
     stop: Callable[[], bool] = lambda: False  # asked after each pass whether to end there
     # Called with the ``GradientFilm`` after each pass, before ``stop``; it leaves the film as it is

@@ -68,6 +68,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         hides=hides,
     )
     sampler, reason = choose(facts)
+    still = f"Mitsuba {mi.__version__} has no animation"
     return {
         "plugins": {kind.lower(): dict(counts.most_common()) for kind, counts in plugins.items() if counts},
         "sensors": [camera.text(number, camera is taken) for number, camera in enumerate(sensors)],
@@ -83,7 +84,8 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
             *([unable] if unable else SAMPLERS[sampler].notes_on(facts)),
             *([f"integrator '{integrator}': the image of '{followed}' is rendered"] * (integrator != followed)),
             *_contents(plugins, facts),
-            *_camera(lens, shutter),
+            *(["depth of field: base and offset paths share their lens samples"] * lens),
+            *([f"shutter: open for {shutter:g} s and sampled, but nothing moves: {still}"] * (shutter > 0)),
         ],
     }
 
@@ -146,10 +148,9 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
     points = any(name in _POINTS for name in plugins["Emitter"])
     if any(name in plugins["BSDF"] for name in _LENSES):
         if able := _finding(facts, "caustics"):
+            how = "by photons alone for lights without size" if points else "best by photons"
             lines.append(
-                "glass: the light behind it, where that is seen in mirrors or through glass, "
-                + ("is found by photons alone for lights without size: " if points else "is found best by photons: ")
-                + able
+                f"glass: the light behind it, where that is seen in mirrors or through glass, is found {how}: {able}"
             )
         if able := _finding(facts, "caustics", and_hidden_lamps=True):
             lines.append(
@@ -172,22 +173,6 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
 
 def _finding(facts: Facts, light: str, and_hidden_lamps: bool = False) -> str:
     """The arguments that name samplers, studies left out, which can render the scene and find such light."""
-    found = [
-        name
-        for name, sampler in SAMPLERS.items()
-        if sampler.standing != "study" and not sampler.refuses(facts)
-        if light in sampler.finds and ("hidden lamps" in sampler.finds) == and_hidden_lamps
-    ]
+    able = {name: s for name, s in SAMPLERS.items() if s.standing != "study" and not s.refuses(facts)}
+    found = [n for n, s in able.items() if light in s.finds and ("hidden lamps" in s.finds) == and_hidden_lamps]
     return ", ".join(f"`--sampler {name}`" for name in found)
-
-
-def _camera(lens: bool, shutter: float) -> list[str]:
-    """What base and offset paths share beside random numbers."""
-    lines = []
-    if lens:
-        lines.append("depth of field: base and offset paths share their lens samples")
-    if shutter > 0:
-        lines.append(
-            f"shutter: open for {shutter:g} s and sampled, but nothing moves: Mitsuba {mi.__version__} has no animation"
-        )
-    return lines

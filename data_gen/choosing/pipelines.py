@@ -48,8 +48,6 @@ REALISED, FROM = 2.0, 2 * LEAST
 
 @dataclass(frozen=True)
 class Pipeline:
-    """A sampler and a method, as a pilot saw them."""
-
     sampler: str
     method: str
     spp: int  # samples per pixel at which the ``error`` was measured
@@ -63,7 +61,6 @@ class Pipeline:
 
     @property
     def shared(self) -> bool:
-        """Whether samples are adaptive."""
         return self.choosing > 0
 
     @property

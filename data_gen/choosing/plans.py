@@ -1,17 +1,17 @@
 """Which sampler, how many samples and which method: chosen by a pilot, small renders by each sampler that could do it.
 
 ``plan`` is for a given time and a method that makes the image: the least error wins. ``plan_sampler`` is for
-``--sampler auto`` where the method is not known. It does the same with even samples and one simple method for each
-sampler: ``wcv`` where there are gradients, else none. It compares the times to reach the error that the scene's own
-sampler is expected to have at the end. It chooses photons where they are clearly better, but not in scenes whose light
-only photons can find. No pilot can see light that none of the samplers has found.
+``--sampler auto`` where the method is not known. It compares, with even samples and one simple method for each sampler,
+the times to reach the error that the scene's own sampler is expected to have at the end. It chooses photons where they
+are clearly better, but not in scenes whose light only photons can find. No pilot can see light that none of the
+samplers has found.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -34,9 +34,8 @@ from ngpt.system.console import brief
 SHARE, SHARE_WITH_METHODS = 0.2, 0.3
 _SHARE_OF_RENDER = 0.15
 # Seconds for an image below which a pilot costs more than it could gain. The trials of gpt and primal on the smallest
-# images take 3.0, 5.5, 5.6 and 13.5 processor seconds (diffuse, glossy, coffee, dining-room), and the methods of the
-# first two 3.5 and 4.4. Two idle cores finish the trials of a room within a fifth of this time. On a slower machine
-# they do not fit, and their time is lost.
+# images take 3.0 to 13.5 processor seconds (diffuse, glossy, coffee, dining-room), the methods about 4. On a machine
+# where they do not fit into a fifth of this time, their time is lost.
 LEAST_SECONDS = 40.0
 # What `ngpt denoise` takes beside the method, and `ngpt render` to write the stack: for the process to begin, and to
 # write a million pixels, read them and write the image
@@ -63,8 +62,6 @@ _RAYS, _IN_ROOMS = 1 << 12, 0.9
 
 @dataclass(frozen=True)
 class Plan:
-    """How a scene is rendered, and why."""
-
     sampler: str
     method: str  # whose result it was chosen for; "" if the method is not known
     shared: bool  # whether samples are adaptive
@@ -101,13 +98,9 @@ def explore(
         lambda sampler: methods_for(sampler, method),
         goes_on=lambda: pilot.clock() - start < SHARE_WITH_METHODS * seconds and not pilot.stop(),
     )
+    grows = scale**_GROWS
     return [
-        replace(
-            p,
-            seconds=p.seconds * scale,
-            after=p.after * scale**_GROWS + _beside(scene),
-            choosing=p.choosing * scale**_GROWS,
-        )
+        replace(p, seconds=p.seconds * scale, after=p.after * grows + _beside(scene), choosing=p.choosing * grows)
         for p in found
     ]
 
@@ -120,7 +113,8 @@ def _beside(scene: mi.Scene) -> float:
 def _able(scene: mi.Scene, method: str) -> list[str]:
     """The samplers to try, whose stacks the method can use: the one that the description stands for first."""
     names = candidates(scene)
-    able = [n for n in sorted(dict.fromkeys([*names, "primal"]), key=_turn(names[0])) if methods_for(n, method)]
+    turns = sorted(dict.fromkeys([*names, "primal"]), key=lambda name: (name != names[0], name != "primal"))
+    able = [name for name in turns if methods_for(name, method)]
     if not able:
         raise NgptError(f"method '{method}' cannot use what the samplers of this scene render; name another, or auto")
     return able
@@ -202,9 +196,8 @@ def plan_sampler(
                 return 0.0
             return min(math.inf if spp is None else trials[sampler].seconds * spp * scale, longest)
 
-        trials = try_all(
-            scene, names, lambda trials: _SHARE_OF_RENDER * whole(trials), _SHARE_OF_RENDER * longest, pilot
-        )
+        budget = lambda trials: _SHARE_OF_RENDER * whole(trials)  # noqa: E731
+        trials = try_all(scene, names, budget, _SHARE_OF_RENDER * longest, pilot)
     found = (sampler, reason)
     if sampler in trials and not pilot.stop():
         found = best_of(measure(trials, methods=lambda name: [simple(name)], shared=False), whole(trials) / scale)
@@ -285,10 +278,6 @@ def judge(default: str, times: dict[str, float]) -> tuple[str, str]:
     others = [f"'{name}' takes {brief(times[name] / times[best])} times as long" for name in times if name != best]
     found = f"to the same error, {', '.join(others)}" if others else "there was no time to try others"
     return best, f"chosen by a pilot: {found}"
-
-
-def _turn(first: str) -> Callable[[str], int]:
-    return lambda name: (first, "primal").index(name) if name in (first, "primal") else 2
 
 
 def _why(ranked: Sequence[Pipeline], seconds: float) -> str:

@@ -45,8 +45,6 @@ SEED = 0x9E3779B9
 
 @dataclass(frozen=True)
 class Trial:
-    """What a pilot has seen of a sampler."""
-
     stacks: list[GradientStack]  # four of as many samples
     seconds: float  # of one sample of the whole image
     # The same in processor seconds of all cores together; 0 if not known, or where a graphics card renders
@@ -175,9 +173,7 @@ def try_out(
 
 
 @dataclass(frozen=True)
-class Witnesses:
-    """The primals of trials, which judge the images of each sampler."""
-
+class Witnesses:  # that judge the images of each sampler
     primals: dict[str, list[np.ndarray]]  # four of each sampler, by name
     noise: dict[str, float]  # of a single primal, by name of sampler
     scale: np.ndarray  # what errors are relative to: an image from all samplers, those with little noise count most
@@ -193,15 +189,16 @@ class Witnesses:
     def against(self, sampler: str, half: int) -> tuple[np.ndarray, np.ndarray]:
         """Two independent images without the sampler's other half: made of its own ``half`` and all other unbiased
         samplers. If there are none, only its own images judge it."""
-        a, b = (self._side(sampler, half, i) for i in range(2))
-        return a, b
+        names = [*(n for n in self.primals if n != sampler), sampler]
+        fair = [n for n in names if not SAMPLERS[n].biased] or names
+        noise = {n: self.noise[n] if n == sampler else self.noise[n] / 2 for n in fair}
 
-    def _side(self, sampler: str, half: int, i: int) -> np.ndarray:
-        images = {n: (four[2 * i] + four[2 * i + 1]) / 2 for n, four in self.primals.items() if n != sampler}
-        weights = {n: self.noise[n] / 2 for n in images}
-        images[sampler], weights[sampler] = self.primals[sampler][2 * half + i], self.noise[sampler]
-        fair = [n for n in images if not SAMPLERS[n].biased] or list(images)
-        return mean_of({n: images[n] for n in fair}, weights)
+        def side(i: int) -> np.ndarray:
+            images = {n: (four[2 * i] + four[2 * i + 1]) / 2 for n, four in self.primals.items()}
+            images[sampler] = self.primals[sampler][2 * half + i]
+            return mean_of({n: images[n] for n in fair}, noise)
+
+        return side(0), side(1)
 
     def error(self, sampler: str, halves: Sequence[Sequence[np.ndarray]]) -> float:
         """The error of independent images by ``sampler``, some from each of its halves.
@@ -259,14 +256,13 @@ def at_most(scene: mi.Scene, pixels: int):
     """
     film = scene.sensors()[0].film()
     (width, height), window = (tuple(int(n) for n in numbers) for numbers in (film.size(), film.crop_size()))
-    size = width, height
-    shrink = math.sqrt(pixels / (size[0] * size[1]))
-    if shrink >= 1 or size != window:
+    shrink = math.sqrt(pixels / (width * height))
+    if shrink >= 1 or (width, height) != window:
         yield 1.0
         return
     small = max(1, round(width * shrink)), max(1, round(height * shrink))
     set_film_size(scene, small)
     try:
-        yield size[0] * size[1] / (small[0] * small[1])
+        yield width * height / (small[0] * small[1])
     finally:
-        set_film_size(scene, size)
+        set_film_size(scene, (width, height))

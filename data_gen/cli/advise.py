@@ -40,8 +40,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class Row:
-    """A sampler and a method, with samples even or shared out (``adaptive``)."""
-
     sampler: str
     method: str
     adaptive: bool

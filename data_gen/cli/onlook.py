@@ -97,11 +97,10 @@ class Onlookers:
         return self.spent + self.expected <= SHARE * gone
 
     def _show(self, stack: GradientStack) -> None:
-        shown = preview(stack)
         if self.page is not None:
-            spp, seconds = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
-            size = f"{stack.width}x{stack.height}"
-            self.page.show(shown, f"{size}, {spp} samples per pixel, {seconds:.3g} s")
+            size, attributes = f"{stack.width}x{stack.height}", stack.attributes
+            line = f"{size}, {attributes['ngpt:spp']} samples per pixel, {attributes['ngpt:seconds']:.3g} s"
+            self.page.show(preview(stack), line)
 
 
 def onlookers(live: bool, scene: str, command: str, console: Console, unit: str) -> Onlookers:

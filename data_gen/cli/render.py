@@ -75,7 +75,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
     for option, given in apart.items():
         if given:
             raise WrongUse(f"{option} belongs to a shot; name its frames: --frames 0:120")
-    for text in (args.scene, *(value for _, value in args.define)):
+    for text in (args.scene, *dict(args.define).values()):
         if varies(text):
             raise WrongUse(f"'{text}' changes from frame to frame; name the frames: --frames 0:120")
     target = Path(args.output or f"{Path(args.scene).stem}.exr")
@@ -238,7 +238,6 @@ def shot(args: argparse.Namespace, denoising: Denoising | None, console: Console
 
 
 def described(made: dict[str, Any]) -> str:
-    """The method that made an image, and its time."""
     return f"{made['ngpt:method']} {made['ngpt:reconstructSeconds']:.2f} s"
 
 

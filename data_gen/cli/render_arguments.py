@@ -181,8 +181,7 @@ def frames(text: str) -> list[int]:
 
 def _of_a_farm(some: str) -> list[int]:
     """First, end and step of ``1-10``, whose end is in it; [] for anything else."""
-    match = re.fullmatch(r"(-?\d+)-(-?\d+)(?:[x:](-?\d+))?", some)
-    if not match:
+    if not (match := re.fullmatch(r"(-?\d+)-(-?\d+)(?:[x:](-?\d+))?", some)):
         return []
     step = int(match[3] or 1)
     return [int(match[1]), int(match[2]) + (1 if step > 0 else -1), step]

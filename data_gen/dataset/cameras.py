@@ -61,7 +61,6 @@ class View:
 
     @classmethod
     def of(cls, record: dict) -> View:
-        """The view of a record, which ``asdict`` makes of one."""
         values: dict[str, Any] = {n: tuple(value) if isinstance(value, list) else value for n, value in record.items()}
         return cls(**values)
 

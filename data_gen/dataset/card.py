@@ -59,11 +59,7 @@ def card(data: Dataset, told: dict) -> str:
     sampler = config.get("sampler", "gpt")
     if config["reference_spp"]:
         what = "the noisiest input and the reference"
-        how = (
-            f"References: {sampler} at {config['reference_spp']} samples per pixel, reconstructed by "
-            f"{config['reference_method']}."
-        )
-    else:
+        how = f"{config['reference_method']}."
         what, how = "halves", f"No references: the two inputs of a crop, by {sampler}, judge each other."
     lines = [
         "# Training set",

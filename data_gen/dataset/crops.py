@@ -217,38 +217,27 @@ def _crop(
     stacks = [first] + [render_input(config, scene, *each, made) for each in further]
     seconds = {"inputs": time.perf_counter() - clock}
     cleaned = [finite(stack) for stack in stacks]
-    told = {
-        "spp": counts,
-        "seeds": seeds,
-        **({"adaptive": uneven} if config.adaptive else {}),
-        "repaired": [count for _, count in cleaned],
-        "seconds": seconds,
-    }
+    told: dict[str, Any] = {"spp": counts, "seeds": seeds} | ({"adaptive": uneven} if config.adaptive else {})
+    told |= {"repaired": [count for _, count in cleaned], "seconds": seconds}
     if config.pairs:
         return CropData([stack for stack, _ in cleaned], counts), told
     clock = time.perf_counter()
-    spp = -(-config.reference_spp // HALVES)
+    spp, method = -(-config.reference_spp // HALVES), config.reference_method
     options = {"made": made, **config.unbiased_options}
     halves = [render_stack(scene, spp, seed, config.sampler, **options) for seed in seeds[-HALVES:]]
     converged = merge(halves)
-    reference, caustic = references(converged, config.reference_method)
-    apart = [references(half, config.reference_method)[0] for half in halves]
+    reference, caustic = references(converged, method)
+    apart = [references(half, method)[0] for half in halves]
     seconds["reference"] = time.perf_counter() - clock
     direct = np.nan_to_num(converged["direct"], posinf=0)
     light = np.maximum(reference, direct)
-    data = CropData(
-        [stack for stack, _ in cleaned],
-        counts,
-        light if caustic is None else light + caustic,
-        direct,
-        caustic,
-        tuple(np.maximum(half, direct) for half in apart),
-    )
-    return data, told
+    light = light if caustic is None else light + caustic
+    parts = tuple(np.maximum(half, direct) for half in apart)
+    return CropData([stack for stack, _ in cleaned], counts, light, direct, caustic, parts), told
 
 
 def references(converged: GradientStack, method: str) -> tuple[np.ndarray, np.ndarray | None]:
-    """The clean image without the light of the layer ``caustic``, and that light; None where there is no such layer."""
+    """The clean image without the light of the layer ``caustic``, and that light; None without such a layer."""
     image = reconstruct(converged, method=method).image
     if "caustic" not in converged:
         return image, None

@@ -1,7 +1,6 @@
 """How a shot of a training set moves: its camera, one thing in it, its light. All of it comes from random numbers.
 
-Each of the three moves or rests independently. Its speed is constant over the frames and log-uniform from shot to shot.
-So there are slow shots and fast ones, and shots in which only the light changes.
+Each of the three moves or rests independently, at a constant speed that is log-uniform from shot to shot.
 """
 
 from __future__ import annotations

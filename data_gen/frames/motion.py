@@ -50,10 +50,8 @@ def _film(sensor: mi.Sensor) -> np.ndarray:
     """The projection of a camera onto its film, in pixels of the crop window."""
     params, film = mi.traverse(sensor), sensor.film()
     if "x_fov" not in params:
-        raise NgptError(
-            f"camera '{camera_name(sensor)}': motion vectors need a perspective or thinlens camera; "
-            "render single images, without --frames"
-        )
+        what = "motion vectors need a perspective or thinlens camera; render single images, without --frames"
+        raise NgptError(f"camera '{camera_name(sensor)}': {what}")
     near, far = sensor.near_clip(), sensor.far_clip()
     fov = float(np.array(params["x_fov"]).ravel()[0])
     projection = mi.perspective_projection(film.size(), film.crop_size(), film.crop_offset(), fov, near, far)
@@ -159,8 +157,6 @@ def window_moved(now: Snapshot, before: Snapshot) -> tuple[int, int]:
 def _displacement(now: Geometry, old: Geometry, what: Seen, here: np.ndarray) -> np.ndarray | None:
     """(n, 3): from where the pixels ``here`` see a shape to where that was; None where that cannot be known."""
     if isinstance(now, Mesh) and isinstance(old, Mesh) and now.faces.shape == old.faces.shape:
-        if np.array_equal(now.vertices, old.vertices):
-            return np.zeros((len(here), 3))
         b1, b2 = what.barycentric[here].T
         weights = np.stack([1 - b1 - b2, b1, b2], axis=-1)[..., None]
         triangles = what.primitive[here]

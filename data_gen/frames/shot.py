@@ -121,7 +121,6 @@ class Shot:
         return scene
 
     def snapshot(self, frame: int) -> Snapshot:
-        """What motion needs of a frame."""
         taken = snapshot(self.at(frame), self._shapes)
         self._shapes = taken.shapes
         return taken
@@ -233,12 +232,7 @@ def _placed(stack: GradientStack, frame: int, previous: int, motion: np.ndarray)
 
 
 def _with_dt(
-    stack: GradientStack,
-    motion: np.ndarray,
-    here: tuple[Shot, int],
-    before: tuple[Shot, int],
-    pairs: int,
-    seed: int,
+    stack: GradientStack, motion: np.ndarray, here: tuple[Shot, int], before: tuple[Shot, int], pairs: int, seed: int
 ) -> GradientStack:
     """The stack with ``dt`` and ``dt_var``, by the ``motion`` from array to array; ``here`` and ``before`` are what has
     the scene, and the frame's number."""
