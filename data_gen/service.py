@@ -80,10 +80,7 @@ def overview() -> dict[str, Any]:
 
     SAMPLERS.load()
     titles = {"samplers": "use", "samplers for some scenes": "niche", "samplers to compare with": "study"}
-    found = {
-        title: {name: entry.summary for name, entry in by_standing(standing).items()}
-        for title, standing in titles.items()
-    }
+    found = {title: {n: entry.summary for n, entry in by_standing(kind).items()} for title, kind in titles.items()}
     return found | {"built-in scenes": {name: (make.__doc__ or "").split("\n")[0] for name, make in SCENES.items()}}
 
 

@@ -117,9 +117,8 @@ def write_frames(
     write_all(skip, {})
     if stop():
         done = {report["frame"] for report in written.frames if "unfinished" not in report}
-        written.interrupted = next(
-            (frame for frame in ours if frame not in done and not asked[frame].done(files[frame])), None
-        )
+        left = (frame for frame in ours if frame not in done and not asked[frame].done(files[frame]))
+        written.interrupted = next(left, None)
     return written
 
 

@@ -29,12 +29,9 @@ class CameraSamples:
     number of its sample. ``random`` holds the random numbers of the paths to come. Cloning it replays them: this
     correlates a path with its shifted copies.
 
-    ``net`` is the size of the first round of points (``data_gen.paths.streams``), or 0: independent samples.
-
-    ``some``, UInt32, are the pixels to sample, which may repeat; ``first`` is then a UInt32 with a number for each.
-
-    Functions that are recorded once (``data_gen.paths.frozen``) may use only the fields of ``DRJIT_STRUCT`` of an
-    argument.
+    ``net`` is the size of the first round of points (``data_gen.paths.streams``), or 0: independent samples. ``some``,
+    UInt32, are the pixels to sample, which may repeat; ``first`` is then a UInt32 with a number for each. Functions
+    that are recorded once (``data_gen.paths.frozen``) may use only the fields of ``DRJIT_STRUCT`` of an argument.
     """
 
     DRJIT_STRUCT = dict.fromkeys(

@@ -2,15 +2,15 @@
 
 Paths are followed from the camera. A path that has scattered at a connectable vertex and then meets a mirror, glass or
 sharp gloss is rare and bright, and cannot be shifted well: its shifted copy meets another point of the glass, and from
-there it misses the lamp. Its differences are nothing but noise. So its light, and all light that follows on the path,
-goes into a separate layer, for methods that need no differences.
+there it misses the lamp. So its light, and all light that follows on the path, goes into a separate layer, for methods
+that need no differences.
 
     rough   the path has scattered smoothly at a connectable vertex
     late    and has later left a vertex by a mirror, glass or sharp gloss: its light belongs to the layer
 
 Both are properties of the path, not of its shift. So primal - caustic is the image of a subset of the paths, and the
 differences belong to this image: a path of the layer counts 0 in them, whether it is a base path or a shifted copy.
-This is exact for pairs: where either of the two paths is late, the shift is rejected from both sides.
+Where either path of a pair is late, the shift is rejected from both sides, so this is exact.
 """
 
 from __future__ import annotations

@@ -34,7 +34,6 @@ class Eye:
 
     @property
     def size(self) -> mi.ScalarVector2u:
-        """Pixels of the film, in x and y."""
         return mi.ScalarVector2u(self.sensor.film().crop_size())
 
     @property
@@ -87,7 +86,6 @@ class Sight:
 
     @classmethod
     def of(cls, camera: CameraSamples) -> Sight:
-        """The sight of these camera samples."""
         ray, importance, _ = camera.rays()
         return cls(Eye.of(camera), camera.random.clone(), ray, importance)
 

@@ -47,8 +47,6 @@ COMMON = {
 
 @dataclass(frozen=True)
 class Entry:
-    """What all samplers have."""
-
     name: str  # as users call it
     summary: str  # one line for the user
     # Where its Mitsuba integrator is, a ``data_gen.samplers.common.GradientIntegrator``; or a function ``make``. It is

@@ -101,9 +101,8 @@ def why_not_shared(media: bool, settings: Mapping[str, Any], variant: str) -> st
     if "rgb" not in variant or "polarized" in variant:
         return f"variant '{variant}' renders other colours than RGB"
     unable = {"reuse": (True, "reuse"), "shift": ("manifold", "shift=manifold")}
-    return next(
-        (f"{name} needs whole paths" for key, (value, name) in unable.items() if settings.get(key) == value), ""
-    )
+    reasons = (f"{name} needs whole paths" for key, (value, name) in unable.items() if settings.get(key) == value)
+    return next(reasons, "")
 
 
 def joined_depth(default: int) -> Option:

@@ -1,15 +1,13 @@
 """How often each lamp of a scene is chosen, by what it brings to what the camera sees.
 
 Mitsuba chooses all lamps alike, unless a scene gives them ``sampling_weight``. The best weights are in proportion to
-The best weights are in proportion to the root of the mean square of what a lamp brings to a vertex, which a short pilot
-measures: at the first vertices of camera paths, each lamp is sampled in turn. So all kinds of lamps, the sun and an
-environment are measured in the same way, and lamps behind walls count for little.
+the root of the mean square of what a lamp brings to a vertex, which a short pilot measures: at the first vertices of
+camera paths, each lamp is sampled in turn. So all kinds of lamps, the sun and an environment are measured in the same
+way, and lamps behind walls count for little.
 
-How often each lamp of a scene is chosen, by place: with many lamps, most light up little of the scene.
-
-The scene is cut into cells. In each cell, lamps are chosen by the mean square of their light at vertices there, which
-a pilot measures (``data_gen.scenes.lamps``). The mean of each cell also includes some virtual samples with the mean of
-its parent. Any probabilities give correct images, as long as none is 0 where a lamp has light. A shifted path keeps its
+With many lamps, most light up little of the scene, which is cut into cells: in each, lamps are chosen by the mean
+square of their light at vertices there. The mean of each cell includes some virtual samples with the mean of its
+parent. Any probabilities give correct images, as long as none is 0 where a lamp has light. A shifted path keeps its
 lamp, and knows the probability of choosing it both where the path comes from and where it goes to.
 """
 
@@ -262,7 +260,7 @@ def learn(lamp: np.ndarray, squares: np.ndarray, at: np.ndarray, whole: np.ndarr
     low, size = low - 0.0137 * extent, 1.0411 * extent / side
     cell = cell_of(at, low, size, side)
     means = np.full((1, 1, 1, lamps), np.nan)
-    for cells in _doubling(side):
+    for cells in (1 << level for level in range(side.bit_length())):  # 1, 2, 4 ... up to ``side``
         key = np.ravel_multi_index((*(cell * cells // side).T, lamp), (cells, cells, cells, lamps))
         count = np.bincount(key, minlength=cells**3 * lamps).reshape(cells, cells, cells, lamps)
         total = np.bincount(key, squares, minlength=cells**3 * lamps).reshape(count.shape)
@@ -276,8 +274,3 @@ def learn(lamp: np.ndarray, squares: np.ndarray, at: np.ndarray, whole: np.ndarr
     total = roots.sum(axis=1, keepdims=True)
     table = np.where(total > 0, (1 - _FLOOR) * roots / np.maximum(total, 1e-300) + _FLOOR * whole, whole)
     return Table(np.vstack([table, whole]), low, size, side)
-
-
-def _doubling(side: int) -> list[int]:
-    """1, 2, 4 ... up to ``side``."""
-    return [1 << level for level in range(side.bit_length())]

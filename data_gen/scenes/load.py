@@ -1,9 +1,7 @@
 """Scenes: loaded from a Mitsuba file or built in, with errors that say what is wrong.
 
-Scene files, whose meshes are merged by material and of whose sensors one may be chosen.
-
-Each shape of a scene is a case of its own in the kernels, which Dr.Jit records before the first ray. A room of 800
-meshes takes seconds for that, and a tenth of it once meshes of one material are one.
+Meshes of scene files are merged by material: each shape is a case of its own in the kernels, which Dr.Jit records
+before the first ray. A room of 800 meshes takes seconds for that, a tenth of it once meshes of one material are one.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 """The cache: for each cell the sum of the light that paths have found there, divided by the reflectance.
 
 Sums are integers, so that they do not depend on the order of additions. What paths read, ``Known``, is made of them
-between two rounds: within a round nothing changes.
-
-Cells of the cache: cubes in space, apart by their size and by the side and direction of the surface.
-
-A cell is small against the *spread* of a path at the vertex where the path looks it up. The spread is the width of the
-bundle of paths that arrive there, and the light of the cell is blurred over that width. Smooth events add to it,
+between two rounds: within a round nothing changes. Cells are cubes in space, apart by their size and by the side and
+direction of the surface. A cell is small against the *spread* of a path at the vertex where the path looks it up: the
+width of the bundle of paths that arrive there, over which the light of the cell is blurred. Smooth events add to it,
 
     spread = Σ t / sqrt(p |cos θ|),
 
@@ -239,11 +236,8 @@ class Cache:
         cells = int(dr.count(self.keys != 0)[0])
         if cells > _FULL * CELLS and not self.full:
             self.full = True
-            _LOG.warning(
-                "the cache of tails is full (%d cells): light that comes to other places is found by single paths; "
-                "--unbiased does without the cache",
-                cells,
-            )
+            what = "light that comes to other places is found by single paths; --unbiased does without the cache"
+            _LOG.warning("the cache of tails is full (%d cells): %s", cells, what)
         each = dr.opaque(mi.Float, self.unit) / dr.maximum(self.count, 1)
         trusted = dr.select(self.count >= LEAST, mi.Float(1), 0)
         # Old values go first, to make room for the new ones.
@@ -276,9 +270,8 @@ def in_table(
         return i + 1, open & ~hit & ~empty & (i < _PLACES - 1), dr.select(hit, at, slot), found | hit
 
     state = (mi.UInt32(0), mi.Bool(active), mi.UInt32(0), dr.full(mi.Bool, False, lanes))
-    _, _, slot, found = dr.while_loop(
-        state, lambda i, open, slot, found: open, body, label="find cells", mode="symbolic"
-    )
+    how = {"label": "find cells", "mode": "symbolic"}
+    _, _, slot, found = dr.while_loop(state, lambda i, open, slot, found: open, body, **how)
     return slot, found
 
 

@@ -105,6 +105,5 @@ def paths(view, plan: Plan, known: Known, camera: CameraSamples) -> tuple[mi.UIn
     """How many records each path has, and these: place, and light of each sort over reflectance, RGB."""
     ray, importance, _ = camera.rays()
     count, records = feed(view, plan, known, camera.random.clone(), (ray, importance))
-    return count, [
-        [*r.place.p, r.place.code, r.place.level, *(each for L in r.L for each in mi.Color3f(L) / r.ρ)] for r in records
-    ]
+    colours = ((each for L in r.L for each in mi.Color3f(L) / r.ρ) for r in records)
+    return count, [[*r.place.p, r.place.code, r.place.level, *its] for r, its in zip(records, colours, strict=True)]

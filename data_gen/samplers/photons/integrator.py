@@ -33,8 +33,6 @@ GRID_BYTES = VERTICES_PER_PATH * (3 + 3 + 3) * 4
 
 @dataclass
 class Traced:
-    """A photon map of a pass."""
-
     photons: Any  # the record
     starts: LightRay  # the light's end of each light path
     paths: int  # light paths of the pass

@@ -111,10 +111,6 @@ def geometry_of(normal: mi.Normal3f, at: mi.Point3f, origin: mi.Point3f) -> mi.F
     return dr.abs(dr.dot(normal, to)) * dr.rsqrt(squared) / squared
 
 
-def select(mask: mi.Bool, yes: Record, no: Record) -> Record:
-    return Record(**{f.name: dr.select(mask, getattr(yes, f.name), getattr(no, f.name)) for f in fields(Record)})
-
-
 def gather(record: Record, lanes: mi.UInt32, active: bool | mi.Bool = True) -> Record:
     """The records of these ``lanes``; zeros where not ``active``."""
     values = ((f.name, getattr(record, f.name)) for f in fields(Record))

@@ -16,7 +16,7 @@ other. Their mixture is unbiased for ``blendbsdf`` too, whose samples give the d
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -87,8 +87,7 @@ class _Kept:
         weight = dr.select(dr.isfinite(weight) & (weight > 0), weight, 0)
         total = self.total + weight
         takes = u * total < weight
-        values = {f.name: dr.select(takes, getattr(new, f.name), getattr(self.chosen, f.name)) for f in fields(_Choice)}
-        return _Kept(_Choice(**values), total, L)
+        return _Kept(dr.select(takes, new, self.chosen), total, L)
 
 
 @dataclass

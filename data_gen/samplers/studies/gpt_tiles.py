@@ -62,10 +62,6 @@ class GPTTiles(GradientIntegrator):
     hidden emitters, polarised and spectral variants; for the last three rendering raises NgptError.
     """
 
-    def __init__(self, props: mi.Properties):
-        super().__init__(props)
-        self.tile, self.roughness_threshold = self.options["tile"], self.options["roughness_threshold"]
-
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """Only the primal estimate."""
         L, Le, _ = trace(scene, self.limits, sampler, ray, mi.Spectrum(1), [])
@@ -79,8 +75,8 @@ class Tiles:
     """Takes the samples of a pass; ``lane_bytes`` grows with the tile."""
 
     def __init__(self, integrator: GPTTiles, scene: mi.Scene):
-        self.integrator, self.scene, self.side = integrator, scene, integrator.tile
-        self.materials = Materials(scene, integrator.roughness_threshold)
+        self.integrator, self.scene, self.side = integrator, scene, integrator.options["tile"]
+        self.materials = Materials(scene, integrator.options["roughness_threshold"])
         self.lane_bytes = _LANE_BYTES + _CONNECTION_BYTES * self.side**2
 
     def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
@@ -224,8 +220,6 @@ class Suffix:
     R: mi.Spectrum  # all other radiance that comes from there
 
     def at(self, lanes: mi.UInt32, active: mi.Bool) -> Suffix:
-        """The suffixes of other lanes."""
-
         def taken(value: Any) -> Any:
             return dr.gather(type(value), value, lanes, active) if dr.width(value) > 1 else value
 

@@ -1,8 +1,7 @@
 r"""Gradient-domain vertex connection and merging: ``vcm``, and each of its paths shifted to four neighbouring pixels.
 
 Paths that connections, lamps and cameras complete are shifted as ``gbdpt`` shifts them: by one map, under one weight
-over all strategies of both ends of a pair. Merging is one of these strategies wherever photons are gathered. Paths that
-merging completes are shifted without a ray: see ``differences``.
+over all strategies of both ends of a pair. Merging is one of these strategies wherever photons are gathered.
 
     a pair of x and y       Δ = 2 (b' - b) / (W(x) + r W(y)), W = Σ p_j / p_s over connections and mergings
     merging at z_b          Δ = b' / W(y) - b / W(x), for photons near to both vertices; else -2 b / W(x)
@@ -13,16 +12,12 @@ the copy of a camera path knows η of its own: ``mis`` carries them along.
 [Sun et al. 2017, "Gradient-Domain Vertex Connection and Merging", eq. 18-23: there photons are gathered everywhere, and
 the edge in front of a photon is shifted, too; here that edge is one of mirrors or glass, and stays]
 
-Photons that are gathered at a camera path, and what they bring to its four offset paths.
-
-A photon stays where it is, whatever path it is gathered at: there is no ray to trace. Symbols as in ``gbdpt``.
-
-At a vertex that both paths share, it is the same photon for both. The path that it ends is shifted by the map of all
-other strategies, at the first vertices, and shares their weight.
-
-At an offset path's own vertex it is gathered if it is near to that one, too. All light here comes from mirrors or
-glass, so the map of the others rejects these paths; merging shifts them by a map of its own, which keeps the light path
-and replays the camera path. r is 1, and weights are for merging only (``pairs.difference_of_one``).
+A photon stays where it is, whatever path it is gathered at: there is no ray to trace. Symbols are as in ``gbdpt``. At a
+vertex that both paths share, it is the same photon for both. The path that it ends is shifted by the map of all other
+strategies, at the first vertices, and shares their weight. At an offset path's own vertex it is gathered if it is near
+to that one, too. All light here comes from mirrors or glass, so the map of the others rejects these paths; merging
+shifts them by a map of its own, which keeps the light path and replays the camera path. r is 1, and weights are for
+merging only (``pairs.difference_of_one``).
 """
 
 from __future__ import annotations
@@ -112,9 +107,8 @@ OFFSETS_BYTES = 1024
 class GVCM(VCM):
     """Gradient-domain vertex connection and merging, for surfaces.
 
-    Plugin ``gvcm``. Parameters: as for ``vcm``; where photons are gathered, paths are connectable as well.
-
-    Not handled: what ``vcm`` does not handle.
+    Plugin ``gvcm``. Parameters, and what is not handled: as for ``vcm``; where photons are gathered, paths are
+    connectable as well.
     """
 
     splatter, plan_class = Marker, Plan

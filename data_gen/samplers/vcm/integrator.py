@@ -62,10 +62,6 @@ class VCM(BDPT):
     splatter = Splatter
     sample_bytes = SAMPLE_BYTES
 
-    def __init__(self, props: mi.Properties):
-        super().__init__(props)
-        self.radius, self.threshold = self.options["radius"], self.options["roughness_threshold"]
-
     @property
     def vertices(self) -> int:
         """The most that are kept of a light path."""
@@ -85,7 +81,7 @@ class VCM(BDPT):
         return f", or no more than -O joined_depth={fits}" if fits else ""
 
     def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
-        world = World(scene, LightEnds(scene, self.name), Materials(scene, self.threshold))
+        world = World(scene, LightEnds(scene, self.name), Materials(scene, self.options["roughness_threshold"]))
         return Passes(self, world, pixel_width(scene, sensor))
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
@@ -107,7 +103,7 @@ class VCM(BDPT):
     ) -> tuple[Photons, Sight, Any]:
         """The light paths of a pass, whose ends at the camera are splatted: their vertices as photons, the
         ``sight`` with random numbers to go on by, and the splatter's state."""
-        n, radius = dr.width(sight.ray), self.radius * passes.width * shrunk(camera.first)
+        n, radius = dr.width(sight.ray), self.options["radius"] * passes.width * shrunk(camera.first)
         η, empty = dr.opaque(mi.Float, eta(radius, n)), Map.empty(n, self.vertices)
         kept, numbers, state, sums = passes.frozen(self.light_paths, passes.world, sight, η, empty, sums=splats.zeros)
         dr.eval(kept, numbers, state, sums)

@@ -106,12 +106,11 @@ class Palette:
 
     def _disney(self) -> xml.Element:
         # Not 0, which would leave the lobe out of the kernel.
-        metallic = 1.0 if self.rng.random() < 0.4 else 0.01
-        rng = self.rng
+        rng, metallic = self.rng, 1.0 if self.rng.random() < 0.4 else 0.01
         principled = plugin(
             "bsdf", "principled", metallic=metallic, specular=rng.uniform(0.2, 0.8), clearcoat=rng.uniform(0.01, 1)
         )
-        low, high = sorted(np.sqrt(self.rng.uniform(0.02, 0.5, 2)))
+        low, high = sorted(np.sqrt(rng.uniform(0.02, 0.5, 2)))
         gloss = low + (high - low) * random_picture(self.rng, low=0, high=1).mean(axis=-1)
         principled.append(self.picture("base_color"))
         principled.append(self.picture("roughness", gloss, raw=True))

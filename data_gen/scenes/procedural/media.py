@@ -53,9 +53,8 @@ def beams(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
         angle = rng.uniform(6, 22)
         power = np.exp(rng.uniform(np.log(8), np.log(60)))
         light = power / (2 * np.pi * (1 - np.cos(np.radians(angle))))
-        spot = plugin(
-            "emitter", "spot", cutoff_angle=angle, beam_width=0.8 * angle, intensity=light * colour(rng, 0.7, 1, 0.8)
-        )
+        intensity = light * colour(rng, 0.7, 1, 0.8)
+        spot = plugin("emitter", "spot", cutoff_angle=angle, beam_width=0.8 * angle, intensity=intensity)
         points = {"origin": [at[0], stage.height - 0.05, at[1]], "target": [target[0], 0, target[1]]}
         transform = xml.SubElement(spot, "transform", name="to_world")
         named = {key: ", ".join(f"{x:.6g}" for x in point) for key, point in points.items()}

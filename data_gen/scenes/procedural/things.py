@@ -126,9 +126,8 @@ def table(rng: np.random.Generator) -> list[Part]:
 
 def chair(rng: np.random.Generator) -> list[Part]:
     height, width = rng.uniform(0.4, 0.5), rng.uniform(0.38, 0.5)
-    legs = [
-        box([0.035, height, 0.035], [i * width / 2.3, height / 2, j * width / 2.3]) for i in (-1, 1) for j in (-1, 1)
-    ]
+    corners = [(i * width / 2.3, j * width / 2.3) for i in (-1, 1) for j in (-1, 1)]
+    legs = [box([0.035, height, 0.035], [x, height / 2, z]) for x, z in corners]
     bars = [box([0.03, 0.5, 0.02], [x, height + 0.25, -width / 2.2]) for x in np.linspace(-0.45, 0.45, 6) * width]
     bars.append(box([width, 0.06, 0.03], [0, height + 0.52, -width / 2.2]))
     seat = box([width, rng.uniform(0.03, 0.1), width], [0, height, 0])

@@ -94,7 +94,6 @@ class CameraPaths:
         return number >= self.limits.max_depth
 
     def begun(self, start: Level, random, rays: list) -> Level:
-        """The first level."""
         paths = [self.first(*ray) for ray in rays]
         for path in paths:
             path.hit = self.integrator.first_hit(self.world.scene, path.ray)

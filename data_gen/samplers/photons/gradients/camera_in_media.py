@@ -47,7 +47,6 @@ class Piece(Path):
 
 
 def ended(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.PreliminaryIntersection3f:
-    """The ``hit`` of a ``ray``, or its end."""
     hit.t = dr.select(hit.is_valid(), hit.t, media.end_of(ray))
     return hit
 
@@ -109,7 +108,6 @@ class PathsByPieces(CameraPaths):
         return frozen(self.seen_directly, level.paths[0])
 
     def seen_directly(self, base: Piece) -> mi.Spectrum:
-        """Lamps as seen through media."""
         fog, none = self.world.fog, mi.UInt32(0)
         lamps = self.integrator.lamps_in_fog(self.world.scene, fog.media, mi.Ray3f(base.ray), fog.within, none)
         return base.β * lamps

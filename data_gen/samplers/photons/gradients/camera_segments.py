@@ -94,7 +94,6 @@ class PathsBySegments(CameraPaths):
         return frozen(self.seen_directly, mi.Ray3f(start.ray), start.importance)
 
     def seen_directly(self, ray: mi.Ray3f, importance) -> mi.Spectrum:
-        """Lamps as seen through media."""
         fog = self.world.fog
         return importance * self.integrator.lamps_in_fog(self.world.scene, fog.media, ray, fog.within, mi.UInt32(0))
 

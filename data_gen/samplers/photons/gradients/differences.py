@@ -16,7 +16,7 @@ from data_gen.paths.mis import gradient_weight
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.photons.gradients.camera import Level
 from data_gen.samplers.photons.gradients.pairs import Near, Pairs, pieces
-from data_gen.samplers.photons.passes import Begun, Passes
+from data_gen.samplers.photons.passes import Passes, begun
 
 # Levels are joined until they have so many paths for each camera sample.
 LEVELS = 3
@@ -39,8 +39,8 @@ def gradient_pass(passes: Passes, camera: CameraSamples, film: GradientFilm, nea
     ``near`` (passes, photon map) yields what is ``Gathered`` of a map; ``pairs`` are in memory together for each camera
     sample.
     """
-    integrator, walk, frozen, begun = passes.integrator, passes.walk, passes.frozen, Begun.of(passes, camera)
-    start, values, n = begun.start, begun.features, dr.width(camera.pixel)
+    integrator, walk, frozen, n = passes.integrator, passes.walk, passes.frozen, dr.width(camera.pixel)
+    start, values = begun(passes, camera)
     shifted = [camera.rays(shift) for shift in SHIFTS.values()]
     rays = [(mi.Ray3f(start.ray), start.importance, mi.Bool(True))]
     rays += [(mi.Ray3f(ray), importance, inside) for ray, importance, inside in shifted]
@@ -106,9 +106,8 @@ def joined(passes: Passes, levels: list[Level]) -> Level:
     paths = [dr.empty(type(path), n) for path in levels[0].paths]
     all_of_it = [dr.empty(mi.UInt32, n), dr.empty(mi.UInt32, n), paths]
     for level in levels:
-        all_of_it = passes.frozen(
-            entered, all_of_it, [level.lanes, level.depth, level.paths], dr.opaque(mi.UInt32, low)
-        )
+        parts = [level.lanes, level.depth, level.paths]
+        all_of_it = passes.frozen(entered, all_of_it, parts, dr.opaque(mi.UInt32, low))
         dr.eval(all_of_it)
         low += dr.width(level.lanes)
     lanes, depth, paths = all_of_it
@@ -171,8 +170,6 @@ def differences(passes: Passes, near: Near, paths: list, longest: mi.UInt32, mos
 
 @dataclass
 class Found:
-    """What pairs bring."""
-
     C: mi.Spectrum  # to the base path
     Δ: list  # gradient samples, with the thing for its own copy; where it is not, with none
     shifts: mi.Float  # that the pair takes part in

@@ -4,8 +4,6 @@ Shifts are done for pairs, all lanes at work; within the walk through the grid o
 list is cut into pieces of a given length, and the sums over the pairs of a point are added up in their order: the same
 pairs give the same bits.
 
-What is near to camera paths: the protocol by which photons, beams and planes give their differences.
-
 A *thing* (a photon, a beam, a plane) is paired with what it is near to on a base path (a vertex, a piece of a ray), the
 *receiver* A. The neighbour's path has the corresponding receiver B. A thing near to both is its own copy. If a thing is
 near only to A, a copy is made near to B.
@@ -57,8 +55,6 @@ class Receivers(Protocol):
 
 @dataclass
 class Points:
-    """Where photons are gathered near to."""
-
     p: mi.Point3f
 
     def each(self, grid: Grid, radius2: mi.Float, active: mi.Bool, visit, state: tuple) -> tuple:
@@ -70,8 +66,6 @@ class Points:
 
 @dataclass
 class Rays:
-    """Pieces of rays, which photons are gathered along."""
-
     ray: mi.Ray3f
     length: mi.Float
 

@@ -207,6 +207,5 @@ def _walk(world: World, paths: Paths, random, depths: tuple, photons, places: tu
 
 
 def _enter(photons, values: dict, place: mi.UInt32, active) -> None:
-    """Enters some fields at these places of a map."""
     for name, value in values.items():
         dr.scatter(getattr(photons, name), value, place, active)

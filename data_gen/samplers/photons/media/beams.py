@@ -236,7 +236,6 @@ class BEAMS(BRE):
     edges, map_bytes = True, BEAM_BYTES + PARTS * PART_BYTES
 
     def near(self, passes: Passes, traced: Traced) -> Iterator[Along]:
-        """Photons on surfaces, and beams, some parts of them at a time."""
         max_depth, fog = self.limits.max_depth, passes.world.fog
         on_surfaces: Gathering | None = Gathering(passes.world, traced, max_depth)
         for parts in parts_of(passes, traced, PARTS * traced.paths):

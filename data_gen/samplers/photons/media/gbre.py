@@ -80,8 +80,8 @@ class Beside:
         return dr.select(active & dr.isfinite(dr.sum(L)), L, 0)
 
 
-def beside_of(pieces: list, which: mi.UInt32 | None, index: mi.UInt32) -> Beside:
-    """A piece of camera paths; of the path of number ``which``, if there is more than one."""
+def beside_of(near, world: World, pieces: list, which: mi.UInt32 | None, index: mi.UInt32) -> Beside:
+    """``Near.receiver``: a piece of camera paths; of the path of number ``which``, if there is more than one."""
     return Beside(*chosen(fields_of, pieces, which, index))
 
 
@@ -144,6 +144,8 @@ def copy_beside(world: World, paths: LightPaths, photon: Photon, A, B, radius2: 
 class AlongPieces(InMedia):
     """``Near``: the photons of a map in media, beside rays."""
 
+    receiver = beside_of
+
     def __init__(self, traced: Traced):
         photons, radius = traced.photons, traced.radius()
         grid = Grid(photons.p, in_media(photons), BALL * radius)
@@ -152,9 +154,6 @@ class AlongPieces(InMedia):
 
     def where(self, world: World, base: Piece) -> tuple[Rays, mi.Bool]:
         return Rays(mi.Ray3f(base.ray.o, base.ray.d), base.length()), inside_of(base)
-
-    def receiver(self, world: World, paths: list, which: mi.UInt32 | None, index: mi.UInt32) -> Beside:
-        return beside_of(paths, which, index)
 
 
 class GBRE(GPM):

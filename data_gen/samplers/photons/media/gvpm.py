@@ -72,11 +72,6 @@ class InBall:
         return dr.select(active & dr.isfinite(dr.sum(L)), L, 0)
 
 
-def ball_of(paths: list, which: mi.UInt32 | None, index: mi.UInt32) -> InBall:
-    """Where camera paths scatter; the path of number ``which``, if there is more than one."""
-    return InBall(*chosen(fields_of, paths, which, index))
-
-
 def fields_of(path: Flight, index: mi.UInt32) -> tuple:
     o, d = dr.gather(mi.Point3f, path.ray.o, index), dr.gather(mi.Vector3f, path.ray.d, index)
     known = (dr.gather(type(value), value, index) for value in (path.medium, path.β, path.alive & path.scatters))
@@ -97,7 +92,7 @@ class InBalls(InMedia):
         return Points(base.ray(base.hit.t)), base.alive & base.scatters
 
     def receiver(self, world: World, paths: list, which: mi.UInt32 | None, index: mi.UInt32) -> InBall:
-        return ball_of(paths, which, index)
+        return InBall(*chosen(fields_of, paths, which, index))
 
 
 class GVPM(GPM):

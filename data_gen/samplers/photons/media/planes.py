@@ -204,9 +204,8 @@ def swept(scene, photons, edges: mi.UInt32, weight: mi.Float):
     Φ = dr.gather(mi.Spectrum, photons.power, edges) * dr.exp((σ - σ_c) * since) * (σ_c * (1 + half) / (2 * half))
     e, depth = dr.gather(mi.Vector3f, photons.e, edges), dr.gather(mi.UInt32, photons.bounce, edges)
     kind = planes_class(mi.variant())
-    return kind(
-        mi.Point3f(p - d * since), d, e, length, dr.select(dr.isfinite(dr.sum(Φ)), Φ * weight, 0), σ, medium, depth
-    )
+    Φ = dr.select(dr.isfinite(dr.sum(Φ)), Φ * weight, 0)
+    return kind(mi.Point3f(p - d * since), d, e, length, Φ, σ, medium, depth)
 
 
 class PLANES(BEAMS):

@@ -45,8 +45,6 @@ PATHS_BYTES = 3072
 
 @dataclass
 class AtVertex:
-    """A vertex of a camera path."""
-
     x: mi.SurfaceInteraction3f
     β: mi.Spectrum
     receives: mi.Bool  # photons

@@ -41,7 +41,7 @@ from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.radius import number_of, spread
 from data_gen.samplers.photons.map.vertices import faces, light, on_surfaces, photon_of
-from data_gen.samplers.photons.passes import Begun, Passes, Start
+from data_gen.samplers.photons.passes import Passes, Start, begun
 
 
 @dataclass(init=False)
@@ -97,15 +97,15 @@ class PPM(PhotonIntegrator):
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
         """One photon map, and one camera path for each camera sample."""
-        begun = Begun.of(passes, camera)
+        start, values = begun(passes, camera)
         near = (one for traced in self.maps(passes, camera) for one in self.near(passes, traced))
-        values, wavelengths = begun.features, begun.start.ray.wavelengths
+        wavelengths = start.ray.wavelengths
         # Emission that camera paths meet is counted with the first map, or without any.
-        L, Le = passes.frozen(self.light, passes.world, begun.start, next(near, None), True)
+        L, Le = passes.frozen(self.light, passes.world, start, next(near, None), True)
         values |= {"primal": to_rgb(L + Le, wavelengths), "direct": to_rgb(Le, wavelengths)}
         dr.eval(values)
         for more in near:
-            L, _ = passes.frozen(self.light, passes.world, begun.start, more, False)
+            L, _ = passes.frozen(self.light, passes.world, start, more, False)
             values["primal"] += to_rgb(L, wavelengths)
             dr.eval(values["primal"])
         film.put_all(values)

@@ -1,6 +1,4 @@
-"""Markov chains of paths, side by side: what they find, splatted.
-
-Mutations of the random numbers that a path is made of, and whether a chain takes them.
+"""Markov chains of paths, side by side: what they find, splatted; and mutations of the random numbers of a path.
 
 [Kelemen et al. 2002, "A Simple and Robust Mutation Strategy for the Metropolis Light Transport Algorithm"]
 """

@@ -30,10 +30,8 @@ _LANES = 1 << 20
 
 @dataclass(frozen=True)
 class Spectra:
-    """Means over samples, and variances of these, (H, W, bins) float64: of the light of each bin, and of its step.
-
-    ``step``  what the next bin has more; the last is 0. None if none was sampled
-    """
+    """Means over samples, and variances of these, (H, W, bins) float64: of the light of each bin, and of its step:
+    what the next bin has more. The last step is 0; None if none was sampled."""
 
     light: np.ndarray
     light_var: np.ndarray
@@ -108,9 +106,8 @@ def reconstructed(spectra: Spectra) -> np.ndarray:
     """
     if spectra.step is None or spectra.step_var is None:
         return spectra.light
-    v, s = (
-        uniform_filter(variance.mean(axis=-1), REACH) for variance in (spectra.light_var, spectra.step_var[..., :-1])
-    )
+    both = spectra.light_var, spectra.step_var[..., :-1]
+    v, s = (uniform_filter(variance.mean(axis=-1), REACH) for variance in both)
     weight = (v / np.maximum(s, 1e-12 * v + 1e-300))[..., None]
     bins = spectra.light.shape[-1]
     # Steps that there are, between bins: for all pixels the same eigenvectors, the cosines
