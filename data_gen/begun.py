@@ -214,7 +214,6 @@ class Asked:
 
 
 def begun_stack(path: Path) -> GradientStack:
-    """What a file has of a render."""
     return rendered(read(path))
 
 

@@ -110,7 +110,6 @@ class _Camera:
 
 
 def _children(nodes: Sequence, node, kind: mi.ObjectType) -> list:
-    """The nodes of a ``kind`` that a node of a parsed scene has."""
     parts = [part.index() for _, part in node.props.items() if isinstance(part, mi.Properties.ResolvedReference)]
     return [nodes[part] for part in parts if nodes[part].type == kind]
 

@@ -87,7 +87,6 @@ class Pipeline:
         return spp - self._choices(spp) / self.seconds
 
     def takes(self, spp: float) -> float:
-        """The seconds of so many samples and of the method."""
         return spp * self.seconds + self._choices(spp) + self.after
 
     def _choices(self, spp: float) -> float:

@@ -115,7 +115,6 @@ def demo_method(method: str, stack: GradientStack, reference: np.ndarray, target
 
 
 def print_table(scenes: list[Scene]) -> None:
-    """The numbers of the report, for those who do not open it."""
     print(f"{'scene':14}{'method':14}{'relMSE trimmed':>16}{'of primal':>12}{'seconds':>10}")
     for scene in scenes:
         for entry in scene.entries:

@@ -68,7 +68,6 @@ def asked(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def image(args: argparse.Namespace, denoising: Denoising | None, console: Console) -> int:
-    """One stack, or its image."""
     from data_gen.cli.onlook import onlookers  # takes as long as all else that help needs
 
     apart = {"--camera": args.camera, "--dt": args.dt, "--shard": args.shard, "--cluster": args.cluster}
@@ -191,7 +190,6 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
 
 
 def shot(args: argparse.Namespace, denoising: Denoising | None, console: Console) -> int:
-    """A stack for each frame, or its image."""
     if args.live:
         raise WrongUse("--live is for single images; leave it out with --frames")
     if args.adaptive or args.error is not None or args.method is not None:

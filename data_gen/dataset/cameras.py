@@ -43,7 +43,6 @@ class View:
     size: int
 
     def apply(self, scene: mi.Scene) -> None:
-        """Sets the first sensor of ``scene`` to this view."""
         params = mi.traverse(scene.sensors()[0])
         params["to_world"] = mi.ScalarTransform4f().look_at(list(self.origin), list(self.target), list(self.up))
         params["x_fov"] = self.fov

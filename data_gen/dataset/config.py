@@ -113,7 +113,6 @@ class Config:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Options of the sampler."""
         return self.samplers.get(self.sampler, {})
 
     @property

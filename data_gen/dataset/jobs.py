@@ -46,7 +46,6 @@ class Pool(ProcessPoolExecutor):
         super().__init__(count, mp_context=get_context("spawn"), initializer=end_with_parent, initargs=(interruptible,))
 
     def end(self) -> None:
-        """Ends the processes, whatever they are at."""
         for process in tuple(self._processes.values()):
             process.terminate()
 
@@ -59,7 +58,6 @@ class Pool(ProcessPoolExecutor):
 
 
 def processes(count: int) -> Executor:
-    """``count`` processes, or only this one."""
     return Serial() if count == 1 else Pool(count)
 
 

@@ -86,7 +86,6 @@ class Stream:
 
     @property
     def scenes(self) -> tuple[str, ...]:
-        """Names of the scenes that are in the buffer now."""
         return tuple(dict.fromkeys(crop.scene for crop in self))
 
     def _check(self) -> None:

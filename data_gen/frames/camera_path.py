@@ -21,8 +21,6 @@ _KNOWN = {"frame", "to_world", *_LOOK, "fov", "fov_axis"}
 
 @dataclass(frozen=True)
 class Key:
-    """A camera at one frame."""
-
     frame: float
     to_world: np.ndarray  # (4, 4), Mitsuba's: columns left, up, forward, position; in a path without scale
     look: np.ndarray | None = None  # (3, 3), rows origin, target and up, where the key was given by them

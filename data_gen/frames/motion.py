@@ -31,8 +31,6 @@ _OFF_RAY = 1e-3
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What motion needs of a scene in one frame."""
-
     shapes: tuple[Geometry, ...]  # in the order of ``scene.shapes()``
     film: np.ndarray  # (4, 4): homogeneous points of the world to (x, y, -, 1) in pixels, the last positive in front
     place: Place  # where the pixels lie

@@ -126,7 +126,6 @@ class Shot:
         return taken
 
     def twin(self) -> Shot:
-        """A copy of this shot, with a scene of its own."""
         return Shot(self.describe, self.size, self.camera, self.update, self.sensor)
 
     def changes(self, frames: Sequence[int]) -> bool:

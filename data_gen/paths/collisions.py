@@ -27,8 +27,6 @@ from data_gen.paths.media import beyond, end_of, onward, pick
 
 @dataclass
 class Collisions:
-    """The null collisions of a segment."""
-
     key: mi.UInt32  # of the random numbers that place them
     n: mi.UInt32
     M: mi.Float

@@ -65,7 +65,6 @@ class Eye:
         return to, importance
 
     def shows(self, uv: mi.Point2f) -> mi.Bool:
-        """Whether the place ``uv`` is on the film."""
         size = self.size
         return (uv.x >= 0) & (uv.y >= 0) & (uv.x < size.x) & (uv.y < size.y)
 

@@ -66,11 +66,9 @@ class LightEnds:
         dr.eval(self.kind, self.position, self.axis, self.cutoff, self.of_ball, self.indices)
 
     def index_of(self, emitter: mi.EmitterPtr, active=True) -> mi.UInt32:
-        """The number of an emitter in the scene."""
         return dr.gather(mi.UInt32, self.indices, dr.reinterpret_array(mi.UInt32, emitter), active)
 
     def far(self, index: mi.UInt32) -> mi.Bool:
-        """Whether the emitter with that number is infinitely far away."""
         return dr.gather(mi.UInt32, self.kind, index) == _FAR
 
     def emission(self, index: mi.UInt32, p: mi.Float, cos: mi.Float, distance2: mi.Float) -> mi.Float:
@@ -93,7 +91,6 @@ class LightEnds:
         return e
 
     def sample(self, scene, random, time, wavelengths) -> LightRay:
-        """The start of a light path."""
         u, u_position, u_direction = random.next_1d(), random.next_2d(), random.next_2d()
         index, weight, _ = scene.sample_emitter(u)
         emitter = dr.gather(mi.EmitterPtr, self.emitters, index)

@@ -28,8 +28,6 @@ from data_gen.paths.media import Media, Place, beyond, depth, end_of, extinction
 
 @dataclass
 class Numbers:
-    """The random numbers of a segment."""
-
     u: mi.Float
     key: mi.UInt32 | None  # of as many as there are null collisions; None without grids
 

@@ -123,7 +123,6 @@ def _stream_class(variant: str) -> type:
             return Stream(self.random)
 
         def at(self, lanes):
-            """The streams of only these lanes."""
             random = mi.PCG32()
             random.state = dr.gather(mi.UInt64, self.random.state, lanes)
             random.inc = dr.gather(mi.UInt64, self.random.inc, lanes)
@@ -137,8 +136,6 @@ def _stream_class(variant: str) -> type:
 
 @cache
 def _sobol_class(variant: str) -> type:
-    """The class of streams for Sobol points."""
-
     class Points(mi.Sampler):
         """Point ``index`` of each dimension from ``dimension`` on, scrambled by ``key``. Cloning replays them.
 

@@ -55,7 +55,6 @@ class Limits:
         return cls(UNLIMITED if depth < 0 else depth, depths["rr_depth"], path.hide_emitters)
 
     def parameters(self) -> dict[str, int | bool]:
-        """The limits as parameters of a plugin."""
         depth = self.max_depth if self.max_depth < UNLIMITED else -1
         return {"max_depth": depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
 

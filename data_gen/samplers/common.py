@@ -106,7 +106,6 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return Limits.of(reference_integrator(scene)).parameters()
 
     def reference(self) -> mi.SamplingIntegrator:
-        """Mitsuba's integrator whose image is rendered."""
         return mi.load_dict({"type": self.follows, **self.limits.parameters()})
 
     def facts(self, scene: mi.Scene, sensor: mi.Sensor) -> Facts:
@@ -131,7 +130,6 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return self.reference().sample(scene, sampler, ray, medium, active)
 
     def render_film(self, scene, sensor, seed: int, spp: int) -> GradientFilm:
-        """The film of ``spp`` samples per pixel."""
         check_camera(sensor)
         limits = {
             "lane_bytes": self.entry.lane_bytes,

@@ -96,7 +96,6 @@ class Entry:
 
 
 def own(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The ``settings`` that are a sampler's own."""
     return {name: value for name, value in settings.items() if name not in COMMON}
 
 
@@ -135,7 +134,6 @@ class Sampler(Entry):
 
     @property
     def plugin(self) -> str:
-        """What Mitsuba calls its integrator."""
         return self.name.replace("-", "_")
 
     def integrator(self, scene: Any, **options: Any) -> Any:
@@ -173,7 +171,6 @@ SAMPLERS: Registry[Sampler] = Registry("ngpt.samplers", "sampler", Sampler, {}, 
 
 
 def by_plugin(plugin: str) -> Sampler:
-    """The sampler whose integrator Mitsuba calls so."""
     return next(entry for entry in SAMPLERS.values() if entry.plugin == plugin)
 
 
@@ -232,6 +229,5 @@ def check_options(name: str, given: Mapping[str, Any]) -> None:
 
 
 def by_standing(standing: str) -> dict[str, Sampler | FrameSampler]:
-    """The samplers of a standing, by name."""
     entries: list[Sampler | FrameSampler] = [*SAMPLERS.values(), *FRAME_SAMPLERS.values()]
     return {entry.name: entry for entry in entries if entry.standing == standing}

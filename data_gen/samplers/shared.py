@@ -106,13 +106,11 @@ def why_not_shared(media: bool, settings: Mapping[str, Any], variant: str) -> st
 
 
 def joined_depth(default: int) -> Option:
-    """The option of samplers that trace paths from both ends."""
     meaning = "edges of a path, up to which it is found from both ends; longer ones from the camera"
     return Option(default, meaning, range=(1, 64))
 
 
 def first_radius(default: float) -> Option:
-    """The option of photon samplers."""
     meaning = "how far photons are gathered from in the first pass, in pixels where most is seen"
     return Option(default, meaning, range=(1e-6, 1e6))
 

@@ -240,7 +240,6 @@ class Places:
         return p * self.probability(x, self.index_of(light.emitter, active))
 
     def index_of(self, emitter: mi.EmitterPtr, active: mi.Bool = True) -> mi.UInt32:
-        """The number of an emitter; 0 where there is none."""
         return dr.gather(mi.UInt32, self.indices, dr.reinterpret_array(mi.UInt32, emitter), active)
 
 

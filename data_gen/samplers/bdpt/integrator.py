@@ -44,8 +44,6 @@ from data_gen.samplers.common import GradientIntegrator
 
 @dataclass
 class Splatter:
-    """Splats what light paths bring to the camera."""
-
     splats: Splats
     ray: mi.Ray3f
     importance: mi.Spectrum
@@ -73,7 +71,6 @@ class BDPT(GradientIntegrator):
         self.longest = min(self.limits.max_depth, self.options["joined_depth"])
 
     def plan(self, world: World, **more) -> Plan:
-        """What paths in the ``world`` have to agree in."""
         return self.plan_class(
             world.scene,
             world.lights,

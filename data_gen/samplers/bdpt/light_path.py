@@ -50,8 +50,6 @@ class Visitor(Protocol):
 
 @dataclass
 class End:
-    """The last vertex of a light path, and how it came there."""
-
     ray: mi.Ray3f
     hit: mi.PreliminaryIntersection3f
     y: Vertex

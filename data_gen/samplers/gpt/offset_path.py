@@ -142,7 +142,6 @@ def settle(step: Step, offsets: list[Offset]) -> None:
 
 
 def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
-    """A step from the offset path's own vertex y."""
     # ----------------------- The vertex --------------------------
     # The state carries only the preliminary hit: whole interactions of four paths would swell every loop.
     y = media.vertex(path.ray, path.hit, path.place)

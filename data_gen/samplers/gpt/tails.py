@@ -80,7 +80,6 @@ class Record:
     L: list[mi.Spectrum]
 
     def find(self, light: mi.Spectrum, late: mi.Bool) -> None:
-        """Adds what the path has found, which is ``late`` or not."""
         parts = caustic.split(late, self.T * light) if len(self.L) > 1 else (self.T * light,)
         self.L = [L + part for L, part in zip(self.L, parts, strict=True)]
 

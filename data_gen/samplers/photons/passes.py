@@ -45,8 +45,6 @@ class Passes:
 
 @dataclass
 class Start:
-    """Where camera paths start."""
-
     ray: mi.RayDifferential3f
     importance: mi.Spectrum
     random: Any  # the stream of their random numbers

@@ -118,7 +118,6 @@ def gather(record: Record, lanes: mi.UInt32, active: bool | mi.Bool = True) -> R
 
 
 def empty(lanes: int) -> Record:
-    """Records of no path."""
     types = (
         *(mi.UInt32, mi.UInt32, mi.Point2f, mi.UInt32, mi.Point3f, mi.ShapePtr),
         *(mi.UInt32, mi.Point2f, mi.Vector3f, mi.Spectrum, mi.Float, mi.Float),

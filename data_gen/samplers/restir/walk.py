@@ -104,8 +104,6 @@ class _RC:
 
 @dataclass
 class _State:
-    """A walk at its vertex x."""
-
     x: mi.SurfaceInteraction3f
     depth: mi.UInt32  # number of x, from 1 on
     F: mi.Spectrum  # integrand up to x, or up to rc where that is before x

@@ -63,7 +63,6 @@ class GPTTiles(GradientIntegrator):
     """
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        """Only the primal estimate."""
         L, Le, _ = trace(scene, self.limits, sampler, ray, mi.Spectrum(1), [])
         return L + Le, mi.Bool(True), []
 
@@ -238,8 +237,6 @@ class Connection:
 
 @dataclass
 class Paths:
-    """One path of each pixel."""
-
     hit: mi.PreliminaryIntersection3f  # its first vertex
     lives: mi.Bool  # whether it has one
     suffix: Suffix

@@ -48,7 +48,6 @@ class GPTSimple(GradientIntegrator):
     """
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        """Only the primal estimate."""
         L, Le, _ = trace(scene, self.limits, sampler, ray, mi.Spectrum(1), [])
         return L + Le, mi.Bool(True), []
 

@@ -64,7 +64,6 @@ class VCM(BDPT):
 
     @property
     def vertices(self) -> int:
-        """The most that are kept of a light path."""
         return max(self.longest - 1, 0)
 
     @property

@@ -49,7 +49,6 @@ class Map:
         return found
 
     def paths(self) -> LightPath:
-        """Each lane's own light path."""
         return LightPath(Reader(self), self.count)
 
 
@@ -60,7 +59,6 @@ class Reader:
         self.kept = kept
 
     def read(self, i: mi.UInt32):
-        """The record of vertex ``i``."""
         vertices, place = self.kept.vertices, self.kept.first + i
         return type(vertices)(*(dr.gather(type(v), v, place) for v in _values(vertices)))
 

@@ -133,7 +133,6 @@ class CameraPaths:
     # ------------------------------ What they all share -----------------------------
 
     def first(self, ray, importance, inside) -> Path:
-        """A path before its first ray is traced."""
         ray, n = mi.Ray3f(ray), dr.width(ray)
         β = mi.Spectrum(importance) + dr.zeros(mi.Spectrum, n)
         # As wide as the ray, and not a constant

@@ -41,7 +41,6 @@ class Piece(Path):
         return self.hit.t
 
     def end(self, alive: mi.Bool) -> Path:
-        """The path where the piece ends."""
         β = self.β * dr.exp(-media.depth(self.σ, self.length()))
         return Path(self.ray, self.hit, β, alive, self.sky)
 
@@ -130,5 +129,4 @@ class PathsByPieces(CameraPaths):
         return [piece.end(piece.alive & ~passes & ~self.goes_through(piece)) for piece in pieces]
 
     def goes_through(self, piece: Piece) -> mi.Bool:
-        """Whether the path goes straight on at the end of the piece."""
         return piece.alive & piece.hit.is_valid() & self.world.fog.media.passes(piece.hit.shape)

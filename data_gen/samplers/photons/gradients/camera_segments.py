@@ -86,7 +86,6 @@ class PathsBySegments(CameraPaths):
         return self.of_lanes(level, flights, random, lanes)
 
     def flight(self, path: Path, segment: segments.Segment, channel) -> Flight:
-        """The ``path`` that goes on by that ``segment``."""
         β, place = path.β * self.world.fog.brought(segment, channel), segment.place
         return Flight(segment.ray, segment.hit, β, path.alive, path.sky, place.medium, place.scatters)
 

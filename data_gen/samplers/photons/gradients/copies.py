@@ -31,8 +31,6 @@ from data_gen.samplers.photons.map.vertices import Photon, is_near, vertex_in_me
 
 @dataclass
 class LightPaths:
-    """What is known of where photons come from."""
-
     starts: LightRay  # the light's ends of all light paths
     photons: Any  # the map
 

@@ -121,7 +121,6 @@ def entered(all_of_it: list, values: list, low: mi.UInt32) -> list:
 
 
 def add_to(sums: list, lanes: mi.UInt32, parts: list) -> None:
-    """Adds a level's parts to the sums of all camera samples."""
     for total, part in zip(sums, parts, strict=False):
         dr.scatter(total, dr.gather(type(total), total, lanes) + part, lanes)
     dr.eval(sums)

@@ -49,8 +49,6 @@ def light(photon: Photon, x: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active) 
 
 
 def photon_of(photons, j: mi.UInt32, active=True) -> Photon:
-    """The photon of that place in the map."""
-
     def its(name: str):
         value = getattr(photons, name)
         return dr.gather(type(value), value, j, active)

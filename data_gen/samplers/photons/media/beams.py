@@ -262,12 +262,10 @@ def parts_of(passes: Passes, traced: Traced, most: int) -> Iterator[Any]:
 
 
 def counted(world: World, photons, rate) -> mi.UInt32:
-    """How many parts each edge has."""
     none = mi.UInt32(0), mi.UInt32(0)
     return cut(world, photons, rate, dr.zeros(mi.UInt32, len(photons)), none, None)
 
 
 def entered(world: World, photons, rate, first: mi.UInt32, window: tuple, parts):
-    """The ``parts`` of these numbers."""
     cut(world, photons, rate, first, window, parts)
     return parts

@@ -93,7 +93,6 @@ def fields_of(piece: Piece, index: mi.UInt32) -> tuple:
 
 
 def inside_of(base: Piece) -> mi.Bool:
-    """Whether a piece goes through a medium."""
     return base.alive & (base.medium != None)  # noqa: E711 - an array of pointers
 
 

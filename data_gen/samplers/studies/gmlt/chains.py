@@ -189,7 +189,6 @@ def run(
 
 
 def stream(keys: tuple[mi.UInt32, mi.UInt32], step: mi.UInt32) -> mi.PCG32:
-    """The random numbers of a step of chains."""
     a, b = mi.sample_tea_32(keys[0], step)
     random = mi.PCG32()
     random.seed(mi.UInt64(a) | (mi.UInt64(b) << 32), mi.UInt64(keys[1]))

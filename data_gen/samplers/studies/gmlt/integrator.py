@@ -88,6 +88,5 @@ def chosen(sums: np.ndarray, n: int, camera: CameraSamples) -> np.ndarray:
 
 
 def make(scene: mi.Scene) -> SamplePass:
-    """The sampler ``gmlt``."""
     gpt = SAMPLERS["gpt"].integrator(scene)
     return GMLT(Paths(gpt, scene, gpt.plan(scene)))
