@@ -26,11 +26,8 @@ from ngpt.stack import GradientStack
 
 
 class Remembering:
-    """The frames of one shot; ``options`` are as in ``render_stack``.
-
-    ``changes``: whether more than the camera may change from frame to frame. Raises NgptError for options that the
-    sampler does not have.
-    """
+    """The frames of one shot; ``options`` are as in ``render_stack``. ``changes``: whether more than the camera may
+    change from frame to frame. Raises NgptError for options that the sampler does not have."""
 
     def __init__(self, entry: FrameSampler, changes: bool, spp: int | None, seed: int, options: dict[str, Any]):
         self.entry, self.changes, self.seed, self.options = entry, changes, seed, dict(options)
@@ -52,10 +49,8 @@ class Remembering:
         depth: np.ndarray | None,
         progress: Callable[[int, int], None],
     ) -> GradientStack:
-        """The stack of frame number ``index`` of the shot; the ``scene`` has its ``shapes`` there.
-
-        Where the shot ``changes``, it is not the scene of the frame before, which must be as it was then.
-        """
+        """The stack of frame number ``index`` of the shot; the ``scene`` has its ``shapes`` there. Where the shot
+        ``changes``, it is not the scene of the frame before, which must be as it was then."""
         start = time.perf_counter()
         progress(0, self.spp)
         if self._sampler is None:
