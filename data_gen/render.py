@@ -97,7 +97,9 @@ def render_stack(
             why_not = f"the integrator is '{facts.integrator}', and only paths of 'path' do"
         if why_not and settings["tails"] == "shared":
             raise WrongUse(f"sampler '{sampler}': tails=shared is not possible: {why_not}; leave it out")
-        if "tails" not in options and not unbiased and not why_not and _enough_to_share(scene, budget):
+        pixels = math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
+        enough_to_share = enough(pixels, budget.spp) and budget.memory >= LEAST_MIB
+        if "tails" not in options and not unbiased and not why_not and enough_to_share:
             settings["tails"] = "shared"
             budget = replace(budget, memory=memory - MIB)
     if adaptive is not None:
@@ -149,12 +151,6 @@ def render_stack(
     if failed:
         raise Unfinished(str(failed) or type(failed).__name__, stack) from failed
     return stack
-
-
-def _enough_to_share(scene: mi.Scene, budget: Budget) -> bool:
-    """Whether a render has paths and memory enough for a cache that they share."""
-    pixels = math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
-    return enough(pixels, budget.spp) and budget.memory >= LEAST_MIB
 
 
 def options_as_attribute(entry: Entry, settings: dict[str, Any]) -> dict[str, str]:

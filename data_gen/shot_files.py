@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from concurrent.futures import as_completed
 from dataclasses import dataclass, field
-from functools import partial
 from inspect import signature
 from pathlib import Path
 from types import SimpleNamespace
@@ -113,7 +112,7 @@ def write_frames(
             raise
 
     for rest, frames in begun.items():
-        write_all(partial(_not_among, frozenset(frames)), rest.options(options.get("seed", 0)))
+        write_all(lambda frame, these=frozenset(frames): frame not in these, rest.options(options.get("seed", 0)))
     write_all(skip, {})
     if stop():
         done = {report["frame"] for report in written.frames if "unfinished" not in report}
@@ -179,7 +178,3 @@ def write_frames_on_cluster(
             made(whole, len(files))
     whole.frames.sort(key=lambda report: order.index(report["frame"]))
     return whole
-
-
-def _not_among(frames: frozenset[int], frame: int) -> bool:
-    return frame not in frames

@@ -1,10 +1,8 @@
 """Pipelines from scene to image: a sampler and a method, and the error that they are expected to leave.
 
-Each sampler that can render the scene renders four small stacks. Every method that can use them reconstructs each of
-the four, and each half merged. The error of such an image is measured against primals of the other half and of the
-other samplers, whose noise has zero mean (``data_gen.choosing.trials``), so blur and lost light count as error. The
-error at the number of samples that fit into the time is extrapolated by a power law. Its exponent comes partly from the
-pilot, which compares one stack to two, and partly from what is usual for this kind of method.
+Every method that can use a sampler's four small stacks (``data_gen.choosing.trials``) reconstructs each of them, and
+each half merged. The error at the number of samples that fit into the time is extrapolated by a power law. Its exponent
+comes partly from the pilot, which compares one stack to two, and partly from what is usual for this kind of method.
 
 No biased sampler (photons) judges others. Where one finds most of the light, the samplers that judge it are noisy:
 twice the standard error is added to the error they give. Light that no sampler has found in the pilot is not handled.

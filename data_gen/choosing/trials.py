@@ -207,7 +207,9 @@ class Witnesses:  # that judge the images of each sampler
 
     def doubt(self, sampler: str, image: np.ndarray) -> float:
         """The standard error of the error of an ``image`` of the first half."""
-        return doubt_of(image, *self.against(sampler, 1), self.scale)
+        a, b = self.against(sampler, 1)
+        values = ((image - a) * (image - b) / _denominator(self.scale)).mean(axis=-1)
+        return float(values.std()) / math.sqrt(values.size)
 
 
 def mean_of(images: dict[str, np.ndarray], noise: dict[str, float]) -> np.ndarray:
@@ -226,12 +228,6 @@ def error_of(x: np.ndarray, a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> 
     """The relMSE of an image by two independent unbiased ones; trimmed as the metric is."""
     under = _denominator(scale)
     return trimmed_mean((x - a) * (x - b) / under, np.square(x - (a + b) / 2) / under, _TRIM)
-
-
-def doubt_of(x: np.ndarray, a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> float:
-    """The standard error of ``error_of``, by how much pixels differ."""
-    values = ((x - a) * (x - b) / _denominator(scale)).mean(axis=-1)
-    return float(values.std()) / math.sqrt(values.size)
 
 
 def _denominator(scale: np.ndarray) -> np.ndarray:

@@ -73,14 +73,12 @@ class CameraSamples:
         dr.eval()
 
     @classmethod
-    def replayed(
-        cls, sensor: mi.Sensor, seed: int, pixel: mi.UInt32, sample: mi.UInt32, place: mi.Point2f, *, net: int = 0
-    ) -> Self:
+    def replayed(cls, sensor: mi.Sensor, seed: int, pixel: mi.UInt32, sample: mi.UInt32, place: mi.Point2f) -> Self:
         """Sample ``sample`` of each ``pixel``, at another ``place`` on the film; drawn in the kernel that needs it."""
         camera = cls.__new__(cls)
         camera.pixel = pixel
         camera._see(sensor)
-        camera._draw(seed, pixel, sample, net)
+        camera._draw(seed, pixel, sample, 0)
         camera.position = place
         return camera
 

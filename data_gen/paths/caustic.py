@@ -1,9 +1,7 @@
 """The layer ``caustic`` has the light of paths that leave a widely scattering surface and later a sharp one.
 
-Paths are followed from the camera. A path that has scattered at a connectable vertex and then meets a mirror, glass or
-sharp gloss is rare and bright, and cannot be shifted well: its shifted copy meets another point of the glass, and from
-there it misses the lamp. So its light, and all light that follows on the path, goes into a separate layer, for methods
-that need no differences.
+Such paths are rare and bright, and cannot be shifted well: a shifted copy meets another point of the glass, and from
+there it misses the lamp. So their light goes into a separate layer, for methods that need no differences.
 
     rough   the path has scattered smoothly at a connectable vertex
     late    and has later left a vertex by a mirror, glass or sharp gloss: its light belongs to the layer

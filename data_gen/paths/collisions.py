@@ -193,10 +193,5 @@ def rescale(
         return cross(passes, trace, ray, medium, reach, **way, scale=scale, most=base.n, active=mi.Bool(True))[-1]
 
     (N,) = dr.if_stmt((N,), moved, lambda N: (placed(),), lambda N: (N,))
-    N *= dr.exp(base.M - M) * list_jacobian(scale, base.n) / base.N_c
+    N *= dr.exp(base.M - M) * dr.select(base.n > 0, dr.power(scale, mi.Float(base.n)), 1) / base.N_c
     return τ, hit, last, end, N, pick(N, channel)
-
-
-def list_jacobian(scale: mi.Float, n: mi.UInt32) -> mi.Float:
-    """The Jacobian of scaling the positions of ``n`` collisions by ``scale``."""
-    return dr.select(n > 0, dr.power(scale, mi.Float(n)), 1)

@@ -28,7 +28,8 @@ class Lights:
     def __init__(self, scene: mi.Scene, places: Places | None = None):
         lamps = [shape for shape in scene.shapes() if shape.is_emitter()]
         far = [mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) for emitter in scene.emitters()]
-        uniform = [shape.emitter().class_name() == "AreaLight" and is_uniform(shape) for shape in lamps]
+        lamps = [shape for shape in lamps if shape.emitter().class_name() == "AreaLight"]
+        uniform = [shape.is_mesh() or shape.class_name() in _UNIFORM_SHAPES for shape in lamps]
         self.near, self.far = not all(far), any(far)
         # Emitters that are neither infinitely far away nor on a shape (point lights) are not counted as uniform.
         self.shared = sum(uniform) + sum(far) == len(scene.emitters())
@@ -41,10 +42,6 @@ class Lights:
             return *scene.sample_emitter_direction(x, u, False, active), None
         chosen = self.places.choose(x, u)
         return *self.places.sample(x, chosen, active), chosen
-
-
-def is_uniform(shape: mi.Shape) -> bool:
-    return shape.is_mesh() or shape.class_name() in _UNIFORM_SHAPES
 
 
 @dataclass

@@ -5,11 +5,11 @@ points, the default, come from Owen-scrambled Sobol sequences, with a new pair o
 
 - A pair of dimensions is the first two of Sobol's sequence, with a new scrambling of the order of the points and of
   both coordinates. [Burley 2020, "Practical Hash-based Owen Scrambling"]
-- Pixels are numbered in Z order, and a pixel's points are side by side, so that the points of aligned blocks of pixels
-  are well spread together, too. [Ahmed and Wonka 2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error
-  via hierarchical ordering of pixels"] This holds within tiles of 64x64 pixels, which are independent of each other.
-- Samples come in *rounds*. The first has the requested number of samples, or 16 if this is not known. Each further
-  round has as many as all rounds before it. Rounds are independent of each other.
+- Pixels are numbered in Z order, within tiles of 64x64 that are independent of each other, and a pixel's points are
+  side by side. [Ahmed and Wonka 2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error via hierarchical
+  ordering of pixels"]
+- Samples come in *rounds*, independent of each other: the first has the requested number of samples, or 16 if this is
+  not known, and each further one as many as all before it.
 - Light paths that are no pixel's own are numbered as they come in a pass; passes are independent of each other.
 """
 

@@ -1,9 +1,7 @@
 """How often each lamp of a scene is chosen, by what it brings to what the camera sees.
 
-Mitsuba chooses all lamps alike, unless a scene gives them ``sampling_weight``. The best weights are in proportion to
-the root of the mean square of what a lamp brings to a vertex, which a short pilot measures: at the first vertices of
-camera paths, each lamp is sampled in turn. So all kinds of lamps, the sun and an environment are measured in the same
-way, and lamps behind walls count for little.
+The best weights are in proportion to the root of the mean square of what a lamp brings to a vertex, which a short pilot
+measures: at the first vertices of camera paths, each lamp is sampled in turn, whatever kind of lamp it is.
 
 With many lamps, most light up little of the scene, which is cut into cells: in each, lamps are chosen by the mean
 square of their light at vertices there. The mean of each cell includes some virtual samples with the mean of its

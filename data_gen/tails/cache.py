@@ -52,12 +52,6 @@ def end_of_round(sample: int) -> int:
     return FIRST if sample < FIRST else 1 << sample.bit_length()
 
 
-def paths_before(sample: int, spp: int | None) -> float:
-    """Paths per pixel that have fed the cache before the round that begins with this ``sample``, of ``spp`` in all."""
-    end = end_of_round(sample)
-    return SHARE * (end if spp is None else min(end, spp))
-
-
 def fineness(sample: int) -> float:
     """The fineness of cells in the round that this ``sample`` is in."""
     return FINENESS * max(1.0, end_of_round(sample) / 128) ** _RATE

@@ -1,9 +1,7 @@
 r"""Bidirectional path tracing: for each camera sample a path from the camera and one from a light, joined every way.
 
-A light path finds at once what a camera path finds only by accident: light from lamps behind shades, or light that goes
-through glass onto a wall. Every way to find a path is a strategy; all are weighted against each other (``mis``). A
-vertex of the camera path is connected to a lamp and to one vertex of the light path, which stands for all of them
-(``choice``).
+Every way to find a path is a strategy; all are weighted against each other (``mis``). A vertex of the camera path is
+connected to a lamp and to one vertex of the light path, which stands for all of them (``camera_path.choose``).
 
     z                 vertices of the camera path
     y                 vertices of the light path, kept while the camera path is traced

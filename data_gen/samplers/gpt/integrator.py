@@ -26,9 +26,8 @@ from elsewhere), then *settled*: joined for longer, ended, or rejected. A base p
 apart walks on as a ghost. Its offset paths replay numbers that it has no use for, so that what their pixels see serves
 this pixel too, with w = 1/2, as it does in random sequence replay; to reject them would double their variance.
 
-All paths begin in ``trace``; the base path is in ``base_path``, the offset paths in ``offset_path``, the rules of
-shifting in ``data_gen.paths.shift``; ``plan`` decides which of all that a scene needs in its kernel. A vertex may be in
-a medium: ``data_gen.paths.space`` knows whether, and ``media`` and ``segments`` how.
+All paths begin in ``trace``; the rules of shifting are in ``data_gen.paths.shift``; ``plan`` decides which of all that
+a scene needs in its kernel. Whether a vertex is in a medium is known to ``data_gen.paths.space``.
 
 Russian roulette looks at all five paths, so that none is starved. It leaves r as it is: the weights of the two
 directions of a difference sum to one whatever paths survive.

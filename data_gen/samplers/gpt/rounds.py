@@ -67,7 +67,8 @@ class SharedTails:
         if self.cache is None:
             return
         pixels = int(dr.prod(mi.ScalarVector2u(sensor.film().crop_size())))
-        wanted = max(round(tails.paths_before(sample, spp) * pixels), tails.FEWEST)
+        end = tails.end_of_round(sample) if spp is None else min(tails.end_of_round(sample), spp)
+        wanted = max(round(tails.SHARE * end * pixels), tails.FEWEST)
         fineness = tails.fineness(sample)
         for part in (round(_FIRST_PART * wanted), wanted) if sample == 0 else (wanted,):
             while self.fed < part:

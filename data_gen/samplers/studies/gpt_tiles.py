@@ -14,9 +14,8 @@ the other pixels of the tile as well. So each of N pixels has N suffixes for its
 
 What ends at s_j, or at a lamp that was sampled there, needs only s_j (C1, q1, D1). What goes on from there needs also
 the direction that was sampled at s_j, whose density depends on where the path has come from (C2, q2, D2). Each path
-keeps its own MIS weights m of emitter against BSDF sampling: C is the contribution f m of one technique. Emitters are
-sampled at x_i by the numbers of all pixels of the tile. The density is the same everywhere, so D is the number of
-pixels.
+keeps its own MIS weights m: C is the contribution f m of one technique. Emitters are sampled at x_i by the numbers of
+all pixels of the tile, all with one density: D is the number of pixels.
 
 A difference across the border of two tiles has only the suffixes of its two pixels, as in ``gpt``. The grid of tiles
 moves by a pixel from sample to sample, so that each pair of pixels is in one tile in its turn. Both are unbiased,

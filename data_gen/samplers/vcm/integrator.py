@@ -1,22 +1,13 @@
 r"""Vertex connection and merging: ``bdpt`` and ``ppm`` in one, and every path of light under one weight.
 
-Connections find light from lamps and over rough surfaces; photons find what comes through glass and is seen in a mirror
-or through glass. Each fails where the other does well, and a scene does not show which one it needs. Here both render
-all light, and each path counts for each of them by the balance heuristic: by how likely it is found so.
-
     s, t        vertices of a path that come from the light, and from the camera
     z, y        vertices of the camera path and of light paths
     r, η        radius of a pass, and π r² N; N: light paths of the pass
 
 A pass has one camera sample and one light path for each pixel. Light paths are traced once: their vertices are
 connected to the camera (splats), kept in a map, connected to the camera path of the same sample (one of them,
-``bdpt.camera_path``), and gathered at all camera paths, within the radius, where materials scatter widely. The radius
-shrinks from pass to pass as in ``ppm``.
-
-Photons are gathered only where light comes from mirrors, clear glass or holes. The papers gather all; but where it
-comes from a surface that scatters, a connection to that one finds the path without any blur.
-
-Merging finds paths of up to ``joined_depth`` edges, like connections; longer ones come only from the camera.
+``bdpt.camera_path``), and gathered at all camera paths, within the radius, where materials scatter widely. Only those
+that light reaches from mirrors, clear glass or holes are gathered (docs/samplers/photons.md).
 
 [Georgiev et al. 2012, "Light Transport Simulation with Vertex Connection and Merging"; Hachisuka et al. 2012, "A Path
 Space Extension for Robust Light Transport Simulation"]

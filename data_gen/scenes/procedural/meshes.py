@@ -126,11 +126,9 @@ def sphere(radius: float, segments: int = 48) -> Mesh:
     return lathe(radius * profile, segments)
 
 
-def cylinder(radius: float, height: float, segments: int = 32, closed: bool = True) -> Mesh:
+def cylinder(radius: float, height: float, segments: int = 32) -> Mesh:
     """Stands on the ground; rims are doubled so that they stay sharp."""
     side = lathe([(radius, 0), (radius, height)], segments)
-    if not closed:
-        return side
     return merge([lathe([(0, 0), (radius, 0)], segments), side, lathe([(radius, height), (0, height)], segments)])
 
 

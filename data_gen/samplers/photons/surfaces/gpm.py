@@ -6,9 +6,8 @@ r"""Gradient-domain photon mapping on surfaces: ``ppm``, and each photon that is
     r           p' J / p of the copy
     Δ           gradient sample, the sum of 2 w (C' - C) over all photons, w = 1 / (1 + r)
 
-A photon that is near to x and to y is its own copy: r = 1, and no ray is traced. What it brings to both is the same
-but for f and β, be it light from a wall or a caustic. With a radius of three pixels, four photons of five are of this
-kind, of one pixel two of five. Others go where ``shift`` has them, see ``copies``. A photon without a copy has w = 1.
+A photon that is near to x and to y is its own copy: r = 1, and no ray is traced. With a radius of three pixels, four
+photons of five are of this kind. Others go where ``shift`` has them, see ``copies``. Without a copy w = 1.
 
 Camera paths are shifted by replay: see ``camera``. Emission that they meet behind mirrors and glass is shifted with
 them; that which is seen directly is not part of the gradients.

@@ -1,9 +1,5 @@
 r"""Progressive photon mapping: light is carried to where the camera looks, and gathered there from near by.
 
-Light that goes through glass and then onto a rough surface, seen in a mirror or through glass itself, is found by no
-connection: neither end can be joined to the other but by meeting it. Photons meet the surface, and are counted within
-a radius of the point that the camera path meets. That blurs the light over the radius, which shrinks from pass to pass.
-
     x           a vertex of the camera path, at a material that scatters widely
     b, d, Φ     a photon within radius r of it, the direction it came along, its power
     A           area of what photons are gathered from: π r², and less along edges (edges.py)
