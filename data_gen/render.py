@@ -57,12 +57,10 @@ def render_stack(
 ) -> GradientStack:
     """Renders a stack from the scene's first sensor.
 
-    ``sampler`` is "auto" or one of ``data_gen.samplers.SAMPLERS``; ``options`` are its options, which may be strings.
-    ``spp``, ``seconds`` and ``memory`` are as in ``data_gen.budget.Budget``, ``progress`` and ``stop`` as in
-    ``data_gen.budget.Watch``; ``newest`` is called after each pass with a function that makes the stack of the samples
-    done by then. With ``diagnostics`` the stack has the images of ``data_gen.film.GradientFilm.diagnose()`` as
-    further channels. Without ``with_features`` it holds only the primal; only sampler "primal" can do without features.
-    The scene's reconstruction filter is not used: the pixels of a stack, and so their differences, are box-filtered.
+    What ``data_gen.render_scene`` has too is as there; ``options`` may be strings. With ``diagnostics`` the images of
+    ``data_gen.film.GradientFilm.diagnose()`` are further channels. Without ``with_features`` the stack holds only the
+    primal; only sampler "primal" can do without features. The scene's reconstruction filter is not used: the pixels of
+    a stack, and so their differences, are box-filtered.
 
     With ``adaptive``, pixels get different numbers of samples, which the layer ``samples`` contains: see
     ``data_gen.adaptive``. ``spp`` and ``ngpt:spp`` are then means over pixels.

@@ -112,7 +112,8 @@ def write_frames(
             raise
 
     for rest, frames in begun.items():
-        write_all(lambda frame, these=frozenset(frames): frame not in these, rest.options(options.get("seed", 0)))
+        others = frozenset(files) - frozenset(frames)
+        write_all(others.__contains__, rest.options(options.get("seed", 0)))
     write_all(skip, {})
     if stop():
         done = {report["frame"] for report in written.frames if "unfinished" not in report}

@@ -53,7 +53,11 @@ class Onlookers:
             if not self.expected:
                 made = stack()
                 self.expected = _LOAD + _PIXEL * made.width * made.height
-            if self._affordable(begin - self.start):
+            gone = begin - self.start
+            if not self.shown:
+                # Relative to the whole render, but cautiously: how long it takes is not known well yet.
+                gone = max(gone, _AHEAD * (gone + self.left))
+            if self.spent + self.expected <= SHARE * gone:
                 self.shown = True
                 try:
                     self._show(made or stack())
@@ -87,12 +91,6 @@ class Onlookers:
 
     def _watched(self) -> bool:
         return self.page is not None and self.page.watched
-
-    def _affordable(self, gone: float) -> bool:
-        if not self.shown:
-            # Relative to the whole render, but cautiously: how long it takes is not known well yet.
-            gone = max(gone, _AHEAD * (gone + self.left))
-        return self.spent + self.expected <= SHARE * gone
 
     def _show(self, stack: GradientStack) -> None:
         if self.page is not None:

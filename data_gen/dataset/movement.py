@@ -53,21 +53,18 @@ class Movement:
         if not self.shape and not self.light:
             return
         params = mi.traverse(scene)
-        if self.shape:
-            self._move(params, np.array(self.shift) * frame)
+        far = np.array(self.shift) * frame
+        if self.shape.endswith(".to_world"):
+            start = self._start.setdefault(self.shape, mi.Transform4f(params[self.shape]))
+            params[self.shape] = mi.Transform4f(mi.ScalarTransform4f().translate(list(map(float, far)))) @ start
+        elif self.shape:
+            put_vertices(params, self.shape, self._start.setdefault(self.shape, vertices(params, self.shape)) + far)
         if self.light:
             start = self._start.setdefault(self.light, type(params[self.light])(params[self.light]))
             value = start * self.gain**frame
             dr.make_opaque(value)  # as a literal it would be compiled into the kernels
             params[self.light] = value
         params.update()
-
-    def _move(self, params: mi.SceneParameters, far: np.ndarray) -> None:
-        if self.shape.endswith(".to_world"):
-            start = self._start.setdefault(self.shape, mi.Transform4f(params[self.shape]))
-            params[self.shape] = mi.Transform4f(mi.ScalarTransform4f().translate(list(map(float, far)))) @ start
-            return
-        put_vertices(params, self.shape, self._start.setdefault(self.shape, vertices(params, self.shape)) + far)
 
     def record(self) -> dict:
         told = {"way": self.way, "turn": self.turn, "shape": self.shape, "shift": self.shift}

@@ -41,29 +41,19 @@ class Remembering:
         self._sampler: Any = None
 
     def render(
-        self,
-        scene: mi.Scene,
-        shapes: Sequence[Geometry],
-        index: int,
-        motion: np.ndarray,
-        depth: np.ndarray | None,
-        progress: Callable[[int, int], None],
+        self, scene: mi.Scene, shapes: Sequence[Geometry], index: int, motion: np.ndarray, depth: np.ndarray | None
     ) -> GradientStack:
         """The stack of frame number ``index`` of the shot; the ``scene`` has its ``shapes`` there. Where the shot
         ``changes``, it is not the scene of the frame before, which must be as it was then."""
         start = time.perf_counter()
-        progress(0, self.spp)
         if self._sampler is None:
             if reason := self.entry.refuses(scene_facts(scene)):
                 raise NgptError(f"sampler '{self.entry.name}' cannot render this scene: {reason}; use --sampler gpt")
             self._sampler = self.entry.made(scene, self.seed, self.spp, self.memory, **self.options)
         film = self._sampler.film(index, motion, depth, (scene, shapes) if self.changes else None)
         more = {"ngpt:confidence": self._sampler.confidence} | options_as_attribute(self.entry, self.options)
-        stack = stack_of(
-            film, scene.sensors()[0], self.seed, self.entry.name, start, more, diagnostics=self.diagnostics
-        )
-        progress(self.spp, self.spp)
-        return stack
+        sensor, name = scene.sensors()[0], self.entry.name
+        return stack_of(film, sensor, self.seed, name, start, more, diagnostics=self.diagnostics)
 
 
 class Shot:
@@ -140,7 +130,6 @@ def render_shot(
     dt: int = 0,
     *,
     skip: Callable[[int], bool] = lambda frame: False,
-    progress: Callable[[int], Callable[[int, int], None]] = lambda frame: lambda done, total: None,
     sampler: str = "auto",
     **options: Any,
 ) -> Iterator[tuple[int, GradientStack]]:
@@ -193,11 +182,11 @@ def render_shot(
                 motion = motion_vectors(scene, now, before, what)
             if remembering is not None:
                 far = None if what is None else depth(scene, now, what)
-                stack = remembering.render(scene, now.shapes, j, motion, far, progress(frame))
+                stack = remembering.render(scene, now.shapes, j, motion, far)
             else:
                 try:
                     own = frame_seed(seed, frame)
-                    stack = render_stack(scene, spp, own, sampler, progress=progress(frame), **options)
+                    stack = render_stack(scene, spp, own, sampler, **options)
                 except Unfinished as error:
                     placed = _placed(error.stack, frame, previous, motion + np.asarray(shift, np.float32))
                     raise Unfinished(f"frame {frame}: {error}", placed) from error

@@ -7,9 +7,8 @@ width of the bundle of paths that arrive there, over which the light of the cell
 
     spread = Σ t / sqrt(p |cos θ|),
 
-for steps of length t whose direction has density p and meets the surface at θ; the same area is in Bekaert et al. 2003,
-"Custom path-space filtering", and ends paths in Müller et al. 2021, "Real-time neural radiance caching for path
-tracing", and in NVIDIA's SHaRC.
+for steps of length t whose direction has density p and meets the surface at θ [the same area: Bekaert et al. 2003,
+"Custom path-space filtering"; Müller et al. 2021, "Real-time neural radiance caching for path tracing"].
 """
 
 from __future__ import annotations

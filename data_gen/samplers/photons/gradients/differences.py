@@ -172,7 +172,7 @@ class Found:
 
 
 def spread_out(near: Any, world: World, paths: list) -> list:
-    return near.spread(world, paths)
+    return [near.spread(world, path) for path in paths]
 
 
 def of_pairs(near: Near, world: World, pairs: Pairs, paths: list, longest: mi.UInt32) -> Found:

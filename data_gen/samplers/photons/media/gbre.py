@@ -4,8 +4,7 @@ r"""Gradients of the beam radiance estimate: ``bre``, and each photon that is ga
     b, b'       a photon beside A and its copy beside B: light path and camera path together make the path and its copy
     t, t'       the distances along A and B to where they are
     C, C'       β T(t) f Φ / (π r² N) of either, both with the density of the photon's path
-    r           p' J / p of the copy
-    Δ           gradient sample, the sum of 2 w (C' - C) over all photons, w = 1 / (1 + r)
+    r, w, Δ     as in ``gpm``
 
 A photon that is beside both is its own copy: r = 1, and no ray is traced. One that is beside only A keeps its distance
 along the ray, and goes to its mirror image beside B: there A is further away than the radius. Between two rays from one

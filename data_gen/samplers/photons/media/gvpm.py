@@ -3,8 +3,7 @@ r"""Gradients of photons in media: ``vpm``, and each photon that is gathered shi
     x, y        where a camera path scatters in a medium, and where the neighbouring pixel's path does
     b, b'       a photon in the ball around x and its copy in that around y
     C, C'       β f Φ / (4/3 π r³ N) of either, both with the density of the photon's path
-    r           p' J / p of the copy
-    Δ           gradient sample, the sum of 2 w (C' - C) over all photons, w = 1 / (1 + r)
+    r, w, Δ     as in ``gpm``
 
 A photon in both balls is its own copy: r = 1, and no ray is traced. A photon only in the ball around x goes to its
 mirror image in the plane between x and y, which is only in the ball around y. (Gruson et al. call both together the

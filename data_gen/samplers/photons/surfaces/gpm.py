@@ -75,11 +75,8 @@ class OnSurfaces:
         x = hit.compute_surface_interaction(mi.Ray3f(o, d))
         return AtVertex(x, β, alive & x.is_valid() & world.materials.connectable(x.bsdf()))
 
-    def spread(self, world: World, paths: list[Path]) -> list[Path]:
-        """The paths, their β times π r² / A: of each its own."""
-        return [self.spread_one(world, path) for path in paths]
-
-    def spread_one(self, world: World, path: Path) -> Path:
+    def spread(self, world: World, path: Path) -> Path:
+        """The path, its β times its own π r² / A."""
         x = path.vertex()
         receives = path.alive & x.is_valid() & world.materials.connectable(x.bsdf())
         return replace(path, β=path.β * spread(world, x, self.radius2, self.number, receives))
