@@ -74,7 +74,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
     for option, given in apart.items():
         if given:
             raise WrongUse(f"{option} belongs to a shot; name its frames: --frames 0:120")
-    for text in (args.scene, *dict(args.define).values()):
+    for text in (args.scene, *(value for _, value in args.define)):
         if varies(text):
             raise WrongUse(f"'{text}' changes from frame to frame; name the frames: --frames 0:120")
     target = Path(args.output or f"{Path(args.scene).stem}.exr")

@@ -59,7 +59,11 @@ def card(data: Dataset, told: dict) -> str:
     sampler = config.get("sampler", "gpt")
     if config["reference_spp"]:
         what = "the noisiest input and the reference"
-        how = f"{config['reference_method']}."
+        how = (
+            f"References: {sampler} at {config['reference_spp']} samples per pixel, reconstructed by "
+            f"{config['reference_method']}."
+        )
+    else:
         what, how = "halves", f"No references: the two inputs of a crop, by {sampler}, judge each other."
     lines = [
         "# Training set",
