@@ -7,8 +7,7 @@ that a sampler finds in one pixel of a thousand is an outlier, which a method ta
 
 What a sample takes is measured in processor seconds, which other work on the machine hardly changes, so a busy moment
 moves no sampler against another. A user gives seconds of the wall. One factor for all trials turns the one into the
-other: their wall seconds over their processor seconds, both of further samples. On an idle machine that is what the
-cores do in parallel; on a busy one also what others leave, which the render will have to live with as well.
+other: their wall seconds over their processor seconds, both of further samples.
 """
 
 from __future__ import annotations

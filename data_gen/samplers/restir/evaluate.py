@@ -7,9 +7,8 @@ vertices that are replayed may be joined, and the one before rc must be connecta
 
 At its own place, by its own camera, E gives back the f that was recorded, to float32.
 
-A shadow ray tests occlusion, with its ends kept off surfaces by epsilons; a walk tests it by what its ray meets. Of
-90,000 paths in three scenes none differed. ``P`` and ``shape`` of a record belong to this scene: what was found in
-another is carried here first, see ``data_gen.samplers.restir.carry``.
+``P`` and ``shape`` of a record belong to this scene: what was found in another is carried here first, see
+``data_gen.samplers.restir.carry``.
 """
 
 from __future__ import annotations

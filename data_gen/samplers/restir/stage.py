@@ -26,7 +26,7 @@ class Stage:
 
 
 def check(plan: Plan) -> None:
-    """Raises NgptError where records would be wrong: other colours than RGB, lamps that hide from the camera."""
+    """Raises NgptError where records would be wrong: other colours than RGB, lamps that hide from the camera, media."""
     if not mi.is_rgb or mi.is_polarized:
         raise NgptError(f"restir: records hold RGB, and the variant is '{mi.variant()}'; use 'llvm_ad_rgb'")
     if plan.limits.hide_emitters:
