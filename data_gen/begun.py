@@ -212,15 +212,12 @@ class Asked:
 
 
 def begun_stack(path: Path) -> GradientStack:
-    return rendered(read(path))
-
-
-def rendered(read: GradientStack) -> GradientStack:
-    """What was rendered of a stack that was read from a file: without the image that a method made of it, if any."""
-    layers = {name: read[name] for name in read.names if name != "error"}
-    attributes = {name: value for name, value in read.attributes.items() if name not in MADE_BY}
-    further = {name: channel for name, channel in pass_through(read).items() if name.startswith(DIAGNOSTICS)}
-    stack = GradientStack(layers, attributes, path=read.path, place=read.place)
+    """What was rendered of the stack in a file: without the image that a method made of it, if any."""
+    found = read(path)
+    layers = {name: found[name] for name in found.names if name != "error"}
+    attributes = {name: value for name, value in found.attributes.items() if name not in MADE_BY}
+    further = {name: channel for name, channel in pass_through(found).items() if name.startswith(DIAGNOSTICS)}
+    stack = GradientStack(layers, attributes, path=found.path, place=found.place)
     return with_channels(stack, further) if further else stack
 
 

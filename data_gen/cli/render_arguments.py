@@ -105,9 +105,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also write the rates of failed shifts and of discarded values, as channels",
     )
     parser.add_argument(
-        "--live",
-        action="store_true",
-        help="show the image while it is rendered, on a page of this machine (127.0.0.1)",
+        "--live", action="store_true", help="show the image while it is rendered, on a page of this machine (127.0.0.1)"
     )
     parser.add_argument("--variant", help="Mitsuba variant: llvm_ad_rgb (default), cuda_ad_rgb")
     parser.add_argument(
@@ -146,9 +144,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     existing = parser.add_mutually_exclusive_group()
     add_force(existing)
     existing.add_argument(
-        "--skip-existing",
-        action="store_true",
-        help="skip finished images and continue unfinished ones",
+        "--skip-existing", action="store_true", help="skip finished images and continue unfinished ones"
     )
     add_json(parser)
 

@@ -4,11 +4,8 @@ Kernel-predicting networks denoise the two apart [Bako et al. 2017, "Kernel-Pred
 Denoising Monte Carlo Renderings", section 5.1]. Light that reaches the camera in several lobes of one vertex is shared
 between the layers in proportion to them, f_diffuse / f (``Lobes``), by whichever technique it was found: that has less
 noise than to go by the lobe which was sampled, and the same mean. The rest, mirrors, glass, gloss, and emission seen
-through holes, is specular. Neither layer holds emission that the camera sees directly:
-
-    primal = direct + diffuse + specular
-
-Holes (null events) are no scattering. Paths are sampled as by Mitsuba's ``path``, steps taken as in ``gpt_simple``.
+through holes, is specular, and primal = direct + diffuse + specular. Holes (null events) are no scattering. Paths are
+sampled as by Mitsuba's ``path``, steps taken as in ``gpt_simple``.
 """
 
 from __future__ import annotations
