@@ -53,9 +53,11 @@ _PART = 96
 
 @dataclass(frozen=True)
 class Adaptive:
-    """How samples are shared out. The ``error`` is relative: the root of the mean of (x - r)² / (r² + 1e-3) over all
-    but the worst 0.1 % of the pixels, for the result x of the ``method`` and the converged image r, as far as standard
-    errors foretell it."""
+    """How samples are shared out.
+
+    The ``error`` is relative: the root of the mean of (x - r)² / (r² + 1e-3) over all but the worst 0.1 % of the
+    pixels, for the result x of the ``method`` and the converged image r, as far as standard errors foretell it.
+    """
 
     error: float | None = None  # that ends the render; None: as far as samples or time go
     method: str = "auto"

@@ -14,9 +14,11 @@ DEFAULT_VARIANT = "llvm_ad_rgb"
 
 
 def use_variant(name: str = DEFAULT_VARIANT) -> None:
-    """Makes ``name`` the current Mitsuba variant and registers our integrators with it. Any JIT variant will do
-    (``llvm_*`` runs on the CPU, ``cuda_*`` on an NVIDIA GPU). Raises NgptError when Mitsuba is not installed, the
-    variant does not exist or is not a JIT variant, or its machinery (LLVM, CUDA driver) is absent."""
+    """Makes ``name`` the current Mitsuba variant and registers our integrators with it.
+
+    Any JIT variant will do (``llvm_*`` runs on the CPU, ``cuda_*`` on an NVIDIA GPU). Raises NgptError when Mitsuba is
+    not installed, the variant does not exist or is not a JIT variant, or its machinery (LLVM, CUDA driver) is absent.
+    """
     try:
         import mitsuba as mi
     except ModuleNotFoundError as error:

@@ -140,8 +140,10 @@ def measure(
     goes_on: Callable[[], bool] = lambda: True,
 ) -> list[Pipeline]:
     """The pipelines of trials by name of sampler: every method that runs here on every stack that it can use.
+
     ``methods`` restricts the methods of each sampler. With ``shared``, samples are also distributed adaptively, else
-    only evenly. Each sampler gets at least one method, and further ones as long as it ``goes_on``."""
+    only evenly. Each sampler gets at least one method, and further ones as long as it ``goes_on``.
+    """
     witnesses = Witnesses.of(trials)
     found = []
     for name, trial in trials.items():

@@ -79,8 +79,10 @@ def explore(
     patient: bool = False,
 ) -> list[Pipeline]:
     """The pipelines of a scene, for an image of its size; see ``plan``, which chooses of them. None where no trial fits
-    into the time; ``patient``, the first sampler has a trial and a method however long they take. ``after`` of them is
-    all that follows the render: its file, a process that reads it, the method, the image's file."""
+    into the time; ``patient``, the first sampler has a trial and a method however long they take.
+
+    ``after`` of them is all that follows the render: its file, a process that reads it, the method, the image's file.
+    """
     start = pilot.clock()
     able = _able(scene, method)
     _check_memory(scene, able[0], None, memory)
@@ -206,16 +208,20 @@ def plan_sampler(
 
 def in_a_room(scene: mi.Scene, facts: Facts, spp: int | None) -> bool:
     """Whether ``primal`` and ``ngpt-primal`` leave less error and FLIP than gradients would, after the same whole time.
+
     They do in rooms of surfaces, where paths share their tails (docs/lab/worth.md). Small images are the same to both,
-    and without OIDN gradients clean better."""
+    and without OIDN gradients clean better.
+    """
     able = samplers.choose(facts)[0] == "gpt" and not facts.media and not SAMPLERS["primal"].refuses(facts)
     return able and enough(_pixels(scene), spp) and not METHODS[_ROOM_METHOD].missing() and enclosed(scene)
 
 
 def enclosed(scene: mi.Scene) -> bool:
-    """Whether nearly all light that reaches what the camera sees comes from other surfaces. Rays go through random
-    pixels, and continue from where they hit in directions sampled by the cosine. Windows without glass count as open.
-    The rays are always the same. It takes 0.15 processor seconds."""
+    """Whether nearly all light that reaches what the camera sees comes from other surfaces.
+
+    Rays go through random pixels, and continue from where they hit in directions sampled by the cosine. Windows without
+    glass count as open. The rays are always the same. It takes 0.15 processor seconds.
+    """
     random = mi.PCG32(_RAYS)
     pairs = (mi.Point2f(random.next_float32(), random.next_float32()) for _ in range(3))
     sensor = scene.sensors()[0]

@@ -78,9 +78,12 @@ def try_all(
     first: float = math.inf,
     pilot: Pilot = Pilot(),
 ) -> dict[str, Trial]:
-    """Trials of the samplers that can render the scene, by name. Together they may take as many seconds of the clock as
-    the ``budget`` returns when called with the trials so far. A trial that would not fit into the remaining time, by
-    its time to compile and to render, is left out. The ``first`` has a budget of its own, and is always compiled."""
+    """Trials of the samplers that can render the scene, by name.
+
+    Together they may take as many seconds of the clock as the ``budget`` returns when called with the trials so far. A
+    trial that would not fit into the remaining time, by its time to compile and to render, is left out. The ``first``
+    has a budget of its own, and is always compiled.
+    """
     clock, stop = pilot.clock, pilot.stop
     start, slow = clock(), 1.0
     trials: dict[str, Trial] = {}
@@ -123,9 +126,11 @@ def try_out(
     stop: Callable[[], bool] = lambda: False,
     unbiased: bool = False,
 ) -> tuple[Trial | None, float]:
-    """Four small stacks by a sampler, and when its kernels were compiled. None for the stacks where it finds, of this
-    scene, that it cannot render it, where they are expected to end later than the ``limit`` from now, and where
-    ``stop`` says so."""
+    """Four small stacks by a sampler, and when its kernels were compiled.
+
+    None for the stacks where it finds, of this scene, that it cannot render it, where they are expected to end later
+    than the ``limit`` from now, and where ``stop`` says so.
+    """
     begins = clock()
     batch = SAMPLERS[sampler].batch
     spp, seed = max(SPP, 2 * batch), seed_of(sampler)
@@ -193,9 +198,11 @@ class Witnesses:  # that judge the images of each sampler
         return side(0), side(1)
 
     def error(self, sampler: str, halves: Sequence[Sequence[np.ndarray]]) -> float:
-        """The error of independent images by ``sampler``, some from each of its halves. It is at least the noise by
-        which the images of one half differ from each other. This bound is certain even where noise in the other
-        samplers hides the rest."""
+        """The error of independent images by ``sampler``, some from each of its halves.
+
+        It is at least the noise by which the images of one half differ from each other. This bound is certain even
+        where noise in the other samplers hides the rest.
+        """
         judged = [
             error_of(image, *self.against(sampler, 1 - half), self.scale)
             for half, images in enumerate(halves)

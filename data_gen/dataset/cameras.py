@@ -146,9 +146,12 @@ def grid_rays(sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float) -> View:
-    """A random view that shows something; views that show more are more likely. ``size``: the crop's, in pixels;
-    ``roll``: the largest angle about the view direction, degrees; ``lens``: standard deviation of the aperture's
-    radius, relative to the distance in focus (0.005 in the paper). Raises NgptError when no view can be found."""
+    """A random view that shows something; views that show more are more likely.
+
+    ``size``: the crop's, in pixels; ``roll``: the largest angle about the view direction, degrees; ``lens``: standard
+    deviation of the aperture's radius, relative to the distance in focus (0.005 in the paper). Raises NgptError when no
+    view can be found.
+    """
     views: list[View] = []
     details: list[float] = []
     for attempt in range(2 * ATTEMPTS):
@@ -202,9 +205,11 @@ def floats(vector: np.ndarray) -> tuple[float, float, float]:
 
 
 def with_one_kernel(around: Surroundings, view: View) -> View:
-    """The view, or one that hardly differs, for which all views of a scene share their kernels. Pixels are square, so
-    two factors of the camera's projection are equal but for rounding. Where they are equal to the last bit, Dr.Jit
-    takes them for one variable, and compiles all kernels, for many seconds, once more."""
+    """The view, or one that hardly differs, for which all views of a scene share their kernels.
+
+    Pixels are square, so two factors of the camera's projection are equal but for rounding. Where they are equal to the
+    last bit, Dr.Jit takes them for one variable, and compiles all kernels, for many seconds, once more.
+    """
     params = mi.traverse(around.scene.sensors()[0])
     crop, corner = mi.ScalarVector2i(view.size, view.size), mi.ScalarVector2i(*view.window)
     # Some sizes have equal factors whatever the field of view: all sizes that are as high as the crop.

@@ -31,9 +31,11 @@ LIT = 0.1  # the share of pixels of the first input that must have seen any ligh
 
 
 def make_shard(config: Config, job: Job, folder: str, variant: str, again: Again | None = None) -> str:
-    """Renders the crops of ``job`` and writes its shard into ``folder``; returns its name there. Runs in any process.
-    The same config and job give the same bits. A crop that fails is recorded and left out. Where there are references
-    (``again``), only inputs are rendered, with new noise."""
+    """Renders the crops of ``job`` and writes its shard into ``folder``; returns its name there.
+
+    Runs in any process. The same config and job give the same bits. A crop that fails is recorded and left out. Where
+    there are references (``again``), only inputs are rendered, with new noise.
+    """
     if (Path(folder) / job.file).exists():  # made by a worker that was lost before it said so
         return job.file
     use_variant(variant)
@@ -244,9 +246,11 @@ def references(converged: GradientStack, method: str) -> tuple[np.ndarray, np.nd
 
 
 def finite(stack: GradientStack) -> tuple[GradientStack, int]:
-    """The stack without values that are not finite, and how many pixels or differences had some. Pixels are filled from
-    their neighbours, and gradients become 0. An unknown variance becomes the square of the value, as if the value were
-    only noise."""
+    """The stack without values that are not finite, and how many pixels or differences had some.
+
+    Pixels are filled from their neighbours, and gradients become 0. An unknown variance becomes the square of the
+    value, as if the value were only noise.
+    """
     whole = repair(stack)
     layers = {"primal": whole.image + whole.direct, "direct": whole.direct}
     if "caustic" in stack:

@@ -29,9 +29,11 @@ class Key:
 
 
 class CameraPath:
-    """Key frames in rising order; before the first and after the last the camera rests. A camera's scale, which
-    exporters write and Mitsuba refuses, is taken out of its matrix. Raises NgptError for a matrix that flattens space
-    or is not finite, and for cameras that are mirrored in some keys and not in others."""
+    """Key frames in rising order; before the first and after the last the camera rests.
+
+    A camera's scale, which exporters write and Mitsuba refuses, is taken out of its matrix. Raises NgptError for a
+    matrix that flattens space or is not finite, and for cameras that are mirrored in some keys and not in others.
+    """
 
     def __init__(self, keys: list[Key]):
         self.keys = [replace(key, to_world=_rigid(key)) for key in keys]
@@ -110,9 +112,11 @@ def _between(one: np.ndarray, other: np.ndarray, t: float) -> np.ndarray:
 
 
 def read_camera_path(path: str | Path) -> CameraPath:
-    """Reads ``{"keys": [{"frame": 0, ...}, ...]}``, or only the list. A key has ``to_world`` (4 rows of 4 numbers,
-    Mitsuba's) or ``origin``, ``target`` and, if not +y, ``up``; and may have ``fov`` in degrees with ``fov_axis`` "x"
-    (default) or "y". Raises NgptError for other files and keys."""
+    """Reads ``{"keys": [{"frame": 0, ...}, ...]}``, or only the list.
+
+    A key has ``to_world`` (4 rows of 4 numbers, Mitsuba's) or ``origin``, ``target`` and, if not +y, ``up``; and may
+    have ``fov`` in degrees with ``fov_axis`` "x" (default) or "y". Raises NgptError for other files and keys.
+    """
     content = read_json(path)
     entries = content.get("keys") if isinstance(content, dict) else content
     if not isinstance(entries, list) or not entries:

@@ -30,9 +30,11 @@ Channel = tuple[np.ndarray, np.ndarray, str]
 
 
 def read_gltf_camera(path: str | Path, fps: float) -> CameraPath:
-    """The path of a file's first camera, a key for each frame; frame 0 is second 0. Coordinates are as in the file,
-    where +y is up. Buffers may be in the file, in its folder or in folders below. Raises NgptError for files that
-    cannot be read, and where no node has a perspective camera."""
+    """The path of a file's first camera, a key for each frame; frame 0 is second 0.
+
+    Coordinates are as in the file, where +y is up. Buffers may be in the file, in its folder or in folders below.
+    Raises NgptError for files that cannot be read, and where no node has a perspective camera.
+    """
     if not 0 < fps < math.inf:
         raise WrongUse(f"{path}: {fps:g} frames a second; give a positive number")
     try:

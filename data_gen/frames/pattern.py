@@ -31,9 +31,11 @@ def varies(text: str) -> bool:
 
 
 def filled(text: str, frame: int) -> str:
-    """The text with its fields replaced: ``{frame}``, ``{frame:04d}``, ``{10 + frame * 3:.2f}``. A field is a number,
-    ``frame``, ``pi``, + - * / // %, brackets, sin, cos, min, max, and how to write it, as in Python, in at most 99
-    letters and with at most 99 places. Raises WrongUse for anything else."""
+    """The text with its fields replaced: ``{frame}``, ``{frame:04d}``, ``{10 + frame * 3:.2f}``.
+
+    A field is a number, ``frame``, ``pi``, + - * / // %, brackets, sin, cos, min, max, and how to write it, as in
+    Python, in at most 99 letters and with at most 99 places. Raises WrongUse for anything else.
+    """
 
     def value(match: re.Match) -> str:
         field, form = match.groups()

@@ -26,9 +26,11 @@ BATCHES = 16
 
 
 def light(scene: mi.Scene, seed: int, spp: int, motion: np.ndarray | None = None) -> list[tuple[int, np.ndarray]]:
-    """All light but what the camera sees directly, in batches: how many samples a pixel, and their mean (H, W, 3). With
-    the ``motion`` (H, W, 2) of a later frame, samples are partners of the samples with the same ``seed`` there. NaN
-    where a partner is not on the film, where the motion is not known, and where a sample is not finite."""
+    """All light but what the camera sees directly, in batches: how many samples a pixel, and their mean (H, W, 3).
+
+    With the ``motion`` (H, W, 2) of a later frame, samples are partners of the samples with the same ``seed`` there.
+    NaN where a partner is not on the film, where the motion is not known, and where a sample is not finite.
+    """
     integrator, sensor = reference_integrator(scene), scene.sensors()[0]
     estimate, medium = radiance(scene, integrator), sensor.get_medium()
     width, height = (int(n) for n in sensor.film().crop_size())

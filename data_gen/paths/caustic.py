@@ -35,8 +35,10 @@ def lit_late(rough: mi.Bool, late: mi.Bool, connectable: mi.Bool) -> mi.Bool:
 
 def ends_late(smooth: mi.Bool, connectable: mi.Bool, sharp_next: mi.Bool) -> mi.Bool:
     """Whether all light from behind the next vertex belongs to the layer: it has no hole, and nothing that scatters
-    widely, and is left late whatever is sampled there. So there is no use in a shifted copy: it is rejected a step
-    before one of the two is late, again from both sides."""
+    widely, and is left late whatever is sampled there.
+
+    So there is no use in a shifted copy: it is rejected a step before one of the two is late, again from both sides.
+    """
     return smooth & connectable & sharp_next
 
 

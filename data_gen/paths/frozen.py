@@ -67,9 +67,11 @@ class Frozen:
 
 
 class _Recorded:
-    """A function that ``dr.freeze`` records, with arrays that it uses beside its arguments. ``dr.freeze`` makes a
-    class, which only Python's collector of circles frees. Until then all would live that the class knows: scenes of
-    earlier renders, which make kernels larger, and whose end has them recorded anew."""
+    """A function that ``dr.freeze`` records, with arrays that it uses beside its arguments.
+
+    ``dr.freeze`` makes a class, which only Python's collector of circles frees. Until then all would live that the
+    class knows: scenes of earlier renders, which make kernels larger, and whose end has them recorded anew.
+    """
 
     def __init__(self, f: Callable, state: list):
         self.f, self.state, this = f, state, weakref.ref(self)

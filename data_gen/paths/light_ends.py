@@ -149,9 +149,11 @@ class LightEnds:
         return self.emission(start.index, p, cos, distance2), p
 
     def redirected(self, scene, start: LightRay, y: mi.SurfaceInteraction3f) -> tuple[LightRay, mi.Float, mi.Float]:
-        """``start`` shifted: the same end, but the edge to vertex ``y``. Its β is Le cos / p with the p of ``start``.
-        With it come p' / p, and dω / dA cos, of the cosine at y: the inverse of the squared distance, or 1 if it is
-        infinite."""
+        """``start`` shifted: the same end, but the edge to vertex ``y``.
+
+        Its β is Le cos / p with the p of ``start``. With it come p' / p, and dω / dA cos, of the cosine at y: the
+        inverse of the squared distance, or 1 if it is infinite.
+        """
         kind = dr.gather(mi.UInt32, self.kind, start.index)
         far = kind == _FAR
         to = mi.Vector3f(y.p - start.end.p)

@@ -79,9 +79,11 @@ def replay_light(
 def replay_lamp(
     lights: Lights, base, base_weight, chosen: Chosen, x, y: mi.SurfaceInteraction3f, *, lit: mi.Bool
 ) -> tuple[LightSample, mi.Float]:
-    """Replays a lamp sample ``chosen`` by place at vertex ``x``: the same point on the same lamp, seen from ``y``. Its
-    ``p`` includes the probability P of choosing the lamp at ``y``, its ``weight`` the probability at ``x``. The ratio
-    P(y) / P(x), a factor of r, is returned as well."""
+    """Replays a lamp sample ``chosen`` by place at vertex ``x``: the same point on the same lamp, seen from ``y``.
+
+    Its ``p`` includes the probability P of choosing the lamp at ``y``, its ``weight`` the probability at ``x``. The
+    ratio P(y) / P(x), a factor of r, is returned as well.
+    """
     places = lights.places
 
     def anew(active: mi.Bool) -> LightSample:

@@ -229,9 +229,11 @@ def walk(
 def follow(
     scene, z, ω, base: Shot, z1, events, *, target: Target, active=True, ends: Ends = nowhere
 ) -> tuple[mi.Vector3f, Shot, mi.Float, mi.Bool]:
-    """The copy, from vertex ``z1``, of the chain that the ``base`` shot took from ``z`` in direction ``ω``. Returns its
-    direction ω', its shot, J = dω'/dω, and whether it exists: the walk has arrived, the walk back has returned, and
-    nothing is between the last event and the target."""
+    """The copy, from vertex ``z1``, of the chain that the ``base`` shot took from ``z`` in direction ``ω``.
+
+    Returns its direction ω', its shot, J = dω'/dω, and whether it exists: the walk has arrived, the walk back has
+    returned, and nothing is between the last event and the target.
+    """
     # Walks begin toward the other chain's first event: along its direction they would miss what is small or near.
     ω1, shot, found = walk(scene, z1, dr.normalize(base.first - z1.p), events, target, active & base.good, ends)
     J = dr.abs(base.det / shot.det)

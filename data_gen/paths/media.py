@@ -200,8 +200,10 @@ def beyond(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, medium: mi.MediumPt
 
 def onward(ray, hit, medium, reach: mi.Float, target: mi.Point3f | None) -> tuple[mi.Ray3f, mi.MediumPtr, mi.Float]:
     """``beyond()``, and what is left of ``reach``; aimed at the ``target`` anew, where there is one and it is finite.
+
     Behind a boundary a ray is displaced along the normal. If it grazes the surface of its target it would meet that
-    before the target, by more than rays to a point are shortened, and seem to be blocked."""
+    before the target, by more than rays to a point are shortened, and seem to be blocked.
+    """
     after, there = beyond(ray, hit, medium)
     left = reach - hit.t
     if target is None:

@@ -99,9 +99,11 @@ def fly_on(passes, trace, ray, medium, channel, u, *, active):
 
 @dr.syntax
 def cross(passes, trace, ray, medium, reach, *, active, target):
-    """Straight along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary. With a
-    ``target``, where that is finite, each piece aims at it anew: see ``media.onward()``. Returns τ, the surface, the
-    last piece of the ray, and the medium there."""
+    """Straight along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary.
+
+    With a ``target``, where that is finite, each piece aims at it anew: see ``media.onward()``. Returns τ, the surface,
+    the last piece of the ray, and the medium there.
+    """
     ray, medium, reach = mi.Ray3f(ray), mi.MediumPtr(medium), mi.Float(reach)
     τ = dr.zeros(mi.Spectrum, dr.width(ray.o))
     hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(ray.o))
@@ -153,9 +155,11 @@ def transmittance(
 
 
 def reconnect(scene, media: Media, y, place: Place, ray, *, x1, base: Segment, channel, active) -> tuple:
-    """``ray`` from the offset path's vertex ``y`` to ``x1``, where the segment ``base`` ends. Returns its integrand
-    over the density of the base path; the ratio of the two densities, of colour c; and whether it is blocked. The
-    Jacobian of x1 itself is not in them."""
+    """``ray`` from the offset path's vertex ``y`` to ``x1``, where the segment ``base`` ends.
+
+    Returns its integrand over the density of the base path; the ratio of the two densities, of colour c; and whether it
+    is blocked. The Jacobian of x1 itself is not in them.
+    """
     reach, medium = dr.select(x1.is_valid(), dr.norm(x1.p - ray.o), dr.inf), place.toward(y, ray.d)
     trace, target = next_surface(scene), dr.select(x1.is_valid(), x1.p, dr.inf)
     if media.grids:

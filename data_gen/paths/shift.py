@@ -22,34 +22,42 @@ from data_gen.paths.vertex import SMOOTH
 
 
 def reconnects(kind: mi.UInt32, base: mi.Bool, base_next: mi.Bool, offset: mi.Bool) -> mi.Bool:
-    """Whether the offset path goes to the base path's next vertex. ``kind`` is the kind of event by which the base path
-    left its vertex; the others say which vertices are connectable, an escape to the environment being so (Kettunen et
-    al. 2015, section 5.2)."""
+    """Whether the offset path goes to the base path's next vertex.
+
+    ``kind`` is the kind of event by which the base path left its vertex; the others say which vertices are connectable,
+    an escape to the environment being so (Kettunen et al. 2015, section 5.2).
+    """
     # All three vertices, so that the rule is its own mirror image: base and offset may change places.
     return (kind == SMOOTH) & base & base_next & offset
 
 
 def replay_inverts(offset_kind: mi.UInt32, offset: mi.Bool, offset_next: mi.Bool, base: mi.Bool) -> mi.Bool:
-    """Whether the replay of an event would be undone by the reverse shift. It would not if that reconnects the path
-    found, whose event is of ``offset_kind``, to the base path's vertex. Else it replays, whatever the kinds of the two
-    events: the same random numbers have the same density (survey, eq. 6)."""
+    """Whether the replay of an event would be undone by the reverse shift.
+
+    It would not if that reconnects the path found, whose event is of ``offset_kind``, to the base path's vertex. Else
+    it replays, whatever the kinds of the two events: the same random numbers have the same density (survey, eq. 6).
+    """
     # The rule above with the two paths changed, as the reverse shift would ask it
     return ~reconnects(offset_kind, offset, offset_next, base)
 
 
 def keeps_joined(kind: mi.UInt32) -> mi.Bool:
-    """Whether a path that has come to the shared vertex from elsewhere may leave it as its companion does. A mirror or
-    a hole, unlike a smooth event, sends light from elsewhere elsewhere. From either side the shift is rejected then:
-    the mirror that one path has sampled, the other cannot have sampled in the same direction."""
+    """Whether a path that has come to the shared vertex from elsewhere may leave it as its companion does.
+
+    A mirror or a hole, unlike a smooth event, sends light from elsewhere elsewhere. From either side the shift is
+    rejected then: the mirror that one path has sampled, the other cannot have sampled in the same direction.
+    """
     return kind == SMOOTH
 
 
 def reconnection_jacobian(
     base: mi.Point3f, offset: mi.Point3f, target: mi.Point3f, normal: mi.Normal3f, in_medium: mi.Bool | None = None
 ) -> mi.Float:
-    """dω'/dω, for directions from ``base`` and from ``offset`` to the same ``target`` with geometric ``normal``:
+    """dω'/dω, for directions from ``base`` and from ``offset`` to the same ``target`` with geometric ``normal``.
+
     (cos θ' / cos θ) (d² / d'²), with angles at the target (survey, section 3.3). In a medium, where distances have a
-    density of their own, it is d² / d'² (survey, section 7.1)."""
+    density of their own, it is d² / d'² (survey, section 7.1).
+    """
     to_base, to_offset = base - target, offset - target
     near, far = dr.squared_norm(to_base), dr.squared_norm(to_offset)
     # One factor is a ratio of cosines, the other of squared distances: r³ would leave float32 before they do.

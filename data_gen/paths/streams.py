@@ -135,9 +135,11 @@ def _stream_class(variant: str) -> type:
 @cache
 def _sobol_class(variant: str) -> type:
     class Points(mi.Sampler):
-        """Point ``index`` of each dimension from ``dimension`` on, scrambled by ``key``. Cloning replays them. A pair
-        of numbers takes two dimensions, and the second is skipped, so that pairs and single numbers can be counted
-        alike. Lanes that draw while others do not are ahead of them."""
+        """Point ``index`` of each dimension from ``dimension`` on, scrambled by ``key``. Cloning replays them.
+
+        A pair of numbers takes two dimensions, and the second is skipped, so that pairs and single numbers can be
+        counted alike. Lanes that draw while others do not are ahead of them.
+        """
 
         def __init__(self, state):
             super().__init__(mi.Properties())
@@ -193,8 +195,10 @@ def mixed(x: mi.UInt32) -> mi.UInt32:
 
 def _reversed_owen(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
     """Nested uniform scrambling of the binary digits of ``x``; its first digit is the lowest bit; bits in usual order.
+
     The bits below a bit decide whether it is flipped. [Laine and Karras 2011, "Stratified sampling for stochastic
-    transparency"; constants of Vegdahl 2021, "Building a better LK hash"]"""
+    transparency"; constants of Vegdahl 2021, "Building a better LK hash"]
+    """
     # Not in place: that would change what the caller has.
     x = x ^ (x * 0x3D20ADEA)
     x = (x + seed) * ((seed >> 16) | 1)

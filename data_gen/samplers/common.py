@@ -30,9 +30,11 @@ from ngpt.options import written
 
 
 def loses_light(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> bool:
-    """Whether the integrator is ``path`` in a scene where that is biased. ``path`` returns 0 for a path that escapes
-    after passing only holes, even if emitter sampling has lit it where the material of a mask is partly there. Scenes
-    with an environment are not affected."""
+    """Whether the integrator is ``path`` in a scene where that is biased.
+
+    ``path`` returns 0 for a path that escapes after passing only holes, even if emitter sampling has lit it where the
+    material of a mask is partly there. Scenes with an environment are not affected.
+    """
     if integrator.class_name() != "PathIntegrator" or scene.environment() or integrator.hide_emitters:
         return False
     return any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in scene.shapes() if shape.bsdf())

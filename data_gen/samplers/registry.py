@@ -149,9 +149,11 @@ class Sampler(Entry):
 
 @dataclass(frozen=True)
 class FrameSampler(Entry):
-    """What renders the frames of a shot one after the other, for it remembers those before; no single images. Its
-    ``make`` (scene, seed, samples per pixel, memory in MiB, options) returns an object whose ``film(index, motion,
-    depth)`` is the film of a frame, numbered in the shot."""
+    """What renders the frames of a shot one after the other, for it remembers those before; no single images.
+
+    Its ``make`` (scene, seed, samples per pixel, memory in MiB, options) returns an object whose ``film(index, motion,
+    depth)`` is the film of a frame, numbered in the shot.
+    """
 
     _: KW_ONLY
     spp: int  # samples per pixel of a frame, where the user gives none

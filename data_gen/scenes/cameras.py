@@ -39,9 +39,11 @@ def place_of(sensor: mi.Sensor) -> Place:
 
 
 def check_camera(sensor: mi.Sensor) -> None:
-    """Raises NgptError for a camera that no sampler renders. Cameras in one film have neither normals in the space of
-    one camera nor differences across their borders. The rays of a scaled meter are no unit vectors in Mitsuba 3.9, by
-    which materials and distances would be wrong."""
+    """Raises NgptError for a camera that no sampler renders.
+
+    Cameras in one film have neither normals in the space of one camera nor differences across their borders. The rays
+    of a scaled meter are no unit vectors in Mitsuba 3.9, by which materials and distances would be wrong.
+    """
     name = camera_name(sensor)
     if name == "batch":
         raise NgptError(

@@ -35,9 +35,11 @@ _TRIM = 0.002
 
 @contextmanager
 def weighed(scene: mi.Scene, lamps: str, by_place: bool = False) -> Iterator[Places | None]:
-    """The ``scene`` with its lamps chosen by "power", where it leaves their weights equal; "uniform": as it is. Yields
-    how they are to be chosen by place, if the sampler can (``by_place``) and there are many. Afterwards the scene is as
-    it was before."""
+    """The ``scene`` with its lamps chosen by "power", where it leaves their weights equal; "uniform": as it is.
+
+    Yields how they are to be chosen by place, if the sampler can (``by_place``) and there are many. Afterwards the
+    scene is as it was before.
+    """
     emitters = scene.emitters()
     before = [emitter.sampling_weight() for emitter in emitters]
     if lamps == "uniform" or len(emitters) < 2 or len(set(before)) > 1:
@@ -83,9 +85,11 @@ def lamp_places(scene: mi.Scene, weights: np.ndarray) -> Places | None:
 
 
 def promised(scene: mi.Scene, weights: np.ndarray) -> tuple[float, Table | None]:
-    """What choosing by place promises to leave of the variance of direct light, and by what table. One half of a
-    pilot's samples tells how often each lamp is chosen, and the other how much better that is. Where the pilot meets
-    nothing there is no table."""
+    """What choosing by place promises to leave of the variance of direct light, and by what table.
+
+    One half of a pilot's samples tells how often each lamp is chosen, and the other how much better that is. Where the
+    pilot meets nothing there is no table.
+    """
     lamp, L, at = _pilot(scene, _PATHS_BY_PLACE)
     squares, half = np.square(L), np.random.default_rng(0).random(len(L)) < 0.5
     if half.all() or not half.any():
@@ -154,9 +158,11 @@ class Chosen:
 
 @dataclass
 class Table:
-    """The probability of each lamp in each cell: ``p``, (cells + 1, lamps), of rows that sum to 1. The last row is for
-    what is nowhere: paths that have ended. ``low`` is the first corner of all cells, ``size`` that of one, (3,); there
-    are ``side`` along each axis."""
+    """The probability of each lamp in each cell: ``p``, (cells + 1, lamps), of rows that sum to 1.
+
+    The last row is for what is nowhere: paths that have ended. ``low`` is the first corner of all cells, ``size`` that
+    of one, (3,); there are ``side`` along each axis.
+    """
 
     p: np.ndarray
     low: np.ndarray

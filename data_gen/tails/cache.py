@@ -94,9 +94,11 @@ class Trail:
 def place_of(
     x: mi.SurfaceInteraction3f, spread: mi.Float, fineness: mi.Float, kind: mi.UInt32 | int, gloss: mi.Bool
 ) -> Place:
-    """Where vertex ``x`` lies among the cells that are ``fineness`` times smaller than the ``spread``. ``kind`` tells
-    vertices apart that have no light in common. Where ``gloss`` counts, light is another one in each direction, and
-    cells are apart by that."""
+    """Where vertex ``x`` lies among the cells that are ``fineness`` times smaller than the ``spread``.
+
+    ``kind`` tells vertices apart that have no light in common. Where ``gloss`` counts, light is another one in each
+    direction, and cells are apart by that.
+    """
     level = mi.Int32(dr.floor(dr.log2(dr.maximum(spread / fineness, 1e-20))))
     normal = octahedral(mi.Normal3f(dr.mulsign(x.sh_frame.n, x.wi.z)), fineness)
     view = dr.select(gloss, mixed(octahedral(x.to_world(x.wi), fineness) + 1), 0)

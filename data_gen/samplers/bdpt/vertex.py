@@ -123,9 +123,11 @@ def light_scattered(si, bsdf, wo: mi.Vector3f, active) -> tuple[mi.Spectrum, mi.
 
 
 def light_sampled(si, bsdf, sample: mi.BSDFSample3f, f_p: mi.Spectrum, active) -> tuple[mi.Spectrum, mi.Float]:
-    """f cos / p of light that leaves by a sampled event, and the density with both directions swapped. ``f_p`` is
-    Mitsuba's for IMPORTANCE. For mirrors and glass it has no cosines. Their cosines are to the half-vector, which is
-    their normal, whatever the shape's normal is."""
+    """f cos / p of light that leaves by a sampled event, and the density with both directions swapped.
+
+    ``f_p`` is Mitsuba's for IMPORTANCE. For mirrors and glass it has no cosines. Their cosines are to the half-vector,
+    which is their normal, whatever the shape's normal is.
+    """
     smooth = event_kind(sample.sampled_type) == SMOOTH
     f, q = light_scattered(si, bsdf, sample.wo, active & smooth)
     h = si.wi + sample.eta * sample.wo

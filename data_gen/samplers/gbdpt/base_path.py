@@ -82,8 +82,10 @@ def base_step(
     plan: Plan, random, z: Vertex, past: Past, active, *, brightest_offset: mi.Float, completed: mi.Bool | bool = True
 ) -> tuple[Step, Past]:
     """Samples an emitter and the next vertex from vertex ``z``; returns the step, and the ``past`` of that vertex.
+
     ``brightest_offset`` is the most that any offset path may yet bring: Russian roulette is to starve none. Light is
-    asked for where paths are ``completed`` at z; random numbers are drawn all the same."""
+    asked for where paths are ``completed`` at z; random numbers are drawn all the same.
+    """
     scene, lights, materials = plan.scene, plan.lights, plan.materials
     si, end, bsdf = z.si, z.end, z.si.bsdf()
     smooth = active & completed & scatters_smoothly(bsdf)

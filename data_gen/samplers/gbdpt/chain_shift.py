@@ -141,9 +141,11 @@ def next_chain(plan: Plan, chain: Chain, course: Course, step: Step) -> Chain:
 
 
 def follow_chain(plan: Plan, step: Step, chain: Chain, start: Any, own: mi.SurfaceInteraction3f, active) -> tuple:
-    """The copy's way from its ``own`` x1' to y, the vertex that ``step`` has led to. ``start`` has β, r and ``end`` at
-    x1', as an offset path does. Returned are the ray that arrives at y, β, r and ``end`` behind it, and what it meets
-    at y: f J / p and ``others``."""
+    """The copy's way from its ``own`` x1' to y, the vertex that ``step`` has led to.
+
+    ``start`` has β, r and ``end`` at x1', as an offset path does. Returned are the ray that arrives at y, β, r and
+    ``end`` behind it, and what it meets at y: f J / p and ``others``.
+    """
     # -------------------------- The walk -------------------------
     scene, y, reached = plan.scene, step.x1, step.x1.is_valid()
     target = Target(y.p, dr.select(reached, mi.Vector3f(y.n), step.d), ~reached)

@@ -98,8 +98,10 @@ class GBDPT(BDPT):
 
 def both_paths(plan: Plan, camera: CameraSamples, visitor: Visitor | None, alone: mi.Bool | None = None) -> tuple:
     """L, Le, and for each of SHIFTS Δ, as colours, of the path from the camera, joined to one from a light; the state
-    of the light path's ``visitor``, and whether the camera path is bent. Δ contains all paths except bent ones. With
-    ``alone`` it contains only bent ones, in the lanes where that is true."""
+    of the light path's ``visitor``, and whether the camera path is bent.
+
+    Δ contains all paths except bent ones. With ``alone`` it contains only bent ones, in the lanes where that is true.
+    """
     sight, light, state = Sight.of(camera), None, mi.UInt64(0)
     shifted = [camera.rays(shift) for shift in SHIFTS.values()]
     if plan.joins:
@@ -139,8 +141,10 @@ def shift_splats(
     threshold: mi.Float,
 ) -> None:
     """Splats the differences of light paths that end at ``marked`` vertices, of those that survive ``roulette``, which
-    goes by the ``threshold`` of each pixel. Paths behind mirrors or glass are few, and their walks long: in one kernel
-    for all paths most lanes would wait."""
+    goes by the ``threshold`` of each pixel.
+
+    Paths behind mirrors or glass are few, and their walks long: in one kernel for all paths most lanes would wait.
+    """
     lanes, depths = marked(marks, plan.longest)
     if not dr.width(lanes):
         return

@@ -235,8 +235,10 @@ def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tupl
 
 def replay(plan: Plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
     """The step by the mirror, glass or hole that the base path's random numbers find here; emission at the next vertex.
+
     Only camera paths find such events in front of the first one that is smooth, so that their random numbers belong to
-    the path for every strategy that finds it: r = 1, and the shift is a function of the path."""
+    the path for every strategy that finds it: r = 1, and the shift is a function of the path.
+    """
     sample, f_p = bsdf.sample(context(RADIANCE), si, step.u_lobe, step.u_direction)
     good = (sample.pdf > 0) & (event_kind(sample.sampled_type) == step.kind)
     d = si.to_world(sample.wo)

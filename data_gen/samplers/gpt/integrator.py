@@ -145,8 +145,10 @@ class GPT(GradientIntegrator):
 
 def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f:
     """L of each sample as the mean over the four pairs with neighbours: what either path of a pair says of this pixel.
-    A pair is sampled from here, with the base path's part ``A``, and from the neighbour, with the offset path's part A
-    + Δ of the same sample there. [Kettunen et al. 2015, section 5]"""
+
+    A pair is sampled from here, with the base path's part ``A``, and from the neighbour, with the offset path's part
+    A + Δ of the same sample there. [Kettunen et al. 2015, section 5]
+    """
     names, lane = list(SHIFTS), dr.arange(mi.Int32, dr.width(inside[0]))
     L = mi.Color3f(0)
     for a, (x, y), active in zip(A, SHIFTS.values(), inside, strict=True):

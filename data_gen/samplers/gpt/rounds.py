@@ -37,9 +37,11 @@ def sharing(view, plan: Plan, frozen: Frozen, take: Take) -> SamplePass:
 
 
 class SharedTails:
-    """A ``data_gen.passes.SamplePass`` whose paths may end in a cache. The cache changes only between rounds. ``take``
-    puts samples into a film, and is given what is known, or None where all paths go on by themselves. ``view`` is the
-    integrator. ``cache`` is None before the first pass, and where it does not pay."""
+    """A ``data_gen.passes.SamplePass`` whose paths may end in a cache. The cache changes only between rounds.
+
+    ``take`` puts samples into a film, and is given what is known, or None where all paths go on by themselves. ``view``
+    is the integrator. ``cache`` is None before the first pass, and where it does not pay.
+    """
 
     def __init__(self, view, plan: Plan, frozen: Frozen, take: Take):
         self.frozen, self.take = frozen, take

@@ -28,9 +28,12 @@ class Traced:
 
 
 def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=None, *, known=None) -> Traced:
-    """Traces base paths that begin with ``camera_ray``, a ray and its importance, and their four offset paths. Offset
-    paths begin with the ``shifted`` rays, and are in the order of SHIFTS. The camera is in the medium ``within``;
-    ``view`` is the integrator, which knows what hides from it. Paths may end in what is ``known`` of the cache."""
+    """Traces base paths that begin with ``camera_ray``, a ray and its importance, and their four offset paths.
+
+    Offset paths begin with the ``shifted`` rays, and are in the order of SHIFTS. The camera is in the medium
+    ``within``; ``view`` is the integrator, which knows what hides from it. Paths may end in what is ``known`` of the
+    cache.
+    """
     # --------------------- First vertices ------------------------
     (ray, importance), space, scene = camera_ray, plan.space, plan.space.scene
     drawn = space.begin(random)

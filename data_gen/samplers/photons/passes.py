@@ -17,9 +17,11 @@ from data_gen.paths.light_ends import World
 
 @dataclass
 class Passes:
-    """The passes of a render, and the memory that one takes. ``integrator`` has ``sample_pass(passes, camera, film)``,
-    ``lane_bytes`` and ``instead(lane_bytes)``: what else than a smaller image would fit into so many bytes for each
-    camera sample."""
+    """The passes of a render, and the memory that one takes.
+
+    ``integrator`` has ``sample_pass(passes, camera, film)``, ``lane_bytes`` and ``instead(lane_bytes)``: what else than
+    a smaller image would fit into so many bytes for each camera sample.
+    """
 
     integrator: Any
     world: World

@@ -52,9 +52,11 @@ def our_radiance(view, plan: Plan, random, ray, medium, active, *, known: Known 
 
 
 def samples(scene, integrator, radiance, features: bool, camera: CameraSamples, known: Known | None = None) -> dict:
-    """Layers: one sample of ``radiance``, and of features, for each camera sample. Where something is ``known`` of a
-    cache, ``radiance`` is given it. Where ``features`` tell what is emission seen directly, that is the mean over a
-    pixel's quarters."""
+    """Layers: one sample of ``radiance``, and of features, for each camera sample.
+
+    Where something is ``known`` of a cache, ``radiance`` is given it. Where ``features`` tell what is emission seen
+    directly, that is the mean over a pixel's quarters.
+    """
     ray, importance, _ = camera.rays()
     medium, all_lanes = camera.sensor.get_medium(), mi.Bool(True)
     more = {"known": known} if known else {}

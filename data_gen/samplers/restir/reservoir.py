@@ -94,9 +94,11 @@ def part(value: mi.Spectrum, sign: int) -> mi.Spectrum:
 def confidence_after(
     before: np.ndarray, motions: np.ndarray, steps: Iterable[tuple[int, int]], cap: float
 ) -> np.ndarray:
-    """(steps, H, W) float32: the confidence of a frame, at most ``cap``. It is 1 plus the confidence of the frame
-    ``before``, weighted by areas; 0 for pairs that reach over the edge of the film. It depends on motion only: what has
-    no random numbers in it may decide what counts."""
+    """(steps, H, W) float32: the confidence of a frame, at most ``cap``.
+
+    It is 1 plus the confidence of the frame ``before``, weighted by areas; 0 for pairs that reach over the edge of the
+    film. It depends on motion only: what has no random numbers in it may decide what counts.
+    """
     count, height, width = before.shape
     y, x = np.mgrid[:height, :width]
     after = np.ones((count, height, width))

@@ -62,9 +62,11 @@ class Restir:
         depth: np.ndarray | None,
         changed: tuple[mi.Scene, Sequence[Geometry]] | None = None,
     ) -> GradientFilm:
-        """Frame number ``index`` of the shot; where it is not the one after the last, history begins anew. ``motion``
-        and ``depth`` are as for ``History.next_frame``. ``changed`` is the scene as it is now, and where its shapes
-        are; None where only the camera has moved. With ``changed``, two frames in turn must be of two scenes."""
+        """Frame number ``index`` of the shot; where it is not the one after the last, history begins anew.
+
+        ``motion`` and ``depth`` are as for ``History.next_frame``. ``changed`` is the scene as it is now, and where its
+        shapes are; None where only the camera has moved. With ``changed``, two frames in turn must be of two scenes.
+        """
         stage = None if changed is None else self._stage(*changed)
         self.stage = stage or self.stage
         if index != self._history.frames:

@@ -49,9 +49,11 @@ _BEFORE, _AT, _BEHIND = 0, 1, 2
 
 @dataclass
 class Candidate:
-    """The path that was chosen: its record, its integrand ``f`` and its weight ``W``; f W estimates the radiance. ``W``
-    is 0 where the walk met no light. ``L`` is the sum over all paths of the walk: what ``path`` would have given.
-    Emission that the camera sees directly is in neither."""
+    """The path that was chosen: its record, its integrand ``f`` and its weight ``W``; f W estimates the radiance.
+
+    ``W`` is 0 where the walk met no light. ``L`` is the sum over all paths of the walk: what ``path`` would have given.
+    Emission that the camera sees directly is in neither.
+    """
 
     record: Record
     f: mi.Spectrum

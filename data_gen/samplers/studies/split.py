@@ -111,9 +111,11 @@ class Lobes:
         self.lambert = ByMaterial(mi.Float(table))
 
     def diffuse(self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
-        """The share, in [0, 1] for each wavelength, in the light that goes from ``wo`` (local) into ``si.wi``. It is 0
-        where there is no such light. It holds for directions that were sampled or chosen otherwise, but not for Dirac
-        deltas, which are never diffuse."""
+        """The share, in [0, 1] for each wavelength, in the light that goes from ``wo`` (local) into ``si.wi``.
+
+        It is 0 where there is no such light. It holds for directions that were sampled or chosen otherwise, but not for
+        Dirac deltas, which are never diffuse.
+        """
         bsdf = si.bsdf()
         flags = bsdf.flags()
         active = active & mi.has_flag(flags, mi.BSDFFlags.Diffuse)

@@ -35,8 +35,10 @@ from data_gen.scenes.load import reference_integrator
 
 class GPTBasic(GradientIntegrator):
     """Gradient-domain path tracing by random sequence replay, around any Mitsuba integrator that samples radiance.
-    Plugin ``gpt_basic``. Its only parameter is a nested integrator (default: ``path``), which decides what transport is
-    rendered. Not meant for production: shifted paths part for good at the first reflection that differs."""
+
+    Plugin ``gpt_basic``. Its only parameter is a nested integrator (default: ``path``), which decides what transport
+    is rendered. Not meant for production: shifted paths part for good at the first reflection that differs.
+    """
 
     nested = True
 

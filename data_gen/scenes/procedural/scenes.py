@@ -156,9 +156,11 @@ LAYOUTS = {"room": room, "open": open_set}
 
 
 def make_scene(seed: int | tuple[int, ...], folder: Path, shares: Mapping[str, float] | None = None) -> Path:
-    """Makes the scene of ``seed`` in the (existing, empty) ``folder``; the same seed gives the same files. ``shares``
-    are the probabilities (0 to 1) of further sights, of all that are in ``data_gen.scenes.procedural.variety.SHARES``.
-    Without them there are none."""
+    """Makes the scene of ``seed`` in the (existing, empty) ``folder``; the same seed gives the same files.
+
+    ``shares`` are the probabilities (0 to 1) of further sights, of all that are in
+    ``data_gen.scenes.procedural.variety.SHARES``. Without them there are none.
+    """
     rng = np.random.default_rng(seed)
     layout = "room" if rng.random() < 0.7 else "open"
     stage = Stage(rng)

@@ -66,9 +66,11 @@ class CameraPaths:
         self.integrator, self.world, self.limits = integrator, world, integrator.limits
 
     def levels(self, rays: list, random: mi.Sampler, frozen: Callable) -> Iterator[Level]:
-        """Level after level of the paths that begin with ``rays``, each evaluated. Each ray is given as (ray,
-        importance, whether it is on the film); the first is the base path's. ``frozen`` calls the functions that make
-        kernels."""
+        """Level after level of the paths that begin with ``rays``, each evaluated.
+
+        Each ray is given as (ray, importance, whether it is on the film); the first is the base path's. ``frozen``
+        calls the functions that make kernels.
+        """
         n, stream = dr.width(rays[0][0].o), type(random)
         start = Level([], dr.arange(mi.UInt32, n), dr.opaque(mi.UInt32, 1, n), dr.opaque(mi.Float, 1, n), random.state)
         dr.eval(start)

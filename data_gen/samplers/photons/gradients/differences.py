@@ -34,9 +34,11 @@ class Gathered:
 
 
 def gradient_pass(passes: Passes, camera: CameraSamples, film: GradientFilm, near: Callable, pairs: int) -> None:
-    """One photon map, and one camera path and its four shifts for each camera sample; a pixel has one sample. ``near``
-    (passes, photon map) yields what is ``Gathered`` of a map; ``pairs`` are in memory together for each camera
-    sample."""
+    """One photon map, and one camera path and its four shifts for each camera sample; a pixel has one sample.
+
+    ``near`` (passes, photon map) yields what is ``Gathered`` of a map; ``pairs`` are in memory together for each camera
+    sample.
+    """
     integrator, walk, frozen, n = passes.integrator, passes.walk, passes.frozen, dr.width(camera.pixel)
     start, values = begun(passes, camera)
     shifted = [camera.rays(shift) for shift in SHIFTS.values()]

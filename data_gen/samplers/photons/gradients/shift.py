@@ -92,8 +92,10 @@ def jacobian_of_planes(t, volume, t1, volume1):
 
 def jacobian(d, n, length2, d1, m, length2_1):
     """J of the way from a, along ``d``, to b̂ (normal ``n``), which becomes that along ``d1`` to ĉ (normal ``m``).
+
     ``length2``, ``length2_1``: squared distances of b̂ and ĉ from a. They are 1 for light from infinitely far away,
-    whose origins move and not the directions."""
+    whose origins move and not the directions.
+    """
     return dr.abs(dr.dot(m, d1) / dr.dot(n, d)) * jacobian_in_medium(length2, length2_1)
 
 

@@ -32,9 +32,11 @@ class Fog:
 
     @dr.syntax
     def around(self, scene, p: mi.Point3f) -> mi.MediumPtr:
-        """The medium around points ``p``: lamps know of none, unless they are boundaries themselves. It is that on this
-        side of the first boundary of media toward the camera, or the camera's if there is none. Other surfaces are in
-        the same medium on both sides, and may be in the way."""
+        """The medium around points ``p``: lamps know of none, unless they are boundaries themselves.
+
+        It is that on this side of the first boundary of media toward the camera, or the camera's if there is none.
+        Other surfaces are in the same medium on both sides, and may be in the way.
+        """
         to = self.eye - p
         distance = dr.norm(to)
         ray = mi.Ray3f(mi.Point3f(p), to / distance, distance, mi.Float(0), dr.zeros(mi.Ray3f).wavelengths)
@@ -71,9 +73,11 @@ class Fog:
         return mi.Spectrum(dr.select(segment.place.scatters, weight, segment.weight))
 
     def power(self, photons) -> mi.Spectrum:
-        """What counts of each photon of a map in media: the power Φ that is scattered there; with grids, Φ / σs. The
-        sum of Φ / σs over a volume is the light that goes through, which is smooth where σs is not: the density of a
-        grid is taken where the camera path scatters, and is not blurred."""
+        """What counts of each photon of a map in media: the power Φ that is scattered there; with grids, Φ / σs.
+
+        The sum of Φ / σs over a volume is the light that goes through, which is smooth where σs is not: the density of
+        a grid is taken where the camera path scatters, and is not blurred.
+        """
         if not self.media.grids:
             return photons.β
         scatters = (photons.depth > 0) & (dr.squared_norm(photons.n) == 0)

@@ -88,9 +88,11 @@ class Grid:
         return self.rows((none, none + 4), lambda k: p, nearer, active, visit, state)
 
     def along(self, ray: mi.Ray3f, length: mi.Float, radius2: mi.Float, active: mi.Bool, visit, state: tuple) -> tuple:
-        """As ``each()``, for points nearer than the radius to a piece of a ray, beside it and not past its ends. The
-        piece is cut into parts so short that two cells along each axis hold what is near to one. Each point is beside
-        only one part."""
+        """As ``each()``, for points nearer than the radius to a piece of a ray, beside it and not past its ends.
+
+        The piece is cut into parts so short that two cells along each axis hold what is near to one. Each point is
+        beside only one part.
+        """
         # What is near to the part is in the ball about its middle with half an edge for a radius; half of that length:
         half = dr.sqrt(dr.maximum(0.25 * dr.square(self.edge) - radius2, 0))
         rate = dr.rcp(2 * half)

@@ -77,9 +77,11 @@ def parts_class(variant: str) -> type:
 
 @dr.syntax
 def cut(world: World, edges, rate: mi.Float, first: mi.UInt32, window: tuple, parts: Any) -> mi.UInt32:
-    """How many parts the ``edges`` of light paths have, ``rate`` of them in a unit of length. The parts of an edge are
-    numbered from ``first`` on. The parts in the ``window`` (low, size) are entered into the arrays ``parts``, unless
-    these are None."""
+    """How many parts the ``edges`` of light paths have, ``rate`` of them in a unit of length.
+
+    The parts of an edge are numbered from ``first`` on. The parts in the ``window`` (low, size) are entered into the
+    arrays ``parts``, unless these are None.
+    """
     scene, fog, (low, size) = world.scene, world.fog, window
     ray, medium = mi.Ray3f(edges.o, edges.e), mi.MediumPtr(edges.begins)  # a piece, and what it goes through
     Φ = mi.Spectrum(edges.power)  # where the piece begins
@@ -207,9 +209,11 @@ class AlongBeams:
 
 
 def nearest(o, d, p, e) -> tuple:
-    """Where two lines are nearest: through ``o`` along ``d``, and through ``p`` along ``e``, unit vectors. Returns the
-    distances from p, and from o, how far the lines are apart, and the sine of their angle. Where they are parallel no
-    value is finite."""
+    """Where two lines are nearest: through ``o`` along ``d``, and through ``p`` along ``e``, unit vectors.
+
+    Returns the distances from p, and from o, how far the lines are apart, and the sine of their angle. Where they are
+    parallel no value is finite.
+    """
     n, to, cos = dr.cross(d, e), p - o, dr.dot(d, e)
     sin2 = dr.squared_norm(n)
     along, back = dr.dot(to, d), dr.dot(to, e)

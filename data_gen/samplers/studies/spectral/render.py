@@ -97,9 +97,11 @@ REACH = 5
 
 
 def reconstructed(spectra: Spectra) -> np.ndarray:
-    """The (H, W, bins) that minimises Σ |I - light|² / v + Σ |I_b+1 - I_b - step|² / s, exactly. v and s are the
-    variances of light and steps, averaged over bins and ``REACH`` pixels, so both are one number for a pixel. The sum
-    over bins equals the light's sum: steps do not determine it."""
+    """The (H, W, bins) that minimises Σ |I - light|² / v + Σ |I_b+1 - I_b - step|² / s, exactly.
+
+    v and s are the variances of light and steps, averaged over bins and ``REACH`` pixels, so both are one number for a
+    pixel. The sum over bins equals the light's sum: steps do not determine it.
+    """
     if spectra.step is None or spectra.step_var is None:
         return spectra.light
     both = spectra.light_var, spectra.step_var[..., :-1]
