@@ -184,8 +184,10 @@ def seconds_to_assess(stack: GradientStack, method: str) -> float:
 
 
 def share_out(need: np.ndarray, n: np.ndarray, samples: float) -> np.ndarray:
-    """How many more blocks each pixel gets of about so many ``samples``: counts in proportion to ``need``. ``n`` are
-    the samples it has. All (pixels)."""
+    """How many more blocks each pixel gets of about so many ``samples``: counts in proportion to ``need``.
+
+    ``n`` are the samples it has. All (pixels).
+    """
     shares = np.clip(need / max(need.mean(), 1e-300), _FLOOR, _CAP)
     low, high = 0.0, (n.max() + samples) / _FLOOR
     for _ in range(60):
@@ -239,8 +241,11 @@ class UnevenRender:
         self.ended = False
 
     def add(self, blocks: np.ndarray, whole: bool = False) -> None:
-        """Renders so many more ``blocks`` of each pixel, (pixels) integers. Unless the ``whole`` is asked for, these
-        are as many of them as there may be; ``ended`` says whether some were left out."""
+        """Renders so many more ``blocks`` of each pixel, (pixels) integers.
+
+        Unless the ``whole`` is asked for, these are as many of them as there may be; ``ended`` says whether some were
+        left out.
+        """
         waiting, level = np.zeros(0, np.uint32), 0
         while True:
             n = self._at_once(whole)

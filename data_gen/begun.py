@@ -52,7 +52,9 @@ def part_seed(seed: int, part: int) -> int:
 
 def scene_name(scene: str, parameters: Mapping[str, str], *files: str | None) -> str:
     """What a header says of a scene: its name, and a checksum of its file, of its parameters and of further ``files``.
-    Meshes and textures do not count. Raises NgptError for files that cannot be read."""
+
+    Meshes and textures do not count. Raises NgptError for files that cannot be read.
+    """
     digest = hashlib.sha256(repr(sorted(parameters.items())).encode())
     for file in (scene, *files):
         if file is not None and Path(file).is_file():
@@ -222,8 +224,10 @@ def begun_stack(path: Path) -> GradientStack:
 
 
 def joined_or_kept(path: Path, rest: GradientStack, begun: GradientStack) -> GradientStack:
-    """Both parts merged; the attributes that say how the render ended come from ``rest``. Where that fails, the rest is
-    written beside ``path``, and NgptError says so."""
+    """Both parts merged; the attributes that say how the render ended come from ``rest``.
+
+    Where that fails, the rest is written beside ``path``, and NgptError says so.
+    """
     try:
         whole = merge([begun, rest])
     except NgptError as error:
@@ -247,8 +251,10 @@ def kept_apart(why: str, stack: GradientStack, path: Path, what: str = "was rend
 
 
 def write_part(path: Path, stack: GradientStack, overwrite: bool, begun: GradientStack | None = None) -> GradientStack:
-    """Writes a stack, in place of the one that was ``begun`` and together with it; returns what is written. Nothing
-    that was rendered is lost: what cannot be written there goes elsewhere (``ngpt.system.files.save``)."""
+    """Writes a stack, in place of the one that was ``begun`` and together with it; returns what is written.
+
+    Nothing that was rendered is lost: what cannot be written there goes elsewhere (``ngpt.system.files.save``).
+    """
     if begun is not None:
         stack, overwrite = joined_or_kept(path, stack, begun), True
     save(path, lambda path, overwrite: write(path, stack, overwrite=overwrite), overwrite)

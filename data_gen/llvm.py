@@ -41,8 +41,11 @@ def llvm_version(path: Path) -> int | None:
 
 
 def use_llvm() -> Path:
-    """Points Dr.Jit to the newest usable LLVM library and returns its path. A library the user has named in
-    DRJIT_LIBLLVM_PATH is used as it is, after a check of its version. Raises NgptError when nothing usable is there."""
+    """Points Dr.Jit to the newest usable LLVM library and returns its path.
+
+    A library the user has named in DRJIT_LIBLLVM_PATH is used as it is, after a check of its version. Raises NgptError
+    when nothing usable is there.
+    """
     chosen = os.environ.get(ENVIRONMENT)
     if chosen:
         path = Path(chosen)

@@ -24,8 +24,10 @@ from ngpt.system.text import by_names
 
 @dataclass(frozen=True)
 class Denoising:
-    """``method`` is a name, or "auto": see ``ngpt.methods.choose``. ``transform`` and ``exposure`` say how a picture
-    shows light, as in `ngpt denoise`."""
+    """``method`` is a name, or "auto": see ``ngpt.methods.choose``.
+
+    ``transform`` and ``exposure`` say how a picture shows light, as in `ngpt denoise`.
+    """
 
     method: str = "auto"
     transform: str = "standard"
@@ -36,8 +38,10 @@ class Denoising:
         return self.method != "auto" and "dx" in runnable(self.method).needs
 
     def check(self, sampler: str, spp: int | None, begun: str = "") -> None:
-        """Raises an error for a method that does not run here, or that needs what such a render lacks. ``begun`` is the
-        file of a render that is gone on with, whose sampler it is."""
+        """Raises an error for a method that does not run here, or that needs what such a render lacks.
+
+        ``begun`` is the file of a render that is gone on with, whose sampler it is.
+        """
         if self.method == "auto":
             return
         needs, entry = runnable(self.method).needs, SAMPLERS.get(sampler)
@@ -52,8 +56,10 @@ class Denoising:
             )
 
     def write(self, file: Path, stack: GradientStack, overwrite: bool, keeps: bool) -> dict[str, Any]:
-        """Makes and writes the image, and returns the attributes that say what made it. What was rendered is not lost
-        where that fails: the stack is written beside ``file``, unless one ``keeps`` it."""
+        """Makes and writes the image, and returns the attributes that say what made it.
+
+        What was rendered is not lost where that fails: the stack is written beside ``file``, unless one ``keeps`` it.
+        """
         from ngpt.cli.denoise_files import Frame, write_frame  # imports metrics, which a stack does not need
 
         try:
@@ -111,8 +117,10 @@ class Output:
             )
 
     def done(self, asked: Asked) -> bool:
-        """Whether all is there that is asked for. Raises NgptError where a stack is there in place of its image, or the
-        image of another method."""
+        """Whether all is there that is asked for.
+
+        Raises NgptError where a stack is there in place of its image, or the image of another method.
+        """
         if not asked.done(self.stack):
             return False
         by = read_header(self.file)[0].get("ngpt:method") if _readable(self.file) else None
@@ -135,8 +143,10 @@ class Output:
     def write(
         self, stack: GradientStack, overwrite: bool, begun: GradientStack | None = None
     ) -> tuple[GradientStack, dict[str, Any]]:
-        """Writes a stack, in place of the one that was ``begun`` and together with it, or the image of both. Returns
-        the whole stack, and the attributes that say what made the image. Nothing that was rendered is lost."""
+        """Writes a stack, in place of the one that was ``begun`` and together with it, or the image of both.
+
+        Returns the whole stack, and the attributes that say what made the image. Nothing that was rendered is lost.
+        """
         if self.denoising is None or self.kept is not None:
             stack = write_part(self.stack, stack, overwrite, begun)
         elif begun is not None:

@@ -17,7 +17,9 @@ _made_for = ""
 
 def register_when_ready() -> None:
     """Registers our integrators with each variant of Mitsuba that is set, in the past or future, once it is imported.
-    Nothing is imported for it."""
+
+    Nothing is imported for it.
+    """
     if sys.modules.get("mitsuba"):
         _follow_variants()
     else:
@@ -78,8 +80,10 @@ def _construct(entry: Any, props: Any) -> Any:
 
 
 def make_classes() -> None:
-    """Has samplers derive from the classes of the current variant: Mitsuba has classes of their own for each. Modules
-    that were imported for another variant are reloaded. Raises NgptError for one that cannot vectorise."""
+    """Has samplers derive from the classes of the current variant: Mitsuba has classes of their own for each.
+
+    Modules that were imported for another variant are reloaded. Raises NgptError for one that cannot vectorise.
+    """
     global _made_for
     import mitsuba as mi
 

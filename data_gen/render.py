@@ -168,7 +168,9 @@ def stack_of(
     diagnostics: bool = False,
 ) -> GradientStack:
     """The stack of a sensor's film, whose rendering began at ``start`` (time.perf_counter()), with ``more`` attributes.
-    It lies where the crop window of the sensor does, in a picture of the whole size."""
+
+    It lies where the crop window of the sensor does, in a picture of the whole size.
+    """
     attributes = {
         "ngpt:seed": str(seed),
         "ngpt:sampler": sampler,

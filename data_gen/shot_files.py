@@ -141,7 +141,9 @@ def asked_of(scene: str, frame: int, **arguments: Any) -> Asked:
 
 def report_of(stack: GradientStack, file: Path, made: Mapping[str, Any]) -> dict[str, Any]:
     """What ``ngpt render --json`` says of a stack: its file, its size, and the attributes of ours, by short names.
-    ``made`` are the attributes of its image, if any."""
+
+    ``made`` are the attributes of its image, if any.
+    """
     attributes = {**stack.attributes, **made}
     ours = {name.removeprefix("ngpt:"): value for name, value in attributes.items() if "ngpt:" in name}
     return {"output": str(file), "width": stack.width, "height": stack.height} | ours

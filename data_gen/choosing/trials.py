@@ -62,7 +62,9 @@ class Pilot:
 
 def candidates(scene: mi.Scene, biased: bool = False) -> list[str]:
     """Samplers that could render the scene: the one that its description stands for, then the ones to compare it with.
-    With ``biased``, biased samplers are included and come last."""
+
+    With ``biased``, biased samplers are included and come last.
+    """
     facts = scene_facts(scene)
     first, _ = choose(facts)
     if math.prod(int(n) for n in scene.sensors()[0].film().crop_size()) < _LEAST_PIXELS:
@@ -243,8 +245,10 @@ def _denominator(scale: np.ndarray) -> np.ndarray:
 
 @contextmanager
 def at_most(scene: mi.Scene, pixels: int):
-    """While in it, images of the scene have no more ``pixels``; yields how many times more they have without it. A
-    cropped film stays as it is: its window could not be set again."""
+    """While in it, images of the scene have no more ``pixels``; yields how many times more they have without it.
+
+    A cropped film stays as it is: its window could not be set again.
+    """
     film = scene.sensors()[0].film()
     (width, height), window = (tuple(int(n) for n in numbers) for numbers in (film.size(), film.crop_size()))
     shrink = math.sqrt(pixels / (width * height))

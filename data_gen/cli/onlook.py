@@ -20,8 +20,10 @@ _LOAD, _PIXEL = 0.1, 3e-6
 
 
 class Onlookers:
-    """The page of a render, if there is one; without it, looking on costs nothing. ``data_gen.render_scene`` calls
-    ``newest`` after each pass, and ``progress`` with the progress."""
+    """The page of a render, if there is one; without it, looking on costs nothing.
+
+    ``data_gen.render_scene`` calls ``newest`` after each pass, and ``progress`` with the progress.
+    """
 
     def __init__(self, page: LivePage | None, say: Callable[[str], None], unit: str):
         self.page, self.say, self.unit = page, say, unit

@@ -154,8 +154,10 @@ _MOST = 1_000_000
 
 
 def frames(text: str) -> list[int]:
-    """``0:120`` (120 is not in it), ``0:120:2``, ``7``, or several of them with commas between; in order. And as farms
-    write them, with the last one in it: ``1-10``, ``1-9x2``, ``1-9:2``."""
+    """``0:120`` (120 is not in it), ``0:120:2``, ``7``, or several of them with commas between; in order.
+
+    And as farms write them, with the last one in it: ``1-10``, ``1-9x2``, ``1-9:2``.
+    """
     numbers: dict[int, None] = {}
     for some in text.split(","):
         try:
@@ -183,7 +185,9 @@ def _of_a_farm(some: str) -> list[int]:
 
 def targets(output: str | None, scene: str, numbers: list[int]) -> dict[int, Path]:
     """Frame -> file. ``output`` is a pattern (``shot.{frame:04d}.exr``), or a folder, which is made if it is not there.
-    Raises WrongUse for a name that is one file for several frames."""
+
+    Raises WrongUse for a name that is one file for several frames.
+    """
     stem = re.sub(r"[._-]*\{[^{}]*\}", "", Path(scene).stem) or "frame"
     pattern = output if output is not None else f"{stem}.{{frame:04d}}.exr"
     if not varies(pattern):

@@ -94,7 +94,9 @@ class Surroundings:
         self, origins: np.ndarray, towards: np.ndarray, boundaries: bool = False
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Distances (n,), Inf where nothing is hit; normals (n, 3); identities of what is hit (n,), 0 for nothing.
-        ``boundaries`` of media, which nobody sees, count only where asked for."""
+
+        ``boundaries`` of media, which nobody sees, count only where asked for.
+        """
         ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(towards.T))
         si = self.scene.ray_intersect(ray)
         passed = mi.Float(0)

@@ -103,8 +103,10 @@ def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:
 
 
 def uneven_inputs(config: Config, name: str, crop: int, counts: list[int]) -> list[bool]:
-    """Which inputs of the crop get adaptive samples: the share ``config.adaptive`` of inputs with enough samples. It
-    uses separate random numbers, so that views, seeds and references are the same as with even samples."""
+    """Which inputs of the crop get adaptive samples: the share ``config.adaptive`` of inputs with enough samples.
+
+    It uses separate random numbers, so that views, seeds and references are the same as with even samples.
+    """
     if not config.adaptive:
         return [False] * len(counts)
     from data_gen.adaptive import LEAST

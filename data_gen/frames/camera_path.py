@@ -45,8 +45,11 @@ class CameraPath:
                 )
 
     def at(self, frame: float) -> Key:
-        """The camera at a frame. Between two keys that both look at a point, origin, target, up and fov change evenly.
-        Else the position does, and the orientation turns evenly about one axis."""
+        """The camera at a frame.
+
+        Between two keys that both look at a point, origin, target, up and fov change evenly. Else the position does,
+        and the orientation turns evenly about one axis.
+        """
         after = bisect_right([key.frame for key in self.keys], frame)
         if after == 0 or after == len(self.keys):
             return self.keys[min(after, len(self.keys) - 1)]
@@ -61,7 +64,9 @@ class CameraPath:
 
 def look_at(origin, target, up) -> np.ndarray:
     """The (4, 4) matrix of a Mitsuba camera at ``origin`` that looks at ``target``; raises ValueError if there is none.
-    A camera looks along its +z, with +x to the left of the image."""
+
+    A camera looks along its +z, with +x to the left of the image.
+    """
     origin, target, up = (np.asarray(v, np.float64) for v in (origin, target, up))
     forward = target - origin
     left = np.cross(up, forward)

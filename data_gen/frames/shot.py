@@ -26,8 +26,11 @@ from ngpt.stack import GradientStack
 
 
 class Remembering:
-    """The frames of one shot; ``options`` are as in ``render_stack``. ``changes``: whether more than the camera may
-    change from frame to frame. Raises NgptError for options that the sampler does not have."""
+    """The frames of one shot; ``options`` are as in ``render_stack``.
+
+    ``changes``: whether more than the camera may change from frame to frame. Raises NgptError for options that the
+    sampler does not have.
+    """
 
     def __init__(self, entry: FrameSampler, changes: bool, spp: int | None, seed: int, options: dict[str, Any]):
         self.entry, self.changes, self.seed, self.options = entry, changes, seed, dict(options)
@@ -43,8 +46,10 @@ class Remembering:
     def render(
         self, scene: mi.Scene, shapes: Sequence[Geometry], index: int, motion: np.ndarray, depth: np.ndarray | None
     ) -> GradientStack:
-        """The stack of frame number ``index`` of the shot; the ``scene`` has its ``shapes`` there. Where the shot
-        ``changes``, it is not the scene of the frame before, which must be as it was then."""
+        """The stack of frame number ``index`` of the shot; the ``scene`` has its ``shapes`` there.
+
+        Where the shot ``changes``, it is not the scene of the frame before, which must be as it was then.
+        """
         start = time.perf_counter()
         if self._sampler is None:
             if reason := self.entry.refuses(scene_facts(scene)):

@@ -114,8 +114,10 @@ class CameraSamples:
         return some
 
     def rays(self, shift=(0, 0)) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Bool]:
-        """Camera rays displaced by ``shift`` = (x, y) pixels, their importance, and whether they are on the film. The
-        ``shift`` is a pair of numbers, one of ``QUARTERS``, or a Vector2f with one for each lane."""
+        """Camera rays displaced by ``shift`` = (x, y) pixels, their importance, and whether they are on the film.
+
+        The ``shift`` is a pair of numbers, one of ``QUARTERS``, or a Vector2f with one for each lane.
+        """
         p = self.position + self._shift(shift)
         inside = (p.x >= 0) & (p.y >= 0) & (p.x < self.ends.x) & (p.y < self.ends.y)
         if self.seen:
@@ -135,8 +137,10 @@ class CameraSamples:
         return mi.Vector2f(*(dr.opaque(mi.Float, s) for s in shift))
 
     def look(self, *shifts: tuple[int, int] | str) -> Self:
-        """These samples, for a function that is recorded once and asks for their rays by these ``shifts``. The function
-        cannot ask most cameras, since Dr.Jit 1.5 does not find their arrays. So they are asked before."""
+        """These samples, for a function that is recorded once and asks for their rays by these ``shifts``.
+
+        The function cannot ask most cameras, since Dr.Jit 1.5 does not find their arrays. So they are asked before.
+        """
         if bytes_of_rays(self.sensor):
             rays = [self.rays(shift) for shift in shifts]
             self.seen = {shift: (mi.Ray3f(ray), weight) for shift, (ray, weight, _) in zip(shifts, rays, strict=True)}
@@ -150,8 +154,10 @@ def bytes_of_rays(sensor: mi.Sensor) -> int:
 
 
 def in_packets(lanes: np.ndarray, camera: CameraSamples) -> tuple[np.ndarray, np.ndarray]:
-    """The ``lanes`` with gaps, and which of them exist: so that no two blocks of samples share a packet of rays. The
-    results of a ray depend, in the last bits, on those traced with it; blocks must not depend on their pass."""
+    """The ``lanes`` with gaps, and which of them exist: so that no two blocks of samples share a packet of rays.
+
+    The results of a ray depend, in the last bits, on those traced with it; blocks must not depend on their pass.
+    """
     _, counts = np.unique(lanes // (camera.pixels * camera.block), return_counts=True)
     padded = -(-counts // _PACKET) * _PACKET
     place = np.arange(len(lanes)) + np.repeat(np.cumsum(padded - counts) - (padded - counts), counts)

@@ -140,7 +140,9 @@ def fly_on(passes, trace, ray, medium, *, channel, u, key, active):
 @dr.syntax
 def cross(passes, trace, ray, medium, reach, *, channel, key, scale, most, target, active):
     """As ``segments.cross()``, where there are grids, with ``most`` collisions at most, their steps ``scale`` long.
-    Returns the same, where τ is the optical depth of homogeneous media, and also M and ∏ σn / μ_c."""
+
+    Returns the same, where τ is the optical depth of homogeneous media, and also M and ∏ σn / μ_c.
+    """
     lanes = dr.width(ray.o)
     ray, medium, reach = mi.Ray3f(ray), mi.MediumPtr(medium), mi.Float(reach)
     ahead, n = scale * step(key, mi.UInt32(0)), mi.UInt32(0)

@@ -78,8 +78,10 @@ def in_media(scene, medium) -> tuple[mi.MediumPtr | None, int]:
 
 @dr.syntax
 def through_medium(medium, ray, length, sampler, steps: int):
-    """The transmittance of a ``medium`` (none: 1) along ``ray`` up to ``length``, and the albedo it scatters there. The
-    albedo is the single-scattering albedo, weighted by the light that the medium takes on each of the ``steps``."""
+    """The transmittance of a ``medium`` (none: 1) along ``ray`` up to ``length``, and the albedo it scatters there.
+
+    The albedo is the single-scattering albedo, weighted by the light that the medium takes on each of the ``steps``.
+    """
     transmittance = mi.unpolarized_spectrum(mi.Spectrum(1))
     albedo = mi.unpolarized_spectrum(mi.Spectrum(0))
     spectrum = type(albedo)

@@ -35,8 +35,10 @@ class Frozen:
         self.settle = _Recorded(_nothing, self.state)
 
     def __call__(self, f: Callable, *args: Any, sums: Callable | None = None) -> Any:
-        """``sums`` makes the last argument, which f adds to. A call that fails may have added already: the next try has
-        others."""
+        """``sums`` makes the last argument, which f adds to.
+
+        A call that fails may have added already: the next try has others.
+        """
 
         def tried(f: Callable) -> Any:
             return f(*args, *([sums()] if sums else []))
@@ -106,8 +108,10 @@ def _say(f: Callable, reason: str) -> None:
 
 
 def _wake_lamps(scene: mi.Scene) -> None:
-    """Has lamps of all scenes in the process make what they are sampled by, such as the distribution of a texture. They
-    make it when they are first asked, and a call asks them all. Dr.Jit records no function amid which that is."""
+    """Has lamps of all scenes in the process make what they are sampled by, such as the distribution of a texture.
+
+    They make it when they are first asked, and a call asks them all. Dr.Jit records no function amid which that is.
+    """
     if scene.emitters():
         scene.emitters_dr().sample_direction(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5), True)
 
@@ -195,8 +199,10 @@ def evaluated(f: Callable) -> Callable:
 
 
 def arrays(owner: Any) -> list:
-    """The arrays in the attributes of an object, and of objects there, which become copies. Kernels tell arrays by how
-    their memory is aligned, and NumPy's is so or so: they would have to be compiled again."""
+    """The arrays in the attributes of an object, and of objects there, which become copies.
+
+    Kernels tell arrays by how their memory is aligned, and NumPy's is so or so: they would have to be compiled again.
+    """
     found: list = []
     for name, value in list(vars(owner).items()) if hasattr(owner, "__dict__") else ():
         if value is not None and dr.is_jit_v(value):

@@ -177,8 +177,10 @@ class LightEnds:
     def seen_from_elsewhere(
         self, scene, light: mi.DirectionSample3f, weight: mi.Spectrum, si: mi.SurfaceInteraction3f, active
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum, mi.Float]:
-        """A sampled ``light`` of ``weight`` Le / p shifted: the same point of the emitter seen from ``si``. The weight
-        that is returned is Le J / p with the p of ``light``. With it comes p' J / p; J = dω' / dω."""
+        """A sampled ``light`` of ``weight`` Le / p shifted: the same point of the emitter seen from ``si``.
+
+        The weight that is returned is Le J / p with the p of ``light``. With it comes p' J / p; J = dω' / dω.
+        """
         index = self.index_of(light.emitter, active)
         kind = dr.gather(mi.UInt32, self.kind, index, active)
         far = kind == _FAR

@@ -37,7 +37,9 @@ class Lights:
 
     def sample(self, scene, x: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool) -> tuple:
         """The direction sample of ``scene.sample_emitter_direction(x, u, False, active)``, its Le / p, and the lamp.
-        That is None where it is not chosen by place."""
+
+        That is None where it is not chosen by place.
+        """
         if not self.places:
             return *scene.sample_emitter_direction(x, u, False, active), None
         chosen = self.places.choose(x, u)
@@ -129,7 +131,9 @@ def emission(
 
 def shared_emission(scene, lights: Lights, x1, Le, p, *, x, y, y1, J) -> tuple[mi.Spectrum, mi.Float]:
     """``emission(scene, y1, y, True, True)`` by way of ``Le`` and ``p`` of the same vertex ``x1``, as seen from ``x``.
-    ``y1`` is ``x1`` with another incident direction; ``J`` is the ratio d'²/d² of the squared distances."""
+
+    ``y1`` is ``x1`` with another incident direction; ``J`` is the ratio d'²/d² of the squared distances.
+    """
     places = lights.places
     if not lights.shared:
         return emission(scene, y1, y, True, True, places)
@@ -145,8 +149,10 @@ def shared_emission(scene, lights: Lights, x1, Le, p, *, x, y, y1, J) -> tuple[m
 
 
 def emission_seen(scene, integrator, medium, ray: mi.RayDifferential3f, active) -> mi.Spectrum:
-    """What a camera ray meets of emitters before anything else: the layer ``direct``. Zero where ``integrator`` hides
-    it or follows no edge, and where the camera is in a ``medium``, which would dim it."""
+    """What a camera ray meets of emitters before anything else: the layer ``direct``.
+
+    Zero where ``integrator`` hides it or follows no edge, and where the camera is in a ``medium``, which would dim it.
+    """
     if not _shows(integrator) or medium is not None:
         return dr.zeros(mi.Spectrum, dr.width(ray))
     ray = mi.Ray3f(ray)

@@ -201,8 +201,10 @@ def turn(code, η, n, d, dn: tuple, dd: tuple) -> tuple[mi.Vector3f, mi.Vector3f
 def walk(
     scene, z, ω: mi.Vector3f, events: mi.UInt32, target: Target, active=True, ends: Ends = nowhere
 ) -> tuple[mi.Vector3f, Shot, mi.Bool]:
-    """Newton's method from ``ω`` on: the direction from ``z`` to the target, its shot, and whether it was found. A step
-    that breaks the chain, or comes no nearer, is halved."""
+    """Newton's method from ``ω`` on: the direction from ``z`` to the target, its shot, and whether it was found.
+
+    A step that breaks the chain, or comes no nearer, is halved.
+    """
     best_ω, best = mi.Vector3f(ω), shoot(scene, z, ω, events, target, active, ends)
     error = dr.norm(best.miss)
     found = best.good & (error < TOLERANCE * best.reach)

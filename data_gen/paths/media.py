@@ -96,7 +96,9 @@ def evaluate_vertex(
     bsdf: mi.BSDFPtr, x: mi.SurfaceInteraction3f, place: Place | None, wo: mi.Vector3f, active: bool | mi.Bool = True
 ) -> tuple[mi.Spectrum, mi.Float]:
     """``evaluate()`` for a vertex of either kind: f, with the cosine of a surface, and the density of sampling ``wo``.
-    ``bsdf`` is the material of the vertex, null in a medium."""
+
+    ``bsdf`` is the material of the vertex, null in a medium.
+    """
     if place is None:
         return evaluate(bsdf, x, wo, active)
     scatters = active & place.scatters

@@ -55,8 +55,10 @@ def next_surface(scene):
 
 
 def fly(media: Media, trace, ray, medium, channel, numbers: Numbers, *, active) -> Segment:
-    """The segment along ``ray``, from within ``medium``, that these ``numbers`` make. ``trace`` (ray, medium, active)
-    finds the next surface, as ``next_surface()`` does."""
+    """The segment along ``ray``, from within ``medium``, that these ``numbers`` make.
+
+    ``trace`` (ray, medium, active) finds the next surface, as ``next_surface()`` does.
+    """
     nulls, N = None, 1
     if media.grids:
         ray, hit, medium, scatters, τ, nulls, N = collisions.fly_on(
@@ -120,7 +122,9 @@ def cross(passes, trace, ray, medium, reach, *, active, target):
 
 def see(media: Media, trace, ray, medium, reach, *, channel, key, active) -> tuple:
     """T along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary: in grids an estimate.
-    Returns T, that surface, and the last piece of the ray."""
+
+    Returns T, that surface, and the last piece of the ray.
+    """
     if not media.grids:
         τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active=active, target=None)
         return dr.exp(-τ), hit, ray
@@ -131,8 +135,10 @@ def see(media: Media, trace, ray, medium, reach, *, channel, key, active) -> tup
 
 
 def clear_view(media: Media, trace, ray, medium, channel, active) -> tuple:
-    """exp(-τ) along ``ray`` up to the first surface that is no boundary, 0 where a grid is on the way. Returns that,
-    the surface, and the last piece of the ray."""
+    """exp(-τ) along ``ray`` up to the first surface that is no boundary, 0 where a grid is on the way.
+
+    Returns that, the surface, and the last piece of the ray.
+    """
     reach = end_of(ray)
     if not media.grids:
         τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active=active, target=None)

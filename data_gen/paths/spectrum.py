@@ -7,8 +7,10 @@ import mitsuba as mi
 
 
 def to_rgb(value: mi.Spectrum, wavelengths: mi.Wavelength) -> mi.Color3f:
-    """Linear RGB (Rec. 709 primaries) of a spectrum sample, for RGB, monochrome and spectral variants. Polarised
-    variants carry Mueller matrices; only the intensity is kept."""
+    """Linear RGB (Rec. 709 primaries) of a spectrum sample, for RGB, monochrome and spectral variants.
+
+    Polarised variants carry Mueller matrices; only the intensity is kept.
+    """
     if mi.is_polarized:
         value = mi.unpolarized_spectrum(value)
     if mi.is_spectral:

@@ -30,8 +30,10 @@ _TILE = 6
 
 
 def first_round(points: str, samples: int | None) -> int:
-    """Samples of a pixel in the first round, a power of two, or 0 where they are independent. ``points`` "sobol" has as
-    many as are asked for (None: not known), "rounds" always 16, "independent" none."""
+    """Samples of a pixel in the first round, a power of two, or 0 where they are independent.
+
+    ``points`` "sobol" has as many as are asked for (None: not known), "rounds" always 16, "independent" none.
+    """
     if points == "independent":
         return 0
     if points == "rounds" or samples is None:

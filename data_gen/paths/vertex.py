@@ -73,8 +73,10 @@ class Materials:
 
 
 class ByMaterial:
-    """Values by Dr.Jit's number of a material. Mitsuba does not list the materials inside shape groups, so they have no
-    value."""
+    """Values by Dr.Jit's number of a material.
+
+    Mitsuba does not list the materials inside shape groups, so they have no value.
+    """
 
     def __init__(self, values: mi.Bool | mi.Float):
         # Opaque: the numbers may be others in each process, and the kernel is to be the same.
@@ -147,8 +149,10 @@ def consistent(
 def evaluate(
     bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: bool | mi.Bool = True
 ) -> tuple[mi.Spectrum, mi.Float]:
-    """f cos θ of a material and the density of sampling ``wo``, for directions that nobody sampled there. Such
-    directions may lie below the horizon, where some materials (``roughplastic``) answer with NaN: zero it is."""
+    """f cos θ of a material and the density of sampling ``wo``, for directions that nobody sampled there.
+
+    Such directions may lie below the horizon, where some materials (``roughplastic``) answer with NaN: zero it is.
+    """
     f, p = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
     good = dr.isfinite(p) & dr.isfinite(dr.sum(f))
     return dr.select(good, f, 0), dr.select(good, p, 0)

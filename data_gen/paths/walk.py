@@ -86,8 +86,10 @@ def brightest(paths: Iterable[Any]) -> mi.Float:
 
 @dataclass
 class Sky:
-    """Whether a path that escapes sees the environment. One that hides from the camera hides as well behind holes,
-    where nothing has been scattered yet."""
+    """Whether a path that escapes sees the environment.
+
+    One that hides from the camera hides as well behind holes, where nothing has been scattered yet.
+    """
 
     seen: mi.Bool
 

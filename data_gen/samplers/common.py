@@ -50,8 +50,10 @@ def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[...
 def recorded(
     scene: mi.Scene, samples: Callable[[CameraSamples], dict], *owners: object, shifts: Iterable = QUARTERS
 ) -> SamplePass:
-    """The pass that puts what ``samples`` gives, recorded once: see ``Frozen``, also for the ``owners``. Beside the
-    rays of the camera samples it asks for those by the ``shifts``."""
+    """The pass that puts what ``samples`` gives, recorded once: see ``Frozen``, also for the ``owners``.
+
+    Beside the rays of the camera samples it asks for those by the ``shifts``.
+    """
     frozen = Frozen(scene, *owners)
     return lambda camera, film: film.put_all(frozen(samples, camera.look((0, 0), *shifts)))
 
@@ -88,7 +90,9 @@ class GradientIntegrator(mi.SamplingIntegrator):
     @classmethod
     def like_path(cls, scene: mi.Scene, plugin: str, places: Places | None = None, **options) -> Self:
         """The integrator ``plugin``, of this class, with the parameters of the scene's own ``path``, and ``options``.
-        Lamps are chosen by ``places``. Raises NgptError where the parameters cannot be read."""
+
+        Lamps are chosen by ``places``. Raises NgptError where the parameters cannot be read.
+        """
         props = mi.Properties(plugin)
         for name, value in (cls.parameters(scene) | options).items():
             props[name] = value
@@ -109,8 +113,10 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return scene_facts(scene, sensor, self.reference())
 
     def prepare(self, scene: mi.Scene, sensor: mi.Sensor | None = None) -> SamplePass:
-        """What takes the samples of a pass of ``sensor``, or of the scene's first one. Raises NgptError for what the
-        registry says that the sampler refuses."""
+        """What takes the samples of a pass of ``sensor``, or of the scene's first one.
+
+        Raises NgptError for what the registry says that the sampler refuses.
+        """
         sensor = sensor or scene.sensors()[0]
         find(self.name, self.facts(scene, sensor))
         return self.begin(scene, sensor)

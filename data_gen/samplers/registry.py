@@ -80,8 +80,10 @@ class Entry:
         return [heads[subject] + text for subject, text in self.notes.items() if subject in heads]
 
     def settings(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """All options, those ``given``, which may be texts, and the others' defaults. Raises NgptError for options that
-        do not exist, and for values that are not allowed."""
+        """All options, those ``given``, which may be texts, and the others' defaults.
+
+        Raises NgptError for options that do not exist, and for values that are not allowed.
+        """
         return settings(f"sampler '{self.name}'", self.options, given)
 
     def unusual(self, settings: Mapping[str, Any]) -> str:
@@ -99,8 +101,10 @@ def own(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Sampler(Entry):
-    """What renders the layers of a gradient stack. It has its own options, and the options in ``COMMON``. Its ``make``
-    (scene, options) returns what takes the samples of a pass (``data_gen.passes.SamplePass``)."""
+    """What renders the layers of a gradient stack. It has its own options, and the options in ``COMMON``.
+
+    Its ``make`` (scene, options) returns what takes the samples of a pass (``data_gen.passes.SamplePass``).
+    """
 
     _: KW_ONLY
     gradients: bool = True  # whether it renders dx and dy

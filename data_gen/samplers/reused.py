@@ -47,8 +47,10 @@ def _key(scene: mi.Scene, options: dict[str, Any]) -> tuple:
 
 
 class _Same:
-    """The value of a parameter, to be compared. It holds the arrays, since Dr.Jit gives their indices to others once
-    they are gone."""
+    """The value of a parameter, to be compared.
+
+    It holds the arrays, since Dr.Jit gives their indices to others once they are gone.
+    """
 
     def __init__(self, value: Any):
         self.arrays = leaves(value)

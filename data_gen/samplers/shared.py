@@ -92,8 +92,10 @@ TAILS = Option(
 
 
 def why_not_shared(media: bool, settings: Mapping[str, Any], variant: str) -> str:
-    """Why paths with these ``settings`` cannot share what they find, of a sampler with the option ``tails``. ``media``:
-    the paths go through media. "" where they can share."""
+    """Why paths with these ``settings`` cannot share what they find, of a sampler with the option ``tails``.
+
+    ``media``: the paths go through media. "" where they can share.
+    """
     if media:
         return "there are media"
     if "rgb" not in variant or "polarized" in variant:

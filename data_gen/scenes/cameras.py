@@ -58,7 +58,9 @@ def check_camera(sensor: mi.Sensor) -> None:
 
 def sensor_number(wanted: int | str | None, ids: Sequence[str], scene: str) -> int:
     """The index of the sensor that is ``wanted``, by id or number, among a scene's sensors, whose ``ids`` may be "".
-    None: the first. Raises WrongUse for one that is not there."""
+
+    None: the first. Raises WrongUse for one that is not there.
+    """
     if wanted is None:
         return 0
     name = str(wanted)

@@ -53,8 +53,10 @@ def plugin_name(integrator: mi.Integrator) -> str:
 
 
 def same_image(plugin: str, hides: bool) -> str:
-    """The plugin that renders the image of ``plugin`` and is one to follow, or ``plugin`` itself. ``hides``: emitters
-    hide from the camera."""
+    """The plugin that renders the image of ``plugin`` and is one to follow, or ``plugin`` itself.
+
+    ``hides``: emitters hide from the camera.
+    """
     return _SAME.get(plugin, ("", ""))[hides] or plugin
 
 
@@ -93,8 +95,10 @@ def objects_in(thing: mi.Object, kind: type) -> list:
 
 
 def lack(plugin: str, nested: int, from_camera: bool = True) -> str:
-    """Why an integrator around so many others renders no image for a stack, "" if it does. ``from_camera``: it traces
-    paths from the camera, unless its name says otherwise."""
+    """Why an integrator around so many others renders no image for a stack, "" if it does.
+
+    ``from_camera``: it traces paths from the camera, unless its name says otherwise.
+    """
     if not from_camera or plugin in _FROM_LAMPS:
         return (
             f"integrator '{plugin}' does not trace paths from the camera, so it has no gradients; "
@@ -113,8 +117,10 @@ def check_integrator(integrator: mi.Integrator) -> None:
 
 
 def own_estimate(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[..., mi.Spectrum]:
-    """(sampler, ray, medium, active) -> what the integrator itself estimates along camera rays. That raises NgptError
-    where the integrator fails."""
+    """(sampler, ray, medium, active) -> what the integrator itself estimates along camera rays.
+
+    That raises NgptError where the integrator fails.
+    """
     call: Callable[..., Any] = partial(integrator.sample, scene)
     if isinstance(integrator, mi.CppADIntegrator):
         # As ``mi.ad.integrators.common.ADIntegrator.render`` calls them

@@ -64,8 +64,10 @@ def _set(scene: mi.Scene, weights) -> None:
 
 
 def lamp_weights(scene: mi.Scene) -> np.ndarray:
-    """The share of each lamp in the choice, in the order of ``scene.emitters()``; they sum to 1. The same for the same
-    scene and camera."""
+    """The share of each lamp in the choice, in the order of ``scene.emitters()``; they sum to 1.
+
+    The same for the same scene and camera.
+    """
     n = len(scene.emitters())
     lamp, L, _ = _pilot(scene, _PATHS)
     roots = np.zeros(n)
@@ -101,7 +103,9 @@ def promised(scene: mi.Scene, weights: np.ndarray) -> tuple[float, Table | None]
 
 def _pilot(scene: mi.Scene, paths: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Samples of lamps at the first vertices of camera paths: each one's number, what it brings, and the vertex (N, 3).
-    What it brings counts by its weight beside BSDF sampling: lamps that are large, or close, count for less."""
+
+    What it brings counts by its weight beside BSDF sampling: lamps that are large, or close, count for less.
+    """
     n = len(scene.emitters())
     lane = dr.arange(mi.UInt32, paths)
     random = mi.PCG32(paths, 0x1A3B)
@@ -219,8 +223,10 @@ class Places:
         return dr.gather(mi.Float, self.p, self.row(x) + lamp)
 
     def sample(self, x: mi.SurfaceInteraction3f, chosen: Chosen, active: mi.Bool) -> tuple:
-        """As ``scene.sample_emitter_direction(x, u, False, active)``: a point of the lamp that is ``chosen``. Its
-        density, and Le over it, count the choice with the probability that ``chosen`` says."""
+        """As ``scene.sample_emitter_direction(x, u, False, active)``: a point of the lamp that is ``chosen``.
+
+        Its density, and Le over it, count the choice with the probability that ``chosen`` says.
+        """
         lamp = dr.gather(mi.EmitterPtr, self.emitters, chosen.lamp, active)
         light, weight = lamp.sample_direction(x, chosen.u, active)
         light.pdf *= chosen.p
@@ -237,7 +243,9 @@ class Places:
 
 def learn(lamp: np.ndarray, squares: np.ndarray, at: np.ndarray, whole: np.ndarray) -> Table:
     """From samples of a pilot: the number of its ``lamp``, the square of what that brings, and its vertex, (N, 3).
-    ``whole``: weights of lamps in the whole scene, (lamps,), none 0."""
+
+    ``whole``: weights of lamps in the whole scene, (lamps,), none 0.
+    """
     lamps, side = len(whole), _SIDE
     while side > 1 and side**3 * lamps > _LARGEST:
         side //= 2

@@ -104,8 +104,10 @@ def _enough_threads() -> Iterator[None]:
 
 
 def set_film_size(scene: mi.Scene, size: tuple[int, int]) -> None:
-    """Sets the film of the scene's first sensor to ``size`` = (width, height) pixels. A crop window stays the same part
-    of it: its edges are rounded to pixels, so that parts which meet still do."""
+    """Sets the film of the scene's first sensor to ``size`` = (width, height) pixels.
+
+    A crop window stays the same part of it: its edges are rounded to pixels, so that parts which meet still do.
+    """
     sensor = scene.sensors()[0]
     film = sensor.film()
     crop = [_scaled(*each) for each in zip(film.crop_offset(), film.crop_size(), film.size(), size, strict=True)]

@@ -158,8 +158,10 @@ class Known:
     fineness: mi.Float
 
     def look(self, place: Place, active: mi.Bool) -> tuple[list[mi.Color3f], mi.Bool]:
-        """The light of each sort at a place, and whether it is trusted. The smallest trusted cell around the place has
-        it."""
+        """The light of each sort at a place, and whether it is trusted.
+
+        The smallest trusted cell around the place has it.
+        """
         values = self._of(place, active)
         for _ in range(LEVELS - 1):
             place, more = coarser(place), active & (values[0].w == 0)
@@ -244,8 +246,10 @@ class Cache:
 def in_table(
     keys: mi.UInt32, h: mi.UInt32, name: mi.UInt32, active: mi.Bool, *, fill: bool = False
 ) -> tuple[mi.UInt32, mi.Bool]:
-    """The places of cells in a table, and which are there; ``fill``: cells that are not there are made. All places from
-    ``h`` on up to the first empty one are searched."""
+    """The places of cells in a table, and which are there; ``fill``: cells that are not there are made.
+
+    All places from ``h`` on up to the first empty one are searched.
+    """
     last, lanes = dr.width(keys) - 1, dr.width(h)
 
     def body(i, open, slot, found):

@@ -39,8 +39,10 @@ class Matt:
         self.α = ByMaterial(mi.Float(table))
 
     def at(self, x: mi.SurfaceInteraction3f, fineness: mi.Float, active: mi.Bool) -> tuple[mi.Bool, mi.Bool]:
-        """Whether the vertices are of such a material, and whether it has gloss that counts at that ``fineness``. More
-        gloss counts the finer the cells are, in the end all of it: so its bias vanishes too."""
+        """Whether the vertices are of such a material, and whether it has gloss that counts at that ``fineness``.
+
+        More gloss counts the finer the cells are, in the end all of it: so its bias vanishes too.
+        """
         listed, α = self.α.of(x.bsdf(), active)
         return listed & (α >= 0), listed & (α > 0) & (α < ROUGH * dr.square(fineness / FINENESS))
 

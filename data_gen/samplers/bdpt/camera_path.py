@@ -45,7 +45,9 @@ class Merges(Protocol):
 @dr.syntax
 def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging: Merges | None = None) -> tuple:
     """L and Le of a path from the camera, joined to the vertices of a ``light_path`` and to photons, where there are.
-    Le is the emission that the camera sees directly, L all other light."""
+
+    Le is the emission that the camera sees directly, L all other light.
+    """
     scene, lights, limits, random = plan.scene, plan.lights, plan.limits, sight.random
     ray = mi.Ray3f(sight.ray)
     si = plan.first_hit(scene, ray).compute_surface_interaction(ray)
@@ -133,7 +135,9 @@ _LEAST_COSINE = 0.1
 @dr.syntax
 def choose(z: Vertex, active, light: LightPath, longest: int, u: mi.Float):
     """The number of the chosen vertex of ``light``, and 1 / the probability of that choice; 0 where there is none.
-    Vertices that paths of at most ``longest`` edges lead to can be chosen, by the random number ``u``."""
+
+    Vertices that paths of at most ``longest`` edges lead to can be chosen, by the random number ``u``.
+    """
     kept, end = light.kept, dr.minimum(light.count, longest - 1 - z.depth)
     come_from = cosine(z.si, z.si.to_world(z.si.wi))
     i = mi.UInt32(0)  # the vertex that is looked at
@@ -155,7 +159,9 @@ def choose(z: Vertex, active, light: LightPath, longest: int, u: mi.Float):
 
 def worth(z: Vertex, come_from: mi.Float, y) -> mi.Float:
     """The light of ``z`` connected to the record ``y`` times its MIS weight, were both surfaces white and matte.
-    ``come_from`` is the cosine at ``z`` of the direction that its path has come from."""
+
+    ``come_from`` is the cosine at ``z`` of the direction that its path has come from.
+    """
     to = mi.Vector3f(y.o + y.d * y.t - z.si.p)
     distance2 = dr.squared_norm(to)
     d = to * dr.rsqrt(distance2)

@@ -95,8 +95,10 @@ def go_on(plan: Plan, random, start: LightRay, y: Vertex, bsdf, active) -> tuple
 
 @dr.syntax
 def light_path(plan: Plan, sight: Sight, visitor: Visitor) -> tuple[LightPath, Any, Any]:
-    """Traces a path from a light; returns its vertices, the random numbers to go on by, and the visitor's state. It has
-    at most ``plan.longest`` edges, the one to the camera included."""
+    """Traces a path from a light; returns its vertices, the random numbers to go on by, and the visitor's state.
+
+    It has at most ``plan.longest`` edges, the one to the camera included.
+    """
     eye, random = sight.eye, sight.random.clone()
     start, end, active = begin(plan, random, sight.ray)
     count = mi.UInt32(0)  # vertices so far

@@ -71,8 +71,11 @@ def gathered(y: Partial, η: mi.Float) -> Partial:
 
 
 def others_merged(z: Partial, q_z: mi.Float, y: Partial, q_y: mi.Float, η: mi.Float) -> mi.Float:
-    """``others`` for a camera path and a light path that merge at ``z`` and ``y``, their last vertices. ``q_y`` is the
-    density of the direction to the light, ``q_z`` the density of the direction to the camera. ``y`` includes η."""
+    """``others`` for a camera path and a light path that merge at ``z`` and ``y``, their last vertices.
+
+    ``q_y`` is the density of the direction to the light, ``q_z`` the density of the direction to the camera.
+    ``y`` includes η.
+    """
     return dr.maximum((z.vcm + z.vc * q_z + y.vcm + y.vc * q_y) / η - 1, 0)
 
 
@@ -82,8 +85,10 @@ def others_emitted(end: Partial, e: mi.Float, p: mi.Float) -> mi.Float:
 
 
 def others_to_light(end: Partial, e: mi.Float, p_light: mi.Float, cos: mi.Float, p, q) -> mi.Float:
-    """``others`` for a camera path whose last vertex is connected to a light. ``p_light`` is the density of sampling
-    that light; it is 0 for a delta light."""
+    """``others`` for a camera path whose last vertex is connected to a light.
+
+    ``p_light`` is the density of sampling that light; it is 0 for a delta light.
+    """
     return dr.select(p_light > 0, p / p_light, 0) + others_to_camera(end, e, cos, q)
 
 

@@ -44,8 +44,10 @@ def connected(scene, z: Vertex, z_bsdf, y: Vertex, active) -> tuple[mi.Spectrum,
 
 
 def connection(scene, z: Vertex, z_bsdf, y: Vertex, active, seen: mi.Bool | bool = False) -> tuple[mi.Spectrum, Edge]:
-    """As ``connected()``, without the camera path's throughput; and the edge, which its MIS weight depends on. Where it
-    is known that the vertices see each other, ``seen``, no ray is traced."""
+    """As ``connected()``, without the camera path's throughput; and the edge, which its MIS weight depends on.
+
+    Where it is known that the vertices see each other, ``seen``, no ray is traced.
+    """
     to = mi.Vector3f(y.si.p - z.si.p)
     distance2 = dr.squared_norm(to)
     d = to * dr.rsqrt(distance2)

@@ -38,8 +38,10 @@ def record_class(variant: str) -> type:
 
     @dataclass
     class Record:
-        """A vertex of a light path as it is kept: 23 words in RGB, and no Bool, with which Dr.Jit 1.5 breaks off. The
-        interaction is computed anew from the ray that led there and what it hit."""
+        """A vertex of a light path as it is kept: 23 words in RGB, and no Bool, with which Dr.Jit 1.5 breaks off.
+
+        The interaction is computed anew from the ray that led there and what it hit.
+        """
 
         o: mi.Point3f
         d: mi.Vector3f

@@ -88,7 +88,9 @@ def shifted_camera_path(
 @dr.syntax
 def shifted_connection(plan: Plan, step: Step, active, light_path: LightPath, u: mi.Float, offsets: list[Offset]):
     """The light of the paths that join the vertex of ``step`` to one of a light path's, by ``u``; and Δ, with them.
-    Only the base path chooses this vertex, so that it stands for all vertices in differences as well."""
+
+    Only the base path chooses this vertex, so that it stands for all vertices in differences as well.
+    """
     z, L, Δ = step.z, dr.zeros(mi.Spectrum, dr.width(step.z.depth)), [offset.Δ for offset in offsets]
     chosen, times = choose(z, active, light_path, plan.longest, u)
     if active & (times > 0):

@@ -66,8 +66,10 @@ def next_course(course: Course, step: Step) -> Course:
 def along(
     plan: Plan, step: Step, course: Course | None, chain: Chain | None
 ) -> tuple[Step, Course | None, Chain | None]:
-    """``step`` with only the light that counts in Δ, and the next ``course`` and ``chain``. With a ``chain`` only the
-    light of bent paths counts, without one all other light; without a ``course`` all light."""
+    """``step`` with only the light that counts in Δ, and the next ``course`` and ``chain``.
+
+    With a ``chain`` only the light of bent paths counts, without one all other light; without a ``course`` all light.
+    """
     if course is None or plan.materials.all_connectable:
         return step, course, chain
     behind = next_course(course, step)

@@ -56,8 +56,10 @@ from data_gen.samplers.gbdpt.roulette import Rater, Worth, survivors, thresholds
 
 
 class GBDPT(BDPT):
-    """Gradient-domain bidirectional path tracing, for surfaces. Plugin ``gbdpt``, with the parameters of ``bdpt`` and
-    ``roughness_threshold``. Not handled: as there."""
+    """Gradient-domain bidirectional path tracing, for surfaces.
+
+    Plugin ``gbdpt``, with the parameters of ``bdpt`` and ``roughness_threshold``. Not handled: as there.
+    """
 
     plan_class = Plan
 

@@ -96,8 +96,10 @@ def splat_differences(
 def differences(
     plan: Plan, eye: Eye, path: Splatted, lit: mi.Bool, bent: bool = False
 ) -> dict[str, tuple[mi.Spectrum, mi.Bool]]:
-    """Δ of the path for each of SHIFTS, and whether it exists: light arrives, and that pixel is on the film. Only paths
-    that are ``lit`` count: with ``bent`` the ones with events in between, else the others."""
+    """Δ of the path for each of SHIFTS, and whether it exists: light arrives, and that pixel is on the film.
+
+    Only paths that are ``lit`` count: with ``bent`` the ones with events in between, else the others.
+    """
     shifts = list(SHIFTS.values())
     state = (mi.UInt32(0), *(mi.Spectrum(0) for _ in shifts))
 

@@ -38,8 +38,10 @@ class Offset:
 
 
 def start(eye: Eye, x, shifted: tuple, hit) -> Offset:
-    """An offset path up to its first vertex; none where there is no base path. It begins with the ``shifted`` camera
-    ray, its importance, and whether it is on the film."""
+    """An offset path up to its first vertex; none where there is no base path.
+
+    It begins with the ``shifted`` camera ray, its importance, and whether it is on the film.
+    """
     ray, importance, inside = shifted
     y = hit.compute_surface_interaction(ray)
     lives = inside & hit.is_valid() & x.is_valid()
@@ -117,8 +119,10 @@ def connect(plan: Plan, step: Step, y: Vertex, times, offsets: list[Offset], Δ:
 def take_step(
     plan: Plan, step: Step, offsets: list[Offset], course: Course | None = None, chain: Chain | None = None
 ) -> list[Offset]:
-    """Takes all offset paths along a step of their base path; connections to the light path are not in it. With a
-    ``chain``, the one behind the step, only bent paths are shifted; ``course`` is the one before the step."""
+    """Takes all offset paths along a step of their base path; connections to the light path are not in it.
+
+    With a ``chain``, the one behind the step, only bent paths are shifted; ``course`` is the one before the step.
+    """
     busy = mi.Bool(False)
     for offset in offsets:
         busy |= offset.apart | offset.joined

@@ -105,7 +105,9 @@ def begin(plan: Plan, x: mi.SurfaceInteraction3f, place, channel, β: mi.Spectru
 
 def base_step(scene, plan: Plan, random, path: Path, offsets: list) -> tuple[Step, Path]:
     """Samples an emitter and the next vertex from the ``path``'s vertex; returns that step, and the path behind it.
-    Random numbers are drawn whether used or not: a replay needs the same ones, whatever its path meets."""
+
+    Random numbers are drawn whether used or not: a replay needs the same ones, whatever its path meets.
+    """
     x, place, space = path.x, path.place, plan.space
 
     # ---------------------- Random numbers -----------------------

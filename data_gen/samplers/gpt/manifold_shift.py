@@ -53,7 +53,9 @@ class Chain:
 
     def end(self, depth, survival, late, x1, Le) -> tuple[Chain, mi.Bool]:
         """Behind the ``depth``-th vertex: whether the chain ends at ``x1``, where it finds ``Le``, and then its record.
-        Only ``late`` light is followed: for a lamp behind panes only, replay is no worse."""
+
+        Only ``late`` light is followed: for a lamp behind panes only, replay is no worse.
+        """
         # A lamp that is a mirror too could be met again further on: a lane has one record.
         sharp = mi.has_flag(x1.bsdf().flags(), mi.BSDFFlags.Delta) | mi.has_flag(x1.bsdf().flags(), mi.BSDFFlags.Null)
         ends = late & (self.state > _OPEN) & ~(x1.is_valid() & sharp) & (dr.max(Le) > 0)
@@ -91,7 +93,9 @@ class Recorded:
 
 def add_followed(plan: Plan, first_hit, camera: CameraSamples, shifts, chain: Chain, Δ: list) -> list:
     """``Δ``, colours of all lanes for each of the ``shifts``, with the samples of all recorded paths added.
-    ``first_hit`` is where a camera ray leads. All arguments are evaluated."""
+
+    ``first_hit`` is where a camera ray leads. All arguments are evaluated.
+    """
     lanes, exists = in_packets(np.array(dr.compress(chain.record != 0)), camera)
     if not len(lanes):
         return Δ

@@ -65,8 +65,10 @@ class Move:
 
 
 def start(plan: Plan, base: Path, first: Segment, importance: mi.Spectrum, inside: mi.Bool) -> Offset:
-    """An offset path behind its ``first`` segment, ``inside`` the film or not; it has ended where it finds nothing. A
-    base path that has ended there walks on as a ghost if the kernel can replay, else the shift is rejected."""
+    """An offset path behind its ``first`` segment, ``inside`` the film or not; it has ended where it finds nothing.
+
+    A base path that has ended there walks on as a ghost if the kernel can replay, else the shift is rejected.
+    """
     hit, none = first.hit, dr.zeros(mi.Spectrum, dr.width(first.hit.t))
     lives = inside & hit.is_valid()
     ended = inside & ~hit.is_valid() & base.x.is_valid()

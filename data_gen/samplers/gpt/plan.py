@@ -46,8 +46,10 @@ def make_plan(
     places: Places | None = None,
     shared: bool = False,
 ) -> Plan:
-    """Inspects the scene; the parameters are as for ``gpt``. Lamps are chosen by ``places``, if given. Without
-    ``volumes`` its media are not seen. Raises NgptError for shifts that know no media."""
+    """Inspects the scene; the parameters are as for ``gpt``. Lamps are chosen by ``places``, if given.
+
+    Without ``volumes`` its media are not seen. Raises NgptError for shifts that know no media.
+    """
     if volumes and shift != "replay":
         raise NgptError(f"gpt: shift '{shift}' does not go through media; use 'replay'")
     space = Filled(scene) if volumes else Space(scene)

@@ -49,7 +49,9 @@ def place(plan: Plan, known: Known, path: Path) -> tuple[Place, mi.Bool, mi.Bool
 
 def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.Spectrum, mi.Spectrum]:
     """Ends paths where the cache knows what follows; returns them, and that, in the layer ``caustic`` or not.
-    Differences get theirs, but for what is in that layer."""
+
+    Differences get theirs, but for what is in that layer.
+    """
     where, able, gloss = place(plan, known, path)
     for y in offsets:
         # A joined path sees the vertex from elsewhere, where gloss has other light.

@@ -99,7 +99,9 @@ class PhotonIntegrator(GradientIntegrator):
 
 def _refuse_lamps_never_chosen(scene, sampler: str) -> None:
     """No photons start at a lamp of weight 0, so that its light would be missing. Mitsuba's paths meet it by chance.
-    Points and single directions of weight 0 are met by nothing: they are off, in Mitsuba as well."""
+
+    Points and single directions of weight 0 are met by nothing: they are off, in Mitsuba as well.
+    """
     for index, emitter in enumerate(scene.emitters()):
         if visible(emitter) and scene.pdf_emitter(mi.UInt32(index))[0] == 0:
             raise NgptError(

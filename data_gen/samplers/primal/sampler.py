@@ -26,8 +26,10 @@ from data_gen.tails.cache import Known
 
 
 def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places | None = None) -> SamplePass:
-    """The sampler ``primal``; without ``features`` it holds only the primal. Lamps may be chosen by ``places``. With
-    ``tails`` "shared" the tails of paths are found in a cache, see ``data_gen.tails``."""
+    """The sampler ``primal``; without ``features`` it holds only the primal. Lamps may be chosen by ``places``.
+
+    With ``tails`` "shared" the tails of paths are found in a cache, see ``data_gen.tails``.
+    """
     integrator = reference_integrator(scene)
     followed = integrator_name(scene) in ("path", *VOLUMETRIC) and not mi.is_polarized
     if not (tails == "shared" or (followed and (places or loses_light(scene, integrator)))):

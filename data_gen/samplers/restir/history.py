@@ -177,7 +177,9 @@ class History:
 
     def _of_kept(self, stage: Stage, kept: Reservoir, elsewhere: bool) -> Requests:
         """Each path that was kept, where the pixels that look for it have it now: 4 requests for each reservoir.
-        ``elsewhere``: in the frame before, where else the path could have been."""
+
+        ``elsewhere``: in the frame before, where else the path could have been.
+        """
 
         def request(lane: mi.UInt32, end: mi.UInt32):
             it = self.at.corner(lane, kept)

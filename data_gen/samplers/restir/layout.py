@@ -102,7 +102,9 @@ class Layout:
 
     def before(self, domain: mi.UInt32, pair: mi.Point2i, side: mi.UInt32, place: mi.Point2f, wrapped: mi.Bool):
         """Where a path of this frame's ``pair`` could have been in the frame before: place, pair, and whether at all.
-        Not ``wrapped``: straight along the motion. Else within the nearest pair, unless that is the same."""
+
+        Not ``wrapped``: straight along the motion. Else within the nearest pair, unless that is the same.
+        """
         exists = self.on_film(pair)
         motion = self.motion(domain, pair, exists)
         to_side, nearest = step(domain) * mi.Int32(side), self._nearest(pair, motion)

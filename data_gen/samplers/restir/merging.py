@@ -109,8 +109,10 @@ class Merging:
 
 
 def differences(at: Layout, kept: Reservoir, partners: Requests) -> tuple[mi.Spectrum, mi.Spectrum]:
-    """dx and dy of the paths that pixels have kept, each weighted against its mirror image. ``partners``: E of these
-    paths in the neighbours of their pixels."""
+    """dx and dy of the paths that pixels have kept, each weighted against its mirror image.
+
+    ``partners``: E of these paths in the neighbours of their pixels.
+    """
     i = dr.arange(mi.UInt32, at.lanes)
     pixel, chain = at.pixel(i), i % at.chains
     found = []

@@ -64,8 +64,10 @@ def weigh(own: mi.Float, others: mi.Float, target: mi.Float, W: mi.Float) -> tup
 
 
 def choose(weights: list[mi.Float], u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-    """The number of the path that is kept, by a random number in [0, 1), and the sum of all resampling weights. It is
-    one whose weight is not 0, wherever there is one."""
+    """The number of the path that is kept, by a random number in [0, 1), and the sum of all resampling weights.
+
+    It is one whose weight is not 0, wherever there is one.
+    """
     total = sum(weights, start=mi.Float(0))
     chosen, below, place = mi.UInt32(0), mi.Float(0), u * total
     for k, weight in enumerate(weights):
@@ -127,7 +129,9 @@ CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 
 def pair_motions(motion: np.ndarray, depth: np.ndarray | None, steps: Iterable[tuple[int, int]]) -> np.ndarray:
     """(steps, H, W, 2): the motion of a pixel, or of a pair of it and the pixel one step on: the nearer one's motion.
-    NaN where that is not known, and for pairs that reach over the edge of the film."""
+
+    NaN where that is not known, and for pairs that reach over the edge of the film.
+    """
     height, width = motion.shape[:2]
     found = np.full((0, height, width, 2), np.nan)
     for x, y in steps:

@@ -159,8 +159,10 @@ class Tiles:
         return Le, Paths(hit, lives, suffix, own, direct)
 
     def connect(self, camera: CameraSamples, paths: Paths, link: Link) -> tuple[Connection, mi.Color3f]:
-        """The first vertex of each pixel, connected to the suffix of the pixel that ``link`` leads to. Also what
-        emitter sampling finds there with that pixel's numbers."""
+        """The first vertex of each pixel, connected to the suffix of the pixel that ``link`` leads to.
+
+        Also what emitter sampling finds there with that pixel's numbers.
+        """
         scene, materials = self.scene, self.materials
         # --------------- The vertices, from what is kept of them ---------------
         ray, importance, _ = camera.rays()
@@ -298,8 +300,10 @@ class Grid:
 
 
 def keep_in_step(camera: CameraSamples) -> None:
-    """Gives all pixels the place in the pixel, the point on the lens and the time of the first one's sample. Within a
-    pixel things look different from place to place, which would be the most of the noise of a difference."""
+    """Gives all pixels the place in the pixel, the point on the lens and the time of the first one's sample.
+
+    Within a pixel things look different from place to place, which would be the most of the noise of a difference.
+    """
     leader = dr.arange(mi.UInt32, dr.width(camera.pixel)) - camera.pixel * dr.opaque(mi.UInt32, camera.block)
     same = camera.at(leader)
     camera.position = mi.Point2f(camera.pixel % camera.size.x, camera.pixel // camera.size.x) + same.position
@@ -308,8 +312,10 @@ def keep_in_step(camera: CameraSamples) -> None:
 
 
 def balanced(members: list[tuple[Link | None, Connection]]) -> mi.Color3f:
-    """Σ_j C_i(s_j) / D(s_j) of each pixel i, by the balance heuristic over the ``members`` of its tile. A link leads to
-    the pixel that made the suffix; the link of a pixel to itself is None."""
+    """Σ_j C_i(s_j) / D(s_j) of each pixel i, by the balance heuristic over the ``members`` of its tile.
+
+    A link leads to the pixel that made the suffix; the link of a pixel to itself is None.
+    """
 
     def of(link: Link | None, values: mi.Float) -> mi.Float:
         return dr.gather(mi.Float, values, link.lane, link.active) if link else values

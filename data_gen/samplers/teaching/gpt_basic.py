@@ -73,7 +73,9 @@ class GPTBasic(GradientIntegrator):
 
     def radiance(self, scene, estimate, camera: CameraSamples, shift) -> tuple[mi.Color3f, mi.Color3f, mi.Bool]:
         """L(u, p + shift) without, and with only, the emission seen directly; and whether p + shift is on the film.
-        Direct emission has little noise of its own, but its edges would be the strongest gradients of the image."""
+
+        Direct emission has little noise of its own, but its edges would be the strongest gradients of the image.
+        """
         ray, importance, inside = camera.rays(shift)
         medium = camera.sensor.get_medium()
         # The clone starts from the same state each time: same u.

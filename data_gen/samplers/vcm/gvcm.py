@@ -105,8 +105,11 @@ OFFSETS_BYTES = 1024
 
 
 class GVCM(VCM):
-    """Gradient-domain vertex connection and merging, for surfaces. Plugin ``gvcm``. Parameters, and what is not
-    handled: as for ``vcm``; where photons are gathered, paths are connectable as well."""
+    """Gradient-domain vertex connection and merging, for surfaces.
+
+    Plugin ``gvcm``. Parameters, and what is not handled: as for ``vcm``; where photons are gathered, paths are
+    connectable as well.
+    """
 
     splatter, plan_class = Marker, Plan
     sample_bytes = VCM.sample_bytes + OFFSETS_BYTES

@@ -73,8 +73,10 @@ def box(size, center=(0, 0, 0)) -> Mesh:
 
 
 def wall(origin, u, v, openings=()) -> Mesh:
-    """A wall from ``origin`` along the edges ``u``, ``v`` (front: u x v), with rectangular openings cut out. An opening
-    is (u0, u1, v0, v1), fractions of the edges; openings must not overlap in u."""
+    """A wall from ``origin`` along the edges ``u``, ``v`` (front: u x v), with rectangular openings cut out.
+
+    An opening is (u0, u1, v0, v1), fractions of the edges; openings must not overlap in u.
+    """
     origin, u, v = (np.asarray(a, float) for a in (origin, u, v))
     cells, end = [], 0.0
     for u0, u1, v0, v1 in sorted(openings):

@@ -37,8 +37,10 @@ class Lamp:
 def further_sights(
     seed: int | tuple[int, ...], shares: Mapping[str, float] = SHARES
 ) -> tuple[frozenset[str], np.random.Generator]:
-    """The names of what falls to the scene of ``seed``, and the random numbers to make it of. ``shares`` has all names
-    of ``SHARES``, in the same order."""
+    """The names of what falls to the scene of ``seed``, and the random numbers to make it of.
+
+    ``shares`` has all names of ``SHARES``, in the same order.
+    """
     rng = np.random.default_rng((*(seed if isinstance(seed, tuple) else (seed,)), 0x5EE))
     return frozenset(name for name, share in shares.items() if rng.random() < share), rng
 

@@ -29,8 +29,10 @@ from data_gen.samplers.photons.passes import Start
 
 @dataclass
 class Piece(Path):
-    """A piece of a camera path through one ``medium`` of extinction ``σ``; β is that with which it begins. Where it
-    meets nothing, ``hit.t`` is how far its ray goes."""
+    """A piece of a camera path through one ``medium`` of extinction ``σ``; β is that with which it begins.
+
+    Where it meets nothing, ``hit.t`` is how far its ray goes.
+    """
 
     medium: mi.MediumPtr
     σ: mi.Spectrum

@@ -147,8 +147,10 @@ def let_through(world: World, way: Way, active, target: mi.Point3f | None = None
 
 
 def redirected(world: World, paths: LightPaths, photon: Photon, foot, target, active) -> Way:
-    """From the photon's predecessor a to ``target`` instead of ``foot``, which is b̂. In media Φ is without T: see
-    ``let_through``."""
+    """From the photon's predecessor a to ``target`` instead of ``foot``, which is b̂.
+
+    In media Φ is without T: see ``let_through``.
+    """
     scene, lights, photons, j = world.scene, world.lights, paths.photons, photon.place
     parent = dr.gather(mi.UInt32, photons.parent, j, active)  # a, or the number of the light path
     density = dr.gather(mi.Float, photons.density, j, active)  # p

@@ -141,8 +141,10 @@ def parts(passes: Passes, near: Gathered, level: Level, longest: mi.UInt32, most
 
 
 def differences(passes: Passes, near: Near, paths: list, longest: mi.UInt32, most: int) -> Iterator[list]:
-    """Piece by piece of all pairs, the sums for each base path: L, four Δ, and counts of photons. ``longest``: edges
-    that the light path of a photon may have, of each base path."""
+    """Piece by piece of all pairs, the sums for each base path: L, four Δ, and counts of photons.
+
+    ``longest``: edges that the light path of a photon may have, of each base path.
+    """
     frozen, world = passes.frozen, passes.world
     # Recorded each time, which is soon done: what it returns may hold a whole map, which Dr.Jit cannot make anew.
     points, receives = near.where(world, paths[0])

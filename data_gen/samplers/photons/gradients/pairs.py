@@ -103,8 +103,10 @@ def counts(around: tuple, points: Receivers, active) -> mi.UInt32:
 
 
 def piece(around: tuple, points: Receivers, active, places: tuple, window: tuple, pairs: tuple) -> Pairs:
-    """The part of the list in the ``window`` (low, size), written into ``pairs``, two arrays of that size. ``places``:
-    where in the list each point's pairs begin, and how many they are."""
+    """The part of the list in the ``window`` (low, size), written into ``pairs``, two arrays of that size.
+
+    ``places``: where in the list each point's pairs begin, and how many they are.
+    """
     (first, count), (begin, length), (point, place) = places, window, pairs
     inside = active & (first < begin + length) & (first + count > begin)
     lane = dr.arange(mi.UInt32, len(points))
@@ -142,8 +144,10 @@ class Near(Protocol):
         """C, what it brings to the camera by A, 0 where it is not near; and where they meet."""
 
     def shared(self, thing: Any, met: Any, B: Any, lit: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
-        """What it brings by B as its own copy; and whether a copy of another place is to be looked for. ``met`` is
-        where thing and A meet, ``lit`` whether it brings anything there."""
+        """What it brings by B as its own copy; and whether a copy of another place is to be looked for.
+
+        ``met`` is where thing and A meet, ``lit`` whether it brings anything there.
+        """
 
     def copied(self, world: World, thing: Any, A: Any, B: Any) -> tuple[mi.Spectrum, mi.Float]:
         """What its copy brings by B, 0 where there is none, and r."""

@@ -38,7 +38,9 @@ def on_plane(b, d, x, n):
 
 def moved(b̂, x, n, y, m):
     """ĉ: the image, in the plane through ``y`` with normal ``m``, of a point in that through ``x`` with normal ``n``.
-    Either normal may point either way; x and y differ."""
+
+    Either normal may point either way; x and y differ.
+    """
     across = dr.normalize(y - x)
     n = mirror(n, across)
     m = dr.select(dr.dot(n, m) < 0, -m, m)
@@ -62,8 +64,10 @@ def rotate(v, n, m):
 
 
 def past(a, e, x, d, u, far):
-    """Where a line from ``a`` passes the ray through ``x`` along ``d``, there, at the signed distance ``u``. ``e`` is a
-    direction near to the line's; where the line comes from infinitely ``far`` away, ``e`` is its direction."""
+    """Where a line from ``a`` passes the ray through ``x`` along ``d``, there, at the signed distance ``u``.
+
+    ``e`` is a direction near to the line's; where the line comes from infinitely ``far`` away, ``e`` is its direction.
+    """
     target = x
     # The line's direction turns the place by a little: each step is better by u over the length.
     for _ in range(6):
@@ -86,7 +90,9 @@ def about(a, d, e, y):
 
 def jacobian_of_planes(t, volume, t1, volume1):
     """J of a plane's second direction, as ``about`` turns it; ``t``, ``t1``: the distances along it to rays.
-    ``volume``, ``volume1``: of edge, direction and ray, each of length 1."""
+
+    ``volume``, ``volume1``: of edge, direction and ray, each of length 1.
+    """
     return (t / t1) * dr.abs(volume1 / volume)
 
 

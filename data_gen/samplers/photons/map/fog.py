@@ -13,8 +13,11 @@ from ngpt.errors import NgptError
 
 
 class Fog:
-    """The media of a scene. One of them may be around the camera ``sensor``: ``within``. Raises NgptError, in the name
-    of the ``sampler``, where light from infinitely far away comes through a medium without end."""
+    """The media of a scene. One of them may be around the camera ``sensor``: ``within``.
+
+    Raises NgptError, in the name of the ``sampler``, where light from infinitely far away comes through a medium
+    without end.
+    """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor, lights: LightEnds, sampler: str):
         self.media = Media(scene)

@@ -21,7 +21,9 @@ _LEAST_CELLS = 1 << 12
 @dataclass(init=False)
 class Grid:
     """Points of index ``index[i]`` at ``p[i]``, sorted by cell; cell c has those from ``start[c]`` to ``start[c + 1]``.
-    ``points`` are all points, and those that ``exist`` are entered; ``radius`` is the largest that is asked for."""
+
+    ``points`` are all points, and those that ``exist`` are entered; ``radius`` is the largest that is asked for.
+    """
 
     low: mi.Point3f
     edge: mi.Float  # of a cell
@@ -79,7 +81,9 @@ class Grid:
 
     def each(self, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, visit, state: tuple) -> tuple:
         """``state`` after ``visit`` (state, place in the list, near) for all points that may be nearer to ``p``.
-        ``near`` says which are, and ``visit`` changes nothing for others. May be called within symbolic loops."""
+
+        ``near`` says which are, and ``visit`` changes nothing for others. May be called within symbolic loops.
+        """
 
         def nearer(q, k):
             return dr.squared_norm(q - p) < radius2
@@ -119,7 +123,9 @@ class Grid:
 
     def rows(self, numbers: tuple, center, is_near, active: mi.Bool, visit, state: tuple) -> tuple:
         """``state`` after visits to all points in the rows of these ``numbers`` (from, to): number k has row k % 4.
-        ``center`` (k) is what the row is near to, and ``is_near`` (point, k) whether a point of it is."""
+
+        ``center`` (k) is what the row is near to, and ``is_near`` (point, k) whether a point of it is.
+        """
         first, last = numbers
 
         # k - 1 is the number of the row, i the place of the point in the list, end that behind the row's last.
@@ -141,5 +147,7 @@ class Grid:
 
     def gather(self, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, value, total):
         """``total`` plus the sum of ``value`` (place in the list, near) over all points nearer to ``p`` than that.
-        ``value`` gives the type of ``total``, and 0 where not ``near``. May be called within symbolic loops."""
+
+        ``value`` gives the type of ``total``, and 0 where not ``near``. May be called within symbolic loops.
+        """
         return self.each(p, radius2, active, lambda sums, i, near: (sums[0] + value(i, near),), (total,))[0]

@@ -129,8 +129,10 @@ def _vertices_of(world: World, edges: bool) -> type:
 
 @dr.syntax
 def _walk(world: World, paths: Paths, random, depths: tuple, photons, places: tuple) -> tuple:
-    """Enters vertices at each path's ``places`` (from, to); paths that are alive then have more of them. ``depths``:
-    the most edges of a path, and the edge from which on Russian roulette is played."""
+    """Enters vertices at each path's ``places`` (from, to); paths that are alive then have more of them.
+
+    ``depths``: the most edges of a path, and the edge from which on Russian roulette is played.
+    """
     scene, fog, receives = world.scene, world.fog, world.materials.connectable
     (max_depth, rr_depth), kind = depths, _vertices_of(world, edges=False)
     keeps_edges, random = hasattr(photons, "bounce"), random.clone()

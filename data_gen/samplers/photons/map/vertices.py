@@ -59,8 +59,10 @@ def photon_of(photons, j: mi.UInt32, active=True) -> Photon:
 
 @cache
 def vertices_class(variant: str, in_media: bool = False, grids: bool = False, edges: bool = False) -> type:
-    """The class of a map's vertices, for a scene ``in_media``, with ``grids`` among them, and with ``edges``. Mitsuba's
-    types belong to a variant."""
+    """The class of a map's vertices, for a scene ``in_media``, with ``grids`` among them, and with ``edges``.
+
+    Mitsuba's types belong to a variant.
+    """
 
     @dataclass
     class Vertices:

@@ -171,8 +171,11 @@ class AlongBeams:
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
 
     def each(self, ray, length, active, visit, state: tuple) -> tuple:
-        """``state`` after visits to the beams beside a piece of a ray, and to parts that are not. ``visit`` is called
-        with (state, place in the list of the grid, whether it is beside), and changes nothing where it is not."""
+        """``state`` after visits to the beams beside a piece of a ray, and to parts that are not.
+
+        ``visit`` is called with (state, place in the list of the grid, whether it is beside), and changes nothing where
+        it is not.
+        """
 
         def beside(state, i, near):
             j = dr.gather(mi.UInt32, self.grid.index, i, near)
@@ -186,8 +189,10 @@ class AlongBeams:
         return self.grid.along(longer, length + 2 * self.reach, dr.square(self.reach), active, beside, state)
 
     def light(self, ray, length, medium: mi.MediumPtr, σ: mi.Spectrum, depth: mi.UInt32, active) -> mi.Spectrum:
-        """Σ of the beams beside a piece of a ray through one ``medium``, of paths that are not too long. ``depth`` is
-        the number of the segment; T(t) is of the piece only."""
+        """Σ of the beams beside a piece of a ray through one ``medium``, of paths that are not too long.
+
+        ``depth`` is the number of the segment; T(t) is of the piece only.
+        """
         parts, longest = self.parts, self.max_depth - depth
         phase, seen = medium.phase_function(), seen_along(ray, medium)
         scattering = scattering_along(ray, medium) if self.grids else None
@@ -222,8 +227,11 @@ def nearest(o, d, p, e) -> tuple:
 
 
 class BEAMS(BRE):
-    """Progressive photon beams in media, and photons on surfaces; no gradients. Plugin ``beams``. Parameters and what
-    is not handled: as for ``vpm``. Biased, and consistent; in media the ``radius`` shrinks faster."""
+    """Progressive photon beams in media, and photons on surfaces; no gradients.
+
+    Plugin ``beams``. Parameters and what is not handled: as for ``vpm``. Biased, and consistent; in media the
+    ``radius`` shrinks faster.
+    """
 
     edges, map_bytes = True, BEAM_BYTES + PARTS * PART_BYTES
 

@@ -63,8 +63,10 @@ class AlongRays:
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
 
     def light(self, ray, length, medium: mi.MediumPtr, σ: mi.Spectrum, depth: mi.UInt32, active) -> mi.Spectrum:
-        """Σ of the photons beside a piece of a ray through one ``medium``, of paths that are not too long. ``depth`` is
-        the number of the segment; T is of the piece only."""
+        """Σ of the photons beside a piece of a ray through one ``medium``, of paths that are not too long.
+
+        ``depth`` is the number of the segment; T is of the piece only.
+        """
         photons, longest = self.photons, self.max_depth - depth
         phase = medium.phase_function()
         seen, scattering = seen_along(ray, medium), scattering_along(ray, medium) if self.grids else None
@@ -113,8 +115,10 @@ class Along:
 
 
 class BRE(PPM):
-    """Progressive photon mapping by the beam radiance estimate in media, and on surfaces; no gradients. Plugin ``bre``.
-    Parameters, bias and what is not handled: as for ``vpm``."""
+    """Progressive photon mapping by the beam radiance estimate in media, and on surfaces; no gradients.
+
+    Plugin ``bre``. Parameters, bias and what is not handled: as for ``vpm``.
+    """
 
     follows, map_bytes = "volpath", MEDIA_MAP_BYTES
 

@@ -132,8 +132,10 @@ class NearBeams:
 
 
 def turned(world: World, paths: LightPaths, beam: Beam, A: Beside, B: Beside, radius: mi.Float) -> tuple:
-    """(copy, t', r, whether it exists) of the ``beam`` that is near to A and not to B. The copy is a photon where the
-    beam passes B, of power 1 / sin θ' times as much."""
+    """(copy, t', r, whether it exists) of the ``beam`` that is near to A and not to B.
+
+    The copy is a photon where the beam passes B, of power 1 / sin θ' times as much.
+    """
     photons, line, edge = paths.photons, beam.line, beam.part.edge
     # ------------------- Where the beam passes A, and how far aside -------------------
     met = line.past(A, radius)
@@ -168,8 +170,10 @@ def turned(world: World, paths: LightPaths, beam: Beam, A: Beside, B: Beside, ra
 
 
 class GBEAMS(GPM):
-    """Gradients of photon beams in homogeneous media, and of photons on surfaces. Plugin ``gbeams``. Parameters: as for
-    ``gpm``. Bias and what is not handled: as for ``beams``."""
+    """Gradients of photon beams in homogeneous media, and of photons on surfaces.
+
+    Plugin ``gbeams``. Parameters: as for ``gpm``. Bias and what is not handled: as for ``beams``.
+    """
 
     follows, walk, edges, pairs = "volpath", PathsByPieces, True, PAIRS
     map_bytes, camera_bytes = BEAM_BYTES + PARTS * PART_BYTES, PATHS_BYTES + PAIRS * PAIR_BYTES

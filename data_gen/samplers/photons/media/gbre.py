@@ -98,7 +98,9 @@ def inside_of(base: Piece) -> mi.Bool:
 @dataclass
 class InMedia:
     """``Near``, of photons in media where they are gathered near to points or beside rays: what both have in common.
-    The receivers ``near()`` know whether a photon is near, and the ``image()`` of its place near to another."""
+
+    The receivers ``near()`` know whether a photon is near, and the ``image()`` of its place near to another.
+    """
 
     paths: LightPaths
     Φ: mi.Spectrum  # what counts of each photon's power
@@ -153,8 +155,10 @@ class AlongPieces(InMedia):
 
 
 class GBRE(GPM):
-    """Gradients of the beam radiance estimate in homogeneous media, and of photons on surfaces. Plugin ``gbre``.
-    Parameters: as for ``gpm``. Bias and what is not handled: as for ``bre``."""
+    """Gradients of the beam radiance estimate in homogeneous media, and of photons on surfaces.
+
+    Plugin ``gbre``. Parameters: as for ``gpm``. Bias and what is not handled: as for ``bre``.
+    """
 
     follows, walk, map_bytes = "volpath", PathsByPieces, MEDIA_MAP_BYTES
     camera_bytes = PATHS_BYTES + PAIRS * PAIR_BYTES

@@ -88,7 +88,9 @@ class NearPlanes:
 
 def copied(plane, at: Crossing, B: Beside) -> tuple:
     """The copy of a ``plane``, met ``at`` a place, where B meets it, J / |d · (e' × w')|, r, and whether it exists.
-    Whether anything is in its way is not known yet."""
+
+    Whether anything is in its way is not known yet.
+    """
     e, s, t = shift.about(plane.a, plane.d, plane.e, B.at(at.u))
     there = Crossing(s, t, at.u, dr.dot(plane.d, dr.cross(e, B.d)))
     J = shift.jacobian_of_planes(at.t, at.volume, t, there.volume)
@@ -100,8 +102,10 @@ def copied(plane, at: Crossing, B: Beside) -> tuple:
 
 
 class GPLANES(GBEAMS):
-    """Gradients of photon planes in homogeneous media, and of beams and photons on surfaces. Plugin ``gplanes``.
-    Parameters: as for ``gpm``, and ``planes``; see there for bias and what is not handled."""
+    """Gradients of photon planes in homogeneous media, and of beams and photons on surfaces.
+
+    Plugin ``gplanes``. Parameters: as for ``gpm``, and ``planes``; see there for bias and what is not handled.
+    """
 
     map_bytes = GBEAMS.map_bytes + VERTICES_PER_PATH * PLANE_BYTES
 

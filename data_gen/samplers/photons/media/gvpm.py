@@ -95,8 +95,10 @@ class InBalls(InMedia):
 
 
 class GVPM(GPM):
-    """Gradients of photons in media and on surfaces. Plugin ``gvpm``. Parameters: as for ``gpm``. Bias and what is not
-    handled: as for ``vpm``."""
+    """Gradients of photons in media and on surfaces.
+
+    Plugin ``gvpm``. Parameters: as for ``gpm``. Bias and what is not handled: as for ``vpm``.
+    """
 
     follows, walk, map_bytes = "volpath", PathsBySegments, MEDIA_MAP_BYTES
     camera_bytes = PATHS_BYTES + PAIRS * PAIR_BYTES

@@ -93,8 +93,10 @@ class AcrossPlanes:
     max_depth: mi.UInt32
 
     def light(self, ray, length, medium: mi.MediumPtr, σ: mi.Spectrum, depth: mi.UInt32, active) -> mi.Spectrum:
-        """Σ of the planes that a piece of a ray through one ``medium`` meets, of paths that are not too long. ``depth``
-        is the number of the segment; T(u) is of the piece only."""
+        """Σ of the planes that a piece of a ray through one ``medium`` meets, of paths that are not too long.
+
+        ``depth`` is the number of the segment; T(u) is of the piece only.
+        """
         longest = self.max_depth - depth
         seen, scattering = seen_along(ray, medium), scattered_of(medium, ray, active)
 
@@ -161,8 +163,10 @@ def only_beams(traced: Traced) -> Traced:
 
 
 def planes_of(passes: Passes, traced: Traced) -> AcrossPlanes:
-    """The planes of some light paths of a map; if there is none, one that nothing meets. Paths are as good as each
-    other, so every k-th stands for k. Further maps are of fewer paths."""
+    """The planes of some light paths of a map; if there is none, one that nothing meets.
+
+    Paths are as good as each other, so every k-th stands for k. Further maps are of fewer paths.
+    """
     integrator, photons, kind = passes.integrator, traced.photons, planes_class(mi.variant())
     lanes, most = len(photons) // VERTICES_PER_PATH, integrator.options["planes"]
     k = (lanes + most - 1) // most

@@ -119,7 +119,9 @@ class PPM(PhotonIntegrator):
 @dr.syntax
 def by_vertices(integrator: PhotonIntegrator, world: World, start: Start, near, emission: bool) -> tuple:
     """L of camera paths from vertex to vertex: what is gathered ``near``, ``emission`` that they meet; and Le.
-    ``near.light`` is called with (vertex, its place, its material, depth, where); or there is nothing near."""
+
+    ``near.light`` is called with (vertex, its place, its material, depth, where); or there is nothing near.
+    """
     scene, fog, limits, random = world.scene, world.fog, integrator.limits, start.random.clone()
     ray, importance = mi.Ray3f(start.ray), start.importance
     connectable, gathered = world.materials.connectable, near.light if near is not None else None

@@ -24,8 +24,10 @@ REMEMBERED = 6 + 8 * 6
 
 
 def small_step(x: mi.Float, u: mi.Float) -> mi.Float:
-    """``x`` in [0, 1), moved by a small step that the uniform number ``u`` chooses. Steps to either side are as likely,
-    and [0, 1) is a circle: densities there and back are the same."""
+    """``x`` in [0, 1), moved by a small step that the uniform number ``u`` chooses.
+
+    Steps to either side are as likely, and [0, 1) is a circle: densities there and back are the same.
+    """
     left = u < 0.5
     u = dr.select(left, 2 * u, 2 * u - 1)
     step = LARGEST * dr.exp(u * dr.log(SMALLEST / LARGEST))
@@ -80,8 +82,10 @@ GRADIENTS = 0.25
 
 
 def value_of(layers: dict[str, mi.Color3f]) -> mi.Float:
-    """f, the value of a path: the luminance of its light, and of its four differences. Wherever a path has anything to
-    splat, f is above 0. [Lehtinen et al. 2013, section 4]"""
+    """f, the value of a path: the luminance of its light, and of its four differences.
+
+    Wherever a path has anything to splat, f is above 0. [Lehtinen et al. 2013, section 4]
+    """
     f = mi.Float(0)
     for name, light in layers.items():
         f += mi.luminance(dr.abs(light)) * (GRADIENTS if name in SHIFTS else 1)

@@ -45,8 +45,10 @@ class Spectra:
 
 
 def render_spectra(scene: mi.Scene, bins: int, samples: int, seed: int = 0, steps: bool = True) -> Spectra:
-    """``samples`` base paths for each bin of each pixel, at least 2; with ``steps`` an offset path each. Radiance is
-    from the scene's own integrator, in its spectral units. Raises NgptError without a spectral variant."""
+    """``samples`` base paths for each bin of each pixel, at least 2; with ``steps`` an offset path each.
+
+    Radiance is from the scene's own integrator, in its spectral units. Raises NgptError without a spectral variant.
+    """
     if not mi.is_spectral or mi.is_polarized:
         raise NgptError(f"variant '{mi.variant()}' has no spectra to render; use 'llvm_ad_spectral'")
     if bins < 2 or samples < 2:
