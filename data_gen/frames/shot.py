@@ -32,7 +32,14 @@ class Remembering:
     sampler does not have.
     """
 
-    def __init__(self, entry: FrameSampler, changes: bool, spp: int | None, seed: int, options: dict[str, Any]):
+    def __init__(
+        self,
+        entry: FrameSampler,
+        changes: bool,
+        spp: int | None,
+        seed: int,
+        options: dict[str, Any],
+    ):
         self.entry, self.changes, self.seed, self.options = entry, changes, seed, dict(options)
         if self.options.pop("seconds", None) is not None:
             raise NgptError(f"sampler '{entry.name}' renders a number of samples, not for a time: use --spp")

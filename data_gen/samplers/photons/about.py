@@ -1,7 +1,15 @@
 """The entries of all samplers that use only photons."""
 
 from data_gen.samplers.registry import Option, Sampler, register
-from data_gen.samplers.shared import GATHERING, IN_MIRRORS, PHOTONS, first_radius, no_media, unseen_media, varying_media
+from data_gen.samplers.shared import (
+    GATHERING,
+    IN_MIRRORS,
+    PHOTONS,
+    first_radius,
+    no_media,
+    unseen_media,
+    varying_media,
+)
 
 _OPTIONS: dict[str, Option] = {
     "radius": first_radius(3.0),

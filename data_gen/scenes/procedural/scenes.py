@@ -18,7 +18,17 @@ import numpy as np
 from data_gen.scenes.procedural import things
 from data_gen.scenes.procedural.materials import SLOTS, Palette, inside, plugin
 from data_gen.scenes.procedural.media import Media, some_media
-from data_gen.scenes.procedural.meshes import Mesh, box, cylinder, lathe, merge, quads, sphere, wall, write_ply
+from data_gen.scenes.procedural.meshes import (
+    Mesh,
+    box,
+    cylinder,
+    lathe,
+    merge,
+    quads,
+    sphere,
+    wall,
+    write_ply,
+)
 from data_gen.scenes.procedural.stage import Stage
 from data_gen.scenes.procedural.textures import colour, sky, write_pfm
 from data_gen.scenes.procedural.variety import SHARES, add_sights, further_sights

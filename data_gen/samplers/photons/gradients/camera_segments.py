@@ -15,7 +15,15 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import media, segments
-from data_gen.samplers.photons.gradients.camera import CameraPaths, Level, Path, at_lanes, scattered, survive, taken
+from data_gen.samplers.photons.gradients.camera import (
+    CameraPaths,
+    Level,
+    Path,
+    at_lanes,
+    scattered,
+    survive,
+    taken,
+)
 from data_gen.samplers.photons.passes import Start
 
 
