@@ -11,8 +11,6 @@ prints the relative squared error of `wcv`, free of the reference's noise, and b
 number of samples to the next.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 from collections.abc import Iterator

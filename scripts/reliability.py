@@ -5,8 +5,6 @@ python scripts/reliability.py --from DIR      only the page, of the files in DIR
 python scripts/reliability.py -k "kill or disk"    some of the campaigns, as pytest chooses them, then the page of them
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

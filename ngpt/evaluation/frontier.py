@@ -1,7 +1,5 @@
 """Speed against accuracy as a picture: error over total seconds, both axes logarithmic, by hand as SVG."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from ngpt.report.axes import Axes

@@ -3,8 +3,6 @@
 Two halves take the reference's noise off every squared metric (``ngpt.measure.metrics``); one image cannot.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What the folder of results holds: results.*, worth.*, against.csv and plots, all from the cells."""
 
-from __future__ import annotations
-
 import csv
 import io
 from pathlib import Path

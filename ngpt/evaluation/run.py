@@ -1,7 +1,5 @@
 """The evaluation itself: scenes x samples x methods x seeds, cell by cell, and the folder of results."""
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Callable
 from datetime import UTC, datetime

@@ -8,8 +8,6 @@ DIR/stability.md, and for each scene and method DIR/stability/SCENE-SPP-METHOD.p
 shutter, each band of rows comes from another seed, so flicker shows as steps between bands; bias does not show.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

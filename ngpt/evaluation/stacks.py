@@ -8,8 +8,6 @@ reference-*-a.exr and -b.exr; and cost-*.json. A folder of stacks of one's own l
 reference may be one image.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """The markdown of an evaluation: what a reader compares, the losses as visible as the wins."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

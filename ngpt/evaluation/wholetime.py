@@ -6,8 +6,6 @@ has the least error of all its settings, and the least FLIP, whichever setting t
 A setting counts from its quickest cell on, unless no setting was measured in so little time.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import math

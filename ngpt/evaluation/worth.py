@@ -12,8 +12,6 @@ curves of errors (``ngpt.evaluation.curves``, which explains the marks; W has th
 with the least and the most samples, so that what a render takes to begin is no part of it.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Sequence

@@ -19,8 +19,6 @@ r(2x+1, y) + r(2x+2, y) / 2. Each row counts by its inverse variance; weights st
 The computation is written once, for PyTorch and for ONNX graphs: ``math`` has what is not +, -, * or /.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

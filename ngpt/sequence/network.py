@@ -11,8 +11,6 @@ takes nothing from what hid it. The network was trained on frames of moving shot
 (``ngpt.training.temporal``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property

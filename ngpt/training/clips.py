@@ -3,8 +3,6 @@
 The loss is in ``ngpt.training.temporal``.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress

@@ -9,8 +9,6 @@
 ``python -m data_gen`` makes them, ``ngpt info DIR`` verifies them, and ``ngpt.training.shards`` describes the files.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Iterator

@@ -24,8 +24,6 @@ A tensor is of half floats where that loses at most ``MAX_LOSS`` of it, measured
 The header's metadata holds the record of the shard as JSON under "ngpt".
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext

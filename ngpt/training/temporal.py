@@ -14,8 +14,6 @@ otherwise the easiest way to remove specks would be to lose their light. The eff
 among filters that know their own variance, the one with the least error now is also the best for later.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
