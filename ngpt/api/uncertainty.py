@@ -31,23 +31,12 @@ from ngpt.system.late import ndimage
 SPREAD = 2.6  # pixels, the standard deviation of the window over which the change is averaged: as large as 9x9 pixels
 SEED = 20261122
 # By `python -m bench.uncertainty`, on scenes named there; of methods that are not here, the most frequent.
-FACTORS = {
-    "primal": 0.9,
-    "l2": 0.9,
-    "l1": 1.7,
-    "cv": 0.85,
-    "wcv": 1.1,
-    "wl2": 1.4,
-}
+FACTORS = {"primal": 0.9, "l2": 0.9, "l1": 1.7, "cv": 0.85, "wcv": 1.1, "wl2": 1.4}
 FACTOR = 1.2
 
 
 def reconstruct_with_error(
-    stack: GradientStack,
-    method: str = "auto",
-    *,
-    halves: tuple[GradientStack, GradientStack] | None = None,
-    **options,
+    stack: GradientStack, method: str = "auto", *, halves: tuple[GradientStack, GradientStack] | None = None, **options
 ) -> Result:
     """As ``ngpt.reconstruct``, with ``Result.error``: the standard error of the image, (H, W, 3) float32, in its unit.
 

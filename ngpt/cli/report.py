@@ -201,14 +201,7 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
     title = f"{', '.join(names)}: {len(frames)} frames"
     facts = {"ngpt": __version__}
     write_report(
-        target,
-        title,
-        scenes,
-        command=args.command,
-        footer=facts,
-        overview=overview,
-        overwrite=args.force,
-        shot=True,
+        target, title, scenes, command=args.command, footer=facts, overview=overview, overwrite=args.force, shot=True
     )
     if large := oversize(target):
         console.say(large)

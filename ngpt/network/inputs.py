@@ -69,11 +69,7 @@ def needs(names: Collection[str], base: str) -> tuple[str, ...]:
 
 
 def gather(
-    data: Repaired,
-    names: Collection[str],
-    base: str,
-    reader: str = "the network's settings",
-    estimate: bool = False,
+    data: Repaired, names: Collection[str], base: str, reader: str = "the network's settings", estimate: bool = False
 ) -> dict:
     """The inputs ``names`` of a network that starts from ``base`` ("" for none): arrays (H, W, C) by name.
 
