@@ -18,13 +18,14 @@ kept, and stacks are kept in --cache.
 """
 
 import argparse
+import itertools
 import json
 import math
 import statistics
 import time
 from pathlib import Path
 
-from bench.common import mean, metadata, save, summary
+from bench.common import mean, measure, metadata, renderer, save
 from bench.pipelines import Kept
 from ngpt.evaluation.config import scene_name
 from ngpt.measure.metrics import relmse_trimmed
@@ -55,9 +56,6 @@ def main() -> None:
         print(table(json.loads(args.output.read_text())))
         return
 
-    from data_gen.backend import use_variant
-
-    use_variant()
     result: dict = {"benchmark": "adaptive", "by": {}, "costs": {}}
     if args.output.exists():
         before = json.loads(args.output.read_text())
@@ -75,9 +73,8 @@ def main() -> None:
 
 def bench_scene(path: str, args: argparse.Namespace) -> dict:
     """Method -> errors of its images of even and of adaptive samples, one of each seed, and what was expected."""
+    load_scene, render_stack = renderer()
     from data_gen import adaptive
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
 
     scene = load_scene(path, tuple(args.size))
     kept = Kept(args.cache / f"{scene_name(path)}-{'x'.join(map(str, args.size))}-{args.spp}-{args.by}")
@@ -107,21 +104,16 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
 
 def bench_costs(path: str, args: argparse.Namespace) -> dict:
     """CPU seconds of even renders, and of adaptive ones by method, in turn."""
+    load_scene, render_stack = renderer()
     from data_gen.adaptive import Adaptive
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
 
-    scene = load_scene(path, tuple(args.timed_size))
-    calls: dict[str, dict] = {"gpt": {}} | {f"adaptive {m}": {"adaptive": Adaptive(None, m)} for m in OF}
-    seconds: dict[str, list[float]] = {name: [] for name in calls}
-    for repeat in range(args.repeats + 1):
-        for name, options in calls.items():
-            start = time.process_time()
-            # The first compiles.
-            render_stack(scene, args.spp if repeat else 32, repeat, "gpt", **options)
-            if repeat:
-                seconds[name].append(time.process_time() - start)
-    return {"size": list(args.timed_size), "spp": args.spp} | {name: summary(each) for name, each in seconds.items()}
+    scene, seeds = load_scene(path, tuple(args.timed_size)), itertools.count()
+    options: dict[str, dict] = {"gpt": {}} | {f"adaptive {m}": {"adaptive": Adaptive(None, m)} for m in OF}
+    calls = {
+        name: lambda more=more: render_stack(scene, args.spp, next(seeds), "gpt", **more)
+        for name, more in options.items()
+    }
+    return {"size": list(args.timed_size), "spp": args.spp} | measure(calls, args.repeats, time.process_time)
 
 
 def table(result: dict) -> str:

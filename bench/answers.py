@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 import ngpt
-from bench.common import measure, metadata, save
+from bench.common import measure, metadata, renderer, save
 from ngpt.api import lightgroups
 from ngpt.image.display import auto_exposure, coloured, heat_table, to_srgb8
 from ngpt.measure.metrics import relmse_trimmed
@@ -33,9 +33,6 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, default=Path("docs/images"))
     parser.add_argument("--only", nargs="*", default=list(ANSWERS), choices=list(ANSWERS))
     args = parser.parse_args()
-    from data_gen.backend import DEFAULT_VARIANT, use_variant
-
-    use_variant(DEFAULT_VARIANT)
     before = read_json(args.output) if args.output.is_file() else {}
     result: dict[str, Any] = before | {"benchmark": "answers"}
     result["metadata"] = metadata("mitsuba", "mitsuba-oidn", "onnxruntime")
@@ -47,16 +44,15 @@ def main() -> None:
 
 def features(_: Path) -> dict[str, Any]:
     """Costs of features over renders without, by scene."""
-    from data_gen.scenes.load import load_scene
-
+    load_scene, _ = renderer()
     return {name: cost(load_scene(name, (320, 180))) for name in ("diffuse", "glossy", "environment")}
 
 
 def cost(scene: Any) -> dict[str, Any]:
     """Cost of our sampler `primal` with features and of Mitsuba's integrator `aov` around its `path`, with seconds."""
+    _, render_stack = renderer()
     import mitsuba as mi
 
-    from data_gen.render import render_stack
     from data_gen.scenes.load import reference_integrator
 
     path, seeds = reference_integrator(scene), iter(range(10_000))
@@ -78,9 +74,8 @@ def cost(scene: Any) -> dict[str, Any]:
 
 def adaptive(pictures: Path) -> dict[str, Any]:
     """Errors of `wcv` of adaptive and even samples, 128 in the mean; and where the samples went."""
+    load_scene, render_stack = renderer()
     from data_gen.adaptive import Adaptive
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
 
     scene = load_scene("glossy", (WIDTH // 2, 118))
     reference = ngpt.denoise(render_stack(scene, 2048, 99, "gpt"), "wcv")
@@ -98,9 +93,7 @@ def adaptive(pictures: Path) -> dict[str, Any]:
 
 def many(_: Path) -> dict[str, Any]:
     """16,384 samples in four parts: errors of 256, 4,096 and all of them, each from two independent renders."""
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
-
+    load_scene, render_stack = renderer()
     scene = load_scene("diffuse", (64, 36))
     before = memory()
     sides = [[render_stack(scene, 4096, 10 * side + part, "primal") for part in range(4)] for side in range(2)]
@@ -120,6 +113,7 @@ def memory() -> int:
 
 def table_of_balls(lights: tuple[str, ...] = ("key", "fill"), size: tuple[int, int] = (140, 118)) -> Any:
     """Balls before nothing, those at the sides out of focus, so that coverage has noise."""
+    renderer()
     import mitsuba as mi
 
     at, ball = mi.ScalarTransform4f(), "sphere"
@@ -144,9 +138,9 @@ def table_of_balls(lights: tuple[str, ...] = ("key", "fill"), size: tuple[int, i
 
 def alpha(pictures: Path) -> dict[str, Any]:
     """Error of alpha at 8 samples, denoised or not."""
+    scene = table_of_balls()
     import mitsuba as mi
 
-    scene = table_of_balls()
     noisy, reference = (np.array(mi.render(scene, spp=spp, seed=seed)) for spp, seed in ((8, 1), (2048, 2)))
     denoiser = ngpt.Denoiser((140, 118), denoise_alpha=True)
     clean = np.asarray(denoiser(noisy))
@@ -158,10 +152,8 @@ def alpha(pictures: Path) -> dict[str, Any]:
 
 def infinite(pictures: Path) -> dict[str, Any]:
     """Sets one pixel of 21,240 to Inf, and measures how much this changes the output of OIDN and of `ngpt denoise`."""
+    load_scene, render_stack = renderer()
     import mitsuba_oidn
-
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
 
     stack = render_stack(load_scene("glossy", (180, 118)), 16, 1, "primal")
     damaged = np.array(stack["primal"])
@@ -178,6 +170,7 @@ def infinite(pictures: Path) -> dict[str, Any]:
 
 def groups(pictures: Path) -> dict[str, Any]:
     """Two lights, each denoised by itself, or so that they add up; the largest gap over the image's largest value."""
+    renderer()
     import mitsuba as mi
 
     size = (140, 118)

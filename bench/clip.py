@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 import ngpt
+from bench.common import renderer
 from bench.shots import SPEEDS, shot_of
 from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.sequence.history import Temporal
@@ -38,9 +39,7 @@ def main() -> None:
 
 def frames(args: argparse.Namespace) -> Iterator[np.ndarray]:
     """(H, 3 W, 3) bytes of each frame."""
-    from data_gen.backend import DEFAULT_VARIANT, use_variant
-
-    use_variant(DEFAULT_VARIANT)
+    renderer()
     from data_gen.frames.shot import render_shot
 
     shot = shot_of(None, args.scene, args.shot, args.size)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.common import blocks, metadata, save, write_page
+from bench.common import blocks, metadata, renderer, save, write_page
 from ngpt.evaluation.config import scene_name
 from ngpt.system.files import atomic_output
 
@@ -42,11 +42,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/convergence.json"))
     parser.add_argument("--picture", type=Path, default=Path("docs/images/convergence.svg"))
     args = parser.parse_args()
-    from data_gen.backend import use_variant
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
-
-    use_variant("llvm_ad_rgb")
+    load_scene, render_stack = renderer()
     counts = [1 << n for n in range(args.most.bit_length())]
     rows = []
     for name in args.scenes:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from bench import panels
+from bench.common import renderer
 from ngpt.image.display import auto_exposure, signed_map, to_srgb8
 from ngpt.methods import reconstruct
 
@@ -25,13 +26,7 @@ def main() -> None:
     parser.add_argument("--method", default="wcv")
     parser.add_argument("--picture", type=Path, default=Path("docs/images/idea.jpg"))
     args = parser.parse_args()
-
-    from data_gen.backend import use_variant
-
-    use_variant()
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
-
+    load_scene, render_stack = renderer()
     stack = render_stack(load_scene(args.scene, TILE), args.spp)
     result = reconstruct(stack, args.method)
     exposure = auto_exposure(result.image)

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import blocks
+from bench.common import blocks, renderer
 from ngpt.evaluation.config import scene_name
 
 # By place where the pilot promises less than so much of the variance, and the option that goes with it
@@ -134,11 +134,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--size", type=int, nargs=2, default=(96, 64))
     args = parser.parse_args()
-    from data_gen.backend import use_variant
-    from data_gen.render import render_stack
+    _, render_stack = renderer()
     from data_gen.scenes import lamps
 
-    use_variant("llvm_ad_rgb")
     lamps.MANY = 2
     print("| scene, sampler | lamps | promise | by place | time | alike |\n|---|--:|--:|--:|--:|--:|")
     for name in args.scenes:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from bench import panels
+from bench.common import renderer
 from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.methods import reconstruct
 
@@ -28,13 +29,7 @@ def main() -> None:
     parser.add_argument("--method", default="oidn")
     parser.add_argument("--picture", type=Path, default=Path("docs/images/points.jpg"))
     args = parser.parse_args()
-
-    from data_gen.backend import use_variant
-
-    use_variant()
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
-
+    load_scene, render_stack = renderer()
     scene = load_scene(os.fspath(args.scene), tuple(args.size))
     x, y, width, height = args.crop
     crop = np.s_[y : y + height, x : x + width]

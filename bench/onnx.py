@@ -28,8 +28,9 @@ from pathlib import Path
 import numpy as np
 
 import ngpt
-from bench.common import measure, metadata, save, summary
+from bench.common import measure, metadata, save
 from bench.reconstruction import synthetic
+from ngpt.evaluation.averages import summary
 from ngpt.methods import METHODS, reconstruct
 from ngpt.network.run_onnx import Network, planes
 from ngpt.network.shipped import WEIGHTS

@@ -55,10 +55,6 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="print the tables of the file, and measure nothing")
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/pipelines.json"))
     args = parser.parse_args()
-
-    from data_gen.backend import use_variant
-
-    use_variant()
     result: dict = {"benchmark": "pipelines", "size": list(args.size), "metadata": metadata("mitsuba"), "scenes": {}}
     if args.output.exists():
         result["scenes"] = json.loads(args.output.read_text())["scenes"]
@@ -89,12 +85,11 @@ class Kept:
 
 def bench_scene(path: str, args: argparse.Namespace) -> dict:
     """What the pilot saw, and what is true: rows of sampler, method, shared -> errors by samples."""
+    load_scene, render_stack = common.renderer()
     from data_gen.adaptive import LEAST, Adaptive
     from data_gen.choosing import pipelines
     from data_gen.choosing.trials import candidates, noise_of
-    from data_gen.render import render_stack
     from data_gen.samplers import SAMPLERS
-    from data_gen.scenes.load import load_scene
 
     scene = load_scene(path, tuple(args.size))
     kept = Kept(args.cache / "{}-{}x{}".format(scene_name(path), *args.size))

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 import ngpt
-from bench.common import metadata, save
+from bench.common import metadata, renderer, save
 from bench.shots import SPEEDS, measured, shot_of
 from ngpt.sequence.history import Temporal
 
@@ -50,9 +50,7 @@ def main() -> None:
     parser.add_argument("--reference-spp", type=int, default=2048)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
-    from data_gen.backend import DEFAULT_VARIANT, use_variant
-
-    use_variant(DEFAULT_VARIANT)
+    renderer()
     result: dict = {"metadata": metadata("mitsuba-oidn"), "scenes": []}
     for scene in args.scenes:
         known = {}

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 import ngpt
-from bench.common import metadata, save
+from bench.common import metadata, renderer, save
 from ngpt.io.frames import shot_files
 from ngpt.measure.flicker import flicker
 from ngpt.measure.metrics import relmse_trimmed
@@ -129,9 +129,7 @@ def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path)
     """Renders stacks, stacks with pairs (without ``--pairs``: the same), references, and with ``--plain`` stacks
     without gradients; returns the folder names, "" for none. Existing files are kept.
     """
-    from data_gen.backend import DEFAULT_VARIANT, use_variant
-
-    use_variant(DEFAULT_VARIANT)
+    renderer()
     from data_gen.frames.shot import render_shot
 
     rests = SPEEDS.get(shot) == 0

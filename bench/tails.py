@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 import ngpt
-from bench.common import blocks, metadata, save
+from bench.common import blocks, metadata, renderer, save
 from ngpt.evaluation.averages import mean, median
 from ngpt.evaluation.config import scene_name
 from ngpt.evaluation.curves import error_at, joined
@@ -96,11 +96,7 @@ def place(cell: dict[str, Any]) -> tuple:
 
 def measured(scene: str, args: argparse.Namespace, known: set[tuple]):
     """The cells of a scene that are not ``known``, one after the other."""
-    from data_gen.backend import use_variant
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
-
-    use_variant()
+    load_scene, render_stack = renderer()
     # A kernel knows the shapes of all scenes in memory.
     gc.collect()
     loaded = load_scene(scene, tuple(map(int, args.size.split("x"))))

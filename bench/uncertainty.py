@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.common import kept, metadata, save
+from bench.common import kept, metadata, renderer, save
 from ngpt.api.uncertainty import FACTOR, FACTORS, reconstruct_with_error
 from ngpt.errors import NgptError
 from ngpt.merging import merge
@@ -78,12 +78,7 @@ def images(scene: str, spp: int, args: argparse.Namespace) -> list[GradientStack
         files.append((f"{name}-{spp}.exr", spp, "auto", spp))
 
     def make(count: int, sampler: str, seed: int) -> GradientStack:
-        from data_gen.backend import use_variant
-
-        use_variant()
-        from data_gen.render import render_stack
-        from data_gen.scenes.load import load_scene
-
+        load_scene, render_stack = renderer()
         at = Path(scene) / "scene.xml"
         return render_stack(load_scene(str(at) if at.exists() else scene, tuple(args.size)), count, seed, sampler)
 
