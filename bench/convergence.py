@@ -19,7 +19,7 @@ import numpy as np
 
 from bench.common import blocks, metadata, renderer, save, write_page
 from ngpt.evaluation.config import scene_name
-from ngpt.system.files import atomic_output
+from ngpt.system.writing import write_text
 
 POINTS = ("sobol", "rounds", "independent")
 SAMPLERS = {"primal": {"features": False}, "gpt": {}}
@@ -67,8 +67,7 @@ def main() -> None:
         settings = {"size": args.size, "reference": args.reference, "seeds": args.seeds, "spp": counts}
         result = {"benchmark": "convergence", "settings": settings, "metadata": metadata("mitsuba", "drjit")}
         save(args.output, result | {"rows": rows})
-    with atomic_output(args.picture, overwrite=True) as temporary:
-        temporary.write_text(picture(rows, counts))
+    write_text(args.picture, picture(rows, counts))
     write_page(PAGE, table(rows), MARKS)
 
 

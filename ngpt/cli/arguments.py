@@ -12,9 +12,10 @@ from ngpt.io.frames import input_files, is_shot
 from ngpt.layers import LAYERS
 from ngpt.system import configs
 from ngpt.system.console import Console
-from ngpt.system.files import atomic_output, check_output, make_folder
+from ngpt.system.files import check_output, make_folder
 from ngpt.system.parts import Registry
 from ngpt.system.text import by_names
+from ngpt.system.writing import write_text
 
 _LOG = logging.getLogger(__name__)
 
@@ -74,8 +75,7 @@ def write_template(args: argparse.Namespace, text: str, verb: str, console: Cons
     """Writes the file of ``--init``, and says what to do with it."""
     make_folder(Path(args.init).parent)
     target = check_output(args.init)
-    with atomic_output(target) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(target, text, overwrite=False)
     console.say(f"{target}: every setting; then: ngpt {verb} --config {target} --out DIR")
     return 0
 

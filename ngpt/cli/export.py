@@ -7,7 +7,7 @@ from ngpt.classical.poisson import DEFAULT_ALPHA
 from ngpt.cli.arguments import add_force, output_file
 from ngpt.errors import NgptError, WrongUse
 from ngpt.system.console import Console
-from ngpt.system.files import atomic_output
+from ngpt.system.writing import write_bytes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,8 +53,7 @@ def write(args: argparse.Namespace) -> list[Path]:
         from ngpt.export.oidn import oidn_weights
 
         data = oidn_weights(args.weights)
-        with atomic_output(args.output, args.force) as temporary:
-            temporary.write_bytes(data)
+        write_bytes(args.output, data, args.force)
         return [args.output]
     if args.output.suffix == ".safetensors":
         from ngpt.export.halves import write_halves
@@ -80,8 +79,7 @@ def write(args: argparse.Namespace) -> list[Path]:
         models = {args.output: network_model(args.weights, name, args.precision)}
         models[beside] = statistics_model(args.weights, name)
     for path, model in models.items():
-        with atomic_output(path, args.force) as temporary:
-            temporary.write_bytes(model.SerializeToString())
+        write_bytes(path, model.SerializeToString(), args.force)
     if args.vector:
         from ngpt.export.vector import write_vector
 

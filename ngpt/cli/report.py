@@ -20,8 +20,8 @@ from ngpt.report.content import REFERENCE, Entry, Overview, Scene
 from ngpt.report.layers import of_stack
 from ngpt.report.page import oversize, write_report
 from ngpt.system.console import Console, tell
-from ngpt.system.files import atomic_output
 from ngpt.system.text import by_names
+from ngpt.system.writing import write_text
 from ngpt.training.run_page import page, read_run
 from ngpt.training.run_summary import is_run
 from ngpt.version import __version__
@@ -129,8 +129,7 @@ def run_trainings(args: argparse.Namespace, target: Path, console: Console) -> i
         raise WrongUse("--ref is for images; leave it out for training runs")
     names = [Path(name).as_posix() for name in labels(args.images)]
     text = page([read_run(path, name) for path, name in zip(args.images, names, strict=True)], args.command)
-    with atomic_output(target, args.force) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+    write_text(target, text, args.force)
     console.say(f"{target}: open it in a browser")
     return 0
 

@@ -8,7 +8,7 @@ from scipy.ndimage import uniform_filter
 from ngpt.image.display import colour_table, coloured
 from ngpt.image.png import encode_png
 from ngpt.stack import GradientStack
-from ngpt.system.files import atomic_output
+from ngpt.system.writing import write_bytes
 
 # Blue where gradients have less variance than differences of pixels, grey where as much, orange where more.
 COLOURS = colour_table(("0b3a75", "2f7fd6", "777777", "d9772b", "ffe6c8")[::-1], 255)
@@ -56,8 +56,7 @@ def write_map(path: Path, stack: GradientStack) -> None:
     """Writes the map with its legend below, as PNG. Magenta is unknown: a light, or no light at all."""
     picture = np.kron(_colours(log_ratio(stack)), np.ones((SCALE, SCALE, 1), np.uint8))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_bytes(encode_png(np.concatenate([picture, legend(picture.shape[1])])))
+    write_bytes(path, encode_png(np.concatenate([picture, legend(picture.shape[1])])))
 
 
 def legend(width: int) -> np.ndarray:

@@ -26,8 +26,7 @@ from ngpt.measure.images import check_size, middle
 from ngpt.measure.metrics import EPSILON, squared_error, trimmed_mean
 from ngpt.report.evaluation import FORMAT
 from ngpt.system.console import Console
-from ngpt.system.files import atomic_output
-from ngpt.system.writing import write_json, write_text
+from ngpt.system.writing import write_bytes, write_json, write_text
 
 
 def flicker_and_bias(images: np.ndarray, *halves: np.ndarray, share: float = 0.001) -> dict[str, float]:
@@ -85,8 +84,7 @@ def study(out: Path) -> list[dict[str, Any]]:
         reference = read_image(out / entry["image"])
         halves = [read_image(out / path) for path in entry["images of halves"]] or [reference]
         path = out / "stability" / f"{scene}-{spp}-{file_part(method)}.png"
-        with atomic_output(path, overwrite=True) as temporary:
-            temporary.write_bytes(encode_png(to_srgb8(rolling_shutter(images), auto_exposure(reference))))
+        write_bytes(path, encode_png(to_srgb8(rolling_shutter(images), auto_exposure(reference))))
         rows.append({"scene": scene, "spp": spp, "method": method, **flicker_and_bias(images, *halves)})
     write_json(out / "stability.json", rows)
     write_text(out / "stability.md", table(rows, len(seeds)))

@@ -18,9 +18,9 @@ from ngpt.report.curves import curves
 from ngpt.report.document import document
 from ngpt.report.markup import plain_table, plots_html
 from ngpt.system.console import span
-from ngpt.system.files import atomic_output
 from ngpt.system.records import read_json
 from ngpt.system.text import markup
+from ngpt.system.writing import write_text
 from ngpt.training.run_summary import LOG, PAGE, SETTINGS, entries_of
 from ngpt.training.settings_text import difference, flat
 
@@ -97,8 +97,7 @@ def write_run(folder: str | Path) -> None:
         return
     run = read_run(folder)
     for name, text in ((PAGE, page([run])), (TABLE, table(run.entries))):
-        with atomic_output(folder / name, overwrite=True) as temporary:
-            temporary.write_text(text, encoding="utf-8", newline="")
+        write_text(folder / name, text)
 
 
 def table(entries: list[dict[str, float]]) -> str:

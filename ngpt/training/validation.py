@@ -17,8 +17,7 @@ from ngpt.network.inputs import base_image
 from ngpt.network.model import Reconstructor
 from ngpt.network.run_torch import layers_of
 from ngpt.repair import repair
-from ngpt.system.files import atomic_output
-from ngpt.system.writing import write_json
+from ngpt.system.writing import write_bytes, write_json
 from ngpt.training.examples import judges_of
 
 # Rows of the picture of a validation.
@@ -48,8 +47,7 @@ class Pictures:
         # Folders of stacks may hold views of different sizes; those that do not fit are left out.
         fit = [i for i, row in enumerate(self._rows) if row.shape == self._rows[0].shape]
         rows = [self._rows[i] for i in fit]
-        with atomic_output(picture, overwrite=True) as temporary:
-            temporary.write_bytes(encode_png(np.ascontiguousarray(np.vstack(rows))))
+        write_bytes(picture, encode_png(np.ascontiguousarray(np.vstack(rows))))
         size = [rows[0].shape[1] // 3, rows[0].shape[0]]
         write_json(Path(picture).with_suffix(".json"), {"size": size, "views": [self._told[i] for i in fit]})
 
