@@ -3,8 +3,9 @@
 import argparse
 import json
 import logging
+import math
 import re
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
 
 from ngpt.errors import WrongUse
@@ -147,27 +148,30 @@ def size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
+def natural(text: str, least: int = 0) -> int:
+    if not text.isdecimal() or int(text) < least:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of {least} or more")
+    return int(text)
+
+
 def positive(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 1 or more")
-    return int(text)
-
-
-def natural(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 0 or more")
-    return int(text)
+    return natural(text, 1)
 
 
 def duration(text: str) -> float:
     """A positive number of seconds."""
+    return number(text, lambda seconds: 0 < seconds < math.inf, "a positive number of seconds")
+
+
+def number(text: str, fits: Callable[[float], bool], what: str) -> float:
+    """A number that ``fits``, as NaN does nowhere; ``what`` says which numbers do."""
     try:
-        seconds = float(text)
+        found = float(text)
     except ValueError:
-        seconds = 0.0
-    if not 0 < seconds < float("inf"):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a positive number of seconds")
-    return seconds
+        found = math.nan
+    if not fits(found):
+        raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
+    return found
 
 
 def stack_files(names: list[str]) -> list[Path]:
@@ -200,7 +204,7 @@ def _strict(value):
         return [_strict(item) for item in value]
     if isinstance(value, str):
         return by_names(value)
-    if isinstance(value, float) and not abs(value) < float("inf"):
+    if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
 

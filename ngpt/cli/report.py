@@ -114,13 +114,7 @@ def images_or_shots(args: argparse.Namespace, target: Path, console: Console) ->
     rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
     scene = Scene(f"{width}x{height}", caption, reference, entries, layers, rising)
     title = ", ".join(names) if len(names) < 5 else f"{len(names)} images"
-    facts = {"ngpt": __version__}
-    overview = Overview(formulas=formulas)
-    write_report(target, title, [scene], command=args.command, footer=facts, overview=overview, overwrite=args.force)
-    if large := oversize(target):
-        console.say(large)
-    console.say(f"{target}: open it in a browser")
-    return 0
+    return finish(args, target, title, [scene], Overview(formulas=formulas), console)
 
 
 def run_trainings(args: argparse.Namespace, target: Path, console: Console) -> int:
@@ -196,11 +190,17 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
             tell(f"{row[0]:{max(map(len, names))}}" + "".join(f"{cell:>16}" for cell in row[1:]))
     formulas = {name: METRICS[name].formula for name in metrics} | ({"flicker": FLICKER} if tables else {})
     formulas |= {"change": CHANGE} if len(frames) > 1 else {}
-    overview = Overview(tables=tables, formulas=formulas)
     title = f"{', '.join(names)}: {len(frames)} frames"
-    facts = {"ngpt": __version__}
+    return finish(args, target, title, scenes, Overview(tables=tables, formulas=formulas), console)
+
+
+def finish(
+    args: argparse.Namespace, target: Path, title: str, scenes: list[Scene], about: Overview, console: Console
+) -> int:
+    """Writes the page, which plays what are frames of folders, and says how to see it."""
+    facts, shot = {"ngpt": __version__}, any(is_shot(path) for path in args.images)
     write_report(
-        target, title, scenes, command=args.command, footer=facts, overview=overview, overwrite=args.force, shot=True
+        target, title, scenes, command=args.command, footer=facts, overview=about, overwrite=args.force, shot=shot
     )
     if large := oversize(target):
         console.say(large)

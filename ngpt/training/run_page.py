@@ -5,8 +5,6 @@ they exist: a page can be made of any run, at any time.
 """
 
 import base64
-import csv
-import io
 import json
 import math
 from dataclasses import dataclass, field
@@ -20,7 +18,7 @@ from ngpt.report.markup import plain_table, plots_html
 from ngpt.system.console import span
 from ngpt.system.records import read_json
 from ngpt.system.text import markup
-from ngpt.system.writing import write_text
+from ngpt.system.writing import csv_text, write_text
 from ngpt.training.run_summary import LOG, PAGE, SETTINGS, entries_of
 from ngpt.training.settings_text import difference, flat
 
@@ -103,11 +101,7 @@ def write_run(folder: str | Path) -> None:
 def table(entries: list[dict[str, float]]) -> str:
     """The log as comma-separated values: a column for each number, empty where a line of the log has none."""
     names = list(dict.fromkeys(name for entry in entries for name in entry))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(entries)
-    return text.getvalue()
+    return csv_text([names, *(map(entry.get, names) for entry in entries)])
 
 
 def page(runs: list[Run], command: str = "") -> str:
@@ -275,11 +269,7 @@ def _own(run: Run) -> list[list[str]]:
 def _differing(runs: list[Run]) -> list[list[str]]:
     """Settings in which not all runs are alike."""
     values = [flat(run.settings) for run in runs]
-    names = difference(*values)
-    return [
-        ["setting", *(run.name for run in runs)],
-        *([name, *(_text(v.get(name)) for v in values)] for name in names),
-    ]
+    return _side_by_side("setting", runs, values, difference(*values))
 
 
 def _system(runs: list[Run]) -> list[list[str]]:

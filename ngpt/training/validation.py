@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -52,21 +51,6 @@ class Pictures:
         write_json(Path(picture).with_suffix(".json"), {"size": size, "views": [self._told[i] for i in fit]})
 
 
-@dataclass(frozen=True)
-class Scores:
-    """Geometric means, over the views, of the trimmed relMSE; with direct emission if the network reads it.
-
-    Where the data have two halves of a reference, the noise of the reference is no part of it.
-
-    ``primal``, ``base``  of the input and of what the network starts from (NaN without)
-    ``network``           of its result
-    """
-
-    primal: float
-    base: float
-    network: float
-
-
 def views(crops: Sequence[Any], count: int) -> list[tuple[Any, int]]:
     """At most ``count`` of all (crop, input), evenly spread."""
     return spread([(crop, k) for crop in crops for k in range(crop.inputs)], count)
@@ -82,8 +66,13 @@ def spread(every: Sequence[Any], count: int) -> list[Any]:
 @torch.no_grad()
 def validate(
     model: Reconstructor, views: Sequence[tuple[Any, int]], picture: str | Path = "", precision: str = "float32"
-) -> Scores:
-    """Scores over views (crop, input); with ``picture``, some of them are drawn into that file (``Pictures``)."""
+) -> dict[str, float]:
+    """Geometric means, over views (crop, input), of the trimmed relMSE; with direct emission if the network reads it.
+
+    Where the data have two halves of a reference, the noise of the reference is no part of it. Beside the result's they
+    are of the input ("relMSE primal") and of what the network starts from ("relMSE base", NaN without). With
+    ``picture``, some views are drawn into that file (``Pictures``).
+    """
     model.eval()
     device = next(model.parameters()).device
     primal, base, network, pictures = [], [], [], Pictures(len(views) if picture else 0)
@@ -102,7 +91,7 @@ def validate(
         if index in pictures.shown:
             pictures.add((given, image, reference), crop.scene, int(crop.spp[k]), primal[-1], network[-1])
     pictures.write(picture)
-    return Scores(_mean(primal), _mean(base), _mean(network))
+    return {"relMSE": _mean(network), "relMSE primal": _mean(primal), "relMSE base": _mean(base)}
 
 
 def _mean(values: list[float]) -> float:
