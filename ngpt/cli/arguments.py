@@ -160,17 +160,17 @@ def positive(text: str) -> int:
 
 def duration(text: str) -> float:
     """A positive number of seconds."""
-    return number(text, lambda seconds: 0 < seconds < math.inf, "a positive number of seconds")
+    return number(text, lambda seconds: 0 < seconds < math.inf, "is not a positive number of seconds")
 
 
-def number(text: str, fits: Callable[[float], bool], what: str) -> float:
-    """A number that ``fits``, as NaN does nowhere; ``what`` says which numbers do."""
+def number(text: str, fits: Callable[[float], bool], else_it: str) -> float:
+    """A number that ``fits``, which NaN does nowhere; what a text ``else_it`` is goes into the error."""
     try:
         found = float(text)
     except ValueError:
         found = math.nan
     if not fits(found):
-        raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
+        raise argparse.ArgumentTypeError(f"'{text}' {else_it}")
     return found
 
 

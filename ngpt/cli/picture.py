@@ -156,7 +156,7 @@ def stops(text: str) -> float | str:
     """A number of stops, or "auto"."""
     if text == "auto":
         return text
-    return number(text, lambda stops: abs(stops) <= 100, "a number of stops, from -100 to 100, or auto")
+    return number(text, lambda stops: abs(stops) <= 100, "is neither a number of stops, from -100 to 100, nor auto")
 
 
 def exposed(asked: float | str, image: np.ndarray) -> float:
@@ -165,4 +165,4 @@ def exposed(asked: float | str, image: np.ndarray) -> float:
 
 
 def frames_a_second(text: str) -> float:
-    return number(text, lambda rate: 0 < rate <= 1000, "a number of frames a second, up to 1000")
+    return number(text, lambda rate: 0 < rate <= 1000, "is not a number of frames a second, up to 1000")
