@@ -117,12 +117,7 @@ def bench_costs(path: str, args: argparse.Namespace) -> dict:
 
 
 def table(result: dict) -> str:
-    """Markdown tables for each method that distributed the samples.
-
-    The first has the ratios of the error with adaptive samples to the error with even ones, their means, and the ratio
-    of the costs. The second has the ratios of the expected error to the true one, for the pilot, even and adaptive
-    samples.
-    """
+    """Markdown for each method that distributed the samples: adaptive over even errors, and expected over true ones."""
     parts = []
     for by, scenes in result["by"].items():
         methods = list(dict.fromkeys(m for entry in scenes.values() for m in entry["methods"]))

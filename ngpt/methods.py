@@ -228,9 +228,7 @@ def choose(layers: Container[str], usable: Callable[[str], bool] | None = None) 
     ``layers``  a stack, or names of its layers. A stack may say what it was rendered for (``ngpt:for``)
     ``usable``  whether a method can be used, by its name; None asks this machine
 
-    The errors behind ``ORDER`` are in docs/lab/RESULTS.md, "By the layers of a stack". Where OIDN is installed it is
-    better than `wcv` and `l1` in the mean up to 16 spp, and by far on what they cannot clean; from 64 spp on they are
-    better on diffuse scenes.
+    The errors behind ``ORDER`` are in docs/lab/RESULTS.md, "By the layers of a stack".
     """
     usable = usable or (lambda name: not METHODS[name].missing())
     made_for = str(layers.attributes.get("ngpt:for")) if isinstance(layers, GradientStack) else ""

@@ -41,7 +41,6 @@ Kind = TypeVar("Kind", bound=Image)  # the kind that went in is the kind that co
 
 
 def is_bitmap(value: Any) -> bool:
-    """Whether it is an ``mi.Bitmap``."""
     return hasattr(value, "pixel_format") and hasattr(value, "component_format")
 
 

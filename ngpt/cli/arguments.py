@@ -73,7 +73,6 @@ def config_of(args: argparse.Namespace, kind: str) -> Path:
 
 
 def write_template(args: argparse.Namespace, text: str, verb: str, console: Console) -> int:
-    """Writes the file of ``--init``, and says what to do with it."""
     make_folder(Path(args.init).parent)
     target = check_output(args.init)
     write_text(target, text, overwrite=False)
@@ -159,7 +158,6 @@ def positive(text: str) -> int:
 
 
 def duration(text: str) -> float:
-    """A positive number of seconds."""
     return number(text, lambda seconds: 0 < seconds < math.inf, "is not a positive number of seconds")
 
 

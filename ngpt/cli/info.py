@@ -92,7 +92,6 @@ def file(args: argparse.Namespace, console: Console) -> int:
 
 
 def overview() -> dict:
-    """What this installation offers."""
     titles = {"methods": "use", "methods for some stacks": "niche", "methods to compare with": "study"}
     METHODS.load()
     report: dict[str, Any] = {"version": __version__}

@@ -110,7 +110,6 @@ def in_picture(image: np.ndarray, place: Place) -> np.ndarray:
 
 
 def seen(place: Place) -> Window:
-    """The pixels that a picture has."""
     return place.data.common(place.display) or place.data
 
 
@@ -153,7 +152,6 @@ def add_look(parser: argparse.ArgumentParser) -> None:
 
 
 def stops(text: str) -> float | str:
-    """A number of stops, or "auto"."""
     if text == "auto":
         return text
     return number(text, lambda stops: abs(stops) <= 100, "is neither a number of stops, from -100 to 100, nor auto")

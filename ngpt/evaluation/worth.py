@@ -7,9 +7,8 @@
     W       m / n: how many times more samples that pipeline needs
     C       the seconds of a further sample with gradients over the seconds of a further sample of that pipeline
 
-W / C is more than W over C where a rival's reconstruction takes longer, and less where ours does. T' and m are read off
-curves of errors (``ngpt.evaluation.curves``, which explains the marks; W has the mark of W / C). C compares the renders
-with the least and the most samples, so that what a render takes to begin is no part of it.
+T' and m are read off curves of errors (``ngpt.evaluation.curves``, which explains the marks; W has the mark of W / C).
+C compares the renders with the least and the most samples, so that what a render takes to begin is no part of it.
 """
 
 from collections.abc import Sequence

@@ -115,9 +115,7 @@ def _computed(name: str, layers: Mapping[str, Tensor], compared_with: str) -> Te
 def reflectance(albedo: Tensor) -> Tensor:
     """What radiance (N, 3, H, W) may be divided by: albedo + ``GLOSS``. Where no albedo is known it is one number.
 
-    It is a continuous function of the albedo. Suppose instead that an albedo of 0 stood for 1. The pixels of a black
-    cable have an albedo of 0 or 0.1 by chance. They would then exchange light with their neighbours ten times too
-    bright.
+    A continuous function of the albedo: pixels that have 0 or 0.1 by chance do not exchange light ten times too bright.
     """
     return albedo + GLOSS
 

@@ -9,13 +9,9 @@
     denoised, denoised_base                    OIDN's images of the primal and of the base
 
 Radiance is without emission seen directly, but for networks that see it, which read images as other renderers write
-them. Features that a network may do without are zeros where the stack lacks them.
-
-OIDN sees no gradients, and removes what it takes for noise; control variates keep every gradient, and their noise.
-OIDN's image of the control variates has less noise to remove, so that it errs elsewhere than its image of the primal. A
-network that sees all three, and the gradients, tells in each pixel whom to believe [after Back et al. 2020, "Deep
-Combiner for Independent and Correlated Pixel Estimates", with a denoiser's image of the correlated estimate for a
-kernel].
+them. Features that a network may do without are zeros where the stack lacks them. OIDN's image of the control variates
+has less noise to remove, so that it errs elsewhere than its image of the primal [after Back et al. 2020, "Deep Combiner
+for Independent and Correlated Pixel Estimates", with a denoiser's image of the correlated estimate for a kernel].
 """
 
 from collections.abc import Collection

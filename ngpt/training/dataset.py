@@ -59,7 +59,6 @@ class Crop:
 
     @property
     def inputs(self) -> int:
-        """The number of inputs."""
         return len(self.spp)
 
     @property

@@ -69,7 +69,6 @@ def training_template(text: str) -> str:
 
 
 def _default(field: Field) -> str:
-    """As TOML has it."""
     return "none: must be given" if field.default is MISSING else f"`{toml(field.default)}`"
 
 

@@ -174,7 +174,6 @@ def _plots(runs: list[Run]) -> dict[str, str]:
 
 
 def _over_time(run: Run, unit: float) -> list[tuple[float, float]]:
-    """relMSE over the time that the run took until then, in units of so many seconds."""
     seconds, points = 0.0, []
     for entry in run.entries:
         seconds = entry.get("seconds", seconds)
@@ -184,7 +183,6 @@ def _over_time(run: Run, unit: float) -> list[tuple[float, float]]:
 
 
 def _time(seconds: float) -> str:
-    """A duration, "-" where none is known."""
     return span(seconds) if math.isfinite(seconds) else "-"
 
 
@@ -246,7 +244,6 @@ def _style(runs: list[Run]) -> str:
 
 
 def _share(row: int, count: int) -> float:
-    """Where a row of so many lies, in per cent as CSS counts."""
     return round(100 * row / max(count - 1, 1), 4)
 
 
@@ -273,7 +270,6 @@ def _differing(runs: list[Run]) -> list[list[str]]:
 
 
 def _system(runs: list[Run]) -> list[list[str]]:
-    """What the runs run on."""
     facts = [flat(run.record.get("system", {})) for run in runs]
     return _side_by_side("system", runs, facts, list(dict.fromkeys(name for fact in facts for name in fact)))
 

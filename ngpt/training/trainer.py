@@ -211,7 +211,6 @@ class Trainer:
         self.model.train()
 
     def _train(self, batch: dict[str, Tensor]) -> dict[str, float]:
-        """One step; returns what is worth logging."""
         self.model.train()
         run, settings = self.settings.run, self.settings.optimizer
         batch = {name: layer.to(self.device, non_blocking=True) for name, layer in batch.items()}
@@ -264,7 +263,6 @@ class Trainer:
 
 
 def _seed(seed: int, step: int) -> int:
-    """A seed for everything random that belongs to one training step."""
     return int(np.random.SeedSequence((seed, step)).generate_state(1, np.uint64)[0] >> 1)
 
 
