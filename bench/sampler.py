@@ -175,12 +175,9 @@ def variance_ratios(stack: GradientStack) -> dict[str, float]:
     return ratios
 
 
-def relative_errors(row: dict) -> dict[str, float]:
-    return {method: row[METRIC][method]["median"] / row[METRIC]["path"]["median"] for method in METHODS}
-
-
 def line(name: str, row: dict) -> str:
-    errors = "  ".join(f"{method} {ratio:.2f}" for method, ratio in relative_errors(row).items())
+    medians = {method: row[METRIC][method]["median"] for method in ("path", *METHODS)}
+    errors = "  ".join(f"{method} {medians[method] / medians['path']:.2f}" for method in METHODS)
     return (
         f"{name:16} cost {row['cost']['median']:.2f}  variance dx {row['variance']['dx']:.1f} "
         f"dy {row['variance']['dy']:.1f}  error over path: {errors}"

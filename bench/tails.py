@@ -2,23 +2,20 @@
 
     python -m bench.tails kitchen/scene.xml bedroom/scene.xml --references FOLDER --groups rooms=kitchen,bedroom
 
-Samplers are `primal` (as it is, "raw", `oidn` and `ngpt-primal`) and `gpt` (`wcv`, `ngpt-fast`, `ngpt-combine` and
-`oidn`), and `mitsuba`: `primal` with Mitsuba's own points and lamps and whole paths, denoised by `oidn`. Each cell has:
+Samplers are `primal`, `gpt`, and `mitsuba`: `primal` with Mitsuba's own points and lamps and whole paths, denoised by
+`oidn`. Methods are those of METHODS. Each cell has:
 
     seconds    of processors, of the render and of the reconstruction, both warmed up; whole: both together
     error      relMSE by two halves of a reference, without the worst 0.1 % of the pixels; FLIP is over their mean
-    steady     the same error, relative to the denoised reference, which also says which pixels are the worst
+    steady     the same error, relative to the denoised reference, which also says which pixels are the worst: where a
+               reference is noisy most of its pixels are too dark, and ``error`` rewards images that are too dark
     blocks     root of the same error of means over 8x8 pixels; none where it is below what the halves can tell
     energy     mean of the image over the mean of the reference
 
-Where a reference is noisy most of its pixels are too dark, and these count more for it: ``error`` has a floor there,
-and images that are too dark come below it. ``steady`` has none.
-
 References are NAME-WxH-a.exr and -b.exr of the folder; what is missing is rendered there, without shared tails. At
-equal whole time a cell with shared tails is over the errors of its own sampler and method with tails=paths, read off
-between their numbers of samples; for the marks see ``ngpt.evaluation.curves``. W, C and W/C of gradients are against
-`primal` with the same tails (``ngpt.evaluation.worth``). Each cell is written as soon as it is there, and cells that
-the file has already are not measured again. Values are medians over seeds, means over scenes geometric.
+equal whole time a cell with shared tails is over the errors of its own sampler and method with tails=paths; for the
+marks see ``ngpt.evaluation.curves``. W, C and W/C of gradients are against `primal` with the same tails. Cells that the
+file has are not measured again. Values are medians over seeds, means over scenes geometric.
 """
 
 import argparse

@@ -110,7 +110,8 @@ def images_or_shots(args: argparse.Namespace, target: Path, console: Console) ->
                 much = f"{abs(stops):.1f} stops {'brighter' if stops > 0 else 'darker'}"
                 console.say(f"{path}: {much} than {args.ref}; is it of the same scene and exposure?")
         formulas = {name: METRICS[name].formula for name in metrics}
-        print_table(entries)
+        rows = [[entry.name, *(f"{value:.4g}" for value in entry.metrics.values())] for entry in entries]
+        print_table([["", *entries[0].metrics], *rows])
     rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
     scene = Scene(f"{width}x{height}", caption, reference, entries, layers, rising)
     title = ", ".join(names) if len(names) < 5 else f"{len(names)} images"
@@ -186,8 +187,7 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
             what = "no frame after the first has motion vectors (layer 'motion'), to tell it from what moves"
             console.say(f"flicker is nan: {what}")
         tables = {f"Means over {len(frames)} frames": rows}
-        for row in rows:
-            tell(f"{row[0]:{max(map(len, names))}}" + "".join(f"{cell:>16}" for cell in row[1:]))
+        print_table(rows)
     formulas = {name: METRICS[name].formula for name in metrics} | ({"flicker": FLICKER} if tables else {})
     formulas |= {"change": CHANGE} if len(frames) > 1 else {}
     title = f"{', '.join(names)}: {len(frames)} frames"
@@ -278,9 +278,8 @@ def add_errors(
         entry.maps[name][part] = values
 
 
-def print_table(entries: list[Entry]) -> None:
+def print_table(rows: list[list[str]]) -> None:
     """The numbers of the page, for those who do not open it."""
-    width = max(len(entry.name) for entry in entries)
-    tell(f"{'':{width}}" + "".join(f"{metric:>16}" for metric in entries[0].metrics))
-    for entry in entries:
-        tell(f"{entry.name:{width}}" + "".join(f"{value:16.4g}" for value in entry.metrics.values()))
+    width = max(len(row[0]) for row in rows)
+    for row in rows:
+        tell(f"{row[0]:{width}}" + "".join(f"{cell:>16}" for cell in row[1:]))

@@ -21,20 +21,8 @@ import numpy as np
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 from ngpt.system.records import Shape, check, read_json
-from ngpt.training.shards import (
-    CAUSTIC,
-    FAR,
-    GRADIENTS,
-    MOTION,
-    OF_INPUTS,
-    REFERENCE_CAUSTIC,
-    REFERENCE_HALVES,
-    REFERENCES,
-    SAMPLES,
-    SPLIT,
-    Shard,
-    tensor_names,
-)
+from ngpt.training import shards
+from ngpt.training.shards import Shard, tensor_names
 
 FORMAT, VERSION = "ngpt-dataset", 1
 MANIFEST = "manifest.json"
@@ -64,7 +52,7 @@ class Crop:
     @property
     def paired(self) -> bool:
         """Whether it has no reference, but two inputs of equally many samples that judge each other."""
-        return REFERENCES[0] not in self.shard.names
+        return shards.REFERENCES[0] not in self.shard.names
 
     def stack(self, k: int) -> GradientStack:
         """Input ``k``, all layers of a rendered stack, with gradients if its sampler has them; all values finite.
@@ -73,15 +61,15 @@ class Crop:
         """
         if not 0 <= k < self.inputs:
             raise NgptError(f"{self.shard.path}: there is no input {k}; the crop has inputs 0 .. {self.inputs - 1}")
-        names = [name for name in self.shard.names if name in OF_INPUTS]
+        names = [name for name in self.shard.names if name in shards.OF_INPUTS]
         layers = {name: self.shard.input(name, self.index, k) for name in names}
         layers["primal"] = layers.pop("indirect") + layers["direct"] + layers.get("caustic", 0)
         for name in [name for name in layers if name.endswith("_se")]:
             layers[name.removesuffix("_se") + "_var"] = np.square(layers.pop(name))
         attributes: dict[str, Any] = {"ngpt:spp": self.spp[k], "ngpt:normalSpace": "camera"}
-        if MOTION in self.shard.names:
-            motion = self.shard.crop(MOTION, self.index)
-            layers[MOTION] = np.where(motion < FAR, motion, np.float32(np.nan))
+        if shards.MOTION in self.shard.names:
+            motion = self.shard.crop(shards.MOTION, self.index)
+            layers[shards.MOTION] = np.where(motion < shards.FAR, motion, np.float32(np.nan))
         if self.frame is not None:
             attributes |= {"ngpt:frame": self.frame, "ngpt:previousFrame": self.frame - 1}
         return GradientStack(layers, attributes, path=f"{self.shard.path}, crop {self.index}, input {k}")
@@ -103,8 +91,8 @@ class Crop:
     @property
     def reference_caustic(self) -> np.ndarray:
         """(H, W, 3) float32, what of it the layer ``caustic`` of the inputs estimates; zeros where they have none."""
-        if REFERENCE_CAUSTIC in self.shard.names:
-            return self.shard.crop(REFERENCE_CAUSTIC, self.index)
+        if shards.REFERENCE_CAUSTIC in self.shard.names:
+            return self.shard.crop(shards.REFERENCE_CAUSTIC, self.index)
         return np.zeros_like(self.reference_direct)
 
     @property
@@ -113,9 +101,9 @@ class Crop:
 
         Each is of half of the reference's samples. What they say alike of an image is no noise of theirs.
         """
-        if REFERENCE_HALVES not in self.shard.names:
+        if shards.REFERENCE_HALVES not in self.shard.names:
             return ()
-        return tuple(self.shard.crop(REFERENCE_HALVES, self.index))
+        return tuple(self.shard.crop(shards.REFERENCE_HALVES, self.index))
 
 
 class Dataset:
@@ -212,7 +200,7 @@ def problems(folder: Path) -> list[str]:
             bad = int(np.sum(~np.isfinite(shard.tensor(name))))
             if bad:
                 found.append(f"{shard.path}: tensor '{name}' has {bad} values that are not finite")
-        if entry["crops"] and REFERENCES[0] not in shard.names:
+        if entry["crops"] and shards.REFERENCES[0] not in shard.names:
             one, other = shard.tensor("indirect").swapaxes(0, 1)
             for crop in np.flatnonzero((one == other).all(axis=(1, 2, 3))):
                 found.append(f"{shard.path}: both halves of crop {crop} are the same: nothing is learnt from them")
@@ -235,9 +223,9 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
     shard, crops = Shard(path), entry["crops"]
     if not crops:
         return shard
-    gradients, caustic = (not tensors.keys().isdisjoint(shard.names) for tensors in (GRADIENTS, CAUSTIC))
-    optional = (REFERENCE_HALVES, MOTION, *SAMPLES, *SPLIT)
-    pairs = set(REFERENCES).isdisjoint(shard.names)
+    gradients, caustic = (not tensors.keys().isdisjoint(shard.names) for tensors in (shards.GRADIENTS, shards.CAUSTIC))
+    optional = (shards.REFERENCE_HALVES, shards.MOTION, *shards.SAMPLES, *shards.SPLIT)
+    pairs = set(shards.REFERENCES).isdisjoint(shard.names)
     names = tensor_names(gradients, caustic, [name for name in optional if name in shard.names], pairs=pairs)
     missing = [name for name in names if name not in shard.names]
     if missing:
@@ -252,11 +240,11 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
         expected: tuple[int, ...] = (len(crops), height, width, 3)
         if name == "spp":
             expected = (len(crops), inputs)
-        elif name in OF_INPUTS:
-            expected = (len(crops), inputs, height, width, OF_INPUTS[name])
-        elif name == REFERENCE_HALVES:
+        elif name in shards.OF_INPUTS:
+            expected = (len(crops), inputs, height, width, shards.OF_INPUTS[name])
+        elif name == shards.REFERENCE_HALVES:
             expected = (len(crops), 2, height, width, 3)
-        elif name == MOTION:
+        elif name == shards.MOTION:
             expected = (len(crops), height, width, 2)
         if shard.shape(name) != expected:
             raise NgptError(f"{path}: tensor '{name}' is {shard.shape(name)}, it must be {expected}")
