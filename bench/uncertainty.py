@@ -96,7 +96,6 @@ def case(method: str, reference: GradientStack, stack: GradientStack, *halves: G
 
 
 def covered(one: tuple[np.ndarray, ...], factor: float) -> dict[str, float]:
-    """The share of values within each interval."""
     difference, changed, variance = one
     width = np.sqrt((factor * changed) ** 2 + variance)
     return {name: round(float(np.mean(np.abs(difference) <= k * width)), 4) for name, (k, _) in INTERVALS.items()}

@@ -121,8 +121,9 @@ def _network(
     return Method(summary, needs, network.run, OPTIONS, standing, network.missing, estimates=estimates)
 
 
-def _variant(method: str, entry: Method, summary: str, **options: Any) -> Method:
+def _variant(method: str, summary: str, **options: Any) -> Method:
     """The method with other defaults, under a name of its own: rows of tables are names that can be asked for."""
+    entry = _OURS[method]
     other = {name: replace(entry.options[name], default=value) for name, value in options.items()}
     return replace(entry, summary=summary, options=entry.options | other, variant=method)
 
@@ -184,14 +185,10 @@ _OURS = {
     ),
 }
 _OURS |= {
-    "oidn-clean": _variant("oidn", _OURS["oidn"], "OIDN that takes the features for clean", auxiliary="clean"),
-    "oidn-noisy": _variant("oidn", _OURS["oidn"], "OIDN that is told the features are noisy", auxiliary="noisy"),
+    "oidn-clean": _variant("oidn", "OIDN that takes the features for clean", auxiliary="clean"),
+    "oidn-noisy": _variant("oidn", "OIDN that is told the features are noisy", auxiliary="noisy"),
     "oidn-fast": _variant(
-        "oidn",
-        _OURS["oidn"],
-        "OIDN's quickest network, with the features as they are",
-        auxiliary="clean",
-        quality="fast",
+        "oidn", "OIDN's quickest network, with the features as they are", auxiliary="clean", quality="fast"
     ),
 }
 METHODS = Registry("ngpt.methods", "method", Method, _OURS)

@@ -99,7 +99,6 @@ def write_frame(
 
 
 def describe(report: dict) -> str:
-    """One line about one file."""
     if "skipped" in report:
         return f"{report['input']} -> {report['output']}: skipped, exists already"
     text = f"{report['input']} -> {report['output']}: {report['method']}"

@@ -50,13 +50,13 @@ def run(args: argparse.Namespace, console: Console) -> int:
 def write(args: argparse.Namespace) -> list[Path]:
     """Writes what the arguments ask for; returns the files."""
     if args.output.suffix == ".tza":
-        from ngpt.export.oidn import oidn_weights
+        from ngpt.export.weights import oidn_weights
 
         data = oidn_weights(args.weights)
         write_bytes(args.output, data, args.force)
         return [args.output]
     if args.output.suffix == ".safetensors":
-        from ngpt.export.halves import write_halves
+        from ngpt.export.weights import write_halves
 
         write_halves(args.weights, args.output, args.force)
         return [args.output]

@@ -175,7 +175,6 @@ def _row(
 
 
 def as_csv(results: dict[str, Any]) -> str:
-    """One line a cell."""
     place, names = ("scene", "spp", "method", "seed", "spp used"), list(results["metrics"])
     rows = [[*place, *(f"{key} s" for key in _SECONDS), *names, "absent"]]
     for cell in results["cells"]:

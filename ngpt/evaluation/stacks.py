@@ -73,7 +73,6 @@ class SceneStacks:
         return self._keys[sampler]
 
     def folder(self, sampler: str) -> Path:
-        """Where the pictures by a sampler are."""
         if self.given:
             return Path(self.source)
         return self.cache / f"{self.name}-{self.key(sampler)[:12]}"

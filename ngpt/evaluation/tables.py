@@ -110,7 +110,6 @@ def _doubtful(results: dict[str, Any]) -> str:
 
 
 def _halved(results: dict[str, Any]) -> list[str]:
-    """The scenes whose references are two halves."""
     references = {name: entry.get("reference") or {} for name, entry in results["scenes"].items()}
     return [name for name, reference in references.items() if reference.get("halves")]
 

@@ -90,7 +90,6 @@ class ModelConfig:
 
     @property
     def kind(self) -> "Kind":
-        """What knows about networks of this kind."""
         return KINDS[self.network]
 
     @property

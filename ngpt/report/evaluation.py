@@ -13,9 +13,8 @@ from ngpt.report.content import Entry, Overview, Scene
 from ngpt.report.page import write_report
 
 FORMAT = 2
-ROOM = (
-    54 * 1280 * 720
-)  # pixels of all pictures that a page takes in acceptable quality: 8 methods and reference, 6 scenes
+# Pixels of all pictures that a page takes in acceptable quality: 8 methods and reference, 6 scenes
+ROOM = 54 * 1280 * 720
 
 
 def write_evaluation_report(folder: str | os.PathLike, output: str | os.PathLike, *, overwrite: bool = False) -> Path:

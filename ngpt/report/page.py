@@ -191,9 +191,6 @@ def _facts(scene: Scene, stops: float, steps: list[int]) -> dict:
     }
 
 
-# --- pixels ----------------------------------------------------------------------------------------------------------
-
-
 def _pixels(scenes: list[Scene], exposures: list[float], room: float) -> tuple[list[str], list[list[int]]]:
     """The script elements of all pictures, in about ``room`` bytes, and the steps per stop of each scene's."""
     exposed = [

@@ -186,9 +186,6 @@ def _time(seconds: float) -> str:
     return span(seconds) if math.isfinite(seconds) else "-"
 
 
-# --- pictures --------------------------------------------------------------------------------------------------------
-
-
 def _drawn(run: Run) -> tuple[Path, dict[str, Any]] | None:
     """The picture of the last validation that has captions, and these."""
     for path in sorted(run.folder.glob("validation-*.json"), reverse=True):
@@ -245,9 +242,6 @@ def _style(runs: list[Run]) -> str:
 
 def _share(row: int, count: int) -> float:
     return round(100 * row / max(count - 1, 1), 4)
-
-
-# --- settings --------------------------------------------------------------------------------------------------------
 
 
 def _settings(title: str, rows: list[list[str]]) -> str:
