@@ -7,14 +7,10 @@
     even      all pixels have --spp samples
     adaptive  --spp in the mean, shared out by the error that --by is expected to have (data_gen/adaptive.py)
 
-All methods that can use the stacks of `gpt` are measured on both, as without `ngpt render --for`. Errors are trimmed
-relMSE against two halves of a reference, geometric means over --seeds, of small images. What adaptive samples cost is
-measured on larger ones, since each pass takes a time to start that a small image does not pay for: CPU seconds of the
-process, all threads together, the runs of the method that the choice needs included.
-
-Beside them stands what `assess`, by which `--error` goes, expects of each method: of 16 even samples per pixel, of the
-even and of the adaptive ones, over what is true. A scene that is in the file already is measured again; the others are
-kept, and stacks are kept in --cache.
+Errors are trimmed relMSE against two halves of a reference, geometric means over --seeds, of small images. What
+adaptive samples cost is measured on larger ones, since each pass takes a time to start: CPU seconds of the process, the
+runs of the method that the choice needs included. Beside them stands what `assess`, by which `--error` goes, expects of
+each method, over what is true. Scenes that are in the file already are measured again; stacks are kept in --cache.
 """
 
 import argparse

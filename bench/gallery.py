@@ -1,15 +1,12 @@
 """The pictures of docs/gallery.md: twelve scenes, each noisy, denoised and converged, side by side.
 
     python -m bench.gallery --folder SCENES --cache out/gallery
-
-SCENES has the scenes that are files. Each row of SCENES_SHOWN is rendered with the command that the page gives, at
-320x180 pixels, and denoised by the method that `ngpt denoise` takes. The reference is rendered without shared paths, in
-two halves of other seeds. Renders are kept in the cache, so a run that was broken off goes on. Written are
-docs/images/gallery, bench/results/gallery.json, and the table between the marks of the page.
-
     python -m bench.gallery --wipe glossy --size 640 360 --cache out/gallery
 
-writes docs/images/wipe.webp: the noisy image, and a line that moves over it and leaves the result.
+SCENES has the scenes that are files. Each row of SCENES_SHOWN is rendered with the command that the page gives, and
+denoised by the method that `ngpt denoise` takes; the reference is rendered without shared paths, in two halves of other
+seeds. Renders are kept in the cache. Written are docs/images/gallery, bench/results/gallery.json, and the table between
+the marks of the page; with --wipe docs/images/wipe.webp, a line that moves over the noisy image and leaves the result.
 """
 
 import argparse

@@ -8,12 +8,12 @@ The camera goes sideways, or a shape or a lamp moves, as in ``bench.shots``. Riv
     after        reservoirs of pixels; differences are computed from the paths they keep: the paper's baseline
     gpt          new samples in each frame
 
-``cost`` is the wall-clock and processor time of a frame relative to a sample of ``gpt``. It is the median of
-``--repeats`` frames of all rivals in turn, at ``--cost-size``, with as many chains as samples. ``noise`` is the
-variance of primal, dx and dy (without the worst 1 % of the pixels) in the last frame, for one chain or sample. It is
-also given times the cost in processor time, relative to ``gpt``: below 1, a frame is worth more than it costs. Then all
-rivals render for the time of ``--chains`` chains of ``restir``, and their frames after ``--skip`` are reconstructed;
-+ temporal: as `ngpt denoise --temporal` does, from the first frame on. relMSE and flicker are as in ``bench.shots``.
+``cost`` is the wall-clock and processor time of a frame relative to a sample of ``gpt``, the median of ``--repeats``
+frames of all rivals in turn, with as many chains as samples. ``noise`` is the variance of primal, dx and dy (without
+the worst 1 % of the pixels) in the last frame, also times the cost, relative to ``gpt``: below 1, a frame is worth more
+than it costs. Then all rivals render for the time of ``--chains`` chains of ``restir``, and their frames after
+``--skip`` are reconstructed; + temporal: as `ngpt denoise --temporal` does. relMSE and flicker are as in
+``bench.shots``.
 """
 
 import argparse

@@ -2,14 +2,13 @@
 
     python -m bench.uncertainty --scenes diffuse lens --checked glossy --cache STACKS -o bench/results/uncertainty.json
 
-Stacks and references are rendered into --cache where they are not there: SCENE-SPP.exr and SCENE-reference.exr. A scene
-is a built-in one, or a folder with scene.xml in it. References have noise; of the intervals for the difference of both,
+A scene is a built-in one, or a folder with scene.xml in it. References have noise; of the intervals for the difference
 it is a part: their half-width is sqrt(error² + variance of the reference). Pixels that show a lamp are left out.
 
-Each method's factor is chosen on --scenes, so that both coverages are closest to 68.3 and 95 %; --checked are scenes
-that it is then checked on. With --halves, each stack is merged of two with half of the samples each, which the error
-goes by, too. Two rows are printed for each method: coverages, and the tail: the share of values that are more than five
-errors off, and the sum of all squared errors over the claimed one. The numbers are written as JSON.
+Each method's factor is chosen on --scenes, so that both coverages are closest to 68.3 and 95 %, and checked on
+--checked. With --halves, each stack is merged of two, which the error goes by, too. Two rows are printed for each
+method: coverages, and the tail: the share of values that are more than five errors off, and the sum of all squared
+errors over the claimed one.
 """
 
 import argparse
