@@ -25,7 +25,7 @@ from ngpt.network.safetensors import load_weights
 from ngpt.repair import repair
 from ngpt.system import configs
 from ngpt.system.writing import markdown_table
-from ngpt.training.cost import per_pixel
+from ngpt.training.cost import network_of, per_pixel
 from ngpt.training.crops import open_crops
 from ngpt.training.examples import judges_of
 from ngpt.training.images import Images
@@ -119,7 +119,7 @@ def main() -> None:
         model, _ = load_weights(out / "weights.safetensors")
         variants[name] = {
             "parameters": parameters(model),
-            "multiplications": per_pixel(model)[0],
+            "multiplications": per_pixel(*network_of(settings))[0],
             "steps": settings.run.steps,
             "inputs": judged(model, held_out),
         }

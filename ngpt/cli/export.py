@@ -52,8 +52,7 @@ def write(args: argparse.Namespace) -> list[Path]:
     if args.output.suffix == ".tza":
         from ngpt.export.weights import oidn_weights
 
-        data = oidn_weights(args.weights)
-        write_bytes(args.output, data, args.force)
+        write_bytes(args.output, oidn_weights(args.weights), args.force)
         return [args.output]
     if args.output.suffix == ".safetensors":
         from ngpt.export.weights import write_halves
@@ -64,17 +63,18 @@ def write(args: argparse.Namespace) -> list[Path]:
         from ngpt.export.poisson import l2_model
 
         models = {args.output: l2_model(args.alpha)}
-    elif kind_of(args.weights) == "temporal":
-        from ngpt.export.temporal import temporal_model
-
-        if args.vector:
-            raise NgptError(
-                f"{args.weights}: this network blends frames, and has no example to write; leave --vector out"
-            )
-        models = {args.output: temporal_model(args.weights)}
     else:
         from ngpt.export.network import network_model, statistics_model
+        from ngpt.export.temporal import temporal_model
+        from ngpt.network.safetensors import read_tensors
 
+        if read_tensors(args.weights)[1].get("kind") == "temporal":
+            if args.vector:
+                raise NgptError(
+                    f"{args.weights}: this network blends frames, and has no example to write; leave --vector out"
+                )
+            write_bytes(args.output, temporal_model(args.weights).SerializeToString(), args.force)
+            return [args.output]
         name, beside = args.weights.stem, output_file(args.output.with_suffix(".statistics.onnx"), args)
         models = {args.output: network_model(args.weights, name, args.precision)}
         models[beside] = statistics_model(args.weights, name)
@@ -85,9 +85,3 @@ def write(args: argparse.Namespace) -> list[Path]:
 
         write_vector(models[args.output], args.vector, args.force)
     return list(models)
-
-
-def kind_of(weights: Path) -> str:
-    from ngpt.network.safetensors import read_tensors
-
-    return read_tensors(weights)[1].get("kind", "")

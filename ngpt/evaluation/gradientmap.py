@@ -31,13 +31,10 @@ def variances_of_differences(stack: GradientStack) -> tuple[np.ndarray, np.ndarr
     """
     dark = stack["direct"].sum(axis=-1) == 0
     values = np.where(dark[..., None], stack["primal_var"], np.nan)
-    results = []
-    for axis in (1, 0):
-        sums = np.full(values.shape, np.nan, np.float64)
-        here, there = (np.s_[:, :-1], np.s_[:, 1:]) if axis == 1 else (np.s_[:-1], np.s_[1:])
-        sums[here] = values[here] + values[there]
-        results.append(sums)
-    return results[0], results[1]
+    across, down = np.full((2, *values.shape), np.nan, np.float64)
+    across[:, :-1] = values[:, :-1] + values[:, 1:]
+    down[:-1] = values[:-1] + values[1:]
+    return across, down
 
 
 def log_ratio(stack: GradientStack) -> np.ndarray:

@@ -107,7 +107,7 @@ class SceneStacks:
 
         ``median`` and quartiles ``low`` and ``high`` of alternating renders, kernels compiled, and the ``sampler`` that
         rendered. What is not in the cache is measured in turn with the clock, and put into the unit of the clock's time
-        there: more samplers do not move the others. Empty for a folder of stacks that were rendered elsewhere.
+        there. Empty for a folder of stacks that were rendered elsewhere.
         """
         if self.given:
             return {}

@@ -87,7 +87,8 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
         seconds = _row(results, name, spp, method)["seconds"]["total"]
         metrics: dict[str, float | Sequence[float]] = {}
         for metric in results["metrics"]:
-            values = [_value(cell["metrics"].get(metric)) for cell in mine if not cell["absent"]]
+            found = [cell["metrics"].get(metric) for cell in mine if not cell["absent"]]
+            values = [math.nan if value is None else value for value in found]
             metrics[metric] = values[0] if len(values) == 1 else values
         entries.append(Entry(method, read_image(folder / pictured["image"]), seconds, metrics))
     # The first metric is the one of the captions, and the one the best method is chosen by.
@@ -106,10 +107,6 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
     facts += ["without " + ", ".join(absent)] if absent else []
     rising = [metric for metric, entry in results["metrics"].items() if entry["better"] == "higher"]
     return Scene(f"{name}, {spp} spp", "; ".join(facts), image, entries, rising=rising)
-
-
-def _value(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 def _row(results: dict, scene: str | None, spp: int, method: str) -> dict:

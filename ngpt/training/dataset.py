@@ -35,8 +35,7 @@ _MANIFEST: Shape = {"config": dict, "planned": int, "shards": [_ENTRY]}
 class Crop:
     """One crop; cheap: pixels are read when they are asked for.
 
-    ``scene`` names the scene, ``spp`` are the samples per pixel of its inputs, ``frame`` is its number in a
-    shot, from 0, None for a single image.
+    ``spp`` are the samples per pixel of its inputs, ``frame`` its number in a shot, from 0, None for a single image.
     """
 
     shard: Shard
@@ -110,8 +109,7 @@ class Dataset:
     """The crops of a training set, in the order of its manifest.
 
     Opens the manifest only; a shard is checked when one of its crops is read, and anew in each process that an instance
-    is sent to. Raises NgptError with the file and what is wrong with it: shards that are
-    missing, are not those that the manifest tells the checksum of, or hold other tensors.
+    is sent to. Raises NgptError for shards that are missing, are other ones than the manifest's, or hold other tensors.
     """
 
     def __init__(self, folder: str | Path):
@@ -236,16 +234,10 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
     inputs, height, width = shape[1:4]
     if pairs and not (inputs == 2 and gradients):
         raise NgptError(f"{path}: has no references, so its crops must be pairs: 2 inputs with gradients, not {inputs}")
+    shapes: dict[str, tuple[int, ...]] = {name: (inputs, height, width, c) for name, c in shards.OF_INPUTS.items()}
+    shapes |= {"spp": (inputs,), shards.REFERENCE_HALVES: (2, height, width, 3), shards.MOTION: (height, width, 2)}
     for name in names:
-        expected: tuple[int, ...] = (len(crops), height, width, 3)
-        if name == "spp":
-            expected = (len(crops), inputs)
-        elif name in shards.OF_INPUTS:
-            expected = (len(crops), inputs, height, width, shards.OF_INPUTS[name])
-        elif name == shards.REFERENCE_HALVES:
-            expected = (len(crops), 2, height, width, 3)
-        elif name == shards.MOTION:
-            expected = (len(crops), height, width, 2)
+        expected = (len(crops), *shapes.get(name, (height, width, 3)))
         if shard.shape(name) != expected:
             raise NgptError(f"{path}: tensor '{name}' is {shard.shape(name)}, it must be {expected}")
         if shard.type(name) not in (("I32",) if name == "spp" else ("F16", "F32")):

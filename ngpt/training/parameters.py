@@ -17,7 +17,7 @@ from ngpt.system.records import described
 from ngpt.system.templates import entries, template, toml
 from ngpt.training import settings
 from ngpt.training.augment import Augmentation
-from ngpt.training.cost import counted, network_of
+from ngpt.training.cost import network_of, per_pixel
 from ngpt.training.loss import TERMS, LossSettings
 
 # The tables of a configuration and what reads them; "" is its top.
@@ -74,7 +74,7 @@ def configuration_table() -> str:
 def configuration_row(name: str) -> str:
     path = configs.find_config(name, configs.TRAINING)
     model, channels = network_of(settings.read_settings(path))
-    cost, _ = counted(model, channels)
+    cost, _ = per_pixel(model, channels)
     return f"| `{name}` | {purpose(path.read_text())} | {parameters(model):,} | {cost / 1e3:.0f} |"
 
 

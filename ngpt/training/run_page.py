@@ -236,12 +236,11 @@ def _style(runs: list[Run]) -> str:
                 f"aspect-ratio: {3 * width} / {height}; }}"
             )
             count = len(told["views"])
-            rules += [f".{_key(run)}.row{i} {{ background-position-y: {_share(i, count)}%; }}" for i in range(count)]
+            rules += [
+                f".{_key(run)}.row{i} {{ background-position-y: {round(100 * i / max(count - 1, 1), 4)}%; }}"
+                for i in range(count)
+            ]
     return "\n".join(rules)
-
-
-def _share(row: int, count: int) -> float:
-    return round(100 * row / max(count - 1, 1), 4)
 
 
 def _settings(title: str, rows: list[list[str]]) -> str:
