@@ -25,6 +25,7 @@ from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.stack import GradientStack
 from ngpt.system.files import atomic_output
+from ngpt.system.writing import markdown_table
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "gallery.md"
@@ -107,10 +108,8 @@ def images(args: argparse.Namespace, row: Shown) -> tuple[list[np.ndarray], dict
     start = time.process_time()
     result = ngpt.reconstruct(stack)
     seconds = float(stack.attributes["gallery:seconds"]) + time.process_time() - start
-    halves = [
-        rendered(args, row, row.reference, row.reference_spp, REFERENCE_SEED + i, unbiased=True)["primal"]
-        for i in (0, 1)
-    ]
+    reference = (args, row, row.reference, row.reference_spp)
+    halves = [rendered(*reference, REFERENCE_SEED + i, unbiased=True)["primal"] for i in (0, 1)]
     facts = {
         "options": options(row),
         "sampler": stack.attributes["ngpt:sampler"],
@@ -141,15 +140,13 @@ def rendered(args: argparse.Namespace, row: Shown, sampler: str, spp: int, seed:
 
 
 def table(found: dict[str, Any]) -> str:
-    lines = [
-        "| scene | options | sampler, method | seconds | error, noisy | result | by `oidn` | light |",
-        "|---|---|---|--:|--:|--:|--:|--:|",
-    ]
+    heads = ["scene", "options", "sampler, method", "seconds", "error, noisy", "result", "by `oidn`", "light"]
+    rows = []
     for name, row in found["rows"].items():
-        how = f"`{row['sampler']}`, `{row['method']}` | {row['CPU seconds']:.0f}"
-        errors = " | ".join(f"{row[key]:.4f}" for key in ("noisy", "result", "oidn"))
-        lines.append(f"| [{name}](#{name}) | `{row['options']}` | {how} | {errors} | {row['light']:.2f} |")
-    return "\n".join(lines)
+        how = [f"`{row['sampler']}`, `{row['method']}`", f"{row['CPU seconds']:.0f}"]
+        errors = [f"{row[key]:.4f}" for key in ("noisy", "result", "oidn")]
+        rows.append([f"[{name}](#{name})", f"`{row['options']}`", *how, *errors, f"{row['light']:.2f}"])
+    return "\n".join(markdown_table(heads, rows, 3))
 
 
 def write_wipe(path: Path, before: np.ndarray, after: np.ndarray) -> None:

@@ -22,16 +22,12 @@ class Tensor(Protocol):
 
 
 class Bitmap(Protocol):
-    """An ``mi.Bitmap``."""
-
     def pixel_format(self) -> Any: ...
 
     def component_format(self) -> Any: ...
 
 
 class Transform(Protocol):
-    """A transform of Mitsuba."""
-
     @property
     def matrix(self) -> Any: ...
 

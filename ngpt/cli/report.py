@@ -119,7 +119,6 @@ def images_or_shots(args: argparse.Namespace, target: Path, console: Console) ->
 
 
 def run_trainings(args: argparse.Namespace, target: Path, console: Console) -> int:
-    """Folders of training runs: the page of one, or a comparison of several."""
     if args.ref:
         raise WrongUse("--ref is for images; leave it out for training runs")
     names = [Path(name).as_posix() for name in labels(args.images)]

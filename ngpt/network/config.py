@@ -115,7 +115,6 @@ class ModelConfig:
         return "dx" in self.needs
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields as TOML and JSON have them."""
         return asdict(self)
 
 
