@@ -85,15 +85,7 @@ def renderer() -> tuple[Callable[..., Any], Callable[..., GradientStack]]:
     return load_scene, render_stack
 
 
-def rendered(
-    folder: Path,
-    size: Sequence[int],
-    scene: str,
-    spp: int,
-    sampler: str,
-    seed: int,
-    names: dict[str, str] | None = None,
-) -> GradientStack:
+def rendered(folder: Path, size: Sequence[int], scene: str, spp: int, sampler: str, seed: int) -> GradientStack:
     """A stack of a scene, from the folder if it is there."""
 
     def make() -> GradientStack:
@@ -101,4 +93,4 @@ def rendered(
         return render_stack(load_scene(scene, (width, height)), spp, seed, sampler)
 
     width, height = size
-    return kept(folder / f"{scene_name(scene)}-{sampler}-{spp}-{seed}-{width}x{height}.exr", make, names)
+    return kept(folder / f"{scene_name(scene)}-{sampler}-{spp}-{seed}-{width}x{height}.exr", make)
