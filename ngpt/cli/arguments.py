@@ -161,14 +161,14 @@ def duration(text: str) -> float:
     return number(text, lambda seconds: 0 < seconds < math.inf, "is not a positive number of seconds")
 
 
-def number(text: str, fits: Callable[[float], bool], else_it: str) -> float:
-    """A number that ``fits``, which NaN does nowhere; what a text ``else_it`` is goes into the error."""
+def number(text: str, fits: Callable[[float], bool], refusal: str) -> float:
+    """The number in a text. Texts without one, and numbers that do not fit, are an error that ends in ``refusal``."""
     try:
         found = float(text)
     except ValueError:
         found = math.nan
     if not fits(found):
-        raise argparse.ArgumentTypeError(f"'{text}' {else_it}")
+        raise argparse.ArgumentTypeError(f"'{text}' {refusal}")
     return found
 
 

@@ -196,7 +196,7 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
 def finish(
     args: argparse.Namespace, target: Path, title: str, scenes: list[Scene], about: Overview, console: Console
 ) -> int:
-    """Writes the page, which plays what are frames of folders, and says how to see it."""
+    """Writes the page of images, or of a shot, whose frames it plays, and says how to see it."""
     facts, shot = {"ngpt": __version__}, any(is_shot(path) for path in args.images)
     write_report(
         target, title, scenes, command=args.command, footer=facts, overview=about, overwrite=args.force, shot=shot
