@@ -26,7 +26,7 @@ from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS, choose, reconstruct
 from ngpt.repair import variance_of_primal
 from ngpt.stack import GradientStack
-from ngpt.system.writing import write_json
+from ngpt.system.writing import markdown_table, write_json
 
 TABLE = Path(__file__).parents[1] / "ngpt" / "measure" / "layers.json"
 SPP, SIZE, REFERENCE_SPP = (4, 16, 64), (192, 108), 2048
@@ -172,14 +172,9 @@ def measured(files: Sequence[tuple[GradientStack, np.ndarray]], oidn: bool) -> t
 
 
 def by_layers(rows: list[dict]) -> str:
-    lines = [
-        f"| layers that it takes | method | {' | '.join(f'{n} spp' for n in SPP)} |",
-        "|---|---|" + "--:|" * len(SPP),
-    ]
-    for row in rows:
-        cells = " | ".join(f"{error:.4f}" for error in row["error"])
-        lines.append(f"| {', '.join(row['layers'])} | `{row['method']}` | {cells} |")
-    return "\n".join(lines)
+    heads = ["layers that it takes", "method", *(f"{n} spp" for n in SPP)]
+    cells = ([", ".join(r["layers"]), f"`{r['method']}`", *(f"{e:.4f}" for e in r["error"])] for r in rows)
+    return "\n".join(markdown_table(heads, cells, 2))
 
 
 def by_renderer(rows: list[Row]) -> str:

@@ -185,7 +185,7 @@ def by_scene(size: Size) -> str:
     return "\n".join(lines)
 
 
-def worth(sizes: list[Size], *only: str) -> str:
+def worth(sizes: list[Size]) -> str:
     """W/C of the best pipelines, a line for each group and size."""
     counts = sorted({n for size in sizes for n in size.counts})
     lines = heading("W / C, geometric means", "C", *(f"{n} spp" for n in counts))
@@ -194,9 +194,8 @@ def worth(sizes: list[Size], *only: str) -> str:
         for group in (group for group in dict.fromkeys(group for group, _ in rows) if group in size.groups):
             here = {n: rows.get((group, n)) for n in counts}
             first = next(row for row in here.values() if row)
-            if not only or group in only:
-                cells = [marked(first, "C"), *(marked(here[n], "W/C") for n in counts)]
-                lines.append(f"| {group} ({first['scenes']}), {size.name} | {' | '.join(cells)} |")
+            cells = [marked(first, "C"), *(marked(here[n], "W/C") for n in counts)]
+            lines.append(f"| {group} ({first['scenes']}), {size.name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -239,13 +238,9 @@ def better(sizes: list[Size]) -> str:
                 key: [min(row[key] for row in rows if row and row[key]) for rows in found if any(rows)]
                 for key in ("error", "FLIP")
             }
-            known = least["error"] and least["FLIP"]
-            text = (
-                f"{mean(least['error']):.2f} ({max(least['error']):.2f}), FLIP {mean(least['FLIP']):.2f}"
-                if known
-                else ""
-            )
-            cells.append(text)
+            error, flips = least["error"], least["FLIP"]
+            known = error and flips
+            cells.append(f"{mean(error):.2f} ({max(error):.2f}), FLIP {mean(flips):.2f}" if known else "")
         if cells:
             lines.append(f"| {group} ({len(scenes)}) | {' | '.join(cells)} |")
     return "\n".join(lines)

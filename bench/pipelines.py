@@ -3,19 +3,15 @@
     python -m bench.pipelines --scenes diffuse glossy SCENE.xml ... [--apart SCENE.xml ...] [--size 64 36]
     python -m bench.pipelines --table        print what the file says, with the rules as they are now
 
-All samplers take turns: each renders four parts with fixed numbers of samples, chosen so that a part takes about as
-long as 64 samples of the first sampler. The cost of a sample relative to the first sampler is the median of the ratios
-of the parts, in processor seconds on all cores together, so other work on the machine has little effect. Errors
-(trimmed relMSE against two halves of a reference) are measured for each method on a few samples, on one part and on all
-four, with even and with adaptive samples. The methods are timed in the same turns. Stacks are kept in --cache, so an
-interrupted benchmark can continue, and rules can be evaluated again without a render.
+All samplers take turns: each renders four parts that take about as long as 64 samples of the first sampler. The cost of
+a sample relative to the first sampler is the median of the ratios of the parts, in processor seconds. Errors (trimmed
+relMSE against two halves of a reference) are measured for each method on a few samples, on one part and on all four,
+with even and with adaptive samples. Stacks are kept in --cache.
 
 The pilot (data_gen/choosing/pipelines.py) gets none of these measurements. The equal times are the time of 16, 64 and
-256 samples of the first sampler plus the time of the slowest method, so that every pipeline fits into each of them. The
-error at the number of samples that a pipeline has time for is interpolated between the measured ones, linearly in the
-logarithms. Regret is the error of the pilot's choice over the least error of all.
-
-Scenes ``--apart`` must not influence any choice.
+256 samples of the first sampler plus the time of the slowest method. The error at the number of samples that a pipeline
+has time for is interpolated between the measured ones, in the logarithms. Regret is the error of the pilot's choice
+over the least error of all. Scenes ``--apart`` must not influence any choice.
 """
 
 import argparse
@@ -55,10 +51,6 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="print the tables of the file, and measure nothing")
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/pipelines.json"))
     args = parser.parse_args()
-
-    from data_gen.backend import use_variant
-
-    use_variant()
     result: dict = {"benchmark": "pipelines", "size": list(args.size), "metadata": metadata("mitsuba"), "scenes": {}}
     if args.output.exists():
         result["scenes"] = json.loads(args.output.read_text())["scenes"]
@@ -89,12 +81,11 @@ class Kept:
 
 def bench_scene(path: str, args: argparse.Namespace) -> dict:
     """What the pilot saw, and what is true: rows of sampler, method, shared -> errors by samples."""
+    load_scene, render_stack = common.renderer()
     from data_gen.adaptive import LEAST, Adaptive
     from data_gen.choosing import pipelines
     from data_gen.choosing.trials import candidates, noise_of
-    from data_gen.render import render_stack
     from data_gen.samplers import SAMPLERS
-    from data_gen.scenes.load import load_scene
 
     scene = load_scene(path, tuple(args.size))
     kept = Kept(args.cache / "{}-{}x{}".format(scene_name(path), *args.size))

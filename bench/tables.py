@@ -110,7 +110,6 @@ def main() -> None:
 
 
 def table(name: str) -> str:
-    """The table as its page has it."""
     return PAGES[name][1](json.loads((RESULTS / f"{name}.json").read_text()))
 
 

@@ -11,7 +11,8 @@ from ngpt.cli.arguments import add_config, config_of, write_template
 from ngpt.errors import NgptError, WrongUse
 from ngpt.system import configs
 from ngpt.system.console import Console
-from ngpt.system.files import atomic_output, exclusive, make_folder
+from ngpt.system.files import exclusive, make_folder
+from ngpt.system.writing import write_text
 from ngpt.training.run_summary import SETTINGS, WEIGHTS
 
 
@@ -64,8 +65,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
             else:
                 say(f"continuing {out} at step {trainer.step} of {settings.run.steps}")
         if processes.rank == 0:
-            with atomic_output(out / SETTINGS, overwrite=True) as temporary:
-                temporary.write_text(json.dumps(settings.to_dict(), indent=2) + "\n")
+            write_text(out / SETTINGS, json.dumps(settings.to_dict(), indent=2) + "\n")
             write_record(out, settings, config, trainer.model, trainer.device)
         # With several processes, one reports for all.
         listener = console if processes.rank == 0 else Console(quiet=True)

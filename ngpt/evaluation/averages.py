@@ -8,7 +8,6 @@ import numpy as np
 
 
 def summary(values: list[float]) -> dict[str, float]:
-    """Median and quartiles."""
     low, median, high = statistics.quantiles(values, n=4, method="inclusive") if len(values) > 1 else values * 3
     return {"median": median, "low": low, "high": high}
 

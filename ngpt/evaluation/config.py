@@ -1,7 +1,5 @@
 """The configuration of an evaluation: a TOML file, checked before any work starts."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, field
 from glob import glob, has_magic
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The evaluation itself: scenes x samples x methods x seeds, cell by cell, and the folder of results."""
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -50,12 +48,8 @@ def evaluate(
         "metadata": metadata(*PACKAGES),
         "settings": config.to_dict(),
         "metrics": {
-            name: {
-                "formula": METRICS[name].formula,
-                "better": METRICS[name].better,
-                "squared": METRICS[name].squared,
-                "absent": scorer.absent_metrics.get(name),
-            }
+            name: {key: getattr(METRICS[name], key) for key in ("formula", "better", "squared")}
+            | {"absent": scorer.absent_metrics.get(name)}
             for name in config.metrics
         },
         "primary": config.primary,
@@ -88,15 +82,8 @@ def evaluate(
                 progress(done + n, total)
 
             try:
-                _scene(
-                    SceneStacks(name, source, config, cache, renderer, say=console.say),
-                    columns,
-                    lacks,
-                    scorer,
-                    results,
-                    out,
-                    advance,
-                )
+                stacks = SceneStacks(name, source, config, cache, renderer, say=console.say)
+                _scene(stacks, columns, lacks, scorer, results, out, advance)
             except NgptError as error:
                 console.error(f"{name}: {error}")
                 results["scenes"].setdefault(name, {"file": source})["absent"] = str(error)

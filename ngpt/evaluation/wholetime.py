@@ -6,10 +6,6 @@ has the least error of all its settings, and the least FLIP, whichever setting t
 A setting counts from its quickest cell on, unless no setting was measured in so little time.
 """
 
-from __future__ import annotations
-
-import csv
-import io
 import math
 from typing import Any
 
@@ -134,16 +130,6 @@ def envelope(results: dict[str, Any], rival: str, scenes: list[str]) -> list[tup
         (mean([seconds for seconds, _ in column], True), mean([least[0] for _, least in column if least], True))
         for column in zip(*parts, strict=True)
     ]
-
-
-def as_csv(against: dict[str, Any]) -> str:
-    """One line for each row."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(FIELDS)
-    for row in against["rows"]:
-        writer.writerow(["" if row[name] is None else row[name] for name in FIELDS])
-    return text.getvalue()
 
 
 def against_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:

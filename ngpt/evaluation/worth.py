@@ -7,15 +7,10 @@
     W       m / n: how many times more samples that pipeline needs
     C       the seconds of a further sample with gradients over the seconds of a further sample of that pipeline
 
-W / C is more than W over C where a rival's reconstruction takes longer, and less where ours does. T' and m are read off
-curves of errors (``ngpt.evaluation.curves``, which explains the marks; W has the mark of W / C). C compares the renders
-with the least and the most samples, so that what a render takes to begin is no part of it.
+T' and m are read off curves of errors (``ngpt.evaluation.curves``, which explains the marks; W has the mark of W / C).
+C compares the renders with the least and the most samples, so that what a render takes to begin is no part of it.
 """
 
-from __future__ import annotations
-
-import csv
-import io
 from collections.abc import Sequence
 from typing import Any
 
@@ -115,16 +110,6 @@ def _means(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str
                     entry[key] = mean(values, geometric=True) if len(values) == len(here) else None
                 means.append(entry | {"mark": joined(row["mark"] for row in here)})
     return means
-
-
-def as_csv(worth: dict[str, Any]) -> str:
-    """One line for each row."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(FIELDS)
-    for row in worth["rows"]:
-        writer.writerow(["" if row.get(name) is None else row[name] for name in FIELDS])
-    return text.getvalue()
 
 
 def worth_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:

@@ -80,11 +80,9 @@ def bytes_per_pixel(model: Reconstructor) -> int:
     """The most memory that a run takes for each pixel, beside the image's layers; measured in
     tests/network/test_run_onnx.py.
 
-    The last convolution reads the longest list of tensors there is; it exists as the list, as one tensor, and about
-    once more in units that are at work. The channels exist raw, cleaned, scaled, encoded, padded, and as one tensor.
-    When these are gone, the head has the prediction, cropped, as weights, and once more. ONNX Runtime's arena, without
-    which a run takes twice as long, gets half as much again and more: most where sizes are halved and doubled without
-    weights, since more tensors of as many lengths are at work then.
+    The last convolution reads the longest list of tensors; it exists as the list, as one tensor, and about once more.
+    The channels exist six times, from raw to one tensor; then the head has the prediction, in three forms. The arena of
+    ONNX Runtime gets half as much again and more, most where sizes are halved and doubled without weights.
     """
     listed = next(model.network.head.parameters()).shape[1]
     body = 3 * listed + 6 * features.channels(model.config.inputs)

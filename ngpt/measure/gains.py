@@ -4,8 +4,6 @@ The errors are measured (layers.json, by ``python -m bench.layers``; docs/lab/RE
 means of the trimmed relMSE over the four built-in scenes, of stacks of the same samples with fewer or more layers.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Collection, Container, Iterator
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ What a network says of a pixel depends on pixels as far as its reach. So a piece
 it is for, and begins at multiples of the network's alignment: where an image is cut does not change the result.
 """
 
-from __future__ import annotations
-
 from itertools import product
 
 # The pieces of one side: the pixels that each piece is for, and where it begins; and the length of all pieces.

@@ -17,8 +17,6 @@ iterations have lowered the variance of a pixel, and smoothed variances (``ngpt.
 In bytes per pixel and frame, beyond the input: 190 in single precision. Time: see docs/use/shots.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
