@@ -74,11 +74,11 @@ def kept(path: Path, make: Callable[[], GradientStack], names: dict[str, str] | 
     return ngpt.read(path, names)
 
 
-def renderer() -> tuple[Callable[..., Any], Callable[..., GradientStack]]:
+def renderer(variant: str | None = None) -> tuple[Callable[..., Any], Callable[..., GradientStack]]:
     """``load_scene`` and ``render_stack``, with Mitsuba's variant set; Mitsuba is loaded only here."""
     from data_gen.backend import use_variant
 
-    use_variant()
+    use_variant(variant)
     from data_gen.render import render_stack
     from data_gen.scenes.load import load_scene
 
