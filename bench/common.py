@@ -76,9 +76,9 @@ def kept(path: Path, make: Callable[[], GradientStack], names: dict[str, str] | 
 
 def renderer(variant: str | None = None) -> tuple[Callable[..., Any], Callable[..., GradientStack]]:
     """``load_scene`` and ``render_stack``, with Mitsuba's variant set; Mitsuba is loaded only here."""
-    from data_gen.backend import use_variant
+    from data_gen.backend import DEFAULT_VARIANT, use_variant
 
-    use_variant(variant)
+    use_variant(variant or DEFAULT_VARIANT)
     from data_gen.render import render_stack
     from data_gen.scenes.load import load_scene
 
