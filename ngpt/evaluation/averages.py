@@ -18,11 +18,14 @@ def median(values: Iterable[float | None]) -> float | None:
     return float(np.median(known)) if known else None
 
 
+def geometric_mean(values: Iterable[float]) -> float:
+    """Values of 0 or less count as 1e-30."""
+    return float(np.exp(np.mean(np.log(np.maximum(list(values), 1e-30)))))
+
+
 def mean(values: Sequence[float], geometric: bool) -> float:
-    """Arithmetic, or geometric with 0 taken for 1e-30."""
-    if not geometric:
-        return float(np.mean(values))
-    return float(np.exp(np.mean(np.log(np.maximum(values, 1e-30)))))
+    """Arithmetic or geometric."""
+    return geometric_mean(values) if geometric else float(np.mean(values))
 
 
 def groups_of(results: dict[str, Any], scenes: Iterable[str]) -> dict[str, list[str]]:

@@ -14,7 +14,7 @@ C compares the renders with the least and the most samples, so that what a rende
 from collections.abc import Sequence
 from typing import Any
 
-from ngpt.evaluation.averages import groups_of, mean, median
+from ngpt.evaluation.averages import geometric_mean, groups_of, median
 from ngpt.evaluation.curves import first_at, joined
 
 FIELDS = (
@@ -107,7 +107,7 @@ def _means(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str
                 entry: dict[str, Any] = {"group": group, "spp": spp, "method": method, "scenes": len(here)}
                 for key in ("W", "C", "W/C"):
                     values = [row[key] for row in here if row[key] is not None]
-                    entry[key] = mean(values, geometric=True) if len(values) == len(here) else None
+                    entry[key] = geometric_mean(values) if len(values) == len(here) else None
                 means.append(entry | {"mark": joined(row["mark"] for row in here)})
     return means
 
