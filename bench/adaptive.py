@@ -23,8 +23,8 @@ from pathlib import Path
 
 from bench.common import measure, metadata, renderer, save
 from bench.pipelines import Kept
-from ngpt.evaluation.averages import geometric_mean
 from ngpt.evaluation.config import scene_name
+from ngpt.measure.averages import geometric_mean
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS, reconstruct
 from ngpt.stack import GradientStack

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 import ngpt
-from ngpt.evaluation.averages import summary
 from ngpt.evaluation.config import scene_name
+from ngpt.measure.averages import summary
 from ngpt.stack import GradientStack
 from ngpt.system import machine
 from ngpt.system.writing import write_json

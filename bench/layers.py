@@ -18,10 +18,10 @@ import numpy as np
 
 import ngpt
 from bench.common import metadata, rendered
-from ngpt.evaluation.averages import geometric_mean
 from ngpt.evaluation.config import scene_name
 from ngpt.io.exr import read
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
+from ngpt.measure.averages import geometric_mean
 from ngpt.measure.gains import NEED_OIDN, cases
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS, choose, reconstruct

@@ -19,10 +19,10 @@ from typing import Any
 
 from bench.common import save, write_page
 from bench.tables import RIVALS, heading
-from ngpt.evaluation.averages import geometric_mean
 from ngpt.evaluation.curves import error_at
 from ngpt.evaluation.wholetime import ratio
 from ngpt.evaluation.worth import marked
+from ngpt.measure.averages import geometric_mean
 
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "bench" / "results" / "main.json"

@@ -25,8 +25,8 @@ from pathlib import Path
 
 from bench import common
 from bench.common import metadata, save
-from ngpt.evaluation.averages import geometric_mean
 from ngpt.evaluation.config import scene_name
+from ngpt.measure.averages import geometric_mean
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.merging import merge
 from ngpt.methods import reconstruct

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.common import save, write_page
-from ngpt.evaluation.averages import geometric_mean
+from ngpt.measure.averages import geometric_mean
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "bench" / "results"

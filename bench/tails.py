@@ -30,11 +30,11 @@ import numpy as np
 
 import ngpt
 from bench.common import blocks, metadata, renderer, save
-from ngpt.evaluation.averages import geometric_mean, median
 from ngpt.evaluation.config import scene_name
 from ngpt.evaluation.curves import error_at, joined
 from ngpt.evaluation.references import HALVES, Reference, read_reference
 from ngpt.evaluation.worth import worth_of_gradients, worth_tables
+from ngpt.measure.averages import geometric_mean, median
 from ngpt.measure.metrics import EPSILON, relmse_trimmed, scores, squared_error, trimmed_mean
 
 RAW = "raw"

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ngpt.evaluation.averages import geometric_mean, groups_of, mean, median, summary
+from ngpt.evaluation.config import groups_of
 from ngpt.evaluation.frontier import Point, draw, pareto
 from ngpt.evaluation.tables import tables, worth_page
 from ngpt.evaluation.wholetime import FIELDS as RIVAL_FIELDS
@@ -12,6 +12,7 @@ from ngpt.evaluation.wholetime import against_rivals, against_tables, envelope
 from ngpt.evaluation.worth import FIELDS as WORTH_FIELDS
 from ngpt.evaluation.worth import worth_of_gradients, worth_tables
 from ngpt.evaluation.worthplots import draw_worth, write_map
+from ngpt.measure.averages import geometric_mean, mean, median, summary
 from ngpt.system.writing import csv_text, write_json, write_text
 
 _SECONDS = ("render", "reconstruct", "total", "reconstruct wall")

@@ -9,8 +9,9 @@ A setting counts from its quickest cell on, unless no setting was measured in so
 import math
 from typing import Any
 
-from ngpt.evaluation.averages import geometric_mean, groups_of
+from ngpt.evaluation.config import groups_of
 from ngpt.evaluation.curves import Points, error_at, joined
+from ngpt.measure.averages import geometric_mean
 
 FIELDS = ("scene", "spp", "method", "seconds", "rival", "setting", "error", "mark", "FLIP", "FLIP mark")
 FLIP = "FLIP"

@@ -14,8 +14,9 @@ C compares the renders with the least and the most samples, so that what a rende
 from collections.abc import Sequence
 from typing import Any
 
-from ngpt.evaluation.averages import geometric_mean, groups_of, median
+from ngpt.evaluation.config import groups_of
 from ngpt.evaluation.curves import first_at, joined
+from ngpt.measure.averages import geometric_mean, median
 
 FIELDS = (
     *("scene", "spp", "method", "sampler", "best", "error", "seconds", "rival", "rival seconds", "rival samples"),

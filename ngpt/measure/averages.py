@@ -2,7 +2,6 @@
 
 import statistics
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -26,10 +25,3 @@ def geometric_mean(values: Iterable[float]) -> float:
 def mean(values: Sequence[float], geometric: bool) -> float:
     """Arithmetic or geometric."""
     return geometric_mean(values) if geometric else float(np.mean(values))
-
-
-def groups_of(results: dict[str, Any], scenes: Iterable[str]) -> dict[str, list[str]]:
-    """The ``scenes`` of each group of the configuration, and all of them as "all" if they are several."""
-    found = list(dict.fromkeys(scenes))
-    groups = {name: [s for s in found if s in listed] for name, listed in results["settings"]["groups"].items()}
-    return groups | ({"all": found} if len(found) > 1 else {})
