@@ -103,7 +103,7 @@ def test_the_pareto_set():
 def test_benchmarks_have_the_same_averages():
     """An error of 0 has no logarithm, and no quartile lies beyond what was measured."""
     assert geometric_mean(iter([1.0, 4.0])) == pytest.approx(2) and geometric_mean([0.0, 1.0]) == pytest.approx(1e-15)
-    clock = iter([0.0, 9.0, 10.0, 11.0, 20.0, 22.0]).__next__
+    clock = iter([0.0, 9.0, 10.0, 11.0, 13.0]).__next__
     assert measure({"a": lambda: None}, 2, clock) == {"a": {"median": 1.5, "low": 1.25, "high": 1.75}}
 
 
