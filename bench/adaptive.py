@@ -21,9 +21,10 @@ import statistics
 import time
 from pathlib import Path
 
-from bench.common import mean, measure, metadata, renderer, save
+from bench.common import measure, metadata, renderer, save
 from bench.pipelines import Kept
 from ngpt.evaluation.config import scene_name
+from ngpt.measure.averages import geometric_mean
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS, reconstruct
 from ngpt.stack import GradientStack
@@ -126,13 +127,13 @@ def table(result: dict) -> str:
             for m in methods:
                 row = entry["methods"].get(m, {"expected": {}})
                 if "even" in row:
-                    found[m].append(mean(row["adaptive"]) / mean(row["even"]))
+                    found[m].append(geometric_mean(row["adaptive"]) / geometric_mean(row["even"]))
                 ratios.append(f"{found[m][-1]:.2f}" if "even" in row else "")
-                over = (math.sqrt(mean(e) / mean(row[name])) for name, e in row["expected"].items())
+                over = (math.sqrt(geometric_mean(e) / geometric_mean(row[name])) for name, e in row["expected"].items())
                 told.append(", ".join(f"{ratio:.2f}" for ratio in over))
             lines.append(f"| {scene} | " + " | ".join(ratios) + " |")
             foretold.append(f"| {scene} | " + " | ".join(told) + " |")
-        lines.append("| mean | " + " | ".join(f"{mean(found[m]):.2f}" for m in methods) + " |")
+        lines.append("| mean | " + " | ".join(f"{geometric_mean(found[m]):.2f}" for m in methods) + " |")
         lines.append("| seconds over even | " + " | ".join(price(result["costs"], m) for m in methods) + " |")
         parts += ["\n".join(lines), "\n".join(foretold)]
     return "\n\n".join(parts)

@@ -1,9 +1,7 @@
-"""What benchmarks share: versions, medians and spread, by which a result can be judged later; renders that are kept."""
+"""What benchmarks share: times and versions, by which a result can be judged later; renders that are kept."""
 
-import math
-import statistics
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -11,8 +9,8 @@ from typing import Any
 import numpy as np
 
 import ngpt
-from ngpt.evaluation.averages import summary
 from ngpt.evaluation.config import scene_name
+from ngpt.measure.averages import summary
 from ngpt.stack import GradientStack
 from ngpt.system import machine
 from ngpt.system.writing import write_json
@@ -51,11 +49,6 @@ def write_page(page: Path, text: str, marks: tuple[str, str]) -> None:
     before, _, rest = page.read_text().partition(marks[0])
     _, _, after = rest.partition(marks[1])
     page.write_text(f"{before}{marks[0]}\n\n{text}\n\n{marks[1]}{after}")
-
-
-def mean(values: Iterable[float]) -> float:
-    """The geometric one."""
-    return math.exp(statistics.mean(map(math.log, values)))
 
 
 def blocks(image: np.ndarray, side: int = 8) -> np.ndarray:

@@ -17,10 +17,11 @@ from pathlib import Path
 import numpy as np
 
 import ngpt
-from bench.common import mean, metadata, rendered
+from bench.common import metadata, rendered
 from ngpt.evaluation.config import scene_name
 from ngpt.io.exr import read
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
+from ngpt.measure.averages import geometric_mean
 from ngpt.measure.gains import NEED_OIDN, cases
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS, choose, reconstruct
@@ -113,7 +114,9 @@ def main() -> None:
 
 def error_of(scenes: Sequence[tuple[GradientStack, np.ndarray]], method: str, layers: Sequence[str]) -> float:
     """The geometric mean over (stack, reference) of what a method leaves of these layers."""
-    return mean(relmse_trimmed(reconstruct(part(stack, layers), method).image, truth) for stack, truth in scenes)
+    return geometric_mean(
+        relmse_trimmed(reconstruct(part(stack, layers), method).image, truth) for stack, truth in scenes
+    )
 
 
 def part(stack: GradientStack, layers: Sequence[str]) -> GradientStack:
@@ -165,7 +168,7 @@ def measured(files: Sequence[tuple[GradientStack, np.ndarray]], oidn: bool) -> t
 
     def error(method: str) -> float:
         images = (reconstruct(stack, method).image for stack, _ in files)
-        return mean(relmse_trimmed(image, truth) for image, (_, truth) in zip(images, files, strict=True))
+        return geometric_mean(relmse_trimmed(image, truth) for image, (_, truth) in zip(images, files, strict=True))
 
     method = choose(files[0][0], lambda name: not METHODS[name].missing() and (oidn or name not in NEED_OIDN))
     return method, error(method), error("oidn") if oidn else None, error("primal")

@@ -17,11 +17,12 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from bench.common import mean, save, write_page
+from bench.common import save, write_page
 from bench.tables import RIVALS, heading
 from ngpt.evaluation.curves import error_at
 from ngpt.evaluation.wholetime import ratio
 from ngpt.evaluation.worth import marked
+from ngpt.measure.averages import geometric_mean
 
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "bench" / "results" / "main.json"
@@ -220,7 +221,7 @@ def by_method(sizes: list[Size]) -> str:
             [c["seconds"]["reconstruct"] for (_, n, m), c in s.cells.items() if (n, m) == (s.counts[0], method)]
             for s in sizes
         ]
-        cells += [f"{mean(found):.2f}" if found else "" for found in times]
+        cells += [f"{geometric_mean(found):.2f}" if found else "" for found in times]
         lines.append(f"| `{method}` | {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -240,7 +241,9 @@ def better(sizes: list[Size]) -> str:
             }
             error, flips = least["error"], least["FLIP"]
             known = error and flips
-            cells.append(f"{mean(error):.2f} ({max(error):.2f}), FLIP {mean(flips):.2f}" if known else "")
+            cells.append(
+                f"{geometric_mean(error):.2f} ({max(error):.2f}), FLIP {geometric_mean(flips):.2f}" if known else ""
+            )
         if cells:
             lines.append(f"| {group} ({len(scenes)}) | {' | '.join(cells)} |")
     return "\n".join(lines)
@@ -262,7 +265,7 @@ def over_primal(sizes: list[Size]) -> str:
         cells = []
         for n in size.counts:
             found = [ratios[scene, n] for scene in size.members(group) if (scene, n) in ratios]
-            cells.append(f"{mean(found):.2f}" if found else "")
+            cells.append(f"{geometric_mean(found):.2f}" if found else "")
         lines.append(f"| {group} ({len(size.members(group))}) | {' | '.join(cells)} |")
     return "\n".join(lines)
 

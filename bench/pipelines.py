@@ -24,8 +24,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from bench import common
-from bench.common import mean, metadata, save
+from bench.common import metadata, save
 from ngpt.evaluation.config import scene_name
+from ngpt.measure.averages import geometric_mean
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.merging import merge
 from ngpt.methods import reconstruct
@@ -256,7 +257,7 @@ def promises(result: dict) -> list[str]:
     for (network, n), ratios in found.items():
         deciles = statistics.quantiles(ratios, n=10)
         ends = ", ".join(f"{deciles[i]:.2f}" for i in (0, 4, 8))
-        lines.append(f"{'networks' if network else 'others'} at {n}: {ends}; {mean(ratios):.2f} in the mean")
+        lines.append(f"{'networks' if network else 'others'} at {n}: {ends}; {geometric_mean(ratios):.2f} in the mean")
     return ["true error over what was expected", *lines]
 
 
@@ -283,11 +284,13 @@ def table(result: dict) -> list[str]:
             lines.append(f"| {scene} | {cell['spp']} | `{cell['choice']}` | {ratios[cell['choice']]:.2f} | `{least}` |")
     for apart, title in ((False, "chosen on"), (True, "apart")):
         if rows := regrets[apart]:
-            lines.append(f"{title}: {mean(rows):.3f} in the mean, {max(rows):.2f} at worst, {len(rows)} cells")
+            lines.append(
+                f"{title}: {geometric_mean(rows):.3f} in the mean, {max(rows):.2f} at worst, {len(rows)} cells"
+            )
             by_auto = autos[apart]
-            lines.append(f"  sampler auto, of samplers alone: {mean(by_auto):.3f}, {max(by_auto):.2f}")
+            lines.append(f"  sampler auto, of samplers alone: {geometric_mean(by_auto):.3f}, {max(by_auto):.2f}")
             whole_rows = {n: r for n, r in fixed[apart].items() if len(r) == len(rows)}
-            whole = {n: mean(r) for n, r in whole_rows.items()}
+            whole = {n: geometric_mean(r) for n, r in whole_rows.items()}
             for name in sorted(whole, key=lambda n: whole[n])[:8]:
                 ahead = sum(r < 0.98 * ours for r, ours in zip(whole_rows[name], rows, strict=True))
                 worst = max(whole_rows[name])

@@ -30,10 +30,10 @@ import numpy as np
 
 import ngpt
 from bench.common import kept, metadata, renderer, save
-from ngpt.evaluation.averages import summary
 from ngpt.evaluation.config import scene_name
 from ngpt.evaluation.gradientmap import variances_of_differences, write_map
 from ngpt.evaluation.references import reference_noise
+from ngpt.measure.averages import summary
 from ngpt.measure.metrics import compare
 from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.common import metadata, save
-from ngpt.evaluation.averages import summary
+from ngpt.measure.averages import summary
 
 WORKER = "--worker"
 # Row -> the method that runs, and the kind of stack that it runs on.

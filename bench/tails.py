@@ -30,11 +30,11 @@ import numpy as np
 
 import ngpt
 from bench.common import blocks, metadata, renderer, save
-from ngpt.evaluation.averages import mean, median
 from ngpt.evaluation.config import scene_name
 from ngpt.evaluation.curves import error_at, joined
 from ngpt.evaluation.references import HALVES, Reference, read_reference
 from ngpt.evaluation.worth import worth_of_gradients, worth_tables
+from ngpt.measure.averages import geometric_mean, median
 from ngpt.measure.metrics import EPSILON, relmse_trimmed, scores, squared_error, trimmed_mean
 
 RAW = "raw"
@@ -302,7 +302,7 @@ def over(values: list[tuple[float, str] | None]) -> str:
     known = [value for value in values if value]
     if len(known) < len(values):
         return "-"
-    return marked((mean([value for value, _ in known], geometric=True), joined(mark for _, mark in known)))
+    return marked((geometric_mean(value for value, _ in known), joined(mark for _, mark in known)))
 
 
 def table(head: list[str], lines: list[list[str]]) -> None:

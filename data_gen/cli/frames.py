@@ -7,7 +7,6 @@ from pathlib import Path
 from data_gen.frames.pattern import filled, varies
 from ngpt.cli.picture import IMAGES
 from ngpt.errors import WrongUse
-from ngpt.system.files import make_folder
 
 # More than anyone renders; a typing error must not fill the memory.
 _MOST = 1_000_000
@@ -45,7 +44,7 @@ def _of_a_farm(part: str) -> list[int]:
 
 
 def targets(output: str | None, scene: str, numbers: list[int]) -> dict[int, Path]:
-    """Frame -> file. ``output`` is a pattern (``shot.{frame:04d}.exr``), or a folder, which is made if it is not there.
+    """Frame -> file. ``output`` is a pattern (``shot.{frame:04d}.exr``), or a folder, which need not be there.
 
     Raises WrongUse for a name that is one file for several frames.
     """
@@ -58,12 +57,10 @@ def targets(output: str | None, scene: str, numbers: list[int]) -> dict[int, Pat
                 named = f"{folder.with_suffix('')}.{{frame:04d}}{folder.suffix}"
                 raise WrongUse(f"{folder}: is one file for {len(numbers)} frames; write -o '{named}', or a folder")
             return {numbers[0]: folder}
-        pattern = str(make_folder(folder) / f"{stem}.{{frame:04d}}.exr")
+        pattern = str(folder / f"{stem}.{{frame:04d}}.exr")
     found = {number: Path(filled(pattern, number)) for number in numbers}
     seen: dict[Path, int] = {}
     for number, path in found.items():
         if (other := seen.setdefault(path, number)) != number:
             raise WrongUse(f"{path}: would be frame {other} and frame {number}; write {{frame:04d}} in the name")
-    for path in found.values():
-        make_folder(path.parent)
     return found

@@ -57,11 +57,11 @@ class Remembering:
         Where the shot ``changes``, it is not the scene of the frame before, which must be as it was then.
         """
         start = time.perf_counter()
-        progress(0, self.spp)
         if self._sampler is None:
             if reason := self.entry.refuses(scene_facts(scene)):
                 raise NgptError(f"sampler '{self.entry.name}' cannot render this scene: {reason}; use --sampler gpt")
             self._sampler = self.entry.made(scene, self.seed, self.spp, self.memory, **self.options)
+        progress(0, self.spp)
         film = self._sampler.film(index, motion, depth, (scene, shapes) if self.changes else None)
         more = {"ngpt:confidence": self._sampler.confidence} | options_as_attribute(self.entry, self.options)
         stack = stack_of(

@@ -23,7 +23,7 @@ from ngpt.io.exr import read, read_views
 from ngpt.io.foreign.files import first_attributes
 from ngpt.io.frames import RESULT_SUFFIX, is_shot, remarks
 from ngpt.io.whole import finished
-from ngpt.methods import METHODS, by_standing, reconstruct
+from ngpt.methods import METHODS, by_standing, reconstruct, runnable
 from ngpt.network.identity import identify
 from ngpt.network.run_onnx import MEMORY
 from ngpt.options import as_text, settings, unusual
@@ -146,6 +146,15 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
             if given:
                 raise WrongUse(f"--temporal and {option} cannot be combined; leave one out")
+    options = {
+        name: value for name in ("alpha", "weights", "device", "memory") if (value := getattr(args, name)) is not None
+    }
+    options |= dict(args.option)
+    if args.method in METHODS:  # what no file could be denoised with
+        settings(f"method '{args.method}'", runnable(args.method).options, options)
+    if "weights" in options:
+        identify(options["weights"])
+    reference = Reference.read(args.ref, args.untrusted) if args.ref else None
     for _, target in pairs:
         if target.suffix.lower() != ".exr":
             check_picture(target, args)
@@ -153,11 +162,6 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
     # Their results are there, but later frames are made of them.
     missing = [i for i, (_, target) in enumerate(pairs) if not finished(target)] if args.temporal else []
     again = {target for _, target in pairs[: missing[-1]]} if missing else set()
-    reference = Reference.read(args.ref, args.untrusted) if args.ref else None
-    options = {
-        name: value for name in ("alpha", "weights", "device", "memory") if (value := getattr(args, name)) is not None
-    }
-    options |= dict(args.option)
     # One stack has no progress to tell, but somebody who looks on sees that it is at work.
     bar = console.progress("denoise", "frames") if len(pairs) > 1 or console.terminal else nullcontext(_unseen)
     overwrite = partial(

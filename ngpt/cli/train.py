@@ -33,6 +33,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     config = config_of(args, configs.TRAINING)
     # Here and not above: a mistyped option is said at once, not after the seconds that torch takes to come in.
     from ngpt.training.cost import cost
+    from ngpt.training.crops import open_crops
     from ngpt.training.distributed import Processes
     from ngpt.training.run_record import write_record
     from ngpt.training.run_summary import PAGE
@@ -51,6 +52,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
         return 0
     if not args.out:
         raise WrongUse("--out is missing: the folder for checkpoint, weights and log")
+    for folder in _on_disk(settings):
+        open_crops(folder)  # its errors come before anything is made
     out = make_folder(args.out)
     say = (lambda text: None) if console.quiet else show
     processes = Processes()
@@ -78,6 +81,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     return 0 if finished or not trainer.signal else 128 + trainer.signal
 
 
+def _on_disk(settings: Any) -> list[str]:
+    """The folders of training sets that are not rendered meanwhile."""
+    return [folder for folder in settings.data.folders if not folder.endswith(".toml")]
+
+
 def _task(settings: Any, out: Path, stack: ExitStack, processes: Any, say: Callable[[str], None]) -> Any:
     """What the settings say to train, on the data in their folders; ``stack`` closes those that are being rendered."""
     from ngpt.system.parts import find_renderer
@@ -89,7 +97,7 @@ def _task(settings: Any, out: Path, stack: ExitStack, processes: Any, say: Calla
     from ngpt.training.temporal import Blending
 
     loss = make_loss(settings.loss)
-    on_disk = [folder for folder in settings.data.folders if not folder.endswith(".toml")]
+    on_disk = _on_disk(settings)
     if settings.temporal:
         if processes.rank == 0:
             methods = ", ".join(settings.temporal.methods)

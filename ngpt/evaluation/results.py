@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ngpt.evaluation.averages import groups_of, mean, median, summary
+from ngpt.evaluation.config import groups_of
 from ngpt.evaluation.frontier import Point, draw, pareto
 from ngpt.evaluation.tables import tables, worth_page
 from ngpt.evaluation.wholetime import FIELDS as RIVAL_FIELDS
@@ -12,6 +12,7 @@ from ngpt.evaluation.wholetime import against_rivals, against_tables, envelope
 from ngpt.evaluation.worth import FIELDS as WORTH_FIELDS
 from ngpt.evaluation.worth import worth_of_gradients, worth_tables
 from ngpt.evaluation.worthplots import draw_worth, write_map
+from ngpt.measure.averages import geometric_mean, mean, median, summary
 from ngpt.system.writing import csv_text, write_json, write_text
 
 _SECONDS = ("render", "reconstruct", "total", "reconstruct wall")
@@ -69,8 +70,8 @@ def points_against(results: dict[str, Any], scenes: list[str]) -> list[Point]:
         for spp in results["settings"]["spp"]:
             here = [r for r in results["summary"] if (r["spp"], r["method"]) == (spp, method) and r["scene"] in scenes]
             if scenes and len(here) == len(scenes) and all(map(_is_drawn, here)):
-                seconds = mean([row["seconds"]["total"] for row in here], geometric=True)
-                error = mean([row["error"] for row in here], geometric=True)
+                seconds = geometric_mean(row["seconds"]["total"] for row in here)
+                error = geometric_mean(row["error"] for row in here)
                 points.append(Point(method, spp, seconds, error, method))
     return points
 
@@ -141,7 +142,7 @@ def summarised(results: dict[str, Any]) -> list[dict[str, Any]]:
                 times: dict[str, float | None] = {}
                 for key in _SECONDS:
                     known = [row["seconds"][key] for row in parts if row["seconds"][key] is not None]
-                    times[key] = mean(known, geometric=True) if len(known) == len(parts) else None
+                    times[key] = geometric_mean(known) if len(known) == len(parts) else None
                 rows.append(_row(results, None, spp, method, scores, times, min(row["seeds"] for row in parts)))
     for scene in {row["scene"] for row in rows}:
         timed = [row for row in rows if row["scene"] == scene and _is_drawn(row)]

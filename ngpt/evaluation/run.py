@@ -3,6 +3,7 @@
 import gc
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -134,12 +135,7 @@ def _scene(
                 continue
             render = renders[column.name]
             used = stacks.samples(render, spp, costs)
-
-            def load(render: Render = render, n: int = used, s: int = seed, held: dict = held) -> GradientStack:
-                if render.name not in held:
-                    held[render.name] = stacks.stack(render, n, s)
-                return held[render.name]
-
+            load = partial(_held, held, stacks, render, used, seed)
             image = picture_path(name, spp, column.name, seed) if wanted(config.images, seed) else None
             key = stacks.stack_key(render, used, seed)
             cell = scorer.cell(column, load, reference, key, out / image if image else None)
@@ -165,6 +161,15 @@ def _scene(
     # All at once: a scene that fails half-way is absent as a whole.
     results["scenes"][name] = entry
     results["cells"] += cells
+
+
+def _held(
+    held: dict[str, GradientStack], stacks: SceneStacks, render: Render, samples: int, seed: int
+) -> GradientStack:
+    """The stack of a render, which all columns share that take it."""
+    if render.name not in held:
+        held[render.name] = stacks.stack(render, samples, seed)
+    return held[render.name]
 
 
 def _seconds(render: float | None, reconstruct: dict[str, float], clock: str) -> dict[str, float | None]:

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from ngpt.errors import NgptError
-from ngpt.evaluation.averages import summary
 from ngpt.evaluation.config import Config
 from ngpt.evaluation.keys import scene_hash
 from ngpt.evaluation.references import HALVES, Reference, find_reference, read_reference
 from ngpt.evaluation.renders import DEFAULTS, Render
 from ngpt.io.exr import read, write
+from ngpt.measure.averages import summary
 from ngpt.renderer import Renderer
 from ngpt.stack import GradientStack
 from ngpt.system.files import save

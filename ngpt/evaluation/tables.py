@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from ngpt.evaluation.averages import mean
 from ngpt.evaluation.curves import REACH
 from ngpt.evaluation.renders import KINDS
+from ngpt.measure.averages import mean
 from ngpt.report.evaluation import several_samplers
 from ngpt.system.writing import markdown_table
 

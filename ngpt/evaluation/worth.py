@@ -14,8 +14,9 @@ C compares the renders with the least and the most samples, so that what a rende
 from collections.abc import Sequence
 from typing import Any
 
-from ngpt.evaluation.averages import groups_of, mean, median
+from ngpt.evaluation.config import groups_of
 from ngpt.evaluation.curves import first_at, joined
+from ngpt.measure.averages import geometric_mean, median
 
 FIELDS = (
     *("scene", "spp", "method", "sampler", "best", "error", "seconds", "rival", "rival seconds", "rival samples"),
@@ -107,7 +108,7 @@ def _means(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str
                 entry: dict[str, Any] = {"group": group, "spp": spp, "method": method, "scenes": len(here)}
                 for key in ("W", "C", "W/C"):
                     values = [row[key] for row in here if row[key] is not None]
-                    entry[key] = mean(values, geometric=True) if len(values) == len(here) else None
+                    entry[key] = geometric_mean(values) if len(values) == len(here) else None
                 means.append(entry | {"mark": joined(row["mark"] for row in here)})
     return means
 

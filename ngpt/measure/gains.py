@@ -12,9 +12,8 @@ from importlib.resources import files as package_files
 from itertools import combinations
 from typing import Any
 
-import numpy as np
-
 from ngpt.layers import LAYERS
+from ngpt.measure.averages import geometric_mean
 from ngpt.methods import METHODS, choose
 
 # Layers that a renderer gives together, and a package.
@@ -102,4 +101,4 @@ def _subsets(groups: Collection[tuple[str, ...]]) -> Iterator[tuple[tuple[str, .
 
 
 def _mean(gain: Gain) -> float:
-    return float(np.exp(np.mean(np.log(list(gain.error.values())))))
+    return geometric_mean(gain.error.values())

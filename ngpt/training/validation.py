@@ -10,6 +10,7 @@ import torch
 
 from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.image.png import encode_png
+from ngpt.measure.averages import geometric_mean
 from ngpt.measure.images import middle
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.network.inputs import base_image
@@ -95,5 +96,5 @@ def validate(
 
 
 def _mean(values: list[float]) -> float:
-    """The geometric mean, NaN of nothing; errors of 0 count as 1e-12."""
-    return float(np.exp(np.mean(np.log(np.maximum(values, 1e-12))))) if values else float("nan")
+    """The geometric mean, NaN of nothing."""
+    return geometric_mean(values) if values else float("nan")

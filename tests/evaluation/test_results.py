@@ -6,6 +6,7 @@ from bench.common import measure
 from ngpt.evaluation.frontier import Point, pareto
 from ngpt.evaluation.results import as_csv, summarised
 from ngpt.evaluation.tables import tables
+from ngpt.measure.averages import geometric_mean
 
 CLOCKS = ("render", "reconstruct", "total", "reconstruct wall")
 
@@ -97,6 +98,13 @@ def test_csv_has_a_line_for_each_cell():
 def test_the_pareto_set():
     points = [Point("a", 4, 1, 3), Point("a", 8, 2, 2), Point("b", 4, 2, 2.5), Point("b", 8, 3, 1), Point("c", 4, 3, 3)]
     assert pareto(points) == [True, True, False, True, False]
+
+
+def test_benchmarks_have_the_same_averages():
+    """An error of 0 has no logarithm, and no quartile lies beyond what was measured."""
+    assert geometric_mean(iter([1.0, 4.0])) == pytest.approx(2) and geometric_mean([0.0, 1.0]) == pytest.approx(1e-15)
+    clock = iter([0.0, 9.0, 10.0, 11.0, 13.0]).__next__
+    assert measure({"a": lambda: None}, 2, clock) == {"a": {"median": 1.5, "low": 1.25, "high": 1.75}}
 
 
 def test_a_mean_is_of_methods_that_are_on_all_scenes():

@@ -1,12 +1,12 @@
 """Networks in ONNX Runtime: tiles, memory, devices, and what is wrong with files."""
 
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from full_stack import full_layers, full_stack
+from processes import complete
 
 from ngpt.errors import NgptError
 from ngpt.methods import reconstruct
@@ -128,7 +128,7 @@ print(mebibytes("VmHWM") - before)
 def test_memory_stays_within_the_bound(program, most):
     """In a process of its own, by the largest size it ever had; the result is beside the bound of a network."""
     code = MEASURED.format(program=program.replace("FAST", repr(str(FAST))))
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    result = complete([sys.executable, "-c", code])
     assert result.returncode == 0, result.stderr
     assert float(result.stdout) <= most
 
