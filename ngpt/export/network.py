@@ -9,7 +9,7 @@ from pathlib import Path
 import onnx
 import torch
 
-from ngpt.classical.controlvariates import SWEEPS
+from ngpt.classical.controlvariates import schedule
 from ngpt.errors import NgptError
 from ngpt.export.builder import IR_VERSION, OPSET
 from ngpt.export.graphs.caustic import REACH
@@ -73,7 +73,7 @@ def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
 
 def _base_reach(model: Reconstructor) -> int:
     """How far the control variates and the smoothing of their weights see, in pixels, rounded up to the alignment."""
-    return -(-(SWEEPS + 2) // model.alignment) * model.alignment if model.config.base else 0
+    return -(-(len(schedule()) + 2) // model.alignment) * model.alignment if model.config.base else 0
 
 
 def bytes_per_pixel(model: Reconstructor) -> int:
