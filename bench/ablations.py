@@ -24,7 +24,8 @@ from ngpt.network.run_torch import layers_of
 from ngpt.network.safetensors import load_weights
 from ngpt.repair import repair
 from ngpt.system import configs
-from ngpt.training.cost import per_pixel
+from ngpt.system.writing import markdown_table
+from ngpt.training.cost import network_of, per_pixel
 from ngpt.training.crops import open_crops
 from ngpt.training.examples import judges_of
 from ngpt.training.images import Images
@@ -83,17 +84,17 @@ def mean(rows: Sequence[dict[str, float]], name: str, few: bool) -> float:
 def table(result: dict[str, Any]) -> str:
     """Markdown: a row for each variant, and one for the input."""
     heads = [f"{name}, {which}" for name in METRICS for which in (f"below {FEW} spp", f"from {FEW} spp")]
-    lines = ["| variant | parameters | multiplications per pixel | " + " | ".join(heads) + " |"]
-    lines += ["|---|--:|--:|" + "--:|" * len(heads)]
 
-    def cells(rows: Sequence[dict[str, float]], end: str = "") -> str:
-        return " | ".join(f"{mean(rows, name + end, few):.4f}" for name in METRICS for few in (True, False))
+    def cells(rows: Sequence[dict[str, float]], end: str = "") -> list[str]:
+        return [f"{mean(rows, name + end, few):.4f}" for name in METRICS for few in (True, False)]
 
-    for name, found in result["variants"].items():
-        cost = f"{found['parameters'] / 1e3:.0f} k | {found['multiplications'] / 1e3:.0f} k"
-        lines.append(f"| {name} | {cost} | {cells(found['inputs'])} |")
+    rows = [
+        [name, *(f"{found[cost] / 1e3:.0f} k" for cost in ("parameters", "multiplications")), *cells(found["inputs"])]
+        for name, found in result["variants"].items()
+    ]
     first = next(iter(result["variants"].values()))
-    return "\n".join([*lines, f"| the input | | | {cells(first['inputs'], ' primal')} |"])
+    rows.append(["the input", "", "", *cells(first["inputs"], " primal")])
+    return "\n".join(markdown_table(["variant", "parameters", "multiplications per pixel", *heads], rows))
 
 
 def main() -> None:
@@ -118,7 +119,7 @@ def main() -> None:
         model, _ = load_weights(out / "weights.safetensors")
         variants[name] = {
             "parameters": parameters(model),
-            "multiplications": per_pixel(model)[0],
+            "multiplications": per_pixel(*network_of(settings))[0],
             "steps": settings.run.steps,
             "inputs": judged(model, held_out),
         }

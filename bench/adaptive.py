@@ -7,26 +7,24 @@
     even      all pixels have --spp samples
     adaptive  --spp in the mean, shared out by the error that --by is expected to have (data_gen/adaptive.py)
 
-All methods that can use the stacks of `gpt` are measured on both, as without `ngpt render --for`. Errors are trimmed
-relMSE against two halves of a reference, geometric means over --seeds, of small images. What adaptive samples cost is
-measured on larger ones, since each pass takes a time to start that a small image does not pay for: CPU seconds of the
-process, all threads together, the runs of the method that the choice needs included.
-
-Beside them stands what `assess`, by which `--error` goes, expects of each method: of 16 even samples per pixel, of the
-even and of the adaptive ones, over what is true. A scene that is in the file already is measured again; the others are
-kept, and stacks are kept in --cache.
+Errors are trimmed relMSE against two halves of a reference, geometric means over --seeds, of small images. What
+adaptive samples cost is measured on larger ones, since each pass takes a time to start: CPU seconds of the process, the
+runs of the method that the choice needs included. Beside them stands what `assess`, by which `--error` goes, expects of
+each method, over what is true. Scenes that are in the file already are measured again; stacks are kept in --cache.
 """
 
 import argparse
+import itertools
 import json
 import math
 import statistics
 import time
 from pathlib import Path
 
-from bench.common import mean, metadata, save, summary
+from bench.common import measure, metadata, renderer, save
 from bench.pipelines import Kept
 from ngpt.evaluation.config import scene_name
+from ngpt.measure.averages import geometric_mean
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS, reconstruct
 from ngpt.stack import GradientStack
@@ -55,9 +53,6 @@ def main() -> None:
         print(table(json.loads(args.output.read_text())))
         return
 
-    from data_gen.backend import use_variant
-
-    use_variant()
     result: dict = {"benchmark": "adaptive", "by": {}, "costs": {}}
     if args.output.exists():
         before = json.loads(args.output.read_text())
@@ -75,9 +70,8 @@ def main() -> None:
 
 def bench_scene(path: str, args: argparse.Namespace) -> dict:
     """Method -> errors of its images of even and of adaptive samples, one of each seed, and what was expected."""
+    load_scene, render_stack = renderer()
     from data_gen import adaptive
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
 
     scene = load_scene(path, tuple(args.size))
     kept = Kept(args.cache / f"{scene_name(path)}-{'x'.join(map(str, args.size))}-{args.spp}-{args.by}")
@@ -107,30 +101,20 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
 
 def bench_costs(path: str, args: argparse.Namespace) -> dict:
     """CPU seconds of even renders, and of adaptive ones by method, in turn."""
+    load_scene, render_stack = renderer()
     from data_gen.adaptive import Adaptive
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
 
-    scene = load_scene(path, tuple(args.timed_size))
-    calls: dict[str, dict] = {"gpt": {}} | {f"adaptive {m}": {"adaptive": Adaptive(None, m)} for m in OF}
-    seconds: dict[str, list[float]] = {name: [] for name in calls}
-    for repeat in range(args.repeats + 1):
-        for name, options in calls.items():
-            start = time.process_time()
-            # The first compiles.
-            render_stack(scene, args.spp if repeat else 32, repeat, "gpt", **options)
-            if repeat:
-                seconds[name].append(time.process_time() - start)
-    return {"size": list(args.timed_size), "spp": args.spp} | {name: summary(each) for name, each in seconds.items()}
+    scene, seeds = load_scene(path, tuple(args.timed_size)), itertools.count()
+    options: dict[str, dict] = {"gpt": {}} | {f"adaptive {m}": {"adaptive": Adaptive(None, m)} for m in OF}
+    calls = {
+        name: lambda more=more: render_stack(scene, args.spp, next(seeds), "gpt", **more)
+        for name, more in options.items()
+    }
+    return {"size": list(args.timed_size), "spp": args.spp} | measure(calls, args.repeats, time.process_time)
 
 
 def table(result: dict) -> str:
-    """Markdown tables for each method that distributed the samples.
-
-    The first has the ratios of the error with adaptive samples to the error with even ones, their means, and the ratio
-    of the costs. The second has the ratios of the expected error to the true one, for the pilot, even and adaptive
-    samples.
-    """
+    """Markdown for each method that distributed the samples: adaptive over even errors, and expected over true ones."""
     parts = []
     for by, scenes in result["by"].items():
         methods = list(dict.fromkeys(m for entry in scenes.values() for m in entry["methods"]))
@@ -143,13 +127,13 @@ def table(result: dict) -> str:
             for m in methods:
                 row = entry["methods"].get(m, {"expected": {}})
                 if "even" in row:
-                    found[m].append(mean(row["adaptive"]) / mean(row["even"]))
+                    found[m].append(geometric_mean(row["adaptive"]) / geometric_mean(row["even"]))
                 ratios.append(f"{found[m][-1]:.2f}" if "even" in row else "")
-                over = (math.sqrt(mean(e) / mean(row[name])) for name, e in row["expected"].items())
+                over = (math.sqrt(geometric_mean(e) / geometric_mean(row[name])) for name, e in row["expected"].items())
                 told.append(", ".join(f"{ratio:.2f}" for ratio in over))
             lines.append(f"| {scene} | " + " | ".join(ratios) + " |")
             foretold.append(f"| {scene} | " + " | ".join(told) + " |")
-        lines.append("| mean | " + " | ".join(f"{mean(found[m]):.2f}" for m in methods) + " |")
+        lines.append("| mean | " + " | ".join(f"{geometric_mean(found[m]):.2f}" for m in methods) + " |")
         lines.append("| seconds over even | " + " | ".join(price(result["costs"], m) for m in methods) + " |")
         parts += ["\n".join(lines), "\n".join(foretold)]
     return "\n\n".join(parts)

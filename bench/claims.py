@@ -11,8 +11,6 @@ prints the relative squared error of `wcv`, free of the reference's noise, and b
 number of samples to the next.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 from collections.abc import Iterator
@@ -22,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import blocks
+from bench.common import blocks, renderer
 from ngpt.evaluation.config import scene_name
 
 LAYERS = ("primal", "caustic", "dx", "dy")
@@ -166,11 +164,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--size", type=int, nargs=2, default=(160, 96))
     args = parser.parse_args()
-    from data_gen.backend import use_variant
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
-
-    use_variant("llvm_ad_rgb")
+    load_scene, render_stack = renderer()
     size = tuple(args.size)
     if args.every:
         print("| scene, layer | least | median | most | within .8 to 1.25 |\n|---|--:|--:|--:|--:|")

@@ -1,39 +1,36 @@
-"""What benchmarks share: versions, medians and spread, by which a result can be judged later; renders that are kept."""
+"""What benchmarks share: times and versions, by which a result can be judged later; renders that are kept."""
 
-import math
-import statistics
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import ngpt
 from ngpt.evaluation.config import scene_name
+from ngpt.measure.averages import summary
 from ngpt.stack import GradientStack
 from ngpt.system import machine
 from ngpt.system.writing import write_json
 
 
-def measure(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, dict]:
+def measure(
+    calls: dict[str, Callable[[], object]], repeats: int, clock: Callable[[], float] = time.perf_counter
+) -> dict[str, dict]:
     """Times each call ``repeats`` times after one warm-up, in turn, so that a busy moment hits all of them alike.
 
-    Returns name -> {"median", "low", "high"} in seconds, low and high being the quartiles.
+    Returns name -> {"median", "low", "high"} in seconds of ``clock``, low and high being the quartiles.
     """
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for repeat in range(repeats + 1):
         for name, call in calls.items():
-            start = time.perf_counter()
+            start = clock()
             call()
             if repeat:
-                seconds[name].append(time.perf_counter() - start)
+                seconds[name].append(clock() - start)
     return {name: summary(values) for name, values in seconds.items()}
-
-
-def summary(values: list[float]) -> dict[str, float]:
-    low, median, high = statistics.quantiles(values, n=4) if len(values) > 1 else values * 3
-    return {"median": median, "low": low, "high": high}
 
 
 def metadata(*packages: str) -> dict:
@@ -54,11 +51,6 @@ def write_page(page: Path, text: str, marks: tuple[str, str]) -> None:
     page.write_text(f"{before}{marks[0]}\n\n{text}\n\n{marks[1]}{after}")
 
 
-def mean(values: Iterable[float]) -> float:
-    """The geometric one."""
-    return math.exp(statistics.mean(map(math.log, values)))
-
-
 def blocks(image: np.ndarray, side: int = 8) -> np.ndarray:
     """Means over blocks of (..., H, W, C)."""
     *n, h, w, c = image.shape
@@ -75,25 +67,23 @@ def kept(path: Path, make: Callable[[], GradientStack], names: dict[str, str] | 
     return ngpt.read(path, names)
 
 
-def rendered(
-    folder: Path,
-    size: Sequence[int],
-    scene: str,
-    spp: int,
-    sampler: str,
-    seed: int,
-    names: dict[str, str] | None = None,
-) -> GradientStack:
+def renderer(variant: str | None = None) -> tuple[Callable[..., Any], Callable[..., GradientStack]]:
+    """``load_scene`` and ``render_stack``, with Mitsuba's variant set; Mitsuba is loaded only here."""
+    from data_gen.backend import DEFAULT_VARIANT, use_variant
+
+    use_variant(variant or DEFAULT_VARIANT)
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
+
+    return load_scene, render_stack
+
+
+def rendered(folder: Path, size: Sequence[int], scene: str, spp: int, sampler: str, seed: int) -> GradientStack:
     """A stack of a scene, from the folder if it is there."""
 
     def make() -> GradientStack:
-        from data_gen.backend import use_variant
-
-        use_variant()
-        from data_gen.render import render_stack
-        from data_gen.scenes.load import load_scene
-
+        load_scene, render_stack = renderer()
         return render_stack(load_scene(scene, (width, height)), spp, seed, sampler)
 
     width, height = size
-    return kept(folder / f"{scene_name(scene)}-{sampler}-{spp}-{seed}-{width}x{height}.exr", make, names)
+    return kept(folder / f"{scene_name(scene)}-{sampler}-{spp}-{seed}-{width}x{height}.exr", make)

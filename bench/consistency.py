@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import blocks, metadata, save
+from bench.common import blocks, metadata, renderer, save
 from bench.tails import REFERENCE_SEED, TAILS
 from ngpt.evaluation.config import scene_name
 from ngpt.measure.metrics import relmse_trimmed
@@ -48,11 +48,7 @@ def main() -> None:
 
 
 def measured(scene: str, args: argparse.Namespace) -> list[dict[str, Any]]:
-    from data_gen.backend import use_variant
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
-
-    use_variant(args.variant)
+    load_scene, render_stack = renderer(args.variant)
     # A kernel knows the shapes of all scenes in memory.
     gc.collect()
     loaded = load_scene(scene, tuple(map(int, args.size.split("x"))))

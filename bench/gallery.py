@@ -1,15 +1,12 @@
 """The pictures of docs/gallery.md: twelve scenes, each noisy, denoised and converged, side by side.
 
     python -m bench.gallery --folder SCENES --cache out/gallery
-
-SCENES has the scenes that are files. Each row of SCENES_SHOWN is rendered with the command that the page gives, at
-320x180 pixels, and denoised by the method that `ngpt denoise` takes. The reference is rendered without shared paths, in
-two halves of other seeds. Renders are kept in the cache, so a run that was broken off goes on. Written are
-docs/images/gallery, bench/results/gallery.json, and the table between the marks of the page.
-
     python -m bench.gallery --wipe glossy --size 640 360 --cache out/gallery
 
-writes docs/images/wipe.webp: the noisy image, and a line that moves over it and leaves the result.
+SCENES has the scenes that are files. Each row of SCENES_SHOWN is rendered with the command that the page gives, and
+denoised by the method that `ngpt denoise` takes; the reference is rendered without shared paths, in two halves of other
+seeds. Renders are kept in the cache. Written are docs/images/gallery, bench/results/gallery.json, and the table between
+the marks of the page; with --wipe docs/images/wipe.webp, a line that moves over the noisy image and leaves the result.
 """
 
 import argparse
@@ -28,6 +25,7 @@ from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.stack import GradientStack
 from ngpt.system.files import atomic_output
+from ngpt.system.writing import markdown_table
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "gallery.md"
@@ -110,10 +108,8 @@ def images(args: argparse.Namespace, row: Shown) -> tuple[list[np.ndarray], dict
     start = time.process_time()
     result = ngpt.reconstruct(stack)
     seconds = float(stack.attributes["gallery:seconds"]) + time.process_time() - start
-    halves = [
-        rendered(args, row, row.reference, row.reference_spp, REFERENCE_SEED + i, unbiased=True)["primal"]
-        for i in (0, 1)
-    ]
+    reference = (args, row, row.reference, row.reference_spp)
+    halves = [rendered(*reference, REFERENCE_SEED + i, unbiased=True)["primal"] for i in (0, 1)]
     facts = {
         "options": options(row),
         "sampler": stack.attributes["ngpt:sampler"],
@@ -144,15 +140,13 @@ def rendered(args: argparse.Namespace, row: Shown, sampler: str, spp: int, seed:
 
 
 def table(found: dict[str, Any]) -> str:
-    lines = [
-        "| scene | options | sampler, method | seconds | error, noisy | result | by `oidn` | light |",
-        "|---|---|---|--:|--:|--:|--:|--:|",
-    ]
+    heads = ["scene", "options", "sampler, method", "seconds", "error, noisy", "result", "by `oidn`", "light"]
+    rows = []
     for name, row in found["rows"].items():
-        how = f"`{row['sampler']}`, `{row['method']}` | {row['CPU seconds']:.0f}"
-        errors = " | ".join(f"{row[key]:.4f}" for key in ("noisy", "result", "oidn"))
-        lines.append(f"| [{name}](#{name}) | `{row['options']}` | {how} | {errors} | {row['light']:.2f} |")
-    return "\n".join(lines)
+        how = [f"`{row['sampler']}`, `{row['method']}`", f"{row['CPU seconds']:.0f}"]
+        errors = [f"{row[key]:.4f}" for key in ("noisy", "result", "oidn")]
+        rows.append([f"[{name}](#{name})", f"`{row['options']}`", *how, *errors, f"{row['light']:.2f}"])
+    return "\n".join(markdown_table(heads, rows, 3))
 
 
 def write_wipe(path: Path, before: np.ndarray, after: np.ndarray) -> None:

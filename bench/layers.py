@@ -17,16 +17,17 @@ from pathlib import Path
 import numpy as np
 
 import ngpt
-from bench.common import mean, metadata, rendered
+from bench.common import metadata, rendered
 from ngpt.evaluation.config import scene_name
 from ngpt.io.exr import read
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
+from ngpt.measure.averages import geometric_mean
 from ngpt.measure.gains import NEED_OIDN, cases
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS, choose, reconstruct
 from ngpt.repair import variance_of_primal
 from ngpt.stack import GradientStack
-from ngpt.system.writing import write_json
+from ngpt.system.writing import markdown_table, write_json
 
 TABLE = Path(__file__).parents[1] / "ngpt" / "measure" / "layers.json"
 SPP, SIZE, REFERENCE_SPP = (4, 16, 64), (192, 108), 2048
@@ -113,7 +114,9 @@ def main() -> None:
 
 def error_of(scenes: Sequence[tuple[GradientStack, np.ndarray]], method: str, layers: Sequence[str]) -> float:
     """The geometric mean over (stack, reference) of what a method leaves of these layers."""
-    return mean(relmse_trimmed(reconstruct(part(stack, layers), method).image, truth) for stack, truth in scenes)
+    return geometric_mean(
+        relmse_trimmed(reconstruct(part(stack, layers), method).image, truth) for stack, truth in scenes
+    )
 
 
 def part(stack: GradientStack, layers: Sequence[str]) -> GradientStack:
@@ -165,21 +168,16 @@ def measured(files: Sequence[tuple[GradientStack, np.ndarray]], oidn: bool) -> t
 
     def error(method: str) -> float:
         images = (reconstruct(stack, method).image for stack, _ in files)
-        return mean(relmse_trimmed(image, truth) for image, (_, truth) in zip(images, files, strict=True))
+        return geometric_mean(relmse_trimmed(image, truth) for image, (_, truth) in zip(images, files, strict=True))
 
     method = choose(files[0][0], lambda name: not METHODS[name].missing() and (oidn or name not in NEED_OIDN))
     return method, error(method), error("oidn") if oidn else None, error("primal")
 
 
 def by_layers(rows: list[dict]) -> str:
-    lines = [
-        f"| layers that it takes | method | {' | '.join(f'{n} spp' for n in SPP)} |",
-        "|---|---|" + "--:|" * len(SPP),
-    ]
-    for row in rows:
-        cells = " | ".join(f"{error:.4f}" for error in row["error"])
-        lines.append(f"| {', '.join(row['layers'])} | `{row['method']}` | {cells} |")
-    return "\n".join(lines)
+    heads = ["layers that it takes", "method", *(f"{n} spp" for n in SPP)]
+    cells = ([", ".join(r["layers"]), f"`{r['method']}`", *(f"{e:.4f}" for e in r["error"])] for r in rows)
+    return "\n".join(markdown_table(heads, cells, 2))
 
 
 def by_renderer(rows: list[Row]) -> str:

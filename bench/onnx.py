@@ -22,13 +22,12 @@ import argparse
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
 
 import ngpt
-from bench.common import measure, metadata, save, summary
+from bench.common import measure, metadata, save
 from bench.reconstruction import synthetic
 from ngpt.methods import METHODS, reconstruct
 from ngpt.network.run_onnx import Network, planes
@@ -145,12 +144,8 @@ def start_up(folder: Path, repeats: int) -> dict:
     """Seconds of wall clock of the whole command on a small stack."""
     ngpt.write(folder / "small.exr", stack_of(64, 64))
     command = [sys.executable, "-m", "ngpt", "denoise", str(folder / "small.exr"), "-m", "ngpt-fast", "--force"]
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        subprocess.run([*command, "-o", str(folder / "clean.exr")], check=True, capture_output=True)
-        seconds.append(time.perf_counter() - start)
-    return summary(seconds)
+    command += ["-o", str(folder / "clean.exr")]
+    return measure({"": lambda: subprocess.run(command, check=True, capture_output=True)}, repeats)[""]
 
 
 def peak(size: str) -> float:

@@ -17,11 +17,12 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from bench.common import mean, save, write_page
+from bench.common import save, write_page
 from bench.tables import RIVALS, heading
 from ngpt.evaluation.curves import error_at
 from ngpt.evaluation.wholetime import ratio
 from ngpt.evaluation.worth import marked
+from ngpt.measure.averages import geometric_mean
 
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "bench" / "results" / "main.json"
@@ -185,7 +186,7 @@ def by_scene(size: Size) -> str:
     return "\n".join(lines)
 
 
-def worth(sizes: list[Size], *only: str) -> str:
+def worth(sizes: list[Size]) -> str:
     """W/C of the best pipelines, a line for each group and size."""
     counts = sorted({n for size in sizes for n in size.counts})
     lines = heading("W / C, geometric means", "C", *(f"{n} spp" for n in counts))
@@ -194,9 +195,8 @@ def worth(sizes: list[Size], *only: str) -> str:
         for group in (group for group in dict.fromkeys(group for group, _ in rows) if group in size.groups):
             here = {n: rows.get((group, n)) for n in counts}
             first = next(row for row in here.values() if row)
-            if not only or group in only:
-                cells = [marked(first, "C"), *(marked(here[n], "W/C") for n in counts)]
-                lines.append(f"| {group} ({first['scenes']}), {size.name} | {' | '.join(cells)} |")
+            cells = [marked(first, "C"), *(marked(here[n], "W/C") for n in counts)]
+            lines.append(f"| {group} ({first['scenes']}), {size.name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -221,7 +221,7 @@ def by_method(sizes: list[Size]) -> str:
             [c["seconds"]["reconstruct"] for (_, n, m), c in s.cells.items() if (n, m) == (s.counts[0], method)]
             for s in sizes
         ]
-        cells += [f"{mean(found):.2f}" if found else "" for found in times]
+        cells += [f"{geometric_mean(found):.2f}" if found else "" for found in times]
         lines.append(f"| `{method}` | {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -239,13 +239,11 @@ def better(sizes: list[Size]) -> str:
                 key: [min(row[key] for row in rows if row and row[key]) for rows in found if any(rows)]
                 for key in ("error", "FLIP")
             }
-            known = least["error"] and least["FLIP"]
-            text = (
-                f"{mean(least['error']):.2f} ({max(least['error']):.2f}), FLIP {mean(least['FLIP']):.2f}"
-                if known
-                else ""
+            error, flips = least["error"], least["FLIP"]
+            known = error and flips
+            cells.append(
+                f"{geometric_mean(error):.2f} ({max(error):.2f}), FLIP {geometric_mean(flips):.2f}" if known else ""
             )
-            cells.append(text)
         if cells:
             lines.append(f"| {group} ({len(scenes)}) | {' | '.join(cells)} |")
     return "\n".join(lines)
@@ -267,7 +265,7 @@ def over_primal(sizes: list[Size]) -> str:
         cells = []
         for n in size.counts:
             found = [ratios[scene, n] for scene in size.members(group) if (scene, n) in ratios]
-            cells.append(f"{mean(found):.2f}" if found else "")
+            cells.append(f"{geometric_mean(found):.2f}" if found else "")
         lines.append(f"| {group} ({len(size.members(group))}) | {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -22,21 +22,6 @@ def scaled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.asarray(Image.fromarray(image).resize(size, filter))
 
 
-def framed(image: np.ndarray, boxes: Sequence[tuple[int, int, int, int]], colours: Sequence[str]) -> np.ndarray:
-    """The image with a rectangle (left, top, width, height) in each colour."""
-    canvas = Image.fromarray(image)
-    draw = ImageDraw.Draw(canvas)
-    for (left, top, width, height), colour in zip(boxes, colours, strict=True):
-        draw.rectangle((left, top, left + width - 1, top + height - 1), outline=colour, width=2)
-    return np.asarray(canvas)
-
-
-def windows(values: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Sums of (H, W) over all windows of so many pixels, by their corner."""
-    sums = np.pad(values, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
-    return sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
-
-
 def columns(headings: Sequence[Sequence[str]], tiles: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
     """(H, W, 3) uint8: column i has the lines ``headings[i]``, the first one larger, above ``tiles[i]``.
 

@@ -3,19 +3,15 @@
     python -m bench.pipelines --scenes diffuse glossy SCENE.xml ... [--apart SCENE.xml ...] [--size 64 36]
     python -m bench.pipelines --table        print what the file says, with the rules as they are now
 
-All samplers take turns: each renders four parts with fixed numbers of samples, chosen so that a part takes about as
-long as 64 samples of the first sampler. The cost of a sample relative to the first sampler is the median of the ratios
-of the parts, in processor seconds on all cores together, so other work on the machine has little effect. Errors
-(trimmed relMSE against two halves of a reference) are measured for each method on a few samples, on one part and on all
-four, with even and with adaptive samples. The methods are timed in the same turns. Stacks are kept in --cache, so an
-interrupted benchmark can continue, and rules can be evaluated again without a render.
+All samplers take turns: each renders four parts that take about as long as 64 samples of the first sampler. The cost of
+a sample relative to the first sampler is the median of the ratios of the parts, in processor seconds. Errors (trimmed
+relMSE against two halves of a reference) are measured for each method on a few samples, on one part and on all four,
+with even and with adaptive samples. Stacks are kept in --cache.
 
 The pilot (data_gen/choosing/pipelines.py) gets none of these measurements. The equal times are the time of 16, 64 and
-256 samples of the first sampler plus the time of the slowest method, so that every pipeline fits into each of them. The
-error at the number of samples that a pipeline has time for is interpolated between the measured ones, linearly in the
-logarithms. Regret is the error of the pilot's choice over the least error of all.
-
-Scenes ``--apart`` must not influence any choice.
+256 samples of the first sampler plus the time of the slowest method. The error at the number of samples that a pipeline
+has time for is interpolated between the measured ones, in the logarithms. Regret is the error of the pilot's choice
+over the least error of all. Scenes ``--apart`` must not influence any choice.
 """
 
 import argparse
@@ -28,8 +24,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from bench import common
-from bench.common import mean, metadata, save
+from bench.common import metadata, save
 from ngpt.evaluation.config import scene_name
+from ngpt.measure.averages import geometric_mean
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.merging import merge
 from ngpt.methods import reconstruct
@@ -55,10 +52,6 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="print the tables of the file, and measure nothing")
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/pipelines.json"))
     args = parser.parse_args()
-
-    from data_gen.backend import use_variant
-
-    use_variant()
     result: dict = {"benchmark": "pipelines", "size": list(args.size), "metadata": metadata("mitsuba"), "scenes": {}}
     if args.output.exists():
         result["scenes"] = json.loads(args.output.read_text())["scenes"]
@@ -89,12 +82,11 @@ class Kept:
 
 def bench_scene(path: str, args: argparse.Namespace) -> dict:
     """What the pilot saw, and what is true: rows of sampler, method, shared -> errors by samples."""
+    load_scene, render_stack = common.renderer()
     from data_gen.adaptive import LEAST, Adaptive
     from data_gen.choosing import pipelines
     from data_gen.choosing.trials import candidates, noise_of
-    from data_gen.render import render_stack
     from data_gen.samplers import SAMPLERS
-    from data_gen.scenes.load import load_scene
 
     scene = load_scene(path, tuple(args.size))
     kept = Kept(args.cache / "{}-{}x{}".format(scene_name(path), *args.size))
@@ -265,7 +257,7 @@ def promises(result: dict) -> list[str]:
     for (network, n), ratios in found.items():
         deciles = statistics.quantiles(ratios, n=10)
         ends = ", ".join(f"{deciles[i]:.2f}" for i in (0, 4, 8))
-        lines.append(f"{'networks' if network else 'others'} at {n}: {ends}; {mean(ratios):.2f} in the mean")
+        lines.append(f"{'networks' if network else 'others'} at {n}: {ends}; {geometric_mean(ratios):.2f} in the mean")
     return ["true error over what was expected", *lines]
 
 
@@ -292,11 +284,13 @@ def table(result: dict) -> list[str]:
             lines.append(f"| {scene} | {cell['spp']} | `{cell['choice']}` | {ratios[cell['choice']]:.2f} | `{least}` |")
     for apart, title in ((False, "chosen on"), (True, "apart")):
         if rows := regrets[apart]:
-            lines.append(f"{title}: {mean(rows):.3f} in the mean, {max(rows):.2f} at worst, {len(rows)} cells")
+            lines.append(
+                f"{title}: {geometric_mean(rows):.3f} in the mean, {max(rows):.2f} at worst, {len(rows)} cells"
+            )
             by_auto = autos[apart]
-            lines.append(f"  sampler auto, of samplers alone: {mean(by_auto):.3f}, {max(by_auto):.2f}")
+            lines.append(f"  sampler auto, of samplers alone: {geometric_mean(by_auto):.3f}, {max(by_auto):.2f}")
             whole_rows = {n: r for n, r in fixed[apart].items() if len(r) == len(rows)}
-            whole = {n: mean(r) for n, r in whole_rows.items()}
+            whole = {n: geometric_mean(r) for n, r in whole_rows.items()}
             for name in sorted(whole, key=lambda n: whole[n])[:8]:
                 ahead = sum(r < 0.98 * ours for r, ours in zip(whole_rows[name], rows, strict=True))
                 worst = max(whole_rows[name])

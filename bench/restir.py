@@ -8,12 +8,12 @@ The camera goes sideways, or a shape or a lamp moves, as in ``bench.shots``. Riv
     after        reservoirs of pixels; differences are computed from the paths they keep: the paper's baseline
     gpt          new samples in each frame
 
-``cost`` is the wall-clock and processor time of a frame relative to a sample of ``gpt``. It is the median of
-``--repeats`` frames of all rivals in turn, at ``--cost-size``, with as many chains as samples. ``noise`` is the
-variance of primal, dx and dy (without the worst 1 % of the pixels) in the last frame, for one chain or sample. It is
-also given times the cost in processor time, relative to ``gpt``: below 1, a frame is worth more than it costs. Then all
-rivals render for the time of ``--chains`` chains of ``restir``, and their frames after ``--skip`` are reconstructed;
-+ temporal: as `ngpt denoise --temporal` does, from the first frame on. relMSE and flicker are as in ``bench.shots``.
+``cost`` is the wall-clock and processor time of a frame relative to a sample of ``gpt``, the median of ``--repeats``
+frames of all rivals in turn, with as many chains as samples. ``noise`` is the variance of primal, dx and dy (without
+the worst 1 % of the pixels) in the last frame, also times the cost, relative to ``gpt``: below 1, a frame is worth more
+than it costs. Then all rivals render for the time of ``--chains`` chains of ``restir``, and their frames after
+``--skip`` are reconstructed; + temporal: as `ngpt denoise --temporal` does. relMSE and flicker are as in
+``bench.shots``.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 import ngpt
-from bench.common import metadata, save
+from bench.common import metadata, renderer, save
 from bench.shots import SPEEDS, measured, shot_of
 from ngpt.sequence.history import Temporal
 
@@ -50,9 +50,7 @@ def main() -> None:
     parser.add_argument("--reference-spp", type=int, default=2048)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
-    from data_gen.backend import DEFAULT_VARIANT, use_variant
-
-    use_variant(DEFAULT_VARIANT)
+    renderer()
     result: dict = {"metadata": metadata("mitsuba-oidn"), "scenes": []}
     for scene in args.scenes:
         known = {}

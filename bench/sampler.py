@@ -29,10 +29,11 @@ from pathlib import Path
 import numpy as np
 
 import ngpt
-from bench.common import kept, metadata, save, summary
+from bench.common import kept, metadata, renderer, save
 from ngpt.evaluation.config import scene_name
 from ngpt.evaluation.gradientmap import variances_of_differences, write_map
 from ngpt.evaluation.references import reference_noise
+from ngpt.measure.averages import summary
 from ngpt.measure.metrics import compare
 from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
@@ -66,9 +67,7 @@ def main() -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    from data_gen.backend import use_variant
-
-    use_variant()
+    renderer()
     from data_gen.scenes.builtin import SCENES
 
     files = [str(path) for path in sorted(args.folder.glob("*/scene.xml"))] if args.folder else []
@@ -94,13 +93,12 @@ def run(args: argparse.Namespace) -> None:
 
 def bench_scene(scene_file: str, name: str, args: argparse.Namespace) -> dict | None:
     """All numbers of one scene; None if `gpt` cannot render it."""
+    load_scene, render_stack = renderer()
     import drjit as dr
     import mitsuba as mi
 
-    from data_gen.render import render_stack
     from data_gen.samplers import choose
     from data_gen.scenes.facts import scene_facts
-    from data_gen.scenes.load import load_scene
 
     size = (args.size[0], args.size[1])
     scene = load_scene(scene_file, size)
@@ -125,7 +123,8 @@ def bench_scene(scene_file: str, name: str, args: argparse.Namespace) -> dict | 
     cost = summary(ratios)
     spp = max(1, round(args.spp * cost["median"]))
     stacks = [render_stack(scene, args.spp, seed) for seed in range(args.repeats)]
-    reference = cached_reference(scene, name, size, args)
+    file = args.cache / f"{name}-reference-{size[0]}x{size[1]}-{args.reference_seconds:g}s.exr"
+    reference = kept(file, lambda: render_stack(scene, None, REFERENCE_SEED, "primal", seconds=args.reference_seconds))
     errors = {"path": [render_stack(scene, spp, EQUAL_TIME_SEED + i, "primal")["primal"] for i in range(args.repeats)]}
     solver = {}
     for method in METHODS:
@@ -144,13 +143,12 @@ def bench_scene(scene_file: str, name: str, args: argparse.Namespace) -> dict | 
         "compile seconds": compiled,
         "variance": variance_ratios(merged),
         "spp at equal time": spp,
-        "relMSE": {
-            key: summary([compare(image, reference["primal"])["relMSE"] for image in images])
-            for key, images in errors.items()
-        },
-        METRIC: {
-            key: summary([compare(image, reference["primal"])[METRIC] for image in images])
-            for key, images in errors.items()
+        **{
+            metric: {
+                key: summary([compare(image, reference["primal"])[metric] for image in images])
+                for key, images in errors.items()
+            }
+            for metric in ("relMSE", METRIC)
         },
         "reconstruction seconds": solver,
         "reference": {"spp": int(reference.attributes["ngpt:spp"]), "noise": reference_noise(reference)},
@@ -168,14 +166,6 @@ def compile_seconds(call) -> float:
     return sum(kernel["codegen_time"] + kernel["backend_time"] for kernel in kernels) / 1000
 
 
-def cached_reference(scene, name: str, size: tuple[int, int], args: argparse.Namespace) -> GradientStack:
-    """A long render by the scene's own integrator, from the cache if it is there."""
-    from data_gen.render import render_stack
-
-    file = args.cache / f"{name}-reference-{size[0]}x{size[1]}-{args.reference_seconds:g}s.exr"
-    return kept(file, lambda: render_stack(scene, None, REFERENCE_SEED, "primal", seconds=args.reference_seconds))
-
-
 def variance_ratios(stack: GradientStack) -> dict[str, float]:
     """Variance of independent differences of neighbours over variance of the gradients, each summed over the image."""
     ratios = {}
@@ -185,12 +175,9 @@ def variance_ratios(stack: GradientStack) -> dict[str, float]:
     return ratios
 
 
-def relative_errors(row: dict) -> dict[str, float]:
-    return {method: row[METRIC][method]["median"] / row[METRIC]["path"]["median"] for method in METHODS}
-
-
 def line(name: str, row: dict) -> str:
-    errors = "  ".join(f"{method} {ratio:.2f}" for method, ratio in relative_errors(row).items())
+    medians = {method: row[METRIC][method]["median"] for method in ("path", *METHODS)}
+    errors = "  ".join(f"{method} {medians[method] / medians['path']:.2f}" for method in METHODS)
     return (
         f"{name:16} cost {row['cost']['median']:.2f}  variance dx {row['variance']['dx']:.1f} "
         f"dy {row['variance']['dy']:.1f}  error over path: {errors}"

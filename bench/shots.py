@@ -4,15 +4,12 @@
     python -m bench.shots --folder SCENES --scenes diffuse glossy --shots slow fast object light --pairs 2 --out OUT
 
 Three shots move a scene's own camera sideways: ``static``, ``slow`` (half a pixel a frame, at the distance of what it
-sees in the median) and ``fast`` (8 pixels a frame, to and fro). ``object`` and ``light`` move a shape, ``MOVES``, where
-the scene is one of those. Stacks and references are rendered once and kept in
-OUT. relMSE is without the worst 0.1 % of the pixels, flicker is ``ngpt.measure.flicker``; both are means over all
-frames but the first. What the references' own noise adds to both, by their variances, is taken off. ``+ temporal`` is
-`ngpt denoise --temporal`, ``+ rules`` the same without its network.
-
-With ``--plain``, methods that read no gradients have stacks without, of so many samples: as many as take the time of
-``--spp`` with. With ``--pairs``, stacks have differences in time, and there is a row more, ``wcv + dt``, at ``--spp``;
-all other rows are then of stacks without, at ``--spp-without``, for pairs take their time.
+sees in the median) and ``fast`` (8 pixels a frame, to and fro). ``object`` and ``light`` move a shape, ``MOVES``.
+relMSE is without the worst 0.1 % of the pixels, flicker is ``ngpt.measure.flicker``; both are means over all frames but
+the first, less what the references' own noise adds. ``+ temporal`` is `ngpt denoise --temporal`, ``+ rules`` the same
+without its network. With ``--plain``, methods that read no gradients have stacks without, of so many samples. With
+``--pairs``, there is a row more, ``wcv + dt``, at ``--spp``; all others are then of stacks without differences in time,
+at ``--spp-without``, for pairs take their time.
 """
 
 import argparse
@@ -23,7 +20,7 @@ from typing import Any
 import numpy as np
 
 import ngpt
-from bench.common import metadata, save
+from bench.common import metadata, renderer, save
 from ngpt.io.frames import shot_files
 from ngpt.measure.flicker import flicker
 from ngpt.measure.metrics import relmse_trimmed
@@ -129,9 +126,7 @@ def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path)
     """Renders stacks, stacks with pairs (without ``--pairs``: the same), references, and with ``--plain`` stacks
     without gradients; returns the folder names, "" for none. Existing files are kept.
     """
-    from data_gen.backend import DEFAULT_VARIANT, use_variant
-
-    use_variant(DEFAULT_VARIANT)
+    renderer()
     from data_gen.frames.shot import render_shot
 
     rests = SPEEDS.get(shot) == 0

@@ -26,7 +26,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bench.common import metadata, save, summary
+from bench.common import metadata, save
+from ngpt.measure.averages import summary
 
 WORKER = "--worker"
 # Row -> the method that runs, and the kind of stack that it runs on.

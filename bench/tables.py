@@ -19,7 +19,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bench.common import mean, save, write_page
+from bench.common import save, write_page
+from ngpt.measure.averages import geometric_mean
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "bench" / "results"
@@ -38,7 +39,7 @@ def by_scene(result: dict[str, Any]) -> str:
         ratios = [cells[*column, method] / least[column] if (*column, method) in cells else None for column in columns]
         shown = ["" if r is None else "**1**" if r == 1 else short(r) for r in ratios]
         # A mean needs all scenes: means over different scenes could not be compared.
-        shown.append("" if None in ratios else short(mean(ratios)))
+        shown.append("" if None in ratios else short(geometric_mean(ratios)))
         lines.append(f"| `{method}` | {' | '.join(shown)} |")
     lines.append(f"| *least error* | {' | '.join(f'{error:.2g}' for error in least.values())} | |")
     costs = result.get("costs", {})
@@ -57,7 +58,10 @@ def means(result: dict[str, Any]) -> str:
     for spp in sorted({cell["spp"] for cell in result["cells"]}):
         texts = {method: [] for method in methods}
         for key in ("error", "FLIP") if both else ("error",):
-            found = {m: mean([c[key] for c in result["cells"] if (c["spp"], c["method"]) == (spp, m)]) for m in methods}
+            found = {
+                m: geometric_mean([c[key] for c in result["cells"] if (c["spp"], c["method"]) == (spp, m)])
+                for m in methods
+            }
             for method, value in found.items():
                 text = f"{value:.3f}" if key == "FLIP" else f"{value:.2g}"
                 texts[method].append(f"**{text}**" if value == min(found.values()) else text)
@@ -83,7 +87,7 @@ def rivals(result: dict[str, Any]) -> str:
         less = [f"{sum(r < 1 for r in over[m, 'error'])} of {len(over[m, 'error'])}" for m in methods]
         lines.append(f"| less error than {text} | {' | '.join(less)} |")
         for key in ("error", "FLIP"):
-            lines.append(f"| {key} over its | {' | '.join(short(mean(over[m, key])) for m in methods)} |")
+            lines.append(f"| {key} over its | {' | '.join(short(geometric_mean(over[m, key])) for m in methods)} |")
     return "\n".join(lines)
 
 
@@ -110,7 +114,6 @@ def main() -> None:
 
 
 def table(name: str) -> str:
-    """The table as its page has it."""
     return PAGES[name][1](json.loads((RESULTS / f"{name}.json").read_text()))
 
 

@@ -2,23 +2,20 @@
 
     python -m bench.tails kitchen/scene.xml bedroom/scene.xml --references FOLDER --groups rooms=kitchen,bedroom
 
-Samplers are `primal` (as it is, "raw", `oidn` and `ngpt-primal`) and `gpt` (`wcv`, `ngpt-fast`, `ngpt-combine` and
-`oidn`), and `mitsuba`: `primal` with Mitsuba's own points and lamps and whole paths, denoised by `oidn`. Each cell has:
+Samplers are `primal`, `gpt`, and `mitsuba`: `primal` with Mitsuba's own points and lamps and whole paths, denoised by
+`oidn`. Methods are those of METHODS. Each cell has:
 
     seconds    of processors, of the render and of the reconstruction, both warmed up; whole: both together
     error      relMSE by two halves of a reference, without the worst 0.1 % of the pixels; FLIP is over their mean
-    steady     the same error, relative to the denoised reference, which also says which pixels are the worst
+    steady     the same error, relative to the denoised reference, which also says which pixels are the worst: where a
+               reference is noisy most of its pixels are too dark, and ``error`` rewards images that are too dark
     blocks     root of the same error of means over 8x8 pixels; none where it is below what the halves can tell
     energy     mean of the image over the mean of the reference
 
-Where a reference is noisy most of its pixels are too dark, and these count more for it: ``error`` has a floor there,
-and images that are too dark come below it. ``steady`` has none.
-
 References are NAME-WxH-a.exr and -b.exr of the folder; what is missing is rendered there, without shared tails. At
-equal whole time a cell with shared tails is over the errors of its own sampler and method with tails=paths, read off
-between their numbers of samples; for the marks see ``ngpt.evaluation.curves``. W, C and W/C of gradients are against
-`primal` with the same tails (``ngpt.evaluation.worth``). Each cell is written as soon as it is there, and cells that
-the file has already are not measured again. Values are medians over seeds, means over scenes geometric.
+equal whole time a cell with shared tails is over the errors of its own sampler and method with tails=paths; for the
+marks see ``ngpt.evaluation.curves``. W, C and W/C of gradients are against `primal` with the same tails. Cells that the
+file has are not measured again. Values are medians over seeds, means over scenes geometric.
 """
 
 import argparse
@@ -32,12 +29,12 @@ from typing import Any
 import numpy as np
 
 import ngpt
-from bench.common import blocks, metadata, save
-from ngpt.evaluation.averages import mean, median
+from bench.common import blocks, metadata, renderer, save
 from ngpt.evaluation.config import scene_name
 from ngpt.evaluation.curves import error_at, joined
 from ngpt.evaluation.references import HALVES, Reference, read_reference
 from ngpt.evaluation.worth import worth_of_gradients, worth_tables
+from ngpt.measure.averages import geometric_mean, median
 from ngpt.measure.metrics import EPSILON, relmse_trimmed, scores, squared_error, trimmed_mean
 
 RAW = "raw"
@@ -96,11 +93,7 @@ def place(cell: dict[str, Any]) -> tuple:
 
 def measured(scene: str, args: argparse.Namespace, known: set[tuple]):
     """The cells of a scene that are not ``known``, one after the other."""
-    from data_gen.backend import use_variant
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
-
-    use_variant()
+    load_scene, render_stack = renderer()
     # A kernel knows the shapes of all scenes in memory.
     gc.collect()
     loaded = load_scene(scene, tuple(map(int, args.size.split("x"))))
@@ -309,7 +302,7 @@ def over(values: list[tuple[float, str] | None]) -> str:
     known = [value for value in values if value]
     if len(known) < len(values):
         return "-"
-    return marked((mean([value for value, _ in known], geometric=True), joined(mark for _, mark in known)))
+    return marked((geometric_mean(value for value, _ in known), joined(mark for _, mark in known)))
 
 
 def table(head: list[str], lines: list[list[str]]) -> None:

@@ -2,14 +2,13 @@
 
     python -m bench.uncertainty --scenes diffuse lens --checked glossy --cache STACKS -o bench/results/uncertainty.json
 
-Stacks and references are rendered into --cache where they are not there: SCENE-SPP.exr and SCENE-reference.exr. A scene
-is a built-in one, or a folder with scene.xml in it. References have noise; of the intervals for the difference of both,
+A scene is a built-in one, or a folder with scene.xml in it. References have noise; of the intervals for the difference
 it is a part: their half-width is sqrt(error² + variance of the reference). Pixels that show a lamp are left out.
 
-Each method's factor is chosen on --scenes, so that both coverages are closest to 68.3 and 95 %; --checked are scenes
-that it is then checked on. With --halves, each stack is merged of two with half of the samples each, which the error
-goes by, too. Two rows are printed for each method: coverages, and the tail: the share of values that are more than five
-errors off, and the sum of all squared errors over the claimed one. The numbers are written as JSON.
+Each method's factor is chosen on --scenes, so that both coverages are closest to 68.3 and 95 %, and checked on
+--checked. With --halves, each stack is merged of two, which the error goes by, too. Two rows are printed for each
+method: coverages, and the tail: the share of values that are more than five errors off, and the sum of all squared
+errors over the claimed one.
 """
 
 import argparse
@@ -17,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.common import kept, metadata, save
+from bench.common import kept, metadata, renderer, save
 from ngpt.api.uncertainty import FACTOR, FACTORS, reconstruct_with_error
 from ngpt.errors import NgptError
 from ngpt.merging import merge
@@ -71,19 +70,12 @@ def main() -> None:
 def images(scene: str, spp: int, args: argparse.Namespace) -> list[GradientStack]:
     """The reference, the stack and, where they are wanted, its halves; rendered where they are not in the cache."""
     name = Path(scene).name
+    halves = [(f"{name}-{spp}-half{i}.exr", spp // 2, "auto", 2 * spp + i) for i in (0, 1)]
     files = [(f"{name}-reference.exr", args.reference, "primal", spp)]
-    if args.halves:
-        files += [(f"{name}-{spp}-half{i}.exr", spp // 2, "auto", 2 * spp + i) for i in (0, 1)]
-    else:
-        files.append((f"{name}-{spp}.exr", spp, "auto", spp))
+    files += halves if args.halves else [(f"{name}-{spp}.exr", spp, "auto", spp)]
 
     def make(count: int, sampler: str, seed: int) -> GradientStack:
-        from data_gen.backend import use_variant
-
-        use_variant()
-        from data_gen.render import render_stack
-        from data_gen.scenes.load import load_scene
-
+        load_scene, render_stack = renderer()
         at = Path(scene) / "scene.xml"
         return render_stack(load_scene(str(at) if at.exists() else scene, tuple(args.size)), count, seed, sampler)
 
@@ -101,7 +93,6 @@ def case(method: str, reference: GradientStack, stack: GradientStack, *halves: G
 
 
 def covered(one: tuple[np.ndarray, ...], factor: float) -> dict[str, float]:
-    """The share of values within each interval."""
     difference, changed, variance = one
     width = np.sqrt((factor * changed) ** 2 + variance)
     return {name: round(float(np.mean(np.abs(difference) <= k * width)), 4) for name, (k, _) in INTERVALS.items()}

@@ -50,7 +50,6 @@ def row(args: argparse.Namespace, scene: str, sampler: str, method: str) -> list
 
 
 def rendered(args: argparse.Namespace, scene: str, sampler: str) -> GradientStack:
-    """A stack, from the cache if it is there."""
     name = Path(scene).parent.name or scene
     file = args.cache / f"{name}-{sampler}-{args.seconds:g}s.exr"
 

@@ -18,8 +18,9 @@ import numpy as np
 
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
 from ngpt.errors import NgptError
-from ngpt.io.exr import MADE_BY, pass_through, read, with_channels, write
+from ngpt.io.exr import pass_through, read, with_channels, write
 from ngpt.io.openexr import read_header
+from ngpt.io.results import MADE_BY
 from ngpt.io.whole import finished
 from ngpt.merging import DIAGNOSTICS, OPTIONS, UNFINISHED, merge
 from ngpt.stack import GradientStack

@@ -166,6 +166,7 @@ def render_frames(
     variant: str | None = None,
     skip: Callable[[int], bool] = lambda frame: False,
     stop: Callable[[], bool] = lambda: False,
+    progress: Callable[[int], Callable[[int, int], None]] = lambda frame: lambda done, total: None,
     **options: Any,
 ) -> Iterator[tuple[int, GradientStack]]:
     """(frame, its stack with motion vectors) of each of the ``frames`` of a shot, one after the other.
@@ -178,6 +179,7 @@ def render_frames(
     ``skip``     asked when a frame's turn has come whether to leave it out
     ``stop``     asked after each pass: a frame that is broken off has ``ngpt:unfinished`` (with ``dt`` it is not
                  given), and none is given after it
+    ``progress`` frame -> what is called as the ``progress`` of ``render_scene``
 
     All else as of ``render_scene``; ``data_gen.frames.shot`` says more of seeds and motion. A shot that changes by
     other means than a file's parameters: ``data_gen.frames.shot.Shot``. Raises NgptError as ``render_scene``, and for
@@ -211,7 +213,7 @@ def render_frames(
     if isinstance(camera, str | Path):
         animated = Path(camera).suffix.lower() in (".glb", ".gltf")
         camera = read_gltf_camera(camera, fps) if animated else read_camera_path(camera)
-    options |= {"seconds": seconds, "memory": memory, "stop": stop, "diagnostics": diagnostics}
+    options |= {"seconds": seconds, "memory": memory, "stop": stop, "diagnostics": diagnostics, "progress": progress}
     if not remembers:
         options["unbiased"] = unbiased
     found = render_shot(

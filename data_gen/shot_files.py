@@ -19,7 +19,7 @@ from data_gen.session import DEFAULT_SPP, render_frames
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.whole import finished
 from ngpt.stack import GradientStack
-from ngpt.system.files import check_output
+from ngpt.system.files import check_output, make_folder
 
 # On a cluster: the frames that a worker renders with one scene in memory, and with kernels compiled once
 FRAMES_OF_A_PART = 8
@@ -54,8 +54,9 @@ def write_frames(
     """Writes the stack of each frame to its file; ``files`` maps all frames of the shot, in order, to their files.
 
     With ``denoising`` it writes images instead of stacks, see ``data_gen.outputs``. With ``shard`` (i, n) it writes
-    only part i of n. ``made`` is called with what is written so far and the number of frames, first and after each
-    frame. ``options`` are as in ``render_frames``. Raises NgptError as ``render_frames`` does, and for files that exist
+    only part i of n. ``made`` is called with what is written so far and the number of frames, before the first sample
+    and after each frame. Folders that are not there are made before the first sample, too. ``options`` are as in
+    ``render_frames``. Raises NgptError as ``render_frames`` does, and for files that exist
     unless ``overwrite`` or ``skip_existing`` says what to do with them.
     """
     number, parts = shard
@@ -67,17 +68,17 @@ def write_frames(
         output.check()
         if skip_existing:
             output.check_skipping()
-        check_output(files[frame], overwrite or skip_existing, may_skip=True)
+        _check(files[frame], overwrite or skip_existing)
     written = Written()
     asked = {frame: asked_of(scene, frame, **options) for frame in ours}
     # Begun frames come first, grouped by what is left of them: the scene stays in memory.
-    begun: dict[Rest, list[int]] = {}
-    for frame in ours:
-        if skip_existing and finished(files[frame]) and (rest := asked[frame].left(files[frame])):
-            outputs[frame].check_begun(rest.sampler)
-            begun.setdefault(rest, []).append(frame)
+    begun = _begun(asked, outputs) if skip_existing else {}
     gone_on = {frame for frames in begun.values() for frame in frames}
-    made(written, len(ours))
+
+    def begins() -> None:
+        for folder in dict.fromkeys(files[frame].parent for frame in ours):
+            make_folder(folder)
+        made(written, len(ours))
 
     def skip(frame: int) -> bool:
         # Only when its turn has come, for several machines may be at work on one shot.
@@ -100,9 +101,12 @@ def write_frames(
         written.frames.append(report_of(stack, files[frame], by) | said)
         made(written, len(ours))
 
+    progress = _once(begins)
+
     def write_all(skip: Callable[[int], bool], more: Mapping[str, Any]) -> None:
+        how = {**options, **more, "skip": skip, "stop": stop, "progress": progress}
         try:
-            for frame, stack in render_frames(scene, list(files), skip=skip, stop=stop, **{**options, **more}):
+            for frame, stack in render_frames(scene, list(files), **how):
                 add(frame, stack)
         except Unfinished as error:
             frame = error.stack.attributes["ngpt:frame"]
@@ -163,7 +167,7 @@ def write_frames_on_cluster(
     if options.pop("shard", None):
         raise WrongUse("--cluster distributes the frames itself; leave --shard out")
     for file in files.values():
-        check_output(file, overwrite or skip_existing, may_skip=True)
+        _check(file, overwrite or skip_existing)
     from data_gen.dataset.jobs import cluster
 
     parts = -(-len(files) // FRAMES_OF_A_PART)
@@ -181,3 +185,30 @@ def write_frames_on_cluster(
             made(whole, len(files))
     whole.frames.sort(key=lambda report: order.index(report["frame"]))
     return whole
+
+
+def _begun(asked: Mapping[int, Asked], outputs: Mapping[int, Output]) -> dict[Rest, list[int]]:
+    """The frames that were begun, by what is left of them."""
+    begun: dict[Rest, list[int]] = {}
+    for frame, output in outputs.items():
+        if finished(output.file) and (rest := asked[frame].left(output.file)):
+            output.check_begun(rest.sampler)
+            begun.setdefault(rest, []).append(frame)
+    return begun
+
+
+def _check(file: Path, overwrite: bool) -> None:
+    """``check_output``, for a file whose folder need not be there."""
+    if file.parent.exists():
+        check_output(file, overwrite, may_skip=True)
+
+
+def _once(begins: Callable[[], None]) -> Callable[[int], Callable[[int, int], None]]:
+    """The ``progress`` of frames that calls ``begins`` when the first of them begins."""
+    waiting = [begins]
+
+    def progress(done: int, total: int) -> None:
+        while waiting:
+            waiting.pop()()
+
+    return lambda frame: progress

@@ -1,13 +1,11 @@
 """Pixels that are empty: alpha is 0 there and the input has no light there, so a result has none either.
 
-Denoisers spread light over the edges of objects. On a transparent film every bright background would show it. Light is
-premultiplied by alpha, so light at alpha 0 is legal: fire and glare add to what is behind them. It stays, and so do the
-dark pixels among it.
+Light is premultiplied by alpha, so light at alpha 0 is legal: fire and glare add to what is behind them. It stays, and
+so do the dark pixels among it.
 
-Light that a method spread into empty pixels may be missed beside them: where hair covers a tenth of each pixel, few
-samples find nothing in most pixels, all that they found lies in the others, and a method evens that out. To drop it
-would turn hair dark. So it goes back to the covered pixels around, in proportion to their alpha, as far as the input
-has more light there than is left.
+Light that a method spread into empty pixels may be missed beside them: where hair covers a tenth of each pixel, a
+method evens out what few samples found. So it goes back to the covered pixels around, in proportion to their alpha, as
+far as the input has more light there than is left.
 """
 
 import numpy as np

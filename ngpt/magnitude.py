@@ -1,9 +1,8 @@
 """Light of any exposure, brought to where single precision holds its squares, and back.
 
-Methods square light, weigh by variances and add small numbers to what they divide by. All of that is done in single
-precision, which ends at 2^±127: squares of light above 2^63 are infinite, and those below 2^-63 are nothing. So a stack
-whose typical light is beyond 2^±``ORDINARY`` is multiplied by a power of two before a method sees it, and the result is
-multiplied back. Both are exact. Any other stack stays as it is, bit for bit.
+Methods square light and weigh by variances in single precision, which ends at 2^±127. So a stack whose typical light is
+beyond 2^±``ORDINARY`` is multiplied by a power of two before a method sees it, and the result is multiplied back. Both
+are exact. Any other stack stays as it is, bit for bit.
 
 Variances may have left the range of single precision before: light of 1e-30 has variances of 1e-60. ``GradientStack``
 keeps double precision if it is given double precision. In files, and in arrays of single precision, such variances are

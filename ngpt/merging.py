@@ -44,19 +44,15 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     Means are weighted by ``ngpt:spp``, or by the layer ``samples`` if a stack has it. A mean of differences is weighted
     by the harmonic mean of the samples of both its pixels, as its variance would be. The merged ``samples`` are sums,
     and are left out if all pixels have the same number. Variances of the mean come from the pooled sums, so merged
-    stacks of n1 and n2 samples equal the stack of n1 + n2 up to the rounding of float32. There are two exceptions.
-    First, variances of dx and dy combine two independent directions, which a stack no longer separates: their merged
-    value has the same expectation, and differs by about 1 / N of itself. Second, a non-finite sample is missing only in
-    its own pixel, which still counts with the full weight of its stack; a pixel that lost all samples is NaN and counts
-    nothing.
+    stacks of n1 and n2 samples equal the stack of n1 + n2 up to the rounding of float32, with two exceptions. Variances
+    of dx and dy combine two independent directions, which a stack no longer separates: their merged value has the same
+    expectation, and differs by about 1 / N of itself. A non-finite sample is missing only in its own pixel; a pixel
+    that lost all samples is NaN and counts nothing. A stack with one sample per pixel has no variances and needs none.
+    ``diagnostics.*`` channels are averaged as layers are.
 
-    A stack with one sample per pixel has no variances and needs none, since its sum of squared deviations is zero: two
-    of them merged have variances. ``diagnostics.*`` channels are averaged as layers are.
-
-    Tiles (``GradientStack.place``) give the smallest rectangle that holds them all, and must fill it. They may overlap.
-    Tiles that do not overlap may have the same seed. The difference from a tile's last column or row to the pixel
-    beyond it was not sampled: it is NaN if no other tile has it, and counts nothing in a reconstruction. If tiles
-    overlap by a pixel, all differences are known.
+    Tiles (``GradientStack.place``) give the smallest rectangle that holds them all, and must fill it. They may overlap;
+    those that do not may have the same seed. The difference from a tile's last column or row to the pixel beyond it was
+    not sampled: it is NaN if no other tile has it, and counts nothing in a reconstruction.
 
     The result's ``ngpt:seed`` lists all seeds, ``ngpt:spp`` is the mean over pixels of the samples that they have,
     ``ngpt:seconds`` and ``ngpt:discarded`` are sums, ``ngpt:samplerOptions`` has the options of all stacks,

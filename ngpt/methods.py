@@ -121,8 +121,9 @@ def _network(
     return Method(summary, needs, network.run, OPTIONS, standing, network.missing, estimates=estimates)
 
 
-def _variant(method: str, entry: Method, summary: str, **options: Any) -> Method:
+def _variant(method: str, summary: str, **options: Any) -> Method:
     """The method with other defaults, under a name of its own: rows of tables are names that can be asked for."""
+    entry = _OURS[method]
     other = {name: replace(entry.options[name], default=value) for name, value in options.items()}
     return replace(entry, summary=summary, options=entry.options | other, variant=method)
 
@@ -184,14 +185,10 @@ _OURS = {
     ),
 }
 _OURS |= {
-    "oidn-clean": _variant("oidn", _OURS["oidn"], "OIDN that takes the features for clean", auxiliary="clean"),
-    "oidn-noisy": _variant("oidn", _OURS["oidn"], "OIDN that is told the features are noisy", auxiliary="noisy"),
+    "oidn-clean": _variant("oidn", "OIDN that takes the features for clean", auxiliary="clean"),
+    "oidn-noisy": _variant("oidn", "OIDN that is told the features are noisy", auxiliary="noisy"),
     "oidn-fast": _variant(
-        "oidn",
-        _OURS["oidn"],
-        "OIDN's quickest network, with the features as they are",
-        auxiliary="clean",
-        quality="fast",
+        "oidn", "OIDN's quickest network, with the features as they are", auxiliary="clean", quality="fast"
     ),
 }
 METHODS = Registry("ngpt.methods", "method", Method, _OURS)
@@ -228,9 +225,7 @@ def choose(layers: Container[str], usable: Callable[[str], bool] | None = None) 
     ``layers``  a stack, or names of its layers. A stack may say what it was rendered for (``ngpt:for``)
     ``usable``  whether a method can be used, by its name; None asks this machine
 
-    The errors behind ``ORDER`` are in docs/lab/RESULTS.md, "By the layers of a stack". Where OIDN is installed it is
-    better than `wcv` and `l1` in the mean up to 16 spp, and by far on what they cannot clean; from 64 spp on they are
-    better on diffuse scenes.
+    The errors behind ``ORDER`` are in docs/lab/RESULTS.md, "By the layers of a stack".
     """
     usable = usable or (lambda name: not METHODS[name].missing())
     made_for = str(layers.attributes.get("ngpt:for")) if isinstance(layers, GradientStack) else ""

@@ -4,8 +4,6 @@
 "ngpt.renderers" names it. Nothing in ngpt imports it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol

@@ -25,7 +25,7 @@ class GradientStack:
     are kept as they are.
 
     ``attributes`` are the header attributes beyond those that OpenEXR itself needs, ``ngpt:spp`` and the like.
-    ``source`` is the file the stack was read from (``ngpt.io.exr.StackSource``), for what passes through it.
+    ``source`` is the file the stack was read from (``ngpt.io.layout.StackSource``), for what passes through it.
     ``path`` is for messages. ``place`` is where the pixels lie in the whole picture; by default, and where it is
     of another size, they are all of it.
 

@@ -4,8 +4,6 @@ OpenEXR calls them data window and display window. Pixels of two images belong t
 where their arrays have the same index.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -27,7 +25,7 @@ class Window:
     height: int
 
     @classmethod
-    def of_box(cls, box: Any) -> Window:
+    def of_box(cls, box: Any) -> "Window":
         """The window from its first to its last pixel, as OpenEXR has it: ((left, top), (right, bottom))."""
         (left, top), (right, bottom) = ((int(n) for n in corner) for corner in box)
         return cls(left, top, right - left + 1, bottom - top + 1)
@@ -50,21 +48,21 @@ class Window:
     def __str__(self) -> str:
         return f"{self.width}x{self.height} at ({self.left}, {self.top})"
 
-    def common(self, other: Window) -> Window | None:
+    def common(self, other: "Window") -> "Window | None":
         """The pixels of both; None where they have none in common."""
         left, top = max(self.left, other.left), max(self.top, other.top)
         width = min(self.left + self.width, other.left + other.width) - left
         height = min(self.top + self.height, other.top + other.height) - top
         return Window(left, top, width, height) if width > 0 and height > 0 else None
 
-    def around(self, other: Window) -> Window:
+    def around(self, other: "Window") -> "Window":
         """The smallest rectangle that holds both."""
         left, top = min(self.left, other.left), min(self.top, other.top)
         right = max(self.left + self.width, other.left + other.width)
         bottom = max(self.top + self.height, other.top + other.height)
         return Window(left, top, right - left, bottom - top)
 
-    def within(self, other: Window) -> tuple[slice, slice]:
+    def within(self, other: "Window") -> tuple[slice, slice]:
         """Rows and columns of these pixels in an image of the window ``other``, which holds them all."""
         x, y = self.left - other.left, self.top - other.top
         return slice(y, y + self.height), slice(x, x + self.width)
@@ -81,7 +79,7 @@ class Place:
     display: Window
 
     @classmethod
-    def whole(cls, width: int, height: int) -> Place:
+    def whole(cls, width: int, height: int) -> "Place":
         """The place of an image when only its size is known."""
         return cls(window := Window(0, 0, width, height), window)
 
@@ -95,7 +93,7 @@ class Place:
             return "x".join(map(str, self.data.size))
         return f"{self.data} of {self.display if any(self.display.corner) else Place.whole(*self.display.size)}"
 
-    def seen_from(self, other: Place) -> Window | None:
+    def seen_from(self, other: "Place") -> "Window | None":
         """The pixels in the coordinates of ``other``; None where the two are pictures of different sizes.
 
         If only the size of an image is known, it lies where the other one of that size does: many programs lose the
@@ -109,7 +107,7 @@ class Place:
                 return None
         return self.data
 
-    def shift_in(self, other: Place) -> tuple[int, int] | None:
+    def shift_in(self, other: "Place") -> tuple[int, int] | None:
         """The column and row of an image at ``other`` where the first pixel of this one is; as ``seen_from``."""
         window = self.seen_from(other)
         return None if window is None else (window.left - other.data.left, window.top - other.data.top)

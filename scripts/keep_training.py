@@ -21,12 +21,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 # For a run that starts from finished weights: a small rate, which the average makes up for
-SETTINGS = {
-    "run.steps": "60000",
-    "run.save": "100",
-    "optimizer.learning_rate": "2e-4",
-    "data.cache": "4096",
-}
+SETTINGS = {"run.steps": "60000", "run.save": "100", "optimizer.learning_rate": "2e-4", "data.cache": "4096"}
 SETS = ("data-cpu", "data-pairs")
 NICE = 10
 # Seconds between looks at the file that says to stand still.
@@ -36,10 +31,7 @@ LOOK = 2.0
 def command(network: str, state: Path, changes: Sequence[str] = ()) -> list[str]:
     """What trains: `ngpt train`, the network's configuration, and what is changed of it."""
     sets = ", ".join(f'"{ROOT / "configs" / name}.toml"' for name in SETS)
-    settings = SETTINGS | {
-        "data.folders": f"[{sets}]",
-        "data.kept": str(state / "references"),
-    }
+    settings = SETTINGS | {"data.folders": f"[{sets}]", "data.kept": str(state / "references")}
     weights = ROOT / "export" / "weights" / f"ngpt-{network}.safetensors"
     settings |= {"initial": str(weights)} if weights.exists() else {}
     given = [f"{name}={value}" for name, value in settings.items()] + list(changes)

@@ -5,8 +5,6 @@ python scripts/reliability.py --from DIR      only the page, of the files in DIR
 python scripts/reliability.py -k "kill or disk"    some of the campaigns, as pytest chooses them, then the page of them
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -130,7 +128,7 @@ def main() -> int:
     parser.add_argument("-k", dest="chosen", metavar="EXPRESSION", help="run only these")
     parser.add_argument("-o", "--output", type=Path, default=PAGE, metavar="FILE", help=f"default: {PAGE}")
     args = parser.parse_args()
-    from ngpt.system.files import atomic_output
+    from ngpt.system.writing import write_text
 
     with tempfile.TemporaryDirectory(prefix="ngpt-reliability-") as fresh:
         folder = args.folder or Path(fresh)
@@ -142,8 +140,7 @@ def main() -> int:
         print("reliability: no campaign left a record")
         return 1
     reports.sort(key=lambda report: report["campaign"])
-    with atomic_output(args.output, overwrite=True) as temporary:
-        temporary.write_text(page(reports, time.strftime("%Y-%m-%d", time.gmtime(newest)), status != 0))
+    write_text(args.output, page(reports, time.strftime("%Y-%m-%d", time.gmtime(newest)), status != 0))
     print(f"reliability: {args.output}: {len(reports)} campaigns")
     return status
 

@@ -6,8 +6,6 @@
 Licences and hashes are of what is installed here, which `make check` sees to.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

@@ -6,7 +6,8 @@ from full_stack import full_stack
 
 import ngpt
 from ngpt.denoisers import caustic, diffusion, oidn
-from ngpt.io.exr import read, read_exr, write
+from ngpt.io.exr import read, write
+from ngpt.io.openexr import read_exr
 from ngpt.io.resolution import resolve
 from ngpt.layers import FEATURE_NOISE
 from ngpt.merging import merge

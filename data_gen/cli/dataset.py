@@ -40,11 +40,14 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if not args.out:
         raise WrongUse("--out is missing: the folder of the training set")
     # Only the verbs that render import the renderer.
+    from data_gen.backend import use_variant
     from data_gen.dataset.card import write_card
     from data_gen.dataset.config import read_config
     from data_gen.dataset.jobs import cluster, generate, processes
 
     config = read_config(path)
+    if not args.cluster:
+        use_variant(args.variant)  # whether it can be used, before anything is made
     executor = cluster(args.cluster) if args.cluster else processes(args.workers)
     with executor as workers, console.progress(str(args.out), "crops", begins=KERNELS) as progress:
         generate(config, args.out, workers, shard=args.shard, variant=args.variant, progress=progress)

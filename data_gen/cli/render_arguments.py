@@ -22,7 +22,6 @@ from ngpt.cli.arguments import (
 from ngpt.cli.picture import IMAGES, add_look
 from ngpt.errors import WrongUse
 from ngpt.methods import METHODS
-from ngpt.system.files import make_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -184,7 +183,7 @@ def _of_a_farm(some: str) -> list[int]:
 
 
 def targets(output: str | None, scene: str, numbers: list[int]) -> dict[int, Path]:
-    """Frame -> file. ``output`` is a pattern (``shot.{frame:04d}.exr``), or a folder, which is made if it is not there.
+    """Frame -> file. ``output`` is a pattern (``shot.{frame:04d}.exr``), or a folder, which need not be there.
 
     Raises WrongUse for a name that is one file for several frames.
     """
@@ -197,12 +196,10 @@ def targets(output: str | None, scene: str, numbers: list[int]) -> dict[int, Pat
                 named = f"{folder.with_suffix('')}.{{frame:04d}}{folder.suffix}"
                 raise WrongUse(f"{folder}: is one file for {len(numbers)} frames; write -o '{named}', or a folder")
             return {numbers[0]: folder}
-        pattern = str(make_folder(folder) / f"{stem}.{{frame:04d}}.exr")
+        pattern = str(folder / f"{stem}.{{frame:04d}}.exr")
     found = {number: Path(filled(pattern, number)) for number in numbers}
     seen: dict[Path, int] = {}
     for number, path in found.items():
         if (other := seen.setdefault(path, number)) != number:
             raise WrongUse(f"{path}: would be frame {other} and frame {number}; write {{frame:04d}} in the name")
-    for path in found.values():
-        make_folder(path.parent)
     return found

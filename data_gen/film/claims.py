@@ -11,20 +11,22 @@ whose expected square is the variance of the pixel's mean where samples are inde
 points of nets, and what the variance of the mean is then, ``data_gen.film.nets.law`` says for each way in which noise
 may fall. One square says little of a pixel, but pixels of about the same noise together show which: where little light
 is found by luck, points help much, and where all is, not at all.
+
+The fewer pixels have most of the noise, the less they show. So the factor is a mean over all laws, weighted by how
+likely they are; a geometric one, since factors are wrong by ratios. All laws expect the same contrast of two samples:
+there, only how usual each law is counts.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from data_gen.film.nets import law
+from data_gen.film.nets import USUAL, law
 
 # Pixels of about the same noise: so many groups at most, of so many pixels at least
 _GROUPS, _LEAST = 64, 64
 # Side of the square of pixels that tells how much noise there is around the one in its middle
 _AROUND = 5
-# As many pixels with independent samples are added to each group, so that few pixels do not decide by chance.
-_PRIOR = 4.0
 
 
 def factors(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net: int) -> np.ndarray:
@@ -65,20 +67,30 @@ def _found(
     laws = [law(max(int(n), 2), net) for n in numbers]
     seen, truth = (np.array(each) for each in zip(*laws, strict=True))
     for group in np.array_split(order, max(1, min(groups, len(order) // _LEAST))):
-        claimed = np.bincount(kind[group], variances[group], len(numbers))
-        total = claimed.sum()
+        total = variances[group].sum()
         if total > 0:
-            prior = _PRIOR / len(group) * total
-            ratio = (squares[group].sum() + prior) / (total + prior)
-            # What is seen falls from law to law, and np.interp wants it to rise.
-            which = np.interp(-ratio, -(claimed @ seen) / total, np.arange(seen.shape[1]))
-            found[group] = (truth @ _hat(which, seen.shape[1]))[kind[group]]
+            each = variances[group] / total
+            share = np.bincount(kind[group], each, len(numbers))
+            ratio, contrasts, pixels = squares[group].sum() / total, share @ (numbers - 1), 1 / np.square(each).sum()
+            found[group] = np.exp(np.log(truth) @ _likely(ratio, share @ seen, contrasts, pixels))[kind[group]]
     return found
 
 
-def _hat(place: float, n: int) -> np.ndarray:
-    """Weights that interpolate linearly between ``n`` values at a ``place`` from 0 to n - 1."""
-    return np.maximum(1 - np.abs(np.arange(n) - place), 0)
+def _likely(ratio: float, expected: np.ndarray, contrasts: float, pixels: float) -> np.ndarray:
+    """How likely each law is, (laws), by the ``ratio`` of squared contrasts to variances, and what laws ``expected``.
+
+    A sample variance is a mean over so many orthogonal ``contrasts``. The one that is seen is held against all others:
+    over what a law expects, the ratio of both has an F distribution. Its degrees of freedom are one and the number of
+    the others, for each of so many ``pixels`` of equal noise.
+    """
+    others = contrasts - 1
+    if others < 1e-6:
+        return USUAL
+    part, by_law = min(ratio / contrasts, 1 - 1e-12), expected / contrasts
+    odds = part / (1 - part) * (1 - by_law) / by_law
+    likelihood = pixels / 2 * (np.log((1 - by_law) / by_law) - contrasts * np.log1p(odds / others))
+    weights = USUAL * np.exp(likelihood - likelihood.max())
+    return weights / weights.sum()
 
 
 def box_means(image: np.ndarray, size: int) -> np.ndarray:

@@ -51,7 +51,13 @@ class Remembering:
         self._sampler: Any = None
 
     def render(
-        self, scene: mi.Scene, shapes: Sequence[Geometry], index: int, motion: np.ndarray, depth: np.ndarray | None
+        self,
+        scene: mi.Scene,
+        shapes: Sequence[Geometry],
+        index: int,
+        motion: np.ndarray,
+        depth: np.ndarray | None,
+        progress: Callable[[int, int], None],
     ) -> GradientStack:
         """The stack of frame number ``index`` of the shot; the ``scene`` has its ``shapes`` there.
 
@@ -62,7 +68,9 @@ class Remembering:
             if reason := self.entry.refuses(scene_facts(scene)):
                 raise NgptError(f"sampler '{self.entry.name}' cannot render this scene: {reason}; use --sampler gpt")
             self._sampler = self.entry.made(scene, self.seed, self.spp, self.memory, **self.options)
+        progress(0, self.spp)
         film = self._sampler.film(index, motion, depth, (scene, shapes) if self.changes else None)
+        progress(self.spp, self.spp)
         more = {"ngpt:confidence": self._sampler.confidence} | options_as_attribute(self.entry, self.options)
         sensor, name = scene.sensors()[0], self.entry.name
         return stack_of(film, sensor, self.seed, name, start, more, diagnostics=self.diagnostics)
@@ -142,6 +150,7 @@ def render_shot(
     dt: int = 0,
     *,
     skip: Callable[[int], bool] = lambda frame: False,
+    progress: Callable[[int], Callable[[int, int], None]] = lambda frame: lambda done, total: None,
     sampler: str = "auto",
     **options: Any,
 ) -> Iterator[tuple[int, GradientStack]]:
@@ -194,11 +203,11 @@ def render_shot(
                 motion = motion_vectors(scene, now, before, what)
             if remembering is not None:
                 far = None if what is None else depth(scene, now, what)
-                stack = remembering.render(scene, now.shapes, j, motion, far)
+                stack = remembering.render(scene, now.shapes, j, motion, far, progress(frame))
             else:
                 try:
                     own = frame_seed(seed, frame)
-                    stack = render_stack(scene, spp, own, sampler, **options)
+                    stack = render_stack(scene, spp, own, sampler, progress=progress(frame), **options)
                 except Unfinished as error:
                     placed = _placed(error.stack, frame, previous, motion + np.asarray(shift, np.float32))
                     raise Unfinished(f"frame {frame}: {error}", placed) from error

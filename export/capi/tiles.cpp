@@ -10,8 +10,11 @@ std::vector<Cut> cuts(int64_t length, int64_t alignment, int64_t overlap) {
     std::vector<Cut> ways;
     for (int64_t pieces = 1; pieces <= std::max<int64_t>(1, length / alignment); pieces++) {
         const int64_t step = (length + pieces * alignment - 1) / (pieces * alignment) * alignment;
-        const int64_t size = std::min(step + 2 * overlap + length % alignment, length);
-        if (ways.empty() || size < ways.back().size) ways.push_back({step, size, (length + step - 1) / step});
+        const int64_t count = (length + step - 1) / step;
+        // Two pieces have a neighbour on one side only.
+        const int64_t beside = std::min<int64_t>(count - 1, 2) * overlap;
+        const int64_t size = std::min(step + beside + length % alignment, length);
+        if (ways.empty() || size < ways.back().size) ways.push_back({step, size, count});
     }
     return ways;
 }

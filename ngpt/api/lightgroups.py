@@ -1,13 +1,11 @@
 """Light groups, denoised so that they still add up to the image: for those who set the lights anew in compositing.
 
-A renderer that splits the image by its lights writes an image for each group beside the whole. Each group is denoised
-by itself, since it has shadows of its own. What their sum then lacks of the reconstruction of the whole, or has too
-much, is divided among them, in each pixel in proportion to the light that they have there:
+Each group is denoised by itself, since it has shadows of its own. What their sum then lacks of the reconstruction of
+the whole, or has too much, is divided among them, in each pixel in proportion to the light that they have there:
 
     o_i = d_i + (D - Σ d_j) |d_i| / Σ |d_j|
 
-so Σ o_i = D whatever the method, and groups of no negative light stay so. Light that is in no group counts as one more
-group, which is not written.
+so Σ o_i = D whatever the method, and groups of no negative light stay so. Light in no group counts as one more group.
 """
 
 from collections.abc import Mapping, Sequence

@@ -22,16 +22,12 @@ class Tensor(Protocol):
 
 
 class Bitmap(Protocol):
-    """An ``mi.Bitmap``."""
-
     def pixel_format(self) -> Any: ...
 
     def component_format(self) -> Any: ...
 
 
 class Transform(Protocol):
-    """A transform of Mitsuba."""
-
     @property
     def matrix(self) -> Any: ...
 
@@ -41,7 +37,6 @@ Kind = TypeVar("Kind", bound=Image)  # the kind that went in is the kind that co
 
 
 def is_bitmap(value: Any) -> bool:
-    """Whether it is an ``mi.Bitmap``."""
     return hasattr(value, "pixel_format") and hasattr(value, "component_format")
 
 

@@ -1,18 +1,8 @@
 """How far a reconstruction may be from the converged image: a standard error for each pixel, for any method.
 
-The method runs a second time, on the stack with more noise added: independent normal noise in primal, dx, dy and
-caustic, with the variances of the stack. The change of the image, over about 9x9 pixels, shows how much noise comes
-through. The method's own errors, mostly blur, lie in about the same places. So the change is multiplied by a factor,
-which is measured for each method. With it, an interval of one standard error holds the truth in 68 % of the pixels, and
-an interval of 1.96 standard errors in 95 %. Both are means over scenes that no factor was chosen on
-(docs/use/uncertainty.md).
-
-The standard error describes most pixels, not the worst ones: about 1 % of the values are more than five standard errors
-off, and hold most of the squared error. They lie where a rare bright path was spread into a blotch, which its variance
-understates. Stacks of two *halves* of the samples, each with its own seeds, show such blotches: one half has them and
-the other does not.
-
-Not handled: errors that do not depend on the noise, such as a caustic that all samples missed.
+The method runs a second time, with more noise added to primal, dx, dy and caustic, of the variances of the stack. The
+change of the image over about 9x9 pixels, times a factor that is measured for each method, is the standard error. How
+good that is, and where it fails: docs/use/uncertainty.md.
 """
 
 from dataclasses import replace
@@ -31,23 +21,12 @@ from ngpt.system.late import ndimage
 SPREAD = 2.6  # pixels, the standard deviation of the window over which the change is averaged: as large as 9x9 pixels
 SEED = 20261122
 # By `python -m bench.uncertainty`, on scenes named there; of methods that are not here, the most frequent.
-FACTORS = {
-    "primal": 0.9,
-    "l2": 0.9,
-    "l1": 1.7,
-    "cv": 0.85,
-    "wcv": 1.1,
-    "wl2": 1.4,
-}
+FACTORS = {"primal": 0.9, "l2": 0.9, "l1": 1.7, "cv": 0.85, "wcv": 1.1, "wl2": 1.4}
 FACTOR = 1.2
 
 
 def reconstruct_with_error(
-    stack: GradientStack,
-    method: str = "auto",
-    *,
-    halves: tuple[GradientStack, GradientStack] | None = None,
-    **options,
+    stack: GradientStack, method: str = "auto", *, halves: tuple[GradientStack, GradientStack] | None = None, **options
 ) -> Result:
     """As ``ngpt.reconstruct``, with ``Result.error``: the standard error of the image, (H, W, 3) float32, in its unit.
 

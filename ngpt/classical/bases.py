@@ -69,7 +69,6 @@ _ALL = (*_GRADIENTS, "primal_var", "dx_var", "dy_var")
 
 
 def weight_of_primal(default: float | str) -> Option:
-    """The option ``alpha``."""
     meaning = "weight of the primal image beside the gradients; auto: by the variances"
     return Option(default, meaning, choices=("auto",), range=(1e-15, 1e15))
 

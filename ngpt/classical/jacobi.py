@@ -20,7 +20,7 @@ import numpy as np
 from ngpt.classical.arrays import map_silent
 
 # Sweeps between two exchanges of rows.
-DEPTH = 5
+DEPTH = 6
 # Rows of a strip without the neighbours' rows. Fewer rows mean more copies; more rows leave threads without work.
 _STRIP = 180
 # Pixels that are worked on at a time: fewer make more calls, more leave the cache.
@@ -29,8 +29,10 @@ _PIXELS = 30720
 _VECTOR = 64
 
 
-def jacobi(r: np.ndarray, primal_var: np.ndarray, difference_var: np.ndarray, factors: list[float]) -> np.ndarray:
-    """The correction u (C, H, W) after one sweep from 0 for each of ``factors``, as of ``controlvariates``.
+def jacobi(
+    r: np.ndarray, primal_var: np.ndarray, difference_var: np.ndarray, schedule: list[tuple[float, float]]
+) -> np.ndarray:
+    """The correction u (C, H, W) after one sweep from 0 for each entry of ``schedule``, as of ``controlvariates``.
 
     ``r`` (2, C, H, W) residuals of the differences, ``primal_var`` (1, H, W) > 0, ``difference_var`` (2, 1, H, W),
     infinite where there is no difference; float32 or float64. ``r`` is overwritten: u is in its memory.
@@ -39,12 +41,12 @@ def jacobi(r: np.ndarray, primal_var: np.ndarray, difference_var: np.ndarray, fa
     count = max(1, round(height / _STRIP))
     cuts = [height * i // count for i in range(count + 1)]
     strips = map_silent(lambda rows: _Strip(r, primal_var[0], difference_var[:, 0], *rows), pairwise(cuts))
-    for first in range(0, len(factors), DEPTH):
-        now = factors[first : first + DEPTH]
+    for first in range(0, len(schedule), DEPTH):
+        now = schedule[first : first + DEPTH]
         if first:
             for upper, lower in pairwise(strips):
                 upper.exchange(lower)
-        map_silent(partial(_Strip.run, factors=now), strips)
+        map_silent(partial(_Strip.run, schedule=now), strips)
     u = r[0]
     for strip in strips:
         u[:, strip.first : strip.last] = strip.inner
@@ -92,18 +94,20 @@ class _Strip:
         here, below = self._grid(self.u)[:, 1:-1], self._grid(lower.u)[:, 1:-1]
         here[:, -DEPTH:], below[:, :DEPTH] = below[:, DEPTH : 2 * DEPTH], here[:, -2 * DEPTH : -DEPTH]
 
-    def run(self, factors: list[float]) -> None:
-        """One sweep for each factor, each one row behind the one before."""
+    def run(self, schedule: list[tuple[float, float]]) -> None:
+        """One sweep for each entry, each one row behind the one before."""
         rows = max(1, _PIXELS // self.pitch)
         scratch = _Scratch(self, rows)
-        numbers = [self.u.dtype.type(factor) for factor in factors]
-        for bottom in range(rows, self.rows + len(factors) + rows - 1, rows):
-            for late, factor in enumerate(numbers):
+        numbers = np.array(schedule, self.u.dtype)
+        for bottom in range(rows, self.rows + len(numbers) + rows - 1, rows):
+            for late, (factor, step) in enumerate(numbers):
                 top, end = max(bottom - rows - late, 0), min(bottom - late, self.rows)
                 if top < end:
-                    self._rows(top, end, factor, scratch, scratch.above[late])
+                    self._rows(top, end, factor, step, scratch, scratch.above[late])
 
-    def _rows(self, top: int, end: int, factor: np.floating, scratch: "_Scratch", above: np.ndarray) -> None:
+    def _rows(
+        self, top: int, end: int, factor: np.floating, step: np.floating, scratch: "_Scratch", above: np.ndarray
+    ) -> None:
         """One sweep over rows top .. end - 1.
 
         ``above`` (C, pitch) is what the last row of those before said of this sweep's first, and will be of the next.
@@ -115,6 +119,7 @@ class _Strip:
         np.add(self.ratio[:, first:last], factor, out=weights)
         np.divide(factor, weights, out=weights)
         np.add.reduce(weights, axis=0, initial=1, out=share)
+        share /= step
         np.subtract(self.neighbours[..., first:last], u, out=d)
         d -= self.r[..., first:last]
         # dy of the row above, as it was before this sweep.

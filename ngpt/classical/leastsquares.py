@@ -198,7 +198,6 @@ class Weighted:
 
 
 def _plus(a: np.ndarray, factor: float, b: np.ndarray, out: np.ndarray) -> np.ndarray:
-    """a + factor b"""
     return by_rows(lambda i, j: (a[:, i:j] + factor * b[:, i:j],), out)[0]
 
 

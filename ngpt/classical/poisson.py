@@ -78,9 +78,8 @@ def l1(
     """The minimiser of the sum of norms, (H, W, C); arguments as of ``l2``.
 
     Stops when five iterations lower the energy by less than ``tolerance`` of it, which leaves it within 0.5 % of the
-    minimum: 0.08 to 0.47 % on twenty-four stacks of eight scenes, after 43 to 50 iterations. Robust to outliers, but
-    not linear, and it darkens where few bright samples carry the energy: the norm seeks the median where l2 seeks the
-    mean.
+    minimum. Robust to outliers, but not linear, and it darkens where few bright samples carry the energy: the norm
+    seeks the median where l2 seeks the mean.
     """
     check_alpha(alpha)
     equations = Equations(primal, dx, dy, trusted)

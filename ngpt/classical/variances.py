@@ -49,13 +49,9 @@ def auto_alpha(primal_var: np.ndarray, dx_var: np.ndarray, dy_var: np.ndarray, n
     """The α that weights the primal against the gradients as their noise does; variances are (H, W, C).
 
     ``norm`` 2: the square root of mean gradient variance over mean primal variance, which weights the two terms of l2
-    by inverse variance. ``norm`` 1: mean standard deviation of gradients over mean standard deviation of the primal,
-    which does the same for l1.
+    by inverse variance. ``norm`` 1: mean standard deviation of gradients over mean standard deviation of the primal.
     Values that are not finite or negative are left out, and so are the largest: one in ten thousand, but at least one.
     The result is in [1e-3, 1e3], and 1 without any noise.
-
-    l2 at this α has 0.46 times the relMSE that it has at 0.2 (geometric mean over ten scenes at 4, 16 and 64 spp; at
-    worst 1.08 times). l1 is within 2 % on average at either.
     """
 
     def mean(*layers: np.ndarray) -> float:

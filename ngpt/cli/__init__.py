@@ -121,7 +121,6 @@ class _Print(argparse.Action):
 
 
 def parsers() -> dict[str, argparse.ArgumentParser]:
-    """The parser of each verb."""
     return {name: _filled(_Parser(prog=f"ngpt {name}"), name, verb) for name, verb in all_verbs().items()}
 
 

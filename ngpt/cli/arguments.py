@@ -3,8 +3,9 @@
 import argparse
 import json
 import logging
+import math
 import re
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
 
 from ngpt.errors import WrongUse
@@ -12,9 +13,10 @@ from ngpt.io.frames import input_files, is_shot
 from ngpt.layers import LAYERS
 from ngpt.system import configs
 from ngpt.system.console import Console
-from ngpt.system.files import atomic_output, check_output, make_folder
+from ngpt.system.files import check_output, make_folder
 from ngpt.system.parts import Registry
 from ngpt.system.text import by_names
+from ngpt.system.writing import write_text
 
 _LOG = logging.getLogger(__name__)
 
@@ -71,11 +73,9 @@ def config_of(args: argparse.Namespace, kind: str) -> Path:
 
 
 def write_template(args: argparse.Namespace, text: str, verb: str, console: Console) -> int:
-    """Writes the file of ``--init``, and says what to do with it."""
     make_folder(Path(args.init).parent)
     target = check_output(args.init)
-    with atomic_output(target) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(target, text, overwrite=False)
     console.say(f"{target}: every setting; then: ngpt {verb} --config {target} --out DIR")
     return 0
 
@@ -147,27 +147,29 @@ def size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
+def natural(text: str, least: int = 0) -> int:
+    if not text.isdecimal() or int(text) < least:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of {least} or more")
+    return int(text)
+
+
 def positive(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 1 or more")
-    return int(text)
-
-
-def natural(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 0 or more")
-    return int(text)
+    return natural(text, 1)
 
 
 def duration(text: str) -> float:
-    """A positive number of seconds."""
+    return number(text, lambda seconds: 0 < seconds < math.inf, "is not a positive number of seconds")
+
+
+def number(text: str, fits: Callable[[float], bool], refusal: str) -> float:
+    """The number in a text. Texts without one, and numbers that do not fit, are an error that ends in ``refusal``."""
     try:
-        seconds = float(text)
+        found = float(text)
     except ValueError:
-        seconds = 0.0
-    if not 0 < seconds < float("inf"):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a positive number of seconds")
-    return seconds
+        found = math.nan
+    if not fits(found):
+        raise argparse.ArgumentTypeError(f"'{text}' {refusal}")
+    return found
 
 
 def stack_files(names: list[str]) -> list[Path]:
@@ -200,7 +202,7 @@ def _strict(value):
         return [_strict(item) for item in value]
     if isinstance(value, str):
         return by_names(value)
-    if isinstance(value, float) and not abs(value) < float("inf"):
+    if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
 

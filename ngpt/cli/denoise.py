@@ -12,20 +12,7 @@ from typing import Any
 
 from ngpt.api import lightgroups
 from ngpt.api.uncertainty import reconstruct_with_error
-from ngpt.cli.arguments import (
-    Names,
-    add_files,
-    add_force,
-    add_json,
-    add_layers,
-    add_options,
-    add_untrusted,
-    add_view,
-    given_files,
-    output_file,
-    print_json,
-    stack_files,
-)
+from ngpt.cli import arguments
 from ngpt.cli.denoise_files import Frame, describe, output_paths, write_frame
 from ngpt.cli.denoise_shot import motion_hint, one_view_only, way, windowed
 from ngpt.cli.picture import add_look, check_picture
@@ -36,7 +23,7 @@ from ngpt.io.exr import read, read_views
 from ngpt.io.foreign.files import first_attributes
 from ngpt.io.frames import RESULT_SUFFIX, is_shot, remarks
 from ngpt.io.whole import finished
-from ngpt.methods import METHODS, by_standing, reconstruct
+from ngpt.methods import METHODS, by_standing, reconstruct, runnable
 from ngpt.network.identity import identify
 from ngpt.network.run_onnx import MEMORY
 from ngpt.options import as_text, settings, unusual
@@ -70,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--method",
         default="auto",
         metavar="NAME",
-        choices=Names(METHODS),
+        choices=arguments.Names(METHODS),
         help=f"auto: a good method for the layers of the file and the installed packages (default); {first}. For "
         f"special cases: {', '.join(by_standing('niche'))}. `ngpt info NAME` describes a method",
     )
@@ -86,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"memory limit for networks; larger images are computed in tiles (default: {MEMORY})",
     )
     parser.add_argument("--threads", type=int, metavar="N", help="number of threads (default: all cores)")
-    add_options(parser, "method", "METHOD")
+    arguments.add_options(parser, "method", "METHOD")
     parser.add_argument(
         "--error",
         action="store_true",
@@ -122,17 +109,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="reference image: print the error in the pixels that both have, as relMSE and as trimmed relMSE, which "
         "leaves out the worst 0.1 %% of the pixels",
     )
-    add_files(parser)
-    add_layers(parser)
-    add_view(parser, "default: all views")
+    arguments.add_files(parser)
+    arguments.add_layers(parser)
+    arguments.add_view(parser, "default: all views")
     add_look(parser)
-    add_untrusted(parser)
+    arguments.add_untrusted(parser)
     existing = parser.add_mutually_exclusive_group()
-    add_force(existing)
+    arguments.add_force(existing)
     existing.add_argument(
         "--skip-existing", action="store_true", help="skip stacks whose results exist, to continue a folder"
     )
-    add_json(parser)
+    arguments.add_json(parser)
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
@@ -145,8 +132,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def denoise(args: argparse.Namespace, console: Console) -> int:
-    files = given_files(args)
-    pairs = output_paths(stack_files(args.stacks), args.output)
+    files = arguments.given_files(args)
+    pairs = output_paths(arguments.stack_files(args.stacks), args.output)
     if files and len(pairs) > 1:
         raise WrongUse(
             f"--{next(iter(files))} belongs to one stack, and {len(pairs)} are given; denoise them one by one"
@@ -159,18 +146,22 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
             if given:
                 raise WrongUse(f"--temporal and {option} cannot be combined; leave one out")
-    for _, target in pairs:
-        if target.suffix.lower() != ".exr":
-            check_picture(target, args)
-        output_file(target, args)
-    # Their results are there, but later frames are made of them.
-    missing = [i for i, (_, target) in enumerate(pairs) if not finished(target)] if args.temporal else []
-    again = {target for _, target in pairs[: missing[-1]]} if missing else set()
-    reference = Reference.read(args.ref, args.untrusted) if args.ref else None
     options = {
         name: value for name in ("alpha", "weights", "device", "memory") if (value := getattr(args, name)) is not None
     }
     options |= dict(args.option)
+    if args.method in METHODS:  # what no file could be denoised with
+        settings(f"method '{args.method}'", runnable(args.method).options, options)
+    if "weights" in options:
+        identify(options["weights"])
+    reference = Reference.read(args.ref, args.untrusted) if args.ref else None
+    for _, target in pairs:
+        if target.suffix.lower() != ".exr":
+            check_picture(target, args)
+        arguments.output_file(target, args)
+    # Their results are there, but later frames are made of them.
+    missing = [i for i, (_, target) in enumerate(pairs) if not finished(target)] if args.temporal else []
+    again = {target for _, target in pairs[: missing[-1]]} if missing else set()
     # One stack has no progress to tell, but somebody who looks on sees that it is at work.
     bar = console.progress("denoise", "frames") if len(pairs) > 1 or console.terminal else nullcontext(_unseen)
     overwrite = partial(
@@ -188,7 +179,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         windows, told = way([source for source, _ in pairs], dict(args.layer), by_wcv)
         console.say(f"--temporal: {told}")
         for name in filter(is_shot, args.stacks):
-            for remark in remarks(name, stack_files([name]), results=False):
+            for remark in remarks(name, arguments.stack_files([name]), results=False):
                 console.say(remark)
     if windows:
         everything = {target for _, target in pairs}
@@ -228,7 +219,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
     if skipped:
         console.say(f"{skipped} of {len(pairs)} stacks were skipped: their results are there")
     if args.json:
-        print_json({"ok": failed == 0, "files": reports})
+        arguments.print_json({"ok": failed == 0, "files": reports})
     return 1 if failed else 0
 
 

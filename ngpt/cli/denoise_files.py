@@ -99,7 +99,6 @@ def write_frame(
 
 
 def describe(report: dict) -> str:
-    """One line about one file."""
     if "skipped" in report:
         return f"{report['input']} -> {report['output']}: skipped, exists already"
     text = f"{report['input']} -> {report['output']}: {report['method']}"
@@ -126,7 +125,6 @@ def describe(report: dict) -> str:
 
 
 def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Path]]:
-    """Where the result of each source goes."""
     if output is None:
         targets = [path.with_name(f"{path.stem}{RESULT_SUFFIX}.exr") for path in sources]
     elif varies(output):

@@ -34,7 +34,6 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def compare_files(names: Sequence[str], args: argparse.Namespace, console: Console) -> int:
-    """Compares the first with the second."""
     images, places = zip(*map(read_picture, names), strict=True)
     both = overlap(names, places)
     image, reference = both.of(images)

@@ -7,7 +7,7 @@ from ngpt.classical.poisson import DEFAULT_ALPHA
 from ngpt.cli.arguments import add_force, output_file
 from ngpt.errors import NgptError, WrongUse
 from ngpt.system.console import Console
-from ngpt.system.files import atomic_output
+from ngpt.system.writing import write_bytes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,14 +50,12 @@ def run(args: argparse.Namespace, console: Console) -> int:
 def write(args: argparse.Namespace) -> list[Path]:
     """Writes what the arguments ask for; returns the files."""
     if args.output.suffix == ".tza":
-        from ngpt.export.oidn import oidn_weights
+        from ngpt.export.weights import oidn_weights
 
-        data = oidn_weights(args.weights)
-        with atomic_output(args.output, args.force) as temporary:
-            temporary.write_bytes(data)
+        write_bytes(args.output, oidn_weights(args.weights), args.force)
         return [args.output]
     if args.output.suffix == ".safetensors":
-        from ngpt.export.halves import write_halves
+        from ngpt.export.weights import write_halves
 
         write_halves(args.weights, args.output, args.force)
         return [args.output]
@@ -65,31 +63,25 @@ def write(args: argparse.Namespace) -> list[Path]:
         from ngpt.export.poisson import l2_model
 
         models = {args.output: l2_model(args.alpha)}
-    elif kind_of(args.weights) == "temporal":
-        from ngpt.export.temporal import temporal_model
-
-        if args.vector:
-            raise NgptError(
-                f"{args.weights}: this network blends frames, and has no example to write; leave --vector out"
-            )
-        models = {args.output: temporal_model(args.weights)}
     else:
         from ngpt.export.network import network_model, statistics_model
+        from ngpt.export.temporal import temporal_model
+        from ngpt.network.safetensors import read_tensors
 
+        if read_tensors(args.weights)[1].get("kind") == "temporal":
+            if args.vector:
+                raise NgptError(
+                    f"{args.weights}: this network blends frames, and has no example to write; leave --vector out"
+                )
+            write_bytes(args.output, temporal_model(args.weights).SerializeToString(), args.force)
+            return [args.output]
         name, beside = args.weights.stem, output_file(args.output.with_suffix(".statistics.onnx"), args)
         models = {args.output: network_model(args.weights, name, args.precision)}
         models[beside] = statistics_model(args.weights, name)
     for path, model in models.items():
-        with atomic_output(path, args.force) as temporary:
-            temporary.write_bytes(model.SerializeToString())
+        write_bytes(path, model.SerializeToString(), args.force)
     if args.vector:
         from ngpt.export.vector import write_vector
 
         write_vector(models[args.output], args.vector, args.force)
     return list(models)
-
-
-def kind_of(weights: Path) -> str:
-    from ngpt.network.safetensors import read_tensors
-
-    return read_tensors(weights)[1].get("kind", "")

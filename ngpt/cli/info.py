@@ -92,7 +92,6 @@ def file(args: argparse.Namespace, console: Console) -> int:
 
 
 def overview() -> dict:
-    """What this installation offers."""
     titles = {"methods": "use", "methods for some stacks": "niche", "methods to compare with": "study"}
     METHODS.load()
     report: dict[str, Any] = {"version": __version__}
@@ -109,12 +108,8 @@ def method(name: str) -> dict:
     if name not in METHODS:
         return {}
     entry = METHODS[name]
-    report: dict[str, Any] = {
-        "method": name,
-        "summary": entry.summary,
-        "standing": entry.standing,
-        "needs": entry.needs,
-    }
+    report: dict[str, Any] = {"method": name, "summary": entry.summary}
+    report |= {"standing": entry.standing, "needs": entry.needs}
     report |= {"uses": entry.uses} if entry.uses else {}
     report["options"] = {option: str(value) for option, value in entry.options.items()}
     return report
@@ -191,7 +186,7 @@ def stack(stack: GradientStack) -> dict:
             if not method.missing() and all(layer in stack for layer in method.needs)
         ],
         "auto": choose(stack),
-        "auto with more": {", ".join(gain.add): bought(gain) for gain in gains(stack)},
+        "auto with more": {", ".join(gain.add): _bought(gain) for gain in gains(stack)},
         "attributes": {name: _plain(value) for name, value in sorted(stack.attributes.items())},
     }
     for name in ("diagnostics", "proposed", "auto with more"):
@@ -200,7 +195,7 @@ def stack(stack: GradientStack) -> dict:
     return report
 
 
-def bought(gain: Gain) -> dict:
+def _bought(gain: Gain) -> dict:
     """What `auto` would take with more layers, and how much of its error it would leave, as measured by samples."""
     return {"auto": gain.method, "times the error at": {f"{n} spp": round(x, 2) for n, x in gain.error.items()}}
 
@@ -231,14 +226,8 @@ def _fitted(line: str, indent: int) -> None:
     """Prints a line: on a terminal broken between words, and indented where it goes on; elsewhere as it is."""
     if sys.stdout.isatty():
         width, start = shutil.get_terminal_size().columns, len(line) - len(line.lstrip())
-        line = textwrap.fill(
-            line.lstrip(),
-            width,
-            initial_indent=" " * start,
-            subsequent_indent=" " * indent,
-            break_long_words=False,
-            break_on_hyphens=False,
-        )
+        wrapper = textwrap.TextWrapper(width, " " * start, " " * indent, break_long_words=False, break_on_hyphens=False)
+        line = wrapper.fill(line.lstrip())
     for part in line.split("\n"):
         tell(part)
 

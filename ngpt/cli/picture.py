@@ -1,12 +1,11 @@
 """``ngpt picture``: PNG, JPEG and WebP of images, and films of shots, by a view transform."""
 
 import argparse
-import math
 from pathlib import Path
 
 import numpy as np
 
-from ngpt.cli.arguments import add_force, add_view, output_file
+from ngpt.cli.arguments import add_force, add_view, number, output_file
 from ngpt.cli.streams import standard_input
 from ngpt.errors import WrongUse
 from ngpt.image.display import auto_exposure
@@ -111,7 +110,6 @@ def in_picture(image: np.ndarray, place: Place) -> np.ndarray:
 
 
 def seen(place: Place) -> Window:
-    """The pixels that a picture has."""
     return place.data.common(place.display) or place.data
 
 
@@ -154,14 +152,9 @@ def add_look(parser: argparse.ArgumentParser) -> None:
 
 
 def stops(text: str) -> float | str:
-    """A number of stops, or "auto"."""
-    try:
-        number = 0.0 if text == "auto" else float(text)
-    except ValueError:
-        number = math.nan
-    if not abs(number) <= 100:
-        raise argparse.ArgumentTypeError(f"'{text}' is neither a number of stops, from -100 to 100, nor auto")
-    return text if text == "auto" else number
+    if text == "auto":
+        return text
+    return number(text, lambda stops: abs(stops) <= 100, "is neither a number of stops, from -100 to 100, nor auto")
 
 
 def exposed(asked: float | str, image: np.ndarray) -> float:
@@ -170,10 +163,4 @@ def exposed(asked: float | str, image: np.ndarray) -> float:
 
 
 def frames_a_second(text: str) -> float:
-    try:
-        rate = float(text)
-    except ValueError:
-        rate = 0.0
-    if not 0 < rate <= 1000:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of frames a second, up to 1000")
-    return rate
+    return number(text, lambda rate: 0 < rate <= 1000, "is not a number of frames a second, up to 1000")

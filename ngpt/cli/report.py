@@ -20,8 +20,8 @@ from ngpt.report.content import REFERENCE, Entry, Overview, Scene
 from ngpt.report.layers import of_stack
 from ngpt.report.page import oversize, write_report
 from ngpt.system.console import Console, tell
-from ngpt.system.files import atomic_output
 from ngpt.system.text import by_names
+from ngpt.system.writing import write_text
 from ngpt.training.run_page import page, read_run
 from ngpt.training.run_summary import is_run
 from ngpt.version import __version__
@@ -110,27 +110,20 @@ def images_or_shots(args: argparse.Namespace, target: Path, console: Console) ->
                 much = f"{abs(stops):.1f} stops {'brighter' if stops > 0 else 'darker'}"
                 console.say(f"{path}: {much} than {args.ref}; is it of the same scene and exposure?")
         formulas = {name: METRICS[name].formula for name in metrics}
-        print_table(entries)
+        rows = [[entry.name, *(f"{value:.4g}" for value in entry.metrics.values())] for entry in entries]
+        print_table([["", *entries[0].metrics], *rows])
     rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
     scene = Scene(f"{width}x{height}", caption, reference, entries, layers, rising)
     title = ", ".join(names) if len(names) < 5 else f"{len(names)} images"
-    facts = {"ngpt": __version__}
-    overview = Overview(formulas=formulas)
-    write_report(target, title, [scene], command=args.command, footer=facts, overview=overview, overwrite=args.force)
-    if large := oversize(target):
-        console.say(large)
-    console.say(f"{target}: open it in a browser")
-    return 0
+    return finish(args, target, title, [scene], Overview(formulas=formulas), console)
 
 
 def run_trainings(args: argparse.Namespace, target: Path, console: Console) -> int:
-    """Folders of training runs: the page of one, or a comparison of several."""
     if args.ref:
         raise WrongUse("--ref is for images; leave it out for training runs")
     names = [Path(name).as_posix() for name in labels(args.images)]
     text = page([read_run(path, name) for path, name in zip(args.images, names, strict=True)], args.command)
-    with atomic_output(target, args.force) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+    write_text(target, text, args.force)
     console.say(f"{target}: open it in a browser")
     return 0
 
@@ -193,22 +186,20 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
             what = "no frame after the first has motion vectors (layer 'motion'), to tell it from what moves"
             console.say(f"flicker is nan: {what}")
         tables = {f"Means over {len(frames)} frames": rows}
-        for row in rows:
-            tell(f"{row[0]:{max(map(len, names))}}" + "".join(f"{cell:>16}" for cell in row[1:]))
+        print_table(rows)
     formulas = {name: METRICS[name].formula for name in metrics} | ({"flicker": FLICKER} if tables else {})
     formulas |= {"change": CHANGE} if len(frames) > 1 else {}
-    overview = Overview(tables=tables, formulas=formulas)
     title = f"{', '.join(names)}: {len(frames)} frames"
-    facts = {"ngpt": __version__}
+    return finish(args, target, title, scenes, Overview(tables=tables, formulas=formulas), console)
+
+
+def finish(
+    args: argparse.Namespace, target: Path, title: str, scenes: list[Scene], about: Overview, console: Console
+) -> int:
+    """Writes the page of images, or of a shot, whose frames it plays, and says how to see it."""
+    facts, shot = {"ngpt": __version__}, any(is_shot(path) for path in args.images)
     write_report(
-        target,
-        title,
-        scenes,
-        command=args.command,
-        footer=facts,
-        overview=overview,
-        overwrite=args.force,
-        shot=True,
+        target, title, scenes, command=args.command, footer=facts, overview=about, overwrite=args.force, shot=shot
     )
     if large := oversize(target):
         console.say(large)
@@ -286,9 +277,8 @@ def add_errors(
         entry.maps[name][part] = values
 
 
-def print_table(entries: list[Entry]) -> None:
+def print_table(rows: list[list[str]]) -> None:
     """The numbers of the page, for those who do not open it."""
-    width = max(len(entry.name) for entry in entries)
-    tell(f"{'':{width}}" + "".join(f"{metric:>16}" for metric in entries[0].metrics))
-    for entry in entries:
-        tell(f"{entry.name:{width}}" + "".join(f"{value:16.4g}" for value in entry.metrics.values()))
+    width = max(len(row[0]) for row in rows)
+    for row in rows:
+        tell(f"{row[0]:{width}}" + "".join(f"{cell:>16}" for cell in row[1:]))

@@ -11,7 +11,8 @@ from ngpt.cli.arguments import add_config, config_of, write_template
 from ngpt.errors import NgptError, WrongUse
 from ngpt.system import configs
 from ngpt.system.console import Console
-from ngpt.system.files import atomic_output, exclusive, make_folder
+from ngpt.system.files import exclusive, make_folder
+from ngpt.system.writing import write_text
 from ngpt.training.run_summary import SETTINGS, WEIGHTS
 
 
@@ -32,6 +33,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     config = config_of(args, configs.TRAINING)
     # Here and not above: a mistyped option is said at once, not after the seconds that torch takes to come in.
     from ngpt.training.cost import cost
+    from ngpt.training.crops import open_crops
     from ngpt.training.distributed import Processes
     from ngpt.training.run_record import write_record
     from ngpt.training.run_summary import PAGE
@@ -50,6 +52,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
         return 0
     if not args.out:
         raise WrongUse("--out is missing: the folder for checkpoint, weights and log")
+    for folder in _on_disk(settings):
+        open_crops(folder)  # its errors come before anything is made
     out = make_folder(args.out)
     say = (lambda text: None) if console.quiet else show
     processes = Processes()
@@ -64,8 +68,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
             else:
                 say(f"continuing {out} at step {trainer.step} of {settings.run.steps}")
         if processes.rank == 0:
-            with atomic_output(out / SETTINGS, overwrite=True) as temporary:
-                temporary.write_text(json.dumps(settings.to_dict(), indent=2) + "\n")
+            write_text(out / SETTINGS, json.dumps(settings.to_dict(), indent=2) + "\n")
             write_record(out, settings, config, trainer.model, trainer.device)
         # With several processes, one reports for all.
         listener = console if processes.rank == 0 else Console(quiet=True)
@@ -76,6 +79,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if processes.rank == 0:
         say(f"{out / PAGE}: open it in a browser")
     return 0 if finished or not trainer.signal else 128 + trainer.signal
+
+
+def _on_disk(settings: Any) -> list[str]:
+    """The folders of training sets that are not rendered meanwhile."""
+    return [folder for folder in settings.data.folders if not folder.endswith(".toml")]
 
 
 def _task(settings: Any, out: Path, stack: ExitStack, processes: Any, say: Callable[[str], None]) -> Any:
@@ -89,7 +97,7 @@ def _task(settings: Any, out: Path, stack: ExitStack, processes: Any, say: Calla
     from ngpt.training.temporal import Blending
 
     loss = make_loss(settings.loss)
-    on_disk = [folder for folder in settings.data.folders if not folder.endswith(".toml")]
+    on_disk = _on_disk(settings)
     if settings.temporal:
         if processes.rank == 0:
             methods = ", ".join(settings.temporal.methods)

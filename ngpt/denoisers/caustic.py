@@ -3,15 +3,12 @@
 Such light is rare and bright: most pixels hold none of it, and a few hold what their whole neighbourhood should. So it
 is spread by a diffusion [Perona and Malik 1990, "Scale-space and edge detection using anisotropic diffusion"] over
 distances of 1, 2, 4, ... pixels [Dammertz et al. 2010, "Edge-avoiding à-trous wavelet transform for fast global
-illumination filtering"]: ``ngpt.denoisers.diffusion``. What one pixel gives is what another gets: no light is lost,
-however rare it is. Pixels exchange less light the more their surfaces differ, and the more they differ themselves
-beyond their noise [variances travel along as in Schied et al. 2017, "Spatiotemporal variance-guided filtering"].
+illumination filtering"]: ``ngpt.denoisers.diffusion``. What one pixel gives is what another gets: no light is lost.
+Pixels exchange less light the more their surfaces differ, and the more they differ themselves beyond their noise
+[variances travel along as in Schied et al. 2017, "Spatiotemporal variance-guided filtering"].
 
-Methods that call OIDN anyway take its image of this light, which has less error where the light has edges. Half the
-size will do: it takes a quarter of the time, and rare light is less rare there, so that OIDN takes less of it for
-noise. What it takes is given back by one factor for the whole image. Neither larger networks nor the whole size are
-better, nor the mean with what OIDN's image of all light has beyond its image of the rest (docs/lab/log). All other
-methods must not depend on a package.
+Methods that call OIDN anyway take its image of this light at half the size, which has less error where the light has
+edges; what it takes for noise is given back by one factor for the whole image (docs/lab/log).
 """
 
 from dataclasses import replace

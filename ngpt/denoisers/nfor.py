@@ -7,10 +7,9 @@ For each pixel p, the light of its neighbourhood is fitted by a linear function 
 [survey, equation 24; Bitterli et al. 2016, "Nonlinearly weighted first-order regression for denoising Monte Carlo
 renderings", section 4], with weights w of non-local means on the colours. The values that a fit gives for all pixels of
 its neighbourhood are averaged with the same weights (their collaborative filtering). Bitterli et al. have two half
-buffers: each gives the weights for the fit to the other. A stack holds one image, so the patch distance subtracts what
-its variance explains instead [Rousselle et al. 2012, "Adaptive rendering with non-local means filtering", equation 4].
-Each pixel takes a mixture of two bandwidths by Stein's unbiased estimate of their errors; Bitterli et al. use the
-halves for this.
+buffers, for these weights and to choose a bandwidth. A stack holds one image, so the patch distance subtracts what its
+variance explains instead [Rousselle et al. 2012, "Adaptive rendering with non-local means filtering", equation 4], and
+each pixel takes a mixture of two bandwidths by Stein's unbiased estimate of their errors.
 """
 
 import math
@@ -76,8 +75,7 @@ def _power(image: np.ndarray) -> int:
 def estimated_variance(image: np.ndarray) -> np.ndarray:
     """The variance of an image (H, W, 3) that comes without, by what sets pixels apart from the median of 3 x 3.
 
-    What is finer than that counts as noise. It leaves 1.3 to 1.7 times the error of true variances at 4 and 16 spp; a
-    second estimate, by what is left to the first result, is no better (docs/lab/log/2026-W48.md).
+    What is finer than that counts as noise (docs/lab/log/2026-W48.md).
     """
     squares = (image.astype(np.float64) - ndimage.median_filter(image, (3, 3, 1), mode="nearest")) ** 2
     for _ in range(2):

@@ -48,11 +48,10 @@ def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
 
 
 def prefiltered(features: Mapping[str, np.ndarray], quality: str) -> dict[str, np.ndarray]:
-    """Albedo and normal (H, W, 3) denoised by OIDN's own models for them.
+    """Albedo and normal (H, W, 3) denoised by OIDN's own models for them, whether they are noisy or not.
 
     With ``quality`` "high" this takes longer than the image itself, with "balanced" less than half of that, and images
-    denoised with their help are as good (docs/lab/log). Features are filtered whether they are noisy or not: callers
-    that know they are not noisy, by the header of a stack, leave this out.
+    denoised with their help are as good (docs/lab/log).
     """
     require_oidn()
     return {name: _prefiltered(name, layer, quality) for name, layer in _in_range(features).items()}
@@ -66,7 +65,6 @@ def _in_range(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _prefiltered(name: str, layer: np.ndarray, quality: str) -> np.ndarray:
-    """A feature denoised by OIDN's own model for it."""
     return filtered({name: layer}, "cpu", quality=QUALITIES[quality]) if layer.any() else layer
 
 

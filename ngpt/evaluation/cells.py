@@ -1,7 +1,5 @@
 """One cell of the table: a method on a stack against the reference; computed once, then taken from the cache."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

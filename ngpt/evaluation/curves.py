@@ -9,8 +9,6 @@ factor of ``REACH`` at most. Marks say which it was:
     "<" ">" farther outside: read at the factor, so that the truth is below or above
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from itertools import pairwise

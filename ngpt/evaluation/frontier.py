@@ -1,7 +1,5 @@
 """Speed against accuracy as a picture: error over total seconds, both axes logarithmic, by hand as SVG."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from ngpt.report.axes import Axes
@@ -59,10 +57,8 @@ def draw(points: list[Point], title: str, metric: str, doubt: float | None = Non
         path = "L".join(f"{axes.x(p.seconds):.1f} {axes.y(p.error):.1f}" for p in own)
         dashes = f' stroke-dasharray="{dash}"' if dash else ""
         parts.append(f'<path d="M{path}" fill="none" stroke="{color}" stroke-width="1.6"{dashes}/>')
-        for p in own:
+        for p in (p for p in own if p.spp):
             shape = f'cx="{axes.x(p.seconds):.1f}" cy="{axes.y(p.error):.1f}"'
-            if not p.spp:
-                continue
             name = markup(f"{method}, {p.spp} spp: {p.seconds:.3g} s, {p.error:.3g}")
             look = f'r="4.5" fill="{color}" stroke="black"' if p in best else f'r="2.5" fill="{color}"'
             parts.append(f"<circle {shape} {look}><title>{name}</title></circle>")

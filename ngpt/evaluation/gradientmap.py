@@ -8,7 +8,7 @@ from scipy.ndimage import uniform_filter
 from ngpt.image.display import colour_table, coloured
 from ngpt.image.png import encode_png
 from ngpt.stack import GradientStack
-from ngpt.system.files import atomic_output
+from ngpt.system.writing import write_bytes
 
 # Blue where gradients have less variance than differences of pixels, grey where as much, orange where more.
 COLOURS = colour_table(("0b3a75", "2f7fd6", "777777", "d9772b", "ffe6c8")[::-1], 255)
@@ -31,13 +31,10 @@ def variances_of_differences(stack: GradientStack) -> tuple[np.ndarray, np.ndarr
     """
     dark = stack["direct"].sum(axis=-1) == 0
     values = np.where(dark[..., None], stack["primal_var"], np.nan)
-    results = []
-    for axis in (1, 0):
-        sums = np.full(values.shape, np.nan, np.float64)
-        here, there = (np.s_[:, :-1], np.s_[:, 1:]) if axis == 1 else (np.s_[:-1], np.s_[1:])
-        sums[here] = values[here] + values[there]
-        results.append(sums)
-    return results[0], results[1]
+    across, down = np.full((2, *values.shape), np.nan, np.float64)
+    across[:, :-1] = values[:, :-1] + values[:, 1:]
+    down[:-1] = values[:-1] + values[1:]
+    return across, down
 
 
 def log_ratio(stack: GradientStack) -> np.ndarray:
@@ -56,8 +53,7 @@ def write_map(path: Path, stack: GradientStack) -> None:
     """Writes the map with its legend below, as PNG. Magenta is unknown: a light, or no light at all."""
     picture = np.kron(_colours(log_ratio(stack)), np.ones((SCALE, SCALE, 1), np.uint8))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_bytes(encode_png(np.concatenate([picture, legend(picture.shape[1])])))
+    write_bytes(path, encode_png(np.concatenate([picture, legend(picture.shape[1])])))
 
 
 def legend(width: int) -> np.ndarray:

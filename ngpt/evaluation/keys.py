@@ -3,8 +3,6 @@
 The code that renders is known to the renderer (``ngpt.renderer``).
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import re

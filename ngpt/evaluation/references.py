@@ -3,8 +3,6 @@
 Two halves take the reference's noise off every squared metric (``ngpt.measure.metrics``); one image cannot.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,8 +27,6 @@ MOST_STOPS = 1.0
 
 @dataclass(frozen=True)
 class Reference:
-    """One stack or two, and their files."""
-
     stacks: tuple[GradientStack, ...]
     files: tuple[str, ...]
 
@@ -70,9 +66,8 @@ class Reference:
         """The relMSE below which the order of methods means little; None if the files hold no variances.
 
         With one image, it is three times the image's noise, which is part of every error. With two halves, it is three
-        standard errors of their remaining noise: the mean of (a - t)(b - t) / (m² + 1e-3), with t the truth. In each
-        pixel the product (a - t)(b - t) has expectation 0, and its variance is the variance of a times the variance
-        of b. Channels count as one, as if their noise were the same.
+        standard errors of the mean of (a - t)(b - t) / (m² + 1e-3), with t the truth: in each pixel the product has
+        expectation 0, and the variance of a times that of b. Channels count as one, as if their noise were the same.
         """
         noise = self.noise
         if noise is None or len(self.stacks) == 1:

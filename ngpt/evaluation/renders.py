@@ -1,7 +1,5 @@
 """What a method is given: a kind of stack, by a sampler."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

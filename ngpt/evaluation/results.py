@@ -1,21 +1,19 @@
 """What the folder of results holds: results.*, worth.*, against.csv and plots, all from the cells."""
 
-from __future__ import annotations
-
-import csv
-import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ngpt.evaluation.averages import groups_of, mean, median, summary
+from ngpt.evaluation.config import groups_of
 from ngpt.evaluation.frontier import Point, draw, pareto
 from ngpt.evaluation.tables import tables, worth_page
+from ngpt.evaluation.wholetime import FIELDS as RIVAL_FIELDS
 from ngpt.evaluation.wholetime import against_rivals, against_tables, envelope
-from ngpt.evaluation.wholetime import as_csv as against_csv
-from ngpt.evaluation.worth import as_csv as worth_csv
+from ngpt.evaluation.worth import FIELDS as WORTH_FIELDS
 from ngpt.evaluation.worth import worth_of_gradients, worth_tables
 from ngpt.evaluation.worthplots import draw_worth, write_map
-from ngpt.system.writing import write_json, write_text
+from ngpt.measure.averages import geometric_mean, mean, median, summary
+from ngpt.system.writing import csv_text, write_json, write_text
 
 _SECONDS = ("render", "reconstruct", "total", "reconstruct wall")
 
@@ -51,7 +49,7 @@ def _write_against(results: dict[str, Any], out: Path) -> None:
         return
     against = results["against"] = against_rivals(results)
     against["tables"] = against_tables(results)
-    write_text(out / "against.csv", against_csv(against))
+    write_text(out / "against.csv", _columns(RIVAL_FIELDS, against["rows"]))
     for group, scenes in groups_of(results, shared_scenes(results)).items():
         points = points_against(results, scenes)
         if points:
@@ -72,17 +70,10 @@ def points_against(results: dict[str, Any], scenes: list[str]) -> list[Point]:
         for spp in results["settings"]["spp"]:
             here = [r for r in results["summary"] if (r["spp"], r["method"]) == (spp, method) and r["scene"] in scenes]
             if scenes and len(here) == len(scenes) and all(map(_is_drawn, here)):
-                seconds, error = (mean([get(row) for row in here], True) for get in (_total, _error))
+                seconds = geometric_mean(row["seconds"]["total"] for row in here)
+                error = geometric_mean(row["error"] for row in here)
                 points.append(Point(method, spp, seconds, error, method))
     return points
-
-
-def _total(row: dict[str, Any]) -> float:
-    return row["seconds"]["total"]
-
-
-def _error(row: dict[str, Any]) -> float:
-    return row["error"]
 
 
 def _write_worth(results: dict[str, Any], out: Path) -> None:
@@ -104,7 +95,7 @@ def _write_worth(results: dict[str, Any], out: Path) -> None:
                 if row["best"] and row["scene"] == scene:
                     row["blocks"] = entry["worth"]["blocks"].get(str(row["spp"]))
     worth["tables"] = worth_tables(results)
-    write_text(out / "worth.csv", worth_csv(worth))
+    write_text(out / "worth.csv", _columns(WORTH_FIELDS, worth["rows"]))
     write_text(out / "worth.md", worth_page(results))
 
 
@@ -151,7 +142,7 @@ def summarised(results: dict[str, Any]) -> list[dict[str, Any]]:
                 times: dict[str, float | None] = {}
                 for key in _SECONDS:
                     known = [row["seconds"][key] for row in parts if row["seconds"][key] is not None]
-                    times[key] = mean(known, geometric=True) if len(known) == len(parts) else None
+                    times[key] = geometric_mean(known) if len(known) == len(parts) else None
                 rows.append(_row(results, None, spp, method, scores, times, min(row["seeds"] for row in parts)))
     for scene in {row["scene"] for row in rows}:
         timed = [row for row in rows if row["scene"] == scene and _is_drawn(row)]
@@ -185,14 +176,14 @@ def _row(
 
 
 def as_csv(results: dict[str, Any]) -> str:
-    """One line a cell."""
-    names = list(results["metrics"])
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["scene", "spp", "method", "seed", "spp used", *(f"{key} s" for key in _SECONDS), *names, "absent"])
+    place, names = ("scene", "spp", "method", "seed", "spp used"), list(results["metrics"])
+    rows = [[*place, *(f"{key} s" for key in _SECONDS), *names, "absent"]]
     for cell in results["cells"]:
-        seconds = cell["seconds"] or {}
-        line = [cell["scene"], cell["spp"], cell["method"], cell["seed"], cell["spp used"]]
-        line += [seconds.get(key) for key in _SECONDS] + [cell["metrics"].get(name) for name in names]
-        writer.writerow([*("" if item is None else item for item in line), cell["absent"] or ""])
-    return text.getvalue()
+        seconds = [(cell["seconds"] or {}).get(key) for key in _SECONDS]
+        metrics = [cell["metrics"].get(name) for name in names]
+        rows.append([*map(cell.get, place), *seconds, *metrics, cell["absent"]])
+    return csv_text(rows)
+
+
+def _columns(fields: Sequence[str], rows: list[dict[str, Any]]) -> str:
+    return csv_text([fields, *(map(row.get, fields) for row in rows)])

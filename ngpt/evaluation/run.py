@@ -1,10 +1,9 @@
 """The evaluation itself: scenes x samples x methods x seeds, cell by cell, and the folder of results."""
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,12 +49,8 @@ def evaluate(
         "metadata": metadata(*PACKAGES),
         "settings": config.to_dict(),
         "metrics": {
-            name: {
-                "formula": METRICS[name].formula,
-                "better": METRICS[name].better,
-                "squared": METRICS[name].squared,
-                "absent": scorer.absent_metrics.get(name),
-            }
+            name: {key: getattr(METRICS[name], key) for key in ("formula", "better", "squared")}
+            | {"absent": scorer.absent_metrics.get(name)}
             for name in config.metrics
         },
         "primary": config.primary,
@@ -88,15 +83,8 @@ def evaluate(
                 progress(done + n, total)
 
             try:
-                _scene(
-                    SceneStacks(name, source, config, cache, renderer, say=console.say),
-                    columns,
-                    lacks,
-                    scorer,
-                    results,
-                    out,
-                    advance,
-                )
+                stacks = SceneStacks(name, source, config, cache, renderer, say=console.say)
+                _scene(stacks, columns, lacks, scorer, results, out, advance)
             except NgptError as error:
                 console.error(f"{name}: {error}")
                 results["scenes"].setdefault(name, {"file": source})["absent"] = str(error)
@@ -147,12 +135,7 @@ def _scene(
                 continue
             render = renders[column.name]
             used = stacks.samples(render, spp, costs)
-
-            def load(render: Render = render, n: int = used, s: int = seed, held: dict = held) -> GradientStack:
-                if render.name not in held:
-                    held[render.name] = stacks.stack(render, n, s)
-                return held[render.name]
-
+            load = partial(_held, held, stacks, render, used, seed)
             image = picture_path(name, spp, column.name, seed) if wanted(config.images, seed) else None
             key = stacks.stack_key(render, used, seed)
             cell = scorer.cell(column, load, reference, key, out / image if image else None)
@@ -178,6 +161,15 @@ def _scene(
     # All at once: a scene that fails half-way is absent as a whole.
     results["scenes"][name] = entry
     results["cells"] += cells
+
+
+def _held(
+    held: dict[str, GradientStack], stacks: SceneStacks, render: Render, samples: int, seed: int
+) -> GradientStack:
+    """The stack of a render, which all columns share that take it."""
+    if render.name not in held:
+        held[render.name] = stacks.stack(render, samples, seed)
+    return held[render.name]
 
 
 def _seconds(render: float | None, reconstruct: dict[str, float], clock: str) -> dict[str, float | None]:

@@ -8,10 +8,7 @@ DIR/stability.md, and for each scene and method DIR/stability/SCENE-SPP-METHOD.p
 shutter, each band of rows comes from another seed, so flicker shows as steps between bands; bias does not show.
 """
 
-from __future__ import annotations
-
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -26,10 +23,9 @@ from ngpt.image.png import encode_png
 from ngpt.io.exr import read_image
 from ngpt.measure.images import check_size, middle
 from ngpt.measure.metrics import EPSILON, squared_error, trimmed_mean
-from ngpt.report.evaluation import FORMAT
+from ngpt.report.evaluation import read_results
 from ngpt.system.console import Console
-from ngpt.system.files import atomic_output
-from ngpt.system.writing import write_json, write_text
+from ngpt.system.writing import markdown_table, write_bytes, write_json, write_text
 
 
 def flicker_and_bias(images: np.ndarray, *halves: np.ndarray, share: float = 0.001) -> dict[str, float]:
@@ -65,12 +61,7 @@ def rolling_shutter(images: np.ndarray) -> np.ndarray:
 
 def study(out: Path) -> list[dict[str, Any]]:
     """Writes what the module's description says and returns the rows of stability.json."""
-    try:
-        results = json.loads((out / "results.json").read_text())
-    except (OSError, ValueError) as error:
-        raise NgptError(f"{out / 'results.json'}: cannot be read: {error}; run eval.py first") from error
-    if results.get("format") != FORMAT:
-        raise NgptError(f"{out / 'results.json'}: is not of format {FORMAT}; run eval.py of this version again")
+    results = read_results(out)
     seeds = range(results["settings"]["seeds"])
     rows = []
     (out / "stability").mkdir(exist_ok=True)
@@ -87,8 +78,7 @@ def study(out: Path) -> list[dict[str, Any]]:
         reference = read_image(out / entry["image"])
         halves = [read_image(out / path) for path in entry["images of halves"]] or [reference]
         path = out / "stability" / f"{scene}-{spp}-{file_part(method)}.png"
-        with atomic_output(path, overwrite=True) as temporary:
-            temporary.write_bytes(encode_png(to_srgb8(rolling_shutter(images), auto_exposure(reference))))
+        write_bytes(path, encode_png(to_srgb8(rolling_shutter(images), auto_exposure(reference))))
         rows.append({"scene": scene, "spp": spp, "method": method, **flicker_and_bias(images, *halves)})
     write_json(out / "stability.json", rows)
     write_text(out / "stability.md", table(rows, len(seeds)))
@@ -98,19 +88,20 @@ def study(out: Path) -> list[dict[str, Any]]:
 def table(rows: list[dict[str, Any]], seeds: int) -> str:
     """Markdown: flicker and bias of each method, the steadiest bold."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    lines = [f"Flicker / bias, the two parts of relMSE (trimmed), over {seeds} seeds; the steadiest in bold.", ""]
-    lines += ["| scene | spp | " + " | ".join(f"`{m}`" for m in methods) + " |", "|---|--:|" + "--:|" * len(methods)]
+    rows_of_text = []
+    title = [f"Flicker / bias, the two parts of relMSE (trimmed), over {seeds} seeds; the steadiest in bold.", ""]
     cells = {(row["scene"], row["spp"], row["method"]): row for row in rows}
     for scene, spp in dict.fromkeys((row["scene"], row["spp"]) for row in rows):
         found = {m: cells[scene, spp, m] for m in methods if (scene, spp, m) in cells}
         least = min(row["flicker"] for row in found.values())
-        texts = []
+        texts = [scene, str(spp)]
         for method in methods:
             row = found.get(method)
             text = f"{row['flicker']:.4f} / {row['bias']:.4f}" if row else ""
             texts.append(f"**{text}**" if row and row["flicker"] == least else text)
-        lines.append(f"| {scene} | {spp} | " + " | ".join(texts) + " |")
-    return "\n".join(lines) + "\n"
+        rows_of_text.append(texts)
+    heads = ["scene", "spp", *(f"`{m}`" for m in methods)]
+    return "\n".join([*title, *markdown_table(heads, rows_of_text)]) + "\n"
 
 
 def main() -> int:

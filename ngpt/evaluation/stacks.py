@@ -8,8 +8,6 @@ reference-*-a.exr and -b.exr; and cost-*.json. A folder of stacks of one's own l
 reference may be one image.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -18,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from ngpt.errors import NgptError
-from ngpt.evaluation.averages import summary
 from ngpt.evaluation.config import Config
 from ngpt.evaluation.keys import scene_hash
 from ngpt.evaluation.references import HALVES, Reference, find_reference, read_reference
 from ngpt.evaluation.renders import DEFAULTS, Render
 from ngpt.io.exr import read, write
+from ngpt.measure.averages import summary
 from ngpt.renderer import Renderer
 from ngpt.stack import GradientStack
 from ngpt.system.files import save
@@ -75,7 +73,6 @@ class SceneStacks:
         return self._keys[sampler]
 
     def folder(self, sampler: str) -> Path:
-        """Where the pictures by a sampler are."""
         if self.given:
             return Path(self.source)
         return self.cache / f"{self.name}-{self.key(sampler)[:12]}"
@@ -110,7 +107,7 @@ class SceneStacks:
 
         ``median`` and quartiles ``low`` and ``high`` of alternating renders, kernels compiled, and the ``sampler`` that
         rendered. What is not in the cache is measured in turn with the clock, and put into the unit of the clock's time
-        there: more samplers do not move the others. Empty for a folder of stacks that were rendered elsewhere.
+        there. Empty for a folder of stacks that were rendered elsewhere.
         """
         if self.given:
             return {}

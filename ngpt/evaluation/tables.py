@@ -1,14 +1,14 @@
 """The markdown of an evaluation: what a reader compares, the losses as visible as the wins."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 
-from ngpt.evaluation.averages import mean
 from ngpt.evaluation.curves import REACH
 from ngpt.evaluation.renders import KINDS
+from ngpt.measure.averages import mean
+from ngpt.report.evaluation import several_samplers
+from ngpt.system.writing import markdown_table
 
 _MARKS = (
     "~: outside of the measured times, by the nearest slope. < and >: no nearer than a factor of "
@@ -66,7 +66,7 @@ def _against(results: dict[str, Any]) -> list[str]:
         "",
     ]
     for title, rows in found.items():
-        lines += [f"{title}:", "", *_table(rows[0], rows[1:], 1), ""]
+        lines += [f"{title}:", "", *markdown_table(rows[0], rows[1:]), ""]
     return lines
 
 
@@ -86,7 +86,7 @@ def worth_page(results: dict[str, Any]) -> str:
         "",
     ]
     for title, rows in results["worth"]["tables"].items():
-        lines += [f"{title}:", "", *_table(rows[0], rows[1:], 1), ""]
+        lines += [f"{title}:", "", *markdown_table(rows[0], rows[1:]), ""]
     return "\n".join([*lines, _origin(results)]) + "\n"
 
 
@@ -110,7 +110,6 @@ def _doubtful(results: dict[str, Any]) -> str:
 
 
 def _halved(results: dict[str, Any]) -> list[str]:
-    """The scenes whose references are two halves."""
     references = {name: entry.get("reference") or {} for name, entry in results["scenes"].items()}
     return [name for name, reference in references.items() if reference.get("halves")]
 
@@ -126,14 +125,9 @@ def _halves(results: dict[str, Any]) -> list[str]:
     ]
 
 
-def _several_samplers(results: dict[str, Any]) -> bool:
-    """Whether any stacks are not by the usual sampler for their kind."""
-    return any(entry["render"] != entry["stack"] for entry in results["methods"].values())
-
-
 def _samplers(results: dict[str, Any]) -> list[str]:
     """Which sampler made the stacks of each method, if it is not always the usual one."""
-    if not _several_samplers(results):
+    if not several_samplers(results):
         return []
     found: dict[str, list[str]] = {}
     for method in _present(results):
@@ -151,11 +145,6 @@ def _heads(results: dict[str, Any], methods: list[str]) -> list[str]:
     return [f"`{m}`" + ("" if results["methods"][m]["stack"] == "gradients" else "†") for m in methods]
 
 
-def _table(heads: list[str], rows: list[list[str]], left: int) -> list[str]:
-    rule = "|---" * left + "|--:" * (len(heads) - left) + "|"
-    return [f"| {' | '.join(heads)} |", rule, *(f"| {' | '.join(row)} |" for row in rows)]
-
-
 def _errors(results: dict[str, Any]) -> list[str]:
     methods = _present(results)
     cells = {(row["scene"], row["spp"], row["method"]): row for row in results["summary"]}
@@ -171,7 +160,7 @@ def _errors(results: dict[str, Any]) -> list[str]:
             texts = [_error(results, m, found, errors, doubt) for m in methods]
             label = scene or "*geometric mean*"
             rows.append([label, str(spp), *texts, f"{noise:.5f}" if noise is not None else ""])
-    return _table(["scene", "spp", *_heads(results, methods), "reference noise"], rows, 1)
+    return markdown_table(["scene", "spp", *_heads(results, methods), "reference noise"], rows)
 
 
 def _error(results: dict[str, Any], method: str, found: dict, errors: dict[str, float], doubt: float | None) -> str:
@@ -208,7 +197,7 @@ def _costs(results: dict[str, Any]) -> list[str]:
         rows.append([*row, f"{spp:.0f}" if spp else "", *([f"`{cost['gradients']['sampler']}`"] if others else [])])
     heads = ["scene", "ms / spp with gradients", "quartiles", "over path", "over path with features"]
     heads += [*(f"over {_over(name)}" for name in others), "reference spp", *(["by sampler"] if others else [])]
-    return ["What a sample with gradients costs:", "", *_table(heads, rows, 1)]
+    return ["What a sample with gradients costs:", "", *markdown_table(heads, rows)]
 
 
 def _over(render: str) -> str:
@@ -225,7 +214,7 @@ def _seconds(results: dict[str, Any]) -> list[str]:
         rows.append(
             [str(spp), *(f"{s['reconstruct']:.2f}" if s and s["reconstruct"] is not None else "" for s in found)]
         )
-    return _table(["spp", *_heads(results, methods)], rows, 0)
+    return markdown_table(["spp", *_heads(results, methods)], rows, 0)
 
 
 def _others(results: dict[str, Any], names: list[str]) -> list[str]:
@@ -240,7 +229,7 @@ def _others(results: dict[str, Any], names: list[str]) -> list[str]:
             texts = ["" if np.isnan(v) else f"**{v:.4g}**" if v == best else f"{v:.4g}" for v in values]
             rows.append([name, str(spp), *texts, *([floors.get(name, "")] if floors else [])])
     heads = ["metric", "spp", *_heads(results, methods), *(["between halves"] if floors else [])]
-    return _table(heads, rows, 1)
+    return markdown_table(heads, rows)
 
 
 def _title_of_others(results: dict[str, Any]) -> str:
@@ -283,7 +272,7 @@ def _duels(results: dict[str, Any], metric: str) -> list[str]:
             texts.append(f"{sum(mine < theirs for mine, theirs in pairs)}/{len(pairs)}" if pairs else "")
         rows.append([f"`{m}`", *texts])
     text = f"In how many cells (a scene at a number of samples) the row's method has the better {metric} of the two:"
-    return [text, "", *_table(["", *_heads(results, methods)], rows, 1), ""]
+    return [text, "", *markdown_table(["", *_heads(results, methods)], rows), ""]
 
 
 def _absences(results: dict[str, Any]) -> list[str]:

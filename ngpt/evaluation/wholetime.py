@@ -6,15 +6,12 @@ has the least error of all its settings, and the least FLIP, whichever setting t
 A setting counts from its quickest cell on, unless no setting was measured in so little time.
 """
 
-from __future__ import annotations
-
-import csv
-import io
 import math
 from typing import Any
 
-from ngpt.evaluation.averages import groups_of, mean
+from ngpt.evaluation.config import groups_of
 from ngpt.evaluation.curves import Points, error_at, joined
+from ngpt.measure.averages import geometric_mean
 
 FIELDS = ("scene", "spp", "method", "seconds", "rival", "setting", "error", "mark", "FLIP", "FLIP mark")
 FLIP = "FLIP"
@@ -103,12 +100,12 @@ def _mean(rows: list[dict[str, Any]]) -> dict[str, Any]:
     seen = [row for row in rows if row["FLIP"] is not None]
     return {
         "scenes": len(rows),
-        "seconds": mean([row["seconds"] for row in rows], geometric=True),
-        "error": mean([row["error"] for row in rows], geometric=True),
+        "seconds": geometric_mean(row["seconds"] for row in rows),
+        "error": geometric_mean(row["error"] for row in rows),
         "mark": joined(row["mark"] for row in rows),
         "less": sum(row["error"] < 1 for row in rows),
         "scenes FLIP": len(seen),
-        "FLIP": mean([row["FLIP"] for row in seen], geometric=True) if seen else None,
+        "FLIP": geometric_mean(row["FLIP"] for row in seen) if seen else None,
         "FLIP mark": joined(row["FLIP mark"] for row in seen),
         "less FLIP": sum(row["FLIP"] < 1 for row in seen),
     }
@@ -131,19 +128,9 @@ def envelope(results: dict[str, Any], rival: str, scenes: list[str]) -> list[tup
     if not parts or any(least is None for part in parts for _, least in part):
         return []
     return [
-        (mean([seconds for seconds, _ in column], True), mean([least[0] for _, least in column if least], True))
+        (geometric_mean(seconds for seconds, _ in column), geometric_mean(least[0] for _, least in column if least))
         for column in zip(*parts, strict=True)
     ]
-
-
-def as_csv(against: dict[str, Any]) -> str:
-    """One line for each row."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(FIELDS)
-    for row in against["rows"]:
-        writer.writerow(["" if row[name] is None else row[name] for name in FIELDS])
-    return text.getvalue()
 
 
 def against_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:

@@ -7,20 +7,16 @@
     W       m / n: how many times more samples that pipeline needs
     C       the seconds of a further sample with gradients over the seconds of a further sample of that pipeline
 
-W / C is more than W over C where a rival's reconstruction takes longer, and less where ours does. T' and m are read off
-curves of errors (``ngpt.evaluation.curves``, which explains the marks; W has the mark of W / C). C compares the renders
-with the least and the most samples, so that what a render takes to begin is no part of it.
+T' and m are read off curves of errors (``ngpt.evaluation.curves``, which explains the marks; W has the mark of W / C).
+C compares the renders with the least and the most samples, so that what a render takes to begin is no part of it.
 """
 
-from __future__ import annotations
-
-import csv
-import io
 from collections.abc import Sequence
 from typing import Any
 
-from ngpt.evaluation.averages import groups_of, mean, median
+from ngpt.evaluation.config import groups_of
 from ngpt.evaluation.curves import first_at, joined
+from ngpt.measure.averages import geometric_mean, median
 
 FIELDS = (
     *("scene", "spp", "method", "sampler", "best", "error", "seconds", "rival", "rival seconds", "rival samples"),
@@ -112,19 +108,9 @@ def _means(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str
                 entry: dict[str, Any] = {"group": group, "spp": spp, "method": method, "scenes": len(here)}
                 for key in ("W", "C", "W/C"):
                     values = [row[key] for row in here if row[key] is not None]
-                    entry[key] = mean(values, geometric=True) if len(values) == len(here) else None
+                    entry[key] = geometric_mean(values) if len(values) == len(here) else None
                 means.append(entry | {"mark": joined(row["mark"] for row in here)})
     return means
-
-
-def as_csv(worth: dict[str, Any]) -> str:
-    """One line for each row."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(FIELDS)
-    for row in worth["rows"]:
-        writer.writerow(["" if row.get(name) is None else row[name] for name in FIELDS])
-    return text.getvalue()
 
 
 def worth_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:

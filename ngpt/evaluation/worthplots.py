@@ -1,7 +1,5 @@
 """Where gradients pay, as SVG: a map of each scene in blocks, at equal time, and W/C over the samples."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -31,9 +31,8 @@ def quiet() -> Any:
 def example_layers() -> dict[str, np.ndarray]:
     """Layers (1, C, height, width) of a noisy picture, the same on every machine.
 
-    It shows a bright disk on a gradient, a lamp above, a darker image of the lamp in a mirror below, and rare bright
-    light that gradients do not contain. It also has typical faults of renderers: non-finite values in every kind of
-    layer, in single pixels and in a hole of 7x7 pixels, and variances of -1.
+    A bright disk on a gradient, a lamp, its image in a mirror, and rare bright light that gradients do not contain;
+    with non-finite values in every kind of layer, in single pixels and in a hole of 7x7 pixels, and variances of -1.
     """
     width, height = SIZE
     rng = np.random.default_rng(7)

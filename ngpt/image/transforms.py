@@ -66,11 +66,7 @@ def _aces() -> Any:
     return config.getProcessor(*view).getDefaultCPUProcessor()
 
 
-TRANSFORMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "standard": encoded_srgb,
-    "filmic": filmic,
-    "aces": aces,
-}
+TRANSFORMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"standard": encoded_srgb, "filmic": filmic, "aces": aces}
 
 
 def shown(image: np.ndarray, transform: str = "standard", stops: float = 0.0) -> np.ndarray:

@@ -20,7 +20,7 @@ from ngpt.io.aliases import writer_of
 from ngpt.io.foreign.files import ENCODED, FROM, file_headers, read_file
 from ngpt.io.isolated import read_exr_isolated
 from ngpt.io.layout import StackSource, file_views, gather, is_half, place_of, scatter, taken
-from ngpt.io.openexr import ExrImage, ExrPart, read_exr, write_exr
+from ngpt.io.openexr import ExrImage, ExrPart, write_exr
 from ngpt.io.primaries import converted, to_rec709
 from ngpt.io.resolution import Found, Resolution, resolve, resolve_alone
 from ngpt.io.resolution import layers_of_light as find_light
@@ -34,28 +34,6 @@ from ngpt.version import __version__
 from ngpt.windows import Place
 
 _LOG = logging.getLogger(__name__)
-
-__all__ = [
-    "MADE_BY",
-    "ExrImage",
-    "ExrPart",
-    "Picture",
-    "StackSource",
-    "channels_alone",
-    "layers_in",
-    "layers_of_light",
-    "pass_through",
-    "read",
-    "read_exr",
-    "read_image",
-    "read_picture",
-    "read_views",
-    "replace_layers_of_light",
-    "views_in",
-    "with_channels",
-    "write",
-    "write_exr",
-]
 
 
 def read(

@@ -1,12 +1,9 @@
 """OpenEXR files, verbatim.
 
 What a file holds passes through a read and a write unharmed: parts, channels of every type, attributes of every type
-that Python's OpenEXR knows, data and display windows, tiles, line order. The exceptions:
-
-- Lossy compression (PXR24, B44, B44A, DWAA, DWAB) becomes ZIP, since a second pass through it would damage the image
-  once more, and gradients, variances and depth for the first time.
-- Only the full-size level of mipmaps and ripmaps is kept.
-- Attributes that are empty lists are dropped, and a rational is reduced (48/2 becomes 24/1).
+that Python's OpenEXR knows, data and display windows, tiles, line order. The exceptions, in the words of
+docs/use/gradient-stack.md: lossy compression becomes ZIP, only the full-size level of a mipmap is kept; and attributes
+that are empty lists are dropped, and a rational is reduced (48/2 becomes 24/1).
 
 Deep images and subsampled channels are refused. OpenEXR holds whole files in memory, and hands over the readable parts
 of a damaged file as if there were no others; here a damaged file is an error. While a file is read, what other threads

@@ -13,7 +13,8 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
-from ngpt.system.files import atomic_output, check_output, make_folder
+from ngpt.system.files import check_output, make_folder
+from ngpt.system.writing import write_bytes, write_text
 
 LISTING = "layers.json"
 
@@ -31,11 +32,9 @@ def write_layers(folder: Path, layers: Mapping[str, np.ndarray], overwrite: bool
     listing = {}
     for name, layer in layers.items():
         data = np.ascontiguousarray(layer, "<f4").tobytes()
-        with atomic_output(folder / f"{name}.f32", overwrite) as temporary:
-            temporary.write_bytes(data)
+        write_bytes(folder / f"{name}.f32", data, overwrite)
         listing[name] = {"shape": list(layer.shape), "sha256": hashlib.sha256(data).hexdigest()}
-    with atomic_output(folder / LISTING, overwrite) as temporary:
-        temporary.write_text(json.dumps(listing, indent=1) + "\n")
+    write_text(folder / LISTING, json.dumps(listing, indent=1) + "\n", overwrite)
 
 
 def planes(stack: GradientStack) -> dict[str, np.ndarray]:

@@ -63,11 +63,7 @@ class _Home(NamedTuple):
 
 
 def resolve(
-    parts: Parts,
-    overrides: Mapping[str, str] | None = None,
-    path: str = "image",
-    writer: str = "",
-    origin: str = "",
+    parts: Parts, overrides: Mapping[str, str] | None = None, path: str = "image", writer: str = "", origin: str = ""
 ) -> Resolution:
     """Finds the layers of the contract among the channel names of a file.
 

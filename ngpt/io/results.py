@@ -21,15 +21,8 @@ STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWind
 }  # fmt: skip
 # Attributes that say what made a result; the stack's own attributes are others, and stay.
 MADE_BY = (
-    "ngpt:method",
-    "ngpt:weights",
-    "ngpt:options",
-    "ngpt:estimated",
-    "ngpt:reconstructSeconds",
-    "ngpt:temporal",
-    "ngpt:history",
-    "ngpt:historyWeights",
-    "ngpt:pass",
+    *("ngpt:method", "ngpt:weights", "ngpt:options", "ngpt:estimated", "ngpt:reconstructSeconds"),
+    *("ngpt:temporal", "ngpt:history", "ngpt:historyWeights", "ngpt:pass"),
 )
 # A primal with this in its name says itself that it is noisy: nobody takes it for the image.
 _NOISY = "noisy"

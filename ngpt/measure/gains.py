@@ -4,8 +4,6 @@ The errors are measured (layers.json, by ``python -m bench.layers``; docs/lab/RE
 means of the trimmed relMSE over the four built-in scenes, of stacks of the same samples with fewer or more layers.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Collection, Container, Iterator
 from dataclasses import dataclass
@@ -14,9 +12,8 @@ from importlib.resources import files as package_files
 from itertools import combinations
 from typing import Any
 
-import numpy as np
-
 from ngpt.layers import LAYERS
+from ngpt.measure.averages import geometric_mean
 from ngpt.methods import METHODS, choose
 
 # Layers that a renderer gives together, and a package.
@@ -104,4 +101,4 @@ def _subsets(groups: Collection[tuple[str, ...]]) -> Iterator[tuple[tuple[str, .
 
 
 def _mean(gain: Gain) -> float:
-    return float(np.exp(np.mean(np.log(list(gain.error.values())))))
+    return geometric_mean(gain.error.values())

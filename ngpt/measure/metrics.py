@@ -46,8 +46,7 @@ def relmse(image: np.ndarray, *halves: np.ndarray) -> float:
 def relmse_trimmed(image: np.ndarray, *halves: np.ndarray, share: float = 0.001) -> float:
     """relMSE without the worst 0.1 % of the pixels (by channel mean), which fireflies would otherwise decide.
 
-    With two halves the worst have the largest (x - m)² / (m² + 1e-3), whatever the sign of their product. That choice
-    sees the reference's noise, which lowers the mean by about 1 % of that noise's own relMSE where it is Gaussian.
+    With two halves the worst have the largest (x - m)² / (m² + 1e-3), whatever the sign of their product.
     """
     errors, sizes = (relative_squared_error(image, *r) for r in (halves, (middle(halves),)))
     return trimmed_mean(errors, sizes, share)

@@ -90,7 +90,6 @@ class ModelConfig:
 
     @property
     def kind(self) -> "Kind":
-        """What knows about networks of this kind."""
         return KINDS[self.network]
 
     @property
@@ -116,7 +115,6 @@ class ModelConfig:
         return "dx" in self.needs
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields as TOML and JSON have them."""
         return asdict(self)
 
 

@@ -1,7 +1,5 @@
 """What a file of weights says of itself, for ``ngpt info``."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from importlib.util import find_spec
 from pathlib import Path

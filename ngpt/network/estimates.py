@@ -13,13 +13,8 @@ def with_variances(data: Repaired, image: np.ndarray) -> Repaired:
 
     ``image`` (H, W, 3) is a reconstruction with little noise, without direct emission. The estimate is the squared
     residual of a layer to it, or to its differences, averaged twice over 3 x 3 pixels. Where the reconstruction blurs,
-    the lost detail counts as noise of the gradients, which is on the safe side.
-
-    Over eight scenes at 4 and 64 spp, with OIDN's ``image``, `ngpt-combine` has 1.06 and 1.09 times the error that it
-    has with true variances, and less error than OIDN in each of the 16 cells. With the ``image`` of `l1`, over eight
-    partly different scenes, `ngpt-fast` has 1.25 and 1.21 times the error that it has with true variances, and 0.42 and
-    0.82 times the error of `l1`. Variances from the curl of the gradients were worse: much of the gradients' noise is
-    the gradient of the pixels' noise, which has no curl.
+    the lost detail counts as noise of the gradients, which is on the safe side (docs/lab/log/2026-W47.md, "what auto
+    takes").
     """
     noise = data.noise
     if noise is None:

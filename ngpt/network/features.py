@@ -39,34 +39,15 @@ from ngpt.network.inputs import DENOISED, MADE
 from ngpt.network.transfer import signed_log
 
 CHANNELS = {
-    "primal": 3,
-    "dx": 3,
-    "dy": 3,
-    "albedo": 3,
-    "normal": 3,
-    "depth": 1,
-    "diffuse": 3,
-    "specular": 3,
-    "base": 3,
-    "denoised": 3,
-    "denoised_base": 3,
-    "primal_se": 1,
-    "dx_se": 1,
-    "dy_se": 1,
-    "diffuse_se": 1,
-    "specular_se": 1,
-    "primal_change": 3,
-    "base_change": 3,
-    "denoised_base_change": 3,
-    "dx_base": 3,
-    "dy_base": 3,
-    "dx_denoised": 3,
-    "dy_denoised": 3,
-    "dx_denoised_base": 3,
-    "dy_denoised_base": 3,
-    "primal_noise": 1,
-    "dx_noise": 1,
-    "dy_noise": 1,
+    name: 1 if name == "depth" or name.endswith(("_se", "_noise")) else 3
+    for name in (
+        *("primal", "dx", "dy", "albedo", "normal", "depth", "diffuse", "specular"),
+        *("base", "denoised", "denoised_base"),
+        *("primal_se", "dx_se", "dy_se", "diffuse_se", "specular_se"),
+        *("primal_change", "base_change", "denoised_base_change"),
+        *("dx_base", "dy_base", "dx_denoised", "dy_denoised", "dx_denoised_base", "dy_denoised_base"),
+        *("primal_noise", "dx_noise", "dy_noise"),
+    )
 }
 
 # What differences to an image, and relative noise, are enlarged by; what is added to depth before division.
@@ -134,9 +115,7 @@ def _computed(name: str, layers: Mapping[str, Tensor], compared_with: str) -> Te
 def reflectance(albedo: Tensor) -> Tensor:
     """What radiance (N, 3, H, W) may be divided by: albedo + ``GLOSS``. Where no albedo is known it is one number.
 
-    It is a continuous function of the albedo. Suppose instead that an albedo of 0 stood for 1. The pixels of a black
-    cable have an albedo of 0 or 0.1 by chance. They would then exchange light with their neighbours ten times too
-    bright.
+    A continuous function of the albedo: pixels that have 0 or 0.1 by chance do not exchange light ten times too bright.
     """
     return albedo + GLOSS
 

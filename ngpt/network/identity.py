@@ -1,7 +1,5 @@
 """Which network a file holds: known by the file's contents, not by what the file calls itself."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from functools import lru_cache

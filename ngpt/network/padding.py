@@ -14,12 +14,7 @@ Pads = tuple[int, int, int, int]
 
 def pads(height: int, width: int, alignment: int, margin: int = MARGIN) -> Pads:
     """(top, bottom, left, right): ``margin`` all around, and more below and right up to multiples of ``alignment``."""
-    return (
-        margin,
-        margin + -(height + 2 * margin) % alignment,
-        margin,
-        margin + -(width + 2 * margin) % alignment,
-    )
+    return (margin, margin + -(height + 2 * margin) % alignment, margin, margin + -(width + 2 * margin) % alignment)
 
 
 def pad(layers: Mapping[str, Tensor], pads: Pads) -> dict[str, Tensor]:

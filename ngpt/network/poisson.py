@@ -6,20 +6,16 @@ With D the image of the other head, w_d, w_x and w_y the weights, the result app
     sum of  w_d |I - D|² + w_x |I(x+1, y) - I(x, y) - dx|² + w_y |I(x, y+1) - I(x, y) - dy|²
 
 [the screened Poisson equation of gradient-domain rendering, Lehtinen et al. 2013; with a weight for each term, as
-Rousselle et al. 2016 and Manzi et al. 2016 compute them from variances]. A network knows more than variances do: where
-the other image is blurred, and which differences a rare path has hit.
+Rousselle et al. 2016 and Manzi et al. 2016 compute them from variances].
 
 The unknown is the change u = I - D. The given differences are the residuals of dx and dy to the differences of D:
-r = dx - ΔD. So detail in D does not enter the coarser resolutions. The equation is not solved to the end. From the
-coarsest of ``SCALES`` resolutions to the finest, ``sweeps`` steps of a damped Jacobi iteration start from the change
-that the coarser one has made. So a result depends only on nearby pixels, and tiles agree with the whole. Coarser
-changes are means over 2 x 2 pixels. A difference between two of these is the mean, over two rows, of r(2x, y) / 2 +
-r(2x+1, y) + r(2x+2, y) / 2. Each row counts by its inverse variance; weights stand in for inverse variances.
+r = dx - ΔD. From the coarsest of ``SCALES`` resolutions to the finest, ``sweeps`` steps of a damped Jacobi iteration
+start from the change that the coarser one has made. So a result depends only on nearby pixels, and tiles agree with the
+whole. Coarser changes are means over 2 x 2 pixels. A difference between two of these is the mean, over two rows, of
+r(2x, y) / 2 + r(2x+1, y) + r(2x+2, y) / 2. Each row counts by its inverse variance, for which the weights stand.
 
 The computation is written once, for PyTorch and for ONNX graphs: ``math`` has what is not +, -, * or /.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Any

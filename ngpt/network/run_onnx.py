@@ -3,8 +3,6 @@
 export/CONTRACT.md tells what the files expect; this is the host that comes with ngpt.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable, Mapping

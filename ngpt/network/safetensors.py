@@ -13,8 +13,8 @@ from torch import Tensor
 from ngpt.errors import NgptError
 from ngpt.network.config import ModelConfig
 from ngpt.network.model import Reconstructor
-from ngpt.system.files import atomic_output
 from ngpt.system.records import parse_json
+from ngpt.system.writing import write_bytes
 
 # The shipped networks in PyTorch's form: beside the .onnx files in an installed package, in another folder in the
 # repository
@@ -29,9 +29,8 @@ def write_tensors(
 ) -> None:
     """Tensors and ``header`` (anything JSON can hold) in one file, complete or not there at all."""
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    with atomic_output(path, overwrite) as temporary:
-        # Not save_file, which makes a temporary file of its own: killed, it would leave that behind.
-        temporary.write_bytes(save(tensors, metadata={"ngpt": json.dumps({"format": FORMAT} | header)}))
+    # Not save_file, which makes a temporary file of its own: killed, it would leave that behind.
+    write_bytes(path, save(tensors, metadata={"ngpt": json.dumps({"format": FORMAT} | header)}), overwrite)
 
 
 def shipped() -> dict[str, Path]:

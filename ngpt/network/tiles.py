@@ -4,8 +4,6 @@ What a network says of a pixel depends on pixels as far as its reach. So a piece
 it is for, and begins at multiples of the network's alignment: where an image is cut does not change the result.
 """
 
-from __future__ import annotations
-
 from itertools import product
 
 # The pieces of one side: the pixels that each piece is for, and where it begins; and the length of all pieces.
@@ -59,9 +57,10 @@ def _cuts(length: int, alignment: int, overlap: int) -> list[Cuts]:
     cuts: list[Cuts] = []
     for count in range(1, max(1, length // alignment) + 1):
         step = -(-length // (count * alignment)) * alignment
-        # All of one size, which is why the last ones begin earlier, and all at multiples of the alignment.
-        size = min(step + 2 * overlap + length % alignment, length)
         starts = range(0, length, step)
+        # All of one size, which is why the last ones begin earlier, and all at multiples of the alignment. Two pieces
+        # have a neighbour on one side only.
+        size = min(step + min(len(starts) - 1, 2) * overlap + length % alignment, length)
         pieces = [(slice(n, min(n + step, length)), min(max(n - overlap, 0), length - size)) for n in starts]
         if not cuts or size < cuts[-1][1]:
             cuts.append((pieces, size))

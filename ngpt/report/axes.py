@@ -1,7 +1,5 @@
 """Axes of a picture drawn by hand as SVG: logarithmic, or linear from left to right."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -5,6 +5,7 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from ngpt.errors import NgptError
 from ngpt.io.exr import read_image
@@ -12,9 +13,8 @@ from ngpt.report.content import Entry, Overview, Scene
 from ngpt.report.page import write_report
 
 FORMAT = 2
-ROOM = (
-    54 * 1280 * 720
-)  # pixels of all pictures that a page takes in acceptable quality: 8 methods and reference, 6 scenes
+# Pixels of all pictures that a page takes in acceptable quality: 8 methods and reference, 6 scenes
+ROOM = 54 * 1280 * 720
 
 
 def write_evaluation_report(folder: str | os.PathLike, output: str | os.PathLike, *, overwrite: bool = False) -> Path:
@@ -26,7 +26,7 @@ def write_evaluation_report(folder: str | os.PathLike, output: str | os.PathLike
     Raises NgptError if the folder has no results that can be read, or none with a picture.
     """
     folder = Path(folder)
-    results = _results(folder)
+    results = read_results(folder)
     cells = [cell for cell in results["cells"] if cell["image"]]
     counts = sorted({cell["spp"] for cell in cells})
     shown = _fitting(results, cells, counts)
@@ -49,7 +49,8 @@ def write_evaluation_report(folder: str | os.PathLike, output: str | os.PathLike
     return write_report(output, title, scenes, command=command, footer=footer, overview=overview, overwrite=overwrite)
 
 
-def _results(folder: Path) -> dict:
+def read_results(folder: Path) -> dict[str, Any]:
+    """The results of an evaluation. Raises NgptError where they cannot be read, or are of another format."""
     path = folder / "results.json"
     try:
         results = json.loads(path.read_text(encoding="utf-8"))
@@ -86,7 +87,8 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
         seconds = _row(results, name, spp, method)["seconds"]["total"]
         metrics: dict[str, float | Sequence[float]] = {}
         for metric in results["metrics"]:
-            values = [_value(cell["metrics"].get(metric)) for cell in mine if not cell["absent"]]
+            found = [cell["metrics"].get(metric) for cell in mine if not cell["absent"]]
+            values = [math.nan if value is None else value for value in found]
             metrics[metric] = values[0] if len(values) == 1 else values
         entries.append(Entry(method, read_image(folder / pictured["image"]), seconds, metrics))
     # The first metric is the one of the captions, and the one the best method is chosen by.
@@ -94,7 +96,7 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
         entry.metrics = dict(sorted(entry.metrics.items(), key=lambda item: item[0] != results["primary"]))
     reference = scene["reference"] or {"image": None}
     image = read_image(folder / reference["image"]) if reference["image"] else None
-    clock = f"sampler {results['settings']['clock']}" if _several_samplers(results) else "gradients"
+    clock = f"sampler {results['settings']['clock']}" if several_samplers(results) else "gradients"
     size = f"{scene['size'][0]}x{scene['size'][1]}"
     facts = [f"{size}, equal rendering time to {spp} spp of {clock}; times are render and method"]
     # For references from elsewhere the number of samples may be unknown.
@@ -105,10 +107,6 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
     facts += ["without " + ", ".join(absent)] if absent else []
     rising = [metric for metric, entry in results["metrics"].items() if entry["better"] == "higher"]
     return Scene(f"{name}, {spp} spp", "; ".join(facts), image, entries, rising=rising)
-
-
-def _value(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 def _row(results: dict, scene: str | None, spp: int, method: str) -> dict:
@@ -138,14 +136,14 @@ def _tables(results: dict) -> dict[str, list[list[str]]]:
     worth = results.get("worth", {}).get("tables", {})
     tables |= {f"{title} (worth.md explains)": rows for title, rows in worth.items()}
     tables |= results.get("against", {}).get("tables", {})
-    if _several_samplers(results):
+    if several_samplers(results):
         tables |= _costs(results)
     if absent:
         tables["Absent"] = [["scene", "method", "why"], *map(list, sorted(absent))]
     return tables
 
 
-def _several_samplers(results: dict) -> bool:
+def several_samplers(results: dict) -> bool:
     """Whether any stacks are not by the usual sampler for their kind."""
     return any(entry["render"] != entry["stack"] for entry in results["methods"].values())
 

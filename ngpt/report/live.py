@@ -96,7 +96,6 @@ class LivePage:
         self.server.server_close()
 
     def _first(self) -> str:
-        """The page while there are no images."""
         return _FIRST.format(title=markup(self.title), line=markup(self.line), command=markup(self.command))
 
     def answer(self, path: str) -> tuple[str, str] | None:

@@ -22,8 +22,8 @@ from ngpt.image import display
 from ngpt.report import pixelcodec
 from ngpt.report.content import REFERENCE, Overview, Scene
 from ngpt.report.markup import overview_html, section
-from ngpt.system.files import atomic_output
 from ngpt.system.text import markup, printable
+from ngpt.system.writing import write_text
 
 _SOURCES = ("report.html", "live.js")
 PAGE_LIMIT = 40e6  # bytes: what mail and a browser still take without complaint
@@ -56,8 +56,7 @@ def write_report(
     if shot:
         exposures = [float(np.median(exposures))] * len(scenes)
     text = page_text(title, scenes, exposures, command=command, footer=footer, overview=overview, shot=shot)
-    with atomic_output(path, overwrite) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+    write_text(path, text, overwrite)
     return path
 
 
@@ -190,9 +189,6 @@ def _facts(scene: Scene, stops: float, steps: list[int]) -> dict:
         "a": first,
         "b": second if second != first else names[-1],
     }
-
-
-# --- pixels ----------------------------------------------------------------------------------------------------------
 
 
 def _pixels(scenes: list[Scene], exposures: list[float], room: float) -> tuple[list[str], list[list[int]]]:

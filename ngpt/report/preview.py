@@ -36,7 +36,8 @@ class Preview:
 
 def preview(stack: GradientStack) -> Preview:
     """A preview from the samples that a stack holds so far, with maps of the standard errors if it has variances."""
-    method = next((name for name in _QUICK if not METHODS[name].missing() and _able(name, stack)), "")
+    able = [name for name in _QUICK if all(layer in stack for layer in METHODS[name].needs)]
+    method = next((name for name in able if not METHODS[name].missing()), "")
     light = stack["primal"]
     unit = np.square(light).mean(axis=-1) + ERROR_EPSILON * 4.0 ** -auto_exposure(light)
     found, maps = Preview({_NOISY: light}), {}
@@ -56,10 +57,6 @@ def preview(stack: GradientStack) -> Preview:
         for name in found.images:
             found.maps.setdefault(name, {})["samples"] = samples / found.most
     return found
-
-
-def _able(method: str, stack: GradientStack) -> bool:
-    return all(layer in stack for layer in METHODS[method].needs)
 
 
 def _place(variance: np.ndarray, unit: np.ndarray) -> np.ndarray:

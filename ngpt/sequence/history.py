@@ -19,10 +19,9 @@ How much history counts, b, is made of
 
     change        less history where h - x is many times what it is around: edges that were seen otherwise
 
-b* is the minimum of Stein's unbiased risk over the line from x to h; Rousselle et al. 2013, "Robust denoising using
-feature and color information", choose between filters by that risk. These are rules (``ngpt.sequence.evidence``); a
-network that sees them and more corrects b, at each of several scales of h - x (``ngpt.sequence.network``). Where direct
-emission is known, only the rest is blended. The method may be any, and knows nothing of time.
+b* is the minimum of Stein's unbiased risk over the line from x to h [Rousselle et al. 2013, "Robust denoising using
+feature and color information"]. These are rules (``ngpt.sequence.evidence``); a network that sees them and more
+corrects b (``ngpt.sequence.network``). Where direct emission is known, only the rest is blended.
 """
 
 from dataclasses import dataclass, replace

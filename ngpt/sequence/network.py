@@ -11,8 +11,6 @@ takes nothing from what hid it. The network was trained on frames of moving shot
 (``ngpt.training.temporal``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -97,7 +95,8 @@ class Blend:
         scale = statistics({"primal": self.primal})[0]
         deviation = np.sqrt(self.evidence.noise)
         log_now, log_then = (np.log1p(np.maximum(image / scale, 0)) for image in (self.now, self.history))
-        change = _signed_log(20 * self.trust[..., None] * (log_then - log_now))
+        change = 20 * self.trust[..., None] * (log_then - log_now)
+        change = np.sign(change) * np.log1p(np.abs(change))
         noise = deviation.mean(axis=-1) / (scale + np.abs(self.now).mean(axis=-1))
         over = np.sqrt(np.square((self.history - self.now) / deviation).mean(axis=-1)) * self.trust
         coarse = np.sqrt(np.square(self.bands / deviation).mean(axis=-1)) * self.trust
@@ -120,10 +119,6 @@ class Blend:
             none if normal is None else normal[..., 2],
         ]
         return np.stack(channels, axis=-1).astype(np.float32)
-
-
-def _signed_log(x: np.ndarray) -> np.ndarray:
-    return np.sign(x) * np.log1p(np.abs(x))
 
 
 class Network:

@@ -23,17 +23,15 @@ def warped(
     def tap(i: int, j: int) -> np.ndarray:
         return image[np.clip(top + j, 0, height - 1), np.clip(left + i, 0, width - 1)]
 
-    four = [[tap(i, j) for i in (0, 1)] for j in (0, 1)]
     if not sharp:
-        rows = [row[0] + fx * (row[1] - row[0]) for row in four]
-        value = rows[0] + fy * (rows[1] - rows[0])
+        upper, lower = (tap(0, j) + fx * (tap(1, j) - tap(0, j)) for j in (0, 1))
+        value = upper + fy * (lower - upper)
     else:
         across, down = _catmull_rom(fx), _catmull_rom(fy)
-        value = sum(
-            down[j] * sum(across[i] * (four[j - 1][i - 1] if {i, j} <= {1, 2} else tap(i - 1, j - 1)) for i in range(4))
-            for j in range(4)
-        )
-        around = [pixel for row in four for pixel in row]
+        taps = [[tap(i, j) for i in range(-1, 3)] for j in range(-1, 3)]
+        rows = [sum(weight * pixel for weight, pixel in zip(across, row, strict=True)) for row in taps]
+        value = sum(weight * row for weight, row in zip(down, rows, strict=True))
+        around = [*taps[1][1:3], *taps[2][1:3]]
         value = np.clip(value, np.minimum.reduce(around), np.maximum.reduce(around))
     return np.where(found[..., None], value, 0).astype(image.dtype, copy=False), found
 

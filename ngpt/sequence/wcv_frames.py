@@ -17,14 +17,12 @@ iterations have lowered the variance of a pixel, and smoothed variances (``ngpt.
 In bytes per pixel and frame, beyond the input: 190 in single precision. Time: see docs/use/shots.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ngpt.classical.controlvariates import SWEEPS, decay
+from ngpt.classical.controlvariates import schedule
 from ngpt.classical.leastsquares import FLOAT32_RANGE, robust_mean
 from ngpt.classical.variances import SHARED, relative, smoothed
 from ngpt.sequence.warp import bilinear_taps, warped
@@ -74,7 +72,7 @@ class Frame:
     link: Link | None
 
 
-def wcv_frames(frames: Sequence[Frame], sweeps: int = SWEEPS) -> list[np.ndarray]:
+def wcv_frames(frames: Sequence[Frame], sweeps: int | None = None) -> list[np.ndarray]:
     """Image and light apart of each frame, (H, W, 3) float32: ``wcv`` where frames have no link."""
     total = [frame.image + frame.apart for frame in frames]
     dtype = np.float64 if _wide(total) else np.float32
@@ -92,13 +90,13 @@ def wcv_frames(frames: Sequence[Frame], sweeps: int = SWEEPS) -> list[np.ndarray
         None if step is None else step.offset - total[i] + step.before(total[i - 1]) for i, step in enumerate(steps)
     ]
     corrections = [np.zeros_like(image) for image in total]
-    for factor in decay(sweeps):
+    for factor, length in schedule()[:sweeps]:
         said = [still.swept(u, factor) for still, u in zip(stills, corrections, strict=True)]
         for i, step in enumerate(steps):
             if step is not None:
                 e = corrections[i] - step.before(corrections[i - 1]) - rest[i]
                 step.add(e, factor * stills[i].primal, factor * stills[i - 1].primal, said[i], said[i - 1])
-        corrections = [u + change / weight for u, (change, weight) in zip(corrections, said, strict=True)]
+        corrections = [u + length * change / weight for u, (change, weight) in zip(corrections, said, strict=True)]
     return [(image + u).astype(np.float32) for image, u in zip(total, corrections, strict=True)]
 
 

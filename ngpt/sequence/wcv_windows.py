@@ -6,8 +6,6 @@ so results of windows pass over into each other. It knows frames before and afte
 part.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property

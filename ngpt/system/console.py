@@ -247,14 +247,7 @@ def span(seconds: float) -> str:
 def _bar(label: str, unit: str, pace: _Pace) -> Iterator[Callable[[int, int], None]]:
     # Imported only here: a pipeline without a terminal does not pay for it.
     from rich.console import Console as Terminal
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        ProgressColumn,
-        TextColumn,
-        TimeElapsedColumn,
-    )
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
 
     terminal = Terminal(stderr=True)
     columns: list[ProgressColumn] = [

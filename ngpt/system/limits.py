@@ -44,7 +44,6 @@ def limit_threads(most: int) -> None:
 
 
 def limited() -> bool:
-    """Whether there is a limit of ``limit_threads``."""
     return _most is not None
 
 
@@ -55,7 +54,6 @@ def memory() -> int:
 
 
 def _physical() -> int:
-    """Bytes of memory of the machine."""
     if hasattr(os, "sysconf"):
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     kibibytes = ctypes.c_ulonglong()

@@ -20,21 +20,17 @@ Shape = type | tuple[type, ...] | list["Shape"] | dict["str | type[str]", "Shape
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Raises NgptError for a file that cannot be read or is no TOML."""
-    return _parsed(tomllib.loads, path)
+    return _call(tomllib.loads, read_text(path), str(path))
 
 
 def read_json(path: str | Path) -> Any:
     """Raises NgptError for a file that cannot be read or is no JSON."""
-    return _parsed(json.loads, path)
+    return _call(json.loads, read_text(path), str(path))
 
 
 def parse_json(text: str, where: str) -> Any:
     """Raises NgptError for what is no JSON; ``where`` begins the message."""
     return _call(json.loads, text, where)
-
-
-def _parsed(parser: Callable[[str], Any], path: str | Path) -> Any:
-    return _call(parser, read_text(path), str(path))
 
 
 def _call(parser: Callable[[str], Any], text: str, where: str) -> Any:

@@ -9,10 +9,8 @@ from multiprocessing import parent_process
 def end_with_parent(interruptible: bool = True) -> None:
     """To be called in a worker of multiprocessing: it ends when its parent does, even if that is killed.
 
-    Without this, a worker of a pool would wait for its next task for ever. Linux' PR_SET_PDEATHSIG is not used: it
-    takes the end of the thread that started the worker for the end of the process. Ctrl-C, which all processes of a
-    terminal receive, ends a worker silently: the parent reports it. A worker that is not ``interruptible`` goes on
-    until its parent ends.
+    Linux' PR_SET_PDEATHSIG would take the end of the thread that started the worker for the end of the process. Ctrl-C,
+    which all processes of a terminal receive, ends a worker silently, unless it is not ``interruptible``.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL if interruptible else signal.SIG_IGN)
     threading.Thread(target=_wait, daemon=True).start()

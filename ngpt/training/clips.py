@@ -3,8 +3,6 @@
 The loss is in ``ngpt.training.temporal``.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -22,7 +20,8 @@ from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import Corrections
 from ngpt.sequence.warp import warped
 from ngpt.stack import GradientStack
-from ngpt.system.files import atomic_output, make_folder
+from ngpt.system.files import make_folder
+from ngpt.system.writing import write_bytes
 from ngpt.training.dataset import Dataset
 
 # Squared relative errors beyond which more is not much worse: single pixels do not rule what is learnt.
@@ -79,8 +78,7 @@ def _results(stacks: Sequence[GradientStack], method: str, folder: Path) -> np.n
     with suppress(OSError, SafetensorError, KeyError):
         return load_file(kept)["results"]
     results = np.stack([reconstruct(stack, method).image for stack in stacks])
-    with atomic_output(kept, overwrite=True) as temporary:
-        temporary.write_bytes(save({"results": results}))
+    write_bytes(kept, save({"results": results}))
     return results
 
 

@@ -20,13 +20,8 @@ def network_of(settings: Settings) -> tuple[nn.Module, int]:
     return Reconstructor(settings.model).network, features.channels(settings.model.inputs)
 
 
-def per_pixel(model: Reconstructor) -> tuple[float, float]:
+def per_pixel(model: Any, channels: int) -> tuple[float, float]:
     """For each pixel of the (padded) image: multiplications, and numbers that go in and out of convolutions."""
-    return counted(model.network, features.channels(model.config.inputs))
-
-
-def counted(model: Any, channels: int) -> tuple[float, float]:
-    """``per_pixel`` of a network that reads so many channels."""
     size, macs, numbers = 8 * model.alignment, 0, 0
 
     def count(module: Any, args: tuple, output: torch.Tensor) -> None:
@@ -53,7 +48,7 @@ def counted(model: Any, channels: int) -> tuple[float, float]:
 def cost(settings: Settings) -> str:
     """A few lines on parameters, multiplications and memory; nothing is trained."""
     (model, channels), run = network_of(settings), settings.run
-    macs, numbers = counted(model, channels)
+    macs, numbers = per_pixel(model, channels)
     pixels = run.batch * (settings.data.crop + 2 * padding.MARGIN) ** 2
     # Backward costs twice as much as forward.
     step = 3 * macs * pixels

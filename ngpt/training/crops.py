@@ -14,7 +14,7 @@ from ngpt.stack import GradientStack
 
 
 class Crop(Protocol):
-    """One view with a reference and several inputs, from ``ngpt.training.dataset`` or ``StackFolder``.
+    """One view with a reference and several inputs, from ``ngpt.training.dataset`` or ``stack_folder``.
 
     Of a crop without a reference, only ``paired`` and its two stacks are used.
     """
@@ -128,35 +128,23 @@ class StackCrop:
         return caustic.denoised(repair(GradientStack(layers | features)))
 
 
-class StackFolder(Sequence[StackCrop]):
-    """A folder with a folder for each view: its ``reference.exr``, and beside it any number of gradient stacks.
+def stack_folder(folder: Path) -> list[StackCrop]:
+    """The views of a folder, each a folder with ``reference.exr`` and any number of gradient stacks.
 
     Raises NgptError where a folder has stacks without a reference, or sizes differ.
     """
-
-    def __init__(self, folder: str | Path):
-        self._crops = []
-        views = [path for path in Path(folder).iterdir() if path.is_dir() and not path.name.startswith(".")]
-        for view in sorted(views, key=natural):
-            stacks = sorted((path for path in view.glob("[!.]*.exr") if path.name != "reference.exr"), key=natural)
-            reference = view / "reference.exr"
-            if not stacks:
-                continue
-            if not reference.is_file():
-                raise NgptError(f"{view}: has {len(stacks)} stacks but no reference.exr; render one with many samples")
-            self._crops.append(StackCrop(view, stacks, reference))
-        if not self._crops:
-            raise NgptError(f"{folder}: no folder in it holds a reference.exr and stacks (*.exr)")
-
-    def __len__(self) -> int:
-        return len(self._crops)
-
-    def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        return self._crops[index]
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(crop.scene for crop in self._crops))
+    crops = []
+    views = [path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
+    for view in sorted(views, key=natural):
+        stacks = sorted((path for path in view.glob("[!.]*.exr") if path.name != "reference.exr"), key=natural)
+        reference = view / "reference.exr"
+        if stacks and not reference.is_file():
+            raise NgptError(f"{view}: has {len(stacks)} stacks but no reference.exr; render one with many samples")
+        if stacks:
+            crops.append(StackCrop(view, stacks, reference))
+    if not crops:
+        raise NgptError(f"{folder}: no folder in it holds a reference.exr and stacks (*.exr)")
+    return crops
 
 
 def open_crops(folder: str | Path) -> Iterable[Any]:
@@ -168,4 +156,4 @@ def open_crops(folder: str | Path) -> Iterable[Any]:
         from ngpt.training.dataset import Dataset
 
         return Dataset(path)
-    return StackFolder(path)
+    return stack_folder(path)

@@ -9,8 +9,6 @@
 ``python -m data_gen`` makes them, ``ngpt info DIR`` verifies them, and ``ngpt.training.shards`` describes the files.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Iterator
@@ -23,20 +21,8 @@ import numpy as np
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 from ngpt.system.records import Shape, check, read_json
-from ngpt.training.shards import (
-    CAUSTIC,
-    FAR,
-    GRADIENTS,
-    MOTION,
-    OF_INPUTS,
-    REFERENCE_CAUSTIC,
-    REFERENCE_HALVES,
-    REFERENCES,
-    SAMPLES,
-    SPLIT,
-    Shard,
-    tensor_names,
-)
+from ngpt.training import shards
+from ngpt.training.shards import Shard, tensor_names
 
 FORMAT, VERSION = "ngpt-dataset", 1
 MANIFEST = "manifest.json"
@@ -49,8 +35,7 @@ _MANIFEST: Shape = {"config": dict, "planned": int, "shards": [_ENTRY]}
 class Crop:
     """One crop; cheap: pixels are read when they are asked for.
 
-    ``scene`` names the scene, ``spp`` are the samples per pixel of its inputs, ``frame`` is its number in a
-    shot, from 0, None for a single image.
+    ``spp`` are the samples per pixel of its inputs, ``frame`` its number in a shot, from 0, None for a single image.
     """
 
     shard: Shard
@@ -61,13 +46,12 @@ class Crop:
 
     @property
     def inputs(self) -> int:
-        """The number of inputs."""
         return len(self.spp)
 
     @property
     def paired(self) -> bool:
         """Whether it has no reference, but two inputs of equally many samples that judge each other."""
-        return REFERENCES[0] not in self.shard.names
+        return shards.REFERENCES[0] not in self.shard.names
 
     def stack(self, k: int) -> GradientStack:
         """Input ``k``, all layers of a rendered stack, with gradients if its sampler has them; all values finite.
@@ -76,15 +60,15 @@ class Crop:
         """
         if not 0 <= k < self.inputs:
             raise NgptError(f"{self.shard.path}: there is no input {k}; the crop has inputs 0 .. {self.inputs - 1}")
-        names = [name for name in self.shard.names if name in OF_INPUTS]
+        names = [name for name in self.shard.names if name in shards.OF_INPUTS]
         layers = {name: self.shard.input(name, self.index, k) for name in names}
         layers["primal"] = layers.pop("indirect") + layers["direct"] + layers.get("caustic", 0)
         for name in [name for name in layers if name.endswith("_se")]:
             layers[name.removesuffix("_se") + "_var"] = np.square(layers.pop(name))
         attributes: dict[str, Any] = {"ngpt:spp": self.spp[k], "ngpt:normalSpace": "camera"}
-        if MOTION in self.shard.names:
-            motion = self.shard.crop(MOTION, self.index)
-            layers[MOTION] = np.where(motion < FAR, motion, np.float32(np.nan))
+        if shards.MOTION in self.shard.names:
+            motion = self.shard.crop(shards.MOTION, self.index)
+            layers[shards.MOTION] = np.where(motion < shards.FAR, motion, np.float32(np.nan))
         if self.frame is not None:
             attributes |= {"ngpt:frame": self.frame, "ngpt:previousFrame": self.frame - 1}
         return GradientStack(layers, attributes, path=f"{self.shard.path}, crop {self.index}, input {k}")
@@ -106,8 +90,8 @@ class Crop:
     @property
     def reference_caustic(self) -> np.ndarray:
         """(H, W, 3) float32, what of it the layer ``caustic`` of the inputs estimates; zeros where they have none."""
-        if REFERENCE_CAUSTIC in self.shard.names:
-            return self.shard.crop(REFERENCE_CAUSTIC, self.index)
+        if shards.REFERENCE_CAUSTIC in self.shard.names:
+            return self.shard.crop(shards.REFERENCE_CAUSTIC, self.index)
         return np.zeros_like(self.reference_direct)
 
     @property
@@ -116,17 +100,16 @@ class Crop:
 
         Each is of half of the reference's samples. What they say alike of an image is no noise of theirs.
         """
-        if REFERENCE_HALVES not in self.shard.names:
+        if shards.REFERENCE_HALVES not in self.shard.names:
             return ()
-        return tuple(self.shard.crop(REFERENCE_HALVES, self.index))
+        return tuple(self.shard.crop(shards.REFERENCE_HALVES, self.index))
 
 
 class Dataset:
     """The crops of a training set, in the order of its manifest.
 
     Opens the manifest only; a shard is checked when one of its crops is read, and anew in each process that an instance
-    is sent to. Raises NgptError with the file and what is wrong with it: shards that are
-    missing, are not those that the manifest tells the checksum of, or hold other tensors.
+    is sent to. Raises NgptError for shards that are missing, are other ones than the manifest's, or hold other tensors.
     """
 
     def __init__(self, folder: str | Path):
@@ -215,7 +198,7 @@ def problems(folder: Path) -> list[str]:
             bad = int(np.sum(~np.isfinite(shard.tensor(name))))
             if bad:
                 found.append(f"{shard.path}: tensor '{name}' has {bad} values that are not finite")
-        if entry["crops"] and REFERENCES[0] not in shard.names:
+        if entry["crops"] and shards.REFERENCES[0] not in shard.names:
             one, other = shard.tensor("indirect").swapaxes(0, 1)
             for crop in np.flatnonzero((one == other).all(axis=(1, 2, 3))):
                 found.append(f"{shard.path}: both halves of crop {crop} are the same: nothing is learnt from them")
@@ -238,9 +221,9 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
     shard, crops = Shard(path), entry["crops"]
     if not crops:
         return shard
-    gradients, caustic = (not tensors.keys().isdisjoint(shard.names) for tensors in (GRADIENTS, CAUSTIC))
-    optional = (REFERENCE_HALVES, MOTION, *SAMPLES, *SPLIT)
-    pairs = set(REFERENCES).isdisjoint(shard.names)
+    gradients, caustic = (not tensors.keys().isdisjoint(shard.names) for tensors in (shards.GRADIENTS, shards.CAUSTIC))
+    optional = (shards.REFERENCE_HALVES, shards.MOTION, *shards.SAMPLES, *shards.SPLIT)
+    pairs = set(shards.REFERENCES).isdisjoint(shard.names)
     names = tensor_names(gradients, caustic, [name for name in optional if name in shard.names], pairs=pairs)
     missing = [name for name in names if name not in shard.names]
     if missing:
@@ -251,16 +234,10 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
     inputs, height, width = shape[1:4]
     if pairs and not (inputs == 2 and gradients):
         raise NgptError(f"{path}: has no references, so its crops must be pairs: 2 inputs with gradients, not {inputs}")
+    shapes: dict[str, tuple[int, ...]] = {name: (inputs, height, width, c) for name, c in shards.OF_INPUTS.items()}
+    shapes |= {"spp": (inputs,), shards.REFERENCE_HALVES: (2, height, width, 3), shards.MOTION: (height, width, 2)}
     for name in names:
-        expected: tuple[int, ...] = (len(crops), height, width, 3)
-        if name == "spp":
-            expected = (len(crops), inputs)
-        elif name in OF_INPUTS:
-            expected = (len(crops), inputs, height, width, OF_INPUTS[name])
-        elif name == REFERENCE_HALVES:
-            expected = (len(crops), 2, height, width, 3)
-        elif name == MOTION:
-            expected = (len(crops), height, width, 2)
+        expected = (len(crops), *shapes.get(name, (height, width, 3)))
         if shard.shape(name) != expected:
             raise NgptError(f"{path}: tensor '{name}' is {shard.shape(name)}, it must be {expected}")
         if shard.type(name) not in (("I32",) if name == "spp" else ("F16", "F32")):

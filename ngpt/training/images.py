@@ -90,8 +90,7 @@ class Images(Task):
     def validate(self, model: nn.Module, picture: Path) -> dict[str, float]:
         if not self.held_out:
             return {}
-        found = validate(model, self.held_out, picture, self.settings.run.precision)  # type: ignore[arg-type]
-        return {"relMSE": found.network, "relMSE primal": found.primal, "relMSE base": found.base}
+        return validate(model, self.held_out, picture, self.settings.run.precision)  # type: ignore[arg-type]
 
     def save(self, path: Path, model: nn.Module, provenance: dict[str, Any]) -> None:
         safetensors.save_weights(path, model, provenance, overwrite=True)  # type: ignore[arg-type]

@@ -87,7 +87,6 @@ class Meter:
 
 
 def _memory(device: torch.device) -> int:
-    """Bytes."""
     if device.type == "cuda":
         return int(torch.cuda.max_memory_allocated(device))
     try:

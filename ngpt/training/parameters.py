@@ -15,28 +15,21 @@ from ngpt.network.model import parameters
 from ngpt.system import configs
 from ngpt.system.records import described
 from ngpt.system.templates import entries, template, toml
+from ngpt.training import settings
 from ngpt.training.augment import Augmentation
-from ngpt.training.cost import counted, network_of
+from ngpt.training.cost import network_of, per_pixel
 from ngpt.training.loss import TERMS, LossSettings
-from ngpt.training.settings import (
-    DataSettings,
-    OptimizerSettings,
-    RunSettings,
-    Settings,
-    TemporalSettings,
-    read_settings,
-)
 
 # The tables of a configuration and what reads them; "" is its top.
 TABLES: dict[str, type] = {
-    "": Settings,
+    "": settings.Settings,
     "model": ModelConfig,
-    "temporal": TemporalSettings,
-    "data": DataSettings,
+    "temporal": settings.TemporalSettings,
+    "data": settings.DataSettings,
     "augmentation": Augmentation,
     "loss": LossSettings,
-    "optimizer": OptimizerSettings,
-    "run": RunSettings,
+    "optimizer": settings.OptimizerSettings,
+    "run": settings.RunSettings,
 }
 
 
@@ -69,7 +62,6 @@ def training_template(text: str) -> str:
 
 
 def _default(field: Field) -> str:
-    """As TOML has it."""
     return "none: must be given" if field.default is MISSING else f"`{toml(field.default)}`"
 
 
@@ -81,8 +73,8 @@ def configuration_table() -> str:
 
 def configuration_row(name: str) -> str:
     path = configs.find_config(name, configs.TRAINING)
-    model, channels = network_of(read_settings(path))
-    cost, _ = counted(model, channels)
+    model, channels = network_of(settings.read_settings(path))
+    cost, _ = per_pixel(model, channels)
     return f"| `{name}` | {purpose(path.read_text())} | {parameters(model):,} | {cost / 1e3:.0f} |"
 
 

@@ -5,8 +5,6 @@ they exist: a page can be made of any run, at any time.
 """
 
 import base64
-import csv
-import io
 import json
 import math
 from dataclasses import dataclass, field
@@ -18,9 +16,9 @@ from ngpt.report.curves import curves
 from ngpt.report.document import document
 from ngpt.report.markup import plain_table, plots_html
 from ngpt.system.console import span
-from ngpt.system.files import atomic_output
 from ngpt.system.records import read_json
 from ngpt.system.text import markup
+from ngpt.system.writing import csv_text, write_text
 from ngpt.training.run_summary import LOG, PAGE, SETTINGS, entries_of
 from ngpt.training.settings_text import difference, flat
 
@@ -97,18 +95,13 @@ def write_run(folder: str | Path) -> None:
         return
     run = read_run(folder)
     for name, text in ((PAGE, page([run])), (TABLE, table(run.entries))):
-        with atomic_output(folder / name, overwrite=True) as temporary:
-            temporary.write_text(text, encoding="utf-8", newline="")
+        write_text(folder / name, text)
 
 
 def table(entries: list[dict[str, float]]) -> str:
     """The log as comma-separated values: a column for each number, empty where a line of the log has none."""
     names = list(dict.fromkeys(name for entry in entries for name in entry))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(entries)
-    return text.getvalue()
+    return csv_text([names, *(map(entry.get, names) for entry in entries)])
 
 
 def page(runs: list[Run], command: str = "") -> str:
@@ -181,7 +174,6 @@ def _plots(runs: list[Run]) -> dict[str, str]:
 
 
 def _over_time(run: Run, unit: float) -> list[tuple[float, float]]:
-    """relMSE over the time that the run took until then, in units of so many seconds."""
     seconds, points = 0.0, []
     for entry in run.entries:
         seconds = entry.get("seconds", seconds)
@@ -191,11 +183,7 @@ def _over_time(run: Run, unit: float) -> list[tuple[float, float]]:
 
 
 def _time(seconds: float) -> str:
-    """A duration, "-" where none is known."""
     return span(seconds) if math.isfinite(seconds) else "-"
-
-
-# --- pictures --------------------------------------------------------------------------------------------------------
 
 
 def _drawn(run: Run) -> tuple[Path, dict[str, Any]] | None:
@@ -248,16 +236,11 @@ def _style(runs: list[Run]) -> str:
                 f"aspect-ratio: {3 * width} / {height}; }}"
             )
             count = len(told["views"])
-            rules += [f".{_key(run)}.row{i} {{ background-position-y: {_share(i, count)}%; }}" for i in range(count)]
+            rules += [
+                f".{_key(run)}.row{i} {{ background-position-y: {round(100 * i / max(count - 1, 1), 4)}%; }}"
+                for i in range(count)
+            ]
     return "\n".join(rules)
-
-
-def _share(row: int, count: int) -> float:
-    """Where a row of so many lies, in per cent as CSS counts."""
-    return round(100 * row / max(count - 1, 1), 4)
-
-
-# --- settings --------------------------------------------------------------------------------------------------------
 
 
 def _settings(title: str, rows: list[list[str]]) -> str:
@@ -276,15 +259,10 @@ def _own(run: Run) -> list[list[str]]:
 def _differing(runs: list[Run]) -> list[list[str]]:
     """Settings in which not all runs are alike."""
     values = [flat(run.settings) for run in runs]
-    names = difference(*values)
-    return [
-        ["setting", *(run.name for run in runs)],
-        *([name, *(_text(v.get(name)) for v in values)] for name in names),
-    ]
+    return _side_by_side("setting", runs, values, difference(*values))
 
 
 def _system(runs: list[Run]) -> list[list[str]]:
-    """What the runs run on."""
     facts = [flat(run.record.get("system", {})) for run in runs]
     return _side_by_side("system", runs, facts, list(dict.fromkeys(name for fact in facts for name in fact)))
 

@@ -1,7 +1,5 @@
 """What ``ngpt info`` says of the folder of a training run, without PyTorch and while the run goes on."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

@@ -182,12 +182,10 @@ def _check(settings: Settings, path: str) -> None:
             raise NgptError(f"{path}: run.{name} = {getattr(settings.run, name)}: must be at least 1")
     if not 0 < settings.data.pairs < 1:
         raise NgptError(f"{path}: data.pairs = {settings.data.pairs}: must be a share between 0 and 1")
-    if not 0 <= settings.data.validation_share < 1:
-        raise NgptError(
-            f"{path}: data.validation_share = {settings.data.validation_share}: must be at least 0 and below 1"
-        )
-    if not 0 <= settings.optimizer.ema < 1:
-        raise NgptError(f"{path}: optimizer.ema = {settings.optimizer.ema}: must be at least 0 and below 1")
+    shares = {"data.validation_share": settings.data.validation_share, "optimizer.ema": settings.optimizer.ema}
+    for name, share in shares.items():
+        if not 0 <= share < 1:
+            raise NgptError(f"{path}: {name} = {share}: must be at least 0 and below 1")
 
 
 def _check_temporal(settings: Settings, table: TemporalSettings, path: str) -> None:

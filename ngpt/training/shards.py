@@ -24,8 +24,6 @@ A tensor is of half floats where that loses at most ``MAX_LOSS`` of it, measured
 The header's metadata holds the record of the shard as JSON under "ngpt".
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -39,9 +37,9 @@ import numpy as np
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 from ngpt.system import files
-from ngpt.system.files import atomic_output
 from ngpt.system.install import install_command
 from ngpt.system.records import check, parse_json
+from ngpt.system.writing import write_bytes
 
 # Tensors of the inputs and their channels.
 GRADIENTS = {"dx": 3, "dy": 3, "dx_se": 3, "dy_se": 3}
@@ -156,12 +154,7 @@ def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]
     # safetensors writes the bytes as they lie in memory, so arrays must be contiguous in C order.
     tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
     data = save(tensors, {"ngpt": json.dumps(record)})
-
-    def write(path: Path, overwrite: bool) -> None:
-        with atomic_output(path, overwrite) as temporary:
-            temporary.write_bytes(data)
-
-    files.save(path, write, alike=True)
+    files.save(path, lambda path, overwrite: write_bytes(path, data, overwrite), alike=True)
 
 
 class Shard:

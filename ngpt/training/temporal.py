@@ -8,13 +8,10 @@ any. The loss of a frame is
     E |y - r|² / E_x + FLICKER E |(y - r) - W (y' - r')|² / F_x
 
 relative to the reference r, where W looks up values along motion and ' marks the frame before. E_x and F_x are the same
-errors of x, so all shots count alike. The noise of a reference is independent of y, and adds the same constant whatever
-the network does. Added to the loss is the square of how much darker or brighter y is than x, in the mean of a batch:
-otherwise the easiest way to remove specks would be to lose their light. The effect of y on later frames is left out:
-among filters that know their own variance, the one with the least error now is also the best for later.
+errors of x, so all shots count alike. Added is the square of how much darker or brighter y is than x, in the mean of a
+batch: otherwise the easiest way to remove specks would be to lose their light. The effect of y on later frames is left
+out: among filters that know their own variance, the one with the least error now is also the best for later.
 """
-
-from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence

@@ -25,8 +25,8 @@ from ngpt.network import safetensors
 from ngpt.network.model import parameters
 from ngpt.system import files
 from ngpt.system.console import print_line
-from ngpt.system.files import atomic_output
 from ngpt.system.records import check
+from ngpt.system.writing import write_text
 from ngpt.training.distributed import Processes
 from ngpt.training.loggers import Logger, Meter, loggers
 from ngpt.training.run_page import write_run
@@ -211,7 +211,6 @@ class Trainer:
         self.model.train()
 
     def _train(self, batch: dict[str, Tensor]) -> dict[str, float]:
-        """One step; returns what is worth logging."""
         self.model.train()
         run, settings = self.settings.run, self.settings.optimizer
         batch = {name: layer.to(self.device, non_blocking=True) for name, layer in batch.items()}
@@ -264,7 +263,6 @@ class Trainer:
 
 
 def _seed(seed: int, step: int) -> int:
-    """A seed for everything random that belongs to one training step."""
     return int(np.random.SeedSequence((seed, step)).generate_state(1, np.uint64)[0] >> 1)
 
 
@@ -279,6 +277,5 @@ def _keep_lines(path: Path, step: int) -> list[dict[str, float]]:
                 entries.append(entry)
         except ValueError:
             continue
-    with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_text("".join(f"{json.dumps(entry)}\n" for entry in entries))
+    write_text(path, "".join(f"{json.dumps(entry)}\n" for entry in entries))
     return entries

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +10,14 @@ import torch
 
 from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.image.png import encode_png
+from ngpt.measure.averages import geometric_mean
 from ngpt.measure.images import middle
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.network.inputs import base_image
 from ngpt.network.model import Reconstructor
 from ngpt.network.run_torch import layers_of
 from ngpt.repair import repair
-from ngpt.system.files import atomic_output
-from ngpt.system.writing import write_json
+from ngpt.system.writing import write_bytes, write_json
 from ngpt.training.examples import judges_of
 
 # Rows of the picture of a validation.
@@ -48,25 +47,9 @@ class Pictures:
         # Folders of stacks may hold views of different sizes; those that do not fit are left out.
         fit = [i for i, row in enumerate(self._rows) if row.shape == self._rows[0].shape]
         rows = [self._rows[i] for i in fit]
-        with atomic_output(picture, overwrite=True) as temporary:
-            temporary.write_bytes(encode_png(np.ascontiguousarray(np.vstack(rows))))
+        write_bytes(picture, encode_png(np.ascontiguousarray(np.vstack(rows))))
         size = [rows[0].shape[1] // 3, rows[0].shape[0]]
         write_json(Path(picture).with_suffix(".json"), {"size": size, "views": [self._told[i] for i in fit]})
-
-
-@dataclass(frozen=True)
-class Scores:
-    """Geometric means, over the views, of the trimmed relMSE; with direct emission if the network reads it.
-
-    Where the data have two halves of a reference, the noise of the reference is no part of it.
-
-    ``primal``, ``base``  of the input and of what the network starts from (NaN without)
-    ``network``           of its result
-    """
-
-    primal: float
-    base: float
-    network: float
 
 
 def views(crops: Sequence[Any], count: int) -> list[tuple[Any, int]]:
@@ -84,8 +67,13 @@ def spread(every: Sequence[Any], count: int) -> list[Any]:
 @torch.no_grad()
 def validate(
     model: Reconstructor, views: Sequence[tuple[Any, int]], picture: str | Path = "", precision: str = "float32"
-) -> Scores:
-    """Scores over views (crop, input); with ``picture``, some of them are drawn into that file (``Pictures``)."""
+) -> dict[str, float]:
+    """Geometric means, over views (crop, input), of the trimmed relMSE; with direct emission if the network reads it.
+
+    Where the data have two halves of a reference, the noise of the reference is no part of it. Beside the result's they
+    are of the input ("relMSE primal") and of what the network starts from ("relMSE base", NaN without). With
+    ``picture``, some views are drawn into that file (``Pictures``).
+    """
     model.eval()
     device = next(model.parameters()).device
     primal, base, network, pictures = [], [], [], Pictures(len(views) if picture else 0)
@@ -104,9 +92,9 @@ def validate(
         if index in pictures.shown:
             pictures.add((given, image, reference), crop.scene, int(crop.spp[k]), primal[-1], network[-1])
     pictures.write(picture)
-    return Scores(_mean(primal), _mean(base), _mean(network))
+    return {"relMSE": _mean(network), "relMSE primal": _mean(primal), "relMSE base": _mean(base)}
 
 
 def _mean(values: list[float]) -> float:
-    """The geometric mean, NaN of nothing; errors of 0 count as 1e-12."""
-    return float(np.exp(np.mean(np.log(np.maximum(values, 1e-12))))) if values else float("nan")
+    """The geometric mean, NaN of nothing."""
+    return geometric_mean(values) if values else float("nan")

@@ -8,7 +8,8 @@ from exr_files import write_raw
 from shots import wall, without
 
 import ngpt
-from ngpt.io.exr import read_exr, read_image
+from ngpt.io.exr import read_image
+from ngpt.io.openexr import read_exr
 from ngpt.sequence.wcv_windows import LENGTH, reconstruct_shot
 
 

@@ -9,7 +9,7 @@ import pytest
 from full_stack import full_stack
 
 import ngpt
-from ngpt.io.exr import MADE_BY
+from ngpt.io.results import MADE_BY
 from ngpt.network.shipped import WEIGHTS
 
 FAST = WEIGHTS / "ngpt-fast.onnx"

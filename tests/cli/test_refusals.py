@@ -115,6 +115,9 @@ ROWS = [
         2,
         "method 'l1', option 'alpha': 'much' is not allowed",
     ),
+    ("denoise noisy.exr other.exr -o new -m l1 -O alpha=much", 2, "'much' is not allowed"),
+    ("denoise noisy.exr other.exr -o new -m ngpt-fast --weights nowhere.onnx", 1, "nowhere.onnx: "),
+    ("denoise noisy.exr other.exr -o new --ref nowhere.exr", 1, "nowhere.exr: not found"),
     ("denoise noisy.exr -O memory", 2, "'memory' is not of the form NAME=VALUE"),
     (
         "denoise eyes.exr -m primal -o out/a.png",
@@ -202,6 +205,7 @@ ROWS = [
     ("train --config fast --dry-run --set model.base=x", 1, "choose one of"),
     ("train --config fast --dry-run --set model.base", 2, "give it as table.key=value"),
     ("train --config tiny --set run.stepz=3", 1, "unknown key 'stepz'; did you mean 'steps'?"),
+    ("train --config tiny --out new", 1, "no such folder; make a training set: ngpt dataset --config ... --out "),
     ("train --config tiny --init notes.exr", 1, "notes.exr: exists already; pass --force"),
     ("dataset --config nowhere --out out/x", 1, "nowhere: cannot be read: no such file; configurations that come with"),
     ("evaluate --config eval-mian --out x", 1, "did you mean 'eval-main'?"),

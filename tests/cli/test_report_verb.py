@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ngpt.io.exr import read, with_channels, write, write_exr
-from ngpt.io.openexr import ExrImage, ExrPart
+from ngpt.io.exr import read, with_channels, write
+from ngpt.io.openexr import ExrImage, ExrPart, write_exr
 from ngpt.measure.metrics import METRICS
 from ngpt.stack import GradientStack
 

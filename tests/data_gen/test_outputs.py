@@ -12,7 +12,7 @@ import pytest
 import ngpt
 from ngpt.errors import NgptError
 from ngpt.image import pictures, transforms
-from ngpt.io.exr import read_exr
+from ngpt.io.openexr import read_exr
 from ngpt.methods import METHODS
 from ngpt.system.interrupts import Interrupt
 

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+from data_gen_scenes import fog
 from renders import dr, mi
 from scipy.ndimage import uniform_filter
 from scipy.stats import kstest
 from unbiased import load
 
 from data_gen.film import GradientFilm
-from data_gen.film.claims import box_means
+from data_gen.film.claims import box_means, factors
 from data_gen.film.nets import RATES, SHARES, law, split
 from data_gen.paths import streams
 from data_gen.paths.streams import sample_streams
@@ -159,8 +160,27 @@ def test_box_means_are_those_of_scipy_to_the_bit(renderer, rng, shape, kind):
 
 @pytest.mark.parametrize(
     ("sampler", "scene", "size", "spp"),
-    # Of photons, over passes: without their net the claim would be five times the noise.
-    [("primal", "glossy", (48, 32), 17), ("gpt", "glossy", (48, 32), 17), ("ppm", "diffuse", (24, 16), 12)],
+    [
+        ("primal", "glossy", (48, 32), 17),
+        ("gpt", "glossy", (48, 32), 17),
+        # Over passes of one sample: just after half of a net, where the claim was 0.7 of the noise
+        ("ppm", "diffuse", (64, 40), 9),
+        ("ppm", "diffuse", (64, 40), 17),
+        # Over passes of eight: two, which say nothing of a net, and three, where the claim was 1.3 times the noise
+        ("gbdpt", "diffuse", (48, 32), 16),
+        ("gbdpt", "diffuse", (48, 32), 24),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                ("bdpt", "diffuse", (64, 40), 12),
+                ("vcm", "diffuse", (64, 40), 9),
+                ("vcm", "diffuse", (64, 40), 17),
+                ("gpm", "glossy", (32, 24), 9),
+                ("bre", fog, (32, 24), 17),
+                ("gbre", fog, (32, 24), 9),
+            )
+        ),
+    ],
 )
 def test_claims_are_those_over_seeds(renderer, sampler, scene, size, spp):
     scene, options = load(renderer, scene, size), {"features": False} if sampler == "primal" else {}
@@ -244,6 +264,32 @@ def test_claims_hold_at_any_number_of_samples(renderer, kind, n):
 @pytest.mark.parametrize("stack_of", [adaptively, merged])
 def test_claims_hold_where_samples_come_in_parts(renderer, stack_of):
     check_claims([stack_of(seed) for seed in range(10)])
+
+
+def test_two_samples_say_nothing_of_the_law(rng):
+    """Their contrast is their sample variance, whatever the law; what it says was up to the last digit once."""
+    a, b = rng.normal(size=(2, 32, 48, 3)) * rng.gamma(0.3, size=(32, 48, 1))
+    found = factors((b - a) / 2, np.var([a, b], axis=0, ddof=1) / 2, np.full((32, 48), 2), 2)
+    assert np.ptp(found) == 0 and 0.6 < found.mean() < 1
+
+
+@pytest.mark.parametrize("pixels", [1, 4, 1 << 14])
+def test_the_more_pixels_the_more_they_say(rng, pixels):
+    """Whether samples are independent or not is known of many pixels, and not of one, which decides nothing."""
+    for rate in (1.0, 1.5):
+        values = rng.normal(size=(pixels, 16))
+        # Pairs of quarters, halves and the whole of a net have less and less noise of their own.
+        for m in (2, 4, 8, 16):
+            blocks = values.reshape(pixels, -1, m)
+            blocks -= blocks.mean(axis=-1, keepdims=True) * (1 - 2 ** ((1 - rate) / 2))
+        contrast, variance = (
+            (values[:, 8:].mean(axis=1) - values[:, :8].mean(axis=1)) / 2,
+            values.var(axis=1, ddof=1) / 16,
+        )
+        found = factors(contrast.reshape(1, -1, 1), variance.reshape(1, -1, 1), np.full((1, pixels), 16), 16).mean()
+        low, high = (0.8, 1.25) if pixels > 64 else (0.1, 2)
+        truth = values.mean(axis=1).var() / variance.mean() if pixels > 64 else 1
+        assert low < found / truth < high, rate
 
 
 @pytest.mark.parametrize("net", [1, 16, 64])

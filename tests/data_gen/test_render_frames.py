@@ -98,6 +98,24 @@ def test_a_shot_is_rendered_and_gone_on_with(renderer, command):
     assert stack.attributes["ngpt:frame"] == 2 and abs(stack["motion"]).max() > 0.05
 
 
+@pytest.mark.parametrize(
+    ("words", "status"),
+    [
+        ("render diffuse --frames 0:2 --dt 1 -o made", 2),
+        ("render none.xml --frames 0:2 -o made", 1),
+        ("render diffuse --frames 0:2 -o made --camera none.json", 1),
+        ("render diffuse --frames 0:2 -o made --sampler gvpm", 1),
+        ("render diffuse --frames 0:2 -o made --sampler restir --time 9", 1),
+        ("render diffuse --frames 0:2 -o made/{frame}.exr --size 300x200 --memory 9", 1),
+        ("dataset --config data-tiny --out made --variant none", 2),
+    ],
+)
+def test_what_is_refused_prints_a_line_and_leaves_nothing(renderer, command, words, status):
+    told = command(words, status)
+    assert told.startswith("ngpt: error: ") and told.count("\n") == 1
+    assert not Path("made").exists()
+
+
 @pytest.fixture
 def shot(renderer, command):
     """Renders the frames 0, 2 and 4 into a folder; returns the stacks there by name."""

@@ -2,9 +2,11 @@
 
 import pytest
 
+from bench.common import measure
 from ngpt.evaluation.frontier import Point, pareto
 from ngpt.evaluation.results import as_csv, summarised
 from ngpt.evaluation.tables import tables
+from ngpt.measure.averages import geometric_mean
 
 CLOCKS = ("render", "reconstruct", "total", "reconstruct wall")
 
@@ -98,7 +100,20 @@ def test_the_pareto_set():
     assert pareto(points) == [True, True, False, True, False]
 
 
+def test_benchmarks_have_the_same_averages():
+    """An error of 0 has no logarithm, and no quartile lies beyond what was measured."""
+    assert geometric_mean(iter([1.0, 4.0])) == pytest.approx(2) and geometric_mean([0.0, 1.0]) == pytest.approx(1e-15)
+    clock = iter([0.0, 9.0, 10.0, 11.0, 13.0]).__next__
+    assert measure({"a": lambda: None}, 2, clock) == {"a": {"median": 1.5, "low": 1.25, "high": 1.75}}
+
+
 def test_a_mean_is_of_methods_that_are_on_all_scenes():
     results = make_results({"l1": [0.01], "oidn": [0.03]})
     results["cells"] = [c for c in results["cells"] if (c["scene"], c["method"]) != ("b", "oidn")]
     assert {row["method"] for row in summarised(results) if row["scene"] is None} == {"l1"}
+
+
+def test_quartiles_of_few_measurements_lie_within_them():
+    # A warm-up, which does not count, then two calls, of 1 and 2 seconds.
+    clock = iter([0, 10, 11, 20, 22])
+    assert measure({"": lambda: None}, 2, lambda: next(clock)) == {"": {"median": 1.5, "low": 1.25, "high": 1.75}}

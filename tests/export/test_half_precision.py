@@ -16,7 +16,7 @@ from networks import dense, untrained
 
 import ngpt
 from ngpt.cli import main
-from ngpt.export.halves import POINTS
+from ngpt.export.weights import POINTS
 from ngpt.network.safetensors import load_weights, read_tensors, save_weights, write_tensors
 from ngpt.sequence.network import INPUTS
 from ngpt.training.temporal import WIDTHS, network

@@ -14,6 +14,7 @@ import ngpt
 from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.network import oidnet, tza
+from ngpt.network.features import channels as channels_of
 from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.safetensors import save_weights
 from ngpt.training.cost import per_pixel
@@ -56,7 +57,7 @@ def agree(image, expected):
 @pytest.mark.parametrize(("channels", "thousands"), [(SMALL, 62.136), (DEFAULT, 125.406)])
 def test_untrained_it_gives_the_colour_back(channels, thousands):
     model = Reconstructor(config(channels))
-    assert per_pixel(model)[0] == pytest.approx(1000 * thousands)
+    assert per_pixel(model.network, channels_of(model.config.inputs))[0] == pytest.approx(1000 * thousands)
     base = 40 * torch.rand(2, 3, 37, 50) ** 4 - 0.01
     with torch.no_grad():
         image = model({"base": base, "albedo": torch.rand(2, 3, 37, 50), "normal": torch.randn(2, 3, 37, 50)})

@@ -1,19 +1,19 @@
 """Networks in ONNX Runtime: tiles, memory, devices, and what is wrong with files."""
 
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from full_stack import full_layers, full_stack
+from processes import complete
 
 from ngpt.errors import NgptError
 from ngpt.methods import reconstruct
 from ngpt.network.run_onnx import Cancelled, Network
 from ngpt.network.shipped import WEIGHTS
 
-FAST = WEIGHTS / "ngpt-fast.onnx"
+FAST, COMBINE = WEIGHTS / "ngpt-fast.onnx", WEIGHTS / "ngpt-combine.onnx"
 SIZE = (333, 497)
 
 
@@ -82,11 +82,18 @@ def test_it_stops_when_asked_to(network, image, least):
 BOUNDED = """
 layers = full_layers(500, 650)
 layers["base"] = layers["primal"]
-network = Network(FAST)
+network = Network(FILE)
+layers |= {name: layers["primal"] for name in network.inputs if name not in layers}
 network.reconstruct({name: layer[:8, :8] for name, layer in layers.items()})
 begin()
 network.reconstruct(layers, memory=BOUND)
 """
+
+
+def bounded(file, memory):
+    return BOUNDED.replace("FILE", repr(str(file))).replace("BOUND", str(memory))
+
+
 # Beside the stack itself, which takes 3.4 GiB: repair, base, tiles and the result.
 LARGE = """
 layers = {name: np.tile(layer, (8, 8, 1)) for name, layer in full_layers(540, 1024).items()}
@@ -119,16 +126,17 @@ print(mebibytes("VmHWM") - before)
 @pytest.mark.parametrize(
     ("program", "most"),
     [
-        pytest.param(BOUNDED.replace("BOUND", "220"), 220 + 500 * 650 * 3 * 4 / 2**20, marks=pytest.mark.slow),
-        pytest.param(BOUNDED.replace("BOUND", "400"), 400 + 500 * 650 * 3 * 4 / 2**20),
+        pytest.param(bounded(FAST, 220), 220 + 500 * 650 * 3 * 4 / 2**20, marks=pytest.mark.slow),
+        pytest.param(bounded(FAST, 400), 400 + 500 * 650 * 3 * 4 / 2**20),
+        pytest.param(bounded(COMBINE, 400), 400 + 500 * 650 * 3 * 4 / 2**20),
         pytest.param(LARGE, 4096, marks=pytest.mark.slow),
     ],
-    ids=["220 MiB", "400 MiB", "8192x4320 in 4 GiB"],
+    ids=["220 MiB", "400 MiB", "ngpt-combine, 400 MiB", "8192x4320 in 4 GiB"],
 )
 def test_memory_stays_within_the_bound(program, most):
     """In a process of its own, by the largest size it ever had; the result is beside the bound of a network."""
-    code = MEASURED.format(program=program.replace("FAST", repr(str(FAST))))
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    code = MEASURED.format(program=program)
+    result = complete([sys.executable, "-c", code])
     assert result.returncode == 0, result.stderr
     assert float(result.stdout) <= most
 

@@ -60,7 +60,7 @@ def test_a_firefly_stays_where_it_is(views, name):
     primal[20, 10] += 1e6
     before, after = ngpt.denoise(stack, name), ngpt.denoise(stack.replace(primal=primal), name)
     model, _ = load_weights(TWINS / f"{name}.safetensors")
-    # 50 sweeps of its base, and what the network sees.
+    # The sweeps of its base reach less far than what the network sees.
     far = np.s_[:, 10 + model.network.radius + 1 :]
     assert np.isfinite(after).all() and before[far].size
     # OIDN sees further than our networks, and its exposure is that of the whole image.

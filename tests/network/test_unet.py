@@ -6,6 +6,7 @@ import torch
 from networks import ALL, dense, layers_for, untrained
 
 from ngpt.network import features, padding
+from ngpt.network.features import channels as channels_of
 from ngpt.network.model import WINDOW, ModelConfig, Reconstructor, parameters
 from ngpt.network.transfer import signed_log
 from ngpt.network.unet import POOLING, Convolution, DenseUNet, PlainUNet, Resampling
@@ -27,7 +28,7 @@ def test_the_papers_network_has_the_papers_parameters():
     assert [parameters(unpool) for unpool in net.unpool] == [256_160, 409_920, 307_520]
     assert parameters(net.head) == 1_254
     assert len([m for m in model.modules() if isinstance(m, Convolution)]) == 51
-    assert round(per_pixel(model)[0] / 1000) == 830
+    assert round(per_pixel(model.network, channels_of(model.config.inputs))[0] / 1000) == 830
 
 
 @pytest.mark.parametrize("kind", ["1x1", "3x3", "pool", "unpool"])

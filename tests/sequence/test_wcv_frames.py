@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ngpt.classical.controlvariates import decay, wcv
+from ngpt.classical.controlvariates import schedule, wcv
 from ngpt.classical.gradients import forward_differences
 from ngpt.classical.variances import FLOOR, SHARED
 from ngpt.sequence import wcv_frames as module
@@ -75,7 +75,7 @@ def test_it_is_the_iteration_of_its_equation_pixel_by_pixel(rng, monkeypatch):
     images = [rng.random(SIZE), rng.random(SIZE)]
     frames = [frame(image, 0.2, rng, spread=0.02) for image in images]
     frames[1] = frame(images[1], 0.2, rng, link(images[1], images[0], motion, 0.01, 0.1, rng), spread=0.02)
-    found = wcv_frames(frames, sweeps=3)
+    found = wcv_frames(frames, sweeps=8)
 
     flat = [0.2**2 * 3, 0.02 * 3, module.DOUBT * max(0.03, 3 * 0.03)]
     sums = {"p": flat[0], "d": max(flat[1], 3 * flat[1])}
@@ -84,7 +84,7 @@ def test_it_is_the_iteration_of_its_equation_pixel_by_pixel(rng, monkeypatch):
     p, d, t = (v / level + FLOOR for v in (sums["p"], sums["d"], flat[2]))
     d *= SHARED
     u = [np.array(f.image) for f in frames]
-    for factor in decay(3):
+    for factor, length in schedule()[:8]:
         own, new = factor * p, [np.array(v) for v in u]
         for k in (0, 1):
             for y in range(height):
@@ -108,7 +108,7 @@ def test_it_is_the_iteration_of_its_equation_pixel_by_pixel(rng, monkeypatch):
                         a = own / (own + t)
                         change += a * (u[1 - k][qy, qx] + (dt if k else -dt) - u[k][y, x])
                         weight += a
-                    new[k][y, x] = u[k][y, x] + change / weight
+                    new[k][y, x] = u[k][y, x] + length * change / weight
         u = new
     for result, expected in zip(found, u, strict=True):
         assert np.allclose(result, expected, atol=2e-5)

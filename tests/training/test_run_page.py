@@ -17,7 +17,6 @@ from ngpt.network import safetensors
 from ngpt.system import configs
 from ngpt.training import images
 from ngpt.training.run_record import write_record
-from ngpt.training.validation import Scores
 
 CROPS = [SyntheticCrop(f"<scene> {i}", i) for i in range(4)]
 MODEL = {"network": "dense", "channels": [4], "units": [1], "inputs": ["primal"]}
@@ -63,7 +62,9 @@ def test_a_run_writes_its_page_while_it_goes_on(finished):
 
 def test_the_best_weights_are_kept_and_outlive_a_stop(tmp_path, monkeypatch):
     errors = iter([0.5, 0.2, 0.3, 0.25, 0.1])
-    monkeypatch.setattr(images, "validate", lambda *_: Scores(1.0, float("nan"), next(errors)))
+    monkeypatch.setattr(
+        images, "validate", lambda *_: {"relMSE": next(errors), "relMSE primal": 1.0, "relMSE base": float("nan")}
+    )
 
     def best():
         return safetensors.load_weights(tmp_path / "best.safetensors")[1]["training"]["step"]

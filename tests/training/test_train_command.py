@@ -19,15 +19,21 @@ from ngpt.system.templates import entries
 from ngpt.training.parameters import TABLES, configuration_row, purpose
 from ngpt.training.settings import read_settings
 
-CONFIGS = sorted(path for path in Path("configs").glob("*.toml") if not path.name.startswith(("data-", "eval-")))
+ROOT = Path(__file__).parents[2]
+CONFIGS = sorted(path for path in (ROOT / "configs").glob("*.toml") if not path.name.startswith(("data-", "eval-")))
 # Those that make images; ``temporal`` learns from shots.
 OF_IMAGES = [path for path in CONFIGS if read_settings(path).model]
-TRAINING = Path("docs/train/training.md")
+TRAINING = ROOT / "docs/train/training.md"
 
 
 def sets(**changes):
     """``table_key=value`` as words of the command."""
     return [word for name, value in changes.items() for word in ("--set", f"{name.replace('_', '.', 1)}={value!r}")]
+
+
+@pytest.fixture(autouse=True)
+def at_the_root(monkeypatch):
+    monkeypatch.chdir(ROOT)
 
 
 @pytest.fixture
@@ -187,7 +193,7 @@ def test_models_are_made_anew_with_scene_files_and_without(model, files, tmp_pat
     if files:
         (tmp_path / "scenes" / "bathroom").mkdir(parents=True)
         (tmp_path / "scenes" / "bathroom" / "scene.xml").touch()
-    command = ["bash", Path("scripts/train-model").resolve(), model, "out", "--set", "run.steps=5"]
+    command = ["bash", ROOT / "scripts/train-model", model, "out", "--set", "run.steps=5"]
     subprocess.run(command, cwd=tmp_path, env={"PATH": "/usr/bin:/bin", "PYTHON": str(python)}, check=True)
     *made, trained, small, whole = (line.split("\t")[:-1] for line in calls.read_text().splitlines())
     sources = [read_config(line[line.index("--config") + 1]) for line in made]

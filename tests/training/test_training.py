@@ -374,7 +374,7 @@ def test_two_processes_do_what_one_does(tmp_path):
         "r = t.trainer(Path(sys.argv[1]), loss=lambda p, q, g: ((p - q).abs().mean(), {}), run_steps=3);"
         "r.run(); r.processes.close()"
     )
-    environment = os.environ | {"PYTHONPATH": os.getcwd(), "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": str(Path(HERE).parents[1]), "OMP_NUM_THREADS": "1"}
     (tmp_path / "run.py").write_text(program)
     one = [sys.executable, str(tmp_path / "run.py"), str(tmp_path / "one"), HERE]
     two = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", one[1], str(tmp_path / "two"), HERE]

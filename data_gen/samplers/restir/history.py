@@ -17,7 +17,7 @@ pixels would find nothing of what they could: the nearest of the four has kept o
 So everything is taken over from the nearest pixel. What lies beside the area is moved by a whole pixel: it *wraps*. A
 path may then have been found in three ways: by this frame's candidate, straight, and wrapped. The MIS weights of the
 three sum to 1, whatever m is. Confidence is handed on in proportion to the areas. [Zhang et al. 2024, "Area ReSTIR";
-gradient-domain ReSTIR 2025, section 4.3.1]
+Wang et al. 2026, "Gradient-Domain ReSTIR Path Tracing", section 4.3.1]
 
 That is unbiased as long as motion depends on no random numbers. Where more than the camera changes there are two
 scenes, and records are carried into the one that E is of: see ``data_gen.samplers.restir.carry``. Lanes of ``chains``

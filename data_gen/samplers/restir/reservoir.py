@@ -81,7 +81,8 @@ def difference(first: mi.Spectrum, second: mi.Spectrum, side: mi.UInt32) -> mi.S
 
     ``first`` and ``second`` are f of the path in either pixel, in the measure of the pixel (``side``) that sampled it:
     one is f itself, the other f |J| of the shift. A pair of paths can be sampled from both sides: the weight is p̂'s
-    share, since after resampling no density is known. [Gradient-domain ReSTIR 2025, equations 13 to 16]
+    share, since after resampling no density is known. [Wang et al. 2026,
+    "Gradient-Domain ReSTIR Path Tracing", equations 13 to 16]
     """
     a, b = mi.luminance(first), mi.luminance(second)
     own, other = dr.select(side == 0, a, b), dr.select(side == 0, b, a)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import ngpt
 from ngpt.errors import NgptError
-from ngpt.system.files import atomic_output
+from ngpt.system.writing import write_text
 
 HERE = Path(__file__).parent
 MODEL = Path(ngpt.__file__).parent / "weights" / "ngpt-fast.onnx"
@@ -56,8 +56,7 @@ def build(output: Path, runtime: Path, example: Path, model: Path = MODEL, overw
         text = re.findall(rf"<{tag}>(.*?)</{tag}>", page, re.DOTALL)[-1]
         digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
         page = page.replace(f"{{{{{tag.upper()}_HASH}}}}", f"sha256-{digest}", 1)
-    with atomic_output(output, overwrite) as temporary:
-        temporary.write_text(page)
+    write_text(output, page, overwrite)
     return output
 
 

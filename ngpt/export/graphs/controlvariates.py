@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ngpt.classical.controlvariates import SWEEPS, decay
+from ngpt.classical.controlvariates import schedule
 from ngpt.classical.variances import FLOOR, SHARED
 from ngpt.export.builder import Value, channels, op, repeat
 from ngpt.export.graphs import variances
@@ -32,7 +32,7 @@ def wcv(
     V = op.Concat(vx, vy, _before(vx, 3, _NEVER), _before(vy, 2, _NEVER), axis=1)
     G = op.Concat(dx, dy, -_before(dx, 3, 0.0), -_before(dy, 2, 0.0), axis=1)
     R = G - _slopes(primal)
-    factors = np.array(decay(SWEEPS), np.float32)
+    factors, steps = np.array(schedule(), np.float32).T.copy()
 
     def sweep(n: Value, u: Value) -> tuple[Value, bool]:
         own = v * op.Gather(factors, n, axis=0)
@@ -40,9 +40,10 @@ def wcv(
         E = _slopes(u) - R
         said = op.Reshape(A, [0, 4, 1, -1]) * op.Reshape(E, [0, 4, 3, -1])
         change = op.Reshape(op.ReduceSum(said, [1], keepdims=0), op.Shape(primal))
-        return u + change / (op.ReduceSum(A, [1], keepdims=1) + 1.0), True
+        step = op.Gather(steps, n, axis=0)
+        return u + change * (step / (op.ReduceSum(A, [1], keepdims=1) + 1.0)), True
 
-    return primal + repeat(SWEEPS, sweep, primal * 0.0, IMAGE)
+    return primal + repeat(len(factors), sweep, primal * 0.0, IMAGE)
 
 
 def _before(x: Value, axis: int, border: float) -> Value:

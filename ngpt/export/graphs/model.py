@@ -75,10 +75,7 @@ def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto
     if config.base:
         made = graph.input("base", ("tiles", 3, "base_height", "base_width"), np.zeros((1, 3, 0, 0)))
         scaled["base"] = choose(
-            op.Equal(op.Size(made), 0),
-            lambda: _base(data, scale, mean),
-            lambda: (made - data.direct) / scale,
-            IMAGE,
+            op.Equal(op.Size(made), 0), lambda: _base(data, scale, mean), lambda: (made - data.direct) / scale, IMAGE
         )
 
     mirror = Mirror(raw["primal"], alignment)

@@ -2,13 +2,11 @@
 
 import statistics
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import numpy as np
 
 
 def summary(values: list[float]) -> dict[str, float]:
-    """Median and quartiles."""
     low, median, high = statistics.quantiles(values, n=4, method="inclusive") if len(values) > 1 else values * 3
     return {"median": median, "low": low, "high": high}
 
@@ -19,15 +17,11 @@ def median(values: Iterable[float | None]) -> float | None:
     return float(np.median(known)) if known else None
 
 
+def geometric_mean(values: Iterable[float]) -> float:
+    """Values of 0 or less count as 1e-30."""
+    return float(np.exp(np.mean(np.log(np.maximum(list(values), 1e-30)))))
+
+
 def mean(values: Sequence[float], geometric: bool) -> float:
-    """Arithmetic, or geometric with 0 taken for 1e-30."""
-    if not geometric:
-        return float(np.mean(values))
-    return float(np.exp(np.mean(np.log(np.maximum(values, 1e-30)))))
-
-
-def groups_of(results: dict[str, Any], scenes: Iterable[str]) -> dict[str, list[str]]:
-    """The ``scenes`` of each group of the configuration, and all of them as "all" if they are several."""
-    found = list(dict.fromkeys(scenes))
-    groups = {name: [s for s in found if s in listed] for name, listed in results["settings"]["groups"].items()}
-    return groups | ({"all": found} if len(found) > 1 else {})
+    """Arithmetic or geometric."""
+    return geometric_mean(values) if geometric else float(np.mean(values))

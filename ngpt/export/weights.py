@@ -1,4 +1,4 @@
-"""Weights as the repository keeps them: in 16 bits, with the curve of their training in the header."""
+"""Weights in 16 bits: as the repository keeps them, with the curve of their training, and as OIDN reads them."""
 
 from pathlib import Path
 from typing import Any
@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from ngpt.errors import NgptError
-from ngpt.network.safetensors import in_halves, read_tensors, write_tensors
+from ngpt.network import tza
+from ngpt.network.safetensors import in_halves, load_weights, read_tensors, write_tensors
 from ngpt.training.run_summary import LOG, entries_of
 
 POINTS = 100
@@ -35,3 +36,15 @@ def curve(entries: list[dict[str, float]], last: int) -> dict[str, list[Any]]:
         "steps": [int(part[-1, 0]) for part in parts],
         "losses": [float(f"{part[:, 1].mean():.4g}") for part in parts],
     }
+
+
+def oidn_weights(weights: str | Path) -> bytes:
+    """The .tza file of weights as `ngpt train` writes them.
+
+    Raises NgptError for networks of another shape, and for numbers that the 16 bits of OIDN cannot hold.
+    """
+    model, _ = load_weights(weights)
+    if model.config.network != "oidn":
+        raise NgptError(f"{weights}: network '{model.config.network}' has not OIDN's shape; export it to an .onnx file")
+    halves = in_halves(model.network.state_dict(), str(weights))
+    return tza.packed({name: tensor.numpy() for name, tensor in halves.items()}, model.config.base or "primal")
