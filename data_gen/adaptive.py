@@ -1,33 +1,30 @@
 """Samples where they pay: after a few samples everywhere, more of them where the result's error is large.
 
-The error is measured on the image that the chosen method reconstructs, not on the stack: it is the standard error of
-``ngpt.api.uncertainty``. A render proceeds in steps, and each step may double the samples. Before each step the method
-runs twice on the samples so far. If a pixel has the error q, relative to its light, after n samples, one sample would
-leave the error s = q sqrt(n). For a given sum of n, the mean of s² / n is least where n is proportional to s. Each step
-brings the counts as near to this as it can. Every pixel gets at least a quarter of its even share, so that light which
-the first samples missed can still be found.
-
-The samples that decide the counts stay in the means. So a pixel whose first samples were too dark by chance might get
-too few further samples, and its expected value would be too dark. Two things keep this bias small: errors are means
-over about 9x9 pixels, where a pixel's own samples have little weight; and they are relative to the light there, so
-noise that darkens a pixel lowers both. docs/use/adaptive.md has measurements.
+Before each step the method that is to reconstruct the image runs twice, which tells the standard error of its result
+(``ngpt.api.uncertainty``); docs/use/adaptive.md says how the samples of a step follow from it. The samples that decide
+the counts stay in the means, so a pixel whose first samples were too dark by chance might get too few: errors that are
+means over about 9x9 pixels, relative to the light there, keep this bias small.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.budget import Budget, Watch
+from data_gen import passes
+from data_gen.budget import LANE_BYTES, Budget, Watch
 from data_gen.film import GradientFilm
-from data_gen.passes import SamplePass, rounds_of
+from data_gen.passes import PACKET, SamplePass, foretold, lanes_within, recording, rounds_of
+from data_gen.paths.camera import CameraSamples, bytes_of_rays
+from data_gen.paths.streams import first_round
 from data_gen.samplers import SAMPLERS, Sampler
-from data_gen.uneven import BLOCK, UnevenRender
 from ngpt.api.uncertainty import FACTOR, FACTORS, change, noisier
 from ngpt.errors import NgptError, WrongUse
 from ngpt.measure.metrics import EPSILON, trimmed_mean
@@ -35,6 +32,8 @@ from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
 from ngpt.system.late import ndimage
 
+# Samples of a pixel come in blocks of a packet of rays, so that no pixel's bits depend on which others are rendered.
+BLOCK = PACKET
 # Least mean number of samples per pixel: the first step everywhere, and as many again to distribute
 LEAST = 2 * BLOCK
 # The least and the most that a pixel gets, relative to an even share
@@ -45,24 +44,22 @@ _MARGIN, _SMALLEST = 1.05, 0.125
 _TRIM = 0.001
 # This share of the changes is cut to the next smaller one: else all pixels around a firefly get its samples.
 _CUT = 0.03
-# Standard errors are right for two values in three. The few that are far off make the mean square larger than so; that
-# of l1, whose standard errors count the light that it leaves out, is smaller. By python -m bench.adaptive, six scenes.
-_TAILS = {"l1": 0.75}
-_TAIL = 1.25
+# Standard errors are right for two values in three. The few that are far off make the mean square larger; that of l1,
+# whose standard errors count the light that it leaves out, is smaller. By python -m bench.adaptive, six scenes.
+_TAILS, _TAIL = {"l1": 0.75}, 1.25
 # Pixels, the side of the part of an image that tells how long the method takes
 _PART = 96
 
 
 @dataclass(frozen=True)
 class Adaptive:
-    """How samples are shared out: for which ``method`` of reconstruction, and up to which ``error``.
+    """How samples are shared out.
 
     The ``error`` is relative: the root of the mean of (x - r)² / (r² + 1e-3) over all but the worst 0.1 % of the
-    pixels, for the result x of the method and the converged image r, as far as standard errors foretell it. None: as
-    far as samples or time go.
+    pixels, for the result x of the ``method`` and the converged image r, as far as standard errors foretell it.
     """
 
-    error: float | None = None
+    error: float | None = None  # that ends the render; None: as far as samples or time go
     method: str = "auto"
 
     def chosen_by(self, stack: GradientStack) -> str:
@@ -85,13 +82,7 @@ def check_adaptive(adaptive: Adaptive, sampler: Sampler, options: dict, spp: int
 
 
 def render_adaptive(
-    sample: SamplePass,
-    sensor: mi.Sensor,
-    seed: int,
-    adaptive: Adaptive,
-    budget: Budget,
-    watch: Watch,
-    **how: Any,
+    sample: SamplePass, sensor: mi.Sensor, seed: int, adaptive: Adaptive, budget: Budget, watch: Watch, **how: Any
 ) -> tuple[GradientFilm, dict]:
     """The film, and attributes that say what its samples were chosen for.
 
@@ -101,8 +92,8 @@ def render_adaptive(
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     pixels = width * height
-    spp, seconds, stop = budget.spp, budget.seconds, watch.stop
-    start, total = time.perf_counter(), spp or LEAST
+    spp, seconds, stop, start = budget.spp, budget.seconds, watch.stop, time.perf_counter()
+    total = spp or LEAST
 
     def report() -> None:
         if seconds is not None:
@@ -157,17 +148,14 @@ def render_adaptive(
 
 @dataclass(frozen=True)
 class Assessment:
-    """What a method makes of a stack: the standard error of each pixel relative to its light, (pixels), and in all."""
-
-    relative: np.ndarray
-    error: float
+    relative: np.ndarray  # the standard error of each pixel relative to its light, (pixels)
+    error: float  # in all
     method: str
 
 
 def assess(stack: GradientStack, method: str) -> Assessment:
     """The expected error of what a method would make of the stack."""
-    result = reconstruct(stack, method)
-    again = reconstruct(noisier(stack), method)
+    result, again = reconstruct(stack, method), reconstruct(noisier(stack), method)
     light = ndimage.uniform_filter(np.nan_to_num(result.image).astype(np.float64), (3, 3, 1))
     unit = np.sqrt(np.square(light) + EPSILON)
     # Made relative before averaging over neighbours: the error of a lamp's edge must not count for the dark beside it.
@@ -182,8 +170,7 @@ def assess(stack: GradientStack, method: str) -> Assessment:
 
 
 def seconds_to_assess(stack: GradientStack, method: str) -> float:
-    """What ``assess`` is expected to take, from what it takes for a part in the middle of the image; 0 where the image
-    is not much larger than that."""
+    """What ``assess`` is expected to take, from a part in the middle of the image; 0 where that is most of it."""
     if stack.width * stack.height < 4 * _PART**2:
         return 0.0
     seconds = 0.0
@@ -215,3 +202,90 @@ def gain(need: np.ndarray) -> float:
     shares = np.clip(need / max(need.mean(), 1e-300), _FLOOR, _CAP)
     squares = np.square(need)
     return float((squares / (shares / shares.mean())).mean() / max(squares.mean(), 1e-300))
+
+
+class UnevenRender:
+    """A render that receives, step by step, how many more blocks of samples each pixel gets.
+
+    The steps make one sequence of blocks: the first block of all pixels that get one, row by row, then the second block
+    of all pixels that get two, and so on. ``most`` samples, the time of the ``budget`` or ``stop`` can end the sequence
+    anywhere. The same total of samples gives the same bits, whatever the passes and whatever ended the render.
+
+    ``sample`` must take samples that do not share anything; see ``data_gen.passes.render_passes()`` for it. ``stop`` is
+    asked before each pass, and ``report`` called after it.
+    """
+
+    def __init__(
+        self,
+        sample: SamplePass,
+        sensor: mi.Sensor,
+        seed: int,
+        most: int | None = None,
+        *,
+        budget: Budget = Budget(),  # noqa: B008 - it is frozen
+        stop: Callable[[], bool] = lambda: False,
+        lane_bytes: int = LANE_BYTES,
+        report: Callable[[], None] = lambda: None,
+        points: str = "sobol",
+    ):
+        width, height = (int(n) for n in sensor.film().crop_size())
+        self.net = first_round(points, None)
+        self.film = GradientFilm(width, height, net=self.net)
+        self.sample, self.sensor, self.seed, self.stop, self.report = sample, sensor, seed, stop, report
+        self.blocks_left = (most or 1 << 62) // BLOCK
+        lane_bytes += bytes_of_rays(sensor)
+        # Raises NgptError where not even one row's worth fits.
+        self.at_once = lanes_within(budget.memory, self.film, BLOCK * width, lane_bytes) // BLOCK
+        self.end = None if budget.seconds is None else time.perf_counter() + budget.seconds
+        self.passes: list[tuple[int, float]] = []  # blocks and seconds of each
+        self.ended = False
+
+    def add(self, blocks: np.ndarray, whole: bool = False) -> None:
+        """Renders so many more ``blocks`` of each pixel, (pixels) integers.
+
+        Unless the ``whole`` is asked for, these are as many of them as there may be; ``ended`` says whether some were
+        left out.
+        """
+        waiting, level = np.zeros(0, np.uint32), 0
+        while True:
+            n = self._at_once(whole)
+            while len(waiting) < n and level < blocks.max():
+                waiting = np.append(waiting, np.flatnonzero(blocks > level).astype(np.uint32))
+                level += 1
+            if not len(waiting):
+                return
+            n = min(n, len(waiting)) if whole else min(n, len(waiting), self.blocks_left)
+            if n < 1 or (self.stop() and not whole):
+                self.ended = True
+                return
+            self._render(np.sort(waiting[:n]))
+            waiting = waiting[n:]
+            self.report()
+
+    def _at_once(self, whole: bool) -> int:
+        """Blocks of the next pass; 0 where there is no time for one."""
+        if not self.passes:
+            return max(1, min(self.at_once, passes.FIRST_LANES // BLOCK))
+        begin, each = foretold(self.passes)
+        # Where a pass takes long to begin, it goes on for longer.
+        n = max(1, min(self.at_once, int(max(passes.PASS_SECONDS - begin, 3 * begin) / each)))
+        if whole or self.end is None:
+            return n
+        left = self.end - time.perf_counter()
+        # Two thirds of the time left, since a pass may take longer than others did; all of it where that is too little.
+        most = int((2 / 3 * left - begin) / each)
+        return min(n, most if most > 0 else int(left > begin + each))
+
+    def _render(self, some: np.ndarray) -> None:
+        """One block of each of ``some`` pixels, ascending; of a pixel that is there more than once, so many."""
+        start = time.perf_counter()
+        pixels, starts, blocks = np.unique(some, return_index=True, return_counts=True)
+        within = np.arange(len(some)) - np.repeat(starts, blocks)
+        first = mi.UInt32(np.repeat(self.film.samples_each[pixels], blocks) + BLOCK * within)
+        with recording():
+            camera = CameraSamples(self.sensor, self.seed, BLOCK, first, BLOCK, mi.UInt32(some), net=self.net)
+            self.sample(camera, self.film)
+            self.film.end_pass(BLOCK, some)
+        dr.sync_thread()
+        self.blocks_left -= len(some)
+        self.passes.append((len(some), time.perf_counter() - start))

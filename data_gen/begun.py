@@ -1,8 +1,7 @@
 """Renders that were begun: whether a file has all that is asked for, and what is left to render of it.
 
-The rest gets its own seed, made from the requested seed and the number of existing parts. So its samples differ from
-the samples in the file and are independent of them: means and variances are merged exactly as for stacks with different
-seeds (``ngpt.merging``). What ends a part does not depend on its samples.
+The rest gets its own seed, made from the requested seed and the number of existing parts. So its samples are
+independent of those in the file, and parts are merged exactly as stacks with different seeds are (``ngpt.merging``).
 """
 
 from __future__ import annotations
@@ -98,7 +97,7 @@ class Rest:
 
 @dataclass(frozen=True)
 class Asked:
-    """What is asked for; ``spp``, ``seconds`` and ``error`` end a render, whichever is reached first."""
+    """What is asked for; of ``spp``, ``seconds`` and ``error`` the one reached first ends a render."""
 
     scene: str
     seed: int
@@ -171,9 +170,8 @@ class Asked:
         named = _options(str(attributes.get(OPTIONS, "")))
         options = named - _EITHER
         # What the file's sampler is called with if any will do; one from another package may be missing here.
-        entry = FRAME_SAMPLERS.get(self.sampler) or (
-            SAMPLERS.get(sampler) if self.sampler in ("auto", sampler) else None
-        )
+        own = SAMPLERS.get(sampler) if self.sampler in ("auto", sampler) else None
+        entry = FRAME_SAMPLERS.get(self.sampler) or own
         wanted = _options(entry.unusual(entry.settings(self.options))) - _EITHER if entry else options
         unbiased = self.unbiased or self.options.get("tails") == "paths"
         theirs_shared, ours_shared = self._sharing(attributes, len(seeds))
@@ -217,38 +215,31 @@ class Asked:
 
 
 def begun_stack(path: Path) -> GradientStack:
-    """What a file has of a render."""
-    return rendered(read(path))
-
-
-def rendered(read: GradientStack) -> GradientStack:
-    """What was rendered of a stack that was read from a file: without the image that a method made of it, if any."""
-    layers = {name: read[name] for name in read.names if name != "error"}
-    attributes = {name: value for name, value in read.attributes.items() if name not in MADE_BY}
-    further = {name: channel for name, channel in pass_through(read).items() if name.startswith(DIAGNOSTICS)}
-    stack = GradientStack(layers, attributes, path=read.path, place=read.place)
+    """What was rendered of the stack in a file: without the image that a method made of it, if any."""
+    found = read(path)
+    layers = {name: found[name] for name in found.names if name != "error"}
+    attributes = {name: value for name, value in found.attributes.items() if name not in MADE_BY}
+    further = {name: channel for name, channel in pass_through(found).items() if name.startswith(DIAGNOSTICS)}
+    stack = GradientStack(layers, attributes, path=found.path, place=found.place)
     return with_channels(stack, further) if further else stack
 
 
-def joined(begun: GradientStack, rest: GradientStack) -> GradientStack:
-    """Merges both parts; the attributes that say how the render ended come from ``rest``."""
-    whole = merge([begun, rest])
-    whole.attributes |= {name: rest.attributes[name] for name in (UNFINISHED, TIME) if name in rest.attributes}
+def joined_or_kept(path: Path, rest: GradientStack, begun: GradientStack) -> GradientStack:
+    """Both parts merged; the attributes that say how the render ended come from ``rest``.
+
+    Where that fails, the rest is written beside ``path``, and NgptError says so.
+    """
+    try:
+        whole = merge([begun, rest])
+    except NgptError as error:
+        raise kept_apart(str(error), rest, path.with_name(f"{path.stem}.rest.exr"), "was rendered now") from error
+    last = (UNFINISHED, TIME, "ngpt:adaptive")
+    whole.attributes |= {name: rest.attributes[name] for name in last if name in rest.attributes}
     # Errors fall with the root of the samples.
     errors = [n for stack in (begun, rest) if (n := _number(stack.attributes, "ngpt:error"))]
     if errors:
         whole.attributes["ngpt:error"] = 1 / math.sqrt(sum(n**-2 for n in errors))
-    if "ngpt:adaptive" in rest.attributes:
-        whole.attributes["ngpt:adaptive"] = rest.attributes["ngpt:adaptive"]
     return whole
-
-
-def joined_or_kept(path: Path, rest: GradientStack, begun: GradientStack) -> GradientStack:
-    """``joined``; where that fails, the rest is written beside ``path``, and NgptError says so."""
-    try:
-        return joined(begun, rest)
-    except NgptError as error:
-        raise kept_apart(str(error), rest, path.with_name(f"{path.stem}.rest.exr"), "was rendered now") from error
 
 
 def kept_apart(why: str, stack: GradientStack, path: Path, what: str = "was rendered") -> NgptError:
@@ -287,6 +278,5 @@ def _colours(variant: str) -> str:
 
 
 def _number(attributes: Mapping[str, Any], name: str) -> float:
-    """An attribute that is a number, else 0."""
     value = attributes.get(name)
     return float(value) if isinstance(value, int | float | np.number) and math.isfinite(value) else 0.0

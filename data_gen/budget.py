@@ -19,16 +19,11 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Budget:
-    """What a render may spend. Of ``spp`` and ``seconds`` whichever is reached first ends it.
+    """What a render may spend. Of ``spp`` and ``seconds`` whichever is reached first ends it."""
 
-    ``spp``      base paths per pixel; None: as many as time allows
-    ``seconds``  of wall-clock time, compilation of kernels included; None: no limit
-    ``memory``   MiB for paths and film
-    """
-
-    spp: int | None = None
-    seconds: float | None = None
-    memory: int = DEFAULT_MEMORY
+    spp: int | None = None  # base paths per pixel; None: as many as time allows
+    seconds: float | None = None  # of wall-clock time, compilation of kernels included; None: no limit
+    memory: int = DEFAULT_MEMORY  # MiB for paths and film
 
     def check(self, ends: bool = False) -> None:
         """Raises WrongUse for what no scene could be rendered with; ``ends``: something else ends the render."""
@@ -44,13 +39,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Watch:
-    """Callbacks during a render.
-
-    ``progress``  called before the first pass and after each
-    ``stop``      asked after each pass whether to end there
-    ``look``      called with the ``GradientFilm`` after each pass, before ``stop``; it leaves the film as it is
-    """
-
-    progress: Progress = lambda done, total: None
-    stop: Callable[[], bool] = lambda: False
+    progress: Progress = lambda done, total: None  # called before the first pass and after each
+    stop: Callable[[], bool] = lambda: False  # asked after each pass whether to end there
+    # Called with the ``GradientFilm`` after each pass, before ``stop``; it leaves the film as it is
     look: Callable[[Any], None] = lambda film: None

@@ -52,7 +52,7 @@ def reached(sampler: str) -> list[str]:
 def _entries_of(module: str) -> str | None:
     """The module with a sampler's entry: the ``about`` of its family."""
     while (module := module.rpartition(".")[0]) not in ("", _REGISTRY):
-        if _exists(about := f"{module}.about"):
+        if _file(about := f"{module}.about").is_file():
             return about
     return None
 
@@ -70,7 +70,7 @@ def _imports(file: Path) -> set[str]:
         for name in names:
             parts = name.split(".")
             prefixes = [".".join(parts[: i + 1]) for i in range(len(parts))]
-            found |= {prefix for prefix in prefixes if parts[0] == "data_gen" and _exists(prefix)}
+            found |= {prefix for prefix in prefixes if parts[0] == "data_gen" and _file(prefix).is_file()}
     return found
 
 
@@ -83,10 +83,6 @@ def _tree(file: Path, changed: int) -> ast.Module:
 @lru_cache(maxsize=1024)
 def _text(file: Path, changed: int) -> str:
     return code_text(file)
-
-
-def _exists(module: str) -> bool:
-    return _file(module).is_file()
 
 
 def _file(module: str) -> Path:

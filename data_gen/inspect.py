@@ -25,11 +25,11 @@ _LENSES = ("dielectric", "roughdielectric")
 
 
 def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
-    """Counts a scene's plugins by kind and says how it would be sampled.
+    """Counts a scene's plugins by kind and says how it would be sampled; arguments are as in ``load_scene``.
 
-    ``name`` and ``parameters`` are as in ``load_scene``. Returns {"plugins": {kind: {plugin: count}},
-    "sensors": a line for each, "size": (width, height) or None where the scene leaves it to Mitsuba, "media": names,
-    "lens": whether there is depth of field, "shutter": seconds it is open, "sampler": name, "plan": lines of text}.
+    Returns {"plugins": {kind: {plugin: count}}, "sensors": a line for each, "size": (width, height) or None where the
+    scene leaves it to Mitsuba, "media": names, "lens": whether there is depth of field, "shutter": seconds it is open,
+    "sampler": name, "plan": lines of text}.
     """
     config = mi.parser.ParserConfig(mi.variant())
     try:
@@ -68,6 +68,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         hides=hides,
     )
     sampler, reason = choose(facts)
+    still = f"Mitsuba {mi.__version__} has no animation"
     return {
         "plugins": {kind.lower(): dict(counts.most_common()) for kind, counts in plugins.items() if counts},
         "sensors": [camera.text(number, camera is taken) for number, camera in enumerate(sensors)],
@@ -80,10 +81,11 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
             f"{sampler}: {SAMPLERS[sampler].summary}",
             f"because {reason}",
             *(["in a room it is 'primal': rays tell, once the scene is loaded"] * (sampler == "gpt" and not media)),
-            *([unable] if unable else SAMPLERS[sampler].notes(facts)),
+            *([unable] if unable else SAMPLERS[sampler].notes_on(facts)),
             *([f"integrator '{integrator}': the image of '{followed}' is rendered"] * (integrator != followed)),
             *_contents(plugins, facts),
-            *_camera(lens, shutter),
+            *(["depth of field: base and offset paths share their lens samples"] * lens),
+            *([f"shutter: open for {shutter:g} s and sampled, but nothing moves: {still}"] * (shutter > 0)),
         ],
     }
 
@@ -108,7 +110,6 @@ class _Camera:
 
 
 def _children(nodes: Sequence, node, kind: mi.ObjectType) -> list:
-    """The nodes of a ``kind`` that a node of a parsed scene has."""
     parts = [part.index() for _, part in node.props.items() if isinstance(part, mi.Properties.ResolvedReference)]
     return [nodes[part] for part in parts if nodes[part].type == kind]
 
@@ -146,10 +147,9 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
     points = any(name in _POINTS for name in plugins["Emitter"])
     if any(name in plugins["BSDF"] for name in _LENSES):
         if able := _finding(facts, "caustics"):
+            how = "by photons alone for lights without size" if points else "best by photons"
             lines.append(
-                "glass: the light behind it, where that is seen in mirrors or through glass, "
-                + ("is found by photons alone for lights without size: " if points else "is found best by photons: ")
-                + able
+                f"glass: the light behind it, where that is seen in mirrors or through glass, is found {how}: {able}"
             )
         if able := _finding(facts, "caustics", and_hidden_lamps=True):
             lines.append(
@@ -172,22 +172,6 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
 
 def _finding(facts: Facts, light: str, and_hidden_lamps: bool = False) -> str:
     """The arguments that name samplers, studies left out, which can render the scene and find such light."""
-    found = [
-        name
-        for name, sampler in SAMPLERS.items()
-        if sampler.standing != "study" and not sampler.refuses(facts)
-        if light in sampler.finds and ("hidden lamps" in sampler.finds) == and_hidden_lamps
-    ]
+    able = {name: s for name, s in SAMPLERS.items() if s.standing != "study" and not s.refuses(facts)}
+    found = [n for n, s in able.items() if light in s.finds and ("hidden lamps" in s.finds) == and_hidden_lamps]
     return ", ".join(f"`--sampler {name}`" for name in found)
-
-
-def _camera(lens: bool, shutter: float) -> list[str]:
-    """What base and offset paths share beside random numbers."""
-    lines = []
-    if lens:
-        lines.append("depth of field: base and offset paths share their lens samples")
-    if shutter > 0:
-        lines.append(
-            f"shutter: open for {shutter:g} s and sampled, but nothing moves: Mitsuba {mi.__version__} has no animation"
-        )
-    return lines

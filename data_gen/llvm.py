@@ -29,13 +29,8 @@ _PATTERNS = (
 
 def find_llvm() -> dict[Path, int]:
     """All LLVM libraries in the usual places, links resolved: path -> major version, newest first."""
-    found = {}
-    for pattern in _PATTERNS:
-        for name in glob.glob(pattern):
-            path = Path(name).resolve()
-            version = llvm_version(path)
-            if version is not None:
-                found[path] = version
+    paths = (Path(name).resolve() for pattern in _PATTERNS for name in glob.glob(pattern))
+    found = {path: version for path in paths if (version := llvm_version(path)) is not None}
     return dict(sorted(found.items(), key=lambda item: -item[1]))
 
 

@@ -90,7 +90,6 @@ class Output:
 
     @property
     def stack(self) -> Path:
-        """The file that has the stack."""
         return self.kept or self.file
 
     def check(self) -> None:
@@ -155,7 +154,6 @@ class Output:
         return stack, self.image(stack, overwrite) if self.denoising else {}
 
     def image(self, stack: GradientStack, overwrite: bool) -> dict[str, Any]:
-        """Writes the image of the whole stack."""
         assert self.denoising is not None
         # Dr.Jit keeps the memory of a render for the next one: at 1920x1080 more than a method takes.
         import drjit as dr

@@ -82,9 +82,7 @@ def _construct(entry: Any, props: Any) -> Any:
 def make_classes() -> None:
     """Has samplers derive from the classes of the current variant: Mitsuba has classes of their own for each.
 
-    Their modules are imported when they are first used. Here modules that were imported for another variant are
-    reloaded.
-    Raises NgptError for a variant that cannot vectorise.
+    Modules that were imported for another variant are reloaded. Raises NgptError for one that cannot vectorise.
     """
     global _made_for
     import mitsuba as mi

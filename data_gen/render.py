@@ -24,7 +24,7 @@ from data_gen.scenes.cameras import place_of
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import check_scene
-from data_gen.tails.schedule import LEAST_MIB, MIB, enough
+from data_gen.tails.cache import LEAST_MIB, MIB, enough
 from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
 from ngpt.io.exr import with_channels
 from ngpt.merging import UNFINISHED
@@ -57,12 +57,10 @@ def render_stack(
 ) -> GradientStack:
     """Renders a stack from the scene's first sensor.
 
-    ``sampler`` is "auto" or one of ``data_gen.samplers.SAMPLERS``; ``options`` are its options, which may be strings.
-    ``spp``, ``seconds`` and ``memory`` are as in ``data_gen.budget.Budget``, ``progress`` and ``stop`` as in
-    ``data_gen.budget.Watch``; ``newest`` is called after each pass with a function that makes the stack of the samples
-    done by then. With ``diagnostics`` the stack has the images of ``data_gen.film.GradientFilm.diagnose()`` as
-    further channels. Without ``with_features`` it holds only the primal; only sampler "primal" can do without features.
-    The scene's reconstruction filter is not used: the pixels of a stack, and so their differences, are box-filtered.
+    What ``data_gen.render_scene`` has too is as there; ``options`` may be strings. With ``diagnostics`` the images of
+    ``data_gen.film.GradientFilm.diagnose()`` are further channels. Without ``with_features`` the stack holds only the
+    primal; only sampler "primal" can do without features. The scene's reconstruction filter is not used: the pixels of
+    a stack, and so their differences, are box-filtered.
 
     With ``adaptive``, pixels get different numbers of samples, which the layer ``samples`` contains: see
     ``data_gen.adaptive``. ``spp`` and ``ngpt:spp`` are then means over pixels.
@@ -97,7 +95,9 @@ def render_stack(
             why_not = f"the integrator is '{facts.integrator}', and only paths of 'path' do"
         if why_not and settings["tails"] == "shared":
             raise WrongUse(f"sampler '{sampler}': tails=shared is not possible: {why_not}; leave it out")
-        if "tails" not in options and not unbiased and not why_not and _enough_to_share(scene, budget):
+        pixels = math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
+        enough_to_share = enough(pixels, budget.spp) and budget.memory >= LEAST_MIB
+        if "tails" not in options and not unbiased and not why_not and enough_to_share:
             settings["tails"] = "shared"
             budget = replace(budget, memory=memory - MIB)
     if adaptive is not None:
@@ -149,12 +149,6 @@ def render_stack(
     if failed:
         raise Unfinished(str(failed) or type(failed).__name__, stack) from failed
     return stack
-
-
-def _enough_to_share(scene: mi.Scene, budget: Budget) -> bool:
-    """Whether a render has paths and memory enough for a cache that they share."""
-    pixels = math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
-    return enough(pixels, budget.spp) and budget.memory >= LEAST_MIB
 
 
 def options_as_attribute(entry: Entry, settings: dict[str, Any]) -> dict[str, str]:

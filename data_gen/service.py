@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,9 @@ from ngpt.stack import GradientStack
 
 if TYPE_CHECKING:
     import mitsuba as mi
+
+# Of the wall, or of this process on all processors, which other work on the machine does not change
+CLOCKS: dict[str, Callable[[], float]] = {"wall": time.perf_counter, "processor": time.process_time}
 
 
 def load(source: str, size: tuple[int, int]) -> mi.Scene:
@@ -32,23 +36,29 @@ def render(scene: mi.Scene, options: Options, spp: int | None, seed: int, *, sec
 
 
 def warm_up(scene: mi.Scene, options: Options) -> GradientStack:
-    from data_gen.choosing import costs
-
-    return costs.warm_up(scene, options)
+    # Kernels do not depend on the number of samples.
+    return render(scene, options, 1, 0, seconds=None)
 
 
 def timed(scene: mi.Scene, options: Options, spp: int, seed: int, clock: str) -> tuple[GradientStack, float]:
-    from data_gen.choosing import costs
-
-    return costs.timed(scene, options, spp, seed, clock)
+    start = CLOCKS[clock]()
+    stack = render(scene, options, spp, seed, seconds=None)
+    return stack, CLOCKS[clock]() - start
 
 
 def measure(
     scene: mi.Scene, renders: Mapping[str, Options], spp: int, repeats: int, *, clock: str
 ) -> tuple[dict[str, list[float]], GradientStack]:
-    from data_gen.choosing import costs
-
-    return costs.measure(scene, renders, spp, repeats, clock=clock)
+    seconds: dict[str, list[float]] = {name: [] for name in renders}
+    for options in renders.values():
+        warm_up(scene, options)
+    stacks = {}
+    # In turn, so that a busy moment hits all alike
+    for seed in range(repeats):
+        for name, options in renders.items():
+            stacks[name], duration = timed(scene, options, spp, seed, clock)
+            seconds[name].append(duration / spp)
+    return seconds, stacks[next(iter(renders))]
 
 
 def batch(sampler: str) -> int:
@@ -70,10 +80,7 @@ def overview() -> dict[str, Any]:
 
     SAMPLERS.load()
     titles = {"samplers": "use", "samplers for some scenes": "niche", "samplers to compare with": "study"}
-    found = {
-        title: {name: entry.summary for name, entry in by_standing(standing).items()}
-        for title, standing in titles.items()
-    }
+    found = {title: {n: entry.summary for n, entry in by_standing(kind).items()} for title, kind in titles.items()}
     return found | {"built-in scenes": {name: (make.__doc__ or "").split("\n")[0] for name, make in SCENES.items()}}
 
 

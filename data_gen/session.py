@@ -94,6 +94,9 @@ def render_scene(
     sense, and for scenes that cannot be loaded or that the sampler cannot render.
     """
     _start(variant)
+    from data_gen.adaptive import Adaptive
+    from data_gen.choosing import plans
+    from data_gen.choosing.trials import Pilot
     from data_gen.render import check_limits, render_stack
     from data_gen.scenes.cameras import sensor_names
 
@@ -109,15 +112,17 @@ def render_scene(
     if sensor is None and len(scene.sensors()) > 1:
         names = sensor_names([camera.id() for camera in scene.sensors()])
         said(f"there are {len(scene.sensors())} sensors ({names}), and none is named: 0 is rendered")
-    pilot = sharing is None and sampler == "auto"
     plan = None
-    if pilot:
-        told = {"said": said, "stop": stop, "unbiased": unbiased}
-        plan = _plan(scene, spp, seconds, method, memory, gradients, **told)
+    if sharing is None and sampler == "auto":
+        pilot = Pilot(said=said, stop=stop, unbiased=unbiased)
+        if method is None or seconds is None:
+            plan = plans.plan_sampler(scene, spp, seconds, memory, pilot, gradients=gradients)
+        else:
+            plan = plans.plan(scene, seconds, method, memory, pilot)
         _LOG.info("plan: sampler %s, method %s: %s", plan.sampler, plan.method or "any", plan.reason)
         chosen(plan)
         sampler, seconds = plan.sampler, plan.render
-        sharing = _adaptive(None, "auto") if plan.shared else None
+        sharing = Adaptive() if plan.shared else None
     stack = render_stack(
         scene,
         spp,
@@ -134,9 +139,8 @@ def render_scene(
         **options,
     )
     if plan is None:
-        from data_gen.choosing.plans import Plan
-
-        plan = Plan(stack.attributes["ngpt:sampler"], method or "", sharing is not None, seconds, "as it was asked for")
+        used = stack.attributes["ngpt:sampler"]
+        plan = plans.Plan(used, method or "", sharing is not None, seconds, "as it was asked for")
     elif plan.method:
         stack.attributes["ngpt:for"] = plan.method
     return Rendered(stack, plan)
@@ -253,34 +257,13 @@ def _loaded(
 
 def _sharing(adaptive: bool, error: float | None, method: str | None, by_itself: bool) -> Adaptive | None:
     """How samples are shared out; None: evenly. ``by_itself``: a time is all that is said of samples and sampler."""
+    from data_gen.adaptive import Adaptive
+
     if adaptive or error is not None:
-        return _adaptive(error, method or "auto")
+        return Adaptive(error, method or "auto")
     if method is not None and not by_itself:
         raise WrongUse(
             "--for needs --adaptive or --error; or give --time without --sampler and --spp, and a pilot chooses the "
             "sampler for it"
         )
     return None
-
-
-def _adaptive(error: float | None, method: str) -> Adaptive:
-    from data_gen.adaptive import Adaptive
-
-    return Adaptive(error, method)
-
-
-def _plan(
-    scene: mi.Scene,
-    spp: int | None,
-    seconds: float | None,
-    method: str | None,
-    memory: int,
-    gradients: bool,
-    **told: Any,
-) -> Plan:
-    """By a pilot: of the sampler and the method for so many ``seconds``, or, without a ``method``, of the sampler."""
-    from data_gen.choosing.plans import plan, plan_sampler
-
-    if method is None or seconds is None:
-        return plan_sampler(scene, spp, seconds, memory, gradients=gradients, **told)
-    return plan(scene, seconds, method, memory, **told)

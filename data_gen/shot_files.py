@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from concurrent.futures import as_completed
 from dataclasses import dataclass, field
-from functools import partial
+from inspect import signature
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from data_gen.backend import DEFAULT_VARIANT
@@ -115,59 +116,31 @@ def write_frames(
             raise
 
     for rest, frames in begun.items():
-        write_all(partial(_not_among, frozenset(frames)), rest.options(options.get("seed", 0)))
+        others = frozenset(files) - frozenset(frames)
+        write_all(others.__contains__, rest.options(options.get("seed", 0)))
     write_all(skip, {})
     if stop():
         done = {report["frame"] for report in written.frames if "unfinished" not in report}
-        written.interrupted = next(
-            (frame for frame in ours if frame not in done and not asked[frame].done(files[frame])), None
-        )
+        left = (frame for frame in ours if frame not in done and not asked[frame].done(files[frame]))
+        written.interrupted = next(left, None)
     return written
 
 
-def asked_of(
-    scene: str,
-    frame: int,
-    *,
-    spp: int | None = None,
-    seed: int = 0,
-    sampler: str = "auto",
-    size: tuple[int, int] | None = None,
-    parameters: Mapping[str, str] | None = None,
-    camera: Any = None,
-    sensor: int | str | None = None,
-    fps: float = 24.0,
-    dt: int = 0,
-    seconds: float | None = None,
-    memory: int | None = None,
-    diagnostics: bool = False,
-    unbiased: bool = False,
-    variant: str | None = None,
-    **options: Any,
-) -> Asked:
-    """What ``render_frames``, which has the same arguments, is asked for a frame."""
-    remembers = FRAME_SAMPLERS.get(sampler)
-    if spp is None and (seconds is None or remembers):
+def asked_of(scene: str, frame: int, **arguments: Any) -> Asked:
+    """What ``render_frames`` is asked for a frame by these ``arguments`` of it."""
+    bound = signature(render_frames).bind(scene, [frame], **arguments)
+    bound.apply_defaults()
+    its = SimpleNamespace(**bound.arguments)
+    remembers, spp = FRAME_SAMPLERS.get(its.sampler), its.spp
+    if spp is None and (its.seconds is None or remembers):
         spp = remembers.spp if remembers else DEFAULT_SPP
-    given = {name: filled(text, frame) for name, text in (parameters or {}).items()} | {
-        "--fps": str(fps),
-        "--dt": str(dt),
-    }
-    given |= {} if sensor is None else {"--sensor": str(sensor)}
-    name = scene_name(filled(scene, frame), given, str(camera) if camera is not None else None)
-    return Asked(
-        name,
-        seed,
-        sampler,
-        options,
-        size,
-        spp,
-        seconds,
-        frame=frame,
-        unbiased=unbiased,
-        variant=variant or DEFAULT_VARIANT,
-        diagnostics=diagnostics,
-    )
+    given = {name: filled(text, frame) for name, text in (its.parameters or {}).items()}
+    given |= {"--fps": str(its.fps), "--dt": str(its.dt)}
+    given |= {} if its.sensor is None else {"--sensor": str(its.sensor)}
+    name = scene_name(filled(scene, frame), given, None if its.camera is None else str(its.camera))
+    same = ("seed", "sampler", "options", "size", "seconds", "unbiased", "diagnostics")
+    known = {field: getattr(its, field) for field in same}
+    return Asked(name, spp=spp, frame=frame, variant=its.variant or DEFAULT_VARIANT, **known)
 
 
 def report_of(stack: GradientStack, file: Path, made: Mapping[str, Any]) -> dict[str, Any]:
@@ -239,7 +212,3 @@ def _once(begins: Callable[[], None]) -> Callable[[int], Callable[[int, int], No
             waiting.pop()()
 
     return lambda frame: progress
-
-
-def _not_among(frames: frozenset[int], frame: int) -> bool:
-    return frame not in frames

@@ -1,19 +1,11 @@
 """Pipelines from scene to image: a sampler and a method, and the error that they are expected to leave.
 
-Each sampler that can render the scene renders four small stacks. Every method that can use them reconstructs each of
-the four, and each half merged. The error of such an image is measured against primals of the other half and of the
-other samplers, whose noise has zero mean (``data_gen.choosing.trials``), so blur and lost light count as error. The
-error at the number of samples that fit into the time is extrapolated by a power law. Its exponent comes partly from the
-pilot, which compares one stack to two, and partly from what is usual for this kind of method.
+Every method that can use a sampler's four small stacks (``data_gen.choosing.trials``) reconstructs each of them, and
+each half merged. The error at the number of samples that fit into the time is extrapolated by a power law. Its exponent
+comes partly from the pilot, which compares one stack to two, and partly from what is usual for this kind of method.
 
-The image of a biased sampler (photons) is judged like a reconstruction, and no biased sampler judges others. Where the
-biased sampler finds most of the light, the samplers that judge it are noisy: twice the standard error is added to the
-error they give.
-
-Samples are even, or adaptive (``data_gen.adaptive``) where this is expected to pay for itself. The gain is computed
-from the pilot's expected errors, pixel by pixel, as if these were exact.
-
-Not handled: light that no sampler has found in the pilot.
+No biased sampler (photons) judges others. Where one finds most of the light, the samplers that judge it are noisy:
+twice the standard error is added to the error they give. Light that no sampler has found in the pilot is not handled.
 """
 
 from __future__ import annotations
@@ -54,31 +46,19 @@ REALISED, FROM = 2.0, 2 * LEAST
 
 @dataclass(frozen=True)
 class Pipeline:
-    """A sampler and a method, as a pilot saw them.
-
-    ``spp``       samples per pixel at which the ``error`` (trimmed relMSE) was measured
-    ``step``      the exponent of the error as a power of the samples, as the pilot measured it
-    ``seconds``   seconds for one sample per pixel of the whole image
-    ``after``     seconds of the method
-    ``adaptive``  expected error of adaptive samples relative to even ones; 1: samples are even
-    ``choosing``  seconds of the method each time that samples are distributed
-    ``doubt``     standard error of a biased sampler's error, by which the error is raised; otherwise 0
-    """
-
     sampler: str
     method: str
-    spp: int
-    error: float
-    step: float
-    seconds: float
-    after: float
-    adaptive: float = 1.0
-    choosing: float = 0.0
-    doubt: float = 0.0
+    spp: int  # samples per pixel at which the ``error`` was measured
+    error: float  # trimmed relMSE
+    step: float  # the exponent of the error as a power of the samples, as the pilot measured it
+    seconds: float  # for one sample per pixel of the whole image
+    after: float  # seconds of the method
+    adaptive: float = 1.0  # expected error of adaptive samples relative to even ones; 1: samples are even
+    choosing: float = 0.0  # seconds of the method each time that samples are distributed
+    doubt: float = 0.0  # standard error of a biased sampler's error, by which the error is raised; otherwise 0
 
     @property
     def shared(self) -> bool:
-        """Whether samples are adaptive."""
         return self.choosing > 0
 
     @property
@@ -105,7 +85,6 @@ class Pipeline:
         return spp - self._choices(spp) / self.seconds
 
     def takes(self, spp: float) -> float:
-        """The seconds of so many samples and of the method."""
         return spp * self.seconds + self._choices(spp) + self.after
 
     def _choices(self, spp: float) -> float:

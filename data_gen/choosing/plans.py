@@ -1,31 +1,30 @@
 """Which sampler, how many samples and which method: chosen by a pilot, small renders by each sampler that could do it.
 
 ``plan`` is for a given time and a method that makes the image: the least error wins. ``plan_sampler`` is for
-``--sampler auto`` where the method is not known. It does the same with even samples and one simple method for each
-sampler: ``wcv`` where there are gradients, else none. It compares the times to reach the error that the scene's own
-sampler is expected to have at the end. It chooses photons where they are clearly better, but not in scenes whose light
-only photons can find. No pilot can see light that none of the samplers has found.
+``--sampler auto`` where the method is not known. It compares, with even samples and one simple method for each sampler,
+the times to reach the error that the scene's own sampler is expected to have at the end. It chooses photons where they
+are clearly better, but not in scenes whose light only photons can find. No pilot can see light that none of the
+samplers has found.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from data_gen import samplers
 from data_gen.budget import DEFAULT_MEMORY
-from data_gen.choosing.enclosed import enclosed
 from data_gen.choosing.pipelines import Pipeline, choose, measure, methods_for
-from data_gen.choosing.trials import PIXELS, Trial, at_most, candidates, try_all
+from data_gen.choosing.trials import PIXELS, Pilot, Trial, at_most, candidates, try_all
 from data_gen.passes import film_within
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.facts import Facts, scene_facts
-from data_gen.tails.schedule import enough
+from data_gen.tails.cache import enough
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS
 from ngpt.system.console import brief
@@ -35,9 +34,8 @@ from ngpt.system.console import brief
 SHARE, SHARE_WITH_METHODS = 0.2, 0.3
 _SHARE_OF_RENDER = 0.15
 # Seconds for an image below which a pilot costs more than it could gain. The trials of gpt and primal on the smallest
-# images take 3.0, 5.5, 5.6 and 13.5 processor seconds (diffuse, glossy, coffee, dining-room), and the methods of the
-# first two 3.5 and 4.4. Two idle cores finish the trials of a room within a fifth of this time. On a slower machine
-# they do not fit, and their time is lost.
+# images take 3.0 to 13.5 processor seconds (diffuse, glossy, coffee, dining-room), the methods about 4. On a machine
+# where they do not fit into a fifth of this time, their time is lost.
 LEAST_SECONDS = 40.0
 # What `ngpt denoise` takes beside the method, and `ngpt render` to write the stack: for the process to begin, and to
 # write a million pixels, read them and write the image
@@ -57,37 +55,18 @@ _ROOM_METHOD = "ngpt-primal"
 _ROOM_REASON = "the camera is in a room, where more samples pay and gradients do not; --sampler gpt renders gradients"
 # A rival must need this much less time: a choice is not worth changing for what chance could have made.
 _MARGIN = 1.1
-
-
-Said = Callable[[str], None]
-Stop = Callable[[], bool]
-
-
-def silent(line: str) -> None:
-    """Discards the line."""
-
-
-def never() -> bool:
-    """Nobody asks to stop."""
-    return False
+# Whether the camera is in a room is told by so many rays: by the share of them leaving visible surfaces that meet
+# another surface, 0.96 to 1 in five rooms, 0.14 to 0.82 around objects and in open boxes (docs/lab/worth.md).
+_RAYS, _IN_ROOMS = 1 << 12, 0.9
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How a scene is rendered, and why.
-
-    ``sampler``  name of the sampler
-    ``method``   the method whose result it was chosen for; "" if the method is not known
-    ``shared``   whether samples are adaptive
-    ``render``   seconds for the render, without pilot and method; None: as long as it takes
-    ``reason``   a line for the user
-    """
-
     sampler: str
-    method: str
-    shared: bool
-    render: float | None
-    reason: str
+    method: str  # whose result it was chosen for; "" if the method is not known
+    shared: bool  # whether samples are adaptive
+    render: float | None  # seconds for the render, without pilot and method; None: as long as it takes
+    reason: str  # a line for the user
 
 
 def explore(
@@ -95,41 +74,33 @@ def explore(
     seconds: float = LONG,
     method: str = "auto",
     memory: int = DEFAULT_MEMORY,
+    pilot: Pilot = Pilot(),  # noqa: B008 - it is frozen
     *,
-    clock: Callable[[], float] = time.perf_counter,
-    said: Said = silent,
-    stop: Stop = never,
     patient: bool = False,
-    unbiased: bool = False,
 ) -> list[Pipeline]:
     """The pipelines of a scene, for an image of its size; see ``plan``, which chooses of them. None where no trial fits
     into the time; ``patient``, the first sampler has a trial and a method however long they take.
 
     ``after`` of them is all that follows the render: its file, a process that reads it, the method, the image's file.
     """
-    start = clock()
+    start = pilot.clock()
     able = _able(scene, method)
     _check_memory(scene, able[0], None, memory)
     pixels = round(PIXELS * min(1.0, max((seconds / LONG) ** 2, LEAST_PIXELS)))
     with at_most(scene, pixels) as scale:
         first = math.inf if patient else SHARE * seconds
-        told: dict[str, Any] = {"clock": clock, "said": said, "stop": stop, "unbiased": unbiased}
-        trials = try_all(scene, able, lambda _: SHARE * seconds, first, **told)
-    if not trials or stop():
+        trials = try_all(scene, able, lambda _: SHARE * seconds, first, pilot)
+    if not trials or pilot.stop():
         return []
     found = measure(
         trials,
-        clock,
+        pilot.clock,
         lambda sampler: methods_for(sampler, method),
-        goes_on=lambda: clock() - start < SHARE_WITH_METHODS * seconds and not stop(),
+        goes_on=lambda: pilot.clock() - start < SHARE_WITH_METHODS * seconds and not pilot.stop(),
     )
+    grows = scale**_GROWS
     return [
-        replace(
-            p,
-            seconds=p.seconds * scale,
-            after=p.after * scale**_GROWS + _beside(scene),
-            choosing=p.choosing * scale**_GROWS,
-        )
+        replace(p, seconds=p.seconds * scale, after=p.after * grows + _beside(scene), choosing=p.choosing * grows)
         for p in found
     ]
 
@@ -142,7 +113,8 @@ def _beside(scene: mi.Scene) -> float:
 def _able(scene: mi.Scene, method: str) -> list[str]:
     """The samplers to try, whose stacks the method can use: the one that the description stands for first."""
     names = candidates(scene)
-    able = [n for n in sorted(dict.fromkeys([*names, "primal"]), key=_turn(names[0])) if methods_for(n, method)]
+    turns = sorted(dict.fromkeys([*names, "primal"]), key=lambda name: (name != names[0], name != "primal"))
+    able = [name for name in turns if methods_for(name, method)]
     if not able:
         raise NgptError(f"method '{method}' cannot use what the samplers of this scene render; name another, or auto")
     return able
@@ -153,28 +125,23 @@ def plan(
     seconds: float,
     method: str = "auto",
     memory: int = DEFAULT_MEMORY,
-    *,
-    clock: Callable[[], float] = time.perf_counter,
-    said: Said = silent,
-    stop: Stop = never,
-    unbiased: bool = False,
+    pilot: Pilot = Pilot(),  # noqa: B008 - it is frozen
 ) -> Plan:
-    """How to use so many ``seconds`` of the ``clock``, which include the pilot and the method.
+    """How to use so many ``seconds`` of the pilot's clock, which include the pilot and the method.
 
     Only the given ``method`` is considered, unless it is "auto". The pilot tries the sampler that the scene's
     description stands for, then ``primal``, then all other unbiased samplers that ``--sampler auto`` compares, as far
     as they fit into a fifth of the time, compilation included. The less time, the smaller are its images. If there is
     no time for a pilot, or if the pilot finds that nothing fits, the description decides, and the render takes the
-    remaining time. ``said`` is called with what is tried; ``stop`` ends the pilot; ``unbiased`` goes to
-    ``data_gen.render.render_stack``. The measurements change from run to run. Raises NgptError for
-    a method that does not run here or cannot use any of the stacks.
+    remaining time. The measurements change from run to run. Raises NgptError for a method that does not run here or
+    cannot use any of the stacks.
     """
-    start = clock()
+    start = pilot.clock()
     able = _able(scene, method)
     whole: list[Pipeline] = []
-    if seconds >= LEAST_SECONDS and not stop():
-        whole = explore(scene, seconds, method, memory, clock=clock, said=said, stop=stop, unbiased=unbiased)
-    left = seconds - (clock() - start)
+    if seconds >= LEAST_SECONDS and not pilot.stop():
+        whole = explore(scene, seconds, method, memory, pilot)
+    left = seconds - (pilot.clock() - start)
     if ranked := choose(whole, left):
         first = ranked[0]
         return Plan(first.sampler, first.method, first.shared, left - first.after, _why(ranked, left))
@@ -193,10 +160,8 @@ def plan_sampler(
     spp: int | None,
     seconds: float | None,
     memory: int = DEFAULT_MEMORY,
+    pilot: Pilot = Pilot(),  # noqa: B008 - it is frozen
     *,
-    said: Said = silent,
-    stop: Stop = never,
-    unbiased: bool = False,
     gradients: bool = False,
 ) -> Plan:
     """The sampler for a render of ``spp`` samples per pixel, or of so many ``seconds``; one of them may be None.
@@ -204,8 +169,8 @@ def plan_sampler(
     In a room it is ``primal``, unless ``gradients`` are wanted: see ``in_a_room``. Elsewhere the description decides,
     at no cost, where only one sampler can render the scene, and where the render is too short for a pilot. What a pilot
     measures changes from run to run, what it chooses hardly; the render itself has the bits of ``--sampler NAME``.
-    ``said`` and ``stop`` are as of ``plan``. Raises NgptError where no sampler with gradients can render the scene, and
-    before anything is tried where the image does not fit into ``memory`` (MiB).
+    Raises NgptError where no sampler with gradients can render the scene, and before anything is tried where the image
+    does not fit into ``memory`` (MiB).
     """
     start = time.perf_counter()
     facts = scene_facts(scene)
@@ -231,11 +196,10 @@ def plan_sampler(
                 return 0.0
             return min(math.inf if spp is None else trials[sampler].seconds * spp * scale, longest)
 
-        share = _SHARE_OF_RENDER
-        told: dict[str, Any] = {"said": said, "stop": stop, "unbiased": unbiased}
-        trials = try_all(scene, names, lambda trials: share * whole(trials), share * longest, **told)
+        budget = lambda trials: _SHARE_OF_RENDER * whole(trials)  # noqa: E731
+        trials = try_all(scene, names, budget, _SHARE_OF_RENDER * longest, pilot)
     found = (sampler, reason)
-    if sampler in trials and not stop():
+    if sampler in trials and not pilot.stop():
         found = best_of(measure(trials, methods=lambda name: [simple(name)], shared=False), whole(trials) / scale)
     # However long the pilot took, the render is begun.
     left = None if seconds is None else max(seconds - (time.perf_counter() - start), 1e-3)
@@ -250,6 +214,24 @@ def in_a_room(scene: mi.Scene, facts: Facts, spp: int | None) -> bool:
     """
     able = samplers.choose(facts)[0] == "gpt" and not facts.media and not SAMPLERS["primal"].refuses(facts)
     return able and enough(_pixels(scene), spp) and not METHODS[_ROOM_METHOD].missing() and enclosed(scene)
+
+
+def enclosed(scene: mi.Scene) -> bool:
+    """Whether nearly all light that reaches what the camera sees comes from other surfaces.
+
+    Rays go through random pixels, and continue from where they hit in directions sampled by the cosine. Windows without
+    glass count as open. The rays are always the same. It takes 0.15 processor seconds.
+    """
+    random = mi.PCG32(_RAYS)
+    pairs = (mi.Point2f(random.next_float32(), random.next_float32()) for _ in range(3))
+    sensor = scene.sensors()[0]
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, next(pairs), next(pairs))
+    seen = scene.ray_intersect(ray)
+    normal = dr.select(dr.dot(seen.n, ray.d) > 0, -seen.n, seen.n)
+    away = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(next(pairs)))
+    again = scene.ray_test(seen.spawn_ray(away), seen.is_valid())
+    hits, others = (int(dr.count(mask)[0]) for mask in (seen.is_valid(), seen.is_valid() & again))
+    return others > _IN_ROOMS * max(hits, 1)
 
 
 def _pixels(scene: mi.Scene) -> int:
@@ -296,10 +278,6 @@ def judge(default: str, times: dict[str, float]) -> tuple[str, str]:
     others = [f"'{name}' takes {brief(times[name] / times[best])} times as long" for name in times if name != best]
     found = f"to the same error, {', '.join(others)}" if others else "there was no time to try others"
     return best, f"chosen by a pilot: {found}"
-
-
-def _turn(first: str) -> Callable[[str], int]:
-    return lambda name: (first, "primal").index(name) if name in (first, "primal") else 2
 
 
 def _why(ranked: Sequence[Pipeline], seconds: float) -> str:

@@ -7,8 +7,7 @@ that a sampler finds in one pixel of a thousand is an outlier, which a method ta
 
 What a sample takes is measured in processor seconds, which other work on the machine hardly changes, so a busy moment
 moves no sampler against another. A user gives seconds of the wall. One factor for all trials turns the one into the
-other: their wall seconds over their processor seconds, both of further samples. On an idle machine that is what the
-cores do in parallel; on a busy one also what others leave, which the render will have to live with as well.
+other: their wall seconds over their processor seconds, both of further samples.
 """
 
 from __future__ import annotations
@@ -45,14 +44,20 @@ SEED = 0x9E3779B9
 
 @dataclass(frozen=True)
 class Trial:
-    """Four stacks of as many samples by one sampler, and the seconds of one sample of the whole image.
-
-    ``processor``  the same in processor seconds of all cores together; 0 if not known, or where a graphics card renders
-    """
-
-    stacks: list[GradientStack]
-    seconds: float
+    stacks: list[GradientStack]  # four of as many samples
+    seconds: float  # of one sample of the whole image
+    # The same in processor seconds of all cores together; 0 if not known, or where a graphics card renders
     processor: float = 0.0
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """How trials go on, and who hears of it."""
+
+    clock: Callable[[], float] = time.perf_counter
+    said: Callable[[str], None] = lambda line: None  # called with what is tried
+    stop: Callable[[], bool] = lambda: False  # whether to end there
+    unbiased: bool = False  # as in ``data_gen.render.render_stack``
 
 
 def candidates(scene: mi.Scene, biased: bool = False) -> list[str]:
@@ -73,19 +78,15 @@ def try_all(
     samplers: Sequence[str],
     budget: Callable[[dict[str, Trial]], float] = lambda trials: math.inf,
     first: float = math.inf,
-    *,
-    clock: Callable[[], float] = time.perf_counter,
-    said: Callable[[str], None] = lambda line: None,
-    stop: Callable[[], bool] = lambda: False,
-    unbiased: bool = False,
+    pilot: Pilot = Pilot(),
 ) -> dict[str, Trial]:
     """Trials of the samplers that can render the scene, by name.
 
-    Together they may take as many seconds of the ``clock`` as the ``budget`` returns when called with the trials so
-    far. A trial that would not fit into the remaining time, by its time to compile and to render, is left out. The
-    ``first`` has a budget of its own, and is always compiled. ``said`` is called with what is tried; ``stop`` says
-    whether to end there. ``unbiased`` goes to ``data_gen.render.render_stack``.
+    Together they may take as many seconds of the clock as the ``budget`` returns when called with the trials so far. A
+    trial that would not fit into the remaining time, by its time to compile and to render, is left out. The ``first``
+    has a budget of its own, and is always compiled.
     """
+    clock, stop = pilot.clock, pilot.stop
     start, slow = clock(), 1.0
     trials: dict[str, Trial] = {}
     for i, name in enumerate(samplers):
@@ -93,9 +94,9 @@ def try_all(
         compiles = SAMPLERS[name].compiles
         if i and slow * compiles > rest:
             continue
-        said(f"pilot: trying '{name}'; to compile its kernels may take {slow * compiles:.0f} s")
+        pilot.said(f"pilot: trying '{name}'; to compile its kernels may take {slow * compiles:.0f} s")
         begins = clock()
-        trial, compiled = try_out(scene, name, clock, rest, stop, unbiased=unbiased)
+        trial, compiled = try_out(scene, name, clock, rest, stop, unbiased=pilot.unbiased)
         if stop():
             break
         # A scene of many materials, or a busy machine, slows down the next one as well. Where kernels are kept from
@@ -171,17 +172,10 @@ def try_out(
 
 
 @dataclass(frozen=True)
-class Witnesses:
-    """The primals of trials, which judge the images of each sampler.
-
-    ``primals``  four of each sampler, by name
-    ``noise``    noise of a single primal, by name of sampler
-    ``scale``    what errors are relative to: an image from all samplers, where samplers with little noise count most
-    """
-
-    primals: dict[str, list[np.ndarray]]
-    noise: dict[str, float]
-    scale: np.ndarray
+class Witnesses:  # that judge the images of each sampler
+    primals: dict[str, list[np.ndarray]]  # four of each sampler, by name
+    noise: dict[str, float]  # of a single primal, by name of sampler
+    scale: np.ndarray  # what errors are relative to: an image from all samplers, those with little noise count most
 
     @classmethod
     def of(cls, trials: dict[str, Trial]) -> Witnesses:
@@ -194,15 +188,16 @@ class Witnesses:
     def against(self, sampler: str, half: int) -> tuple[np.ndarray, np.ndarray]:
         """Two independent images without the sampler's other half: made of its own ``half`` and all other unbiased
         samplers. If there are none, only its own images judge it."""
-        a, b = (self._side(sampler, half, i) for i in range(2))
-        return a, b
+        names = [*(n for n in self.primals if n != sampler), sampler]
+        fair = [n for n in names if not SAMPLERS[n].biased] or names
+        noise = {n: self.noise[n] if n == sampler else self.noise[n] / 2 for n in fair}
 
-    def _side(self, sampler: str, half: int, i: int) -> np.ndarray:
-        images = {n: (four[2 * i] + four[2 * i + 1]) / 2 for n, four in self.primals.items() if n != sampler}
-        weights = {n: self.noise[n] / 2 for n in images}
-        images[sampler], weights[sampler] = self.primals[sampler][2 * half + i], self.noise[sampler]
-        fair = [n for n in images if not SAMPLERS[n].biased] or list(images)
-        return mean_of({n: images[n] for n in fair}, weights)
+        def side(i: int) -> np.ndarray:
+            images = {n: (four[2 * i] + four[2 * i + 1]) / 2 for n, four in self.primals.items()}
+            images[sampler] = self.primals[sampler][2 * half + i]
+            return mean_of({n: images[n] for n in fair}, noise)
+
+        return side(0), side(1)
 
     def error(self, sampler: str, halves: Sequence[Sequence[np.ndarray]]) -> float:
         """The error of independent images by ``sampler``, some from each of its halves.
@@ -220,7 +215,9 @@ class Witnesses:
 
     def doubt(self, sampler: str, image: np.ndarray) -> float:
         """The standard error of the error of an ``image`` of the first half."""
-        return doubt_of(image, *self.against(sampler, 1), self.scale)
+        a, b = self.against(sampler, 1)
+        values = ((image - a) * (image - b) / _denominator(self.scale)).mean(axis=-1)
+        return float(values.std()) / math.sqrt(values.size)
 
 
 def mean_of(images: dict[str, np.ndarray], noise: dict[str, float]) -> np.ndarray:
@@ -241,12 +238,6 @@ def error_of(x: np.ndarray, a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> 
     return trimmed_mean((x - a) * (x - b) / under, np.square(x - (a + b) / 2) / under, _TRIM)
 
 
-def doubt_of(x: np.ndarray, a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> float:
-    """The standard error of ``error_of``, by how much pixels differ."""
-    values = ((x - a) * (x - b) / _denominator(scale)).mean(axis=-1)
-    return float(values.std()) / math.sqrt(values.size)
-
-
 def _denominator(scale: np.ndarray) -> np.ndarray:
     """m² + 1e-3 of an image that has noise itself, which the mean over 7x7 pixels lessens."""
     return ndimage.uniform_filter(scale.astype(np.float64), (7, 7, 1)) ** 2 + EPSILON
@@ -260,14 +251,13 @@ def at_most(scene: mi.Scene, pixels: int):
     """
     film = scene.sensors()[0].film()
     (width, height), window = (tuple(int(n) for n in numbers) for numbers in (film.size(), film.crop_size()))
-    size = width, height
-    shrink = math.sqrt(pixels / (size[0] * size[1]))
-    if shrink >= 1 or size != window:
+    shrink = math.sqrt(pixels / (width * height))
+    if shrink >= 1 or (width, height) != window:
         yield 1.0
         return
     small = max(1, round(width * shrink)), max(1, round(height * shrink))
     set_film_size(scene, small)
     try:
-        yield size[0] * size[1] / (small[0] * small[1])
+        yield width * height / (small[0] * small[1])
     finally:
-        set_film_size(scene, size)
+        set_film_size(scene, (width, height))

@@ -40,18 +40,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class Row:
-    """A sampler and a method, with samples even or shared out (``adaptive``); ``seconds`` is the time of both.
-
-    ``low`` and ``high`` are where eight of ten such errors turned out to lie.
-    """
-
     sampler: str
     method: str
     adaptive: bool
     spp: int
-    seconds: float
+    seconds: float  # of sampler and method
     error: float
-    low: float
+    low: float  # from here to ``high`` eight of ten such errors turned out to lie
     high: float
 
 
@@ -62,6 +57,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     use_variant(args.variant or DEFAULT_VARIANT)
     from data_gen.choosing.plans import LEAST_SECONDS, LONG, SHARE_WITH_METHODS, explore
+    from data_gen.choosing.trials import Pilot
     from data_gen.scenes.load import load_scene
 
     start = time.perf_counter()
@@ -69,7 +65,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     # Its own time is not part of the time that it advises on, but no more than that. On a machine that is too busy for
     # it the first sampler is tried all the same, on a small image, and no other.
     whole = LONG if args.seconds is None else min(max(args.seconds / SHARE_WITH_METHODS, LEAST_SECONDS), LONG)
-    seen = explore(scene, whole, said=console.say, patient=True)
+    seen = explore(scene, whole, pilot=Pilot(said=console.say), patient=True)
     if not seen:
         raise NgptError(f"{args.scene}: no sampler can render it; `ngpt info` says what it holds")
     found = rows_of(seen, args.seconds, args.error)

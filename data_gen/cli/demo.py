@@ -59,11 +59,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     report = check_output(folder / "report.html", args.force)
     start = time.perf_counter()
     scenes = [demo_scene(name, args, folder, console) for name in names]
-    command = shlex.join(
-        ["ngpt", "demo", "--spp", str(args.spp), "--reference-spp", str(args.reference_spp)]
-        + ["--size", f"{args.size[0]}x{args.size[1]}"]
-        + [word for name in args.scene or [] for word in ("--scene", name)]
-    )
+    words = ["--spp", str(args.spp), "--reference-spp", str(args.reference_spp), "--size", "{}x{}".format(*args.size)]
+    command = shlex.join(["ngpt", "demo", *words, *(word for name in args.scene or [] for word in ("--scene", name))])
     footer = {
         "ngpt": __version__,
         "Mitsuba": f"{mi.__version__} ({mi.variant()})",
@@ -118,7 +115,6 @@ def demo_method(method: str, stack: GradientStack, reference: np.ndarray, target
 
 
 def print_table(scenes: list[Scene]) -> None:
-    """The numbers of the report, for those who do not open it."""
     print(f"{'scene':14}{'method':14}{'relMSE trimmed':>16}{'of primal':>12}{'seconds':>10}")
     for scene in scenes:
         for entry in scene.entries:

@@ -55,7 +55,11 @@ class Onlookers:
             if not self.expected:
                 made = stack()
                 self.expected = _LOAD + _PIXEL * made.width * made.height
-            if self._affordable(begin - self.start):
+            gone = begin - self.start
+            if not self.shown:
+                # Relative to the whole render, but cautiously: how long it takes is not known well yet.
+                gone = max(gone, _AHEAD * (gone + self.left))
+            if self.spent + self.expected <= SHARE * gone:
                 self.shown = True
                 try:
                     self._show(made or stack())
@@ -90,18 +94,11 @@ class Onlookers:
     def _watched(self) -> bool:
         return self.page is not None and self.page.watched
 
-    def _affordable(self, gone: float) -> bool:
-        if not self.shown:
-            # Relative to the whole render, but cautiously: how long it takes is not known well yet.
-            gone = max(gone, _AHEAD * (gone + self.left))
-        return self.spent + self.expected <= SHARE * gone
-
     def _show(self, stack: GradientStack) -> None:
-        shown = preview(stack)
         if self.page is not None:
-            spp, seconds = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
-            size = f"{stack.width}x{stack.height}"
-            self.page.show(shown, f"{size}, {spp} samples per pixel, {seconds:.3g} s")
+            size, attributes = f"{stack.width}x{stack.height}", stack.attributes
+            line = f"{size}, {attributes['ngpt:spp']} samples per pixel, {attributes['ngpt:seconds']:.3g} s"
+            self.page.show(preview(stack), line)
 
 
 def onlookers(live: bool, scene: str, command: str, console: Console, unit: str) -> Onlookers:

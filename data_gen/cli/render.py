@@ -10,8 +10,8 @@ from typing import Any
 from data_gen.backend import DEFAULT_VARIANT
 from data_gen.begun import Asked, Unfinished, begun_stack, scene_name
 from data_gen.cli import KERNELS
-from data_gen.cli.frames import targets
 from data_gen.cli.render_arguments import add_arguments as add_arguments
+from data_gen.cli.render_arguments import targets
 from data_gen.frames.pattern import filled, varies
 from data_gen.outputs import Denoising, Output
 from data_gen.samplers import check_options
@@ -68,7 +68,6 @@ def asked(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def image(args: argparse.Namespace, denoising: Denoising | None, console: Console) -> int:
-    """One stack, or its image."""
     from data_gen.cli.onlook import onlookers  # takes as long as all else that help needs
 
     apart = {"--camera": args.camera, "--dt": args.dt, "--shard": args.shard, "--cluster": args.cluster}
@@ -191,7 +190,6 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
 
 
 def shot(args: argparse.Namespace, denoising: Denoising | None, console: Console) -> int:
-    """A stack for each frame, or its image."""
     if args.live:
         raise WrongUse("--live is for single images; leave it out with --frames")
     if args.adaptive or args.error is not None or args.method is not None:
@@ -238,7 +236,6 @@ def shot(args: argparse.Namespace, denoising: Denoising | None, console: Console
 
 
 def described(made: dict[str, Any]) -> str:
-    """The method that made an image, and its time."""
     return f"{made['ngpt:method']} {made['ngpt:reconstructSeconds']:.2f} s"
 
 

@@ -8,7 +8,7 @@ sees, and look at something else it sees.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -43,7 +43,6 @@ class View:
     size: int
 
     def apply(self, scene: mi.Scene) -> None:
-        """Sets the first sensor of ``scene`` to this view."""
         params = mi.traverse(scene.sensors()[0])
         params["to_world"] = mi.ScalarTransform4f().look_at(list(self.origin), list(self.target), list(self.up))
         params["x_fov"] = self.fov
@@ -59,12 +58,8 @@ class View:
             params["focus_distance"] = dr.opaque(mi.Float, self.focus)
         params.update()
 
-    def record(self) -> dict:
-        return asdict(self)
-
     @classmethod
     def of(cls, record: dict) -> View:
-        """The view of a record."""
         values: dict[str, Any] = {n: tuple(value) if isinstance(value, list) else value for n, value in record.items()}
         return cls(**values)
 
@@ -155,9 +150,9 @@ def grid_rays(sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
 def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float) -> View:
     """A random view that shows something; views that show more are more likely.
 
-    ``size`` is the crop size in pixels, ``roll`` the largest angle about the view direction in degrees, ``lens`` the
-    standard deviation of the aperture's radius relative to the distance in focus (0.005 in the paper). Raises NgptError
-    when no view can be found.
+    ``size``: the crop's, in pixels; ``roll``: the largest angle about the view direction, degrees; ``lens``: standard
+    deviation of the aperture's radius, relative to the distance in focus (0.005 in the paper). Raises NgptError when no
+    view can be found.
     """
     views: list[View] = []
     details: list[float] = []
@@ -234,10 +229,8 @@ def with_one_kernel(around: Surroundings, view: View) -> View:
 
 
 def what_shows(around: Surroundings, view: View) -> float:
-    """The share of edges in a view; 0 if it is not worth rendering.
-
-    That is: mostly empty, a wall at the lens, the inside of a small object, or one flat surface.
-    """
+    """The share of edges in a view; 0 if it is not worth rendering: mostly empty, a wall at the lens, the inside of a
+    small object, or one flat surface."""
     view.apply(around.scene)
     n = GRID
     distance, normal, shape = around.cast(*grid_rays(around.scene.sensors()[0]))

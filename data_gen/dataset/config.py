@@ -71,40 +71,41 @@ class Config:
     def __post_init__(self) -> None:
         low, high = self.spp
         unknown = ", ".join(f"'{name}'" for name in self.sights if name not in SHARES)
-        for bad, text in (
+        shares = all(0 <= share <= 1 for share in self.sights.values())
+        few = 0 < self.reference_spp < 4 or self.reference_spp < 0
+        _refuse(
             (not 2 <= low <= high, f"spp = [{low}, {high}]: at least 2 (one sample has no variance), low to high"),
             (self.size < 8, f"size = {self.size}: at least 8 pixels"),
             (min(self.inputs, self.frames, self.crops, self.crops_per_shard) < 1, "counts must be at least 1"),
-            (
-                0 < self.reference_spp < 4 or self.reference_spp < 0,
-                f"reference_spp = {self.reference_spp}: at least 4, two for each of its halves; or 0, for pairs",
-            ),
+            (few, f"reference_spp = {self.reference_spp}: at least 4, two for each of its halves; or 0, for pairs"),
             (self.reference_method not in METHODS, f"reference_method: no method '{self.reference_method}'"),
-            (
-                bool(unknown),
-                f"sights: no sight is called {unknown}; there are {', '.join(SHARES)}",
-            ),
-            (
-                not all(0 <= share <= 1 for share in self.sights.values()),
-                f"sights = {self.sights}: each is the share of scenes that have it, 0 to 1",
-            ),
+            (bool(unknown), f"sights: no sight is called {unknown}; there are {', '.join(SHARES)}"),
+            (not shares, f"sights = {self.sights}: each is the share of scenes that have it, 0 to 1"),
             (bool(self.sights) and not self.varied, "sights are those of varied scenes; set varied = true"),
             (not self.scenes and not self.files, "no scenes: set scenes = N, or add a [[files]] table"),
-        ):
-            if bad:
-                raise NgptError(f"data configuration: {text}")
+        )
         for name, options in self.samplers.items():
             if name != self.sampler:
                 raise NgptError(f"data configuration: samplers.{name}: this set is rendered by '{self.sampler}'")
             check_options(name, options)
         if self.adaptive:
             self._check_adaptive()
+        flat = self.sampler != "auto" and not find(self.sampler).gradients
         if self.pairs:
-            self._check_pairs()
-            return
-        if self.sampler == "auto":
-            return
-        if not find(self.sampler).gradients and "dx" in METHODS[self.reference_method].needs:
+            halves = "(reference_spp = 0 asks for pairs)"
+            teach = (
+                f"sampler = '{self.sampler}': renders no gradients, and without them halves teach nothing; use 'gpt'"
+            )
+            _refuse(
+                (
+                    self.inputs != 2,
+                    f"inputs = {self.inputs}: set inputs = 2, the halves that judge each other {halves}",
+                ),
+                (self.frames > 1, f"frames = {self.frames}: shots are learnt from references; leave it out {halves}"),
+                (self.adaptive > 0, f"adaptive = {self.adaptive:g}: halves are alike; leave it out {halves}"),
+                (flat, f"{teach} {halves}"),
+            )
+        elif flat and "dx" in METHODS[self.reference_method].needs:
             raise NgptError(
                 f"data configuration: reference_method '{self.reference_method}' needs gradients, and sampler "
                 f"'{self.sampler}' renders none; use 'oidn', or 'primal' with many samples"
@@ -112,7 +113,6 @@ class Config:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Options of the sampler."""
         return self.samplers.get(self.sampler, {})
 
     @property
@@ -125,31 +125,20 @@ class Config:
         """Whether its crops have no reference, and two inputs of equally many samples that judge each other."""
         return self.reference_spp == 0
 
-    def _check_pairs(self) -> None:
-        for bad, text in (
-            (self.inputs != 2, f"inputs = {self.inputs}: set inputs = 2, the halves that judge each other"),
-            (self.frames > 1, f"frames = {self.frames}: shots are learnt from references; leave it out"),
-            (self.adaptive > 0, f"adaptive = {self.adaptive:g}: halves are alike; leave it out"),
-            (
-                self.sampler != "auto" and not find(self.sampler).gradients,
-                f"sampler = '{self.sampler}': renders no gradients, and without them halves teach nothing; use 'gpt'",
-            ),
-        ):
-            if bad:
-                raise NgptError(f"data configuration: {text} (reference_spp = 0 asks for pairs)")
-
     def _check_adaptive(self) -> None:
         from data_gen.adaptive import LEAST  # It needs the renderer.
 
-        name = self.sampler
-        for bad, text in (
-            (not 0 < self.adaptive <= 1, "the share of inputs whose samples are shared out, 0 to 1"),
-            (self.frames > 1, "frames of shots have even samples; leave it out"),
-            (self.spp[1] < LEAST, f"fewer than {LEAST} samples cannot be shared out; spp goes up to {self.spp[1]}"),
-            (name != "auto" and find(name).even, f"the samples of '{name}' depend on each other; use 'gpt'"),
-        ):
-            if bad:
-                raise NgptError(f"data configuration: adaptive = {self.adaptive:g}: {text}")
+        name, of = self.sampler, f"adaptive = {self.adaptive:g}:"
+        even = name != "auto" and find(name).even
+        _refuse(
+            (not 0 < self.adaptive <= 1, f"{of} the share of inputs whose samples are shared out, 0 to 1"),
+            (self.frames > 1, f"{of} frames of shots have even samples; leave it out"),
+            (
+                self.spp[1] < LEAST,
+                f"{of} fewer than {LEAST} samples cannot be shared out; spp goes up to {self.spp[1]}",
+            ),
+            (even, f"{of} the samples of '{name}' depend on each other; use 'gpt'"),
+        )
 
     def plan(self, turn: int = 0) -> list[Job]:
         """The shards to make. It depends only on the configuration, so that n machines agree on who makes which.
@@ -172,7 +161,6 @@ class Config:
     def _scene_jobs(
         self, turn: int, name: str, crops: int, path: str = "", parameters: dict | None = None, box: list | None = None
     ) -> list[Job]:
-        """The shards of one scene."""
         starts = range(0, crops, self.crops_per_shard)
         # Procedural scenes are others in each turn, and have all their crops in one.
         turn = turn if path else 0
@@ -181,6 +169,12 @@ class Config:
             batch = range(turn * crops + start, turn * crops + min(start + self.crops_per_shard, crops))
             jobs.append(Job(name, i, tuple(batch), path, parameters or {}, box))
         return jobs
+
+
+def _refuse(*cases: tuple[bool, str]) -> None:
+    for bad, text in cases:
+        if bad:
+            raise NgptError(f"data configuration: {text}")
 
 
 def made_name(number: int) -> str:

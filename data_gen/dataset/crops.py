@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 import zlib
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,8 +33,8 @@ LIT = 0.1  # the share of pixels of the first input that must have seen any ligh
 def make_shard(config: Config, job: Job, folder: str, variant: str, again: Again | None = None) -> str:
     """Renders the crops of ``job`` and writes its shard into ``folder``; returns its name there.
 
-    Runs in any process. The same config and job give the same bits. A crop that fails is recorded and left out.
-    ``again``  existing references, for which only inputs are rendered, with new noise
+    Runs in any process. The same config and job give the same bits. A crop that fails is recorded and left out. Where
+    there are references (``again``), only inputs are rendered, with new noise.
     """
     if (Path(folder) / job.file).exists():  # made by a worker that was lost before it said so
         return job.file
@@ -116,8 +116,7 @@ def uneven_inputs(config: Config, name: str, crop: int, counts: list[int]) -> li
 
 
 def render_input(config: Config, scene, spp: int, seed: int, uneven: bool, made: Any = None) -> GradientStack:
-    """One input. All inputs of a set that has uneven ones have the layer ``samples``. ``made`` is
-    passed to ``render_stack``."""
+    """One input. All inputs of a set that has uneven ones have the layer ``samples``."""
     from data_gen.adaptive import Adaptive
     from data_gen.render import render_stack
 
@@ -163,7 +162,7 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
                 clock = time.perf_counter()
                 first = render_input(config, scene, counts[0], seeds[0], uneven[0], around.made)
             data, told = _crop(config, scene, first, counts, seeds, uneven, clock=clock, made=around.made)
-            told = {"crop": crop, "view": movement.view_at(frame).record()} | told
+            told = {"crop": crop, "view": asdict(movement.view_at(frame))} | told
             told["seconds"] = {part: round(value, 4) for part, value in (told["seconds"] | {"camera": found}).items()}
             if moving:
                 now = snapshot(scene, None if before is None or movement.shape else before.shapes)
@@ -179,10 +178,7 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
 
 
 def make_inputs(config: Config, scene, made: Any, kept: Kept, place: int, seed: int) -> list[tuple[CropData, dict]]:
-    """The crop at that place of kept references and its record: the view of then, inputs with noise by ``seed``.
-
-    ``made`` is passed to ``render_stack``.
-    """
+    """The crop at that place of kept references and its record: the view of then, inputs with noise by ``seed``."""
     from data_gen.dataset.cameras import View
 
     told = kept.record["crops"][place]
@@ -214,46 +210,34 @@ def _crop(
     clock: float,
     made: Any,
 ) -> tuple[CropData, dict]:
-    """The crop whose first input is ``first``, and its record; it was begun at ``clock``. ``made`` is passed to
-    ``render_stack``."""
+    """The crop whose first input is ``first``, and its record; it was begun at ``clock``."""
     from data_gen.render import render_stack
 
     further = zip(counts[1:], seeds[1:-HALVES], uneven[1:], strict=True)
     stacks = [first] + [render_input(config, scene, *each, made) for each in further]
     seconds = {"inputs": time.perf_counter() - clock}
     cleaned = [finite(stack) for stack in stacks]
-    told = {
-        "spp": counts,
-        "seeds": seeds,
-        **({"adaptive": uneven} if config.adaptive else {}),
-        "repaired": [count for _, count in cleaned],
-        "seconds": seconds,
-    }
+    told: dict[str, Any] = {"spp": counts, "seeds": seeds} | ({"adaptive": uneven} if config.adaptive else {})
+    told |= {"repaired": [count for _, count in cleaned], "seconds": seconds}
     if config.pairs:
         return CropData([stack for stack, _ in cleaned], counts), told
     clock = time.perf_counter()
-    spp = -(-config.reference_spp // HALVES)
+    spp, method = -(-config.reference_spp // HALVES), config.reference_method
     options = {"made": made, **config.unbiased_options}
     halves = [render_stack(scene, spp, seed, config.sampler, **options) for seed in seeds[-HALVES:]]
     converged = merge(halves)
-    reference, caustic = references(converged, config.reference_method)
-    apart = [references(half, config.reference_method)[0] for half in halves]
+    reference, caustic = references(converged, method)
+    apart = [references(half, method)[0] for half in halves]
     seconds["reference"] = time.perf_counter() - clock
     direct = np.nan_to_num(converged["direct"], posinf=0)
     light = np.maximum(reference, direct)
-    data = CropData(
-        [stack for stack, _ in cleaned],
-        counts,
-        light if caustic is None else light + caustic,
-        direct,
-        caustic,
-        tuple(np.maximum(half, direct) for half in apart),
-    )
-    return data, told
+    light = light if caustic is None else light + caustic
+    parts = tuple(np.maximum(half, direct) for half in apart)
+    return CropData([stack for stack, _ in cleaned], counts, light, direct, caustic, parts), told
 
 
 def references(converged: GradientStack, method: str) -> tuple[np.ndarray, np.ndarray | None]:
-    """The clean image without the light of the layer ``caustic``, and that light; None where there is no such layer."""
+    """The clean image without the light of the layer ``caustic``, and that light; None without such a layer."""
     image = reconstruct(converged, method=method).image
     if "caustic" not in converged:
         return image, None

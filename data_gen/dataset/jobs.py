@@ -46,7 +46,6 @@ class Pool(ProcessPoolExecutor):
         super().__init__(count, mp_context=get_context("spawn"), initializer=end_with_parent, initargs=(interruptible,))
 
     def end(self) -> None:
-        """Ends the processes, whatever they are at."""
         for process in tuple(self._processes.values()):
             process.terminate()
 
@@ -59,7 +58,6 @@ class Pool(ProcessPoolExecutor):
 
 
 def processes(count: int) -> Executor:
-    """``count`` processes, or only this one."""
     return Serial() if count == 1 else Pool(count)
 
 
@@ -106,9 +104,8 @@ def generate(
             done += len(job.crops)
             progress(done, total)
     except BrokenProcessPool as error:
-        raise NgptError(
-            f"{folder}: a worker process died (out of memory?); run the same command to continue"
-        ) from error
+        why = "a worker process died (out of memory?); run the same command to continue"
+        raise NgptError(f"{folder}: {why}") from error
     finally:
         update_manifest(folder)
 
@@ -158,9 +155,8 @@ def update_manifest(folder: Path) -> None:
         for path in sorted((folder / "shards").glob("[!.]*.safetensors")):
             name = path.relative_to(folder).as_posix()
             if name not in known:
-                known[name] = {"file": name, "sha256": checksum(path), "bytes": path.stat().st_size} | Shard(
-                    path
-                ).record
+                entry = {"file": name, "sha256": checksum(path), "bytes": path.stat().st_size}
+                known[name] = entry | Shard(path).record
             entries.append(known[name])
         if entries != manifest["shards"]:
             write_json(folder / MANIFEST, manifest | {"shards": entries})

@@ -1,7 +1,6 @@
 """How a shot of a training set moves: its camera, one thing in it, its light. All of it comes from random numbers.
 
-Each of the three moves or rests independently. Its speed is constant over the frames and log-uniform from shot to shot.
-So there are slow shots and fast ones, and shots in which only the light changes.
+Each of the three moves or rests independently, at a constant speed that is log-uniform from shot to shot.
 """
 
 from __future__ import annotations
@@ -32,20 +31,15 @@ RADIANCE = (".radiance.value", ".intensity.value", ".irradiance.value")
 
 @dataclass
 class Movement:
-    """What changes from frame to frame; without anything but a view, nothing does.
-
-    ``way``, ``turn``  of the camera, and of its target beside it, world units a frame
-    ``shape``, ``shift``  the parameter that places a shape, and its way a frame
-    ``light``, ``gain``   the parameter of a light, and its factor a frame
-    """
+    """What changes from frame to frame; without anything but a view, nothing does."""
 
     view: View
-    way: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    shape: str = ""
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    light: str = ""
-    gain: float = 1.0
+    way: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the camera, world units a frame
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of its target beside it
+    shape: str = ""  # the parameter that places a shape,
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # and its way a frame
+    light: str = ""  # the parameter of a light,
+    gain: float = 1.0  # and its factor a frame
     _start: dict = field(default_factory=dict, repr=False)
 
     def view_at(self, frame: int) -> View:
@@ -59,21 +53,18 @@ class Movement:
         if not self.shape and not self.light:
             return
         params = mi.traverse(scene)
-        if self.shape:
-            self._move(params, np.array(self.shift) * frame)
+        far = np.array(self.shift) * frame
+        if self.shape.endswith(".to_world"):
+            start = self._start.setdefault(self.shape, mi.Transform4f(params[self.shape]))
+            params[self.shape] = mi.Transform4f(mi.ScalarTransform4f().translate(list(map(float, far)))) @ start
+        elif self.shape:
+            put_vertices(params, self.shape, self._start.setdefault(self.shape, vertices(params, self.shape)) + far)
         if self.light:
             start = self._start.setdefault(self.light, type(params[self.light])(params[self.light]))
             value = start * self.gain**frame
             dr.make_opaque(value)  # as a literal it would be compiled into the kernels
             params[self.light] = value
         params.update()
-
-    def _move(self, params: mi.SceneParameters, far: np.ndarray) -> None:
-        if self.shape.endswith(".to_world"):
-            start = self._start.setdefault(self.shape, mi.Transform4f(params[self.shape]))
-            params[self.shape] = mi.Transform4f(mi.ScalarTransform4f().translate(list(map(float, far)))) @ start
-            return
-        put_vertices(params, self.shape, self._start.setdefault(self.shape, vertices(params, self.shape)) + far)
 
     def record(self) -> dict:
         told = {"way": self.way, "turn": self.turn, "shape": self.shape, "shift": self.shift}

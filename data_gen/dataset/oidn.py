@@ -51,7 +51,6 @@ def write_layout(data: Dataset, folder: Path, progress: Callable[[int, int], Non
 
 
 def _named(data: Dataset) -> Iterator[tuple[str, Crop]]:
-    """The crops, each with its name in its scene."""
     counts: dict[str, int] = {}
     for crop in data:
         number = counts.get(crop.scene, 0)
@@ -76,7 +75,6 @@ def _images(crop: Crop, digits: int) -> Iterator[tuple[str, dict[str, np.ndarray
 
 
 def _file(image: np.ndarray, half: bool) -> ExrImage:
-    """Three channels that it reads as they are."""
     kind = np.float16 if half else np.float32
     channels = {name: np.ascontiguousarray(image[..., i], kind) for i, name in enumerate("RGB")}
     return ExrImage([ExrPart("", {}, channels)])

@@ -3,11 +3,8 @@
     with Stream(config, executor) as data:
         for step in ...:
             crop = data[rng.integers(len(data))]
-
-Scenes never run out: after the scenes of the configuration come others of their kind, and further views of scene files.
-
-With ``kept``, a folder, the references of the configuration are made once and stored there in compressed form. They are
-used repeatedly with new inputs, so no noise is ever seen twice. New inputs take a third of the time.
+After the scenes of the configuration come others of their kind, and further views of scene files. With ``kept``, a
+folder, its references are made once and stored there in compressed form, and used repeatedly with new inputs.
 """
 
 from __future__ import annotations
@@ -89,7 +86,6 @@ class Stream:
 
     @property
     def scenes(self) -> tuple[str, ...]:
-        """Names of the scenes that are in the buffer now."""
         return tuple(dict.fromkeys(crop.scene for crop in self))
 
     def _check(self) -> None:
@@ -116,10 +112,8 @@ class Stream:
                     job, again = next(jobs)
                     # Two of one name would be one file.
                     if job.file not in running.values():
-                        future = self.executor.submit(
-                            make_shard, self.config, job, self._temporary.name, self.variant, again
-                        )
-                        running[future] = job.file
+                        given = (self.config, job, self._temporary.name, self.variant, again)
+                        running[self.executor.submit(make_shard, *given)] = job.file
                 for future in wait(running, timeout=0.5, return_when=FIRST_COMPLETED).done:
                     self._take(future)
                     del running[future]
@@ -137,12 +131,9 @@ class Stream:
         shard = Shard(path, keep_open=True)
         if self.kept and shard.names and not (kept := self.kept / future.result()).exists():
             keep(shard, kept)
-        told = shard.record["crops"]
+        told, crops = shard.record, enumerate(shard.record["crops"])
         with self._changed:
-            self._crops.extend(
-                Crop(shard, i, shard.record["scene"], tuple(crop["spp"]), crop.get("frame"))
-                for i, crop in enumerate(told)
-            )
+            self._crops.extend(Crop(shard, i, told["scene"], tuple(c["spp"]), c.get("frame")) for i, c in crops)
             self._changed.notify_all()
         # Kept open, it lives on for as long as one of its crops does.
         path.unlink()

@@ -21,19 +21,11 @@ _KNOWN = {"frame", "to_world", *_LOOK, "fov", "fov_axis"}
 
 @dataclass(frozen=True)
 class Key:
-    """A camera at one frame.
-
-    ``to_world``  (4, 4), Mitsuba's camera to the world: columns left, up, forward, position; in a path without scale
-    ``look``      (3, 3), rows origin, target and up, where the key was given by them
-    ``fov``       degrees; None: the scene's own
-    ``fov_axis``  "x" (width) or "y" (height): the axis of ``fov``
-    """
-
     frame: float
-    to_world: np.ndarray
-    look: np.ndarray | None = None
-    fov: float | None = None
-    fov_axis: str = "x"
+    to_world: np.ndarray  # (4, 4), Mitsuba's: columns left, up, forward, position; in a path without scale
+    look: np.ndarray | None = None  # (3, 3), rows origin, target and up, where the key was given by them
+    fov: float | None = None  # degrees; None: the scene's own
+    fov_axis: str = "x"  # the axis of ``fov``: "x" (width) or "y" (height)
 
 
 class CameraPath:

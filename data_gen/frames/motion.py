@@ -2,8 +2,7 @@
 
 A pixel shows what the ray through its centre meets first that scatters smoothly. The hit is looked up in the scene of
 the frame before by shape, primitive and barycentric coordinates, which holds for any deformation of a mesh; shapes that
-are no meshes, and instances, move by their ``to_world``. The scene before need not be in memory: a ``Snapshot`` has its
-geometry.
+are no meshes, and instances, move by their ``to_world``. Of the scene before, a ``Snapshot`` keeps the geometry.
 
 What is seen in mirrors and through glass stands where it seems to: at the end of the straight ray of the path's length.
 That is exact for plane mirrors in a scene at rest, and takes no notice of things that move behind curved ones. Rays
@@ -31,16 +30,9 @@ _OFF_RAY = 1e-3
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What motion needs of a scene in one frame.
-
-    ``shapes``  in the order of ``scene.shapes()``
-    ``film``    (4, 4): homogeneous points of the world to (x, y, -, 1) in pixels, the last positive in front
-    ``place``   where the pixels lie
-    """
-
-    shapes: tuple[Geometry, ...]
-    film: np.ndarray
-    place: Place
+    shapes: tuple[Geometry, ...]  # in the order of ``scene.shapes()``
+    film: np.ndarray  # (4, 4): homogeneous points of the world to (x, y, -, 1) in pixels, the last positive in front
+    place: Place  # where the pixels lie
 
 
 def snapshot(scene: mi.Scene, shapes: tuple[Geometry, ...] | None = None) -> Snapshot:
@@ -55,10 +47,8 @@ def _film(sensor: mi.Sensor) -> np.ndarray:
     """The projection of a camera onto its film, in pixels of the crop window."""
     params, film = mi.traverse(sensor), sensor.film()
     if "x_fov" not in params:
-        raise NgptError(
-            f"camera '{camera_name(sensor)}': motion vectors need a perspective or thinlens camera; "
-            "render single images, without --frames"
-        )
+        what = "motion vectors need a perspective or thinlens camera; render single images, without --frames"
+        raise NgptError(f"camera '{camera_name(sensor)}': {what}")
     near, far = sensor.near_clip(), sensor.far_clip()
     fov = float(np.array(params["x_fov"]).ravel()[0])
     projection = mi.perspective_projection(film.size(), film.crop_size(), film.crop_offset(), fov, near, far)
@@ -82,19 +72,13 @@ class _Middle:
 
 @dataclass(frozen=True)
 class Seen:
-    """What the rays through the centres of all pixels meet, row by row; arrays of N pixels.
+    """What the rays through the centres of all N pixels meet, row by row."""
 
-    ``points``      (N, 4) homogeneous, in the world: where it seems to be; directions where rays escape
-    ``straight``    whether it is there: no mirror and no lens on the way
-    ``shape``       its number in ``scene.shapes()``, -1 where rays escape
-    ``primitive``   the triangle, ``barycentric`` (N, 2) the weights of its second and third vertex
-    """
-
-    points: np.ndarray
-    straight: np.ndarray
-    shape: np.ndarray
-    primitive: np.ndarray
-    barycentric: np.ndarray
+    points: np.ndarray  # (N, 4) homogeneous, in the world: where it seems to be; directions where rays escape
+    straight: np.ndarray  # whether it is there: no mirror and no lens on the way
+    shape: np.ndarray  # its number in ``scene.shapes()``, -1 where rays escape
+    primitive: np.ndarray  # the triangle
+    barycentric: np.ndarray  # (N, 2) the weights of its second and third vertex
 
 
 def seen(scene: mi.Scene) -> Seen:
@@ -137,10 +121,9 @@ def depth(scene: mi.Scene, now: Snapshot, what: Seen) -> np.ndarray:
 def motion_vectors(scene: mi.Scene, now: Snapshot, before: Snapshot, what: Seen | None = None) -> np.ndarray:
     """(H, W, 2) float32: pixels from each pixel to where what it shows was in the frame ``before``; x right, y down.
 
-    It leads from pixel to pixel of the two arrays. Where crop windows move from frame to frame, the motion in the whole
-    picture is the sum of it and ``window_moved``.
-    ``now`` is the snapshot of ``scene``, ``what`` its ``seen(scene)`` if that is known. NaN where motion is not known:
-    behind the camera of before, or on a shape that was not there. Raises NgptError for a camera without a projection.
+    It leads from pixel to pixel of the two arrays; the motion in the whole picture is the sum of it and
+    ``window_moved``. ``now`` is the snapshot of ``scene``, ``what`` its ``seen(scene)`` if that is known. NaN where
+    motion is not known: behind the camera of before, or on a shape that was not there.
     """
     what = seen(scene) if what is None else what
     moved = what.points.copy()
@@ -171,8 +154,6 @@ def window_moved(now: Snapshot, before: Snapshot) -> tuple[int, int]:
 def _displacement(now: Geometry, old: Geometry, what: Seen, here: np.ndarray) -> np.ndarray | None:
     """(n, 3): from where the pixels ``here`` see a shape to where that was; None where that cannot be known."""
     if isinstance(now, Mesh) and isinstance(old, Mesh) and now.faces.shape == old.faces.shape:
-        if np.array_equal(now.vertices, old.vertices):
-            return np.zeros((len(here), 3))
         b1, b2 = what.barycentric[here].T
         weights = np.stack([1 - b1 - b2, b1, b2], axis=-1)[..., None]
         triangles = what.primitive[here]

@@ -1,4 +1,4 @@
-"""Text that changes from frame to frame: ``{frame}``, ``{frame:04d}``, ``{10 + frame * 3:.2f}``."""
+"""Text that changes from frame to frame, see ``filled``."""
 
 import ast
 import math
@@ -43,8 +43,7 @@ def filled(text: str, frame: int) -> str:
             raise WrongUse(f"'{text}': '{form}' is no way to write frame {frame}; write :04d or :.2f, with 99 at most")
         try:
             number = _value(ast.parse(field.strip(), mode="eval").body, frame)
-            if form and form[-1] in "dxX" and number == int(number):
-                number = int(number)
+            number = int(number) if form and form[-1] in "dxX" and number == int(number) else number
             return format(number, form or "")
         except WrongUse as error:
             raise WrongUse(f"'{text}': {error}") from error

@@ -11,17 +11,69 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.begun import Unfinished, frame_seed
+from data_gen.budget import DEFAULT_MEMORY
 from data_gen.frames.camera_path import CameraPath, horizontal
-from data_gen.frames.frame_sampler import Remembering
 from data_gen.frames.motion import Snapshot, depth, motion_vectors, seen, snapshot, window_moved
 from data_gen.frames.time_differences import difference, light
-from data_gen.render import render_stack
-from data_gen.samplers import FRAME_SAMPLERS
+from data_gen.render import options_as_attribute, render_stack, stack_of
+from data_gen.samplers import FRAME_SAMPLERS, FrameSampler
+from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.geometry import Geometry
 from data_gen.scenes.load import load_scene
 from ngpt.errors import NgptError
 from ngpt.merging import UNFINISHED
 from ngpt.stack import GradientStack
+
+
+class Remembering:
+    """The frames of one shot; ``options`` are as in ``render_stack``.
+
+    ``changes``: whether more than the camera may change from frame to frame. Raises NgptError for options that the
+    sampler does not have.
+    """
+
+    def __init__(
+        self,
+        entry: FrameSampler,
+        changes: bool,
+        spp: int | None,
+        seed: int,
+        options: dict[str, Any],
+    ):
+        self.entry, self.changes, self.seed, self.options = entry, changes, seed, dict(options)
+        if self.options.pop("seconds", None) is not None:
+            raise NgptError(f"sampler '{entry.name}' renders a number of samples, not for a time: use --spp")
+        self.spp = spp or entry.spp
+        self.memory = self.options.pop("memory", None) or DEFAULT_MEMORY
+        self.diagnostics = self.options.pop("diagnostics", False)
+        self.options.pop("stop", None)
+        self.options = entry.settings(self.options)
+        self._sampler: Any = None
+
+    def render(
+        self,
+        scene: mi.Scene,
+        shapes: Sequence[Geometry],
+        index: int,
+        motion: np.ndarray,
+        depth: np.ndarray | None,
+        progress: Callable[[int, int], None],
+    ) -> GradientStack:
+        """The stack of frame number ``index`` of the shot; the ``scene`` has its ``shapes`` there.
+
+        Where the shot ``changes``, it is not the scene of the frame before, which must be as it was then.
+        """
+        start = time.perf_counter()
+        if self._sampler is None:
+            if reason := self.entry.refuses(scene_facts(scene)):
+                raise NgptError(f"sampler '{self.entry.name}' cannot render this scene: {reason}; use --sampler gpt")
+            self._sampler = self.entry.made(scene, self.seed, self.spp, self.memory, **self.options)
+        progress(0, self.spp)
+        film = self._sampler.film(index, motion, depth, (scene, shapes) if self.changes else None)
+        progress(self.spp, self.spp)
+        more = {"ngpt:confidence": self._sampler.confidence} | options_as_attribute(self.entry, self.options)
+        sensor, name = scene.sensors()[0], self.entry.name
+        return stack_of(film, sensor, self.seed, name, start, more, diagnostics=self.diagnostics)
 
 
 class Shot:
@@ -67,13 +119,11 @@ class Shot:
         return scene
 
     def snapshot(self, frame: int) -> Snapshot:
-        """What motion needs of a frame."""
         taken = snapshot(self.at(frame), self._shapes)
         self._shapes = taken.shapes
         return taken
 
     def twin(self) -> Shot:
-        """A copy of this shot, with a scene of its own."""
         return Shot(self.describe, self.size, self.camera, self.update, self.sensor)
 
     def changes(self, frames: Sequence[int]) -> bool:
@@ -108,18 +158,17 @@ def render_shot(
 
     Stacks have the layer ``motion`` to the previous frame in ``frames``. For the first frame, it is the motion to the
     frame that a shot of the same step would have before it, or all NaN if there is none. Motion refers to the whole
-    picture; crop windows may show another part of it in each frame. Attributes: ``ngpt:frame``, ``ngpt:previousFrame``.
-    Each frame has its own seed, so its bits do not depend on which other frames are rendered. ``options`` are as in
-    ``render_stack``. Raises NgptError as ``render_stack`` does, and for cameras without a projection.
+    picture; crop windows may show another part of it in each frame. Each frame has its own seed, so its bits do not
+    depend on which other frames are rendered. ``options`` and errors are as in ``render_stack``; cameras without a
+    projection raise NgptError.
 
-    A ``sampler`` of ``data_gen.samplers.FRAME_SAMPLERS`` reuses the previous frames. If frames are skipped, up to
-    ``warm_up`` of them are rendered nevertheless, but not yielded. Such a sampler uses ``seed`` for all frames. If more
-    than the camera changes, it needs the scene of the previous frame: two scenes are in memory, in turn.
+    A ``sampler`` of ``data_gen.samplers.FRAME_SAMPLERS`` reuses the previous frames, up to ``warm_up`` of them where
+    frames are skipped, and uses ``seed`` for all frames. If more than the camera changes, it needs the scene of the
+    previous frame: two scenes are in memory, in turn.
 
-    With ``dt`` pairs of samples per pixel, 2 or more, stacks have ``dt`` and ``dt_var``. These use separate samples
-    (``data_gen.frames.time_differences``) by Mitsuba's integrator, without features. Each pair is two paths, one of
-    them in the scene of the previous frame: where parameters change, scenes are loaded twice per frame. The time for
-    this is included in ``ngpt:seconds``.
+    With ``dt`` pairs of samples per pixel, 2 or more, stacks have ``dt`` and ``dt_var``, of separate samples
+    (``data_gen.frames.time_differences``) by Mitsuba's integrator. Where parameters change, scenes are loaded twice per
+    frame then. The time for this is included in ``ngpt:seconds``.
     """
     before: Snapshot | None = None
     last = None
@@ -180,12 +229,7 @@ def _placed(stack: GradientStack, frame: int, previous: int, motion: np.ndarray)
 
 
 def _with_dt(
-    stack: GradientStack,
-    motion: np.ndarray,
-    here: tuple[Shot, int],
-    before: tuple[Shot, int],
-    pairs: int,
-    seed: int,
+    stack: GradientStack, motion: np.ndarray, here: tuple[Shot, int], before: tuple[Shot, int], pairs: int, seed: int
 ) -> GradientStack:
     """The stack with ``dt`` and ``dt_var``, by the ``motion`` from array to array; ``here`` and ``before`` are what has
     the scene, and the frame's number."""

@@ -1,12 +1,9 @@
 """Differences in time: the same random numbers in the scene of this frame and in the scene of the previous frame.
 
-A camera sample at x in this frame has a partner in the previous frame at x + m, with the pixel's motion m: this is
-where the visible point was. From there on, both paths use the same random numbers. So where nothing but the motion has
-changed, both paths find the same light, and their difference has almost no noise. Its mean over a pixel p is
-
-    I_t(p) - I_{t-1}(p + m)
-
-where p + m is a pixel between the pixels of the film, box-filtered like them: nothing is interpolated.
+A camera sample at x in this frame has a partner at x + m in the previous frame, with the pixel's motion m. From there
+on, both paths use the same random numbers: where nothing but the motion has changed, both find the same light. The mean
+of the difference over a pixel p is I_t(p) - I_{t-1}(p + m), where p + m is a pixel between the pixels of the film,
+box-filtered like them: nothing is interpolated.
 
 [Random sequence replay between frames: Manzi et al. 2016, "Temporal gradient-domain path tracing", section 4]
 """

@@ -29,12 +29,9 @@ class CameraSamples:
     number of its sample. ``random`` holds the random numbers of the paths to come. Cloning it replays them: this
     correlates a path with its shifted copies.
 
-    ``net`` is the size of the first round of points (``data_gen.paths.streams``), or 0: independent samples.
-
-    ``some``, UInt32, are the pixels to sample, which may repeat; ``first`` is then a UInt32 with a number for each.
-
-    Functions that are recorded once (``data_gen.paths.frozen``) may use only the fields of ``DRJIT_STRUCT`` of an
-    argument.
+    ``net`` is the size of the first round of points (``data_gen.paths.streams``), or 0: independent samples. ``some``,
+    UInt32, are the pixels to sample, which may repeat; ``first`` is then a UInt32 with a number for each. Functions
+    that are recorded once (``data_gen.paths.frozen``) may use only the fields of ``DRJIT_STRUCT`` of an argument.
     """
 
     DRJIT_STRUCT = dict.fromkeys(
@@ -76,14 +73,12 @@ class CameraSamples:
         dr.eval()
 
     @classmethod
-    def replayed(
-        cls, sensor: mi.Sensor, seed: int, pixel: mi.UInt32, sample: mi.UInt32, place: mi.Point2f, *, net: int = 0
-    ) -> Self:
+    def replayed(cls, sensor: mi.Sensor, seed: int, pixel: mi.UInt32, sample: mi.UInt32, place: mi.Point2f) -> Self:
         """Sample ``sample`` of each ``pixel``, at another ``place`` on the film; drawn in the kernel that needs it."""
         camera = cls.__new__(cls)
         camera.pixel = pixel
         camera._see(sensor)
-        camera._draw(seed, pixel, sample, net)
+        camera._draw(seed, pixel, sample, 0)
         camera.position = place
         return camera
 

@@ -1,16 +1,14 @@
 """The layer ``caustic`` has the light of paths that leave a widely scattering surface and later a sharp one.
 
-Paths are followed from the camera. A path that has scattered at a connectable vertex and then meets a mirror, glass or
-sharp gloss is rare and bright, and cannot be shifted well: its shifted copy meets another point of the glass, and from
-there it misses the lamp. Its differences are nothing but noise. So its light, and all light that follows on the path,
-goes into a separate layer, for methods that need no differences.
+Such paths are rare and bright, and cannot be shifted well: a shifted copy meets another point of the glass, and from
+there it misses the lamp. So their light goes into a separate layer, for methods that need no differences.
 
     rough   the path has scattered smoothly at a connectable vertex
     late    and has later left a vertex by a mirror, glass or sharp gloss: its light belongs to the layer
 
 Both are properties of the path, not of its shift. So primal - caustic is the image of a subset of the paths, and the
 differences belong to this image: a path of the layer counts 0 in them, whether it is a base path or a shifted copy.
-This is exact for pairs: where either of the two paths is late, the shift is rejected from both sides.
+Where either path of a pair is late, the shift is rejected from both sides, so this is exact.
 """
 
 from __future__ import annotations
@@ -24,8 +22,7 @@ from data_gen.paths.vertex import DELTA, SMOOTH
 def classes(rough: mi.Bool, late: mi.Bool, found: mi.Bool, kind: mi.UInt32, connectable: mi.Bool) -> tuple:
     """``rough`` and ``late`` behind a vertex that is ``connectable`` or not, left by an event of that ``kind``.
 
-    Where no direction was ``found``, the path ends, and nothing changes: what its shifted copies go on to find is
-    theirs. Holes change nothing either.
+    Where no direction was ``found``, the path ends, and nothing changes: what its copies go on to find is theirs.
     """
     smooth = found & (kind == SMOOTH)
     sharp = (found & (kind == DELTA)) | (smooth & ~connectable)

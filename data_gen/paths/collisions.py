@@ -7,13 +7,10 @@ are known. A list of n null collisions with a vertex at the end has the density
     exp(-M) ∏ σn(x_i) / μ · σ,        M the majorant's optical depth of the segment, only in grids
 
 and the integrand has σs in place of σ, and has colours. Collisions are exponential steps along the optical depth m of
-the majorant, which uses the same units in all grids and gaps that the segment crosses.
-
-    replay      the same steps, and the same random numbers to choose between real and null collisions: r = 1
-    reconnect   the list of the base path, m_i' = m_i M' / M, with the Jacobian (M' / M)^n; its steps are generated
-                again from the base path's key, so only n has to be kept
-
-Homogeneous media are handled separately: they use one exponential number for each segment, and no list.
+the majorant, which uses the same units in all grids and gaps that the segment crosses. A replay takes the same steps
+and random numbers: r = 1. A reconnection takes the list of the base path, m_i' = m_i M' / M, with the Jacobian
+(M' / M)^n; its steps are generated again from the base path's key, so only n has to be kept. Homogeneous media use one
+exponential number for each segment, and no list.
 
 [Miller et al. 2019, "A null-scattering path integral formulation of light transport"; docs/samplers/media.md]
 """
@@ -30,8 +27,6 @@ from data_gen.paths.media import beyond, end_of, onward, pick
 
 @dataclass
 class Collisions:
-    """The null collisions of a segment."""
-
     key: mi.UInt32  # of the random numbers that place them
     n: mi.UInt32
     M: mi.Float
@@ -200,10 +195,5 @@ def rescale(
         return cross(passes, trace, ray, medium, reach, **way, scale=scale, most=base.n, active=mi.Bool(True))[-1]
 
     (N,) = dr.if_stmt((N,), moved, lambda N: (placed(),), lambda N: (N,))
-    N *= dr.exp(base.M - M) * list_jacobian(scale, base.n) / base.N_c
+    N *= dr.exp(base.M - M) * dr.select(base.n > 0, dr.power(scale, mi.Float(base.n)), 1) / base.N_c
     return τ, hit, last, end, N, pick(N, channel)
-
-
-def list_jacobian(scale: mi.Float, n: mi.UInt32) -> mi.Float:
-    """The Jacobian of scaling the positions of ``n`` collisions by ``scale``."""
-    return dr.select(n > 0, dr.power(scale, mi.Float(n)), 1)

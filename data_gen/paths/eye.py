@@ -34,7 +34,6 @@ class Eye:
 
     @property
     def size(self) -> mi.ScalarVector2u:
-        """Pixels of the film, in x and y."""
         return mi.ScalarVector2u(self.sensor.film().crop_size())
 
     @property
@@ -53,11 +52,9 @@ class Eye:
         """From ``si`` to the place ``lens`` on the lens: a DirectionSample3f, and the camera's W / distance².
 
         ``uv`` of it is the place on the film, in pixels; ``p`` is where the ray from there begins, on the near plane;
-        ``pdf`` is 0 where the camera does not see ``si``, whatever is in between: off the film, before the near plane
-        or beyond the far one; else 1. W = 1 / (A cos³), with A the film's area at distance 1.
-
-        Only the direction and the place come from Mitsuba 3.9. Its importance is 0 in the part of the film that an
-        offset of the principal point adds, and its thin lens sees what is before the near plane.
+        ``pdf`` is 0 where the camera does not see ``si``, whatever is in between, else 1. W = 1 / (A cos³), with A the
+        film's area at distance 1. Mitsuba 3.9's own importance is 0 in the part of the film that an offset of the
+        principal point adds, and its thin lens sees what is before the near plane.
         """
         to, _ = self.sensor.sample_direction(si, lens, active)
         cos = -dr.dot(to.n, to.d)
@@ -68,7 +65,6 @@ class Eye:
         return to, importance
 
     def shows(self, uv: mi.Point2f) -> mi.Bool:
-        """Whether the place ``uv`` is on the film."""
         size = self.size
         return (uv.x >= 0) & (uv.y >= 0) & (uv.x < size.x) & (uv.y < size.y)
 
@@ -89,7 +85,6 @@ class Sight:
 
     @classmethod
     def of(cls, camera: CameraSamples) -> Sight:
-        """The sight of these camera samples."""
         ray, importance, _ = camera.rays()
         return cls(Eye.of(camera), camera.random.clone(), ray, importance)
 

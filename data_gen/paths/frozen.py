@@ -90,10 +90,8 @@ def _nothing(*args: Any) -> None:
 
 
 def _of_each_kind() -> list:
-    """A pointer of each type. A call goes through all objects of its kind in the process.
-
-    Dr.Jit looks at these objects only if the function is given a pointer of that type. The objects of this scene do
-    without, but a material that no shape has, in this scene or another, would keep the function from being recorded.
+    """A pointer of each type: a call goes through all objects of its kind in the process, and Dr.Jit looks at them only
+    if the function is given such a pointer. A material that no shape has would keep the function from being recorded.
     """
     return [dr.zeros(getattr(mi, name)) for name in dir(mi) if name.endswith("Ptr")]
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from data_gen.paths.vertex import Materials
 from ngpt.errors import NgptError
 
 # An emitter is an area, a point (spots are points that fill a cone), or infinitely far away.
@@ -64,11 +66,9 @@ class LightEnds:
         dr.eval(self.kind, self.position, self.axis, self.cutoff, self.of_ball, self.indices)
 
     def index_of(self, emitter: mi.EmitterPtr, active=True) -> mi.UInt32:
-        """The number of an emitter in the scene."""
         return dr.gather(mi.UInt32, self.indices, dr.reinterpret_array(mi.UInt32, emitter), active)
 
     def far(self, index: mi.UInt32) -> mi.Bool:
-        """Whether the emitter with that number is infinitely far away."""
         return dr.gather(mi.UInt32, self.kind, index) == _FAR
 
     def emission(self, index: mi.UInt32, p: mi.Float, cos: mi.Float, distance2: mi.Float) -> mi.Float:
@@ -91,7 +91,6 @@ class LightEnds:
         return e
 
     def sample(self, scene, random, time, wavelengths) -> LightRay:
-        """The start of a light path."""
         u, u_position, u_direction = random.next_1d(), random.next_2d(), random.next_2d()
         index, weight, _ = scene.sample_emitter(u)
         emitter = dr.gather(mi.EmitterPtr, self.emitters, index)
@@ -245,3 +244,13 @@ def _somewhere(position: mi.Point3f, time, wavelengths) -> mi.Interaction3f:
     it = dr.zeros(mi.Interaction3f, dr.width(position))
     it.t, it.p, it.time, it.wavelengths = 0, position, time, wavelengths
     return it
+
+
+@dataclass
+class World:
+    """It does not change in a render. Functions that are ``frozen`` take it as one argument."""
+
+    scene: mi.Scene
+    lights: LightEnds
+    materials: Materials | None = None  # for samplers that ask nothing of them
+    fog: Any = None  # ``photons.map.fog.Fog``: the media, for samplers that gather photons there

@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.camera import QUARTERS, CameraSamples
+from data_gen.scenes.lamps import Chosen, Places
 from data_gen.scenes.load import path_depths
-from data_gen.scenes.places import Chosen, Places
 
 # Shapes that Mitsuba samples uniformly by area, besides meshes; for spheres it samples the visible part.
 _UNIFORM_SHAPES = ("Rectangle", "Disk", "Cylinder")
@@ -21,16 +21,15 @@ class Lights:
 
     This holds for all emitters that are infinitely far away, and for area lights on shapes that are sampled uniformly.
     Replaying their sampling at another vertex changes only the solid angle, so they need not be sampled again: they are
-    ``shared``, if there are no others in the scene (a kernel with both kinds of code gained nothing).
-
-    ``near``, ``far``: whether there are emitters of finite and of infinite distance.
-    ``places``: how often each is chosen, by place; None: as often as the scene says, everywhere.
+    ``shared``, if there are no others in the scene. ``near``, ``far``: whether there are emitters of finite and of
+    infinite distance; ``places``: how often each is chosen, by place; None: as often as the scene says, everywhere.
     """
 
     def __init__(self, scene: mi.Scene, places: Places | None = None):
         lamps = [shape for shape in scene.shapes() if shape.is_emitter()]
         far = [mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) for emitter in scene.emitters()]
-        uniform = [shape.emitter().class_name() == "AreaLight" and is_uniform(shape) for shape in lamps]
+        lamps = [shape for shape in lamps if shape.emitter().class_name() == "AreaLight"]
+        uniform = [shape.is_mesh() or shape.class_name() in _UNIFORM_SHAPES for shape in lamps]
         self.near, self.far = not all(far), any(far)
         # Emitters that are neither infinitely far away nor on a shape (point lights) are not counted as uniform.
         self.shared = sum(uniform) + sum(far) == len(scene.emitters())
@@ -45,10 +44,6 @@ class Lights:
             return *scene.sample_emitter_direction(x, u, False, active), None
         chosen = self.places.choose(x, u)
         return *self.places.sample(x, chosen, active), chosen
-
-
-def is_uniform(shape: mi.Shape) -> bool:
-    return shape.is_mesh() or shape.class_name() in _UNIFORM_SHAPES
 
 
 @dataclass
@@ -79,10 +74,7 @@ def shadowed(scene: mi.Scene, si: mi.SurfaceInteraction3f, light: LightSample, f
 def replay_light(
     scene, lights: Lights, base, base_weight, u, y: mi.SurfaceInteraction3f, *, lit: mi.Bool
 ) -> LightSample:
-    """``sample_light(scene, y, u, lit, False)``, by way of what the same numbers gave at another vertex.
-
-    ``base`` is the direction sample there and ``base_weight`` its Le / p.
-    """
+    """``sample_light(scene, y, u, lit, False)``, by the direction sample ``base``, of Le / p, at another vertex."""
     return _replayed(lights, base, base_weight, y, lit, lambda anew: sample_light(scene, y, u, anew, False))
 
 
@@ -185,9 +177,9 @@ def emission_in_pixel(
 ) -> mi.Spectrum:
     """The layer ``direct`` of camera samples that meet ``Le``: the mean over four rays, one in each quarter of a pixel.
 
-    Lamps and windows differ most from what is beside them: one of whose frame a pixel's few samples see too much is a
-    black dot, which no reconstruction fills, for this light is in no gradient. Rays cost little beside paths.
-    ``Le`` is weighted by the camera's importance; ``emission``, which tells what a ray meets, is not.
+    Lamps differ most from what is beside them: where a pixel's few samples see too much of a frame it is a black dot,
+    which no reconstruction fills, for this light is in no gradient. ``Le`` is weighted by the camera's importance;
+    ``emission``, which tells what a ray meets, is not.
     """
     if not any(visible(emitter) for emitter in scene.emitters()):
         return Le

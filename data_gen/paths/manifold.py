@@ -54,30 +54,19 @@ class Target:
 
 @dataclass
 class Shot:
-    """A chain from a vertex z in some direction, up to the plane of the target.
+    """A chain from a vertex z in some direction, up to the plane of the target."""
 
-    ``good``    it has met all its events, and arrives from before the plane
-    ``miss``    on the plane, the way from the target to where it arrives
-    ``reach``   the length that ``miss`` compares with
-    ``B0``, ``B1``   columns of B, for two orthogonal turns of ω
-    ``first``   point of the first event
-    ``weight``  product of the events' f / P, and ``P`` of the probabilities with which sampling takes such events
-    ``η``       product of the events' relative indices of refraction
-    ``turns``   product of the quotients of cosines, behind over before an event, to the geometric normals
-    ``ray``     from the last event on
-    """
-
-    good: mi.Bool
-    miss: mi.Vector2f
-    reach: mi.Float
-    B0: mi.Vector2f
+    good: mi.Bool  # it has met all its events, and arrives from before the plane
+    miss: mi.Vector2f  # on the plane, the way from the target to where it arrives
+    reach: mi.Float  # the length that ``miss`` compares with
+    B0: mi.Vector2f  # columns of B, for two orthogonal turns of ω
     B1: mi.Vector2f
-    first: mi.Point3f
-    weight: mi.Spectrum
-    P: mi.Float
-    η: mi.Float
-    turns: mi.Float
-    ray: mi.Ray3f
+    first: mi.Point3f  # point of the first event
+    weight: mi.Spectrum  # product of the events' f / P,
+    P: mi.Float  # and of the probabilities with which sampling takes such events
+    η: mi.Float  # product of the events' relative indices of refraction
+    turns: mi.Float  # product of the quotients of cosines, behind over before an event, to the geometric normals
+    ray: mi.Ray3f  # from the last event on
 
     @property
     def det(self) -> mi.Float:
@@ -108,6 +97,7 @@ def add_event(events: mi.UInt32, code: mi.UInt32) -> tuple[mi.UInt32, mi.Bool]:
     return events | (code << place), fits
 
 
+@dr.syntax
 def shoot(
     scene,
     z: mi.SurfaceInteraction3f,
@@ -115,16 +105,9 @@ def shoot(
     events: mi.UInt32,
     target: Target,
     active=True,
-    *,
     ends: Ends = nowhere,
 ) -> Shot:
     """Follows the ``events`` from ``z`` in direction ``ω`` (world space), and its differentials with them."""
-    return _shoot(scene, z, ω, events, target, active=active, ends=ends)
-
-
-# ``dr.syntax`` forgets the defaults of keywords.
-@dr.syntax
-def _shoot(scene, z, ω, events, target: Target, *, active, ends: Ends) -> Shot:
     # ------------------------ Loop state -------------------------
     ray = z.spawn_ray(ω)
     frame = mi.Frame3f(ω)
@@ -214,19 +197,15 @@ def turn(code, η, n, d, dn: tuple, dd: tuple) -> tuple[mi.Vector3f, mi.Vector3f
     return a * d + b * N, *changes
 
 
+@dr.syntax
 def walk(
-    scene, z, ω: mi.Vector3f, events: mi.UInt32, target: Target, active=True, *, ends: Ends = nowhere
+    scene, z, ω: mi.Vector3f, events: mi.UInt32, target: Target, active=True, ends: Ends = nowhere
 ) -> tuple[mi.Vector3f, Shot, mi.Bool]:
     """Newton's method from ``ω`` on: the direction from ``z`` to the target, its shot, and whether it was found.
 
     A step that breaks the chain, or comes no nearer, is halved.
     """
-    return _walk(scene, z, ω, events, target, active=active, ends=ends)
-
-
-@dr.syntax
-def _walk(scene, z, ω, events, target: Target, *, active, ends: Ends) -> tuple[mi.Vector3f, Shot, mi.Bool]:
-    best_ω, best = mi.Vector3f(ω), shoot(scene, z, ω, events, target, active, ends=ends)
+    best_ω, best = mi.Vector3f(ω), shoot(scene, z, ω, events, target, active, ends)
     error = dr.norm(best.miss)
     found = best.good & (error < TOLERANCE * best.reach)
     active = best.good & ~found
@@ -238,7 +217,7 @@ def _walk(scene, z, ω, events, target: Target, *, active, ends: Ends) -> tuple[
         s = (best.B1.y * best.miss.x - best.B1.x * best.miss.y) * scale
         t = (best.B0.x * best.miss.y - best.B0.y * best.miss.x) * scale
         next_ω = dr.normalize(best_ω + turns.s * s + turns.t * t)
-        shot = shoot(scene, z, next_ω, events, target, active & dr.isfinite(s + t), ends=ends)
+        shot = shoot(scene, z, next_ω, events, target, active & dr.isfinite(s + t), ends)
         nearer = shot.good & (dr.norm(shot.miss) < error)
         part = dr.select(nearer, dr.fmin(1, 2 * part), part / 2)
         if nearer:
@@ -258,10 +237,10 @@ def follow(
     returned, and nothing is between the last event and the target.
     """
     # Walks begin toward the other chain's first event: along its direction they would miss what is small or near.
-    ω1, shot, found = walk(scene, z1, dr.normalize(base.first - z1.p), events, target, active & base.good, ends=ends)
+    ω1, shot, found = walk(scene, z1, dr.normalize(base.first - z1.p), events, target, active & base.good, ends)
     J = dr.abs(base.det / shot.det)
     found &= dr.isfinite(J) & (J > 0)
-    back, _, returned = walk(scene, z, dr.normalize(shot.first - z.p), events, target, found, ends=ends)
+    back, _, returned = walk(scene, z, dr.normalize(shot.first - z.p), events, target, found, ends)
     found &= returned & (dr.squared_norm(back - ω) < RETURNS**2)
     ray = mi.Ray3f(shot.ray)
     ray.maxt = dr.select(target.far, dr.largest(mi.Float), dr.norm(target.p - ray.o) * (1 - mi.math.ShadowEpsilon))

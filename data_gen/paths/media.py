@@ -20,13 +20,10 @@ from data_gen.scenes.facts import media_of
 
 @dataclass
 class Place:
-    """Where a vertex is."""
-
     medium: mi.MediumPtr  # around it, on the side from which the path has come; null where there is none
     scatters: mi.Bool  # in the medium, not on a surface
 
     def toward(self, x: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.MediumPtr:
-        """The medium into which direction ``d`` leads from vertex ``x``."""
         changes = ~self.scatters & x.is_valid() & x.is_medium_transition()
         return dr.select(changes, x.target_medium(d), self.medium)
 
@@ -48,7 +45,6 @@ class Media:
         dr.eval(self.matched)
 
     def passes(self, shape: mi.ShapePtr) -> mi.Bool:
-        """Whether a ray goes straight through this shape."""
         index = dr.reinterpret_array(mi.UInt32, shape)
         return dr.gather(mi.Bool, self.matched, index, index < self.size)
 

@@ -1,8 +1,7 @@
 """Segments of a path through media: how far they go, how much light they transmit, and how they are shifted.
 
-A *segment* leads from vertex to vertex. It goes straight through index-matched boundaries, which neither bend nor
-reflect light. These boundaries are no vertices: they do not count in the length of a path, and emitters are sampled and
-found through them.
+A *segment* leads from vertex to vertex. It goes straight through index-matched boundaries, which are no vertices: they
+do not count in the length of a path, and emitters are sampled and found through them.
 
     σ, σs       extinction and scattering coefficients, one for each colour
     c           the colour by which the distances of a path are sampled, the same for all five paths
@@ -11,10 +10,8 @@ found through them.
 
 An optical depth in colour c is sampled, not a distance: one number decides where a path scatters, through whatever
 homogeneous media it goes. The density of a vertex in a medium is T_c σ_c, and T_c on a surface. A shifted copy that
-reconnects to the vertex has T_c' instead of T_c, and the same σ_c. A copy that replays the number has r = 1. For media
-whose density varies see ``data_gen.paths.collisions``.
-
-[Hua et al. 2019, section 7.1; docs/samplers/media.md]
+reconnects to the vertex has T_c' instead of T_c. A copy that replays the number has r = 1. For media whose density
+varies see ``data_gen.paths.collisions``. [Hua et al. 2019, section 7.1; docs/samplers/media.md]
 """
 
 from __future__ import annotations
@@ -31,8 +28,6 @@ from data_gen.paths.media import Media, Place, beyond, depth, end_of, extinction
 
 @dataclass
 class Numbers:
-    """The random numbers of a segment."""
-
     u: mi.Float
     key: mi.UInt32 | None  # of as many as there are null collisions; None without grids
 

@@ -37,11 +37,9 @@ class Space:
         self.scene = scene
 
     def passed(self, shape: mi.Shape) -> bool:
-        """Whether rays go straight through that shape."""
         return False
 
     def begin(self, random) -> Drawn | None:
-        """What the first segment needs."""
         return None
 
     def draw(self, random, channel: mi.UInt32 | None) -> Drawn | None:
@@ -53,11 +51,9 @@ class Space:
         return straight(ray, view.first_hit(self.scene, ray))
 
     def fly(self, x, place: Place | None, ray, drawn: Drawn | None, active) -> Segment:
-        """The segment along ``ray`` from vertex ``x``."""
         return straight(ray, self.scene.ray_intersect_preliminary(ray, active=active))
 
     def end(self, x, segment: Segment) -> mi.SurfaceInteraction3f:
-        """The vertex where the ``segment`` from vertex ``x`` ends."""
         return media.vertex(segment.ray, segment.hit, segment.place)
 
     def sees(self, x, place: Place | None, target: mi.Point3f, drawn: Drawn | None, active) -> tuple[Any, mi.Bool]:
@@ -72,7 +68,6 @@ class Space:
 
 
 def straight(ray, hit: mi.PreliminaryIntersection3f) -> Segment:
-    """Through nothing."""
     return Segment(ray, hit, place=None, weight=1, albedo=1, τ_c=0, nulls=None)
 
 

@@ -2,16 +2,14 @@
 
 There are two kinds of ``points``. "independent" points come from a random number generator for each sample. "sobol"
 points, the default, come from Owen-scrambled Sobol sequences, with a new pair of dimensions for each pair of numbers.
-Samples of a pixel and of neighbouring pixels are then well spread, which lowers the errors of pixels and of blocks of
-pixels. Each single point is uniform, so all estimates stay unbiased; but samples are no longer independent.
 
 - A pair of dimensions is the first two of Sobol's sequence, with a new scrambling of the order of the points and of
   both coordinates. [Burley 2020, "Practical Hash-based Owen Scrambling"]
-- Pixels are numbered in Z order, and a pixel's points are side by side, so that the points of aligned blocks of pixels
-  are well spread together, too. [Ahmed and Wonka 2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error
-  via hierarchical ordering of pixels"] This holds within tiles of 64x64 pixels, which are independent of each other.
-- Samples come in *rounds*. The first has the requested number of samples, or 16 if this is not known. Each further
-  round has as many as all rounds before it. Rounds are independent of each other.
+- Pixels are numbered in Z order, within tiles of 64x64 that are independent of each other, and a pixel's points are
+  side by side. [Ahmed and Wonka 2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error via hierarchical
+  ordering of pixels"]
+- Samples come in *rounds*, independent of each other: the first has the requested number of samples, or 16 if this is
+  not known, and each further one as many as all before it.
 - Light paths that are no pixel's own are numbered as they come in a pass; passes are independent of each other.
 """
 
@@ -125,7 +123,6 @@ def _stream_class(variant: str) -> type:
             return Stream(self.random)
 
         def at(self, lanes):
-            """The streams of only these lanes."""
             random = mi.PCG32()
             random.state = dr.gather(mi.UInt64, self.random.state, lanes)
             random.inc = dr.gather(mi.UInt64, self.random.inc, lanes)
@@ -139,8 +136,6 @@ def _stream_class(variant: str) -> type:
 
 @cache
 def _sobol_class(variant: str) -> type:
-    """The class of streams for Sobol points."""
-
     class Points(mi.Sampler):
         """Point ``index`` of each dimension from ``dimension`` on, scrambled by ``key``. Cloning replays them.
 
@@ -171,20 +166,17 @@ def _sobol_class(variant: str) -> type:
             return mi.Point2f(_unit(x), _unit(y))
 
         def next_key(self):
-            """Any 32 bits, from which more random numbers are made than would be drawn whether used or not."""
             bits = mixed(self._scramble() ^ mixed(self.index + 0x967A889B))
             self.dimension = self.dimension + 1
             return bits
 
         def skip(self, count):
-            """Leaves out so many numbers of each lane, UInt32."""
             self.dimension = self.dimension + count
 
         def clone(self):
             return Points(self.state)
 
         def at(self, lanes):
-            """The streams of only these lanes."""
             return Points([dr.gather(mi.UInt32, each, lanes) for each in self.state])
 
         def schedule_state(self):

@@ -22,12 +22,9 @@ class Materials:
 
     A vertex is *connectable* if its material has a component without a Dirac delta, and the smallest roughness of all
     such components exceeds ``threshold``. This includes materials that also have a mirror component (``plastic``),
-    although the shift is rejected when the mirror is sampled at the shared vertex: replaying them instead would cost
-    more than it gains.
-
-    Connectability depends only on the material, not on the sampled direction or lobe. So a path and its shifted copy
-    agree on it, which keeps the shift invertible. Textured roughness counts with its smallest texel.
-    Materials with no parameter for their roughness (``diffuse``, ``measured``) count as rough.
+    although the shift is rejected when the mirror is sampled at the shared vertex. Connectability depends only on the
+    material, so that a path and its shifted copy agree on it, which keeps the shift invertible. Textured roughness
+    counts with its smallest texel; materials with no parameter for it (``diffuse``, ``measured``) count as rough.
 
     Shapes that are ``passed`` have no vertices, and do not count. With ``media`` in the scene rough glass is not
     connectable, however rough: light that leaves a medium by it is found by few paths, see docs/samplers/media.md.

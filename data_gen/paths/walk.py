@@ -55,7 +55,6 @@ class Limits:
         return cls(UNLIMITED if depth < 0 else depth, depths["rr_depth"], path.hide_emitters)
 
     def parameters(self) -> dict[str, int | bool]:
-        """The limits as parameters of a plugin."""
         depth = self.max_depth if self.max_depth < UNLIMITED else -1
         return {"max_depth": depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
 
@@ -68,10 +67,9 @@ class Limits:
 def roulette(throughput: mi.Float, plays: mi.Bool | bool, η: mi.Float | None = None) -> mi.Float:
     """Russian roulette: the probability to survive, by which what survives is to be divided; 1 where none ``plays``.
 
-    Of a path from the camera, ``throughput`` is the largest channel of its weight behind the step, and ``η`` the
+    For a path from the camera, ``throughput`` is the largest channel of its weight behind the step, and ``η`` the
     product of the relative indices of refraction up to there: η² undoes what refraction does to radiance, as in
-    Mitsuba's ``path``. Of a path from a light it is relative to the weight that the path began with. Paths that are
-    correlated survive together, by the ``brightest()``: so none of them is starved.
+    Mitsuba's ``path``. For a path from a light it is relative to the weight that the path began with.
     """
     if η is not None:
         throughput = throughput * dr.square(η)

@@ -23,9 +23,8 @@ from data_gen.samplers.registry import SAMPLERS, Sampler, by_plugin, find
 from data_gen.scenes.cameras import check_camera
 from data_gen.scenes.facts import Facts, scene_facts
 from data_gen.scenes.integrators import own_estimate
-from data_gen.scenes.lamps import weighed
+from data_gen.scenes.lamps import Places, weighed
 from data_gen.scenes.load import path_depths, reference_integrator
-from data_gen.scenes.places import Places
 from ngpt.layers import LAYERS
 from ngpt.options import written
 
@@ -65,17 +64,14 @@ class GradientIntegrator(mi.SamplingIntegrator):
     ``render()`` returns a tensor (height, width, channels) whose channels ``aov_names()`` lists, in the order of the
     layers of a stack. The film's reconstruction filter is not used, since a gradient is a difference of box-filtered
     pixels. Derived classes implement ``begin()``.
-
-    ``follows``  Mitsuba's integrator whose image is rendered
-    ``name``     of the sampler, whose ``entry`` in the registry says which options there are, and what it refuses
-    ``options``  all of them, as given or by default
-    ``nested``   whether another integrator traces the paths, so that there are no ``limits``
     """
 
-    follows, nested = "path", False
+    follows = "path"  # Mitsuba's integrator whose image is rendered
+    nested = False  # whether another integrator traces the paths, so that there are no ``limits``
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
+        # Of the sampler, whose ``entry`` in the registry says which options there are, and what it refuses
         self.name = by_plugin(props.plugin_name()).name
         self.options = self.entry.settings({name: props[name] for name in self.entry.options if name in props})
         # Whether the film counts failed shifts, where the sampler ``diagnoses`` them
@@ -110,7 +106,6 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return Limits.of(reference_integrator(scene)).parameters()
 
     def reference(self) -> mi.SamplingIntegrator:
-        """Mitsuba's integrator whose image is rendered."""
         return mi.load_dict({"type": self.follows, **self.limits.parameters()})
 
     def facts(self, scene: mi.Scene, sensor: mi.Sensor) -> Facts:
@@ -135,7 +130,6 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return self.reference().sample(scene, sampler, ray, medium, active)
 
     def render_film(self, scene, sensor, seed: int, spp: int) -> GradientFilm:
-        """The film of ``spp`` samples per pixel."""
         check_camera(sensor)
         limits = {
             "lane_bytes": self.entry.lane_bytes,

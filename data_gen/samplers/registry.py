@@ -7,7 +7,7 @@ sampler is made.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -21,18 +21,6 @@ if TYPE_CHECKING:
 
 # Why a scene of these facts cannot be rendered by the sampler of a name; "" where it can
 Rule = Callable[["Facts", str], str]
-
-
-def _of_no_module(*args: Any, **options: Any) -> Any:
-    raise NotImplementedError
-
-
-def _anything(facts: Facts) -> str:
-    return ""
-
-
-def _nothing_to_note(facts: Facts) -> list[str]:
-    return []
 
 
 def integrator_of(module: str) -> Any:
@@ -59,43 +47,37 @@ COMMON = {
 
 @dataclass(frozen=True)
 class Entry:
-    """What all samplers have.
-
-    ``name``      as users call it
-    ``summary``   one line for the user
-    ``module``    where its Mitsuba integrator is, a ``data_gen.samplers.common.GradientIntegrator``; or a function
-                  ``make``. It is imported when the sampler is made, since its classes belong to a variant of Mitsuba
-    ``make``      what makes it, where there is no ``module``
-    ``standing``  one of ``STANDINGS``: which samplers help shows first, and which laws run in `make test`
-    ``options``   name -> ``Option``; ``make`` takes all of them, except the options in ``COMMON``
-    ``refuses``   facts about a scene -> why the sampler cannot render it, "" if it can
-    ``refusals``  the same as rules that several samplers share; the first that gives a reason counts
-    ``notes``     facts about a scene -> what the user should know about rendering it, a line each
-    """
-
-    name: str
-    summary: str
-    module: str = ""
-    make: Callable[..., Any] = field(default=_of_no_module, kw_only=True)
-    standing: str = field(default="niche", kw_only=True)
+    name: str  # as users call it
+    summary: str  # one line for the user
+    # Where its Mitsuba integrator is, a ``data_gen.samplers.common.GradientIntegrator``; or a function ``make``. It is
+    # imported when the sampler is made, since its classes belong to a variant of Mitsuba.
+    module: str
+    standing: str = field(default="niche", kw_only=True)  # of ``STANDINGS``: what help shows first, and what is tested
+    # All of them are given to ``make``, except the options in ``COMMON``.
     options: Mapping[str, Option] = field(default_factory=dict, kw_only=True)
-    refuses: Callable[[Facts], str] = field(default=_anything, kw_only=True)
-    refusals: tuple[Rule, ...] = field(default=(), kw_only=True)
-    notes: Callable[[Facts], list[str]] = field(default=_nothing_to_note, kw_only=True)
+    refusals: tuple[Rule, ...] = field(default=(), kw_only=True)  # the first that gives a reason counts
+    # What the user should know about rendering, by subject: "transport" and "noise"; "mirrors" and "media" where a
+    # scene has them
+    notes: Mapping[str, str] = field(default_factory=dict, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.standing not in STANDINGS:
             raise NgptError(f"sampler '{self.name}': standing '{self.standing}' is none of {', '.join(STANDINGS)}")
-        if self.refusals:
-            object.__setattr__(self, "refuses", self._first_refusal)
-        if self.module:
-            object.__setattr__(self, "make", self._make)
 
-    def _make(self, *args: Any, **options: Any) -> Any:
+    def make(self, *args: Any, **options: Any) -> Any:
+        """What the module makes; raises NgptError for a scene that cannot be rendered."""
         return import_module(self.module).make(*args, **options)
 
-    def _first_refusal(self, facts: Facts) -> str:
+    def refuses(self, facts: Facts) -> str:
+        """Why the sampler cannot render a scene of these ``facts``, "" if it can."""
         return next(filter(None, (rule(facts, self.name) for rule in self.refusals)), "")
+
+    def notes_on(self, facts: Facts) -> list[str]:
+        """What the user should know about rendering a scene of these ``facts``, a line each."""
+        heads = {"transport": f"transport: Mitsuba's '{facts.integrator}', ", "noise": "noise: "}
+        heads |= {"mirrors": "mirrors or clear glass: "} if facts.mirrors else {}
+        heads |= {"media": "media: "} if facts.media else {}
+        return [heads[subject] + text for subject, text in self.notes.items() if subject in heads]
 
     def settings(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """All options, those ``given``, which may be texts, and the others' defaults.
@@ -114,7 +96,6 @@ class Entry:
 
 
 def own(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The ``settings`` that are a sampler's own."""
     return {name: value for name, value in settings.items() if name not in COMMON}
 
 
@@ -122,38 +103,29 @@ def own(settings: Mapping[str, Any]) -> dict[str, Any]:
 class Sampler(Entry):
     """What renders the layers of a gradient stack. It has its own options, and the options in ``COMMON``.
 
-    ``make``        (scene, options) -> what takes the samples of a pass (``data_gen.passes.SamplePass``); raises
-                    NgptError for a scene it cannot render
-    ``gradients``   whether it renders dx and dy
-    ``rank``        "auto" takes the sampler of least rank that can render the scene; 0: never
-    ``tried``       whether the pilot of "auto" compares it with others, where it can render the scene. True for
-                    samplers that were seen to be chosen where they are best (``data_gen.choosing.plans``)
-    ``compiles``    seconds that a core takes to compile its kernels, of most scenes; given where ``tried`` is true
-    ``finds``       what light it finds that paths from the camera hardly find: "caustics" (seen in mirrors or through
-                    glass after glass has focussed it on something rough), "hidden lamps" (hidden from what they light),
-                    "grids" (light in media whose density varies, by photons)
-    ``diagnoses``   whether it counts failed shifts, which ``--diagnostics`` writes: ``make`` takes ``diagnostics=True``
-    ``batch``       0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass
-                    has so many, and variances are over passes
-    ``together``    whether pixels share paths, so that a pass has all of them, with as many samples each
-    ``lane_bytes``  memory that a lane, one sample of one pixel, takes in a pass
-    ``counts``      whether it replays numbers one by one, so that they must be independent: it takes no ``points``
-    ``by_place``    whether it can choose lamps by place: ``make`` takes ``places``
-    ``biased``      whether its mean approaches the mean of Mitsuba's integrator only as the number of samples grows
+    Its ``make`` (scene, options) returns what takes the samples of a pass (``data_gen.passes.SamplePass``).
     """
 
-    gradients: bool = field(default=True, kw_only=True)
-    rank: int = field(default=0, kw_only=True)
-    tried: bool = field(default=False, kw_only=True)
-    compiles: float = field(default=2.0, kw_only=True)
-    finds: tuple[str, ...] = field(default=(), kw_only=True)
-    diagnoses: bool = field(default=False, kw_only=True)
-    batch: int = field(default=0, kw_only=True)
-    together: bool = field(default=False, kw_only=True)
-    lane_bytes: int = field(default=LANE_BYTES, kw_only=True)
-    by_place: bool = field(default=False, kw_only=True)
-    biased: bool = field(default=False, kw_only=True)
-    counts: bool = field(default=False, kw_only=True)
+    _: KW_ONLY
+    gradients: bool = True  # whether it renders dx and dy
+    rank: int = 0  # "auto" takes the sampler of least rank that can render the scene; 0: never
+    # Whether the pilot of "auto" compares it with others, where it can render the scene: True for samplers that were
+    # seen to be chosen where they are best (``data_gen.choosing.plans``)
+    tried: bool = False
+    compiles: float = 2.0  # seconds that a core takes to compile its kernels, given where it is ``tried``
+    # Light that it finds and paths from the camera hardly find: "caustics" (seen in mirrors or glass after glass has
+    # focussed it on something rough), "hidden lamps" (hidden from what they light), "grids" (light in media of varying
+    # density, by photons)
+    finds: tuple[str, ...] = ()
+    diagnoses: bool = False  # whether it counts failed shifts (--diagnostics): ``make`` takes ``diagnostics=True``
+    # 0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass has so many,
+    # and variances are over passes
+    batch: int = 0
+    together: bool = False  # whether pixels share paths, so that a pass has all of them, with as many samples each
+    lane_bytes: int = LANE_BYTES  # memory that a lane, one sample of one pixel, takes in a pass
+    by_place: bool = False  # whether it can choose lamps by place: ``make`` takes ``places``
+    biased: bool = False  # whether its mean approaches Mitsuba's only as the number of samples grows
+    counts: bool = False  # whether it replays numbers one by one, which must be independent: it takes no ``points``
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -162,16 +134,15 @@ class Sampler(Entry):
 
     @property
     def plugin(self) -> str:
-        """What Mitsuba calls its integrator."""
         return self.name.replace("-", "_")
 
     def integrator(self, scene: Any, **options: Any) -> Any:
         """Its integrator with the parameters of the scene's own ``path``, and ``options`` that are checked."""
         return integrator_of(self.module).like_path(scene, self.plugin, **options)
 
-    def _make(self, scene: Any, **options: Any) -> Any:
+    def make(self, scene: Any, **options: Any) -> Any:
         if integrator_of(self.module) is None:
-            return super()._make(scene, **options)
+            return super().make(scene, **options)
         return self.integrator(scene, **options).prepare(scene)
 
     @property
@@ -184,16 +155,14 @@ class Sampler(Entry):
 class FrameSampler(Entry):
     """What renders the frames of a shot one after the other, for it remembers those before; no single images.
 
-    ``make``     (scene, seed, samples per pixel, memory in MiB, options) -> an object whose ``film(index, motion,
-                 depth)`` is the film of a frame, numbered in the shot; raises NgptError for what it cannot render
-    ``spp``      samples per pixel of a frame, where the user gives none
-    ``warm_up``  frames before, that are rendered where a shot is gone on with: its history
-    ``alone``    why it renders no single images
+    Its ``make`` (scene, seed, samples per pixel, memory in MiB, options) returns an object whose ``film(index, motion,
+    depth)`` is the film of a frame, numbered in the shot.
     """
 
-    spp: int = field(kw_only=True)
-    warm_up: int = field(kw_only=True)
-    alone: str = field(kw_only=True)
+    _: KW_ONLY
+    spp: int  # samples per pixel of a frame, where the user gives none
+    warm_up: int  # frames before, that are rendered where a shot is gone on with: its history
+    alone: str  # why it renders no single images
 
 
 FRAME_SAMPLERS: dict[str, FrameSampler] = {}
@@ -202,7 +171,6 @@ SAMPLERS: Registry[Sampler] = Registry("ngpt.samplers", "sampler", Sampler, {}, 
 
 
 def by_plugin(plugin: str) -> Sampler:
-    """The sampler whose integrator Mitsuba calls so."""
     return next(entry for entry in SAMPLERS.values() if entry.plugin == plugin)
 
 
@@ -261,6 +229,5 @@ def check_options(name: str, given: Mapping[str, Any]) -> None:
 
 
 def by_standing(standing: str) -> dict[str, Sampler | FrameSampler]:
-    """The samplers of a standing, by name."""
     entries: list[Sampler | FrameSampler] = [*SAMPLERS.values(), *FRAME_SAMPLERS.values()]
     return {entry.name: entry for entry in entries if entry.standing == standing}

@@ -38,12 +38,23 @@ def no_media(facts: Facts, name: str) -> str:
     return "" if facts.media else "there are no media, and 'ppm' has the same image"
 
 
+def unrendered_media(facts: Facts, name: str) -> str:
+    if facts.integrator not in ("path", *VOLUMETRIC):
+        return f"the integrator is '{facts.integrator}', and '{name}' knows only 'path', 'volpath' and 'volpathmis'"
+    unseen = ", ".join(facts.media) if facts.integrator == "path" else ""
+    return f"there are media ({unseen}), which the integrator 'path' does not render" if unseen else ""
+
+
 def varying_media(facts: Facts, name: str) -> str:
     return f"there are media whose density varies, which '{name}' does not render" if facts.grids else ""
 
 
 def hidden_emitters(facts: Facts, name: str) -> str:
     return "its integrator hides emitters" if facts.hides else ""
+
+
+def mirrors(facts: Facts, name: str) -> str:
+    return "there are mirrors or clear glass, at which paths cannot be reconnected" if facts.mirrors else ""
 
 
 def unreachable_camera(facts: Facts, name: str) -> str:
@@ -90,29 +101,18 @@ def why_not_shared(media: bool, settings: Mapping[str, Any], variant: str) -> st
     if "rgb" not in variant or "polarized" in variant:
         return f"variant '{variant}' renders other colours than RGB"
     unable = {"reuse": (True, "reuse"), "shift": ("manifold", "shift=manifold")}
-    return next(
-        (f"{name} needs whole paths" for key, (value, name) in unable.items() if settings.get(key) == value), ""
-    )
+    reasons = (f"{name} needs whole paths" for key, (value, name) in unable.items() if settings.get(key) == value)
+    return next(reasons, "")
 
 
 def joined_depth(default: int) -> Option:
-    """The option of samplers that trace paths from both ends."""
     meaning = "edges of a path, up to which it is found from both ends; longer ones from the camera"
     return Option(default, meaning, range=(1, 64))
 
 
 def first_radius(default: float) -> Option:
-    """The option of photon samplers."""
     meaning = "how far photons are gathered from in the first pass, in pixels where most is seen"
     return Option(default, meaning, range=(1e-6, 1e6))
 
 
-def notes_on_photons(facts: Facts) -> list[str]:
-    how = "found by photons; blurred, less with every sample"
-    return [f"transport: Mitsuba's '{facts.integrator}', {how}", *notes_on_mirrors(facts)]
-
-
-def notes_on_mirrors(facts: Facts) -> list[str]:
-    """The note of photon samplers."""
-    line = "mirrors or clear glass: followed from the camera and from the lights, caustics seen in them too"
-    return [line] if facts.mirrors else []
+IN_MIRRORS = "followed from the camera and from the lights, caustics seen in them too"

@@ -74,5 +74,4 @@ def sensor_number(wanted: int | str | None, ids: Sequence[str], scene: str) -> i
 
 
 def sensor_names(ids: Sequence[str]) -> str:
-    """A scene's sensors in words, by number and id."""
     return ", ".join(f"{number} '{known}'" if known else str(number) for number, known in enumerate(ids))

@@ -12,29 +12,19 @@ from data_gen.scenes.integrators import check_integrator, followed, objects_in, 
 
 @dataclass(frozen=True)
 class Facts:
-    """Facts about a scene, known without rendering it.
+    """Facts about a scene, known without rendering it."""
 
-    ``integrator``  the plugin name of the integrator whose image is rendered, or the name of its class; "path" if the
-                    scene has none: see ``data_gen.scenes.integrators.followed``
-    ``media``       the names of its media, sorted
-    ``polarised``   the name of a variant that renders polarised light, or ""
-    ``spectral``    the name of a variant whose paths have wavelengths, or ""
-    ``hides``       whether emitters hide from the camera
-    ``mirrors``     whether there are mirrors or clear glass; known of scene files that were inspected
-    ``grids``       whether there are media whose density varies
-    ``camera``      the plugin name of its first camera, or the name of its class
-    ``hair``        whether there is Mitsuba's material ``hair``, which is not the same in both directions
-    """
-
+    # The plugin name of the integrator whose image is rendered, or the name of its class; "path" if the scene has none:
+    # see ``data_gen.scenes.integrators.followed``
     integrator: str
-    media: tuple[str, ...]
-    polarised: str = ""
-    mirrors: bool = False
-    grids: bool = False
-    camera: str = "perspective"
-    hair: bool = False
-    spectral: str = ""
-    hides: bool = False
+    media: tuple[str, ...]  # the names of its media, sorted
+    polarised: str = ""  # the name of a variant that renders polarised light, or ""
+    mirrors: bool = False  # whether there are mirrors or clear glass; known of scene files that were inspected
+    grids: bool = False  # whether there are media whose density varies
+    camera: str = "perspective"  # the plugin name of its first camera, or the name of its class
+    hair: bool = False  # whether there is Mitsuba's material ``hair``, which is not the same in both directions
+    spectral: str = ""  # the name of a variant whose paths have wavelengths, or ""
+    hides: bool = False  # whether emitters hide from the camera
 
 
 def scene_facts(scene: mi.Scene, sensor: mi.Sensor | None = None, integrator: mi.Integrator | None = None) -> Facts:

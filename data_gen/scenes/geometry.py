@@ -30,7 +30,6 @@ def geometry(shape: mi.Shape) -> Geometry:
 
 
 def geometry_of(params: Mapping[str, Any]) -> Geometry:
-    """The geometry of a shape with these parameters."""
     if "to_world" in params:
         return matrix(params["to_world"])
     if (name := vertices_name(params)) and "faces" in params:
@@ -50,7 +49,6 @@ def vertices(params: Mapping[str, Any], name: str) -> np.ndarray:
 
 
 def put_vertices(params: Any, name: str, moved: np.ndarray) -> None:
-    """Has a parameter hold other vertices (V, 3)."""
     params[name] = type(params[name])(np.ascontiguousarray(moved, np.float32).reshape(np.shape(params[name])))
 
 

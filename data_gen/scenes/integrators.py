@@ -1,8 +1,4 @@
-"""Mitsuba's integrators: what each is called, and which other one renders the same image where ours follow only that.
-
-Integrators for derivatives (``prb`` and its like) are written in Python. They render the same images as ``path``
-and ``volpath``, which our samplers follow.
-"""
+"""Mitsuba's integrators: what each is called, and which other one renders the same image where ours follow it only."""
 
 from __future__ import annotations
 

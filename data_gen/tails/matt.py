@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.paths.vertex import ByMaterial, materials_of, smallest_roughness
-from data_gen.tails.schedule import FINENESS
+from data_gen.tails.cache import FINENESS
 
 # Gloss that is rougher than this passes for matt beside a diffuse part, where cells are coarsest: its α.
 ROUGH = 0.15

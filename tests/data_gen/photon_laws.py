@@ -8,16 +8,14 @@ from data_gen.film import GradientFilm
 from data_gen.passes import recording
 from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.light_ends import LightEnds, LightRay
+from data_gen.paths.light_ends import LightEnds, LightRay, World
 from data_gen.paths.streams import sample_streams
 from data_gen.paths.vertex import Materials
-from data_gen.paths.world import World
 from data_gen.samplers import find
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
 from data_gen.samplers.photons.gradients.copies import LightPaths, start_of
-from data_gen.samplers.photons.map.photon import Photon, photon_of
 from data_gen.samplers.photons.map.trace import trace
-from data_gen.samplers.photons.map.vertices import vertex_in_media_of, vertex_of
+from data_gen.samplers.photons.map.vertices import Photon, photon_of, vertex_in_media_of, vertex_of
 
 
 def largest(value) -> float:

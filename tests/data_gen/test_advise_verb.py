@@ -12,6 +12,7 @@ pytest.importorskip("mitsuba")
 
 from data_gen.choosing import pipelines, plans
 from data_gen.choosing.pipelines import Pipeline, usual_fall
+from data_gen.choosing.trials import Pilot
 from data_gen.scenes.load import load_scene
 
 
@@ -74,9 +75,9 @@ def test_on_a_busy_machine_one_sampler_is_tried_and_no_more(renderer, monkeypatc
     """Every look at the clock is a second late: nothing fits, and the first trial ends all the same."""
     scene, seconds = load_scene("diffuse", (48, 32)), count()
     monkeypatch.setattr(plans, "candidates", lambda scene: ["gpt", "bdpt"])
-    found = plans.explore(scene, 30.0, clock=lambda: float(next(seconds)), patient=True)
+    found = plans.explore(scene, 30.0, pilot=Pilot(lambda: float(next(seconds))), patient=True)
     assert {p.sampler for p in found} == {"gpt"} and len(found) == 1
-    assert plans.explore(scene, 30.0, clock=lambda: float(next(seconds))) == []
+    assert plans.explore(scene, 30.0, pilot=Pilot(lambda: float(next(seconds)))) == []
 
 
 def test_the_further_beyond_the_samples_of_a_pilot_the_less_is_known():

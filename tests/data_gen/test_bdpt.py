@@ -13,7 +13,7 @@ from data_gen.film.splats import Splats
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.eye import Sight
 from data_gen.samplers.bdpt import mis
-from data_gen.samplers.bdpt.choice import choose
+from data_gen.samplers.bdpt.camera_path import choose
 from data_gen.samplers.bdpt.light_path import light_path
 from data_gen.samplers.bdpt.vertex import Vertex, cosine
 

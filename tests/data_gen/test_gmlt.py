@@ -25,17 +25,10 @@ def chains(renderer):
     return chains
 
 
-@pytest.fixture
-def mutation(renderer):
-    from data_gen.samplers.studies.gmlt import mutation
-
-    return mutation
-
-
-def test_small_steps_go_either_way_and_around(mutation):
-    rng, small, large = np.random.default_rng(0), mutation.SMALLEST, mutation.LARGEST
+def test_small_steps_go_either_way_and_around(chains):
+    rng, small, large = np.random.default_rng(0), chains.SMALLEST, chains.LARGEST
     x = rng.random(100_000, np.float32)
-    y = np.array(mutation.small_step(mi.Float(x), mi.Float(rng.random(x.size, np.float32))), np.float64)
+    y = np.array(chains.small_step(mi.Float(x), mi.Float(rng.random(x.size, np.float32))), np.float64)
     assert np.all((y >= 0) & (y < 1))
     step = (y - x + 0.5) % 1 - 0.5
     assert np.all((np.abs(step) > small * 0.999) & (np.abs(step) < large * 1.001))
@@ -46,17 +39,17 @@ def test_small_steps_go_either_way_and_around(mutation):
     counts = np.histogram(y, 50, (0, 1))[0]
     assert np.square(counts - 2000).sum() / 2000 < 100
     # Around both ends, and what rounds to 1 is 0.
-    ends = np.array(mutation.small_step(mi.Float([0.0, 1 - 2**-24, 1e-9]), mi.Float([0.1, 0.9, 0.49999])))
+    ends = np.array(chains.small_step(mi.Float([0.0, 1 - 2**-24, 1e-9]), mi.Float([0.1, 0.9, 0.49999])))
     assert ends[0] > 0.98 and ends[1] < 0.02 and 0 <= ends[2] < 1
 
 
-def test_acceptance_balances_every_pair_of_states(mutation):
+def test_acceptance_balances_every_pair_of_states(chains):
     """f(x) a(x -> y) = f(y) a(y -> x); from and to what has no value as well."""
     f = np.array([1e-20, 1e-3, 0.5, 0.5, 2, 7, 1e6], np.float32)
     x, y = (mi.Float(a.ravel()) for a in np.meshgrid(f, f))
-    there, back = mutation.acceptance(x, y), mutation.acceptance(y, x)
+    there, back = chains.acceptance(x, y), chains.acceptance(y, x)
     assert np.allclose(x * there, y * back, rtol=1e-6) and dr.all(there <= 1)
-    assert mutation.acceptance(mi.Float(1), mi.Float(0))[0] == 0
+    assert chains.acceptance(mi.Float(1), mi.Float(0))[0] == 0
 
 
 class Steps:
@@ -92,7 +85,7 @@ def test_a_chain_visits_paths_in_proportion_to_their_values(renderer, monkeypatc
     assert np.array(rate).mean() > 0.4
 
 
-def test_numbers_that_do_not_change_make_the_same_path(monkeypatch, chains, mutation):
+def test_numbers_that_do_not_change_make_the_same_path(monkeypatch, chains):
     """What a chain remembers of a candidate is the candidate, and what it accepted is what it remembers."""
     counts = dr.zeros(mi.UInt32, 2)
     acceptance = chains.acceptance
@@ -102,7 +95,7 @@ def test_numbers_that_do_not_change_make_the_same_path(monkeypatch, chains, muta
             dr.scatter_add(counts, mi.UInt32(1), mi.UInt32(i), which)
         return acceptance(f, proposed)
 
-    monkeypatch.setattr(mutation, "small_step", lambda x, u: x)
+    monkeypatch.setattr(chains, "small_step", lambda x, u: x)
     monkeypatch.setattr(chains, "acceptance", counted)
     monkeypatch.setattr(chains, "LARGE_STEPS", 0.3)
     render_stack(load(mi, "glossy", SIZE), 8, 1, "gmlt")

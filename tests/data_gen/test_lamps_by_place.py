@@ -15,8 +15,7 @@ from unbiased import FAR, assert_unbiased, load, render_ours
 
 from data_gen.paths.lights import Lights, emission, replay_lamp, shared_emission
 from data_gen.paths.vertex import seen_from
-from data_gen.scenes.lamps import weighed
-from data_gen.scenes.places import Places, Table
+from data_gen.scenes.lamps import Places, Table, weighed
 
 LANES = 1 << 14
 

@@ -244,7 +244,7 @@ def test_an_interrupted_render_gives_its_image(renderer, command, monkeypatch, n
     said = command(f"{GPT} --spp 64 --denoise -o {name}", 130)
     assert f"{name} holds the 16 samples per pixel done by then" in said and Path(name).exists()
     if name == "it.exr":
-        assert begun.rendered(ngpt.read(name)).attributes["ngpt:unfinished"] == "interrupted"
+        assert begun.begun_stack(name).attributes["ngpt:unfinished"] == "interrupted"
 
 
 @pytest.mark.parametrize("more", ["", "--denoise wcv"])

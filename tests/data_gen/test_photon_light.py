@@ -16,7 +16,7 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.streams import sample_streams
 from data_gen.samplers import find
-from data_gen.samplers.photons.map.edges import spread
+from data_gen.samplers.photons.map.radius import spread
 from data_gen.scenes.builtin import _camera, _diffuse
 
 # ------------------------- The start of light paths -------------------------

@@ -13,15 +13,13 @@ from unbiased import load
 
 from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.light_ends import LightEnds
+from data_gen.paths.light_ends import LightEnds, World
 from data_gen.paths.vertex import Materials
-from data_gen.paths.world import World
 from data_gen.samplers import find
 from data_gen.samplers.photons.gradients import shift as shifts
 from data_gen.samplers.photons.gradients.copies import LightPaths, copy
 from data_gen.samplers.photons.map.fog import Fog
-from data_gen.samplers.photons.map.photon import is_near
-from data_gen.samplers.photons.map.vertices import vertex_of
+from data_gen.samplers.photons.map.vertices import is_near, vertex_of
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,8 @@ from unbiased import load
 pytest.importorskip("mitsuba")
 
 from data_gen.choosing import plans, trials
-from data_gen.choosing.enclosed import enclosed
 from data_gen.choosing.pipelines import Pipeline, usual_fall
-from data_gen.choosing.plans import best_of, judge, simple, times_to_the_end
+from data_gen.choosing.plans import best_of, enclosed, judge, simple, times_to_the_end
 from data_gen.choosing.trials import Witnesses, candidates
 from data_gen.render import render_stack
 from data_gen.samplers import SAMPLERS, Sampler
@@ -168,5 +167,5 @@ def test_seeds_of_trials_do_not_depend_on_other_samplers(monkeypatch):
     before = {name: trials.seed_of(name) for name in SAMPLERS}
     seeds = {seed + i for seed in before.values() for i in range(8)}
     assert len(seeds) == 8 * len(before) and max(seeds) < 2**64
-    monkeypatch.setattr(trials, "SAMPLERS", {"first": Sampler("first", "of another package"), **SAMPLERS})
+    monkeypatch.setattr(trials, "SAMPLERS", {"first": Sampler("first", "of another package", "first"), **SAMPLERS})
     assert {name: trials.seed_of(name) for name in before} == before

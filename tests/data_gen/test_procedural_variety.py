@@ -17,7 +17,7 @@ from data_gen.dataset import crops, jobs
 from data_gen.dataset.cameras import Surroundings, find_view
 from data_gen.dataset.config import Config, made_name
 from data_gen.scenes.builtin import _box, _camera, _diffuse, _sphere, _volume, _wall
-from data_gen.scenes.procedural import media, variety
+from data_gen.scenes.procedural import media, things, variety
 from data_gen.scenes.procedural.scenes import make_scene
 from data_gen.scenes.procedural.stage import Stage
 from ngpt.errors import NgptError
@@ -99,7 +99,7 @@ def test_small_lamps_are_10_to_50_and_small(seed, monkeypatch):
 
 def test_hair_is_as_thin_as_hair():
     rng = np.random.default_rng(2)
-    for parts in (variety.strands.wires(rng, (4, 4), 2.4), variety.strands.tuft(rng), variety.strands.net(rng)):
+    for parts in (things.wires(rng, (4, 4), 2.4), things.tuft(rng), things.net(rng)):
         mesh = parts[0][1]
         corners = mesh.vertices[mesh.faces]
         edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)

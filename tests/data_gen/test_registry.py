@@ -33,15 +33,15 @@ def test_defaults_are_allowed_and_other_values_are_not(name, option):
 
 def test_names():
     with pytest.raises(NgptError, match="there is a sampler 'gpt' already"):
-        register(Sampler("gpt", "another"))
+        register(Sampler("gpt", "another", "other"))
     with pytest.raises(NgptError, match="there is a sampler 'restir' already"):
-        register(Sampler("restir", "another"))
+        register(Sampler("restir", "another", "other"))
     with pytest.raises(NgptError, match=r"unknown sampler 'gtp'; did you mean 'gpt'\? choose one of: auto, gpt,"):
         find("gtp")
     with pytest.raises(NgptError, match=r"; for shots \(--frames\): restir$"):
         find("foo")
     with pytest.raises(NgptError, match="standing 'useful' is none of use, niche, study"):
-        Sampler("new", "another", standing="useful")
+        Sampler("new", "another", "other", standing="useful")
 
 
 def test_options_of_auto_are_refused_with_samplers_that_have_them():

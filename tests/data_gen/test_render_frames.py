@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import ngpt
-from data_gen.cli.frames import frames, targets
+from data_gen.cli.render_arguments import frames, targets
 from data_gen.frames.pattern import filled
 from ngpt.cli import main
 from ngpt.errors import NgptError

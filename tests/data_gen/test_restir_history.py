@@ -11,10 +11,9 @@ from restir_shots import FRAMES, Room, close, inverse, lamp, rendered_by_gpt, th
 from data_gen.samplers.restir import history as of_history
 from data_gen.samplers.restir import layout, merging
 from data_gen.samplers.restir.evaluate import evaluate_record
-from data_gen.samplers.restir.footprint import pair_motions
-from data_gen.samplers.restir.pose import Pose
 from data_gen.samplers.restir.record import gather
-from data_gen.samplers.restir.reservoir import confidence_after
+from data_gen.samplers.restir.reservoir import confidence_after, pair_motions
+from data_gen.samplers.restir.stage import Pose
 from ngpt.testing import z_test
 
 STEPS = ((0, 0), (1, 0), (0, 1))

@@ -1,5 +1,8 @@
 """A toy shows what it takes to add a sampler; the laws of all are in ``laws``."""
 
+import sys
+from types import SimpleNamespace
+
 import drjit as dr
 import mitsuba as mi
 import pytest
@@ -49,9 +52,11 @@ class Toy:
 TOY = Sampler(
     "toy",
     "a toy",
-    make=Toy,
-    refuses=lambda facts: "" if facts.integrator in ("path", "volpath") else "toys know only 'path' and 'volpath'",
-    notes=lambda facts: [f"a note on {facts.integrator}"],
+    "toys",
+    refusals=(
+        lambda facts, name: "" if facts.integrator in ("path", "volpath") else "toys know only 'path' and 'volpath'",
+    ),
+    notes={"transport": "toys"},
     options={"share": Option(0.5, "of each value that is splatted", range=(0, 1))},
     rank=5,
     batch=8,
@@ -59,8 +64,9 @@ TOY = Sampler(
 
 
 @pytest.fixture(autouse=True)
-def toy():
+def toy(monkeypatch):
     """One registration, undone after each test."""
+    monkeypatch.setitem(sys.modules, "toys", SimpleNamespace(make=Toy))
     register(TOY)
     yield
     del SAMPLERS["toy"]

@@ -20,10 +20,10 @@ SIZE = (24, 16)
 def spectral(renderer):
     """The names of the study, in a spectral variant of Mitsuba with its glass; the usual variant afterwards."""
     use_variant("llvm_ad_spectral")
-    from data_gen.samplers.studies.spectral import render, scene, solve
+    from data_gen.samplers.studies.spectral import glass, render
 
     register()
-    yield SimpleNamespace(**vars(render), prism=scene.prism, reconstructed=solve.reconstructed, to_rgb=solve.to_rgb)
+    yield SimpleNamespace(**vars(render), prism=glass.prism)
     use_variant()
 
 

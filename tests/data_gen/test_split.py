@@ -11,7 +11,6 @@ from split_scenes import coats, everything, principled, shelf, without_gloss
 from unbiased import assert_unbiased, load, render_ours
 
 import ngpt
-from data_gen.paths.lobes import Lobes
 from data_gen.render import render_stack
 from ngpt.cli import main
 from ngpt.layers import LAYERS
@@ -62,6 +61,8 @@ def test_diffuse_light_is_that_of_the_same_materials_without_gloss(renderer):
 
 def shares(mi, description, n=2000):
     """The share of diffuse lobes at random pairs of directions, f of them alone, of the others alone, of all."""
+    from data_gen.samplers.studies.split import Lobes
+
     scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle", "bsdf": description}})
     rng = np.random.default_rng(0)
     ray = mi.Ray3f(mi.Point3f(0.1, 0.2, 1), dr.normalize(mi.Vector3f(rng.uniform(-0.1, 0.1, (3, n))) - [0, 0, 1]))

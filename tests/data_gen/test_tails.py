@@ -19,7 +19,7 @@ from data_gen.adaptive import Adaptive
 from data_gen.render import render_stack
 from data_gen.scenes import builtin
 from data_gen.tails import cache
-from data_gen.tails.cells import Place
+from data_gen.tails.cache import Place
 from data_gen.tails.matt import is_matt
 from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError, WrongUse

@@ -10,8 +10,8 @@ from tails_scenes import SIZE, contact, corner_box, door, shade, sheet, shelf, s
 from unbiased import REFERENCES, load
 
 from data_gen.render import render_stack
-from data_gen.tails import schedule
-from data_gen.tails.schedule import FINENESS, end_of_round, fineness
+from data_gen.tails import cache as tails_cache
+from data_gen.tails.cache import FINENESS, end_of_round, fineness
 
 BLOCK = 4
 
@@ -116,7 +116,7 @@ def test_bias_vanishes_with_the_size_of_cells(renderer, monkeypatch, description
     scene, found = load(renderer, description, (16, 12)), []
     paths = whole(description, (16, 12), 1024, 4)
     for size in sizes:
-        monkeypatch.setattr(schedule, "FINENESS", size)
+        monkeypatch.setattr(tails_cache, "fineness", lambda sample, size=size: fineness(sample) * size / FINENESS)
         found.append(bias(images(scene, "shared", 256, range(6)), paths).rms)
     assert found[0] > least
     assert all(abs(after) < share * before for before, after, share in zip(found, found[1:], shares, strict=False)), (

@@ -10,10 +10,10 @@ from ngpt.stack import GradientStack
 pytest.importorskip("mitsuba")
 
 from data_gen import passes
+from data_gen.adaptive import UnevenRender
 from data_gen.film import GradientFilm
 from data_gen.render import render_stack
 from data_gen.samplers import find
-from data_gen.uneven import UnevenRender
 
 SIZE = (12, 8)
 PIXELS = SIZE[0] * SIZE[1]

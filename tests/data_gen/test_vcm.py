@@ -24,7 +24,7 @@ from data_gen.paths.vertex import Materials
 from data_gen.render import render_stack
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, cosine, evaluate, scatters_smoothly
-from data_gen.samplers.photons.map.photon import Photon
+from data_gen.samplers.photons.map.vertices import Photon
 from data_gen.samplers.vcm.merging import Map, Merging, Photons
 
 ETA = 0.05
@@ -120,7 +120,7 @@ class Beside:
     """Copies at their vertex ``t``, the same the other way, and a photon beside each vertex on the same surface."""
 
     def __init__(self, copies, t, radius, number=4096):
-        from data_gen.samplers.vcm.differences import ShiftedMerging
+        from data_gen.samplers.vcm.gvcm import ShiftedMerging
 
         connectable = copies.materials.connectable
         base, own, offset = copies.from_camera[t - 1], copies.copied[t - 1], copies.offsets[t - 1]

@@ -77,7 +77,7 @@ def test_what_renders_nothing_does_not_change_the_key(tree, tmp_path):
     before = key_of("diffuse", tmp_path)
     film = tree / "film" / "gradient_film.py"
     film.write_text("# A remark.\n" + re.sub(r'"""(?=[A-Z])', '"""More words. ', film.read_text()))
-    files = ("dataset/crops.py", "scenes/procedural/scenes.py", "inspect.py", "choosing/costs.py", "__main__.py")
+    files = ("dataset/crops.py", "scenes/procedural/scenes.py", "inspect.py", "choosing/plans.py", "__main__.py")
     for name in (*files, "session.py", "cli/render.py", "samplers/studies/about.py", "samplers/__init__.py"):
         (tree / name).write_text((tree / name).read_text() + "\nsomething = 1\n")
     assert key_of("diffuse", tmp_path) == before

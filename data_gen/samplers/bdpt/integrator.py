@@ -1,9 +1,7 @@
 r"""Bidirectional path tracing: for each camera sample a path from the camera and one from a light, joined every way.
 
-A light path finds at once what a camera path finds only by accident: light from lamps behind shades, or light that goes
-through glass onto a wall. Every way to find a path is a strategy; all are weighted against each other (``mis``). A
-vertex of the camera path is connected to a lamp and to one vertex of the light path, which stands for all of them
-(``choice``).
+Every way to find a path is a strategy; all are weighted against each other (``mis``). A vertex of the camera path is
+connected to a lamp and to one vertex of the light path, which stands for all of them (``camera_path.choose``).
 
     z                 vertices of the camera path
     y                 vertices of the light path, kept while the camera path is traced
@@ -34,9 +32,8 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.eye import Sight
 from data_gen.paths.features import features
 from data_gen.paths.frozen import Frozen
-from data_gen.paths.light_ends import LightEnds
+from data_gen.paths.light_ends import LightEnds, World
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.world import World
 from data_gen.samplers.bdpt.camera_path import camera_path
 from data_gen.samplers.bdpt.light_path import Seen, light_path
 from data_gen.samplers.bdpt.plan import Plan
@@ -45,8 +42,6 @@ from data_gen.samplers.common import GradientIntegrator
 
 @dataclass
 class Splatter:
-    """Splats what light paths bring to the camera."""
-
     splats: Splats
     ray: mi.Ray3f
     importance: mi.Spectrum
@@ -62,15 +57,9 @@ class Splatter:
 class BDPT(GradientIntegrator):
     """Bidirectional path tracing, for surfaces; no gradients.
 
-    Plugin ``bdpt``. Parameters, the first three as for Mitsuba's ``path``:
-
-    ``max_depth``      default -1: no limit
-    ``rr_depth``       5
-    ``hide_emitters``  false
-    ``joined_depth``   10, the number of edges up to which paths are found from both ends
-
-    Not handled: media, polarised variants, cameras that are neither perspective nor thin lenses, emitters other than
-    areas, points, spots and those infinitely far away. Rendering raises NgptError for them.
+    Plugin ``bdpt``, with the parameters of Mitsuba's ``path`` and ``joined_depth``. Not handled: media, polarised
+    variants, cameras that are neither perspective nor thin lenses, emitters other than areas, points, spots and those
+    infinitely far away. Rendering raises NgptError for them.
     """
 
     plan_class = Plan
@@ -80,7 +69,6 @@ class BDPT(GradientIntegrator):
         self.longest = min(self.limits.max_depth, self.options["joined_depth"])
 
     def plan(self, world: World, **more) -> Plan:
-        """What paths in the ``world`` have to agree in."""
         return self.plan_class(
             world.scene,
             world.lights,

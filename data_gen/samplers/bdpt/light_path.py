@@ -10,9 +10,8 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.eye import Sight
-from data_gen.paths.light_ends import LightRay
+from data_gen.paths.light_ends import LightRay, World
 from data_gen.paths.walk import roulette
-from data_gen.paths.world import World
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.plan import Plan
 from data_gen.samplers.bdpt.strategies import to_camera
@@ -51,8 +50,6 @@ class Visitor(Protocol):
 
 @dataclass
 class End:
-    """The last vertex of a light path, and how it came there."""
-
     ray: mi.Ray3f
     hit: mi.PreliminaryIntersection3f
     y: Vertex

@@ -8,16 +8,14 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.light_ends import World
 from data_gen.paths.walk import Limits
-from data_gen.paths.world import World
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Partial
 
 
 @dataclass(kw_only=True)
 class Plan(World):
-    """What does not change in a pass."""
-
     limits: Limits
     longest: int  # the number of edges up to which paths are found from both ends
     first_hit: Callable  # (scene, ray, active): where a ray from the camera leads
@@ -26,7 +24,6 @@ class Plan(World):
 
     @property
     def joins(self) -> bool:
-        """Whether there are paths from lights."""
         return self.longest > 1 and self.lights.emitters is not None
 
     def merged(self, bsdf: mi.BSDFPtr, joins: mi.Bool | bool = True) -> mi.Float:

@@ -10,7 +10,7 @@ import mitsuba as mi
 from data_gen.paths.eye import Sight
 from data_gen.paths.walk import Sky
 from data_gen.samplers.bdpt import mis
-from data_gen.samplers.bdpt.choice import choose
+from data_gen.samplers.bdpt.camera_path import choose
 from data_gen.samplers.bdpt.light_path import LightPath
 from data_gen.samplers.bdpt.vertex import Vertex, cosine, recall, scatters_smoothly
 from data_gen.samplers.gbdpt.base_path import Past, Plan, Step, base_step
@@ -20,7 +20,7 @@ from data_gen.samplers.gbdpt.pairs import weighted
 
 
 class MergesPairs(Protocol):
-    """What gathers photons at camera paths and their copies, see ``vcm.differences``."""
+    """What gathers photons at camera paths and their copies, see ``vcm.gvcm``."""
 
     def differences(self, z: Vertex, bsdf: mi.BSDFPtr, active: mi.Bool, offsets: list[Offset]) -> tuple:
         """The light of the photons near to the vertex ``z``, weighted; and Δ of the ``offsets``, with it."""

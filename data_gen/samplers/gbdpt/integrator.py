@@ -41,10 +41,9 @@ from data_gen.paths.camera import CameraSamples, in_packets
 from data_gen.paths.eye import Eye, Sight
 from data_gen.paths.features import features
 from data_gen.paths.frozen import Frozen
-from data_gen.paths.light_ends import LightEnds
+from data_gen.paths.light_ends import LightEnds, World
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials
-from data_gen.paths.world import World
 from data_gen.samplers.bdpt.integrator import BDPT
 from data_gen.samplers.bdpt.light_path import Visitor, light_path
 from data_gen.samplers.gbdpt.base_path import Plan
@@ -59,11 +58,7 @@ from data_gen.samplers.gbdpt.roulette import Rater, Worth, survivors, thresholds
 class GBDPT(BDPT):
     """Gradient-domain bidirectional path tracing, for surfaces.
 
-    Plugin ``gbdpt``. Parameters: as for ``bdpt``, and
-
-    ``roughness_threshold``  0.05, the microfacet roughness above which materials are connectable
-
-    Not handled: what ``bdpt`` does not handle.
+    Plugin ``gbdpt``, with the parameters of ``bdpt`` and ``roughness_threshold``. Not handled: as there.
     """
 
     plan_class = Plan

@@ -16,8 +16,8 @@ from data_gen.paths.vertex import DELTA, SMOOTH, event_kind
 from data_gen.paths.walk import Sky, roulette
 from data_gen.samplers.gpt.manifold_shift import Chain, advance, no_chain
 from data_gen.samplers.gpt.plan import Plan
-from data_gen.scenes.places import Chosen
-from data_gen.tails.cells import Trail
+from data_gen.scenes.lamps import Chosen
+from data_gen.tails.cache import Trail
 
 
 @dataclass

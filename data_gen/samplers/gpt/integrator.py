@@ -26,9 +26,8 @@ from elsewhere), then *settled*: joined for longer, ended, or rejected. A base p
 apart walks on as a ghost. Its offset paths replay numbers that it has no use for, so that what their pixels see serves
 this pixel too, with w = 1/2, as it does in random sequence replay; to reject them would double their variance.
 
-All paths begin in ``trace``; the base path is in ``base_path``, the offset paths in ``offset_path``, the rules of
-shifting in ``data_gen.paths.shift``; ``plan`` decides which of all that a scene needs in its kernel. A vertex may be in
-a medium: ``data_gen.paths.space`` knows whether, and ``media`` and ``segments`` how.
+All paths begin in ``trace``; the rules of shifting are in ``data_gen.paths.shift``; ``plan`` decides which of all that
+a scene needs in its kernel. Whether a vertex is in a medium is known to ``data_gen.paths.space``.
 
 Russian roulette looks at all five paths, so that none is starved. It leaves r as it is: the weights of the two
 directions of a difference sum to one whatever paths survive.
@@ -66,25 +65,15 @@ from ngpt.errors import NgptError
 class GPT(GradientIntegrator):
     """Gradient-domain path tracing with reconnection and random sequence replay, for surfaces and media.
 
-    Plugin ``gpt``. Parameters, the first three as for Mitsuba's ``path``:
+    Plugin ``gpt``, with the parameters of Mitsuba's ``path``, the options of its entry, and
 
-    ``max_depth``            default -1: no limit
-    ``rr_depth``             5
-    ``hide_emitters``        false
-    ``roughness_threshold``  0.05, the microfacet roughness above which materials are connectable
-    ``shift``                "replay" before paths join; or "half-vector", which copies the half vectors of smooth
-                             events and replays other events, and is rarely better; or "manifold": light that comes to
-                             the first rough vertex through mirrors and glass is not in the layer ``caustic``, but
-                             followed to its lamp by walks: see ``manifold_shift``
-    ``reuse``                false; true makes the primal the mean over base paths and the offset paths of neighbours.
-                             Its variance is 2.6 times lower, but the noise of neighbouring pixels is then correlated.
-    ``caustic``              true: light that has come over a rough surface and then mirrors, glass or sharp gloss is in
-                             a layer of its own, not in the gradients, see ``data_gen.paths.caustic``; false: it is
-    ``tails``                "paths": each path finds all of its light; "shared": it may end where others have been, see
-                             ``data_gen.tails``
-    ``volumes``              false: media are not seen, as with ``path``; true: they are, as with ``volpath``
-    ``diagnostics``          false; true adds the layer ``shift_failures``, the share in [0, 1] of a sample's shifts
-                             without a counterpart: rejected, or of zero density, at a step that the base path took
+    ``volumes``      false: media are not seen, as with ``path``; true: they are, as with ``volpath``
+    ``diagnostics``  false; true adds the layer ``shift_failures``, the share in [0, 1] of a sample's shifts without a
+                     counterpart: rejected, or of zero density, at a step that the base path took
+
+    The primal of ``reuse`` has 2.6 times less variance, but the noise of neighbouring pixels is then correlated. The
+    shift "half-vector" is rarely better than "replay"; for "manifold" see ``manifold_shift``, for the other options
+    ``data_gen.paths.caustic`` and ``data_gen.tails``.
 
     Not handled: polarised variants, for which rendering raises NgptError. Through media only "replay" goes. There is no
     limit to the collisions in grids, and each null event at a mask or a thin pane counts in ``max_depth``.

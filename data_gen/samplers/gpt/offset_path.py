@@ -142,7 +142,6 @@ def settle(step: Step, offsets: list[Offset]) -> None:
 
 
 def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
-    """A step from the offset path's own vertex y."""
     # ----------------------- The vertex --------------------------
     # The state carries only the preliminary hit: whole interactions of four paths would swell every loop.
     y = media.vertex(path.ray, path.hit, path.place)
@@ -218,19 +217,8 @@ def replayed_light(scene, plan: Plan, step: Step, path: Offset, own: Own) -> tup
 
 def no_move(path: Offset) -> Move:
     """The move of a path that neither reconnects nor parts: rejected, with β' = 0 and r = 0."""
-    none = mi.Bool(False)
-    return Move(
-        ray=path.ray,
-        hit=path.hit,
-        place=path.place,
-        f_p=mi.Spectrum(0),
-        r=mi.Float(0),
-        sky=path.sky,
-        rough=path.rough,
-        L_bsdf=mi.Spectrum(0),
-        reaches=none,
-        good=none,
-    )
+    f_p, r, L_bsdf, none = mi.Spectrum(0), mi.Float(0), mi.Spectrum(0), mi.Bool(False)
+    return Move(path.ray, path.hit, path.place, f_p, r, path.sky, path.rough, L_bsdf, reaches=none, good=none)
 
 
 def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:

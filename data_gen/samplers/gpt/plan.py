@@ -10,36 +10,28 @@ from data_gen.paths.lights import Lights
 from data_gen.paths.space import Filled, Space
 from data_gen.paths.vertex import Materials
 from data_gen.paths.walk import Limits
-from data_gen.scenes.places import Places
+from data_gen.scenes.lamps import Places
 from data_gen.tails.matt import Matt
 from ngpt.errors import NgptError
 
 
 @dataclass
 class Plan:
-    """Facts about a scene, and options, that do not change while it is rendered.
-
-    ``space``         what is between its surfaces: nothing, or media
-    ``replays``       offset paths may stay apart for more than a step: there are mirrors, glass, holes or polish
-    ``half_vectors``  smooth events that cannot be reconnected are shifted by half-vector copy, else by replay
-    ``caustic``       light that no shift can follow goes into a layer of its own, see ``data_gen.paths.caustic``
-    ``manifold``      some of that light is followed all the same, see ``data_gen.samplers.gpt.manifold_shift``
-    ``matt``          where paths may end in the cache of ``data_gen.tails``; None: nowhere
-    ``hides``         the environment hides from the camera, so that a path must know whether it has seen a surface
-    """
+    """Facts about a scene, and options, that do not change while it is rendered."""
 
     materials: Materials
     lights: Lights
-    space: Space
+    space: Space  # what is between its surfaces: nothing, or media
     limits: Limits
-    replays: bool
-    half_vectors: bool
-    caustic: bool
-    manifold: bool
-    matt: Matt | None = None
+    replays: bool  # offset paths may stay apart for more than a step: there are mirrors, glass, holes or polish
+    half_vectors: bool  # smooth events that cannot be reconnected are shifted by half-vector copy, else by replay
+    caustic: bool  # light that no shift can follow goes into a layer of its own, see ``data_gen.paths.caustic``
+    manifold: bool  # some of it is followed all the same, see ``data_gen.samplers.gpt.manifold_shift``
+    matt: Matt | None = None  # where paths may end in the cache of ``data_gen.tails``; None: nowhere
 
     @property
     def hides(self) -> bool:
+        """The environment hides from the camera, so that a path must know whether it has seen a surface."""
         return self.limits.hide_emitters and self.lights.far
 
 
@@ -54,11 +46,9 @@ def make_plan(
     places: Places | None = None,
     shared: bool = False,
 ) -> Plan:
-    """Inspects the scene; the parameters are as for ``gpt``. Without ``volumes`` its media are not seen.
+    """Inspects the scene; the parameters are as for ``gpt``. Lamps are chosen by ``places``, if given.
 
-    With ``places``, lamps are chosen by them.
-
-    Raises NgptError for shifts that know no media.
+    Without ``volumes`` its media are not seen. Raises NgptError for shifts that know no media.
     """
     if volumes and shift != "replay":
         raise NgptError(f"gpt: shift '{shift}' does not go through media; use 'replay'")

@@ -15,9 +15,8 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.frozen import Frozen
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.gpt.tails import feed
-from data_gen.tails import schedule
-from data_gen.tails.cache import Cache, Known, joined
-from data_gen.tails.cells import Place
+from data_gen.tails import cache as tails
+from data_gen.tails.cache import Cache, Known, Place, joined
 
 # Paths that feed the cache have random numbers of their own: "TAILS".
 _SEED = 0x5441494C53
@@ -59,21 +58,20 @@ class SharedTails:
         return self.cache is not None
 
     def end_of_round(self, sample: int) -> int | None:
-        """The sample before which a pass must end that begins with this ``sample``; None: there is no limit."""
-        return schedule.end_of_round(sample) if self.cache else None
+        return tails.end_of_round(sample) if self.cache else None
 
     def begin(self, sensor: mi.Sensor, seed: int, sample: int, spp: int | None) -> None:
-        """Feeds the cache if this ``sample`` begins a round.
-
-        It is called before each pass. ``spp`` counts all samples, if known.
-        """
+        """Feeds the cache if this ``sample`` begins a round."""
         if sample == 0:
-            self.cache, self.fed = self.empty() if self.plan.matt.any else None, 0
+            # The light of the layer ``caustic`` is kept apart, where there is such a layer.
+            empty = Cache(tails.fineness(0), 2 if self.plan.caustic else 1) if self.plan.matt.any else None
+            self.cache, self.fed = empty, 0
         if self.cache is None:
             return
         pixels = int(dr.prod(mi.ScalarVector2u(sensor.film().crop_size())))
-        wanted = max(round(schedule.paths_before(sample, spp) * pixels), schedule.FEWEST)
-        fineness = schedule.fineness(sample)
+        end = tails.end_of_round(sample) if spp is None else min(tails.end_of_round(sample), spp)
+        wanted = max(round(tails.SHARE * end * pixels), tails.FEWEST)
+        fineness = tails.fineness(sample)
         for part in (round(_FIRST_PART * wanted), wanted) if sample == 0 else (wanted,):
             while self.fed < part:
                 first = self.fed == 0
@@ -85,10 +83,6 @@ class SharedTails:
                 self.cache.settle(fineness)
         if fineness != self.cache.fineness:
             self.cache.settle(fineness)
-
-    def empty(self) -> Cache:
-        """A cache that keeps the light of the layer ``caustic`` apart, where there is such a layer."""
-        return Cache(schedule.fineness(0), 2 if self.plan.caustic else 1)
 
     def feed(self, sensor: mi.Sensor, seed: int, pixels: int, n: int) -> float:
         """Has so many paths feed the cache; returns the share of them that come by a place to end."""
@@ -112,6 +106,5 @@ def paths(view, plan: Plan, known: Known, camera: CameraSamples) -> tuple[mi.UIn
     """How many records each path has, and these: place, and light of each sort over reflectance, RGB."""
     ray, importance, _ = camera.rays()
     count, records = feed(view, plan, known, camera.random.clone(), (ray, importance))
-    return count, [
-        [*r.place.p, r.place.code, r.place.level, *(each for L in r.L for each in mi.Color3f(L) / r.ρ)] for r in records
-    ]
+    colours = ((each for L in r.L for each in mi.Color3f(L) / r.ρ) for r in records)
+    return count, [[*r.place.p, r.place.code, r.place.level, *its] for r, its in zip(records, colours, strict=True)]

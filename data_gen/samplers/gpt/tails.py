@@ -29,9 +29,7 @@ from data_gen.paths.mis import gradient_weight
 from data_gen.paths.walk import UNLIMITED
 from data_gen.samplers.gpt.base_path import Path, base_step, begin
 from data_gen.samplers.gpt.plan import Plan
-from data_gen.tails.cache import Known
-from data_gen.tails.cells import Place, Trail, place_of
-from data_gen.tails.schedule import NEAR
+from data_gen.tails.cache import NEAR, Known, Place, Trail, place_of
 
 # Records that a path may have
 RECORDS = 3
@@ -82,7 +80,6 @@ class Record:
     L: list[mi.Spectrum]
 
     def find(self, light: mi.Spectrum, late: mi.Bool) -> None:
-        """Adds what the path has found, which is ``late`` or not."""
         parts = caustic.split(late, self.T * light) if len(self.L) > 1 else (self.T * light,)
         self.L = [L + part for L, part in zip(self.L, parts, strict=True)]
 

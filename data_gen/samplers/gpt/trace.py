@@ -13,7 +13,7 @@ from data_gen.samplers.gpt.manifold_shift import Chain
 from data_gen.samplers.gpt.offset_path import Offset, next_steps, start
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.gpt.tails import end
-from data_gen.tails.cells import Trail
+from data_gen.tails.cache import Trail
 
 
 @dataclass
@@ -70,7 +70,6 @@ def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=Non
 
 
 def go_on(scene, plan: Plan, random, path: Path, so_far: Traced, *, known, first=False) -> tuple[Path, Traced]:
-    """One step of all paths."""
     # The base path first: an offset path can only join a vertex that is known.
     step, path = base_step(scene, plan, random, path, so_far.offsets)
     # Two techniques, two terms: they are weighted by m against each other, and shifted separately.
@@ -88,7 +87,6 @@ def go_on(scene, plan: Plan, random, path: Path, so_far: Traced, *, known, first
 
 @dr.syntax
 def walk(scene, plan: Plan, random, path: Path, so_far: Traced, known) -> Traced:
-    """All that is left of all paths."""
     active = path.goes_on(plan, so_far.offsets)
     while dr.hint(active, label="gpt", exclude=[known]):
         path, so_far = go_on(scene, plan, random, path, so_far, known=known)

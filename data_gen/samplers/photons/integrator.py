@@ -12,11 +12,10 @@ import mitsuba as mi
 from data_gen.passes import SamplePass
 from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.light_ends import LightEnds, LightRay
+from data_gen.paths.light_ends import LightEnds, LightRay, World
 from data_gen.paths.lights import visible
 from data_gen.paths.streams import light_streams
 from data_gen.paths.vertex import Materials
-from data_gen.paths.world import World
 from data_gen.samplers.common import GradientIntegrator
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.radius import pixel_width, shrunk
@@ -34,8 +33,6 @@ GRID_BYTES = VERTICES_PER_PATH * (3 + 3 + 3) * 4
 
 @dataclass
 class Traced:
-    """A photon map of a pass."""
-
     photons: Any  # the record
     starts: LightRay  # the light's end of each light path
     paths: int  # light paths of the pass

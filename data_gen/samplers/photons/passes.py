@@ -12,7 +12,7 @@ from data_gen.film import GradientFilm
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.frozen import Frozen
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 
 
 @dataclass
@@ -45,24 +45,15 @@ class Passes:
 
 @dataclass
 class Start:
-    """Where camera paths start."""
-
     ray: mi.RayDifferential3f
     importance: mi.Spectrum
     random: Any  # the stream of their random numbers
 
 
-@dataclass
-class Begun:
-    """What a pass begins with."""
-
-    start: Start
-    features: dict  # layers of the film
-
-    @classmethod
-    def of(cls, passes: Passes, camera: CameraSamples) -> Begun:
-        ray, importance, _ = camera.rays()
-        random = camera.random.clone()
-        dr.eval(ray, importance)
-        layers = passes.frozen(features, passes.world.scene, camera.sensor, camera.random, ray)
-        return cls(Start(ray, importance, random), layers)
+def begun(passes: Passes, camera: CameraSamples) -> tuple[Start, dict]:
+    """Where the camera paths of a pass start, and the layers of their features."""
+    ray, importance, _ = camera.rays()
+    random = camera.random.clone()
+    dr.eval(ray, importance)
+    layers = passes.frozen(features, passes.world.scene, camera.sensor, camera.random, ray)
+    return Start(ray, importance, random), layers

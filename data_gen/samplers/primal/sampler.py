@@ -20,8 +20,8 @@ from data_gen.samplers.gpt.trace import trace
 from data_gen.samplers.registry import SAMPLERS
 from data_gen.samplers.shared import VOLUMETRIC
 from data_gen.scenes.facts import integrator_name
+from data_gen.scenes.lamps import Places
 from data_gen.scenes.load import reference_integrator
-from data_gen.scenes.places import Places
 from data_gen.tails.cache import Known
 
 
@@ -56,9 +56,8 @@ def our_radiance(view, plan: Plan, random, ray, medium, active, *, known: Known 
 def samples(scene, integrator, radiance, features: bool, camera: CameraSamples, known: Known | None = None) -> dict:
     """Layers: one sample of ``radiance``, and of features, for each camera sample.
 
-    Where something is ``known`` of a cache, ``radiance`` is given it.
-
-    Where ``features`` tell what is emission seen directly, that is the mean over a pixel's quarters.
+    Where something is ``known`` of a cache, ``radiance`` is given it. Where ``features`` tell what is emission seen
+    directly, that is the mean over a pixel's quarters.
     """
     ray, importance, _ = camera.rays()
     medium, all_lanes = camera.sensor.get_medium(), mi.Bool(True)

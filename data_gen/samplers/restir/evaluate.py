@@ -7,13 +7,13 @@ vertices that are replayed may be joined, and the one before rc must be connecta
 
 At its own place, by its own camera, E gives back the f that was recorded, to float32.
 
-A shadow ray tests occlusion, with its ends kept off surfaces by epsilons; a walk tests it by what its ray meets. Of
-90,000 paths in three scenes none differed. ``P`` and ``shape`` of a record belong to this scene: what was found in
-another is carried here first, see ``data_gen.samplers.restir.carry``.
+``P`` and ``shape`` of a record belong to this scene: what was found in another is carried here first, see
+``data_gen.samplers.restir.carry``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -25,9 +25,9 @@ from data_gen.paths.mis import mis_weight
 from data_gen.paths.vertex import SMOOTH, evaluate, seen_from
 from data_gen.samplers.gpt.base_path import light_mis
 from data_gen.samplers.gpt.plan import Plan
-from data_gen.samplers.restir.events import Numbers, draw, sample_event
-from data_gen.samplers.restir.record import HIT, LIGHT, RC_LIGHT, REPLAY, STUCK, Record, geometry_of
+from data_gen.samplers.restir.record import HIT, LIGHT, RC_LIGHT, REPLAY, STUCK, Record, gather, geometry_of
 from data_gen.samplers.restir.stage import Stage
+from data_gen.samplers.restir.walk import Numbers, draw, sample_event
 
 
 @dataclass
@@ -120,3 +120,56 @@ def _connected(
     shadow = dr.select(far, y.spawn_ray(d), to_rc)
     active &= dr.max(f) > 0
     return dr.select(active & ~scene.ray_test(shadow, active), f, 0), J, geometry
+
+
+# From lanes and the number of the end, 0 or 1: which record, at what place on the film, and whether there is one
+Request = Callable[["mi.UInt32", "mi.UInt32"], "tuple[mi.UInt32, mi.Point2f, mi.Bool]"]
+_NONE = 0xFFFFFFFF
+
+
+@dataclass
+class Requests:
+    """E of some of many ``lanes``, each at one place or, the second half, at two."""
+
+    slot: mi.UInt32
+    count: mi.UInt32
+    shifted: Shifted
+
+    def at(self, lane: mi.UInt32, active: bool | mi.Bool = True, end: int = 0) -> Shifted:
+        """What is known of these lanes; 0 with a Jacobian of 1 where nothing was asked for."""
+        slot = dr.gather(mi.UInt32, self.slot, dr.select(active, lane, 0))
+        asked, slot = (slot != _NONE) & active, slot + (self.count if end else 0)
+        f = dr.gather(mi.Spectrum, self.shifted.f, slot, asked)
+        J, geometry = (dr.gather(mi.Float, v, slot, asked) for v in (self.shifted.J, self.shifted.geometry))
+        return Shifted(f, dr.select(asked, J, 1), geometry)
+
+    def part(self, lane: mi.UInt32, active: bool | mi.Bool = True, end: int = 0) -> mi.Spectrum:
+        """f |J|."""
+        shifted = self.at(lane, active, end)
+        return shifted.f * shifted.J
+
+
+def evaluate_some(
+    evaluate: Callable[[Record, mi.Point2f, mi.Bool], Shifted],
+    pool: Record,
+    lanes: int,
+    ends: int,
+    active: mi.Bool,
+    request: Request,
+) -> Requests:
+    """E, which is ``evaluate``, of the ``active`` ones of so many requests to records of the ``pool``."""
+    slot = dr.full(mi.UInt32, _NONE, lanes)
+    index = dr.compress(active)
+    count = dr.width(index)
+    if not count:
+        none = dr.zeros(mi.Float, 1)
+        return Requests(slot, mi.UInt32(0), Shifted(dr.zeros(mi.Spectrum, 1), none + 1, none))
+    dr.scatter(slot, dr.arange(mi.UInt32, count), index)
+    each = dr.opaque(mi.UInt32, count)
+    number = dr.arange(mi.UInt32, count * ends)
+    lane, end = dr.gather(mi.UInt32, index, number % each), number // each
+    source, place, exists = request(lane, end)
+    record = gather(pool, source, exists)
+    shifted = evaluate(record, place, exists)
+    dr.eval(slot, shifted)
+    return Requests(slot, each, shifted)

@@ -39,15 +39,12 @@ import numpy as np
 from data_gen.passes import recording
 from data_gen.paths.camera import CameraSamples
 from data_gen.samplers.restir.carry import Carry
-from data_gen.samplers.restir.evaluate import evaluate_record
-from data_gen.samplers.restir.footprint import CORNERS, pair_motions
+from data_gen.samplers.restir.evaluate import Request, Requests, evaluate_record, evaluate_some
 from data_gen.samplers.restir.layout import RESERVOIRS, STEPS, Layout, across, step
 from data_gen.samplers.restir.merging import Evaluated, Merging, differences
-from data_gen.samplers.restir.pose import Pose
 from data_gen.samplers.restir.record import Record
-from data_gen.samplers.restir.requests import Request, Requests, evaluate_some
-from data_gen.samplers.restir.reservoir import Reservoir, confidence_after
-from data_gen.samplers.restir.stage import Stage, check
+from data_gen.samplers.restir.reservoir import CORNERS, Reservoir, confidence_after, pair_motions
+from data_gen.samplers.restir.stage import Pose, Stage, check
 from data_gen.samplers.restir.walk import Candidate, choices, walk
 
 
@@ -74,24 +71,14 @@ class History:
     see ``stage.check``.
     """
 
-    def __init__(
-        self,
-        stage: Stage,
-        seed: int,
-        chains: int = 1,
-        cap: float = 32,
-        pairs: bool = True,
-    ):
+    def __init__(self, stage: Stage, seed: int, chains: int = 1, cap: float = 32, pairs: bool = True):
         check(stage.plan)
         self.stage = self.before = stage
-        self.seed = seed
-        self.chains, self.cap, self.pairs = chains, cap, pairs
-        self.gradients = True
-        self.frames = 0
+        self.seed, self.chains, self.cap, self.pairs = seed, chains, cap, pairs
+        self.gradients, self.frames = True, 0
         self.kept: Reservoir | None = None
         self.pose: Pose | None = None
-        width, height = (int(n) for n in stage.sensor.film().crop_size())
-        self.size = (width, height)
+        self.size = width, height = tuple(int(n) for n in stage.sensor.film().crop_size())
         self.confidence = np.zeros((len(STEPS), height, width), np.float32)
 
     def next_frame(
@@ -112,10 +99,9 @@ class History:
         motions = pair_motions(np.zeros((height, width, 2)) if motion is None else motion, depth, STEPS.values())
         with recording():
             self.at = Layout(self.size, self.chains, RESERVOIRS if self.pairs else 1, motions, self.confidence)
-            camera = CameraSamples(self.stage.sensor, self.seed, self.chains, self.frames * self.chains)
-            sample = (
-                dr.opaque(mi.UInt32, self.frames * self.chains) + dr.arange(mi.UInt32, self.at.lanes) % self.at.chains
-            )
+            first = self.frames * self.chains
+            camera = CameraSamples(self.stage.sensor, self.seed, self.chains, first)
+            sample = dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, self.at.lanes) % self.at.chains
             choice = choices(self.seed, camera, sample)
             found = walk(self.stage, camera, sample, choice)
             u = [choice.next_1d() for _ in range(self.at.reservoirs)]
@@ -127,8 +113,7 @@ class History:
         return frame
 
     @property
-    def _ends(self) -> int:
-        """Pixels that a value is of."""
+    def _ends(self) -> int:  # pixels that a value is of
         return 2 if self.pairs else 1
 
     @contextmanager
@@ -187,9 +172,8 @@ class History:
         lane = dr.arange(mi.UInt32, 4 * self.at.lanes)
         i, where = place(lane)
         active = (dr.gather(mi.Float, W, i) > 0) & self.at.on_film(mi.Point2i(dr.floor(where)))
-        return self._of(
-            self.stage, record, 4 * self.at.lanes, 1, active, lambda lane, end: (*place(lane), mi.Bool(True))
-        )
+        request = lambda lane, end: (*place(lane), mi.Bool(True))  # noqa: E731
+        return self._of(self.stage, record, 4 * self.at.lanes, 1, active, request)
 
     def _of_kept(self, stage: Stage, kept: Reservoir, elsewhere: bool) -> Requests:
         """Each path that was kept, where the pixels that look for it have it now: 4 requests for each reservoir.

@@ -8,8 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.samplers.restir.footprint import CORNERS
-from data_gen.samplers.restir.reservoir import Reservoir
+from data_gen.samplers.restir.reservoir import CORNERS, Reservoir
 
 # What reservoirs are of, and of pairs the step to the second pixel. Reservoirs are numbered in the order 0 primal,
 # 1 dx+, 2 dx-, 3 dy+, 4 dy-.

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.samplers.restir.footprint import CORNERS
+from data_gen.samplers.restir.evaluate import Requests
 from data_gen.samplers.restir.layout import STEPS, Layout, step
-from data_gen.samplers.restir.record import gather, select
-from data_gen.samplers.restir.requests import Requests
-from data_gen.samplers.restir.reservoir import Reservoir, choose, difference, part, weigh, weight_of
+from data_gen.samplers.restir.record import gather
+from data_gen.samplers.restir.reservoir import CORNERS, Reservoir, choose, difference, part, weigh, weight_of
 from data_gen.samplers.restir.walk import Candidate
 
 
@@ -65,7 +64,7 @@ class Merging:
         if self.kept is not None:
             old = chosen >= candidates
             history = gather(self.kept.record, best.source, old).moved(best.place, best.geometry)
-            record = select(old, history, record)
+            record = dr.select(old, history, record)
         return Reservoir(record, best.side, best.value, weight_of(total, best.value))
 
     def _candidate(self, r: mi.UInt32, i: mi.UInt32, side: mi.UInt32) -> _Offer:

@@ -2,7 +2,7 @@ r"""A path in 80 bytes: all that is needed to find its counterpart in another pi
 
 A path is a prefix, a vertex *rc* where copies of the path reconnect to it, and what comes behind. The prefix is not
 stored but replayed: its random numbers belong to a pixel and a sample. rc is the first vertex that is joined to its
-predecessor: a smooth event between two connectable vertices, see ``data_gen.samplers.restir.events``. Each part has a
+predecessor: a smooth event between two connectable vertices, see ``data_gen.samplers.restir.walk``. Each part has a
 measure of its own, so that a shift has one Jacobian and not one at each vertex:
 
 | part | measure | Jacobian of a shift |
@@ -111,10 +111,6 @@ def geometry_of(normal: mi.Normal3f, at: mi.Point3f, origin: mi.Point3f) -> mi.F
     return dr.abs(dr.dot(normal, to)) * dr.rsqrt(squared) / squared
 
 
-def select(mask: mi.Bool, yes: Record, no: Record) -> Record:
-    return Record(**{f.name: dr.select(mask, getattr(yes, f.name), getattr(no, f.name)) for f in fields(Record)})
-
-
 def gather(record: Record, lanes: mi.UInt32, active: bool | mi.Bool = True) -> Record:
     """The records of these ``lanes``; zeros where not ``active``."""
     values = ((f.name, getattr(record, f.name)) for f in fields(Record))
@@ -122,7 +118,6 @@ def gather(record: Record, lanes: mi.UInt32, active: bool | mi.Bool = True) -> R
 
 
 def empty(lanes: int) -> Record:
-    """Records of no path."""
     types = (
         *(mi.UInt32, mi.UInt32, mi.Point2f, mi.UInt32, mi.Point3f, mi.ShapePtr),
         *(mi.UInt32, mi.Point2f, mi.Vector3f, mi.Spectrum, mi.Float, mi.Float),

@@ -90,9 +90,8 @@ class Restir:
     def _put(self, film: GradientFilm, frame: Frame) -> None:
         camera = frame.camera
         ray, importance, _ = camera.rays()
-        direct = importance * emission_seen(
-            self.stage.scene, reference_integrator(self.stage.scene), None, ray, mi.Bool(True)
-        )
+        integrator = reference_integrator(self.stage.scene)
+        direct = importance * emission_seen(self.stage.scene, integrator, None, ray, mi.Bool(True))
         film.put("primal", mi.Color3f(frame.primal + direct))
         film.put("direct", mi.Color3f(direct))
         for name in ("dx", "dy"):

@@ -1,33 +1,8 @@
 """The entries of samplers that were measured and lost."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from data_gen.samplers.gbdpt.about import SPLATTING_BYTES
 from data_gen.samplers.registry import Option, Sampler, register
 from data_gen.samplers.shared import CONNECTABLE, SURFACES, hidden_emitters, spectra
-
-if TYPE_CHECKING:
-    from data_gen.scenes.facts import Facts
-
-
-def _notes_on_tiles(facts: Facts) -> list[str]:
-    lines = [
-        f"transport: Mitsuba's '{facts.integrator}', paths are shared in tiles where materials are rough",
-        "noise: correlated within tiles, which denoisers of independent noise do not expect",
-    ]
-    if facts.mirrors:
-        lines.append("mirrors or clear glass: nothing is shared there, and gradients are as noisy as pixels")
-    return lines
-
-
-def _notes_on_chains(facts: Facts) -> list[str]:
-    return [
-        f"transport: Mitsuba's '{facts.integrator}', by chains of paths that change little by little",
-        "noise: correlated between pixels, which denoisers of independent noise do not expect",
-    ]
-
 
 register(
     Sampler(
@@ -36,7 +11,11 @@ register(
         "data_gen.samplers.studies.gpt_tiles",
         standing="study",
         refusals=(*SURFACES, spectra, hidden_emitters),
-        notes=_notes_on_tiles,
+        notes={
+            "transport": "paths are shared in tiles where materials are rough",
+            "noise": "correlated within tiles, which denoisers of independent noise do not expect",
+            "mirrors": "nothing is shared there, and gradients are as noisy as pixels",
+        },
         options={
             "tile": Option(2, "pixels along a side of a tile", choices=(2, 4)),
             "roughness_threshold": CONNECTABLE,
@@ -51,7 +30,10 @@ register(
         "data_gen.samplers.studies.gmlt.integrator",
         standing="study",
         refusals=SURFACES,
-        notes=_notes_on_chains,
+        notes={
+            "transport": "by chains of paths that change little by little",
+            "noise": "correlated between pixels, which denoisers of independent noise do not expect",
+        },
         batch=8,
         counts=True,
         lane_bytes=SPLATTING_BYTES,
@@ -64,9 +46,7 @@ register(
         "data_gen.samplers.studies.split",
         standing="study",
         refusals=(*SURFACES, hidden_emitters),
-        notes=lambda facts: [
-            f"transport: Mitsuba's '{facts.integrator}', split by the lobe of the first scattering event",
-        ],
+        notes={"transport": "split by the lobe of the first scattering event"},
         gradients=False,
     )
 )

@@ -14,9 +14,8 @@ the other pixels of the tile as well. So each of N pixels has N suffixes for its
 
 What ends at s_j, or at a lamp that was sampled there, needs only s_j (C1, q1, D1). What goes on from there needs also
 the direction that was sampled at s_j, whose density depends on where the path has come from (C2, q2, D2). Each path
-keeps its own MIS weights m of emitter against BSDF sampling: C is the contribution f m of one technique. Emitters are
-sampled at x_i by the numbers of all pixels of the tile. The density is the same everywhere, so D is the number of
-pixels.
+keeps its own MIS weights m: C is the contribution f m of one technique. Emitters are sampled at x_i by the numbers of
+all pixels of the tile, all with one density: D is the number of pixels.
 
 A difference across the border of two tiles has only the suffixes of its two pixels, as in ``gpt``. The grid of tiles
 moves by a pixel from sample to sample, so that each pair of pixels is in one tile in its turn. Both are unbiased,
@@ -56,24 +55,13 @@ _LANE_BYTES, _CONNECTION_BYTES = 272, 32
 class GPTTiles(GradientIntegrator):
     """Gradient-domain path tracing with path reuse in tiles, for surfaces.
 
-    Plugin ``gpt_tiles``. Parameters, the first two as for Mitsuba's ``path``:
-
-    ``max_depth``            default -1: no limit
-    ``rr_depth``             5, and from the third vertex on at the earliest
-    ``tile``                 2, pixels along a side of a tile; or 4
-    ``roughness_threshold``  0.05, the microfacet roughness above which materials are connectable
-
-    The noise of pixels of a tile is correlated, for they share their paths; variances are of each pixel over its
-    samples, and do not say so. Not handled: media (they are not seen), hidden emitters, polarised and spectral
-    variants; for the last three rendering raises NgptError, as for other sides of a tile.
+    Plugin ``gpt_tiles``, with ``max_depth`` and ``rr_depth`` (from the third vertex on at the earliest) of Mitsuba's
+    ``path``, ``tile`` and ``roughness_threshold``. The noise of pixels of a tile is correlated, for they share their
+    paths; variances are of each pixel over its samples, and do not say so. Not handled: media (they are not seen),
+    hidden emitters, polarised and spectral variants; for the last three rendering raises NgptError.
     """
 
-    def __init__(self, props: mi.Properties):
-        super().__init__(props)
-        self.tile, self.roughness_threshold = self.options["tile"], self.options["roughness_threshold"]
-
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        """Only the primal estimate."""
         L, Le, _ = trace(scene, self.limits, sampler, ray, mi.Spectrum(1), [])
         return L + Le, mi.Bool(True), []
 
@@ -85,8 +73,8 @@ class Tiles:
     """Takes the samples of a pass; ``lane_bytes`` grows with the tile."""
 
     def __init__(self, integrator: GPTTiles, scene: mi.Scene):
-        self.integrator, self.scene, self.side = integrator, scene, integrator.tile
-        self.materials = Materials(scene, integrator.roughness_threshold)
+        self.integrator, self.scene, self.side = integrator, scene, integrator.options["tile"]
+        self.materials = Materials(scene, integrator.options["roughness_threshold"])
         self.lane_bytes = _LANE_BYTES + _CONNECTION_BYTES * self.side**2
 
     def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
@@ -123,12 +111,8 @@ class Tiles:
 
     def trace(self, camera: CameraSamples) -> tuple[mi.Spectrum, Paths]:
         """The layer ``direct``, and the path of each pixel: its first vertex, its suffix, and what it is worth here."""
-        scene, materials, random, limit = (
-            self.scene,
-            self.materials,
-            camera.random.clone(),
-            self.integrator.limits.max_depth,
-        )
+        scene, materials, random = self.scene, self.materials, camera.random.clone()
+        limit = self.integrator.limits.max_depth
         ray, importance, _ = camera.rays()
         ray = mi.Ray3f(ray)
         hit = scene.ray_intersect_preliminary(ray, coherent=True)
@@ -234,8 +218,6 @@ class Suffix:
     R: mi.Spectrum  # all other radiance that comes from there
 
     def at(self, lanes: mi.UInt32, active: mi.Bool) -> Suffix:
-        """The suffixes of other lanes."""
-
         def taken(value: Any) -> Any:
             return dr.gather(type(value), value, lanes, active) if dr.width(value) > 1 else value
 
@@ -254,8 +236,6 @@ class Connection:
 
 @dataclass
 class Paths:
-    """One path of each pixel."""
-
     hit: mi.PreliminaryIntersection3f  # its first vertex
     lives: mi.Bool  # whether it has one
     suffix: Suffix

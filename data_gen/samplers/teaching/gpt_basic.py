@@ -37,10 +37,7 @@ class GPTBasic(GradientIntegrator):
     """Gradient-domain path tracing by random sequence replay, around any Mitsuba integrator that samples radiance.
 
     Plugin ``gpt_basic``. Its only parameter is a nested integrator (default: ``path``), which decides what transport
-    is rendered; ``path`` and ``volpath`` are the usual ones.
-
-    Not meant for production: shifted paths part for good at the first reflection that differs. This makes gradients
-    noisier than with a shift that reconnects.
+    is rendered. Not meant for production: shifted paths part for good at the first reflection that differs.
     """
 
     nested = True

@@ -3,19 +3,8 @@ r"""The gradient-domain path tracer to be read: ``gpt`` where every shift is a r
 It renders scenes whose materials all scatter widely. There an offset path always goes straight from its own first
 vertex to the second vertex of its base path, so that the first two steps can be written down one after the other. What
 ``gpt`` does beyond that (replay, half-vectors, ghosts, shared emitters, kernels cut to a scene) is left out. Functions
-and symbols are as in ``data_gen.samplers.gpt``, to be read side by side:
-
-    x, y              base path, offset path y = T(x); x1 is the base path's next vertex
-    L, Le             radiance of the base path without, and of only, the emission that the camera sees directly
-    β, β'             throughput f |J| / p of either path, both divided by the density of the *base* path
-    J                 |dT/dx|, the Jacobian of the shift
-    p, p'             densities of BSDF sampling, in solid angle
-    r                 p(y) |J| / p(x), the product of the ratios of each step (survey, eq. 17); 0 once rejected
-    w                 1 / (1 + r): see data_gen.paths.mis.gradient_weight()
-    m                 MIS weight of emitter against BSDF sampling, each path's own
-    Δ                 gradient sample 2 w (C(y) |J| - C(x)) / p(x) (survey, eq. 4 and 16), the sum over all lengths of
-                      paths and over the two techniques, which are shifted separately: C is the contribution f m of one
-    a                 once a path is settled, all that follows in Δ is a times the radiance R that reaches the base path
+and symbols (x, y, L, Le, β, J, p, r, w, m, Δ, a) are as in ``data_gen.samplers.gpt.integrator``, to be read side by
+side. R is the radiance that reaches a settled path, and r is 0 once a path is rejected.
 
 An offset path is *apart* from its base path at the first vertex, *joined* to it at the second (it shares the vertex,
 but arrives there from elsewhere), and *settled* from the third on, where both are one path. A rejected one needs no
@@ -59,7 +48,6 @@ class GPTSimple(GradientIntegrator):
     """
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        """Only the primal estimate."""
         L, Le, _ = trace(scene, self.limits, sampler, ray, mi.Spectrum(1), [])
         return L + Le, mi.Bool(True), []
 

@@ -1,22 +1,13 @@
 r"""Vertex connection and merging: ``bdpt`` and ``ppm`` in one, and every path of light under one weight.
 
-Connections find light from lamps and over rough surfaces; photons find what comes through glass and is seen in a mirror
-or through glass. Each fails where the other does well, and a scene does not show which one it needs. Here both render
-all light, and each path counts for each of them by the balance heuristic: by how likely it is found so.
-
     s, t        vertices of a path that come from the light, and from the camera
     z, y        vertices of the camera path and of light paths
     r, η        radius of a pass, and π r² N; N: light paths of the pass
 
 A pass has one camera sample and one light path for each pixel. Light paths are traced once: their vertices are
 connected to the camera (splats), kept in a map, connected to the camera path of the same sample (one of them,
-``bdpt.choice``), and gathered at all camera paths, within the radius, where materials scatter widely. The radius
-shrinks from pass to pass as in ``ppm``.
-
-Photons are gathered only where light comes from mirrors, clear glass or holes. The papers gather all; but where it
-comes from a surface that scatters, a connection to that one finds the path without any blur.
-
-Merging finds paths of up to ``joined_depth`` edges, like connections; longer ones come only from the camera.
+``bdpt.camera_path``), and gathered at all camera paths, within the radius, where materials scatter widely. Only those
+that light reaches from mirrors, clear glass or holes are gathered (docs/samplers/photons.md).
 
 [Georgiev et al. 2012, "Light Transport Simulation with Vertex Connection and Merging"; Hachisuka et al. 2012, "A Path
 Space Extension for Robust Light Transport Simulation"]
@@ -36,15 +27,13 @@ from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.eye import Sight
 from data_gen.paths.features import features
-from data_gen.paths.light_ends import LightEnds
+from data_gen.paths.light_ends import LightEnds, World
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials
-from data_gen.paths.world import World
 from data_gen.samplers.bdpt.camera_path import camera_path
 from data_gen.samplers.bdpt.integrator import BDPT, Splatter
 from data_gen.samplers.bdpt.light_path import light_path
-from data_gen.samplers.photons.map.edges import number_of
-from data_gen.samplers.photons.map.radius import pixel_width, shrunk
+from data_gen.samplers.photons.map.radius import number_of, pixel_width, shrunk
 from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.vcm.merging import VERTEX_BYTES, Keeper, Map, Merging, Photons, eta
 
@@ -55,32 +44,17 @@ SAMPLE_BYTES = 1536
 class VCM(BDPT):
     """Vertex connection and merging, for surfaces; no gradients.
 
-    Plugin ``vcm``. Parameters, the first three as for Mitsuba's ``path``:
-
-    ``max_depth``            default -1: no limit
-    ``rr_depth``             5
-    ``hide_emitters``        false
-    ``joined_depth``         17, the number of edges up to which paths are found from both ends
-    ``radius``               2, of the first pass, in pixels where the camera sees something (the median)
-    ``roughness_threshold``  0.05, the microfacet roughness above which photons are gathered at a material
-
-    Biased, and consistent, as ``ppm``, but only where light comes through glass or by mirrors.
-
-    Not handled: media, polarised and spectral variants, cameras that are neither perspective nor thin lenses, emitters
-    other than areas, points, spots and those infinitely far away. Rendering raises NgptError for them.
+    Plugin ``vcm``, with the parameters of Mitsuba's ``path`` and the options of its entry. Biased, and consistent, as
+    ``ppm``, but only where light comes through glass or by mirrors. Not handled: media, polarised and spectral
+    variants, and what ``bdpt`` does not handle. Rendering raises NgptError for them.
     """
 
     # What becomes of light paths that end at the camera
     splatter = Splatter
     sample_bytes = SAMPLE_BYTES
 
-    def __init__(self, props: mi.Properties):
-        super().__init__(props)
-        self.radius, self.threshold = self.options["radius"], self.options["roughness_threshold"]
-
     @property
     def vertices(self) -> int:
-        """The most that are kept of a light path."""
         return max(self.longest - 1, 0)
 
     @property
@@ -97,7 +71,7 @@ class VCM(BDPT):
         return f", or no more than -O joined_depth={fits}" if fits else ""
 
     def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
-        world = World(scene, LightEnds(scene, self.name), Materials(scene, self.threshold))
+        world = World(scene, LightEnds(scene, self.name), Materials(scene, self.options["roughness_threshold"]))
         return Passes(self, world, pixel_width(scene, sensor))
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
@@ -119,7 +93,7 @@ class VCM(BDPT):
     ) -> tuple[Photons, Sight, Any]:
         """The light paths of a pass, whose ends at the camera are splatted: their vertices as photons, the
         ``sight`` with random numbers to go on by, and the splatter's state."""
-        n, radius = dr.width(sight.ray), self.radius * passes.width * shrunk(camera.first)
+        n, radius = dr.width(sight.ray), self.options["radius"] * passes.width * shrunk(camera.first)
         η, empty = dr.opaque(mi.Float, eta(radius, n)), Map.empty(n, self.vertices)
         kept, numbers, state, sums = passes.frozen(self.light_paths, passes.world, sight, η, empty, sums=splats.zeros)
         dr.eval(kept, numbers, state, sums)

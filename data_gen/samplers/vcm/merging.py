@@ -19,9 +19,9 @@ from data_gen.samplers.bdpt.light_path import LightPath, Seen, Visitor
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.plan import Plan
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, evaluate, record_class
-from data_gen.samplers.photons.map.edges import spread
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.photon import Photon, faces
+from data_gen.samplers.photons.map.radius import spread
+from data_gen.samplers.photons.map.vertices import Photon, faces
 
 # Bytes of a vertex: 23 words of a record and whether it is a photon, and 12 words of a grid that is made.
 VERTEX_BYTES = (23 + 1 + 12) * 4
@@ -49,7 +49,6 @@ class Map:
         return found
 
     def paths(self) -> LightPath:
-        """Each lane's own light path."""
         return LightPath(Reader(self), self.count)
 
 
@@ -60,7 +59,6 @@ class Reader:
         self.kept = kept
 
     def read(self, i: mi.UInt32):
-        """The record of vertex ``i``."""
         vertices, place = self.kept.vertices, self.kept.first + i
         return type(vertices)(*(dr.gather(type(v), v, place) for v in _values(vertices)))
 

@@ -56,6 +56,10 @@ def inside(element: xml.Element, *children: xml.Element) -> xml.Element:
     return element
 
 
+def two_sided(bsdf: xml.Element) -> xml.Element:
+    return inside(plugin("bsdf", "twosided"), bsdf)
+
+
 class Palette:
     """The materials of one scene. ``save(image, raw)`` stores a picture and returns its file name."""
 
@@ -74,21 +78,16 @@ class Palette:
         return float(np.exp(self.rng.uniform(np.log(low), np.log(high))))
 
     def _matte(self) -> xml.Element:
-        diffuse = inside(plugin("bsdf", "diffuse"), self.picture("reflectance"))
-        return inside(plugin("bsdf", "twosided"), diffuse)
+        return two_sided(inside(plugin("bsdf", "diffuse"), self.picture("reflectance")))
 
     def _paper(self) -> xml.Element:
         image = random_picture(self.rng, ("text", "blots", "dots", "stripes"), 0.03, 0.9)
-        diffuse = inside(plugin("bsdf", "diffuse"), self.picture("reflectance", image))
-        return inside(plugin("bsdf", "twosided"), diffuse)
-
-    def _coat(self) -> xml.Element:
-        names = ("wood", "wood", "noise", "marble", "checks", "bricks")
-        coat = plugin("bsdf", "roughplastic", alpha=self._roughness(0.04, 0.4), distribution="ggx", nonlinear=True)
-        return inside(coat, self.picture("diffuse_reflectance", random_picture(self.rng, names)))
+        return two_sided(inside(plugin("bsdf", "diffuse"), self.picture("reflectance", image)))
 
     def _varnish(self) -> xml.Element:
-        return inside(plugin("bsdf", "twosided"), self._coat())
+        names = ("wood", "wood", "noise", "marble", "checks", "bricks")
+        coat = plugin("bsdf", "roughplastic", alpha=self._roughness(0.04, 0.4), distribution="ggx", nonlinear=True)
+        return two_sided(inside(coat, self.picture("diffuse_reflectance", random_picture(self.rng, names))))
 
     def _bump(self) -> xml.Element:
         name = str(self.rng.choice(["noise", "weave", "bricks", "dots"]))
@@ -97,43 +96,32 @@ class Palette:
         bump = plugin("bsdf", "bumpmap", scale=0.3)
         bump.append(self.picture("arbitrary", self.rng.uniform(0.15, 1) * relief, raw=True))
         # Not a coat: Mitsuba's roughplastic is NaN where the tilted frame leaves a direction below the horizon.
-        return inside(plugin("bsdf", "twosided"), inside(bump, self._disney()))
+        return two_sided(inside(bump, self._disney()))
 
     def _plastic(self) -> xml.Element:
-        plastic = inside(plugin("bsdf", "plastic", nonlinear=True), self.picture("diffuse_reflectance"))
-        return inside(plugin("bsdf", "twosided"), plastic)
+        return two_sided(inside(plugin("bsdf", "plastic", nonlinear=True), self.picture("diffuse_reflectance")))
 
     def _principled(self) -> xml.Element:
-        return inside(plugin("bsdf", "twosided"), self._disney())
+        return two_sided(self._disney())
 
     def _disney(self) -> xml.Element:
         # Not 0, which would leave the lobe out of the kernel.
-        metallic = 1.0 if self.rng.random() < 0.4 else 0.01
+        rng, metallic = self.rng, 1.0 if self.rng.random() < 0.4 else 0.01
         principled = plugin(
-            "bsdf",
-            "principled",
-            metallic=metallic,
-            specular=self.rng.uniform(0.2, 0.8),
-            clearcoat=self.rng.uniform(0.01, 1),
+            "bsdf", "principled", metallic=metallic, specular=rng.uniform(0.2, 0.8), clearcoat=rng.uniform(0.01, 1)
         )
-        low, high = sorted(np.sqrt(self.rng.uniform(0.02, 0.5, 2)))
+        low, high = sorted(np.sqrt(rng.uniform(0.02, 0.5, 2)))
         gloss = low + (high - low) * random_picture(self.rng, low=0, high=1).mean(axis=-1)
         principled.append(self.picture("base_color"))
         principled.append(self.picture("roughness", gloss, raw=True))
         return principled
 
     def _metal(self) -> xml.Element:
-        metal = plugin(
-            "bsdf",
-            "roughconductor",
-            material=str(self.rng.choice(METALS)),
-            alpha=self._roughness(0.02, 0.4),
-            distribution="ggx",
-        )
-        return inside(plugin("bsdf", "twosided"), metal)
+        material, alpha = str(self.rng.choice(METALS)), self._roughness(0.02, 0.4)
+        return two_sided(plugin("bsdf", "roughconductor", material=material, alpha=alpha, distribution="ggx"))
 
     def _mirror(self) -> xml.Element:
-        return inside(plugin("bsdf", "twosided"), plugin("bsdf", "conductor", material=str(self.rng.choice(METALS))))
+        return two_sided(plugin("bsdf", "conductor", material=str(self.rng.choice(METALS))))
 
     def _glass(self) -> xml.Element:
         return plugin("bsdf", "dielectric", int_ior=1.5)
@@ -149,4 +137,4 @@ class Palette:
         mask = plugin("bsdf", "mask")
         opacity = plugin("texture", "bitmap", "opacity", filename=self.save(leaf(), True), raw=True)
         diffuse = inside(plugin("bsdf", "diffuse"), self.picture("reflectance", image))
-        return inside(mask, opacity, inside(plugin("bsdf", "twosided"), diffuse))
+        return inside(mask, opacity, two_sided(diffuse))

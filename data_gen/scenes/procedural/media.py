@@ -53,9 +53,8 @@ def beams(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
         angle = rng.uniform(6, 22)
         power = np.exp(rng.uniform(np.log(8), np.log(60)))
         light = power / (2 * np.pi * (1 - np.cos(np.radians(angle))))
-        spot = plugin(
-            "emitter", "spot", cutoff_angle=angle, beam_width=0.8 * angle, intensity=light * colour(rng, 0.7, 1, 0.8)
-        )
+        intensity = light * colour(rng, 0.7, 1, 0.8)
+        spot = plugin("emitter", "spot", cutoff_angle=angle, beam_width=0.8 * angle, intensity=intensity)
         points = {"origin": [at[0], stage.height - 0.05, at[1]], "target": [target[0], 0, target[1]]}
         transform = xml.SubElement(spot, "transform", name="to_world")
         named = {key: ", ".join(f"{x:.6g}" for x in point) for key, point in points.items()}
@@ -111,12 +110,8 @@ def liquid(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
     return media
 
 
-KINDS: dict[str, Callable[[Stage, np.random.Generator, Path], Media]] = {
-    "fog": fog,
-    "beams": beams,
-    "smoke": smoke,
-    "liquid": liquid,
-}
+Maker = Callable[[Stage, np.random.Generator, Path], Media]
+KINDS: dict[str, Maker] = {made.__name__: made for made in (fog, beams, smoke, liquid)}
 
 
 def some_media(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:

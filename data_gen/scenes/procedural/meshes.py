@@ -35,7 +35,6 @@ class Mesh:
 
 
 def merge(meshes: list[Mesh]) -> Mesh:
-    """One mesh of all of them."""
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     return Mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
@@ -129,11 +128,9 @@ def sphere(radius: float, segments: int = 48) -> Mesh:
     return lathe(radius * profile, segments)
 
 
-def cylinder(radius: float, height: float, segments: int = 32, closed: bool = True) -> Mesh:
+def cylinder(radius: float, height: float, segments: int = 32) -> Mesh:
     """Stands on the ground; rims are doubled so that they stay sharp."""
     side = lathe([(radius, 0), (radius, height)], segments)
-    if not closed:
-        return side
     return merge([lathe([(0, 0), (radius, 0)], segments), side, lathe([(radius, height), (0, height)], segments)])
 
 

@@ -93,21 +93,8 @@ def _side(stage: Stage, start, end, height: float, windows: bool) -> None:
         frame += [box([0.03, tall, 0.04], [t * wide, 0, 0]) for t in (np.arange(bars) + 1) / (bars + 1) - 0.5]
         parts: list[things.Part] = [("wood", merge(frame))]
         if rng.random() < 0.35:
-            parts.append(
-                (
-                    "pane",
-                    quads(
-                        [
-                            [
-                                [-wide / 2, -tall / 2, 0],
-                                [wide / 2, -tall / 2, 0],
-                                [wide / 2, tall / 2, 0],
-                                [-wide / 2, tall / 2, 0],
-                            ]
-                        ]
-                    ),
-                )
-            )
+            x, y = wide / 2, tall / 2
+            parts.append(("pane", quads([[[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]])))
         if blinds:
             slats = [box([wide, 0.004, 0.04], [0, y, 0.08]) for y in np.arange(-tall / 2, tall / 2, 0.05)]
             parts.append(("wood", merge(slats)))
@@ -210,6 +197,7 @@ def make_scene(seed: int | tuple[int, ...], folder: Path, shares: Mapping[str, f
         # Far below, where nobody looks: what holds the place of a material that this scene has no use for.
         mesh = merge(stage.meshes.get(slot, [box([0.01] * 3, [0, -50, 0])]))
         root.append(_shape(folder, slot, mesh, palette.material(slot)))
+    black = plugin("bsdf", "diffuse", reflectance=(0.0, 0.0, 0.0))
     if "lamp" in stage.meshes:
         lamps = merge(stage.meshes["lamp"])
         power = np.exp(rng.uniform(np.log(10), np.log(250)))
@@ -217,12 +205,10 @@ def make_scene(seed: int | tuple[int, ...], folder: Path, shares: Mapping[str, f
         # Always two emitters: a single one would need a different kernel.
         middle = len(stage.meshes["lamp"][0].faces) if len(stage.meshes["lamp"]) > 1 else len(lamps.faces) // 2
         for name, part in (("lamp0", np.s_[:middle]), ("lamp1", np.s_[middle:])):
-            black = plugin("bsdf", "diffuse", reflectance=(0.0, 0.0, 0.0))
             shape = _shape(folder, name, replace(lamps, faces=lamps.faces[part]), black)
             tint = colour(rng, 0.75, 1, 0.5)
             root.append(inside(shape, plugin("emitter", "area", radiance=light * tint)))
     for i, lamp in enumerate(bulbs):
-        black = plugin("bsdf", "diffuse", reflectance=(0.0, 0.0, 0.0))
         shape = _shape(folder, f"bulb{i}", lamp.mesh, black)
         root.append(inside(shape, plugin("emitter", "area", radiance=lamp.radiance)))
     root.extend(media.elements)

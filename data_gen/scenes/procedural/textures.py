@@ -100,15 +100,7 @@ def blots(rng: np.random.Generator) -> np.ndarray:
 
 PATTERNS: dict[str, Callable[[np.random.Generator], np.ndarray]] = {
     "noise": lambda rng: noise(rng, rng.uniform(0.4, 1.8)),
-    "marble": marble,
-    "wood": wood,
-    "bricks": bricks,
-    "checks": checks,
-    "stripes": stripes,
-    "weave": weave,
-    "dots": dots,
-    "text": text,
-    "blots": blots,
+    **{make.__name__: make for make in (marble, wood, bricks, checks, stripes, weave, dots, text, blots)},
 }
 
 
@@ -164,9 +156,8 @@ def sky(rng: np.random.Generator) -> np.ndarray:
     if rng.random() < 0.75:
         height_of_sun = rng.uniform(0.05, 0.35) if evening else rng.uniform(0.3, 1.3)
         direction = rng.uniform(0, 2 * np.pi)
-        cosine = np.sin(elevation) * np.sin(height_of_sun) + np.cos(elevation) * np.cos(height_of_sun) * np.cos(
-            azimuth - direction
-        )
+        away = np.cos(azimuth - direction)
+        cosine = np.sin(elevation) * np.sin(height_of_sun) + np.cos(elevation) * np.cos(height_of_sun) * away
         radius = rng.uniform(0.05, 0.2)
         disk = cosine > np.cos(radius)
         power = rng.uniform(0.3, 3) / (np.pi * radius**2)

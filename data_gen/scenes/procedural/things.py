@@ -21,6 +21,7 @@ from data_gen.scenes.procedural.meshes import (
     rotation,
     scattered_quads,
     sphere,
+    surface,
     torus,
 )
 
@@ -125,9 +126,8 @@ def table(rng: np.random.Generator) -> list[Part]:
 
 def chair(rng: np.random.Generator) -> list[Part]:
     height, width = rng.uniform(0.4, 0.5), rng.uniform(0.38, 0.5)
-    legs = [
-        box([0.035, height, 0.035], [i * width / 2.3, height / 2, j * width / 2.3]) for i in (-1, 1) for j in (-1, 1)
-    ]
+    corners = [(i * width / 2.3, j * width / 2.3) for i in (-1, 1) for j in (-1, 1)]
+    legs = [box([0.035, height, 0.035], [x, height / 2, z]) for x, z in corners]
     bars = [box([0.03, 0.5, 0.02], [x, height + 0.25, -width / 2.2]) for x in np.linspace(-0.45, 0.45, 6) * width]
     bars.append(box([width, 0.06, 0.03], [0, height + 0.52, -width / 2.2]))
     seat = box([width, rng.uniform(0.03, 0.1), width], [0, height, 0])
@@ -236,13 +236,59 @@ def picture(rng: np.random.Generator, width: float, height: float) -> list[Part]
 
 
 LARGE: dict[str, Callable[[np.random.Generator], list[Part]]] = {
-    "table": table,
-    "chair": chair,
-    "sofa": sofa,
-    "shelf": shelf,
-    "plant": plant,
-    "stairs": stairs,
-    "screen": screen,
-    "column": column,
-    "sculpture": sculpture,
+    make.__name__: make for make in (table, chair, sofa, shelf, plant, stairs, screen, column, sculpture)
 }
+
+
+SIDES = 4
+
+
+def tube(points: np.ndarray, radius: float, taper: float = 1.0) -> Mesh:
+    """A tube of ``radius`` along ``points`` (n, 3), ``taper`` times as thick at its end as where it starts."""
+    along = np.gradient(points, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.cross(along, [0.31, 0.17, 0.93])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    up = np.cross(along, across)
+    angle = np.linspace(0, 2 * np.pi, SIDES + 1)[None, :, None]
+    ring = np.cos(angle) * across[:, None] + np.sin(angle) * up[:, None]
+    thickness = radius * np.linspace(1, taper, len(points))[:, None, None]
+    return surface(points[:, None] + thickness * ring)
+
+
+def wires(rng: np.random.Generator, area: tuple[float, float], height: float) -> list[Part]:
+    """Some wires that hang across the whole place, of 0.3 to 2 mm radius."""
+    strands = []
+    for _ in range(rng.integers(3, 12)):
+        a, b = rng.uniform(-0.5, 0.5, (2, 3)) * [area[0], 0.35 * height, area[1]] + [0, 0.7 * height, 0]
+        t = np.linspace(0, 1, 24)[:, None]
+        sag = rng.uniform(0.02, 0.3) * 4 * t * (1 - t)
+        strands.append(tube(a + t * (b - a) - sag * [0, 1, 0], rng.uniform(0.0003, 0.002)))
+    return [(str(rng.choice(["metal", "object", "fabric"])), merge(strands))]
+
+
+def tuft(rng: np.random.Generator) -> list[Part]:
+    """Grass, bristles or fur: hundreds of bent blades that grow out of a spot."""
+    count, length = rng.integers(150, 500), rng.uniform(0.08, 0.5)
+    t = np.linspace(0, 1, 6)[:, None]
+    blades = []
+    for _ in range(count):
+        foot = rng.normal(0, 0.35 * length, 2)
+        lean = 1.2 * foot + rng.normal(0, 0.3 * length, 2)
+        far = t**2 * lean + foot
+        rise = t * length * rng.uniform(0.6, 1)
+        blades.append(tube(np.hstack([far[:, :1], rise, far[:, 1:]]), rng.uniform(0.0004, 0.0015), 0.2))
+    return [(str(rng.choice(["object", "fabric", "wood"])), merge(blades))]
+
+
+def net(rng: np.random.Generator) -> list[Part]:
+    """A frame strung with threads: a sieve, a harp, a fence."""
+    width, height = rng.uniform(0.5, 1.4), rng.uniform(0.6, 1.8)
+    pitch, radius = rng.uniform(0.008, 0.04), rng.uniform(0.0003, 0.0015)
+    threads = [tube(np.array([[x, 0, 0], [x, height, 0]]), radius) for x in np.arange(-width / 2, width / 2, pitch)]
+    if rng.random() < 0.6:
+        level = np.arange(0, height, pitch)
+        threads += [tube(np.array([[-width / 2, y, 0], [width / 2, y, 0]]), radius) for y in level]
+    edge = [[-width / 2, 0, 0], [-width / 2, height, 0], [width / 2, height, 0], [width / 2, 0, 0]]
+    frame = [tube(np.array([edge[i], edge[(i + 1) % 4]], float), 0.012) for i in range(4)]
+    return [(str(rng.choice(["metal", "fabric", "object"])), merge(threads)), ("metal", merge(frame))]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_gen.scenes.procedural import strands
+from data_gen.scenes.procedural import things
 from data_gen.scenes.procedural.meshes import Mesh, box, cylinder, lathe, merge, sphere, torus
 from data_gen.scenes.procedural.stage import Stage
 from data_gen.scenes.procedural.textures import colour
@@ -75,12 +75,12 @@ def hair(stage: Stage) -> None:
     rng = stage.rng
     kinds = rng.permutation(["wires", "tuft", "net"])[: rng.integers(1, 4)]
     if "wires" in kinds:
-        stage.add(strands.wires(rng, stage.area, stage.height))
+        stage.add(things.wires(rng, stage.area, stage.height))
     if "tuft" in kinds:
         for _ in range(rng.integers(1, 4)):
-            stage.stand(strands.tuft(rng), stage.area)
+            stage.stand(things.tuft(rng), stage.area)
     if "net" in kinds:
-        stage.stand(strands.net(rng), stage.area)
+        stage.stand(things.net(rng), stage.area)
 
 
 def bulbs(stage: Stage, others: list[Lamp]) -> list[Lamp]:

@@ -17,10 +17,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.light_ends import World
 from data_gen.paths.mis import gradient_weight
 from data_gen.paths.vertex import SMOOTH, Materials, event_kind
 from data_gen.paths.walk import Sky, brightest, roulette
-from data_gen.paths.world import World
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.photons.passes import Start
 
@@ -94,7 +94,6 @@ class CameraPaths:
         return number >= self.limits.max_depth
 
     def begun(self, start: Level, random, rays: list) -> Level:
-        """The first level."""
         paths = [self.first(*ray) for ray in rays]
         for path in paths:
             path.hit = self.integrator.first_hit(self.world.scene, path.ray)
@@ -134,7 +133,6 @@ class CameraPaths:
     # ------------------------------ What they all share -----------------------------
 
     def first(self, ray, importance, inside) -> Path:
-        """A path before its first ray is traced."""
         ray, n = mi.Ray3f(ray), dr.width(ray)
         β = mi.Spectrum(importance) + dr.zeros(mi.Spectrum, n)
         # As wide as the ray, and not a constant

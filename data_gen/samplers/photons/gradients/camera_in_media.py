@@ -41,13 +41,11 @@ class Piece(Path):
         return self.hit.t
 
     def end(self, alive: mi.Bool) -> Path:
-        """The path where the piece ends."""
         β = self.β * dr.exp(-media.depth(self.σ, self.length()))
         return Path(self.ray, self.hit, β, alive, self.sky)
 
 
 def ended(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.PreliminaryIntersection3f:
-    """The ``hit`` of a ``ray``, or its end."""
     hit.t = dr.select(hit.is_valid(), hit.t, media.end_of(ray))
     return hit
 
@@ -109,7 +107,6 @@ class PathsByPieces(CameraPaths):
         return frozen(self.seen_directly, level.paths[0])
 
     def seen_directly(self, base: Piece) -> mi.Spectrum:
-        """Lamps as seen through media."""
         fog, none = self.world.fog, mi.UInt32(0)
         lamps = self.integrator.lamps_in_fog(self.world.scene, fog.media, mi.Ray3f(base.ray), fog.within, none)
         return base.β * lamps
@@ -132,5 +129,4 @@ class PathsByPieces(CameraPaths):
         return [piece.end(piece.alive & ~passes & ~self.goes_through(piece)) for piece in pieces]
 
     def goes_through(self, piece: Piece) -> mi.Bool:
-        """Whether the path goes straight on at the end of the piece."""
         return piece.alive & piece.hit.is_valid() & self.world.fog.media.passes(piece.hit.shape)

@@ -86,7 +86,6 @@ class PathsBySegments(CameraPaths):
         return self.of_lanes(level, flights, random, lanes)
 
     def flight(self, path: Path, segment: segments.Segment, channel) -> Flight:
-        """The ``path`` that goes on by that ``segment``."""
         β, place = path.β * self.world.fog.brought(segment, channel), segment.place
         return Flight(segment.ray, segment.hit, β, path.alive, path.sky, place.medium, place.scatters)
 
@@ -94,7 +93,6 @@ class PathsBySegments(CameraPaths):
         return frozen(self.seen_directly, mi.Ray3f(start.ray), start.importance)
 
     def seen_directly(self, ray: mi.Ray3f, importance) -> mi.Spectrum:
-        """Lamps as seen through media."""
         fog = self.world.fog
         return importance * self.integrator.lamps_in_fog(self.world.scene, fog.media, ray, fog.within, mi.UInt32(0))
 

@@ -23,18 +23,14 @@ import mitsuba as mi
 
 from data_gen.paths import collisions, media, segments
 from data_gen.paths.collisions import Collisions
-from data_gen.paths.light_ends import LightRay
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import LightRay, World
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
 from data_gen.samplers.photons.gradients import shift
-from data_gen.samplers.photons.map.photon import Photon, is_near
-from data_gen.samplers.photons.map.vertices import vertex_in_media_of, vertex_of
+from data_gen.samplers.photons.map.vertices import Photon, is_near, vertex_in_media_of, vertex_of
 
 
 @dataclass
 class LightPaths:
-    """What is known of where photons come from."""
-
     starts: LightRay  # the light's ends of all light paths
     photons: Any  # the map
 
@@ -137,23 +133,14 @@ def let_through(world: World, way: Way, active, target: mi.Point3f | None = None
     reach = mi.Float(dr.inf) if target is None else dr.norm(target - way.ray.o)
     fog, ray, through = world.fog, media.shortened(way.ray, reach), way.through
     trace = segments.next_surface(world.scene)
+    passes = fog.media.passes
     if through.nulls is not None:
+        how = {"channel": through.channel, "active": active, "target": target, "to_surface": target is None}
         τ, met, ray, medium, N, N_c = collisions.rescale(
-            fog.media.passes,
-            trace,
-            ray,
-            through.medium,
-            reach,
-            through.nulls,
-            channel=through.channel,
-            active=active,
-            target=target,
-            to_surface=target is None,
+            passes, trace, ray, through.medium, reach, through.nulls, **how
         )
     else:
-        τ, met, ray, medium = segments.cross(
-            fog.media.passes, trace, ray, through.medium, reach, active=active, target=target
-        )
+        τ, met, ray, medium = segments.cross(passes, trace, ray, through.medium, reach, active=active, target=target)
         N, N_c = 1, 1
     T, T_c = dr.exp(through.τ_c - τ) * N, dr.exp(through.τ_c - media.pick(τ, through.channel)) * N_c
     return Passage(T, T_c, met, ray, medium)
@@ -225,29 +212,25 @@ def redirected(world: World, paths: LightPaths, photon: Photon, foot, target, ac
 def known_of_media(world: World, photons, photon: Photon, origin) -> Through:
     """Media between the ``photon`` and the ``origin`` of its last edge."""
     b, fog, trace = dr.zeros(mi.SurfaceInteraction3f, dr.width(photon.p)), world.fog, segments.next_surface(world.scene)
-    b.p, b.n = photon.p, photon.n
+    b.p, b.n, passes = photon.p, photon.n, fog.media.passes
     back, medium, nulls = b.spawn_ray(-photon.d), photon.medium, None
     reach = dr.dot(back.o - origin, photon.d)
     if fog.media.grids:
         # Only the majorant's optical depth M of the way back: with no collision to place
         back, none = media.shortened(back, reach), mi.UInt32(0)
         steps = {"channel": photon.channel, "key": none, "scale": mi.Float(1), "most": none, "target": None}
-        τ, _, _, medium, M, _ = collisions.cross(fog.media.passes, trace, back, medium, reach, **steps, active=True)
+        τ, _, _, medium, M, _ = collisions.cross(passes, trace, back, medium, reach, **steps, active=True)
         key, n, N_c = (dr.gather(type(v), v, photon.place) for v in (photons.key, photons.nulls, photons.N_c))
         nulls = Collisions(key, n, M, N_c)
     elif not fog.media.boundaries:
         τ = media.depth(media.extinction(medium, back), reach)
     else:
         back = media.shortened(back, reach)
-        τ, _, _, medium = segments.cross(
-            fog.media.passes, trace, back, medium, reach, active=mi.Bool(True), target=None
-        )
+        τ, _, _, medium = segments.cross(passes, trace, back, medium, reach, active=mi.Bool(True), target=None)
     return Through(medium, media.pick(τ, photon.channel), photon.channel, nulls)
 
 
 def start_of(starts: LightRay, path: mi.UInt32, active) -> LightRay:
-    """The light's end of a light path."""
-
     def taken(value):
         return dr.gather(type(value), value, path, active)
 

@@ -11,13 +11,12 @@ import mitsuba as mi
 
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.light_ends import World
 from data_gen.paths.mis import gradient_weight
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.world import World
 from data_gen.samplers.photons.gradients.camera import Level
-from data_gen.samplers.photons.gradients.near import Near
-from data_gen.samplers.photons.gradients.pairs import Pairs, pieces
-from data_gen.samplers.photons.passes import Begun, Passes
+from data_gen.samplers.photons.gradients.pairs import Near, Pairs, pieces
+from data_gen.samplers.photons.passes import Passes, begun
 
 # Levels are joined until they have so many paths for each camera sample.
 LEVELS = 3
@@ -40,8 +39,8 @@ def gradient_pass(passes: Passes, camera: CameraSamples, film: GradientFilm, nea
     ``near`` (passes, photon map) yields what is ``Gathered`` of a map; ``pairs`` are in memory together for each camera
     sample.
     """
-    integrator, walk, frozen, begun = passes.integrator, passes.walk, passes.frozen, Begun.of(passes, camera)
-    start, values, n = begun.start, begun.features, dr.width(camera.pixel)
+    integrator, walk, frozen, n = passes.integrator, passes.walk, passes.frozen, dr.width(camera.pixel)
+    start, values = begun(passes, camera)
     shifted = [camera.rays(shift) for shift in SHIFTS.values()]
     rays = [(mi.Ray3f(start.ray), start.importance, mi.Bool(True))]
     rays += [(mi.Ray3f(ray), importance, inside) for ray, importance, inside in shifted]
@@ -107,9 +106,8 @@ def joined(passes: Passes, levels: list[Level]) -> Level:
     paths = [dr.empty(type(path), n) for path in levels[0].paths]
     all_of_it = [dr.empty(mi.UInt32, n), dr.empty(mi.UInt32, n), paths]
     for level in levels:
-        all_of_it = passes.frozen(
-            entered, all_of_it, [level.lanes, level.depth, level.paths], dr.opaque(mi.UInt32, low)
-        )
+        parts = [level.lanes, level.depth, level.paths]
+        all_of_it = passes.frozen(entered, all_of_it, parts, dr.opaque(mi.UInt32, low))
         dr.eval(all_of_it)
         low += dr.width(level.lanes)
     lanes, depth, paths = all_of_it
@@ -123,7 +121,6 @@ def entered(all_of_it: list, values: list, low: mi.UInt32) -> list:
 
 
 def add_to(sums: list, lanes: mi.UInt32, parts: list) -> None:
-    """Adds a level's parts to the sums of all camera samples."""
     for total, part in zip(sums, parts, strict=False):
         dr.scatter(total, dr.gather(type(total), total, lanes) + part, lanes)
     dr.eval(sums)
@@ -172,8 +169,6 @@ def differences(passes: Passes, near: Near, paths: list, longest: mi.UInt32, mos
 
 @dataclass
 class Found:
-    """What pairs bring."""
-
     C: mi.Spectrum  # to the base path
     Δ: list  # gradient samples, with the thing for its own copy; where it is not, with none
     shifts: mi.Float  # that the pair takes part in
@@ -181,7 +176,7 @@ class Found:
 
 
 def spread_out(near: Any, world: World, paths: list) -> list:
-    return near.spread(world, paths)
+    return [near.spread(world, path) for path in paths]
 
 
 def of_pairs(near: Near, world: World, pairs: Pairs, paths: list, longest: mi.UInt32) -> Found:

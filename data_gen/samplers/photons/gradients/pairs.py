@@ -3,18 +3,24 @@
 Shifts are done for pairs, all lanes at work; within the walk through the grid one lane in five would have a photon. The
 list is cut into pieces of a given length, and the sums over the pairs of a point are added up in their order: the same
 pairs give the same bits.
+
+A *thing* (a photon, a beam, a plane) is paired with what it is near to on a base path (a vertex, a piece of a ray), the
+*receiver* A. The neighbour's path has the corresponding receiver B. A thing near to both is its own copy. If a thing is
+near only to A, a copy is made near to B.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.frozen import call
+from data_gen.paths.light_ends import World
+from data_gen.samplers.photons.gradients.camera import Path
 from data_gen.samplers.photons.map.grid import Grid
 
 
@@ -49,8 +55,6 @@ class Receivers(Protocol):
 
 @dataclass
 class Points:
-    """Where photons are gathered near to."""
-
     p: mi.Point3f
 
     def each(self, grid: Grid, radius2: mi.Float, active: mi.Bool, visit, state: tuple) -> tuple:
@@ -62,8 +66,6 @@ class Points:
 
 @dataclass
 class Rays:
-    """Pieces of rays, which photons are gathered along."""
-
     ray: mi.Ray3f
     length: mi.Float
 
@@ -121,3 +123,31 @@ def piece(around: tuple, points: Receivers, active, places: tuple, window: tuple
     last = dr.minimum(first + count, begin + length)
     start = dr.maximum(first, begin)
     return Pairs(point, place, *(dr.select(inside, x - begin, 0) for x in (start, last)))
+
+
+class Near(Protocol):
+    """The things of a photon map. All its arrays are evaluated."""
+
+    grid: Grid | None  # in which things are found within ``radius2``; None where any may be near
+    radius2: mi.Float | None
+
+    def where(self, world: World, base: Path) -> tuple[Receivers, mi.Bool]:
+        """Where base paths receive light, for the grid; and which of them do."""
+
+    def receiver(self, world: World, paths: list, which: mi.UInt32 | None, index: mi.UInt32) -> Any:
+        """What receives light of each path ``index``; of the path of number ``which``, if there are some ``paths``."""
+
+    def thing(self, place: mi.UInt32) -> Any:
+        """The thing of that place in the list of the grid. It has ``depth``, the edges of its light path."""
+
+    def brought(self, thing: Any, A: Any, active: mi.Bool) -> tuple[mi.Spectrum, Any]:
+        """C, what it brings to the camera by A, 0 where it is not near; and where they meet."""
+
+    def shared(self, thing: Any, met: Any, B: Any, lit: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
+        """What it brings by B as its own copy; and whether a copy of another place is to be looked for.
+
+        ``met`` is where thing and A meet, ``lit`` whether it brings anything there.
+        """
+
+    def copied(self, world: World, thing: Any, A: Any, B: Any) -> tuple[mi.Spectrum, mi.Float]:
+        """What its copy brings by B, 0 where there is none, and r."""

@@ -68,7 +68,6 @@ class Grid:
             edge *= 1.25
 
     def linear(self, x: mi.UInt32, y: mi.UInt32, z: mi.UInt32) -> mi.UInt32:
-        """The number of a cell."""
         return x + self.n.x * (y + self.n.y * z)
 
     def row(self, p: mi.Point3f, k: mi.UInt32, active) -> tuple[mi.UInt32, mi.UInt32]:
@@ -137,21 +136,14 @@ class Grid:
             i = i + 1
             next_row = ~(i < end) & (k < last)
             begin, stop = self.row(center(k), k & 3, next_row)
-            return (
-                dr.select(next_row, k + 1, k),
-                dr.select(next_row, begin, i),
-                dr.select(next_row, stop, end),
-                state,
-            )
+            moves = ((k + 1, k), (begin, i), (stop, end))
+            return *(dr.select(next_row, new, old) for new, old in moves), state
 
         # A first step without a point: i = end, and so the first row is next.
         none = dr.zeros(mi.UInt32, dr.width(first))
-        return dr.while_loop(
-            (mi.UInt32(first), mi.UInt32(none), mi.UInt32(none), state),
-            lambda k, i, end, state: active & ((k < last) | (i < end)),
-            step,
-            label="gather",
-        )[3]
+        begun = (mi.UInt32(first), mi.UInt32(none), mi.UInt32(none), state)
+        goes_on = lambda k, i, end, state: active & ((k < last) | (i < end))  # noqa: E731
+        return dr.while_loop(begun, goes_on, step, label="gather")[3]
 
     def gather(self, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, value, total):
         """``total`` plus the sum of ``value`` (place in the list, near) over all points nearer to ``p`` than that.

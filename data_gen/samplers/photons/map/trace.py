@@ -18,11 +18,10 @@ import mitsuba as mi
 
 from data_gen.paths import media
 from data_gen.paths.frozen import call
-from data_gen.paths.light_ends import LightRay
+from data_gen.paths.light_ends import LightRay, World
 from data_gen.paths.segments import next_surface
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.paths.walk import UNLIMITED, roulette
-from data_gen.paths.world import World
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, context, light_sampled
 from data_gen.samplers.photons.map.vertices import at, put, vertices_class
 
@@ -208,6 +207,5 @@ def _walk(world: World, paths: Paths, random, depths: tuple, photons, places: tu
 
 
 def _enter(photons, values: dict, place: mi.UInt32, active) -> None:
-    """Enters some fields at these places of a map."""
     for name, value in values.items():
         dr.scatter(getattr(photons, name), value, place, active)

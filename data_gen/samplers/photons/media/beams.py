@@ -32,7 +32,7 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import collisions, media
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.trace import EDGE_BYTES, VERTICES_PER_PATH
@@ -236,7 +236,6 @@ class BEAMS(BRE):
     edges, map_bytes = True, BEAM_BYTES + PARTS * PART_BYTES
 
     def near(self, passes: Passes, traced: Traced) -> Iterator[Along]:
-        """Photons on surfaces, and beams, some parts of them at a time."""
         max_depth, fog = self.limits.max_depth, passes.world.fog
         on_surfaces: Gathering | None = Gathering(passes.world, traced, max_depth)
         for parts in parts_of(passes, traced, PARTS * traced.paths):
@@ -263,12 +262,10 @@ def parts_of(passes: Passes, traced: Traced, most: int) -> Iterator[Any]:
 
 
 def counted(world: World, photons, rate) -> mi.UInt32:
-    """How many parts each edge has."""
     none = mi.UInt32(0), mi.UInt32(0)
     return cut(world, photons, rate, dr.zeros(mi.UInt32, len(photons)), none, None)
 
 
 def entered(world: World, photons, rate, first: mi.UInt32, window: tuple, parts):
-    """The ``parts`` of these numbers."""
     cut(world, photons, rate, first, window, parts)
     return parts

@@ -26,9 +26,9 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.paths import collisions, media
+from data_gen.paths.light_ends import World
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.paths.walk import Sky, roulette
-from data_gen.paths.world import World
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, PhotonIntegrator, Traced
 from data_gen.samplers.photons.map.fog import Fog

@@ -22,15 +22,14 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera_in_media import PathsByPieces, Piece
 from data_gen.samplers.photons.gradients.copies import LightPaths, let_through, redirected
 from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, Gathered
 from data_gen.samplers.photons.integrator import Traced
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.photon import Photon
-from data_gen.samplers.photons.map.vertices import at
+from data_gen.samplers.photons.map.vertices import Photon, at
 from data_gen.samplers.photons.media.beams import BEAM_BYTES, PART_BYTES, AlongBeams, nearest, parts_of
 from data_gen.samplers.photons.media.gbre import PATHS_BYTES, Beside, beside_of, inside_of
 from data_gen.samplers.photons.passes import Passes
@@ -78,15 +77,15 @@ class Beam:
 
 
 @dataclass
-class RaysAmongBeams:
-    """Pieces of rays, which beams are gathered along."""
+class RaysAmong:
+    """Pieces of rays among things that each of them may be near to."""
 
     ray: mi.Ray3f
     length: mi.Float
-    beams: AlongBeams
+    things: Any  # beams or planes
 
-    def each(self, grid: Grid, radius2: mi.Float, active: mi.Bool, visit, state: tuple) -> tuple:
-        return self.beams.each(self.ray, self.length, active, visit, state)
+    def each(self, grid: Grid | None, radius2: mi.Float | None, active: mi.Bool, visit, state: tuple) -> tuple:
+        return self.things.each(self.ray, self.length, active, visit, state)
 
     def __len__(self) -> int:
         return dr.width(self.length)
@@ -101,16 +100,13 @@ class NearBeams:
     grid: Grid
     radius2: mi.Float
 
-    def where(self, world: World, base: Piece) -> tuple[RaysAmongBeams, mi.Bool]:
-        return RaysAmongBeams(mi.Ray3f(base.ray.o, base.ray.d), base.length(), self.beams), inside_of(base)
+    receiver = beside_of
 
-    def receiver(self, world: World, paths: list, which: mi.UInt32 | None, index: mi.UInt32) -> Beside:
-        return beside_of(paths, which, index)
+    def where(self, world: World, base: Piece) -> tuple[RaysAmong, mi.Bool]:
+        return RaysAmong(mi.Ray3f(base.ray.o, base.ray.d), base.length(), self.beams), inside_of(base)
 
     def thing(self, place: mi.UInt32) -> Beam:
-        j, parts = dr.gather(mi.UInt32, self.grid.index, place), self.beams.parts
-
-        part = at(parts, j)
+        part = at(self.beams.parts, dr.gather(mi.UInt32, self.grid.index, place))
         back = dr.dot(part.p - dr.gather(mi.Point3f, self.paths.photons.o, part.edge), part.d)
         return Beam(Line(part.p, part.d, back), part)
 
@@ -183,7 +179,6 @@ class GBEAMS(GPM):
     map_bytes, camera_bytes = BEAM_BYTES + PARTS * PART_BYTES, PATHS_BYTES + PAIRS * PAIR_BYTES
 
     def near(self, passes: Passes, traced: Traced) -> Iterator[Gathered]:
-        """Photons on surfaces, and beams, some parts of them at a time."""
         on_surfaces: OnSurfaces | None = OnSurfaces(traced)
         radius2 = dr.opaque(mi.Float, traced.radius(1) ** 2)
         for parts in parts_of(passes, traced, PARTS * traced.paths):

@@ -4,8 +4,7 @@ r"""Gradients of the beam radiance estimate: ``bre``, and each photon that is ga
     b, b'       a photon beside A and its copy beside B: light path and camera path together make the path and its copy
     t, t'       the distances along A and B to where they are
     C, C'       β T(t) f Φ / (π r² N) of either, both with the density of the photon's path
-    r           p' J / p of the copy
-    Δ           gradient sample, the sum of 2 w (C' - C) over all photons, w = 1 / (1 + r)
+    r, w, Δ     as in ``gpm``
 
 A photon that is beside both is its own copy: r = 1, and no ray is traced. One that is beside only A keeps its distance
 along the ray, and goes to its mirror image beside B: there A is further away than the radius. Between two rays from one
@@ -26,7 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera_in_media import PathsByPieces, Piece
 from data_gen.samplers.photons.gradients.copies import LightPaths, copy_in_medium
@@ -34,8 +33,7 @@ from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, G
 from data_gen.samplers.photons.gradients.pairs import Rays
 from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.photon import Photon, photon_of
-from data_gen.samplers.photons.map.vertices import in_media
+from data_gen.samplers.photons.map.vertices import Photon, in_media, photon_of
 from data_gen.samplers.photons.media.bre import BALL, seen_along
 from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.photons.surfaces.gpm import GPM, OnSurfaces
@@ -81,8 +79,8 @@ class Beside:
         return dr.select(active & dr.isfinite(dr.sum(L)), L, 0)
 
 
-def beside_of(pieces: list, which: mi.UInt32 | None, index: mi.UInt32) -> Beside:
-    """A piece of camera paths; of the path of number ``which``, if there is more than one."""
+def beside_of(near, world: World, pieces: list, which: mi.UInt32 | None, index: mi.UInt32) -> Beside:
+    """``Near.receiver``: a piece of camera paths; of the path of number ``which``, if there is more than one."""
     return Beside(*chosen(fields_of, pieces, which, index))
 
 
@@ -94,7 +92,6 @@ def fields_of(piece: Piece, index: mi.UInt32) -> tuple:
 
 
 def inside_of(base: Piece) -> mi.Bool:
-    """Whether a piece goes through a medium."""
     return base.alive & (base.medium != None)  # noqa: E711 - an array of pointers
 
 
@@ -145,6 +142,8 @@ def copy_beside(world: World, paths: LightPaths, photon: Photon, A, B, radius2: 
 class AlongPieces(InMedia):
     """``Near``: the photons of a map in media, beside rays."""
 
+    receiver = beside_of
+
     def __init__(self, traced: Traced):
         photons, radius = traced.photons, traced.radius()
         grid = Grid(photons.p, in_media(photons), BALL * radius)
@@ -153,9 +152,6 @@ class AlongPieces(InMedia):
 
     def where(self, world: World, base: Piece) -> tuple[Rays, mi.Bool]:
         return Rays(mi.Ray3f(base.ray.o, base.ray.d), base.length()), inside_of(base)
-
-    def receiver(self, world: World, paths: list, which: mi.UInt32 | None, index: mi.UInt32) -> Beside:
-        return beside_of(paths, which, index)
 
 
 class GBRE(GPM):

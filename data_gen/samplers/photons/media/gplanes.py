@@ -25,16 +25,15 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera_in_media import Piece
 from data_gen.samplers.photons.gradients.differences import Gathered
 from data_gen.samplers.photons.integrator import Traced
-from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.photon import Photon
 from data_gen.samplers.photons.map.trace import VERTICES_PER_PATH
+from data_gen.samplers.photons.map.vertices import Photon
 from data_gen.samplers.photons.media.bre import seen_along
-from data_gen.samplers.photons.media.gbeams import GBEAMS
+from data_gen.samplers.photons.media.gbeams import GBEAMS, RaysAmong
 from data_gen.samplers.photons.media.gbre import Beside, beside_of, inside_of
 from data_gen.samplers.photons.media.planes import (
     PLANE_BYTES,
@@ -49,21 +48,6 @@ from data_gen.samplers.photons.passes import Passes
 
 
 @dataclass
-class RaysAcrossPlanes:
-    """Pieces of rays, which planes are met by."""
-
-    ray: mi.Ray3f
-    length: mi.Float
-    planes: AcrossPlanes
-
-    def each(self, grid: Grid | None, radius2: mi.Float | None, active: mi.Bool, visit, state: tuple) -> tuple:
-        return self.planes.each(self.ray, self.length, active, visit, state)
-
-    def __len__(self) -> int:
-        return dr.width(self.length)
-
-
-@dataclass
 class NearPlanes:
     """``Near``: the planes of a map. Each ray may meet each plane: there is no grid and no radius."""
 
@@ -71,11 +55,10 @@ class NearPlanes:
     grid: None = None
     radius2: None = None
 
-    def where(self, world: World, base: Piece) -> tuple[RaysAcrossPlanes, mi.Bool]:
-        return RaysAcrossPlanes(mi.Ray3f(base.ray.o, base.ray.d), base.length(), self.planes), inside_of(base)
+    receiver = beside_of
 
-    def receiver(self, world: World, paths: list, which: mi.UInt32 | None, index: mi.UInt32) -> Beside:
-        return beside_of(paths, which, index)
+    def where(self, world: World, base: Piece) -> tuple[RaysAmong, mi.Bool]:
+        return RaysAmong(mi.Ray3f(base.ray.o, base.ray.d), base.length(), self.planes), inside_of(base)
 
     def thing(self, place: mi.UInt32) -> Any:
         return self.planes.plane(place)
@@ -127,6 +110,5 @@ class GPLANES(GBEAMS):
     map_bytes = GBEAMS.map_bytes + VERTICES_PER_PATH * PLANE_BYTES
 
     def near(self, passes: Passes, traced: Traced) -> Iterator[Gathered]:
-        """What ``gbeams`` has of other edges, and planes."""
         yield from super().near(passes, only_beams(traced))
         yield Gathered(None, NearPlanes(planes_of(passes, traced)))

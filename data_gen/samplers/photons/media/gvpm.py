@@ -3,8 +3,7 @@ r"""Gradients of photons in media: ``vpm``, and each photon that is gathered shi
     x, y        where a camera path scatters in a medium, and where the neighbouring pixel's path does
     b, b'       a photon in the ball around x and its copy in that around y
     C, C'       β f Φ / (4/3 π r³ N) of either, both with the density of the photon's path
-    r           p' J / p of the copy
-    Δ           gradient sample, the sum of 2 w (C' - C) over all photons, w = 1 / (1 + r)
+    r, w, Δ     as in ``gpm``
 
 A photon in both balls is its own copy: r = 1, and no ray is traced. A photon only in the ball around x goes to its
 mirror image in the plane between x and y, which is only in the ball around y. (Gruson et al. call both together the
@@ -25,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera_segments import Flight, PathsBySegments
 from data_gen.samplers.photons.gradients.copies import LightPaths
@@ -34,8 +33,7 @@ from data_gen.samplers.photons.gradients.pairs import Points
 from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.photon import Photon
-from data_gen.samplers.photons.map.vertices import in_media
+from data_gen.samplers.photons.map.vertices import Photon, in_media
 from data_gen.samplers.photons.media.bre import seen_along
 from data_gen.samplers.photons.media.gbre import PATHS_BYTES, InMedia
 from data_gen.samplers.photons.passes import Passes
@@ -73,11 +71,6 @@ class InBall:
         return dr.select(active & dr.isfinite(dr.sum(L)), L, 0)
 
 
-def ball_of(paths: list, which: mi.UInt32 | None, index: mi.UInt32) -> InBall:
-    """Where camera paths scatter; the path of number ``which``, if there is more than one."""
-    return InBall(*chosen(fields_of, paths, which, index))
-
-
 def fields_of(path: Flight, index: mi.UInt32) -> tuple:
     o, d = dr.gather(mi.Point3f, path.ray.o, index), dr.gather(mi.Vector3f, path.ray.d, index)
     known = (dr.gather(type(value), value, index) for value in (path.medium, path.β, path.alive & path.scatters))
@@ -98,7 +91,7 @@ class InBalls(InMedia):
         return Points(base.ray(base.hit.t)), base.alive & base.scatters
 
     def receiver(self, world: World, paths: list, which: mi.UInt32 | None, index: mi.UInt32) -> InBall:
-        return ball_of(paths, which, index)
+        return InBall(*chosen(fields_of, paths, which, index))
 
 
 class GVPM(GPM):

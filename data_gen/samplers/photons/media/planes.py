@@ -33,7 +33,7 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import media, segments
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.integrator import Traced
 from data_gen.samplers.photons.map.trace import VERTICES_PER_PATH
 from data_gen.samplers.photons.media.beams import BEAMS
@@ -87,8 +87,6 @@ def crossing(a, d, e, o, w) -> Crossing:
 
 @dataclass
 class AcrossPlanes:
-    """Photon planes, where rays meet them."""
-
     world: World
     planes: Any
     number: mi.UInt32
@@ -124,12 +122,10 @@ class AcrossPlanes:
         return dr.while_loop((first, state), lambda i, _: active & (i < self.number), step, label="planes")[1]
 
     def plane(self, i: mi.UInt32, active=True):
-        """The planes of these numbers."""
         fields = get_type_hints(type(self.planes))
         return type(self.planes)(*(dr.gather(t, getattr(self.planes, name), i, active) for name, t in fields.items()))
 
     def crossing(self, i: mi.UInt32, ray, active) -> Crossing:
-        """Where a ray meets the plane of that number."""
         a = dr.gather(mi.Point3f, self.planes.a, i, active)
         d, e = dr.gather(mi.Vector3f, self.planes.d, i, active), dr.gather(mi.Vector3f, self.planes.e, i, active)
         return crossing(a, d, e, ray.o, ray.d)
@@ -204,9 +200,8 @@ def swept(scene, photons, edges: mi.UInt32, weight: mi.Float):
     Φ = dr.gather(mi.Spectrum, photons.power, edges) * dr.exp((σ - σ_c) * since) * (σ_c * (1 + half) / (2 * half))
     e, depth = dr.gather(mi.Vector3f, photons.e, edges), dr.gather(mi.UInt32, photons.bounce, edges)
     kind = planes_class(mi.variant())
-    return kind(
-        mi.Point3f(p - d * since), d, e, length, dr.select(dr.isfinite(dr.sum(Φ)), Φ * weight, 0), σ, medium, depth
-    )
+    Φ = dr.select(dr.isfinite(dr.sum(Φ)), Φ * weight, 0)
+    return kind(mi.Point3f(p - d * since), d, e, length, Φ, σ, medium, depth)
 
 
 class PLANES(BEAMS):
@@ -222,6 +217,5 @@ class PLANES(BEAMS):
     map_bytes = BEAMS.map_bytes + VERTICES_PER_PATH * PLANE_BYTES
 
     def near(self, passes: Passes, traced: Traced) -> Iterator[Along]:
-        """What ``beams`` has of other edges, and planes."""
         yield from super().near(passes, only_beams(traced))
         yield Along(None, planes_of(passes, traced))

@@ -73,8 +73,6 @@ class GatheringInMedia:
 
 @dataclass
 class InBoth:
-    """Photons on surfaces, and photons in media."""
-
     on_surfaces: Gathering
     in_media: GatheringInMedia
 

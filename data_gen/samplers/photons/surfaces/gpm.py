@@ -6,9 +6,8 @@ r"""Gradient-domain photon mapping on surfaces: ``ppm``, and each photon that is
     r           p' J / p of the copy
     Δ           gradient sample, the sum of 2 w (C' - C) over all photons, w = 1 / (1 + r)
 
-A photon that is near to x and to y is its own copy: r = 1, and no ray is traced. What it brings to both is the same
-but for f and β, be it light from a wall or a caustic. With a radius of three pixels, four photons of five are of this
-kind, of one pixel two of five. Others go where ``shift`` has them, see ``copies``. A photon without a copy has w = 1.
+A photon that is near to x and to y is its own copy: r = 1, and no ray is traced. With a radius of three pixels, four
+photons of five are of this kind. Others go where ``shift`` has them, see ``copies``. Without a copy w = 1.
 
 Camera paths are shifted by replay: see ``camera``. Emission that they meet behind mirrors and glass is shifted with
 them; that which is seen directly is not part of the gradients.
@@ -28,16 +27,15 @@ import numpy as np
 
 from data_gen.film import GradientFilm
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.world import World
+from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.gradients.camera import CameraPaths, Path
 from data_gen.samplers.photons.gradients.copies import LightPaths, copy
 from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen, gradient_pass
 from data_gen.samplers.photons.gradients.pairs import Points
 from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
-from data_gen.samplers.photons.map.edges import number_of, spread
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.photon import Photon, is_near, light, photon_of
-from data_gen.samplers.photons.map.vertices import on_surfaces
+from data_gen.samplers.photons.map.radius import number_of, spread
+from data_gen.samplers.photons.map.vertices import Photon, is_near, light, on_surfaces, photon_of
 from data_gen.samplers.photons.passes import Passes
 
 # Bytes of a camera sample beside that: levels of five paths with their rays, hits and throughputs, and as many sums
@@ -46,8 +44,6 @@ PATHS_BYTES = 3072
 
 @dataclass
 class AtVertex:
-    """A vertex of a camera path."""
-
     x: mi.SurfaceInteraction3f
     β: mi.Spectrum
     receives: mi.Bool  # photons
@@ -79,11 +75,8 @@ class OnSurfaces:
         x = hit.compute_surface_interaction(mi.Ray3f(o, d))
         return AtVertex(x, β, alive & x.is_valid() & world.materials.connectable(x.bsdf()))
 
-    def spread(self, world: World, paths: list[Path]) -> list[Path]:
-        """The paths, their β times π r² / A: of each its own."""
-        return [self.spread_one(world, path) for path in paths]
-
-    def spread_one(self, world: World, path: Path) -> Path:
+    def spread(self, world: World, path: Path) -> Path:
+        """The path, its β times its own π r² / A."""
         x = path.vertex()
         receives = path.alive & x.is_valid() & world.materials.connectable(x.bsdf())
         return replace(path, β=path.β * spread(world, x, self.radius2, self.number, receives))

@@ -1,9 +1,5 @@
 r"""Progressive photon mapping: light is carried to where the camera looks, and gathered there from near by.
 
-Light that goes through glass and then onto a rough surface, seen in a mirror or through glass itself, is found by no
-connection: neither end can be joined to the other but by meeting it. Photons meet the surface, and are counted within
-a radius of the point that the camera path meets. That blurs the light over the radius, which shrinks from pass to pass.
-
     x           a vertex of the camera path, at a material that scatters widely
     b, d, Φ     a photon within radius r of it, the direction it came along, its power
     A           area of what photons are gathered from: π r², and less along edges (edges.py)
@@ -31,18 +27,17 @@ import numpy as np
 from data_gen.film import GradientFilm
 from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.light_ends import World
 from data_gen.paths.segments import next_surface
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.paths.walk import Sky, roulette
-from data_gen.paths.world import World
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
-from data_gen.samplers.photons.map.edges import number_of, spread
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.photon import faces, light, photon_of
-from data_gen.samplers.photons.map.vertices import on_surfaces
-from data_gen.samplers.photons.passes import Begun, Passes, Start
+from data_gen.samplers.photons.map.radius import number_of, spread
+from data_gen.samplers.photons.map.vertices import faces, light, on_surfaces, photon_of
+from data_gen.samplers.photons.passes import Passes, Start, begun
 
 
 @dataclass(init=False)
@@ -98,15 +93,15 @@ class PPM(PhotonIntegrator):
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
         """One photon map, and one camera path for each camera sample."""
-        begun = Begun.of(passes, camera)
+        start, values = begun(passes, camera)
         near = (one for traced in self.maps(passes, camera) for one in self.near(passes, traced))
-        values, wavelengths = begun.features, begun.start.ray.wavelengths
+        wavelengths = start.ray.wavelengths
         # Emission that camera paths meet is counted with the first map, or without any.
-        L, Le = passes.frozen(self.light, passes.world, begun.start, next(near, None), True)
+        L, Le = passes.frozen(self.light, passes.world, start, next(near, None), True)
         values |= {"primal": to_rgb(L + Le, wavelengths), "direct": to_rgb(Le, wavelengths)}
         dr.eval(values)
         for more in near:
-            L, _ = passes.frozen(self.light, passes.world, begun.start, more, False)
+            L, _ = passes.frozen(self.light, passes.world, start, more, False)
             values["primal"] += to_rgb(L, wavelengths)
             dr.eval(values["primal"])
         film.put_all(values)

@@ -1,8 +1,7 @@
 r"""Gradient-domain Metropolis light transport: where a path of ``gpt`` has found light, small changes make others.
 
 A pass is a render of its own. It takes one independent path, a candidate, for each camera sample, as ``gpt`` does, and
-then runs Markov chains over the random numbers of such paths. Chains begin at candidates, chosen by their value, and
-visit paths in proportion to it.
+then runs Markov chains over the random numbers of such paths, which visit paths in proportion to their value.
 
     x        a path with its four offset paths; g(x) what it brings to a layer
     f(x)     its value: the luminance of its light and of its differences
@@ -15,8 +14,7 @@ Either term is weighted by the balance heuristic. A mutation finds x K f(x) / b 
 is dim comes from candidates, evenly, and what is bright from chains. No path counts for more than g / (f K) b̂: there
 are no fireflies. b0 is the same in all passes, whatever they find, so that both weights of a path sum to one.
 
-Chains begin at candidates chosen in proportion to f, and count b̂: that is unbiased, however short they are. Passes are
-independent of each other, so variances over passes are variances of the noise.
+Chains begin at candidates chosen in proportion to f, and count b̂: that is unbiased, however short they are.
 
 [Lehtinen et al. 2013, "Gradient-Domain Metropolis Light Transport"; Kelemen et al. 2002; Veach and Guibas 1997,
 "Metropolis Light Transport", section 5.1; survey, section 6.2]
@@ -88,6 +86,5 @@ def chosen(sums: np.ndarray, n: int, camera: CameraSamples) -> np.ndarray:
 
 
 def make(scene: mi.Scene) -> SamplePass:
-    """The sampler ``gmlt``: chains of the paths of ``gpt``."""
     gpt = SAMPLERS["gpt"].integrator(scene)
     return GMLT(Paths(gpt, scene, gpt.plan(scene)))

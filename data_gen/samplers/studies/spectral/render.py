@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 from data_gen.passes import recording
 from data_gen.paths.camera import CameraSamples
@@ -29,10 +30,8 @@ _LANES = 1 << 20
 
 @dataclass(frozen=True)
 class Spectra:
-    """Means over samples, and variances of these, (H, W, bins) float64: of the light of each bin, and of its step.
-
-    ``step``  what the next bin has more; the last is 0. None if none was sampled
-    """
+    """Means over samples, and variances of these, (H, W, bins) float64: of the light of each bin, and of its step:
+    what the next bin has more. The last step is 0; None if none was sampled."""
 
     light: np.ndarray
     light_var: np.ndarray
@@ -93,3 +92,43 @@ def _sampled(estimate, camera: CameraSamples, bins: int, count: int, steps: bool
         values.append(dr.select(bin_ + 1 < n, light(wavelength + width, bin_ + 1 < n) - values[0], 0))
     dr.eval(values)
     return values
+
+
+# Pixels over which variances are averaged: they are as noisy as the light.
+REACH = 5
+
+
+def reconstructed(spectra: Spectra) -> np.ndarray:
+    """The (H, W, bins) that minimises Σ |I - light|² / v + Σ |I_b+1 - I_b - step|² / s, exactly.
+
+    v and s are the variances of light and steps, averaged over bins and ``REACH`` pixels, so both are one number for a
+    pixel. The sum over bins equals the light's sum: steps do not determine it.
+    """
+    if spectra.step is None or spectra.step_var is None:
+        return spectra.light
+    both = spectra.light_var, spectra.step_var[..., :-1]
+    v, s = (uniform_filter(variance.mean(axis=-1), REACH) for variance in both)
+    weight = (v / np.maximum(s, 1e-12 * v + 1e-300))[..., None]
+    bins = spectra.light.shape[-1]
+    # Steps that there are, between bins: for all pixels the same eigenvectors, the cosines
+    rows = np.arange(bins)
+    basis = np.cos(np.pi * (rows[:, None] + 0.5) * rows / bins) * np.sqrt(2 / bins)
+    basis[:, 0] = np.sqrt(1 / bins)
+    eigenvalues = 4 * np.sin(np.pi * rows / 2 / bins) ** 2
+    flux = spectra.step.copy()
+    flux[..., -1] = 0
+    divergence = -flux
+    divergence[..., 1:] += flux[..., :-1]
+    right = (spectra.light + weight * divergence) @ basis
+    return (right / (1 + weight * eigenvalues)) @ basis.T
+
+
+def to_rgb(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Linear RGB, (H, W, 3), of spectra (H, W, bins) that are constant between the ``edges`` in nm."""
+    fine = 16
+    steps = (np.arange(fine) + 0.5) / fine
+    wavelengths = (edges[:-1, None] + steps * np.diff(edges)[:, None]).ravel()
+    # A pixel of a film has the mean of light over density, which is 1 / (HIGH - LOW) here.
+    light = mi.Float(np.full(wavelengths.size, edges[-1] - edges[0], np.float32))
+    colours = np.array(mi.spectrum_to_srgb(mi.Spectrum(light), mi.Spectrum(mi.Float(wavelengths.astype(np.float32)))))
+    return values @ colours.T.reshape(-1, fine, 3).mean(axis=1) / len(values[0, 0])
