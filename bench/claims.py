@@ -2,6 +2,7 @@
 
     python -m bench.claims coffee.xml staircase.xml --spp 16 64
     python -m bench.claims glossy diffuse coffee.xml --every 5 130 --size 64 40 --points rounds
+    python -m bench.claims diffuse --sampler ppm --spp 5 9 17 --size 64 40
 
 prints, scene by scene, the real variance over the one that the stack claims: of pixels, and of means over 8x8 pixels,
 `primal` (without the layer `caustic`), `caustic`, `dx` and `dy`. The noisiest 1 % of pixels and 3 % of blocks are left
@@ -177,7 +178,7 @@ def main() -> None:
     for name in args.scenes:
         scene = load_scene(os.fspath(name), size)
         for spp in args.spp:
-            options = {"points": args.points, "tails": args.tails}
+            options = {"points": args.points} | ({} if args.tails == "paths" else {"tails": args.tails})
             stacks = [render_stack(scene, spp, s, args.sampler, **options) for s in range(args.seeds)]
             found = real_over_claimed([stack.layers for stack in stacks])
             texts = [f"{found[layer][0]:.2f}, {found[layer][1]:.2f}" if layer in found else "-" for layer in LAYERS]
