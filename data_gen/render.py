@@ -27,6 +27,7 @@ from data_gen.scenes.load import check_scene
 from data_gen.tails.cache import LEAST_MIB, MIB, enough
 from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
 from ngpt.io.exr import with_channels
+from ngpt.layers import GATHERED
 from ngpt.merging import UNFINISHED
 from ngpt.stack import GradientStack
 from ngpt.version import __version__
@@ -107,11 +108,12 @@ def render_stack(
     more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
     sensor = scene.sensors()[0]
     chosen: dict[str, Any] = {}
+    known = {GATHERED: 1} if entry.gathers else {}
     whole: list[GradientFilm] = []  # the film after the last pass, if there was one
 
     def look(film: GradientFilm) -> None:
         whole[:] = [film]
-        newest(lambda: stack_of(film, sensor, seed, sampler, start, {}))
+        newest(lambda: stack_of(film, sensor, seed, sampler, start, known))
 
     # If time may end the render, the number of samples is not known, except that it is at most ``spp``.
     if settings.get("points") == "sobol" and (spp is None or seconds is not None or adaptive is not None):
@@ -142,7 +144,7 @@ def render_stack(
     if "tails" in settings and not rounds_of(sample).shares:
         settings["tails"] = "paths"
     done = round(float(film.samples_each.mean()))
-    chosen = chosen | {"ngpt:spp": done} | options_as_attribute(entry, settings)
+    chosen = chosen | known | {"ngpt:spp": done} | options_as_attribute(entry, settings)
     if failed or (stop() and (spp is None or done < spp)):
         chosen[UNFINISHED] = "failed" if failed else "interrupted"
     stack = stack_of(film, sensor, seed, sampler, start, chosen, diagnostics=diagnostics)

@@ -57,3 +57,7 @@ DIFFERENCES: dict[str, tuple[int, int, int]] = {"dx": (1, 0, 0), "dy": (0, 1, 0)
 # Header attribute: the variance of a pixel's mean of ``albedo`` or ``normal``, the mean over pixels and channels;
 # whichever is larger
 FEATURE_NOISE = "ngpt:featureNoise"
+
+# Header attribute: 1 where photons, gathered within a radius, found the light in ``caustic``. Neighbouring pixels
+# gather the same photons, so they share its noise, which OIDN takes for detail.
+GATHERED = "ngpt:gathered"

@@ -17,6 +17,7 @@ from ngpt.coverage import kept_within
 from ngpt.denoisers import caustic, nfor, nlm, oidn
 from ngpt.errors import NgptError, WrongUse, did_you_mean
 from ngpt.io.primaries import converted, inside_rec709
+from ngpt.layers import GATHERED
 from ngpt.magnitude import enlarged, magnitude, scaled
 from ngpt.network.identity import Identity, identify
 from ngpt.network.inputs import ESTIMATED
@@ -42,6 +43,7 @@ class Method:
     ``uses``     layers that it takes where the stack has them
     ``estimates``  layers that it estimates from the others where the stack lacks them
     ``variant``  the method that it is with other options, "" for a method of its own
+    ``apart``    whether what photons brought is taken out of the image and denoised by ``ngpt.denoisers.caustic``
     ``rec709``   whether it was made for colours of Rec. 709: others are converted for it, as far as they are within
     """
 
@@ -54,6 +56,7 @@ class Method:
     uses: tuple[str, ...] = ()
     estimates: tuple[str, ...] = ()
     variant: str = ""
+    apart: bool = False
     rec709: bool = False
 
 
@@ -181,6 +184,7 @@ _OURS = {
         "use",
         oidn.missing,
         uses=("albedo", "normal"),
+        apart=True,
         rec709=True,
     ),
 }
@@ -270,7 +274,8 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         light = {name: converted(stack[name], matrix) for name in ("primal", "direct", "caustic") if name in stack}
         stack = stack.replace(**light)
     power = magnitude(stack)
-    data = repair(_known(scaled(stack, power), entry.estimates), gradients="dx" in reads)
+    apart = entry.apart and bool(stack.number(GATHERED))
+    data = repair(_known(scaled(stack, power), entry.estimates), gradients="dx" in reads or apart)
     # Extreme values may leave the range of float32 inside; what comes out is checked.
     with np.errstate(over="ignore", invalid="ignore"):
         image = entry.run(data, **values) + data.direct

@@ -60,8 +60,8 @@ class Repaired:
 def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
     """Separates direct emission, replaces non-finite pixels and finds the gradients that cannot be trusted.
 
-    ``gradients``  whether this is for a method that reads gradients: it works on what they are the differences of,
-                   without ``caustic``. All others see the whole primal, and the variance of all of it.
+    ``gradients``  whether this is for a method that reads gradients, or leaves the light of photons to another: it
+                   works on light without ``caustic``. All others see the whole primal, and the variance of all of it.
 
     A difference is not trusted if it is not finite itself or one of its two pixels was not. Raises NgptError when the
     primal has no finite pixel at all.

@@ -9,7 +9,7 @@ from ngpt.denoisers import caustic, diffusion, oidn
 from ngpt.io.exr import read, write
 from ngpt.io.openexr import read_exr
 from ngpt.io.resolution import resolve
-from ngpt.layers import FEATURE_NOISE
+from ngpt.layers import FEATURE_NOISE, GATHERED
 from ngpt.merging import merge
 from ngpt.methods import METHODS, reconstruct
 from ngpt.network.shipped import WEIGHTS
@@ -42,6 +42,22 @@ def test_other_methods_see_all_light_and_all_its_variance():
     assert data.caustic is None and np.array_equal(data.image, LIT["primal"])
     assert np.array_equal(data.noise, LIT["primal_var"] + LIT["caustic_var"])
     assert np.array_equal(ngpt.denoise(LIT, "primal"), LIT["primal"])
+
+
+@pytest.mark.parametrize("auxiliary", ["none", "prefiltered"])
+def test_oidn_leaves_the_light_of_photons_to_the_diffusion(auxiliary):
+    """Other methods see all light, and so does OIDN where no photons brought it."""
+    pytest.importorskip("mitsuba_oidn")
+    alone = {name: layer for name, layer in LIT.layers.items() if name not in ("dx", "dy", "dx_var", "dy_var")}
+    photons = GradientStack(alone, {GATHERED: 1})
+    plain = GradientStack({name: PLAIN[name] for name in alone if not name.startswith("caustic")})
+    data = repair(photons)
+    expected = ngpt.denoise(plain, "oidn", auxiliary=auxiliary) + caustic.denoised(data)
+    assert np.allclose(ngpt.denoise(photons, "oidn", auxiliary=auxiliary), expected, atol=1e-4)
+    for method in ("primal", "nfor"):
+        assert np.array_equal(ngpt.denoise(photons, method), ngpt.denoise(GradientStack(alone), method))
+    whole = GradientStack({name: layer for name, layer in alone.items() if not name.startswith("caustic")})
+    assert np.array_equal(ngpt.denoise(GradientStack(alone), "oidn"), ngpt.denoise(whole, "oidn"))
 
 
 @pytest.mark.parametrize("method", ["l2", "l1", "cv", "wcv", "wl2"])

@@ -124,6 +124,7 @@ class Sampler(Entry):
     together: bool = False  # whether pixels share paths, so that a pass has all of them, with as many samples each
     lane_bytes: int = LANE_BYTES  # memory that a lane, one sample of one pixel, takes in a pass
     by_place: bool = False  # whether it can choose lamps by place: ``make`` takes ``places``
+    gathers: bool = False  # whether its layer ``caustic`` is what photons brought (``ngpt.layers.GATHERED``)
     biased: bool = False  # whether its mean approaches Mitsuba's only as the number of samples grows
     counts: bool = False  # whether it replays numbers one by one, which must be independent: it takes no ``points``
 

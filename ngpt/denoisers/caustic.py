@@ -1,4 +1,4 @@
-"""The light that no gradient holds, with less noise: the one place where reconstructions from gradients get it from.
+"""The light that no gradient holds, and the light of photons, with less noise: all methods get it from here.
 
 Such light is rare and bright: most pixels hold none of it, and a few hold what their whole neighbourhood should. So it
 is spread by a diffusion [Perona and Malik 1990, "Scale-space and edge detection using anisotropic diffusion"] over
@@ -7,8 +7,11 @@ illumination filtering"]: ``ngpt.denoisers.diffusion``. What one pixel gives is 
 Pixels exchange less light the more their surfaces differ, and the more they differ themselves beyond their noise
 [variances travel along as in Schied et al. 2017, "Spatiotemporal variance-guided filtering"].
 
-Methods that call OIDN anyway take its image of this light at half the size, which has less error where the light has
-edges; what it takes for noise is given back by one factor for the whole image (docs/lab/log).
+Photons are the same case: neighbouring pixels gather the same ones, and OIDN takes their blotches for detail, but the
+variance tells them. So method `oidn` leaves them to the diffusion (``ngpt.layers.GATHERED``).
+
+Methods from gradients that call OIDN anyway take its image of this light at half the size, which has less error where
+the light has edges; what it takes for noise is given back by one factor for the whole image (docs/lab/log).
 """
 
 from dataclasses import replace

@@ -26,6 +26,7 @@ from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, cosine, evaluate, scatters_smoothly
 from data_gen.samplers.photons.map.vertices import Photon
 from data_gen.samplers.vcm.merging import Map, Merging, Photons
+from ngpt.layers import GATHERED
 
 ETA = 0.05
 
@@ -188,6 +189,20 @@ def test_pairs_that_merging_completes_are_the_same_from_both_ends(copies, t):
     else:
         error = np.abs(there + back_again) / (np.abs(there) + L)
     assert np.median(error) < 1e-5 and np.quantile(error, 0.85) < 1e-2
+
+
+# ------------------------- The light of photons -------------------------
+
+
+def test_the_light_of_photons_is_a_layer_of_its_own(renderer):
+    """With the least radius there is hardly any; the image is the sum, and each part has a variance."""
+    scene = load(renderer, SCENES["glass"], (24, 16))
+    wide, least = (render_stack(scene, 8, 3, "vcm", radius=radius) for radius in (2.0, 1e-5))
+    assert wide.attributes[GATHERED] == 1 and {"caustic_var", "primal_var"} <= set(wide.names)
+    share = [stack["caustic"].mean() / stack["primal"].mean() for stack in (wide, least)]
+    assert share[0] > 0.02 and share[1] < 1e-3
+    assert (wide["primal"] >= wide["caustic"] - 1e-4).all() and (wide["caustic_var"] > 0).any()
+    assert GATHERED not in render_stack(scene, 2, 3, "bdpt").attributes
 
 
 # ------------------------- Where nothing merges -------------------------

@@ -114,8 +114,12 @@ def differences(image, pixels=1):
 
 
 def light_apart(stack):
-    """The light that dx and dy do not hold: the layers ``direct`` and ``caustic``; one that is not there is 0."""
-    return sum((stack[name] for name in ("direct", "caustic") if name in stack), np.zeros_like(stack["primal"]))
+    """The light that dx and dy do not hold: the layers ``direct`` and ``caustic``; one that is not there is 0.
+
+    Where there are no dx and dy, ``caustic`` is the light of photons, and it is part of what others are compared with.
+    """
+    apart = ("direct", "caustic") if "dx" in stack else ("direct",)
+    return sum((stack[name] for name in apart if name in stack), np.zeros_like(stack["primal"]))
 
 
 def light_of_gradients(stack):

@@ -44,16 +44,16 @@ class Merges(Protocol):
 
 @dr.syntax
 def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging: Merges | None = None) -> tuple:
-    """L and Le of a path from the camera, joined to the vertices of a ``light_path`` and to photons, where there are.
+    """L, Le and L_merged of a path from the camera, joined to a ``light_path`` and to photons, where there are.
 
-    Le is the emission that the camera sees directly, L all other light.
+    Le is the emission that the camera sees directly, L_merged the light of photons, L all other light.
     """
     scene, lights, limits, random = plan.scene, plan.lights, plan.limits, sight.random
     ray = mi.Ray3f(sight.ray)
     si = plan.first_hit(scene, ray).compute_surface_interaction(ray)
     Le = sight.importance * si.emitter(scene).eval(si, mi.Bool(limits.shows))
 
-    L = dr.zeros(mi.Spectrum, dr.width(ray))
+    L, L_merged = dr.zeros(mi.Spectrum, dr.width(ray)), dr.zeros(mi.Spectrum, dr.width(ray))
     β = mi.Spectrum(sight.importance)  # throughput f / p up to the vertex si
     η = mi.Float(1)  # product of the relative indices of refraction
     depth = mi.UInt32(1)  # edges of the path up to si
@@ -90,7 +90,7 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
 
         # ------------------- To photons near by ------------------
         if dr.hint(merging is not None, mode="scalar"):
-            L += merging.light(z, bsdf, smooth & joined)
+            L_merged += merging.light(z, bsdf, smooth & joined)
 
         # ---------------------- Next vertex ----------------------
         found = active & (sample.pdf > 0)
@@ -113,7 +113,7 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
         si = reached
         active &= si.is_valid() & (depth < limits.max_depth)
         end = mis.arrive(end, cosine(si, d), dr.square(si.t))
-    return L, Le
+    return L, Le, L_merged
 
 
 @dr.syntax

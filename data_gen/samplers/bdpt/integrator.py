@@ -99,7 +99,7 @@ class BDPT(GradientIntegrator):
             splatter = Splatter(Splats.on(sight.eye.pixels, 3, sums), sight.ray, sight.importance)
             lit, random, _ = light_path(plan, sight, splatter)
             sight = replace(sight, random=random)
-        L, Le = camera_path(plan, sight, lit)
+        L, Le, _ = camera_path(plan, sight, lit)
         Le = self.emission_in_pixel(plan.scene, camera, Le)
         values = {"primal": to_rgb(L + Le, sight.ray.wavelengths), "direct": to_rgb(Le, sight.ray.wavelengths)}
         values |= features(plan.scene, camera.sensor, camera.random.clone(), sight.ray)

@@ -22,6 +22,7 @@ for _name, _summary in (
             notes=_NOTES,
             options=_OPTIONS,
             gradients=_name == "gvcm",
+            gathers=_name == "vcm",
             finds=("caustics", "hidden lamps"),
             batch=1,
             biased=True,

@@ -7,7 +7,8 @@ r"""Vertex connection and merging: ``bdpt`` and ``ppm`` in one, and every path o
 A pass has one camera sample and one light path for each pixel. Light paths are traced once: their vertices are
 connected to the camera (splats), kept in a map, connected to the camera path of the same sample (one of them,
 ``bdpt.camera_path``), and gathered at all camera paths, within the radius, where materials scatter widely. Only those
-that light reaches from mirrors, clear glass or holes are gathered (docs/samplers/photons.md).
+that light reaches from mirrors, clear glass or holes are gathered (docs/samplers/photons.md). Their light is the layer
+``caustic`` (``ngpt.layers.GATHERED``).
 
 [Georgiev et al. 2012, "Light Transport Simulation with Vertex Connection and Merging"; Hachisuka et al. 2012, "A Path
 Space Extension for Robust Light Transport Simulation"]
@@ -81,8 +82,9 @@ class VCM(BDPT):
         values = frozen(features, world.scene, camera.sensor, camera.random.clone(), sight.ray)
         if self.plan(world).joins:
             photons, sight, _ = self.light_pass(passes, sight, camera, film.splats("primal"))
-        L, Le = frozen(self.camera_pass, world, sight, photons)
-        values |= {"primal": to_rgb(L + Le, sight.ray.wavelengths), "direct": to_rgb(Le, sight.ray.wavelengths)}
+        L, Le, L_merged = frozen(self.camera_pass, world, sight, photons)
+        layers = {"primal": L + Le, "direct": Le, "caustic": L_merged}
+        values |= {name: to_rgb(light, sight.ray.wavelengths) for name, light in layers.items()}
         dr.eval(values)
         film.put_all(values)
 
@@ -109,8 +111,8 @@ class VCM(BDPT):
 
     # ------------------------ Camera paths: joins, and merges ------------------------
 
-    def camera_pass(self, world: World, sight: Sight, photons: Photons | None) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """L and Le of camera paths, joined to their own light paths and to the ``photons`` of all."""
+    def camera_pass(self, world: World, sight: Sight, photons: Photons | None) -> tuple:
+        """L, Le and L_merged of camera paths, joined to their own light paths and to the ``photons`` of all."""
         sight = replace(sight, random=sight.random.clone())
         if photons is None:
             return camera_path(self.plan(world), sight, None)
