@@ -39,7 +39,7 @@ def scene_code(name: str) -> str:
 def reached(sampler: str) -> list[str]:
     """The modules of data_gen that a render by the sampler runs, sorted."""
     entries = [SAMPLERS[sampler]] if sampler in SAMPLERS else [s for s in SAMPLERS.values() if s.rank]
-    modules = [entry.module for entry in entries if sampler in (entry.name, "auto") and entry.module]
+    modules = [entry.module for entry in entries if sampler in (entry.name, "auto") and isinstance(entry.module, str)]
     queue, found = ["data_gen.render", _MACHINERY, *modules, *filter(None, map(_entries_of, modules))], set()
     while queue:
         module = queue.pop()

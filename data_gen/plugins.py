@@ -60,7 +60,7 @@ def _register() -> None:
     from data_gen.samplers import SAMPLERS
 
     for entry in SAMPLERS.values():
-        if entry.module:
+        if isinstance(entry.module, str):
             mi.register_integrator(entry.plugin, lambda props, entry=entry: _construct(entry, props))
 
 

@@ -97,7 +97,6 @@ def add_event(events: mi.UInt32, code: mi.UInt32) -> tuple[mi.UInt32, mi.Bool]:
     return events | (code << place), fits
 
 
-@dr.syntax
 def shoot(
     scene,
     z: mi.SurfaceInteraction3f,
@@ -105,9 +104,16 @@ def shoot(
     events: mi.UInt32,
     target: Target,
     active=True,
+    *,
     ends: Ends = nowhere,
 ) -> Shot:
     """Follows the ``events`` from ``z`` in direction ``ω`` (world space), and its differentials with them."""
+    return _shoot(scene, z, ω, events, target, active=active, ends=ends)
+
+
+# ``dr.syntax`` forgets the defaults of keywords.
+@dr.syntax
+def _shoot(scene, z, ω, events, target: Target, *, active, ends: Ends) -> Shot:
     # ------------------------ Loop state -------------------------
     ray = z.spawn_ray(ω)
     frame = mi.Frame3f(ω)
@@ -197,15 +203,19 @@ def turn(code, η, n, d, dn: tuple, dd: tuple) -> tuple[mi.Vector3f, mi.Vector3f
     return a * d + b * N, *changes
 
 
-@dr.syntax
 def walk(
-    scene, z, ω: mi.Vector3f, events: mi.UInt32, target: Target, active=True, ends: Ends = nowhere
+    scene, z, ω: mi.Vector3f, events: mi.UInt32, target: Target, active=True, *, ends: Ends = nowhere
 ) -> tuple[mi.Vector3f, Shot, mi.Bool]:
     """Newton's method from ``ω`` on: the direction from ``z`` to the target, its shot, and whether it was found.
 
     A step that breaks the chain, or comes no nearer, is halved.
     """
-    best_ω, best = mi.Vector3f(ω), shoot(scene, z, ω, events, target, active, ends)
+    return _walk(scene, z, ω, events, target, active=active, ends=ends)
+
+
+@dr.syntax
+def _walk(scene, z, ω, events, target: Target, *, active, ends: Ends) -> tuple[mi.Vector3f, Shot, mi.Bool]:
+    best_ω, best = mi.Vector3f(ω), shoot(scene, z, ω, events, target, active, ends=ends)
     error = dr.norm(best.miss)
     found = best.good & (error < TOLERANCE * best.reach)
     active = best.good & ~found
@@ -217,7 +227,7 @@ def walk(
         s = (best.B1.y * best.miss.x - best.B1.x * best.miss.y) * scale
         t = (best.B0.x * best.miss.y - best.B0.y * best.miss.x) * scale
         next_ω = dr.normalize(best_ω + turns.s * s + turns.t * t)
-        shot = shoot(scene, z, next_ω, events, target, active & dr.isfinite(s + t), ends)
+        shot = shoot(scene, z, next_ω, events, target, active & dr.isfinite(s + t), ends=ends)
         nearer = shot.good & (dr.norm(shot.miss) < error)
         part = dr.select(nearer, dr.fmin(1, 2 * part), part / 2)
         if nearer:
@@ -237,10 +247,10 @@ def follow(
     returned, and nothing is between the last event and the target.
     """
     # Walks begin toward the other chain's first event: along its direction they would miss what is small or near.
-    ω1, shot, found = walk(scene, z1, dr.normalize(base.first - z1.p), events, target, active & base.good, ends)
+    ω1, shot, found = walk(scene, z1, dr.normalize(base.first - z1.p), events, target, active & base.good, ends=ends)
     J = dr.abs(base.det / shot.det)
     found &= dr.isfinite(J) & (J > 0)
-    back, _, returned = walk(scene, z, dr.normalize(shot.first - z.p), events, target, found, ends)
+    back, _, returned = walk(scene, z, dr.normalize(shot.first - z.p), events, target, found, ends=ends)
     found &= returned & (dr.squared_norm(back - ω) < RETURNS**2)
     ray = mi.Ray3f(shot.ray)
     ray.maxt = dr.select(target.far, dr.largest(mi.Float), dr.norm(target.p - ray.o) * (1 - mi.math.ShadowEpsilon))

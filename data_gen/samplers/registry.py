@@ -49,9 +49,9 @@ COMMON = {
 class Entry:
     name: str  # as users call it
     summary: str  # one line for the user
-    # Where its Mitsuba integrator is, a ``data_gen.samplers.common.GradientIntegrator``; or a function ``make``. It is
-    # imported when the sampler is made, since its classes belong to a variant of Mitsuba.
-    module: str
+    # Where its Mitsuba integrator is, a ``data_gen.samplers.common.GradientIntegrator``, or a function ``make``. It is
+    # imported when the sampler is made, since its classes belong to a variant of Mitsuba. Or the function itself
+    module: str | Callable[..., Any]
     standing: str = field(default="niche", kw_only=True)  # of ``STANDINGS``: what help shows first, and what is tested
     # All of them are given to ``make``, except the options in ``COMMON``.
     options: Mapping[str, Option] = field(default_factory=dict, kw_only=True)
@@ -66,7 +66,8 @@ class Entry:
 
     def make(self, *args: Any, **options: Any) -> Any:
         """What the module makes; raises NgptError for a scene that cannot be rendered."""
-        return import_module(self.module).make(*args, **options)
+        make = self.module if callable(self.module) else import_module(self.module).make
+        return make(*args, **options)
 
     def refuses(self, facts: Facts) -> str:
         """Why the sampler cannot render a scene of these ``facts``, "" if it can."""
@@ -142,7 +143,7 @@ class Sampler(Entry):
         return integrator_of(self.module).like_path(scene, self.plugin, **options)
 
     def make(self, scene: Any, **options: Any) -> Any:
-        if integrator_of(self.module) is None:
+        if callable(self.module) or integrator_of(self.module) is None:
             return super().make(scene, **options)
         return self.integrator(scene, **options).prepare(scene)
 

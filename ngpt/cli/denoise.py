@@ -150,10 +150,13 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         name: value for name in ("alpha", "weights", "device", "memory") if (value := getattr(args, name)) is not None
     }
     options |= dict(args.option)
-    if args.method in METHODS:  # what no file could be denoised with
-        settings(f"method '{args.method}'", runnable(args.method).options, options)
+    # What no file could be denoised with
     if "weights" in options:
         identify(options["weights"])
+    elif args.method != "auto":
+        runnable(args.method)
+    if args.method != "auto":
+        settings(f"method '{args.method}'", METHODS[args.method].options, options)
     reference = Reference.read(args.ref, args.untrusted) if args.ref else None
     for _, target in pairs:
         if target.suffix.lower() != ".exr":

@@ -297,7 +297,7 @@ def test_fine_tuning_starts_from_weights(done):
     safetensors.write_tensors(path, safetensors.in_halves(tensors, ""), header, overwrite=True)
     for name, tensor in trainer(done, initial=path).model.state_dict().items():
         assert tensor.dtype == torch.float32 and torch.equal(tensor, tensors[name].half().float())
-    with pytest.raises(NgptError, match=r"another \[model\]"):
+    with pytest.raises(NgptError, match=r"differs from \[model\] of the run"):
         trainer(done, initial=path, model_units=[2, 2])
 
 
