@@ -3,7 +3,7 @@
     python -m bench.tails kitchen/scene.xml bedroom/scene.xml --references FOLDER --groups rooms=kitchen,bedroom
 
 Samplers are `primal`, `gpt`, and `mitsuba`: `primal` with Mitsuba's own points and lamps and whole paths, denoised by
-`oidn`. Methods are those of METHODS. Each cell has:
+`oidn`. Methods are in METHODS. Each cell has:
 
     seconds    of processors, of the render and of the reconstruction, both warmed up; whole: both together
     error      relMSE by two halves of a reference, without the worst 0.1 % of the pixels; FLIP is over their mean

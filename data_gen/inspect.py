@@ -160,7 +160,7 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
     if facts.media and points and not SAMPLERS["gpt"].refuses(facts):
         lines.append("small lights in media: paths find their beams with less noise than photons: `--sampler gpt`")
     if any(name in plugins["BSDF"] for name in ("mask", "null")):
-        lines.append("holes: features are those of what is seen through them")
+        lines.append("holes: features belong to what is seen through them")
     if any(name in plugins["BSDF"] for name in ("bumpmap", "normalmap")):
         lines.append("bump or normal maps: in the normals, except where they are inside another material")
     if any(name not in _POINTS for name in plugins["Emitter"]):

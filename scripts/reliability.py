@@ -67,7 +67,7 @@ def page(reports: list[dict], date: str, failed: bool) -> str:
 
 
 def kinds(reports: list[dict]) -> list[list[dict]]:
-    """The reports, with those of one kind together; see ``KINDS``."""
+    """The reports, campaigns of one kind in one; see ``KINDS``."""
     found: dict[str, list[dict]] = {}
     for report in reports:
         kind = min((report["campaign"].partition(word)[0] for word in KINDS), key=len)
@@ -107,7 +107,7 @@ def worst_of(report: dict) -> dict:
 
 
 def largest(worst: dict) -> dict:
-    """Of more than four measures the three that are largest, by the number that they begin with."""
+    """The three largest of more than four measures, by the number that they begin with."""
     if len(worst) <= 4:
         return worst
     order = sorted(worst, key=lambda what: float(re.match(r"[\d.]*", str(worst[what]))[0] or 0), reverse=True)

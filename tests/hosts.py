@@ -84,7 +84,7 @@ def agree(image, expected):
 
 
 def agree_but_for_rounding_in_oidn(image, expected):
-    """Of networks that read OIDN's image of the base: 1e-4 on average, 2e-2 at worst, relative as in ``agree``.
+    """As ``agree``, for networks that read OIDN's image of the base: 1e-4 on average, 2e-2 at worst, relative.
 
     On CPUs with bfloat16 OIDN rounds to it: of bases that differ in their last bit it makes images that differ by
     2^-8 in some values. No host has the base of NumPy to the last bit.

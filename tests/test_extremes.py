@@ -23,7 +23,7 @@ every_method = pytest.mark.parametrize("method", [pytest.param(name, marks=marks
 
 
 def layers_of(height=9, width=12, seed=0):
-    """Those of a stack with all that may be apart in it: a lamp, and light that no gradient holds."""
+    """Layers of a stack with all that may be apart in it: a lamp, and light that no gradient holds."""
     layers = full_layers(height, width, seed=seed)
     layers["direct"], layers["caustic"] = np.zeros((2, height, width, 3), np.float32)
     layers["direct"][1:3, 1:4], layers["caustic"][4:6, 5:9] = 20, 0.5

@@ -81,7 +81,7 @@ class Config:
             (self.reference_method not in METHODS, f"reference_method: no method '{self.reference_method}'"),
             (bool(unknown), f"sights: no sight is called {unknown}; there are {', '.join(SHARES)}"),
             (not shares, f"sights = {self.sights}: each is the share of scenes that have it, 0 to 1"),
-            (bool(self.sights) and not self.varied, "sights are those of varied scenes; set varied = true"),
+            (bool(self.sights) and not self.varied, "only varied scenes have sights; set varied = true"),
             (not self.scenes and not self.files, "no scenes: set scenes = N, or add a [[files]] table"),
         )
         for name, options in self.samplers.items():

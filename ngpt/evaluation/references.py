@@ -67,7 +67,8 @@ class Reference:
 
         With one image, it is three times the image's noise, which is part of every error. With two halves, it is three
         standard errors of the mean of (a - t)(b - t) / (m² + 1e-3), with t the truth: in each pixel the product has
-        expectation 0, and the variance of a times that of b. Channels count as one, as if their noise were the same.
+        expectation 0, and its variance is the product of the variances of a and b. Channels count as one, as if they
+        had the same noise.
         """
         noise = self.noise
         if noise is None or len(self.stacks) == 1:

@@ -28,7 +28,7 @@ def run(data: Repaired, path: Path, device: str = "auto", memory: int = 3072) ->
     colour, albedo, normal = (np.ascontiguousarray(layers[name], np.float32) for name in names)
     require_oidn()
     if device not in DEVICES:
-        raise NgptError(f"device '{device}' is unknown; those of OIDN are: {', '.join(DEVICES)}")
+        raise NgptError(f"device '{device}' is unknown; OIDN has: {', '.join(DEVICES)}")
     images = {"color": colour, "albedo": albedo, "normal": normal}
     try:
         image = filtered(images, device, tza.read(path)[0], hdr=True, max_memory_mb=memory)

@@ -247,7 +247,7 @@ def runtime() -> Any:
 def _made(path: str, _modified: int, device: str, threads: int):
     onnxruntime = runtime()
     if device not in DEVICES:
-        raise NgptError(f"device '{device}' is unknown; those of ONNX Runtime are: {', '.join(DEVICES)}")
+        raise NgptError(f"device '{device}' is unknown; ONNX Runtime has: {', '.join(DEVICES)}")
     provider, available = DEVICES[device], onnxruntime.get_available_providers()
     if provider not in available:
         have = [name for name, provider in DEVICES.items() if provider in available]

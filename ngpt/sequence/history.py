@@ -168,5 +168,5 @@ def _doubt(weight: np.ndarray, found: np.ndarray, trust: np.ndarray) -> str:
     if not found.any():
         return "motion is not known, or leads out of the frame before"
     if trust.mean() < NOTHING:
-        return "albedo, normal or depth are not those of the frame before, where motion leads"
+        return "albedo, normal or depth differ from the frame before, where motion leads"
     return "the light differs from the frame before by more than its noise"

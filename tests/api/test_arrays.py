@@ -148,7 +148,7 @@ def test_arrays_of_other_libraries(layers, features):
 
 
 def test_help_names_methods_and_options():
-    """Of the registry, so that nothing has to be kept in step."""
+    """Names come from the registry, so that nothing has to be kept in step."""
     import pydoc
 
     for thing in (ngpt, ngpt.denoise, ngpt.Denoiser):

@@ -132,7 +132,7 @@ def test_the_command_takes_halves(stack, tmp_path, rng, command):
 
 
 def test_it_says_how_far_the_truth_is(stack):
-    """Of a method that removes noise, on a flat image, where there is no bias: never too little."""
+    """The error of a method that removes noise is never claimed too small on a flat image, where there is no bias."""
     result = ngpt.reconstruct_with_error(stack, "wcv")
     within = np.mean(np.abs(result.image - 1) <= result.error)
     assert 0.6 < within < 0.95 and np.mean(result.error) < 0.5 * np.mean(np.sqrt(stack["primal_var"]))

@@ -50,7 +50,7 @@ def test_rows_of_tables_are_methods(source, name):
 
 
 def test_help_and_lists_have_methods_by_standing(source, capsys):
-    """Those of standing "use" with a line each; rows of tables and studies are asked for by name."""
+    """Entries of standing "use" with a line each; rows of tables and studies are asked for by name."""
     with pytest.raises(SystemExit):
         main(["denoise", "--help"])
     words = " ".join(capsys.readouterr().out.split())

@@ -354,7 +354,7 @@ def compare(others, densities, strategy, good, path, worst=0.01, least=100):
 
 
 def check_weights(ends):
-    """Of all connections, to vertices, the light's own point and the camera."""
+    """The weights of all connections: to vertices, the light's own point and the camera."""
     scene = ends.scene
     for t in range(1, 4):
         for s in range(1, 4):

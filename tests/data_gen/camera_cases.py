@@ -52,12 +52,12 @@ def card():
 
 
 def meter(kind):
-    """Of one pixel; looks at the floor, the ball and the wall."""
+    """A sensor of one pixel; looks at the floor, the ball and the wall."""
     return {"sensor": camera(kind, film=film(1, 1))}
 
 
 def irradiance():
-    """Of what falls on a small card above the floor, from the side of the lamp."""
+    """A sensor of what falls on a small card above the floor, from the side of the lamp."""
     shape = _wall([-0.5, 0.2, 0.9], [0.3, 1, 0.1], (0.4, 0.4), _diffuse(0.3, 0.3, 0.3))
     return {"sensor": shape | {"sensor": {"type": "irradiancemeter", "film": film(16, 16)}}}
 

@@ -67,7 +67,7 @@ def listed():
 
 
 def quick_first(row):
-    """Those of `make test`, so that a run that is broken off has them."""
+    """Rows of `make test` come first, so that a run that is broken off has them."""
     return row[1] not in QUICK
 
 

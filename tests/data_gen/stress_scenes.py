@@ -81,7 +81,7 @@ def panes():
 
 
 def principled():
-    """Of glass, of cloth, lacquered, of metal that is brushed; and a thin leaf."""
+    """Materials: glass, cloth, lacquer, brushed metal, and a thin leaf."""
     glass = {"type": "principled", "base_color": _rgb(0.9, 0.95, 0.9), "roughness": 0.3, "spec_trans": 0.8, "eta": 1.4}
     cloth = {"type": "principled", "base_color": _rgb(0.5, 0.1, 0.2), "sheen": 1.0, "sheen_tint": 0.5, "flatness": 0.5}
     metal = {"type": "principled", "base_color": _rgb(0.9, 0.6, 0.3), "metallic": 1.0, "roughness": 0.35}

@@ -356,7 +356,7 @@ def crop_below_the_glass(mi):
 @pytest.mark.slow
 @pytest.mark.parametrize("light", [False, True])
 def test_less_noise_than_without(renderer, monkeypatch, light):
-    """Of camera paths under glass; of light of one direction, through a ball, by a mirror and straight to a floor."""
+    """Camera paths under glass; light of one direction, through a ball, by a mirror and straight to a floor."""
     from data_gen.samplers.gbdpt import chain_shift, light_shift
 
     scene = load(renderer, by_the_sun, (48, 48)) if light else crop_below_the_glass(renderer)

@@ -15,7 +15,7 @@ from data_gen.paths.streams import sample_streams
 
 
 def test_camera_rays_meet_coplanar_surfaces_as_those_of_volpath(renderer):
-    """Of a boundary that lies in the floor Embree finds one or the other, and it matters how rays are traced.
+    """Where a boundary lies in the floor, Embree finds one or the other, and it matters how rays are traced.
 
     The sky is seen through the floor where it finds the boundary. Coherent rays saw half as much of it.
     """

@@ -64,7 +64,7 @@ def first(made):
 
 
 def test_references_share_no_tails(made, first):
-    """Those of inputs that do are the same to the bit."""
+    """Images of inputs that do are the same to the bit."""
     for paths, shared in zip(first[1], made(replace(SMALL, samplers={"gpt": {"tails": "shared"}}))[1], strict=True):
         assert np.array_equal(paths.reference, shared.reference)
         assert not np.array_equal(paths.stack(1)["primal"], shared.stack(1)["primal"])

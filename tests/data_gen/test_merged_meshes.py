@@ -89,7 +89,7 @@ def test_it_is_the_same_scene(renderer, scene_file):
 
 
 def test_a_scene_of_nothing_else_has_its_bounds(renderer, tmp_path):
-    """Of rectangles that Mitsuba merges by itself they are lost, and with them the sky's sphere."""
+    """Mitsuba loses the bounds of rectangles that it merges by itself, and with them the sky's sphere."""
     for i, name in enumerate("abc"):
         (tmp_path / f"{name}.ply").write_text(quad(1.2 * i))
     shapes = "".join(shape(name, '<ref id="red"/>') for name in "abc")

@@ -38,7 +38,7 @@ def wall(mi, z=0.0):
 
 
 def pixel_width(distance, fov=30):
-    """Of the film, in the world, at a distance from the camera."""
+    """The width of a pixel in the world, at a distance from the camera."""
     return 2 * distance * np.tan(np.radians(fov) / 2) / SIZE[0]
 
 

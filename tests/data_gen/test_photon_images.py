@@ -175,7 +175,7 @@ def test_it_converges(renderer, sampler, name, size, photons, least):
     cases([("bre", "vpm", 1.0, 4, 5)], [("beams", "bre", 0.5, 2, 2)]),
 )
 def test_they_have_less_noise_than_points(renderer, better, worse, radius, photons, times):
-    """Of the same light paths, in thin fog; ``bre`` was measured to have 25 times less than ``vpm``."""
+    """The noise of the same light paths, in thin fog; ``bre`` was measured to have 25 times less than ``vpm``."""
     scene = load(renderer, media_scenes.haze, (16, 16))
     noise = []
     for name in (better, worse):

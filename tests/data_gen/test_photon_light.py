@@ -23,7 +23,7 @@ from data_gen.scenes.builtin import _camera, _diffuse
 
 
 def power_of(kind, scene, radius):
-    """Of a lamp, in each colour; of one that is far, what crosses a disk of that radius in every direction of it."""
+    """The power of a lamp, in each colour; for one that is far, what crosses a disk of that radius each way."""
     if kind == "picture":
         # A bilinear texture that is clamped: its mean is not that of its texels.
         u, v = np.meshgrid(*[(np.arange(200) + 0.5) / 200] * 2)
@@ -193,8 +193,8 @@ SAMPLERS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("sampler", SAMPLERS)
 def test_bias_goes_to_zero_with_the_radius(renderer, sampler):
-    """Of images under lamps of all kinds, and of their differences: what is off with a quarter of the radius is
-    little, and no more than half of what was."""
+    """The bias of images under lamps of all kinds, and of their differences: what is off with a quarter of the radius
+    is little, and no more than half of what was."""
     photons, fog = SAMPLERS[sampler]
     scene = load(renderer, lambda: lit_by(fog=fog), (48, 32))
     expected = references(renderer, partial(lit_by, fog=fog), (48, 32))

@@ -74,7 +74,7 @@ def assert_told(measured, told, most=1e-5, quantile=0.99):
 
 @pytest.mark.parametrize("far", [False, True])
 def test_jacobian_by_finite_differences(rays, far):
-    """Of directions from the predecessor; of light from infinity, of origins on a plane across the light."""
+    """The Jacobian of directions from the predecessor; for light from infinity, of origins on a plane across it."""
     g, dr = rays, rays.dr
     way, a = -g.d, g.x + g.d * g.t
     s, t = across(g, way)
@@ -284,7 +284,7 @@ def test_planes_turn_to_and_fro(rays):
 
 @pytest.mark.parametrize("name", ["forward", *(pytest.param(n, marks=pytest.mark.slow) for n in ("haze", "nested"))])
 def test_copies_of_planes_are_planes_and_their_copies_are_the_planes(renderer, name):
-    """Of light paths in a scene: r(T(x)) r(x) = 1, T(T(x)) = x, and Φ'' = Φ."""
+    """Laws of light paths in a scene: r(T(x)) r(x) = 1, T(T(x)) = x, and Φ'' = Φ."""
     from data_gen.samplers.photons.media.gplanes import copied
     from data_gen.samplers.photons.media.planes import crossing, planes_of
 

@@ -19,7 +19,7 @@ SHAPE = (32, 48, 3)
 
 
 def images(rng, noise, n=4, bias=0.0):
-    """Of an image that is 1: with that relative variance."""
+    """Images of a mean of 1, with that relative variance."""
     return [1 + bias + rng.normal(0, noise**0.5, SHAPE) for _ in range(n)]
 
 
@@ -146,7 +146,7 @@ def test_rooms_are_rendered_without_gradients(renderer, monkeypatch):
 
 
 def test_every_camera_is_asked_whether_it_is_in_a_room(renderer):
-    """Those that fill a surface have ray differentials only."""
+    """Cameras that fill a surface have ray differentials only."""
     from camera_cases import RENDERED, scene_with
 
     assert [view for view in (*RENDERED, "batch") if enclosed(scene_with(renderer, view)) not in (True, False)] == []

@@ -35,7 +35,7 @@ def truth():
 
 
 def stack(rng, seed, spp=8, variance=0.5, of_gradients=None):
-    """Of ``truth``, with the relative variance of a sample; and of gradients, where there are any."""
+    """A stack of ``truth``, with the relative variance of a sample; and of gradients, where there are any."""
     image = truth()
     attributes = {"ngpt:spp": spp, "ngpt:seed": str(seed), "ngpt:sampler": "test", "ngpt:normalSpace": "camera"}
     noise = variance / spp * image**2
@@ -51,7 +51,7 @@ def stack(rng, seed, spp=8, variance=0.5, of_gradients=None):
 
 
 def test_what_is_measured_is_the_true_error(renderer, rng, monkeypatch):
-    """Of every method, whatever it blurs: no pilot knows the truth."""
+    """The estimate holds for every method, whatever it blurs: no pilot knows the truth."""
     monkeypatch.setattr(pipelines, "WITH_GRADIENTS", ("wcv", "ngpt-fast"))
     monkeypatch.setattr(pipelines, "WITHOUT", ("primal", "oidn"))
     made = {

@@ -63,7 +63,7 @@ def test_a_gap_is_bridged_by_so_many_frames_and_no_more(renderer, monkeypatch):
 
 
 def test_variances_are_those_over_seeds(renderer):
-    """Of the mean over chains; and differences are not half of themselves."""
+    """The law of the mean over chains; and differences are not half of themselves."""
     found = [rendered(range(2), spp=16, seed=seed)[1] for seed in range(6)]
     for name in ("dx", "dy"):
         over_seeds = np.var([stack[name] for stack in found], axis=0, ddof=1).mean()

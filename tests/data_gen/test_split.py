@@ -50,7 +50,7 @@ def test_what_is_not_has_no_diffuse_light(renderer):
 
 @pytest.mark.slow
 def test_diffuse_light_is_that_of_the_same_materials_without_gloss(renderer):
-    """Of light that lamps send to what the camera sees; Mitsuba renders the materials whose gloss is black."""
+    """The mean of light that lamps send to what the camera sees; Mitsuba renders the materials whose gloss is black."""
     stacks = render_ours(load(renderer, shelf(coats(), 2), (32, 32)), "split", spp=32)
     expected = references(renderer, without_gloss, (32, 32))
     result = z_test(np.stack([stack["diffuse"] for stack in stacks]), expected)

@@ -38,7 +38,7 @@ def blocks(image):
 
 @dataclass
 class Bias:
-    """Of blocks: root mean square relative to the light, and (H / 4, W / 4) of each, with its standard error."""
+    """The error of blocks: root mean square relative to the light; (H / 4, W / 4) of each, with its standard error."""
 
     rms: float
     each: np.ndarray
@@ -132,7 +132,7 @@ def test_cells_shrink_with_samples():
 
 
 def test_odd_images(renderer):
-    """Of one pixel, of part of a picture, and without light."""
+    """Images of one pixel, of part of a picture, and without light."""
 
     def room(lit=True, **film):
         scene = contact()

@@ -92,7 +92,7 @@ def test_weights_of_merging_are_those_of_all_densities(ends):
 
 @pytest.fixture(scope="module")
 def copies(renderer):
-    """Of so many light paths, or of such a radius, that merging has its share."""
+    """With so many light paths, or such a radius, that merging has its share."""
     return Copies(load(renderer, without_hole, (24, 24)), (2, 1), η=1000.0, length=5)
 
 

@@ -62,7 +62,7 @@ def test_noise_and_doubt(tmp_path, rng):
 
 
 def test_the_noise_of_the_reference_is_not_in_the_errors(tmp_path):
-    """Of many references: with halves the errors are those of the clean one, with one image its noise is added."""
+    """Means over many references: halves give the errors of the clean one, a single image adds its noise."""
     rng, room = np.random.default_rng(3), tmp_path / "room"
     clean = write_scene(room, rng, spp=(16,))
     image = ngpt.denoise(ngpt.read(room / "gradients-16-0.exr"), "l2")

@@ -37,7 +37,7 @@ FAST = ROOT / "export" / "weights" / "ngpt-fast.safetensors"
 
 
 def session(model):
-    """Of a model, or of a file."""
+    """A session of a model or of a file."""
     source = model if isinstance(model, Path) else model.SerializeToString()
     return onnxruntime.InferenceSession(source, quiet(), providers=["CPUExecutionProvider"])
 

@@ -21,7 +21,7 @@ BOTH = ("primal", "base")
 
 
 def images(head, height=9, width=11):
-    """Those that a head reads, of radiance from 0 to 1 but one pixel of 1e12."""
+    """Images that a head reads, of radiance from 0 to 1 but one pixel of 1e12."""
     made = [torch.rand(1, 3, height + 2 * head.radius, width + 2 * head.radius) for _ in head.start]
     for image in made:
         image[0, 0, 4, 5] = 1e12

@@ -70,7 +70,7 @@ def test_a_firefly_stays_where_it_is(views, name):
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_sixteen_bits_cost_little(views, name):
-    """Of the body; the error of the image, where it matters most to a user."""
+    """The error of the body; the error of the image, where it matters most to a user."""
     from ngpt.network.run_torch import layers_of
     from ngpt.repair import repair
 

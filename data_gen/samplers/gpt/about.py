@@ -18,8 +18,8 @@ register(
         options={
             "shift": Option(
                 "replay",
-                "before paths join; half-vector copies that of smooth events, manifold follows some of the light of "
-                "'caustic' to its lamps",
+                "before paths join; half-vector copies the half vectors of smooth events, manifold follows some of the "
+                "light of 'caustic' to its lamps",
                 choices=("replay", "half-vector", "manifold"),
             ),
             "reuse": Option(False, "the primal is the mean over base paths and the offset paths of neighbours"),

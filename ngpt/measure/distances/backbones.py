@@ -104,7 +104,7 @@ def _checked(kind: type[SqueezeNet] | type[Vgg16], file: Path) -> dict[str, Tens
     content = read_bytes(file, _LARGEST)
     if hashlib.sha256(content).hexdigest() != kind.SHA256:
         raise NgptError(
-            f"{file}: its checksum is not {kind.SHA256[:8]}..., that of {kind.FILE}; download it again, or convert "
+            f"{file}: its checksum is not {kind.SHA256[:8]}..., as {kind.FILE} has it; download it again, or convert "
             "other weights to .safetensors"
         )
     return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)

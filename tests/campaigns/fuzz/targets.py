@@ -148,7 +148,7 @@ def shard(number: int, folder: Path) -> None:
 
 @cache
 def _weights() -> tuple[bytes, bytes]:
-    """Of a tiny network, and the checkpoint of its training after one step."""
+    """Weights of a tiny network, and the checkpoint of its training after one step."""
     with tempfile.TemporaryDirectory() as folder:
         run = _trainer(Path(folder))
         run.run()
@@ -203,7 +203,7 @@ def checkpoint(number: int, folder: Path) -> None:
 
 
 def settings(number: int, folder: Path) -> None:
-    """Of training and of data generation."""
+    """Configurations of training and of data generation."""
     from data_gen.dataset.config import read_config
     from ngpt.training.settings import read_settings
 
