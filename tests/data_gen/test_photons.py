@@ -211,11 +211,11 @@ def test_what_is_lost_along_the_edges_of_grids_falls_like_the_radius(renderer):
     scene = load(renderer, media_scenes.smoke, (16, 16))
     theirs = [image.mean() for image in references(renderer, media_scenes.smoke, (16, 16))]
     wide, narrow = (
-        [s["primal"].mean() for s in render_ours(scene, "vpm", 16, 1, seed=seed, photons=128, radius=radius)]
+        [s["primal"].mean() for s in render_ours(scene, "vpm", 32, 1, seed=seed, photons=128, radius=radius)]
         for seed, radius in ((0, 0.4), (100, 0.2))
     )
     off = 2 * np.mean(narrow) - np.mean(wide) - np.mean(theirs)
-    error = np.sqrt((4 * np.var(narrow) + np.var(wide) + np.var(theirs)) / 15)
+    error = np.sqrt((4 * np.var(narrow) + np.var(wide)) / 31 + np.var(theirs) / (len(theirs) - 1))
     assert abs(off) < 4 * error and error < 0.03 * np.mean(theirs), (off, error)
     assert np.mean(theirs) - np.mean(wide) > 2 * error
 
@@ -297,7 +297,7 @@ def test_light_by_planes_has_no_bias(renderer, planes_alone):
         for depth in (6, 2)
     )
     expected = np.stack([a["primal"] - b["primal"] for a, b in zip(long, short, strict=True)])
-    assert expected.mean() > 0.05
+    assert expected.mean() > 0.03
     result = z_test(np.stack([stack["primal"] for stack in ours]), expected, block=4)
     assert result.passed, result
 
