@@ -44,8 +44,9 @@ _MARGIN, _SMALLEST = 1.05, 0.125
 _TRIM = 0.001
 # This share of the changes is cut to the next smaller one: else all pixels around a firefly get its samples.
 _CUT = 0.03
-# Standard errors are right for two values in three. The few that are far off make the mean square larger; that of l1,
-# whose standard errors count the light that it leaves out, is smaller. By python -m bench.adaptive, six scenes.
+# The mean square error over the mean of squared standard errors. A standard error is right for two values in three, and
+# a few values far off raise the mean square. Standard errors of l1 count the light that it leaves out, so its factor is
+# below 1. By python -m bench.adaptive, six scenes.
 _TAILS, _TAIL = {"l1": 0.75}, 1.25
 # Pixels, the side of the part of an image that tells how long the method takes
 _PART = 96

@@ -55,9 +55,9 @@ def write_frames(
 
     With ``denoising`` it writes images instead of stacks, see ``data_gen.outputs``. With ``shard`` (i, n) it writes
     only part i of n. ``made`` is called with what is written so far and the number of frames, before the first sample
-    and after each frame. Folders that are not there are made before the first sample, too. ``options`` are as in
-    ``render_frames``. Raises NgptError as ``render_frames`` does, and for files that exist
-    unless ``overwrite`` or ``skip_existing`` says what to do with them.
+    and after each frame. Missing folders are made before the first sample, too. ``options`` are as in
+    ``render_frames``. Raises NgptError as ``render_frames`` does, and for files that exist unless ``overwrite`` or
+    ``skip_existing`` says what to do with them.
     """
     number, parts = shard
     # Each part is a run of consecutive frames, since a frame needs the scene of the previous one.
@@ -127,7 +127,7 @@ def write_frames(
 
 
 def asked_of(scene: str, frame: int, **arguments: Any) -> Asked:
-    """What ``render_frames`` is asked for a frame by these ``arguments`` of it."""
+    """What ``render_frames`` is asked for a frame by these ``arguments``; the defaults are in its signature."""
     bound = signature(render_frames).bind(scene, [frame], **arguments)
     bound.apply_defaults()
     its = SimpleNamespace(**bound.arguments)

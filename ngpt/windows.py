@@ -156,7 +156,7 @@ def put(image: np.ndarray, window: Window, canvas: Window, outside: float = 0.0)
         return image
     if canvas.width * canvas.height > MOST:
         raise NgptError(
-            f"the display window is {canvas.width}x{canvas.height} pixels, of which the file has {window}; "
+            f"the display window is {canvas.width}x{canvas.height} pixels, and the file has {window}; "
             f"at most {MOST >> 20} million pixels are shown: set a smaller display window"
         )
     filled = np.full((canvas.height, canvas.width, *image.shape[2:]), outside, image.dtype)

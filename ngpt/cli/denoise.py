@@ -150,13 +150,12 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         name: value for name in ("alpha", "weights", "device", "memory") if (value := getattr(args, name)) is not None
     }
     options |= dict(args.option)
-    # What no file could be denoised with
-    if "weights" in options:
-        identify(options["weights"])
-    elif args.method != "auto":
-        runnable(args.method)
+    # What no file could be denoised with. A method without shipped weights runs by the user's.
+    if args.weights:
+        identify(args.weights)
     if args.method != "auto":
-        settings(f"method '{args.method}'", METHODS[args.method].options, options)
+        entry = METHODS[args.method] if args.weights else runnable(args.method)
+        settings(f"method '{args.method}'", entry.options, options)
     reference = Reference.read(args.ref, args.untrusted) if args.ref else None
     for _, target in pairs:
         if target.suffix.lower() != ".exr":

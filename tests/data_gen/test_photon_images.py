@@ -272,7 +272,7 @@ TWINS = [("gvpm", "vpm"), ("gbre", "bre"), ("gbeams", "beams"), ("gplanes", "pla
     ),
 )
 def test_the_primal_is_that_of_the_sampler_without_gradients(renderer, pair, name):
-    """The same camera paths and photons; only Russian roulette looks at five paths instead of one."""
+    """Camera paths and photons are the same. Russian roulette differs: it looks at five paths instead of one."""
     scene = load(renderer, named(name, max_depth=5, rr_depth=9), (24, 16))
     ours, theirs = (render_ours(scene, sampler, 1, 2, radius=1.0)[0] for sampler in pair)
     for layer in ("primal", "direct", "albedo", "normal", "depth"):
