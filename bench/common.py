@@ -78,12 +78,15 @@ def renderer(variant: str | None = None) -> tuple[Callable[..., Any], Callable[.
     return load_scene, render_stack
 
 
-def rendered(folder: Path, size: Sequence[int], scene: str, spp: int, sampler: str, seed: int) -> GradientStack:
-    """A stack of a scene, from the folder if it is there."""
+def rendered(
+    folder: Path, size: Sequence[int], scene: str | Path, spp: int, sampler: str, seed: int, **options: Any
+) -> GradientStack:
+    """A stack of a scene, from the folder if it is there; ``options`` are the sampler's."""
 
     def make() -> GradientStack:
         load_scene, render_stack = renderer()
-        return render_stack(load_scene(scene, (width, height)), spp, seed, sampler)
+        return render_stack(load_scene(str(scene), (width, height)), spp, seed, sampler, **options)
 
     width, height = size
-    return kept(folder / f"{scene_name(scene)}-{sampler}-{spp}-{seed}-{width}x{height}.exr", make)
+    how = "".join(f"-{name}={value:g}" for name, value in options.items())
+    return kept(folder / f"{scene_name(str(scene))}-{sampler}-{spp}-{seed}{how}-{width}x{height}.exr", make)

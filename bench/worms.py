@@ -9,11 +9,12 @@ Written are bench/results/worms.json and the table between the marks of the page
 """
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import ngpt
-from bench.common import kept, metadata, save, write_page
+from bench.common import metadata, rendered, save, write_page
 from ngpt.evaluation.config import scene_name
 from ngpt.layers import GATHERED
 from ngpt.measure.flip import flip
@@ -61,32 +62,18 @@ def main() -> None:
 
 def of_scene(args: argparse.Namespace, case: Case) -> list[dict[str, Any]]:
     """The errors of both ways, for each number of samples."""
-    how = (case.sampler, case.reference_spp, case.radius)
-    halves = [rendered(args, case.scene, *how, seed)["primal"] for seed in REFERENCE_SEEDS]
+    scene = args.folder / case.scene if (args.folder / case.scene).exists() else case.scene
+    render = partial(rendered, args.cache, args.size, scene)
+    halves = [render(case.reference_spp, case.sampler, seed, radius=case.radius)["primal"] for seed in REFERENCE_SEEDS]
     middle, cells = sum(halves) / 2, []
     for spp in case.spp:
-        stack = rendered(args, case.scene, "vcm", spp, RADIUS, SEED)
+        stack = render(spp, "vcm", SEED, radius=RADIUS)
         for apart in (False, True):
             image = ngpt.denoise(GradientStack(stack.layers, {GATHERED: int(apart)}), "oidn")
             errors = {"relMSE": relmse(image, *halves), "relMSE trimmed": relmse_trimmed(image, *halves)}
             cell = {"scene": scene_name(case.scene), "spp": spp, "apart": apart}
             cells.append(cell | errors | {"FLIP": flip(image, middle)[0]})
     return cells
-
-
-def rendered(args: argparse.Namespace, scene: str, sampler: str, spp: int, radius: float, seed: int) -> GradientStack:
-    """A stack, from the cache if it is there."""
-
-    def make() -> GradientStack:
-        import data_gen
-
-        path = args.folder / scene if (args.folder / scene).exists() else scene
-        options = {"size": tuple(args.size), "radius": radius}
-        return data_gen.render_scene(path, spp=spp, seed=seed, sampler=sampler, **options)[0]
-
-    width, height = args.size
-    name = f"{scene_name(scene)}-{sampler}-{spp}-{radius:g}-{seed}-{width}x{height}.exr"
-    return kept(args.cache / name, make, {"direct": "direct"})
 
 
 def table(cells: list[dict[str, Any]]) -> str:
