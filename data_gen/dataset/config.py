@@ -43,7 +43,7 @@ class Config:
     ``reference_method``  that reconstructs the references
     ``scenes``     procedural scenes
     ``varied``     whether some of them have further sights
-    ``sights``     share of the varied scenes that have each sight: fine, hair, bulbs, caustic, media
+    ``sights``     share of the varied scenes that have each sight: names of data_gen.scenes.procedural.variety.SHARES
     ``adaptive``   share of the inputs from 32 samples on whose samples are uneven, docs/use/adaptive.md
     ``crops``      of each procedural scene
     ``files``      scene files, a table [[files]] each: pattern and crops, and if you like parameters and boxes

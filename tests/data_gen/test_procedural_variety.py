@@ -17,8 +17,9 @@ from data_gen.dataset import crops, jobs
 from data_gen.dataset.cameras import Surroundings, find_view
 from data_gen.dataset.config import Config, made_name
 from data_gen.scenes.builtin import _box, _camera, _diffuse, _sphere, _volume, _wall
-from data_gen.scenes.procedural import media, things, variety
-from data_gen.scenes.procedural.scenes import make_scene
+from data_gen.scenes.procedural import hard_light, media, things, variety
+from data_gen.scenes.procedural.materials import ROLES
+from data_gen.scenes.procedural.scenes import _surface, make_scene
 from data_gen.scenes.procedural.stage import Stage
 from ngpt.errors import NgptError
 from ngpt.system.writing import write_json
@@ -57,7 +58,7 @@ def test_each_sight_comes_as_often_as_is_said():
     found = [variety.further_sights((11, i))[0] for i in range(3000)]
     for name, share in variety.SHARES.items():
         count = sum(name in sights for sights in found)
-        assert abs(count - share * 3000) < 4 * np.sqrt(3000 * share * (1 - share)), name
+        assert abs(count - share * 3000) <= 4 * np.sqrt(3000 * share * (1 - share)), name
     assert 0.1 <= variety.SHARES["media"] <= 0.2
     # Each for itself: both together as often as chance has it.
     both = sum({"hair", "fine"} <= sights for sights in found) / 3000
@@ -107,6 +108,51 @@ def test_hair_is_as_thin_as_hair():
         assert np.median(edges.min(axis=1)) < 0.004  # metres round the tube
 
 
+def room_of(seed: int) -> Stage:
+    """A room of 6 x 4 x 3 metres with a camera in it."""
+    stage = Stage(np.random.default_rng(seed))
+    stage.area, stage.height, stage.closed = (6.0, 4.0), 3.0, True
+    stage.standing.append((1.0, -0.5, 0.6))
+    return stage
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_partition_leaves_one_opening_beside_the_camera(seed):
+    stage = room_of(seed)
+    hard_light.partition(stage)
+    slots = [slot for slot in ROLES["wall"] if slot in stage.meshes]
+    faces = [mesh for slot in slots for mesh in stage.meshes[slot]]
+    assert len(faces) == 2
+    low, high = (np.min([m.vertices.min(0) for m in faces], 0), np.max([m.vertices.max(0) for m in faces], 0))
+    thick, wide = sorted((high - low)[[0, 2]])
+    assert thick == pytest.approx(0.1) and wide in (pytest.approx(4), pytest.approx(6))
+    areas = [_surface(mesh) for mesh in faces]
+    assert areas[0] == pytest.approx(areas[1]) and 0.4 * 3 * wide < areas[0] < 3 * wide - 0.01 * 1.5
+    across = 0 if wide == pytest.approx(4) else 2
+    assert abs((low + high)[across] / 2 - (1.0, 0, -0.5)[across]) > hard_light.CLEAR
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_lamps_differ_by_up_to_100_and_mirrors_are_in_the_room(seed):
+    stage = room_of(seed)
+    lamps = hard_light.lamps(stage, variety.EMITTERS)
+    assert len(lamps) == variety.EMITTERS
+    power = [light.mean() * _surface(mesh) for mesh, light in lamps]
+    assert max(power) / min(power) < 100 * (1 / 0.6)
+    hard_light.mirrors(stage)
+    for mesh in [*(mesh for mesh, _ in lamps), *(mesh for meshes in stage.meshes.values() for mesh in meshes)]:
+        # Shades and ledges may reach into walls.
+        assert (np.abs(mesh.vertices) <= [3.5, 4.0, 2.5]).all()
+
+
+def test_lamps_of_unlike_power_are_unlike():
+    ratios = []
+    for seed in range(40):
+        power = [light.mean() * _surface(mesh) for mesh, light in hard_light.lamps(room_of(seed), variety.EMITTERS)]
+        ratios.append(max(power) / min(power))
+    assert 8 < np.median(ratios) < 50
+
+
 def test_fine_pictures_repeat_more_often(monkeypatch):
     stage = Stage(np.random.default_rng(0))
     stage.add([("floor", variety.box([4, 0.1, 4]))])
@@ -130,6 +176,7 @@ def test_each_kind_renders(tmp_path, monkeypatch):
     """In Mitsuba's scalar variant, which compiles no kernel."""
     paths = []
     cases = [("hair", ""), ("bulbs", ""), ("caustic", ""), ("fine", ""), *(("media", kind) for kind in media.KINDS)]
+    cases += [("partition", ""), ("lamps", ""), ("mirrors", "")]
     for number, (sight, kind) in enumerate(cases):
         folder = tmp_path / f"{sight}{kind}"
         folder.mkdir()

@@ -5,9 +5,11 @@ import pytest
 import torch
 from crops import PairedCrop, SyntheticCrop, settings
 
+from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError
+from ngpt.stack import GradientStack
 from ngpt.training.augment import Augmentation
-from ngpt.training.examples import Examples, collated
+from ngpt.training.examples import Examples, collated, other_half
 from ngpt.training.halves import halves
 
 
@@ -109,5 +111,27 @@ def test_what_cannot_be_learnt_from_is_refused():
     crop.stack = lambda k: crop.of.stack(0)
     with pytest.raises(NgptError, match="both halves are the same"):
         examples_of(crop)[0]
-    with pytest.raises(NgptError, match="the network reads none"):
-        Examples([crop], settings(model_inputs=["primal", "albedo"]).model, Augmentation(), 32, seed=0)
+
+
+def test_networks_without_gradients_are_judged_by_the_differences_of_the_whole_light():
+    """Gradients hold none of the layer ``caustic``: its own differences are added to them, and their variances."""
+    rng = np.random.default_rng(4)
+    light = [rng.random((6, 5, 3), np.float32) for _ in range(2)]
+    primal = [rng.random((6, 5, 3), np.float32) for _ in range(2)]
+    variances = {f"{name}_var": np.full((6, 5, 3), v, np.float32) for name, v in (("dx", 1), ("dy", 4))}
+    halves_of = [
+        GradientStack.from_arrays(
+            **{"primal": a + b, "caustic": b, "caustic_var": np.full_like(b, 9), "primal_var": np.full_like(b, 25)},
+            **dict(zip(("dx", "dy"), forward_differences(a), strict=True)),
+            **variances,
+        )
+        for a, b in zip(primal, light, strict=True)
+    ]
+    judge, apart = (other_half(*halves_of, whole) for whole in (True, False))
+    assert np.allclose(judge["primal"], primal[1] + light[1]) and np.allclose(apart["primal"], primal[1], atol=1e-6)
+    for name, axis, own in (("dx", 1, 1), ("dy", 0, 4)):
+        inside = np.s_[:, :-1] if axis else np.s_[:-1]
+        assert np.allclose(judge[name][inside], np.diff(primal[1] + light[1], axis=axis), atol=1e-5)
+        assert np.allclose(apart[name][inside], np.diff(primal[1], axis=axis), atol=1e-5)
+        assert np.allclose(judge[f"{name}_se"][inside] ** 2, own + 18) and np.allclose(apart[f"{name}_se"] ** 2, own)
+    assert np.allclose(judge["primal_se"] ** 2, 34) and np.allclose(apart["primal_se"] ** 2, 25)

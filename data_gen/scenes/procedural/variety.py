@@ -1,4 +1,5 @@
-"""Sights that few scenes have, each added to some scenes: fine pictures, hair, many small lamps, caustics, media.
+"""Sights that few scenes have, each added to some scenes: fine pictures, hair, many small lamps, caustics, media, and
+those of ``data_gen.scenes.procedural.hard_light``.
 
 They come on top of a scene that is there already, drawn from random numbers of their own: a scene that none of them
 falls to is the same without this file.
@@ -11,13 +12,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_gen.scenes.procedural import things
+from data_gen.scenes.procedural import hard_light, things
 from data_gen.scenes.procedural.meshes import Mesh, box, cylinder, lathe, merge, sphere, torus
 from data_gen.scenes.procedural.stage import Stage
 from data_gen.scenes.procedural.textures import colour
 
 # The share of scenes that each falls to, independently, where a configuration says nothing else.
-SHARES = {"fine": 0.25, "hair": 0.25, "bulbs": 0.15, "caustic": 0.15, "media": 0.16}
+SHARES = {
+    **{"fine": 0.25, "hair": 0.25, "bulbs": 0.15, "caustic": 0.15, "media": 0.16},
+    **{"partition": 0.0, "lamps": 0.0, "mirrors": 0.0},
+}
 
 # Small lamps are this many emitters, whatever they are: kernels depend on the number.
 EMITTERS = 4
@@ -42,15 +46,23 @@ def further_sights(
     ``shares`` has all names of ``SHARES``, in the same order.
     """
     rng = np.random.default_rng((*(seed if isinstance(seed, tuple) else (seed,)), 0x5EE))
-    return frozenset(name for name, share in shares.items() if rng.random() < share), rng
+    # A share of 0 draws no number, so that sights that a configuration does not ask for change no scene.
+    return frozenset(name for name, share in shares.items() if share and rng.random() < share), rng
 
 
 def add_sights(stage: Stage, sights: frozenset[str], rng: np.random.Generator) -> list[Lamp]:
     """Puts them on the stage, but for media; returns the lamps among them, ``EMITTERS`` or none."""
     before, stage.rng = stage.rng, rng
     lamps: list[Lamp] = []
+    if "partition" in sights:
+        hard_light.partition(stage)
+    if "mirrors" in sights:
+        hard_light.mirrors(stage)
     if "hair" in sights:
         hair(stage)
+    # These sights bring all the lamps that a scene may have further.
+    if "lamps" in sights and not sights & {"caustic", "bulbs"}:
+        lamps = [Lamp(*lamp) for lamp in hard_light.lamps(stage, EMITTERS)]
     if "caustic" in sights:
         lamps = caustic(stage)
     if "bulbs" in sights:
