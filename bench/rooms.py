@@ -5,7 +5,7 @@
 The files of one ARM are its seeds. Error is the trimmed relMSE against two halves of a path-traced reference. FLIP is
 measured against the mean of the halves. Brightness is the mean of the image over the mean of the reference. Error and
 FLIP are ratios to ``--start``, geometric means over the rooms, each followed by its standard error over seeds and
-rooms. Stacks are rendered by `gpt` with one seed.
+rooms. Stacks are rendered with one seed, as `ngpt render` renders them: where it pays, paths share their tails.
 """
 
 import argparse
@@ -30,6 +30,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--weights", nargs="+", default=[], metavar="ARM=FILE")
     parser.add_argument("--start", default="export/weights/ngpt-combine.safetensors", metavar="FILE")
+    parser.add_argument("--sampler", default="gpt", help="of the stacks, such as primal for ngpt-primal")
     parser.add_argument("--size", type=int, nargs=2, default=[320, 180])
     parser.add_argument("--spp", type=int, nargs="+", default=[4, 16, 64])
     parser.add_argument("--reference", type=int, default=384, metavar="SPP", help="of each half")
@@ -40,15 +41,24 @@ def main() -> None:
     rows = json.loads(args.output.read_text())["rows"] if args.output.exists() else []
     for scene in args.scenes:
         halves = tuple(
-            rendered(args.cache, args.size, scene, args.reference, "primal", seed)["primal"] for seed in (1000, 1001)
+            rendered(args.cache, args.size, scene, args.reference, "primal", seed, unbiased=True)["primal"]
+            for seed in (1000, 1001)
         )
         for spp in args.spp:
-            stack = rendered(args.cache, args.size, scene, spp, "gpt", 1)
+            stack = rendered(args.cache, args.size, scene, spp, args.sampler, 1, unbiased=False)
             for arm, path in given:
                 about = {"room": scene_name(scene), "spp": spp, "arm": arm, "weights": Path(path).as_posix()}
                 if not any(about.items() <= row.items() for row in rows):
                     rows.append(about | judged(ngpt.denoise(stack, "ngpt", weights=str(path)), halves))
-                    save(args.output, {"metadata": metadata("torch", "mitsuba"), "size": args.size, "rows": rows})
+                    save(
+                        args.output,
+                        {
+                            "metadata": metadata("torch", "mitsuba"),
+                            "sampler": args.sampler,
+                            "size": args.size,
+                            "rows": rows,
+                        },
+                    )
     print(table(rows, args.spp))
 
 
