@@ -59,25 +59,21 @@ def _entries_of(module: str) -> str | None:
 
 def _imports(file: Path) -> set[str]:
     """The modules of data_gen that a file imports, and the packages they are in."""
-    found = set()
-    for node in ast.walk(_tree(file, file.stat().st_mtime_ns)):
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and not node.level:
-            names = [node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)]
-        else:
-            continue
-        for name in names:
-            parts = name.split(".")
-            prefixes = [".".join(parts[: i + 1]) for i in range(len(parts))]
-            found |= {prefix for prefix in prefixes if parts[0] == "data_gen" and _file(prefix).is_file()}
-    return found
+    return {name for name in _named(file, file.stat().st_mtime_ns) if _file(name).is_file()}
 
 
 # Cached by the time of the last change of the file
 @lru_cache(maxsize=1024)
-def _tree(file: Path, changed: int) -> ast.Module:
-    return ast.parse(file.read_bytes())
+def _named(file: Path, changed: int) -> frozenset[str]:
+    """Names in data_gen that a file imports, and what they are in."""
+    found = set()
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            found |= {node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)}
+    parts = [name.split(".") for name in found if name.partition(".")[0] == "data_gen"]
+    return frozenset(".".join(words[: i + 1]) for words in parts for i in range(len(words)))
 
 
 @lru_cache(maxsize=1024)

@@ -8,7 +8,6 @@ import ngpt
 from ngpt.denoisers import caustic, diffusion, oidn
 from ngpt.io.exr import read, write
 from ngpt.io.openexr import read_exr
-from ngpt.io.resolution import resolve
 from ngpt.layers import FEATURE_NOISE, GATHERED
 from ngpt.merging import merge
 from ngpt.methods import METHODS, reconstruct
@@ -89,16 +88,6 @@ def test_files_keep_it_in_full_precision(tmp_path):
     write(tmp_path / "result.exr", ngpt.denoise(again, "wcv"), like=again)
     for held in (again, read(tmp_path / "result.exr")):
         assert all(np.array_equal(held[name], stack[name]) for name in ("primal", "caustic", "caustic_var"))
-
-
-def test_the_name_counts_only_in_files_of_ours():
-    def names(*layers):
-        return [f"{layer}.{c}" if layer else c for layer in layers for c in "RGB"]
-
-    assert "caustic" not in resolve([("", names("", "caustic"))])
-    assert "caustic" in resolve([("", names("", "caustic"))], {"caustic": "caustic"})
-    for beside in ("dx", "caustic_var"):
-        assert "caustic" in resolve([("", names("", "caustic", beside))])
 
 
 def test_merged_stacks_are_the_stack_of_all_samples(rng):

@@ -146,27 +146,6 @@ def test_the_readme_is_short_and_its_numbers_are_in_the_results():
         assert pair in results, pair
 
 
-def test_campaigns_of_one_kind_share_a_row():
-    from scripts.reliability import kinds, row, together
-
-    def report(campaign, done, temporary):
-        outcomes = {"done": done, "one line": 1}
-        return {
-            "campaign": campaign,
-            "tried": done + 1,
-            "outcomes": outcomes,
-            "worst": {"files": temporary},
-            "seconds": 2,
-        }
-
-    reports = [report("Kills at random moments of a", 3, 0), report("Kills at random moments of b, c", 4, 1)]
-    first, second = kinds([*reports, report("Weights, mutated", 5, 0)])
-    assert row(together(first)) == "| Kills at random moments of: a, b c | 9 | 7 done; 2 one line | files: 1 | 4 |\n"
-    assert row(together(second)).startswith("| Weights, mutated | 6 |")
-    many = report("Scenes", 1, 0) | {"worst": {"a": "2.5 dx", "b": "1 dy", "c": "6.5 dx", "d": "0.2 dx", "e": "3 dx"}}
-    assert "| c: 6.5 dx; e: 3 dx; a: 2.5 dx |" in row(many)
-
-
 @pytest.fixture
 def blocks_of(tmp_path, monkeypatch):
     """The blocks of Python on a page, and an empty folder to run them in."""

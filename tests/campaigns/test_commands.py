@@ -78,8 +78,10 @@ def test_kills(tmp_path, kind, kills):
 EARLY, DONE = "while Python starts and imports its own modules: as Python does", "done before"
 
 
-@pytest.mark.parametrize("name", SIGNALS)
-@pytest.mark.parametrize(("kind", "interrupts"), [("denoise", 4), *(at_length(kind, 20) for kind in COMMANDS)])
+@pytest.mark.parametrize(
+    ("kind", "name", "interrupts"),
+    [("denoise", "Ctrl-C", 4), *(at_length(kind, name, 20) for kind in COMMANDS for name in SIGNALS)],
+)
 def test_interrupts(tmp_path, kind, name, interrupts):
     """At moments spread over a whole run."""
     number = SIGNALS[name]
@@ -117,10 +119,12 @@ STREAMS = {
 }
 
 
-@pytest.mark.parametrize("kinds", [["merge"], at_length(list(COMMANDS))])
-def test_output_that_nobody_takes(tmp_path, kinds):
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+def test_output_that_nobody_takes(tmp_path):
+    """In short in tests/robustness/test_interrupts.py."""
     outcomes = {"work done": 0, "quiet or one line, nothing half-written": 0}
-    for kind in kinds:
+    for kind in COMMANDS:
         folder = tmp_path / kind
         folder.mkdir()
         job = make_work(kind, folder)

@@ -161,19 +161,6 @@ def test_missing_variances_are_filled_from_their_neighbours(name, value):
     run(name, *data, [np.full_like(v, value) for v in variances])
 
 
-@pytest.mark.parametrize("name", [name for name in ngpt.METHODS if name in ("primal", *METHODS)])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_pixels_and_gradients_that_are_not_finite_are_repaired(name, value):
-    _, *data, variances = noisy_stack(24, 30)
-    layers = dict(zip(("primal", "dx", "dy", "primal_var", "dx_var", "dy_var"), (*data, *variances), strict=True))
-    good = ngpt.denoise(ngpt.GradientStack.from_arrays(**layers), name)
-    for layer in layers.values():
-        layer[10:12, 11] = value
-    result = ngpt.reconstruct(ngpt.GradientStack.from_arrays(**layers), name)
-    assert result.repaired == 2 and np.isfinite(result.image).all()
-    assert np.abs(result.image - good)[:, 22:].max() < 0.1 * good.max()
-
-
 # Symmetry
 
 

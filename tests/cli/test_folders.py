@@ -4,16 +4,13 @@ import json
 import os
 import re
 import subprocess
-import sys
 
 import numpy as np
 import pytest
 from full_stack import full_stack
-from processes import ENVIRONMENT, ROOT, complete
+from processes import ENVIRONMENT, NGPT, ROOT, complete
 
 import ngpt
-
-NGPT = (sys.executable, "-m", "ngpt")
 
 
 @pytest.fixture
@@ -26,7 +23,7 @@ def frames(tmp_path):
     return folder
 
 
-@pytest.mark.parametrize("method", ["wcv", "ngpt-fast", "nfor"])
+@pytest.mark.parametrize("method", ["wcv", "ngpt-fast"])
 def test_a_folder_gives_the_bits_of_its_frames(frames, tmp_path, method, command):
     command(f"denoise frames -o all -m {method} -q")
     for path in frames.iterdir():

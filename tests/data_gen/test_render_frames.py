@@ -101,7 +101,6 @@ def test_a_shot_is_rendered_and_gone_on_with(renderer, command):
 @pytest.mark.parametrize(
     ("words", "status"),
     [
-        ("render diffuse --frames 0:2 --dt 1 -o made", 2),
         ("render none.xml --frames 0:2 -o made", 1),
         ("render diffuse --frames 0:2 -o made --camera none.json", 1),
         ("render diffuse --frames 0:2 -o made --sampler gvpm", 1),

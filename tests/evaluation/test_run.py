@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -16,6 +17,7 @@ from ngpt.evaluation import cells
 from ngpt.evaluation.run import picture_path
 from ngpt.evaluation.stability import flicker_and_bias, rolling_shutter, study
 from ngpt.io.exr import read_image
+from ngpt.system.files import exclusive
 
 CONFIG = """
 scenes = ["{folder}"]
@@ -97,6 +99,7 @@ def test_what_is_done_is_not_done_again_unless_a_stack_changed(done, tmp_path, m
 
 def test_killed_half_way_goes_on(room, monkeypatch):
     folder, config = room
+    config = replace(config, methods=("primal", "l2", "wcv", "cv"))
     real, calls = cells.reconstruct, []
 
     def dies(*arguments, **options):
@@ -141,7 +144,7 @@ def spoilt(tmp_path_factory):
     for name, (spoil, _) in SPOILT.items():
         spoil(folder / name)
     scenes = ", ".join(f'"{folder}/{name}"' for name in ("hall", *SPOILT))
-    config = replace(read(CONFIG.replace('"{folder}"', scenes), folder), methods=("primal", "l2"))
+    config = replace(read(CONFIG.replace('"{folder}"', scenes), folder), spp=(16,), methods=("primal", "l2"))
     return evaluated(config, folder / "out"), (folder / "out" / "results.md").read_text()
 
 
@@ -204,6 +207,7 @@ def test_a_configuration_may_build_on_another(tmp_path):
 
 def test_the_command(room, capsys):
     folder, _ = room
+    read('methods = ["primal"]'.join(re.split("methods = .*", CONFIG.format(folder=folder / "room"))), folder)
     out = folder / "out"
     write_scene(folder / "hall", np.random.default_rng(1))
     arguments = ["--config", str(folder / "config.toml"), "--out", str(out), "--scenes", str(folder / "hall"), "-q"]
@@ -212,6 +216,9 @@ def test_the_command(room, capsys):
     assert set(results["scenes"]) == {"room", "hall"} and "--scenes" in results["command"]
     assert command(["--config", str(folder / "none.toml"), "--out", str(out)]) == 1
     assert "none.toml: cannot be read" in capsys.readouterr().err
+    with exclusive(out):
+        assert command(arguments) == 1
+    assert "another process is writing there" in capsys.readouterr().err
     (folder / "hall" / "reference.exr").unlink()
     assert command(arguments) == 1
 

@@ -106,8 +106,8 @@ def test_heads_are_the_same_as_graphs(head):
     sides, sweeps = (16 + 2 * head.radius, 24 + 2 * head.radius), isinstance(head, Poisson)
     prediction = 2 * torch.randn(2, head.outputs, 16, 24)
     if sweeps:
-        # Sweeps carry what a bright pixel is rounded by to its dark neighbours, and some processors round exp to 20 units
-        # of the last place: no pixel is more than some hundred times as bright as the next.
+        # Sweeps carry what a bright pixel is rounded by to its dark neighbours, and some processors round exp to 20
+        # units of the last place: no pixel is more than some hundred times as bright as the next.
         prediction[:, : head.inner.outputs] /= 4
         gradients = [torch.randn(2, 3, *sides), torch.randn(2, 3, *sides), *torch.rand(2, 2, 1, *sides)]
         gradients[2][..., head.radius + 3, :] = 0

@@ -12,7 +12,7 @@ torch = pytest.importorskip("torch")
 # ruff: noqa: E402
 import onnx
 from full_stack import full_stack
-from networks import dense, untrained
+from networks import plain, untrained
 
 import ngpt
 from ngpt.cli import main
@@ -21,7 +21,7 @@ from ngpt.network.safetensors import load_weights, read_tensors, save_weights, w
 from ngpt.sequence.network import INPUTS
 from ngpt.training.temporal import WIDTHS, network
 
-CONFIG = dense(("primal", "base", "primal_se", "dx_se"), "wcv", start=("primal", "base"))
+CONFIG = plain(("primal", "base", "primal_se", "dx_se"), "wcv", start=("primal", "base"), channels=(4, 4))
 STEPS = 1000
 
 

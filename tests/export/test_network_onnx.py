@@ -16,7 +16,7 @@ import onnx
 import onnxruntime
 from full_stack import full_layers
 from hosts import read_layers, stack_of
-from networks import ALL, GRAPHED, untrained
+from networks import ALL, GRAPHED, plain, untrained
 from scipy.ndimage import uniform_filter
 
 from export.__main__ import main
@@ -267,8 +267,9 @@ def test_metadata_tell_all_and_nothing_of_this_machine():
     assert not any(initializer.external_data for initializer in model.graph.initializer)
 
 
-def test_command(tmp_path, weights, capsys):
-    output, path = tmp_path / "m.onnx", weights / "as published.safetensors"
+def test_command(tmp_path, capsys):
+    output, path = tmp_path / "m.onnx", tmp_path / "w.safetensors"
+    save_weights(path, untrained(plain(ALL, channels=(4, 4))), {})
     command = ["--weights", str(path), "-o", str(output)]
     assert main([*command, "--vector", str(tmp_path / "vector")]) == 0
     # Hosts look for it there.

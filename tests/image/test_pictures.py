@@ -98,8 +98,7 @@ def test_denoise_writes_a_picture_and_says_what_it_cannot_hold(tmp_path, image, 
     words = ["denoise", str(tmp_path / "a.exr"), "-m", "primal", "-o", str(tmp_path / "a.png")]
     for more in (["--error"], ["--groups"], ["--skip-existing"]):
         assert main([*words, *more]) == 2
-    assert main([*words[:-1], str(tmp_path / "a.tiff")]) == 2
-    assert "let the name end in .exr .pfm .png .jpg" in capfd.readouterr().err
+    capfd.readouterr()
     assert main([*words, "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["files"][0]["output"].endswith("a.png")
     assert np.array_equal(np.asarray(opened(tmp_path / "a.png")), shown(image))

@@ -236,6 +236,7 @@ def test_layers_that_look_like_missing_ones_are_proposed(channels, expected):
     [
         ("direct", "direct.RGB", {"writer": "ngpt"}),
         ("direct", "direct.RGB", {"overrides": {"direct": "direct"}}),
+        ("caustic", "caustic.RGB", {"overrides": {"caustic": "caustic"}}),
         ("albedo", "diffuse.RGB", {"writer": "V-Ray"}),
         ("diffuse", "diffuse.RGB", {"writer": "ngpt"}),
         ("specular", "specular.RGB", {"writer": "ngpt"}),
@@ -249,7 +250,14 @@ def test_names_that_mean_something_else_elsewhere(layer, channels, taken):
 
 
 @pytest.mark.parametrize(
-    ("layer", "beside"), [("direct", "dy"), ("diffuse", "diffuse_var"), ("specular", "specular_var")]
+    ("layer", "beside"),
+    [
+        ("direct", "dy"),
+        ("caustic", "dx"),
+        ("caustic", "caustic_var"),
+        ("diffuse", "diffuse_var"),
+        ("specular", "specular_var"),
+    ],
 )
 def test_layers_that_nobody_else_writes_tell_what_those_beside_them_mean(layer, beside):
     assert layer in resolve([("", names("RGB", f"{layer}.RGB", f"{beside}.RGB"))])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from full_stack import full_stack, hidden_oidn
+from hosts import agree
 from processes import in_a_child, needs_forks, no_warning_of_forks
 
 import ngpt
@@ -46,12 +47,6 @@ def files(tmp_path_factory):
         arguments = ["export", "--weights", folder / f"{name}.safetensors", "-o", folder / f"{name}.tza"]
         assert main([str(word) for word in arguments]) == 0
     return folder
-
-
-def agree(image, expected):
-    """To 1e-4 of each value; the darkest to 1e-6 of the typical one."""
-    assert image.shape == expected.shape
-    assert (np.abs(image - expected) <= 1e-4 * (np.abs(expected) + 1e-2 * np.median(expected))).all()
 
 
 @pytest.mark.parametrize(("channels", "thousands"), [(SMALL, 62.136), (DEFAULT, 125.406)])

@@ -14,7 +14,7 @@ from ngpt.network.run_onnx import Cancelled, Network
 from ngpt.network.shipped import WEIGHTS
 
 FAST, COMBINE = WEIGHTS / "ngpt-fast.onnx", WEIGHTS / "ngpt-combine.onnx"
-SIZE = (333, 497)
+SIZE = (305, 341)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def least(network):
 SMALLEST = [pytest.param(1, 1, marks=pytest.mark.slow), pytest.param(1.3, 2, marks=pytest.mark.slow)]
 
 
-@pytest.mark.parametrize(("tiles", "batch"), [(1.7, 1), (1.3, 3), *SMALLEST])
+@pytest.mark.parametrize(("tiles", "batch"), [(1.3, 1), (1.3, 3), *SMALLEST])
 def test_tiles_do_not_show_and_tell_how_far_they_are(network, image, least, tiles, batch):
     """In memory for so many of the smallest tiles."""
     layers, whole = image
@@ -75,12 +75,12 @@ def test_it_stops_when_asked_to(network, image, least):
     seen = []
     with pytest.raises(Cancelled, match="2 of "):
         network.reconstruct(
-            image[0], memory=int(1.7 * least), progress=lambda *call: seen.append(call), stop=lambda: len(seen) > 2
+            image[0], memory=int(1.3 * least), progress=lambda *call: seen.append(call), stop=lambda: len(seen) > 2
         )
 
 
 BOUNDED = """
-layers = full_layers(500, 650)
+layers = full_layers(410, 520)
 layers["base"] = layers["primal"]
 network = Network(FILE)
 layers |= {name: layers["primal"] for name in network.inputs if name not in layers}
@@ -126,9 +126,9 @@ print(mebibytes("VmHWM") - before)
 @pytest.mark.parametrize(
     ("program", "most"),
     [
-        pytest.param(bounded(FAST, 220), 220 + 500 * 650 * 3 * 4 / 2**20, marks=pytest.mark.slow),
-        pytest.param(bounded(FAST, 400), 400 + 500 * 650 * 3 * 4 / 2**20),
-        pytest.param(bounded(COMBINE, 400), 400 + 500 * 650 * 3 * 4 / 2**20),
+        pytest.param(bounded(FAST, 220), 220 + 410 * 520 * 3 * 4 / 2**20, marks=pytest.mark.slow),
+        pytest.param(bounded(FAST, 400), 400 + 410 * 520 * 3 * 4 / 2**20),
+        pytest.param(bounded(COMBINE, 400), 400 + 410 * 520 * 3 * 4 / 2**20),
         pytest.param(LARGE, 4096, marks=pytest.mark.slow),
     ],
     ids=["220 MiB", "400 MiB", "ngpt-combine, 400 MiB", "8192x4320 in 4 GiB"],
@@ -147,18 +147,12 @@ def test_memory_stays_within_the_bound(program, most):
         (FAST, "tensorrt", "device 'tensorrt': this build of ONNX Runtime has only: cpu"),
         (FAST, "abacus", "device 'abacus' is unk"),
         (Path("none.onnx"), "cpu", "no such file"),
-        (WEIGHTS / "ngpt-fast.statistics.onnx", "cpu", r"statistics\.onnx: lacks the metadata"),
     ],
 )
 def test_devices_and_files_that_are_not_there_are_named_not_replaced(file, device, message):
+    """Damaged files: tests/cli/test_refusals.py."""
     with pytest.raises(NgptError, match=message):
         Network(file, device)
-
-
-def test_a_damaged_file_is_named(tmp_path):
-    (tmp_path / "damaged.onnx").write_bytes(FAST.read_bytes()[:5000])
-    with pytest.raises(NgptError, match=r"damaged\.onnx: ONNX Runtime cannot load it"):
-        Network(tmp_path / "damaged.onnx")
 
 
 def test_the_method_takes_files_of_both_kinds():

@@ -8,6 +8,7 @@ import pytest
 from processes import NGPT, SIGNALS, complete, content, half_written, make_work, one_error, shell, start
 
 import ngpt
+from ngpt.cli import main
 from ngpt.system.console import print_line, run_command
 
 
@@ -112,10 +113,11 @@ def test_files_do_not_take_the_place_of_a_closed_stream(tmp_path, stack):
     out = tmp_path / "o.exr"
     run = shell('"$@" >&- 2>&-', *NGPT, "denoise", stack, "-o", out, "-m", "l2", "--json")
     assert run.returncode == 0 and half_written(tmp_path) == []
-    assert complete([*NGPT, "denoise", stack, "-o", tmp_path / "p.exr", "-m", "l2"]).returncode == 0
+    assert main(["denoise", str(stack), "-o", str(tmp_path / "p.exr"), "-m", "l2"]) == 0
     assert content(out) == content(tmp_path / "p.exr")
 
 
 def test_results_that_cannot_be_printed_are_an_error(stack):
     run = shell('"$@" > /dev/full', *NGPT, "info", stack, "--json")
     assert run.returncode == 1 and one_error(run.stderr) and "No space left" in run.stderr
+    assert shell('"$@" > /dev/full 2>&1', *NGPT, "info", stack, "--json").returncode == 1
