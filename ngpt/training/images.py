@@ -10,6 +10,7 @@ from torch.utils.data import DataLoader
 
 from ngpt.errors import NgptError
 from ngpt.network import padding, safetensors
+from ngpt.network.device import body_precision
 from ngpt.network.model import Reconstructor
 from ngpt.network.transfer import signed_exp
 from ngpt.system import limits
@@ -80,8 +81,7 @@ class Images(Task):
         layers = dict(batch)
         target = layers.pop("target", None)
         other = {name.removeprefix(OTHER): layers.pop(name) for name in batch if name.startswith(OTHER)}
-        bfloat16 = self.settings.run.precision == "bfloat16"
-        with torch.autocast(generator.device.type, torch.bfloat16, enabled=bfloat16):
+        with body_precision(generator.device.type, self.settings.run.precision):
             logarithm = model.predict(layers)  # type: ignore[operator]
         edge = padding.MARGIN + JITTER
         prediction = signed_exp(logarithm[..., edge:-edge, edge:-edge].clamp(-LIMIT, LIMIT))

@@ -70,7 +70,8 @@ class RunSettings:
     """How long, how precise, how often.
 
     ``steps``, ``batch``  length of the run, and examples per step over all processes
-    ``precision``  of the network's body: "float32" or "bfloat16"
+    ``precision``  of the network's body: "float32" or "bfloat16"; CPUs without instructions for the latter, which
+                   would take several times as long, compute in float32
     ``seed``       of everything random: weights, order, augmentation, transforms of the loss
     ``minutes``    wall-clock budget of one call; 0 is none. A run that it stops can be resumed
     ``log``, ``save``, ``validate``  every so many steps

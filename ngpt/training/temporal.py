@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from ngpt.errors import NgptError
 from ngpt.measure.images import middle
 from ngpt.network import safetensors
+from ngpt.network.device import body_precision
 from ngpt.network.unet import PlainUNet
 from ngpt.sequence.network import BANDS, INPUTS, LARGEST, MOST, Corrections
 from ngpt.training.clips import Clip, blended, errors, play, relit, robust
@@ -118,7 +119,7 @@ class Blending(Task):
         self, model: nn.Module, batch: dict[str, Tensor], generator: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
         device = batch["inputs"].device.type
-        with torch.autocast(device, torch.bfloat16, enabled=self.settings.run.precision == "bfloat16"):
+        with body_precision(device, self.settings.run.precision):
             corrections = model(batch["inputs"])
         return loss(corrections.float(), batch)
 

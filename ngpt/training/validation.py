@@ -13,6 +13,7 @@ from ngpt.image.png import encode_png
 from ngpt.measure.averages import geometric_mean
 from ngpt.measure.images import middle
 from ngpt.measure.metrics import relmse_trimmed
+from ngpt.network.device import body_precision
 from ngpt.network.inputs import base_image
 from ngpt.network.model import Reconstructor
 from ngpt.network.run_torch import layers_of
@@ -82,7 +83,7 @@ def validate(
         halves = judges_of(crop, model.config)
         reference = middle(halves)
         layers = {name: layer[None].to(device) for name, layer in layers_of(data, model.config).items()}
-        with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
+        with body_precision(device.type, precision):
             image = model(layers)[0].permute(1, 2, 0).float().cpu().numpy()
         given = layers["primal"][0].permute(1, 2, 0).cpu().numpy()
         primal.append(relmse_trimmed(given, *halves))
