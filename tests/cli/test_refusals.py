@@ -118,6 +118,13 @@ ROWS = [
     ("denoise noisy.exr other.exr -o new -m l1 -O alpha=much", 2, "'much' is not allowed"),
     ("denoise noisy.exr other.exr -o new -m ngpt-fast --weights nowhere.onnx", 1, "nowhere.onnx: "),
     ("denoise noisy.exr other.exr -o new --ref nowhere.exr", 1, "nowhere.exr: not found"),
+    ("denoise noisy.exr other.exr -o new --device toaster", 1, "device 'toaster' is unknown; ONNX Runtime has: cpu"),
+    ("denoise noisy.exr other.exr -o new -m ngpt-fast --device toaster", 1, "device 'toaster' is unknown"),
+    ("denoise noisy.exr other.exr -o new --weights cut.onnx", 1, "cut.onnx: ONNX Runtime cannot load it"),
+    ("denoise noisy.exr other.exr -o new -m ngpt --weights empty.safetensors", 1, "not a readable safetensors file"),
+    ("denoise noisy.exr other.exr -o new --memory 0", 2, "option 'memory': '0' is not allowed"),
+    ("denoise noisy.exr other.exr -o new -O qualty=high", 2, "has an option 'qualty'; did you mean 'quality'?"),
+    ("denoise noisy.exr other.exr -o new -O quality=higher", 2, "method 'oidn', option 'quality': 'higher' is not"),
     ("denoise noisy.exr -O memory", 2, "'memory' is not of the form NAME=VALUE"),
     (
         "denoise eyes.exr -m primal -o out/a.png",
