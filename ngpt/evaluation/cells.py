@@ -18,6 +18,7 @@ from ngpt.io.exr import write
 from ngpt.measure.metrics import METRICS, scores
 from ngpt.methods import METHODS, check_request, reconstruct
 from ngpt.stack import GradientStack
+from ngpt.system.files import make_folder
 from ngpt.system.machine import versions
 from ngpt.system.writing import write_json
 
@@ -33,7 +34,7 @@ class Scorer:
 
     def __init__(self, config: Config, cache: Path):
         self.config, self.cache = config, cache
-        self.cache.mkdir(parents=True, exist_ok=True)
+        make_folder(self.cache)
         self._warm: set[tuple] = set()
         self._code = [_FORMAT, library_hash(), versions(*PACKAGES)]
         # Options of metrics that have some.

@@ -206,6 +206,8 @@ ROWS = [
     ("demo --scene difuse", 2, "did you mean 'diffuse'?"),
     ("train", 2, "--config is missing: a TOML file, or one of: ablations, "),
     ("train --config papr", 1, "did you mean 'paper'?"),
+    ("train --config empty --out new", 1, "empty: is a directory; name a file in it, or one of: ablations"),
+    ("export --weights empty -o out/o.onnx", 1, "empty: is a directory; name a file in it, or one of: ngpt-combine"),
     ("train --config nowhere.toml --dry-run", 1, "nowhere.toml: cannot be read"),
     ("train --config fast", 2, "--out is missing"),
     ("train --config fast --dry-run --set model.units=3", 1, "units = 3: must be a list"),

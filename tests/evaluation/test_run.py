@@ -10,12 +10,14 @@ import pytest
 from folders import evaluated, read, write_scene
 
 import ngpt
+from data_gen import service
 from eval import main as command
 from ngpt.errors import NgptError
 from ngpt.evaluation import cells, run
 from ngpt.evaluation.run import picture_path
 from ngpt.evaluation.stability import flicker_and_bias, rolling_shutter, study
 from ngpt.io.exr import read_image
+from ngpt.system.console import Console
 
 CONFIG = """
 scenes = ["{folder}"]
@@ -178,6 +180,13 @@ def test_what_does_not_exist_is_refused_before_any_work(renderer, room, monkeypa
     with pytest.raises(NgptError) as error:
         evaluated(config, folder / "new")
     assert message in str(error.value) and not (folder / "new").exists()
+
+
+def test_a_cache_that_cannot_be_made_is_named(room):
+    folder, config = room
+    (folder / "file").touch()
+    with pytest.raises(NgptError, match=r"file/cells: cannot be made: .*; name another folder"):
+        run.evaluate(config, folder / "new", Console(quiet=True), "", service, folder / "file")
 
 
 def test_weights_that_cannot_be_loaded_are_said_before_any_work(room):
