@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from data_gen import code as source
 from data_gen.backend import use_variant
 from data_gen.code import code as code
-from data_gen.code import scene_code as scene_code
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, by_standing, find
 from ngpt.renderer import Options
 from ngpt.stack import GradientStack
@@ -72,6 +72,15 @@ def gradients(sampler: str) -> bool:
 def unusual(sampler: str, options: Options) -> str:
     entry = find(sampler)
     return entry.unusual(entry.settings(options))
+
+
+def scene_code(name: str) -> str:
+    use_variant()
+    from data_gen.scenes.builtin import SCENES, no_scene
+
+    if name not in SCENES:
+        raise no_scene(name)
+    return source.scene_code(name)
 
 
 def overview() -> dict[str, Any]:

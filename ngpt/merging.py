@@ -22,7 +22,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.io.exr import pass_through, with_channels
-from ngpt.layers import DIFFERENCES, FEATURE_NOISE
+from ngpt.layers import DIFFERENCES, FEATURE_NOISE, GATHERED
 from ngpt.stack import GradientStack
 from ngpt.windows import Place, Window
 
@@ -56,7 +56,8 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
 
     The result's ``ngpt:seed`` lists all seeds, ``ngpt:spp`` is the mean over pixels of the samples that they have,
     ``ngpt:seconds`` and ``ngpt:discarded`` are sums, ``ngpt:samplerOptions`` has the options of all stacks,
-    ``ngpt:featureNoise`` is the noise of the merged features where all stacks have it, ``ngpt:unfinished`` is left out,
+    ``ngpt:gathered`` is 1 where any stack has it, ``ngpt:featureNoise`` is the noise of the merged features where all
+    stacks have it, ``ngpt:unfinished`` is left out,
     and all other attributes come from the first stack. Raises NgptError for fewer than two stacks, stacks that differ
     in layers or sampler, or are of pictures of different size, tiles that leave pixels out, a seed that occurs twice in
     one place, missing ``ngpt:spp`` or ``ngpt:seed``, ``samples`` that are negative or not finite, ``ngpt:seconds``,
@@ -95,6 +96,8 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     for name in ("ngpt:seconds", "ngpt:discarded"):
         if all(name in stack.attributes for stack in stacks):
             attributes[name] = sum(_number(stack, name) for stack in stacks)
+    if any(stack.number(GATHERED) for stack in stacks):
+        attributes[GATHERED] = 1  # the light of photons is in the mean, whichever stack it comes from
     attributes.pop(FEATURE_NOISE, None)
     if all(FEATURE_NOISE in stack.attributes for stack in stacks):
         attributes[FEATURE_NOISE] = _feature_noise(tiles, total)

@@ -6,7 +6,7 @@ packages bring theirs by entry points of the group "ngpt.methods" (docs/methods/
 
 import logging
 import time
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -237,6 +237,51 @@ def choose(layers: Container[str], usable: Callable[[str], bool] | None = None) 
         if name in METHODS and all(layer in layers for layer in METHODS[name].needs) and usable(name):
             return name
     return "primal"
+
+
+def check_request(method: str, options: Mapping[str, Any]) -> None:
+    """Raises NgptError for what no stack can be denoised with; ``method`` and ``options`` are as in ``reconstruct``.
+
+    This is a method that does not run here, an option that does not exist or has no such value, weights that cannot be
+    loaded, or a device that cannot be used.
+    """
+    own = options.get("weights")
+    if own:
+        identify(own)
+    if method != "auto":
+        # A method without shipped weights runs by the user's.
+        entry = METHODS[method] if own else runnable(method)
+        _check_network(method, settings(f"method '{method}'", entry.options, options))
+        return
+    methods = {"ngpt": METHODS["ngpt"]} if own else METHODS
+    for name, value in options.items():
+        owners = {owner: entry.options for owner, entry in methods.items() if name in entry.options}
+        if not owners:
+            meant = did_you_mean(name, {option for entry in methods.values() for option in entry.options})
+            raise WrongUse(f"no method has an option '{name}'; {meant}`ngpt info METHOD` lists them".rstrip())
+        _check_value(owners, name, value)
+    networks = ["ngpt"] if own else [name for name in ORDER if "device" in METHODS[name].options]
+    usable = [name for name in networks if own or not METHODS[name].missing()]
+    if usable and (own or "device" in options):
+        known = METHODS[usable[0]].options
+        _check_network(usable[0], settings("", known, {n: v for n, v in options.items() if n in known}))
+
+
+def _check_value(owners: Mapping[str, dict[str, Option]], name: str, value: Any) -> None:
+    """Raises WrongUse where none of the ``owners`` of an option takes the value."""
+    refusals = []
+    for owner, options in owners.items():
+        try:
+            settings(f"method '{owner}'", options, {name: value})
+            return
+        except WrongUse as refusal:
+            refusals.append(refusal)
+    raise refusals[0]
+
+
+def _check_network(method: str, values: dict[str, Any]) -> None:
+    if "weights" in METHODS[method].options:
+        Shipped(method).reads(**values)
 
 
 def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result:

@@ -13,6 +13,7 @@ from ngpt.merging import merge
 from ngpt.methods import METHODS, reconstruct
 from ngpt.network.shipped import WEIGHTS
 from ngpt.repair import repair
+from ngpt.sequence.history import Temporal
 from ngpt.stack import GradientStack
 
 SIZE = (20, 27)
@@ -57,6 +58,35 @@ def test_oidn_leaves_the_light_of_photons_to_the_diffusion(auxiliary):
         assert np.array_equal(ngpt.denoise(photons, method), ngpt.denoise(GradientStack(alone), method))
     whole = GradientStack({name: layer for name, layer in alone.items() if not name.startswith("caustic")})
     assert np.array_equal(ngpt.denoise(GradientStack(alone), "oidn"), ngpt.denoise(whole, "oidn"))
+
+
+@pytest.mark.parametrize("marked", [(0, 1), (1, 0), (1, 1), (0, 0)])
+def test_merged_photons_are_known_for_photons_wherever_they_come_from(marked):
+    stacks = []
+    for seed, (mark, light) in enumerate(zip(marked, (LIT["caustic"], 3 * LIT["caustic"]), strict=True)):
+        known = {"ngpt:spp": 4, "ngpt:seed": str(seed), "ngpt:sampler": "vcm"} | ({GATHERED: 1} if mark else {})
+        stacks.append(GradientStack({**LIT.layers, "caustic": light, "primal": PLAIN["primal"] + light}, known))
+    merged = merge(stacks)
+    assert merged.attributes.get(GATHERED) == (1 if any(marked) else None)
+    assert np.allclose(merged["caustic"], 2 * LIT["caustic"], rtol=1e-5)
+    assert np.allclose(merged["primal"], LIT["primal"] + LIT["caustic"], rtol=1e-5, atol=1e-6)
+    assert np.allclose(repair(merged).image, repair(LIT).image, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("corrections", [None, "shipped"])
+def test_photons_of_a_shot_are_neither_lost_nor_doubled(corrections):
+    """Frames at rest: their results, each with its photons denoised apart, are blended with those before."""
+    pytest.importorskip("mitsuba_oidn")
+    rng, temporal = np.random.default_rng(5), Temporal(corrections)
+    for frame in range(4):
+        light = LIT["caustic"] * rng.uniform(0.5, 1.5, (*SIZE, 1)).astype(np.float32)
+        known = {GATHERED: 1, "ngpt:frame": frame, "ngpt:previousFrame": frame - 1}
+        layers = {"caustic": light, "primal": PLAIN["primal"] + light, "motion": np.zeros((*SIZE, 2), np.float32)}
+        stack = GradientStack({**LIT.layers, **layers}, known)
+        image = ngpt.denoise(stack, "oidn")
+        blended = temporal.next(stack, image)
+        assert blended.sum(dtype=np.float64) == pytest.approx(stack["primal"].sum(dtype=np.float64), rel=0.03)
+        assert (temporal.share > 0.1) == (frame > 0)
 
 
 @pytest.mark.parametrize("method", ["l2", "l1", "cv", "wcv", "wl2"])

@@ -2,7 +2,8 @@
 
 import argparse
 import shlex
-from contextlib import closing, nullcontext
+from collections.abc import Callable
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -201,11 +202,20 @@ def shot(args: argparse.Namespace, denoising: Denoising | None, console: Console
     files = targets(args.output, args.scene, args.frames)
     more = {"camera": args.camera, "fps": args.fps, "dt": args.dt}
     more |= {"overwrite": args.force, "skip_existing": args.skip_existing, "denoising": denoising, **asked(args)}
-    with console.progress(f"render {args.scene}", "frames", begins=KERNELS) as progress:
+    with ExitStack() as shown:
         said = 0
+        progress: Callable[[int, int], None] | None = None
+
+        def begin() -> Callable[[int, int], None]:
+            return shown.enter_context(console.progress(f"render {args.scene}", "frames", begins=KERNELS))
+
+        # A bar before the cluster has answered would tell of work that nobody does.
+        if not args.cluster:
+            progress = begin()
 
         def made(written: Written, total: int) -> None:
-            nonlocal said
+            nonlocal said, progress
+            progress = progress or begin()
             for report in written.frames[said:]:
                 frame, what = report["frame"], "{width}x{height}, {spp} spp, {seconds:.2f} s".format(**report)
                 what += ", {method} {reconstructSeconds:.2f} s".format(**report) if denoising else ""

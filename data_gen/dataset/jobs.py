@@ -70,8 +70,11 @@ def cluster(address: str) -> Iterator[Executor]:
         raise NgptError(f"a Dask cluster needs distributed; `{install_command('cluster')}`") from error
     try:
         client = Client(address, timeout="20s")
-    except OSError as error:
-        raise NgptError(f"no Dask scheduler answers at {address}: {error}") from error
+    except (OSError, ValueError) as error:
+        raise NgptError(
+            f"--cluster {address}: no Dask scheduler answers there: {error}; start `dask scheduler`, or correct the "
+            "address"
+        ) from error
     with client:
         yield client.get_executor(retries=3)
 

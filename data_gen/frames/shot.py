@@ -49,6 +49,16 @@ class Remembering:
         self.options.pop("stop", None)
         self.options = entry.settings(self.options)
         self._sampler: Any = None
+        self._making = 0.0  # seconds that belong to the first frame
+
+    def begin(self, scene: mi.Scene) -> None:
+        """Makes the sampler, if there is none yet. Raises NgptError where it cannot render the scene in its memory."""
+        if self._sampler is None:
+            if reason := self.entry.refuses(scene_facts(scene)):
+                raise NgptError(f"sampler '{self.entry.name}' cannot render this scene: {reason}; use --sampler gpt")
+            start = time.perf_counter()
+            self._sampler = self.entry.made(scene, self.seed, self.spp, self.memory, **self.options)
+            self._making = time.perf_counter() - start
 
     def render(
         self,
@@ -59,15 +69,11 @@ class Remembering:
         depth: np.ndarray | None,
         progress: Callable[[int, int], None],
     ) -> GradientStack:
-        """The stack of frame number ``index`` of the shot; the ``scene`` has its ``shapes`` there.
+        """The stack of frame number ``index`` of the shot, after ``begin``; the ``scene`` has its ``shapes`` there.
 
         Where the shot ``changes``, it is not the scene of the frame before, which must be as it was then.
         """
-        start = time.perf_counter()
-        if self._sampler is None:
-            if reason := self.entry.refuses(scene_facts(scene)):
-                raise NgptError(f"sampler '{self.entry.name}' cannot render this scene: {reason}; use --sampler gpt")
-            self._sampler = self.entry.made(scene, self.seed, self.spp, self.memory, **self.options)
+        start, self._making = time.perf_counter() - self._making, 0.0
         progress(0, self.spp)
         film = self._sampler.film(index, motion, depth, (scene, shapes) if self.changes else None)
         progress(self.spp, self.spp)
@@ -191,17 +197,17 @@ def render_shot(
                 before = _before(other, previous, first=j == 0)
             now = shot.snapshot(frame)
             scene = shot.at(frame)
-            width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
-            motion, what, shift = np.full((height, width, 2), np.nan), None, (0, 0)
-            if before is not None:
-                if (dt or remembers) and now.place.data.size != before.place.data.size:
-                    raise NgptError(
-                        f"frame {frame} is {now.place.data} and frame {previous} {before.place.data}: --dt and "
-                        "samplers that reuse frames need crop windows of one size; only move them"
-                    )
-                what, shift = seen(scene), window_moved(now, before)
-                motion = motion_vectors(scene, now, before, what)
+            other_size = before is not None and now.place.data.size != before.place.data.size
+            if before is not None and (dt or remembers) and other_size:
+                raise NgptError(
+                    f"frame {frame} is {now.place.data} and frame {previous} {before.place.data}: --dt and "
+                    "samplers that reuse frames need crop windows of one size; only move them"
+                )
+            # What cannot be rendered, for lack of memory for example, is refused before motion is computed.
+            failed = None
             if remembering is not None:
+                remembering.begin(scene)
+                motion, shift, what = _motion(scene, now, before)
                 far = None if what is None else depth(scene, now, what)
                 stack = remembering.render(scene, now.shapes, j, motion, far, progress(frame))
             else:
@@ -209,17 +215,31 @@ def render_shot(
                     own = frame_seed(seed, frame)
                     stack = render_stack(scene, spp, own, sampler, progress=progress(frame), **options)
                 except Unfinished as error:
-                    placed = _placed(error.stack, frame, previous, motion + np.asarray(shift, np.float32))
-                    raise Unfinished(f"frame {frame}: {error}", placed) from error
+                    stack, failed = error.stack, error
+                motion, shift, _ = _motion(scene, now, before)
             before, last = now, frame
         done = i + 1
         stack = _placed(stack, frame, previous, motion + np.asarray(shift, np.float32))
+        if failed is not None:
+            raise Unfinished(f"frame {frame}: {failed}", stack) from failed
         del scene  # two scenes in memory would make kernels larger
         if dt and UNFINISHED in stack.attributes:
             return
         if dt:
             stack = _with_dt(stack, motion, (shot, frame), (other, previous), dt, frame_seed(seed, frame, 1))
         yield frame, stack
+
+
+def _motion(scene: mi.Scene, now: Snapshot, before: Snapshot | None) -> tuple[np.ndarray, Any, Any]:
+    """Motion vectors from array to array, how far the crop window has moved, and what ``seen`` returns.
+
+    Without a frame ``before``, motion is NaN and nothing was looked at.
+    """
+    if before is None:
+        width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
+        return np.full((height, width, 2), np.nan), (0, 0), None
+    what = seen(scene)
+    return motion_vectors(scene, now, before, what), window_moved(now, before), what
 
 
 def _placed(stack: GradientStack, frame: int, previous: int, motion: np.ndarray) -> GradientStack:

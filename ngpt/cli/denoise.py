@@ -23,7 +23,7 @@ from ngpt.io.exr import read, read_views
 from ngpt.io.foreign.files import first_attributes
 from ngpt.io.frames import RESULT_SUFFIX, is_shot, remarks
 from ngpt.io.whole import finished
-from ngpt.methods import METHODS, by_standing, reconstruct, runnable
+from ngpt.methods import METHODS, by_standing, check_request, reconstruct
 from ngpt.network.identity import identify
 from ngpt.network.run_onnx import MEMORY
 from ngpt.options import as_text, settings, unusual
@@ -150,12 +150,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         name: value for name in ("alpha", "weights", "device", "memory") if (value := getattr(args, name)) is not None
     }
     options |= dict(args.option)
-    # What no file could be denoised with. A method without shipped weights runs by the user's.
-    if args.weights:
-        identify(args.weights)
-    if args.method != "auto":
-        entry = METHODS[args.method] if args.weights else runnable(args.method)
-        settings(f"method '{args.method}'", entry.options, options)
+    check_request(args.method, options)
     reference = Reference.read(args.ref, args.untrusted) if args.ref else None
     for _, target in pairs:
         if target.suffix.lower() != ".exr":

@@ -16,8 +16,9 @@ from ngpt.evaluation.keys import code_of, file_hash, library_hash
 from ngpt.evaluation.references import Reference
 from ngpt.io.exr import write
 from ngpt.measure.metrics import METRICS, scores
-from ngpt.methods import METHODS, reconstruct
+from ngpt.methods import METHODS, check_request, reconstruct
 from ngpt.stack import GradientStack
+from ngpt.system.files import make_folder
 from ngpt.system.machine import versions
 from ngpt.system.writing import write_json
 
@@ -33,7 +34,7 @@ class Scorer:
 
     def __init__(self, config: Config, cache: Path):
         self.config, self.cache = config, cache
-        self.cache.mkdir(parents=True, exist_ok=True)
+        make_folder(self.cache)
         self._warm: set[tuple] = set()
         self._code = [_FORMAT, library_hash(), versions(*PACKAGES)]
         # Options of metrics that have some.
@@ -107,4 +108,10 @@ def absence(column: Column) -> str:
     if weights and not Path(weights).is_file():
         return f"weights {weights}: no such file; train them first"
     lack = METHODS[column.method].missing()
-    return "" if weights and "weights" in lack else lack
+    if lack and not (weights and "weights" in lack):
+        return lack
+    try:
+        check_request(column.method, column.options)
+    except NgptError as error:
+        return str(error)
+    return ""

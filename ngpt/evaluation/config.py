@@ -11,6 +11,7 @@ from ngpt.evaluation.renders import KINDS, Render
 from ngpt.io.frames import natural
 from ngpt.measure.metrics import METRICS
 from ngpt.methods import METHODS
+from ngpt.options import settings
 from ngpt.system.parts import find_renderer
 from ngpt.system.records import check, from_table, read_toml
 
@@ -117,6 +118,12 @@ class Config:
                 raise NgptError(f"evaluation: variants.{name}: stack must be one of {', '.join(KINDS)}")
             if "method" not in table:
                 raise NgptError(f"evaluation: variants.{name}: method is missing: which one it is a variant of")
+            if table["method"] in METHODS:
+                options = {key: value for key, value in table.items() if key not in ("method", "stack", "sampler")}
+                try:
+                    settings(f"method '{table['method']}'", METHODS[table["method"]].options, options)
+                except NgptError as error:
+                    raise NgptError(f"evaluation: variants.{name}: {error}") from None
         for name in self.sampler_options:
             self.sampler(name)
         for name, files in self.references.items():

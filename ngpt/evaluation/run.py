@@ -12,7 +12,7 @@ from ngpt.evaluation.cells import PACKAGES, Scorer, absence
 from ngpt.evaluation.config import Column, Config, file_part
 from ngpt.evaluation.gradientmap import write_map
 from ngpt.evaluation.references import HALVES, Reference
-from ngpt.evaluation.renders import Render
+from ngpt.evaluation.renders import KINDS, Render
 from ngpt.evaluation.results import write_results
 from ngpt.evaluation.stacks import USUAL, Costs, SceneStacks
 from ngpt.image.display import auto_exposure
@@ -23,7 +23,7 @@ from ngpt.renderer import Renderer
 from ngpt.report.evaluation import FORMAT
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
-from ngpt.system.files import exclusive
+from ngpt.system.files import exclusive, make_folder
 from ngpt.system.machine import metadata
 
 
@@ -33,11 +33,13 @@ def evaluate(
     """Fills the folder ``out`` and returns what its results.json holds; ``renderer`` renders what is not there yet.
 
     What is in the cache, ``out``/cache by default, is not computed again: an interrupted run goes on when it is started
-    again. Whatever a scene or a method lacks becomes a row that says so.
+    again. Whatever a scene or a method lacks becomes a row that says so. Raises NgptError, before anything is rendered,
+    for scenes, references and samplers of all scenes that do not exist.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    cache = cache or out / "cache"
     scenes = config.scene_files()
+    check_named(config, scenes, renderer)
+    make_folder(out)
+    cache = cache or out / "cache"
     columns = config.columns()
     lacks = {column.name: absence(column) for column in columns}
     scorer = Scorer(config, cache / "cells")
@@ -99,6 +101,26 @@ def evaluate(
             gc.collect()
         progress(total, total)
     return results
+
+
+def check_named(config: Config, scenes: dict[str, str], renderer: Renderer) -> None:
+    """Raises NgptError unless all ``scenes`` exist, their references, and the samplers that every scene needs."""
+    for name, source in scenes.items():
+        if not Path(source).exists():
+            renderer.scene_code(source)
+        named = config.references.get(name, [])
+        for file in [named] if isinstance(named, str) else named:
+            if not Path(file).is_file():
+                raise NgptError(f"{file}: no such file; evaluation: references.{name} names it")
+    if all(Path(source).is_dir() for source in scenes.values()):
+        return  # What rendered their stacks may have any name.
+    for entry in ("clock", "reference_sampler"):
+        sampler, _ = config.sampler(getattr(config, entry))
+        if sampler != KINDS["gradients"]:
+            try:
+                renderer.unusual(sampler, {})
+            except NgptError as error:
+                raise NgptError(f"evaluation: {entry}: {error}") from None
 
 
 def _scene(

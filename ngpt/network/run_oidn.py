@@ -17,6 +17,13 @@ def reads(path: Path) -> tuple[tuple[str, ...], str]:
     return ("primal" if colour == "primal" else "base", "albedo", "normal"), colour.removeprefix("primal")
 
 
+def check_device(device: str) -> None:
+    """Raises NgptError where OIDN is not installed, and for a name that is none of its devices'."""
+    require_oidn()
+    if device not in DEVICES:
+        raise NgptError(f"device '{device}' is unknown; OIDN has: {', '.join(DEVICES)}")
+
+
 def run(data: Repaired, path: Path, device: str = "auto", memory: int = 3072) -> np.ndarray:
     """The image (H, W, 3) float32, scene-linear, of the light that the data's ``image`` is of, by that file's weights.
 
@@ -26,9 +33,7 @@ def run(data: Repaired, path: Path, device: str = "auto", memory: int = 3072) ->
     names, base = reads(path)
     layers = inputs.gather(data, names, base, f"weights {path}", estimate=True)
     colour, albedo, normal = (np.ascontiguousarray(layers[name], np.float32) for name in names)
-    require_oidn()
-    if device not in DEVICES:
-        raise NgptError(f"device '{device}' is unknown; OIDN has: {', '.join(DEVICES)}")
+    check_device(device)
     images = {"color": colour, "albedo": albedo, "normal": normal}
     try:
         image = filtered(images, device, tza.read(path)[0], hdr=True, max_memory_mb=memory)

@@ -43,6 +43,8 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     else."""
     if not Path(path).is_file():
         names = shipped()
+        if str(path) not in names and Path(path).is_dir():
+            raise NgptError(f"{path}: is a directory; name a file in it, or one of: {', '.join(names)}")
         if str(path) not in names:
             raise NgptError(f"{path}: no such file; networks that come with ngpt: {', '.join(names)}")
         path = names[str(path)]

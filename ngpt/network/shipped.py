@@ -50,9 +50,13 @@ class Shipped:
         return self.also_missing()
 
     def reads(self, weights: str, device: str, memory: int) -> tuple[str, ...]:
-        """What ``run`` with these options reads: layers of a stack, and what is made of them (``inputs.gather``)."""
+        """What ``run`` with these options reads: layers of a stack, and what is made of them (``inputs.gather``).
+
+        Raises NgptError for weights that cannot be loaded, and for a device that cannot be used.
+        """
         path = Path(weights or self.path)
         if path.suffix == ".tza":
+            run_oidn.check_device(device)
             names, base = run_oidn.reads(path)
             return (*names, *inputs.needs(names, base))
         if path.suffix != ".safetensors":

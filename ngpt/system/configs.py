@@ -33,6 +33,8 @@ def find_config(name: str, kind: str) -> Path:
     stem, known = name.removesuffix(".toml"), names(kind)
     if stem in known:
         return FOLDER / f"{stem}.toml"
+    if Path(name).is_dir():
+        raise NgptError(f"{name}: is a directory; name a file in it, or one of: {', '.join(known)}")
     meant = did_you_mean(stem, known)
     raise NgptError(
         f"{name}: cannot be read: no such file; {meant}configurations that come with ngpt: {', '.join(known)}"

@@ -161,6 +161,20 @@ def test_two_pairs_are_rendered(renderer, command):
     assert not stack["dt"].any() and stack["dt_var"].shape == stack["primal"].shape
 
 
+@pytest.mark.parametrize(
+    "line", ["render diffuse --frames 0:2 -o shot/{frame}.exr", "dataset --config data-tiny --out shot"]
+)
+def test_a_cluster_that_cannot_be_used_is_refused_before_anything_is_shown(
+    renderer, command, monkeypatch, tmp_path, line
+):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    monkeypatch.setattr(Console, "progress", lambda *arguments, **how: pytest.fail("work is shown"))
+    told = command(f"{line} --cluster tcp://nowhere:1", 1)
+    (error,) = told.splitlines()
+    assert command.output == "" and "a Dask cluster needs distributed; `" in error
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_ctrl_c_interrupts_a_cluster_at_once_and_no_render_that_is_done(renderer, command, monkeypatch):
     before, seen = signal.getsignal(signal.SIGINT), []
     note = lambda *_, **__: seen.append(signal.getsignal(signal.SIGINT)) or shot_files.Written()  # noqa: E731

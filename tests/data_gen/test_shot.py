@@ -53,6 +53,18 @@ def test_a_frame_is_the_same_whatever_others_are_rendered(renderer, tmp_path):
     assert np.isfinite(last[3]["dt"]).mean() > 0.5 and np.nanmax(np.abs(last[3]["dt"])) > 0
 
 
+@pytest.mark.parametrize("sampler", ["primal", "gpt", "restir"])
+def test_too_little_memory_is_refused_before_motion_is_computed(renderer, tmp_path, monkeypatch, sampler):
+    from data_gen.frames import shot as module
+
+    for name in ("seen", "motion_vectors"):
+        monkeypatch.setattr(module, name, lambda *arguments: pytest.fail("motion was computed"))
+    moving = shot(tmp_path)
+    moving.size = (160, 120)
+    with pytest.raises(NgptError, match=r"160x120 pixels need \d+ MiB of memory .* pass --memory \d+"):
+        rendered(moving, range(1, 3), sampler=sampler, memory=1)
+
+
 def test_frames_have_seeds_of_their_own_and_say_who_they_are(renderer, tmp_path):
     stacks = rendered(shot(tmp_path, moving=False), [0, 2, 5])
     assert not np.array_equal(stacks[0]["primal"], stacks[2]["primal"])

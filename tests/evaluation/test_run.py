@@ -11,12 +11,14 @@ import pytest
 from folders import evaluated, read, write_scene
 
 import ngpt
+from data_gen import service
 from eval import main as command
 from ngpt.errors import NgptError
-from ngpt.evaluation import cells
+from ngpt.evaluation import cells, run
 from ngpt.evaluation.run import picture_path
 from ngpt.evaluation.stability import flicker_and_bias, rolling_shutter, study
 from ngpt.io.exr import read_image
+from ngpt.system.console import Console
 from ngpt.system.files import exclusive
 
 CONFIG = """
@@ -131,7 +133,6 @@ SPOILT = {
     "bright": (brighter, "3.0 stops brighter"),
     "bare": (lambda room: (room / "reference.exr").unlink(), "no reference"),
     "few": (lambda room: (room / "gradients-16-1.exr").unlink(), "gradients-16-1.exr: no such stack"),
-    "none": (shutil.rmtree, ""),
 }
 
 
@@ -153,8 +154,50 @@ def test_bad_scenes_are_named_and_the_others_go_on(spoilt, name, message):
     results, page = spoilt
     cells = [cell for cell in results["cells"] if cell["scene"] == name]
     assert any(cell["absent"] and message in cell["absent"] for cell in cells if cell["method"] == "l2")
-    assert message in page and (name != "none" or all(cell["absent"] for cell in cells))
+    assert message in page
     assert results["scenes"]["hall"]["absent"] is None
+
+
+def never(*arguments, **options):
+    pytest.fail("work was done")
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ('scenes = ["{folder}/room", "none.xml"]', "none.xml: no such file, nor a built-in scene"),
+        ('scenes = ["{folder}/room", "difuse"]', "difuse: no such file, nor a built-in scene; did you mean 'diffuse'?"),
+        (
+            '[references]\nroom = ["{folder}/room/reference.exr", "none.exr"]',
+            "none.exr: no such file; evaluation: refer",
+        ),
+        ('scenes = ["{folder}/room", "diffuse"]\nclock = "gtp"', "evaluation: clock: unknown sampler 'gtp'; did you"),
+        ('scenes = ["diffuse"]\nreference_sampler = "gtp"', "evaluation: reference_sampler: unknown sampler 'gtp'"),
+    ],
+)
+def test_what_does_not_exist_is_refused_before_any_work(renderer, room, monkeypatch, entry, message):
+    folder, _ = room
+    monkeypatch.setattr(run, "SceneStacks", never)
+    scenes = "" if "scenes" in entry else 'scenes = ["{folder}/room"]\n'
+    config = read((scenes + entry + "\n").replace("{folder}", str(folder)), folder)
+    with pytest.raises(NgptError) as error:
+        evaluated(config, folder / "new")
+    assert message in str(error.value) and not (folder / "new").exists()
+
+
+def test_a_cache_that_cannot_be_made_is_named(room):
+    folder, config = room
+    (folder / "file").touch()
+    with pytest.raises(NgptError, match=r"file/cells: cannot be made: .*; name another folder"):
+        run.evaluate(config, folder / "new", Console(quiet=True), "", service, folder / "file")
+
+
+def test_weights_that_cannot_be_loaded_are_said_before_any_work(room):
+    folder, _ = room
+    (folder / "cut.onnx").write_bytes(b"cut")
+    text = f'methods = ["x"]\n[variants.x]\nmethod = "ngpt"\nweights = "{folder / "cut.onnx"}"\n'
+    (column,) = read(text, folder).columns()
+    assert "cut.onnx: ONNX Runtime cannot load it" in cells.absence(column)
 
 
 @pytest.mark.parametrize(
@@ -170,6 +213,14 @@ def test_bad_scenes_are_named_and_the_others_go_on(spoilt, name, message):
         ('images = "some"', "images = 'some'"),
         ('[variants.x]\nstack = "left"\nmethod = "l1"', "stack must be one of"),
         ("[variants.x]\nalpha = 1", "variants.x: method is missing"),
+        (
+            '[variants.x]\nmethod = "l1"\nalhpa = 1',
+            "variants.x: method 'l1' has no option 'alhpa'; did you mean 'alpha'?",
+        ),
+        (
+            '[variants.x]\nmethod = "l1"\nalpha = "much"',
+            "variants.x: method 'l1', option 'alpha': 'much' is not allowed",
+        ),
         ("samplers = []", "samplers and rivals must not be empty"),
         ('samplers = ["gpt", "gpt"]', "a sampler is listed twice"),
         ("rivals = [1]", "must be a list of str"),
