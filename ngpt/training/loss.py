@@ -25,7 +25,6 @@ _OURS: dict[str, Term] = {
     "l1": pixelwise.l1,
     "gradient": pixelwise.gradient_l1,
     "relative": pixelwise.relative,
-    "geometric": pixelwise.geometric,
     "logarithmic": pixelwise.logarithmic,
     "huber": pixelwise.huber,
     "pyramid": pixelwise.pyramid,
@@ -42,8 +41,8 @@ class LossSettings:
                      "pu" (OIDN's), or for none the name of a term, such as "l1", whose weight is 1 then
     ``evaluations``  draws of the random transforms that are averaged in each step
     ``scales``       largest downscaling among the transforms; NGPT trains with 2
-    ``l1``, ``gradient``, ``relative``, ``geometric``, ``logarithmic``, ``huber``, ``pyramid``, ``flip``
-                     weights of the pixelwise parts; NGPT has 0.01 of the first two, and no others
+    ``l1``, ``gradient``, ``relative``, ``logarithmic``, ``huber``, ``pyramid``, ``flip``
+                     weights of the pixelwise parts; NGPT has 0.01, 0.01, 0, 0, 0, 0, 0
     ``halves``       weight of the loss of pairs, ``ngpt.training.halves``; 0.25 has as much effect as the weights in
                      combine.toml
     ``backbone``, ``weights``  files of E-LPIPS (docs/train/losses.md); "" looks for the backbone in PyTorch's cache
@@ -55,7 +54,6 @@ class LossSettings:
     l1: float = 0.01
     gradient: float = 0.01
     relative: float = 0.0
-    geometric: float = 0.0
     logarithmic: float = 0.0
     huber: float = 0.0
     pyramid: float = 0.0

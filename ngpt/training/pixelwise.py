@@ -15,8 +15,6 @@ _SCALES, _EXPOSURES = 4, (0.25, 1.0, 4.0)
 # For ``flip``: typical radiance over the exposure is 4. The first exposure makes it white; the last makes 32 times as
 # much white.
 _WHITES = (0.25, 0.0078)
-# For ``geometric``: an error that nobody sees. References hold more noise than that.
-_LEAST = 1e-5
 # The parts of ``pu``.
 _PU_L1, _PU_STRUCTURE = 0.16, 0.84
 
@@ -52,19 +50,6 @@ def huber(prediction: Tensor, target: Tensor, epsilon: float = 1e-2, knee: float
     """
     error = ((prediction - target) / (prediction.detach().square() + epsilon).sqrt()).abs()
     return torch.where(error < knee, error.square() / 2, knee * (error - knee / 2)).mean()
-
-
-def geometric(prediction: Tensor, target: Tensor) -> Tensor:
-    """Mean over images of ln(``_LEAST`` + mean over pixels of rho((p - t)² / (t² + 1/4))), rho straight from 1 on.
-
-    Tables compare errors by ratios and geometric means over scenes. In a mean of errors, noisy images outweigh quiet
-    ones, and the network errs by a percent where its inputs do not. Radiance is over the exposure, so 1/4 equals
-    relMSE's ε for a typical radiance of 1/4.
-    """
-    square = (prediction - target).square() / (target.square() + 0.25)
-    # Few pixels hold the largest errors, as fireflies of the target do.
-    rho = torch.where(square < 1, square, 2 * square.clamp(min=1).sqrt() - 1)
-    return torch.log(_LEAST + rho.mean((1, 2, 3))).mean()
 
 
 def logarithmic(prediction: Tensor, target: Tensor) -> Tensor:

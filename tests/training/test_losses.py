@@ -380,27 +380,6 @@ def test_tone_mapping_is_that_of_ngpt(lit, expected):
     assert pixelwise.tone_mapped(image).flatten().tolist() == pytest.approx(expected)
 
 
-def test_the_geometric_term_counts_errors_by_ratios():
-    """Ten times the squared error adds ln 10, whatever the image, and fireflies of the target count by their number."""
-    target = 4 * images(2, 3, 24, 24)
-    quiet, noisy = (
-        target + size * torch.randn(target.shape, generator=torch.Generator().manual_seed(5)) for size in (0.1, 0.3)
-    )
-    both = pixelwise.geometric(torch.stack([quiet[0], noisy[1]]), target)
-    each = (pixelwise.geometric(a[None], b[None]) for a, b in ((quiet[0], target[0]), (noisy[1], target[1])))
-    assert both.item() == pytest.approx(sum(each).item() / 2, rel=1e-5)
-    assert (pixelwise.geometric(noisy, target) - pixelwise.geometric(quiet, target)).item() == pytest.approx(
-        np.log(9), abs=0.1
-    )
-    bright = target.clone()
-    bright[:, :, 3, 3] = 1e6
-    further = target.clone()
-    further[:, :, 3, 3] = 1e9
-    assert pixelwise.geometric(quiet, bright).item() == pytest.approx(
-        pixelwise.geometric(quiet, further).item(), abs=1e-3
-    )
-
-
 def test_of_errors_of_one_size_the_pyramid_sees_the_wide_ones():
     """A patch that is off counts as much at every resolution; a checkerboard of the same error only at the finest."""
     target = torch.full((1, 3, 64, 64), 0.2)
