@@ -5,7 +5,7 @@ from data_gen.samplers.registry import own
 from ngpt.options import written
 
 # Standing -> what the table calls it
-GROUPS = {"use": "", "niche": "for some scenes", "study": "measured, and better elsewhere: to compare with"}
+GROUPS = {"use": "", "niche": "for some scenes", "study": "for comparison: another sampler is better"}
 
 
 def table() -> str:

@@ -29,7 +29,7 @@ _SUMMARIES = {
     "beams": "photon beams: light in media gathered from whole light paths, without gradients "
     "(thin fog, beams of lamps)",
     "gbeams": "gradients of photon beams (thin fog, beams of lamps)",
-    "planes": "photon planes: light scattered in media again and again without blur, without gradients (thin fog)",
+    "planes": "photon planes: light scattered many times in media, unblurred, without gradients (thin fog)",
     "gplanes": "gradients of photon planes (thin fog)",
 }
 _STANDINGS = {"ppm": "use", "gpm": "niche", "bre": "niche"}  # others are studies
