@@ -1,6 +1,7 @@
 """The evaluation itself: scenes x samples x methods x seeds, cell by cell, and the folder of results."""
 
 import gc
+import os
 from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import partial
@@ -106,13 +107,13 @@ def evaluate(
 def check_named(config: Config, scenes: dict[str, str], renderer: Renderer) -> None:
     """Raises NgptError unless all ``scenes`` exist, their references, and the samplers that every scene needs."""
     for name, source in scenes.items():
-        if not Path(source).exists():
+        if not os.path.exists(source):
             renderer.scene_code(source)
         named = config.references.get(name, [])
         for file in [named] if isinstance(named, str) else named:
-            if not Path(file).is_file():
+            if not os.path.isfile(file):
                 raise NgptError(f"{file}: no such file; evaluation: references.{name} names it")
-    if all(Path(source).is_dir() for source in scenes.values()):
+    if all(os.path.isdir(source) for source in scenes.values()):
         return  # What rendered their stacks may have any name.
     for entry in ("clock", "reference_sampler"):
         sampler, _ = config.sampler(getattr(config, entry))

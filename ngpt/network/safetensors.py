@@ -1,6 +1,7 @@
 """Weights on disk: safetensors with the whole configuration in the header. Nothing is ever unpickled."""
 
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -41,9 +42,9 @@ def shipped() -> dict[str, Path]:
 def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """What ``write_tensors`` wrote into a file, or a network of ``shipped`` by its name. Raises NgptError for anything
     else."""
-    if not Path(path).is_file():
+    if not os.path.isfile(path):
         names = shipped()
-        if str(path) not in names and Path(path).is_dir():
+        if str(path) not in names and os.path.isdir(path):
             raise NgptError(f"{path}: is a directory; name a file in it, or one of: {', '.join(names)}")
         if str(path) not in names:
             raise NgptError(f"{path}: no such file; networks that come with ngpt: {', '.join(names)}")

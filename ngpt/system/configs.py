@@ -33,7 +33,7 @@ def find_config(name: str, kind: str) -> Path:
     stem, known = name.removesuffix(".toml"), names(kind)
     if stem in known:
         return FOLDER / f"{stem}.toml"
-    if Path(name).is_dir():
+    if os.path.isdir(name):
         raise NgptError(f"{name}: is a directory; name a file in it, or one of: {', '.join(known)}")
     meant = did_you_mean(stem, known)
     raise NgptError(

@@ -18,10 +18,10 @@ from data_gen.scenes.procedural.stage import Stage
 from data_gen.scenes.procedural.textures import colour
 
 # The share of scenes that each falls to, independently, where a configuration says nothing else.
-SHARES = {
-    **{"fine": 0.25, "hair": 0.25, "bulbs": 0.15, "caustic": 0.15, "media": 0.16},
-    **{"partition": 0.0, "lamps": 0.0, "mirrors": 0.0},
-}
+SHARES = {"fine": 0.25, "hair": 0.25, "bulbs": 0.15, "caustic": 0.15, "media": 0.16}
+# Drawn from random numbers of their own, as they came later: scenes without them are the same as before.
+LATER = {"partition": 0.0, "lamps": 0.0, "mirrors": 0.0}
+SHARES |= LATER
 
 # Small lamps are this many emitters, whatever they are: kernels depend on the number.
 EMITTERS = 4
@@ -45,9 +45,10 @@ def further_sights(
 
     ``shares`` has all names of ``SHARES``, in the same order.
     """
-    rng = np.random.default_rng((*(seed if isinstance(seed, tuple) else (seed,)), 0x5EE))
-    # A share of 0 draws no number, so that sights that a configuration does not ask for change no scene.
-    return frozenset(name for name, share in shares.items() if share and rng.random() < share), rng
+    parts = seed if isinstance(seed, tuple) else (seed,)
+    rng, later = (np.random.default_rng((*parts, salt)) for salt in (0x5EE, 0x5EF))
+    drawn = {name: (later if name in LATER else rng).random() for name in shares}
+    return frozenset(name for name, share in shares.items() if drawn[name] < share), rng
 
 
 def add_sights(stage: Stage, sights: frozenset[str], rng: np.random.Generator) -> list[Lamp]:
