@@ -148,8 +148,9 @@ def print_every(name: str, found: dict[int, dict]) -> None:
     worst = max(rises, key=rises.__getitem__)
     print(
         f"`{name}`: error of `wcv` {found[numbers[0]]['wcv'][0]:.5f} at {numbers[0]} samples, "
-        f"{found[numbers[-1]]['wcv'][0]:.5f} at {numbers[-1]}; at most {rises[worst]:.3f} times that of one "
-        f"sample less, at {worst} (standard error {found[worst]['wcv'][1] / found[worst]['wcv'][0]:.3f} of it)",
+        f"{found[numbers[-1]]['wcv'][0]:.5f} at {numbers[-1]}. Over the error with one sample "
+        f"less it is at most {rises[worst]:.3f}, at {worst} samples "
+        f"(standard error {found[worst]['wcv'][1] / found[worst]['wcv'][0]:.3f} of it)",
         flush=True,
     )
 

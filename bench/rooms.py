@@ -37,6 +37,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path("out/rooms"), help="folder of renders")
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/rooms.json"))
     args = parser.parse_args()
+    about_run = {"metadata": metadata("torch", "mitsuba"), "sampler": args.sampler, "size": args.size}
     given = [(START, args.start), *(arm.split("=", 1) for arm in args.weights)]
     rows = json.loads(args.output.read_text())["rows"] if args.output.exists() else []
     for scene in args.scenes:
@@ -50,15 +51,7 @@ def main() -> None:
                 about = {"room": scene_name(scene), "spp": spp, "arm": arm, "weights": Path(path).as_posix()}
                 if not any(about.items() <= row.items() for row in rows):
                     rows.append(about | judged(ngpt.denoise(stack, "ngpt", weights=str(path)), halves))
-                    save(
-                        args.output,
-                        {
-                            "metadata": metadata("torch", "mitsuba"),
-                            "sampler": args.sampler,
-                            "size": args.size,
-                            "rows": rows,
-                        },
-                    )
+                    save(args.output, about_run | {"rows": rows})
     print(table(rows, args.spp))
 
 

@@ -10,14 +10,16 @@ def default_device() -> torch.device:
     return torch.device(f"cuda:{os.environ.get('LOCAL_RANK', 0)}" if torch.cuda.is_available() else "cpu")
 
 
-def emulates_bfloat16(device: str) -> bool:
-    """Whether PyTorch takes longer in bfloat16 than in float32 on this type of device: on CPUs that end with AVX2.
+def in_bfloat16(device: str, precision: str) -> bool:
+    """Whether this type of device computes in bfloat16 if a run asks for ``precision``, see ``RunSettings``.
 
-    A training step of ngpt-primal takes 6.5 times as long there (docs/lab/log).
+    CPUs with AVX2 but without AVX-512 emulate it: a training step of ngpt-primal takes 6.5 times as long as in float32
+    (docs/lab/log).
     """
-    return device == "cpu" and torch.backends.cpu.get_cpu_capability() == "AVX2"
+    emulated = device == "cpu" and torch.backends.cpu.get_cpu_capability() == "AVX2"
+    return precision == "bfloat16" and not emulated
 
 
 def body_precision(device: str, precision: str) -> torch.autocast:
-    """A context for the convolutions of a network: ``precision`` is "float32" or "bfloat16", see ``RunSettings``."""
-    return torch.autocast(device, torch.bfloat16, enabled=precision == "bfloat16" and not emulates_bfloat16(device))
+    """A context for the convolutions of a network: ``precision`` is "float32" or "bfloat16"."""
+    return torch.autocast(device, torch.bfloat16, enabled=in_bfloat16(device, precision))

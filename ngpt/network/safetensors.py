@@ -44,10 +44,10 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     else."""
     if not os.path.isfile(path):
         names = shipped()
-        if str(path) not in names and os.path.isdir(path):
-            raise NgptError(f"{path}: is a directory; name a file in it, or one of: {', '.join(names)}")
         if str(path) not in names:
-            raise NgptError(f"{path}: no such file; networks that come with ngpt: {', '.join(names)}")
+            directory = "is a directory; name a file in it, or one of"
+            lack = directory if os.path.isdir(path) else "no such file; networks that come with ngpt"
+            raise NgptError(f"{path}: {lack}: {', '.join(names)}")
         path = names[str(path)]
     try:
         with safe_open(str(path), framework="pt") as file:

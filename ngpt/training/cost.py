@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 from ngpt.network import features, padding
-from ngpt.network.device import default_device, emulates_bfloat16
+from ngpt.network.device import default_device, in_bfloat16
 from ngpt.network.model import Reconstructor, parameters
 from ngpt.network.unet import Convolution, LastConvolution
 from ngpt.sequence.network import INPUTS
@@ -53,8 +53,7 @@ def cost(settings: Settings) -> str:
     pixels = run.batch * (settings.data.crop + 2 * padding.MARGIN) ** 2
     # Backward costs twice as much as forward.
     step = 3 * macs * pixels
-    short = run.precision == "bfloat16" and not emulates_bfloat16(default_device().type)
-    activations = numbers * pixels * (2 if short else 4)
+    activations = numbers * pixels * (2 if in_bfloat16(default_device().type, run.precision) else 4)
     # Weights, gradients, two moments, and the average.
     states = parameters(model) * 4 * (5 if settings.optimizer.ema else 4)
     lines = {

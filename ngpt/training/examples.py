@@ -9,11 +9,12 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset as TorchDataset
 
+from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError
 from ngpt.network import features, padding
 from ngpt.network.config import ModelConfig
 from ngpt.network.run_torch import layers_of
-from ngpt.repair import repair
+from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
 from ngpt.training.augment import Augmentation, Layers, quieter, rarer
 from ngpt.training.crops import Crop
@@ -94,7 +95,8 @@ class Examples(TorchDataset):
         data = repair(stack, self.config.reads_gradients)
         layers = layers_of(data, self.config)
         if crop.paired:
-            judge = _tensors(other_half(stack, crop.stack(1 - k), not self.config.reads_gradients))
+            half = data if self.config.reads_gradients else repair(stack)
+            judge = _tensors(other_half(half, crop.stack(1 - k), not self.config.reads_gradients))
         else:
             judge = _tensors({"target": target_of(crop, self.config)})
         self._cache[crop, k] = layers, judge
@@ -136,34 +138,32 @@ def collated(examples: Sequence[Layers]) -> Layers:
     return {name: torch.stack([example[name] for example in ordered if name in example]) for name in names}
 
 
-def other_half(half: GradientStack, other: GradientStack, whole: bool) -> dict[str, np.ndarray]:
-    """What ``ngpt.training.halves`` judges ``half`` by: arrays (H, W, C) of ``other``, and standard errors of ``half``.
+def other_half(ours: Repaired, other: GradientStack, whole: bool) -> dict[str, np.ndarray]:
+    """What ``ngpt.training.halves`` judges a half by: arrays (H, W, C) of ``other``, and standard errors of the half.
 
-    ``whole``  whether with the light of the layer ``caustic``. Gradients hold none of it, so its own differences, whose
-               noise is larger, are added to them
+    ``ours``   the half, repaired for a method that reads gradients
+    ``whole``  whether the light of the layer ``caustic`` is included. Gradients hold none of it, so its own
+               differences, whose noise is larger, are added to them
 
     Raises NgptError where both are the same, and where one lacks gradients or their variances.
     """
-    ours, theirs = repair(half), repair(other)
+    theirs = repair(other)
     if ours.variances is None or theirs.dx is None:
         raise NgptError(f"{other.path}: one half lacks gradients or their variances, without which pairs teach nothing")
+    if np.array_equal(ours.image, theirs.image):
+        raise NgptError(
+            f"{other.path}: both halves are the same, so noise would be learnt; render them with different seeds"
+        )
     layers = {"primal": theirs.image, "dx": theirs.dx, "dy": theirs.dy}
     known = [np.isfinite(variance).all(axis=-1) for variance in ours.variances]
     variances = [np.where(k[..., None], v, 0) for k, v in zip(known, ours.variances, strict=True)]
     if whole and theirs.caustic is not None:
-        light = theirs.caustic
-        layers = {"primal": theirs.image + light} | {
-            name: layers[name] + np.diff(light, axis=axis, append=np.take(light, [-1], axis))
-            for name, axis in (("dx", 1), ("dy", 0))
-        }
+        light = (theirs.caustic, *forward_differences(theirs.caustic))
+        layers = {name: layer + further for (name, layer), further in zip(layers.items(), light, strict=True)}
     if whole and ours.caustic_var is not None:
         variance = np.nan_to_num(ours.caustic_var)
         after = [np.concatenate([np.delete(variance, 0, axis), np.take(variance, [-1], axis)], axis) for axis in (1, 0)]
         variances = [variances[0] + variance, *(v + variance + a for v, a in zip(variances[1:], after, strict=True))]
-    if np.array_equal(repair(half, not whole).image, layers["primal"]):
-        raise NgptError(
-            f"{other.path}: both halves are the same, so noise would be learnt; render them with different seeds"
-        )
     layers |= dict(zip(("primal_se", "dx_se", "dy_se"), (np.sqrt(v) for v in variances), strict=True))
     # Where lamps are seen, the variance of the light beside them is not known.
     counts = known[0] & ~theirs.direct.any(axis=-1)

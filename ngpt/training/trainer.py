@@ -22,7 +22,7 @@ from torch import Tensor
 
 from ngpt.errors import NgptError
 from ngpt.network import safetensors
-from ngpt.network.device import emulates_bfloat16
+from ngpt.network.device import in_bfloat16
 from ngpt.network.model import parameters
 from ngpt.system import files
 from ngpt.system.console import print_line
@@ -76,7 +76,7 @@ class Trainer:
         steps, warmup = settings.run.steps, warmup_of(settings.optimizer, settings.run.steps)
         if warmup < settings.optimizer.warmup:
             say(f"the run's {steps} steps would end within its warm-up of {settings.optimizer.warmup}: taking {warmup}")
-        if settings.run.precision == "bfloat16" and emulates_bfloat16(self.device.type):
+        if settings.run.precision == "bfloat16" and not in_bfloat16(self.device.type, settings.run.precision):
             say("run.precision: this processor has no instructions for bfloat16: computing in float32, which is faster")
         self._stop = False
         # The least error of a validation so far.

@@ -232,7 +232,7 @@ def test_damage_is_one_line(tmp_path, name, data, expected):
 
 @pytest.mark.parametrize("data", [b"#?RADIANCE\n\n+X 1 -Y 1\n", png(np.zeros((4, 4, 3), int), 2)[:-20]])
 def test_damage_is_told_by_a_process_of_its_own_in_the_same_words(tmp_path, data):
-    """Of a header, which is read before it starts, and of pixels, which it reads."""
+    """The first file has a damaged header, which is read before the process starts; the second has damaged pixels."""
     (tmp_path / "a").write_bytes(data)
     messages = set()
     for isolated in (False, True):

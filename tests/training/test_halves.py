@@ -7,6 +7,7 @@ from crops import PairedCrop, SyntheticCrop, settings
 
 from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError
+from ngpt.repair import repair
 from ngpt.stack import GradientStack
 from ngpt.training.augment import Augmentation
 from ngpt.training.examples import Examples, collated, other_half
@@ -127,11 +128,14 @@ def test_networks_without_gradients_are_judged_by_the_differences_of_the_whole_l
         )
         for a, b in zip(primal, light, strict=True)
     ]
-    judge, apart = (other_half(*halves_of, whole) for whole in (True, False))
+    ours, other = repair(halves_of[0]), halves_of[1]
+    judge, apart = (other_half(ours, other, whole) for whole in (True, False))
     assert np.allclose(judge["primal"], primal[1] + light[1]) and np.allclose(apart["primal"], primal[1], atol=1e-6)
     for name, axis, own in (("dx", 1, 1), ("dy", 0, 4)):
         inside = np.s_[:, :-1] if axis else np.s_[:-1]
         assert np.allclose(judge[name][inside], np.diff(primal[1] + light[1], axis=axis), atol=1e-5)
         assert np.allclose(apart[name][inside], np.diff(primal[1], axis=axis), atol=1e-5)
         assert np.allclose(judge[f"{name}_se"][inside] ** 2, own + 18) and np.allclose(apart[f"{name}_se"] ** 2, own)
+    with pytest.raises(NgptError, match="both halves are the same"):
+        other_half(ours, halves_of[0], True)
     assert np.allclose(judge["primal_se"] ** 2, 34) and np.allclose(apart["primal_se"] ** 2, 25)

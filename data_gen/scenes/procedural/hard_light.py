@@ -26,11 +26,10 @@ def partition(stage: Stage) -> None:
     # Across x, or, turned by a quarter, across z.
     turned = bool(rng.random() < 0.5)
     length, across = (stage.area[0], stage.area[1]) if turned else (stage.area[1], stage.area[0])
-    keep_from = [spot[1] if turned else spot[0] for spot in stage.standing[-1:]]
+    camera = stage.standing[-1][1 if turned else 0]
     places = rng.uniform(-0.3, 0.3, 50) * across
-    place = max(places[:10], key=lambda c: min([abs(c - k) for k in keep_from], default=1.0))
-    clear = [c for c in places if all(abs(c - k) > CLEAR for k in keep_from)]
-    place = clear[0] if clear else place
+    # In a narrow room none may be clear of the camera.
+    place = next((c for c in places if abs(c - camera) > CLEAR), max(places, key=lambda c: abs(c - camera)))
     kind = str(rng.choice(["doorway", "ajar", "crack", "slats", "pane"]))
     low, high = (
         (0.0, min(DOOR, 0.95 * height)) if kind in ("doorway", "ajar", "crack") else (0.25 * height, 0.8 * height)

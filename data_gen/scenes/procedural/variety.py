@@ -1,5 +1,5 @@
 """Sights that few scenes have, each added to some scenes: fine pictures, hair, many small lamps, caustics, media, and
-those of ``data_gen.scenes.procedural.hard_light``.
+the light of ``data_gen.scenes.procedural.hard_light``.
 
 They come on top of a scene that is there already, drawn from random numbers of their own: a scene that none of them
 falls to is the same without this file.
@@ -17,11 +17,10 @@ from data_gen.scenes.procedural.meshes import Mesh, box, cylinder, lathe, merge,
 from data_gen.scenes.procedural.stage import Stage
 from data_gen.scenes.procedural.textures import colour
 
-# The share of scenes that each falls to, independently, where a configuration says nothing else.
-SHARES = {"fine": 0.25, "hair": 0.25, "bulbs": 0.15, "caustic": 0.15, "media": 0.16}
-# Drawn from random numbers of their own, as they came later: scenes without them are the same as before.
+# The share of scenes that each falls to, independently, where a configuration says nothing else. LATER ones are drawn
+# from random numbers of their own, so scenes without them are the same as before there were any.
 LATER = {"partition": 0.0, "lamps": 0.0, "mirrors": 0.0}
-SHARES |= LATER
+SHARES = {"fine": 0.25, "hair": 0.25, "bulbs": 0.15, "caustic": 0.15, "media": 0.16} | LATER
 
 # Small lamps are this many emitters, whatever they are: kernels depend on the number.
 EMITTERS = 4
