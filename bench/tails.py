@@ -36,9 +36,10 @@ from ngpt.evaluation.references import HALVES, Reference, read_reference
 from ngpt.evaluation.worth import worth_of_gradients, worth_tables
 from ngpt.measure.averages import geometric_mean, median
 from ngpt.measure.metrics import EPSILON, relmse_trimmed, scores, squared_error, trimmed_mean
+from ngpt.methods import choose
 
 RAW = "raw"
-SECONDS = (5, 10, 20, 40)
+SECONDS = (5, 10, 20, 40, 120)
 METHODS = {
     "primal": [RAW, "oidn", "ngpt-primal"],
     "gpt": ["wcv", "ngpt-fast", "ngpt-combine", "oidn"],
@@ -94,11 +95,14 @@ def place(cell: dict[str, Any]) -> tuple:
 def measured(scene: str, args: argparse.Namespace, known: set[tuple]):
     """The cells of a scene that are not ``known``, one after the other."""
     load_scene, render_stack = renderer()
+    from data_gen.choosing.plans import plan_sampler
+
     # A kernel knows the shapes of all scenes in memory.
     gc.collect()
     loaded = load_scene(scene, tuple(map(int, args.size.split("x"))))
     reference = reference_of(loaded, scene, args)
     clean = np.mean([ngpt.reconstruct(half, "oidn").image for half in reference.stacks], axis=0, dtype=np.float64)
+    chosen = plan_sampler(loaded, min(args.spp), None)
     for sampler in args.samplers:
         warm: set[str] = set()
         name, options = ("primal", RIVAL) if sampler == "mitsuba" else (sampler, {})
@@ -117,6 +121,8 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]):
                     stack = render_stack(loaded, spp, seed, name, tails=tails, **options)
                     cell = dict(zip(CELL, values, strict=True)) | {"seconds": processor_seconds() - start}
                     cell |= {"load average": load, "options": stack.attributes.get("ngpt:samplerOptions", "")}
+                    if sampler == chosen.sampler:
+                        cell["auto"] = chosen.method or choose(stack)
                     yield cell | {"methods": {name: judged(stack, name, reference, clean) for name in METHODS[sampler]}}
 
 
@@ -233,6 +239,8 @@ def show(cells: list[dict], groups: dict[str, list[str]]) -> None:
     for tails in sorted({cell["tails"] for cell in cells}):
         print(f"\npipelines after equal whole time, tails={tails}: error and FLIP relative to `primal` with `oidn`")
         table(["scenes", "processor s", *pipelines(), "mitsuba+oidn"], against_oidn(cells, tails, groups))
+        print("\nwhat `ngpt render` and `ngpt denoise` take by default, relative to the best of our pipelines")
+        table(["scenes", *(f"{seconds} s" for seconds in SECONDS)], default_over_best(cells, tails, groups))
     loads = [cell["load average"] for cell in cells]
     print(f"\nload average {min(loads):.1f} to {max(loads):.1f}")
 
@@ -247,31 +255,60 @@ def pipelines() -> dict[str, dict[str, str]]:
     }
 
 
-def against_oidn(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> list[list[str]]:
-    """A row for each scene and group, and each of ``SECONDS``: error and FLIP of all ``pipelines`` and of Mitsuba."""
-    names = [*pipelines(), "mitsuba+oidn"]
+def curves_of(cells: list[dict], tails: str) -> dict[str, dict[str, dict[str, list]]]:
+    """Scene -> pipeline -> error and FLIP -> (whole seconds, value) of all ``pipelines`` and of Mitsuba."""
     curves: dict[str, dict[str, dict[str, list]]] = {}
     for (scene, _, sampler, method), by_spp in rows_of(cells).items():
-        if (name := f"{sampler}+{method}") in names:
+        if (name := f"{sampler}+{method}") in (*pipelines(), "mitsuba+oidn"):
             each = "paths" if sampler == "mitsuba" else tails
             lines = [by[each] for by in by_spp.values() if each in by]
             points = {value: [(line["whole"], line[value]) for line in lines] for value in ("error", "FLIP")}
             curves.setdefault(scene, {})[name] = points
+    return curves
+
+
+def groups_of(curves: dict[str, Any], groups: dict[str, list[str]]) -> list[tuple[str, list[str]]]:
+    """Each scene, and each group that has any, with the scenes that were measured."""
+    known = [(name, [scene for scene in members if scene in curves]) for name, members in groups.items()]
+    return [*((scene, [scene]) for scene in curves), *((name, members) for name, members in known if members)]
+
+
+def against_oidn(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> list[list[str]]:
+    """A row for each scene and group, and each of ``SECONDS``: error and FLIP of all ``pipelines`` and of Mitsuba."""
+    curves = curves_of(cells, tails)
 
     def ratio(scene: str, name: str, value: str, seconds: float) -> tuple[float, str] | None:
         a, b = (error_at(seconds, curves[scene].get(each, {}).get(value, [])) for each in (name, "primal+oidn"))
         return (a[0] / b[0], joined((a[1], b[1]))) if a and b else None
 
     rows = []
-    for label, members in [*((scene, [scene]) for scene in curves), *groups.items()]:
-        here = [scene for scene in members if scene in curves]
-        for seconds in SECONDS if here else ():
-            values = {
-                name: [over([ratio(scene, name, value, seconds) for scene in here]) for value in ("error", "FLIP")]
-                for name in names
-            }
-            rows.append([label, str(seconds), *map(", ".join, values.values())])
+    for label, here in groups_of(curves, groups):
+        for seconds in SECONDS:
+            values = [
+                ", ".join(over([ratio(scene, name, value, seconds) for scene in here]) for value in ("error", "FLIP"))
+                for name in (*pipelines(), "mitsuba+oidn")
+            ]
+            rows.append([label, str(seconds), *values])
     return rows
+
+
+def default_over_best(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> list[list[str]]:
+    """A row for each scene and group: error and FLIP of the pipeline that is taken by default, at each of ``SECONDS``."""
+    curves = curves_of(cells, tails)
+    taken = {cell["scene"]: f"{cell['sampler']}+{cell['auto']}" for cell in cells if "auto" in cell}
+
+    def ratio(scene: str, value: str, seconds: float) -> tuple[float, str] | None:
+        ours = {name: error_at(seconds, curves[scene][name][value]) for name in pipelines() if name in curves[scene]}
+        known = {name: found for name, found in ours.items() if found}
+        if taken.get(scene) not in known:
+            return None
+        best = min(known.values())
+        return known[taken[scene]][0] / best[0], joined((known[taken[scene]][1], best[1]))
+
+    return [
+        [label, *(", ".join(over([ratio(s, v, t) for s in here]) for v in ("error", "FLIP")) for t in SECONDS)]
+        for label, here in groups_of(curves, groups)
+    ]
 
 
 def evaluated(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> dict[str, Any]:

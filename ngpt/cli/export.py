@@ -12,7 +12,13 @@ from ngpt.system.writing import write_bytes
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     source = parser.add_mutually_exclusive_group()
-    source.add_argument("--weights", type=Path, metavar="FILE.safetensors", help="network that `ngpt train` made")
+    source.add_argument(
+        "--weights",
+        type=Path,
+        nargs="+",
+        metavar="FILE.safetensors",
+        help="network that `ngpt train` made; of several files to a .safetensors, the mean",
+    )
     source.add_argument(
         "--method", choices=["l2"], help="a method instead of a network: l2 (default), screened Poisson"
     )
@@ -41,6 +47,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
         raise WrongUse("--vector belongs to networks; leave it out for a classical method")
     if args.output.suffix in (".tza", ".safetensors") and (not args.weights or args.vector):
         raise WrongUse(f"{args.output}: {args.output.suffix} files hold only networks; give --weights, and no --vector")
+    if args.weights and len(args.weights) > 1 and args.output.suffix != ".safetensors":
+        raise WrongUse(f"{args.output}: the mean of several files is written to a .safetensors file; export that one")
     output_file(args.output, args)
     for path in write(args):
         console.say(f"{path}: {path.stat().st_size} bytes")
@@ -52,7 +60,7 @@ def write(args: argparse.Namespace) -> list[Path]:
     if args.output.suffix == ".tza":
         from ngpt.export.weights import oidn_weights
 
-        write_bytes(args.output, oidn_weights(args.weights), args.force)
+        write_bytes(args.output, oidn_weights(args.weights[0]), args.force)
         return [args.output]
     if args.output.suffix == ".safetensors":
         from ngpt.export.weights import write_halves
@@ -64,20 +72,21 @@ def write(args: argparse.Namespace) -> list[Path]:
 
         models = {args.output: l2_model(args.alpha)}
     else:
+        weights = args.weights[0]
         from ngpt.export.network import network_model, statistics_model
         from ngpt.export.temporal import temporal_model
         from ngpt.network.safetensors import read_tensors
 
-        if read_tensors(args.weights)[1].get("kind") == "temporal":
+        if read_tensors(weights)[1].get("kind") == "temporal":
             if args.vector:
                 raise NgptError(
-                    f"{args.weights}: this network blends frames, and has no example to write; leave --vector out"
+                    f"{weights}: this network blends frames, and has no example to write; leave --vector out"
                 )
-            write_bytes(args.output, temporal_model(args.weights).SerializeToString(), args.force)
+            write_bytes(args.output, temporal_model(weights).SerializeToString(), args.force)
             return [args.output]
-        name, beside = args.weights.stem, output_file(args.output.with_suffix(".statistics.onnx"), args)
-        models = {args.output: network_model(args.weights, name, args.precision)}
-        models[beside] = statistics_model(args.weights, name)
+        name, beside = weights.stem, output_file(args.output.with_suffix(".statistics.onnx"), args)
+        models = {args.output: network_model(weights, name, args.precision)}
+        models[beside] = statistics_model(weights, name)
     for path, model in models.items():
         write_bytes(path, model.SerializeToString(), args.force)
     if args.vector:

@@ -1,9 +1,12 @@
 """Weights in 16 bits: as the repository keeps them, with the curve of their training, and as OIDN reads them."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from ngpt.errors import NgptError
 from ngpt.network import tza
@@ -13,19 +16,42 @@ from ngpt.training.run_summary import LOG, entries_of
 POINTS = 100
 
 
-def write_halves(weights: str | Path, path: str | Path, overwrite: bool = False) -> None:
-    """Writes weights to ``path`` in 16 bits.
+def write_halves(files: Sequence[str | Path], path: str | Path, overwrite: bool = False) -> None:
+    """Writes weights, or the mean of several, to ``path`` in 16 bits; see ``mean``.
 
     Raises NgptError for files that hold no weights, and for numbers that 16 bits cannot hold.
     """
-    tensors, header = read_tensors(weights)
-    kind = header.get("kind")
-    if kind not in ("weights", "temporal"):
-        raise NgptError(f"{weights}: holds a {kind or 'something'}, not weights; pass weights.safetensors")
-    log, training = Path(weights).with_name(LOG), header.get("training")
-    if log.is_file() and isinstance(training, dict) and "step" in training:
-        header["curve"] = curve(entries_of(log), training["step"])
-    write_tensors(path, in_halves(tensors, str(weights)), header, overwrite)
+    if len(files) > 1:
+        tensors, header = mean(files)
+    else:
+        tensors, header = read_tensors(files[0])
+        kind = header.get("kind")
+        if kind not in ("weights", "temporal"):
+            raise NgptError(f"{files[0]}: holds a {kind or 'something'}, not weights; pass weights.safetensors")
+        log, training = Path(files[0]).with_name(LOG), header.get("training")
+        if log.is_file() and isinstance(training, dict) and "step" in training:
+            header["curve"] = curve(entries_of(log), training["step"])
+    write_tensors(path, in_halves(tensors, str(path)), header, overwrite)
+
+
+def mean(files: Sequence[str | Path]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The mean of the weights in several files, and a header; a file that is named twice counts twice.
+
+    Networks that were tuned from the same weights can be averaged. The mean with these weights keeps more of what they
+    knew than the tuned network does [Wortsman et al. 2022, "Robust fine-tuning of zero-shot models"]. The header is the
+    first file's, with the training of each file. Raises NgptError for files that hold no weights or another network
+    than the first one.
+    """
+    models, headers = zip(*map(load_weights, files), strict=True)
+    for file, model in zip(files, models, strict=True):
+        if model.config != models[0].config:
+            raise NgptError(f"{file}: its network differs from that of {files[0]}; give weights of one [model]")
+    states = [model.state_dict() for model in models]
+    tensors = {name: torch.stack([state[name].double() for state in states]).mean(0).float() for name in states[0]}
+    trainings = [header.get("training") for header in headers]
+    own = trainings[0] if isinstance(trainings[0], dict) else {}
+    header = {name: value for name, value in headers[0].items() if name != "curve"}
+    return tensors, header | {"training": own | {"mean of": trainings}}
 
 
 def curve(entries: list[dict[str, float]], last: int) -> dict[str, list[Any]]:

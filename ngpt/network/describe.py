@@ -104,6 +104,8 @@ def _training(record: Any) -> dict[str, Any]:
     if not isinstance(record, dict):
         return {}
     facts = {name: value for name, value in record.items() if isinstance(value, int | float | str)}
+    if isinstance(record.get("mean of"), list):
+        facts["mean of"] = f"{len(record['mean of'])} files"
     settings = record.get("settings")
     for table, names in _SETTINGS.items():
         values = settings.get(table) if isinstance(settings, dict) else None

@@ -137,6 +137,14 @@ def test_what_is_no_scene_is_said_with_its_remedy(renderer):
         data_gen.render_frames(box, range(2))
 
 
+def test_a_folder_in_place_of_a_scene_is_said_to_be_one(renderer, tmp_path):
+    with pytest.raises(NgptError, match=r"is a folder; name a scene file$"):
+        data_gen.load_scene(str(tmp_path))
+    (tmp_path / "room.xml").write_text("")
+    with pytest.raises(NgptError, match=r"is a folder; name a scene file, such as .*room\.xml$"):
+        data_gen.load_scene(str(tmp_path))
+
+
 def test_the_tensor_of_an_integrator_is_told_how_it_becomes_a_stack(renderer):
     box = renderer.cornell_box() | {"integrator": {"type": "gpt", "max_depth": 3}}
     box["sensor"]["film"] |= {"width": 16, "height": 12}

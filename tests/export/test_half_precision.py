@@ -63,6 +63,36 @@ def test_what_reads_them_computes_in_32_bits(run, tmp_path):
     np.testing.assert_allclose(onnx_image, ours, rtol=1e-4, atol=1e-5 * ours.max())
 
 
+def test_the_mean_of_several_files_counts_a_file_as_often_as_it_is_named(run, tmp_path, capsys):
+    other = untrained(CONFIG)
+    with torch.no_grad():
+        for parameter in other.parameters():
+            parameter.mul_(3).add_(0.5)
+    save_weights(tmp_path / "tuned.safetensors", other, {"step": 7})
+    files = [run, run, tmp_path / "tuned.safetensors"]
+    output = tmp_path / "mean.safetensors"
+    assert main(["export", "--weights", *map(str, files), "-o", str(output)]) == 0
+    tensors, header = read_tensors(output)
+    first, tuned = read_tensors(run)[0], read_tensors(files[2])[0]
+    for name, tensor in tensors.items():
+        np.testing.assert_allclose(tensor, (2 * first[name] + tuned[name]) / 3, rtol=1e-3, atol=1e-6)
+    assert [record["step"] for record in header["training"]["mean of"]] == [STEPS, STEPS, 7]
+    assert header["training"]["step"] == STEPS and "curve" not in header
+    assert main(["info", str(output)]) == 0
+    assert "3 files" in capsys.readouterr().out
+
+
+def test_means_of_networks_that_differ_are_refused(run, tmp_path, capsys):
+    wider = plain(("primal", "base", "primal_se", "dx_se"), "wcv", start=("primal", "base"), channels=(4, 8))
+    save_weights(tmp_path / "wider.safetensors", untrained(wider), {})
+    two = ["export", "--weights", str(run), str(tmp_path / "wider.safetensors"), "-o"]
+    assert main([*two, str(tmp_path / "mean.safetensors")]) == 1
+    assert "wider.safetensors: its network differs" in capsys.readouterr().err
+    assert main([*two, str(tmp_path / "mean.onnx")]) == 2
+    assert "is written to a .safetensors file" in capsys.readouterr().err
+    assert not list(tmp_path.glob("mean.*"))
+
+
 def test_networks_that_blend_frames(tmp_path):
     torch.manual_seed(2)
     header = {"kind": "temporal", "inputs": list(INPUTS), "widths": list(WIDTHS), "training": {}}

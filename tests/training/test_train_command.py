@@ -195,16 +195,29 @@ def test_models_are_made_anew_with_scene_files_and_without(model, files, tmp_pat
         (tmp_path / "scenes" / "bathroom" / "scene.xml").touch()
     command = ["bash", ROOT / "scripts/train-model", model, "out", "--set", "run.steps=5"]
     subprocess.run(command, cwd=tmp_path, env={"PATH": "/usr/bin:/bin", "PYTHON": str(python)}, check=True)
-    *made, trained, small, whole = (line.split("\t")[:-1] for line in calls.read_text().splitlines())
-    sources = [read_config(line[line.index("--config") + 1]) for line in made]
-    assert any(source.files for source in sources) == files
-    changes = [trained[i + 1] for i, word in enumerate(trained) if word == "--set"]
-    settings = read_settings(trained[trained.index("--config") + 1], changes)
-    assert settings.run.steps == 5 and settings.data.folders == tuple(line[line.index("--out") + 1] for line in made)
-    for name in settings.data.validation:
-        scenes = [f"made-{i:05d}" for i in range(max(source.scenes for source in sources))]
-        scenes += [Path(table.pattern).parent.name for source in sources for table in source.files]
-        assert 0 < sum(scene.startswith(name) for scene in scenes) < len(scenes)
+    *stages, small, whole = (line.split("\t")[:-1] for line in calls.read_text().splitlines())
+    made, weights, sources = [], [], []
+    for line in stages:
+        if line[0] == "-m":
+            made.append(line)
+            continue
+        sources = [read_config(each[each.index("--config") + 1]) for each in made]
+        if not weights:
+            assert any(source.files for source in sources) == files
+        changes = [line[i + 1] for i, word in enumerate(line) if word == "--set"]
+        settings = read_settings(line[line.index("--config") + 1], changes)
+        assert settings.run.steps == 5
+        assert settings.data.folders == tuple(each[each.index("--out") + 1] for each in made)
+        assert settings.initial == (weights[-1] if weights else "")
+        for name in settings.data.validation:
+            scenes = [f"made-{i:05d}" for i in range(max(source.scenes for source in sources))]
+            scenes += [Path(table.pattern).parent.name for source in sources for table in source.files]
+            assert 0 < sum(scene.startswith(name) for scene in scenes) < len(scenes)
+        weights.append(f"{line[line.index('--out') + 1]}/weights.safetensors")
+        made = []
+    assert len(weights) == (2 if model == "primal" else 1) and not made
+    at = small.index("--weights") + 1
+    assert small[at : at + len(weights)] == weights
     assert small[-1] in whole and whole[-1].endswith(".onnx")
 
 
