@@ -28,6 +28,8 @@ ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "bench" / "results" / "main.json"
 IMAGES = ROOT / "docs" / "images"
 OURS = ("ngpt-combine", "ngpt-primal", "ngpt-fast")
+# With shared tails, as `ngpt render` renders by default; all others are unbiased
+SHARED = {"ngpt-primal-shared": "`ngpt-primal`, shared tails", "oidn-shared": "`oidn`, shared tails"}
 COMPARED = ("l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal")
 # Groups whose frontiers are shown
 DRAWN = ("blind", "all")
@@ -97,7 +99,8 @@ def blocks(result: dict[str, Any]) -> dict[tuple[str, str], str]:
         (card("combine"), "over primal"): over_primal(sizes),
     }
     for name in ("fast", "combine", "primal"):
-        made[card(name), "results"] = of_groups(sizes, *sizes[0].groups, methods=(f"ngpt-{name}",))
+        own = tuple(method for method in (*SHARED, *OURS) if method.startswith(f"ngpt-{name}"))
+        made[card(name), "results"] = of_groups(sizes, *sizes[0].groups, methods=own)
     for name in ("combine", "primal"):
         made[card(name), "losses"] = losses(sizes[0], f"ngpt-{name}")
     return made
@@ -137,7 +140,7 @@ class Size:
         return [group for group in DRAWN if group in self.groups]
 
 
-def of_groups(sizes: list[Size], *groups: str, methods: tuple[str, ...] = OURS) -> str:
+def of_groups(sizes: list[Size], *groups: str, methods: tuple[str, ...] = (*SHARED, *OURS)) -> str:
     """Error and FLIP over both rivals' for each group and size, and in how many cells they are less."""
     tables = []
     for size in sizes:
@@ -147,7 +150,7 @@ def of_groups(sizes: list[Size], *groups: str, methods: tuple[str, ...] = OURS) 
                 for rival, text in size.rivals.items():
                     cells = [size.both(size.means.get((group, n, method, rival))) for n in size.counts]
                     won = ", ".join(size.won(group, method, rival, key) for key in ("", " FLIP"))
-                    first = f"{group} ({len(size.members(group))}): `{method}`"
+                    first = f"{group} ({len(size.members(group))}): {SHARED.get(method, f'`{method}`')}"
                     lines.append(f"| {first} | {text} | {' | '.join(cells)} | {won} |")
         if len(lines) > 2:
             tables.append("\n".join(lines))

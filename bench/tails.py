@@ -102,11 +102,11 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]):
     loaded = load_scene(scene, tuple(map(int, args.size.split("x"))))
     reference = reference_of(loaded, scene, args)
     clean = np.mean([ngpt.reconstruct(half, "oidn").image for half in reference.stacks], axis=0, dtype=np.float64)
-    chosen = plan_sampler(loaded, min(args.spp), None)
     for sampler in args.samplers:
         warm: set[str] = set()
         name, options = ("primal", RIVAL) if sampler == "mitsuba" else (sampler, {})
         for spp in args.spp:
+            chosen = plan_sampler(loaded, spp, None)
             for seed in args.seeds:
                 for tails in args.tails if sampler != "mitsuba" else ["paths"]:
                     values = (scene_name(scene), args.size, sampler, tails, spp, seed)
@@ -293,17 +293,28 @@ def against_oidn(cells: list[dict], tails: str, groups: dict[str, list[str]]) ->
 
 
 def default_over_best(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> list[list[str]]:
-    """A row for each scene and group: error and FLIP of the pipeline that is taken by default, at each of ``SECONDS``."""
-    curves = curves_of(cells, tails)
-    taken = {cell["scene"]: f"{cell['sampler']}+{cell['auto']}" for cell in cells if "auto" in cell}
+    """A row for each scene and group: error and FLIP of what is taken by default over the best, at each of ``SECONDS``.
+
+    What is taken depends on the samples; it is that of the most samples that the seconds suffice for.
+    """
+    curves, rows = curves_of(cells, tails), rows_of(cells)
+    taken: dict[str, list[tuple[float, str]]] = {}
+    for cell in cells:
+        if "auto" in cell and cell["tails"] == tails:
+            line = rows[cell["scene"], cell["size"], cell["sampler"], cell["auto"]][cell["spp"]][tails]
+            taken.setdefault(cell["scene"], []).append((line["whole"], f"{cell['sampler']}+{cell['auto']}"))
 
     def ratio(scene: str, value: str, seconds: float) -> tuple[float, str] | None:
         ours = {name: error_at(seconds, curves[scene][name][value]) for name in pipelines() if name in curves[scene]}
         known = {name: found for name, found in ours.items() if found}
-        if taken.get(scene) not in known:
+        if scene not in taken:
+            return None
+        fit = [each for each in taken[scene] if each[0] <= seconds] or [min(taken[scene])]
+        mine = known.get(max(fit)[1])
+        if not mine:
             return None
         best = min(known.values())
-        return known[taken[scene]][0] / best[0], joined((known[taken[scene]][1], best[1]))
+        return mine[0] / best[0], joined((mine[1], best[1]))
 
     return [
         [label, *(", ".join(over([ratio(s, v, t) for s in here]) for v in ("error", "FLIP")) for t in SECONDS)]
