@@ -171,10 +171,10 @@ def plan_sampler(
     """The sampler for a render of ``spp`` samples per pixel, or of so many ``seconds``; one of them may be None.
 
     Where gradients do not pay it is ``primal``, unless they are wanted: see ``why_plain``. Elsewhere the description
-    decides, at no cost, where only one sampler can render the scene, and where the render is too short for a pilot. What a pilot
-    measures changes from run to run, what it chooses hardly; the render itself has the bits of ``--sampler NAME``.
-    Raises NgptError where no sampler with gradients can render the scene, and before anything is tried where the image
-    does not fit into ``memory`` (MiB).
+    decides, at no cost, where only one sampler can render the scene, and where the render is too short for a pilot.
+    What a pilot measures changes from run to run, what it chooses hardly; the render itself has the bits of ``--sampler
+    NAME``. Raises NgptError where no sampler with gradients can render the scene, and before anything is tried where
+    the image does not fit into ``memory`` (MiB).
     """
     start = time.perf_counter()
     facts = scene_facts(scene)

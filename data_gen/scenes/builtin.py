@@ -5,6 +5,7 @@ Each function returns a Mitsuba scene dictionary, without its film size: units a
 
 from __future__ import annotations
 
+import glob
 import os
 from collections.abc import Iterable
 
@@ -270,7 +271,8 @@ SCENES = SURFACES | MEDIA
 def no_scene(name: str, others: Iterable[str] = ()) -> NgptError:
     """The error for what is neither a file nor a built-in scene; ``others`` are names that may have been meant too."""
     if os.path.isdir(name):
-        files = sorted(each for each in os.listdir(name) if each.endswith(".xml"))
-        return NgptError(f"{name}: is a folder; name a scene file{f', such as {os.path.join(name, files[0])}' if files else ''}")
+        files = sorted(glob.glob(os.path.join(glob.escape(name), "*.xml")))
+        such = f", such as {files[0]}" if files else ""
+        return NgptError(f"{name}: is a folder; name a scene file{such}")
     meant = did_you_mean(name, [*SCENES, *others])
     return NgptError(f"{name}: no such file, nor a built-in scene; {meant}those are: {', '.join(SCENES)}")
