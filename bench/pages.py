@@ -21,7 +21,7 @@ from bench.common import save, write_page
 from bench.tables import RIVALS, heading
 from ngpt.evaluation.curves import error_at
 from ngpt.evaluation.wholetime import ratio
-from ngpt.evaluation.worth import marked
+from ngpt.evaluation.worth import marked, worth_of_gradients
 from ngpt.measure.averages import geometric_mean
 
 ROOT = Path(__file__).parents[1]
@@ -75,7 +75,10 @@ def kept(results: dict[str, Any]) -> dict[str, Any]:
         for row in results["summary"]
         if row["scene"]
     ]
-    tables = {name: {key: results[name][key] for key in ("rows", "means")} for name in ("against", "worth")}
+    # Gradients are compared to unbiased rivals only.
+    unbiased = [row for row in results["summary"] if row["method"] not in SHARED]
+    found = {"against": results["against"], "worth": worth_of_gradients(results | {"summary": unbiased})}
+    tables = {name: {key: table[key] for key in ("rows", "means")} for name, table in found.items()}
     settings["rivals"] = settings.pop("against")
     return facts | settings | {"cells": cells} | tables
 
@@ -148,6 +151,8 @@ def of_groups(sizes: list[Size], *groups: str, methods: tuple[str, ...] = (*SHAR
         for group in (group for group in groups if group in size.groups):
             for method in methods:
                 for rival, text in size.rivals.items():
+                    if not any((group, n, method, rival) in size.means for n in size.counts):
+                        continue
                     cells = [size.both(size.means.get((group, n, method, rival))) for n in size.counts]
                     won = ", ".join(size.won(group, method, rival, key) for key in ("", " FLIP"))
                     first = f"{group} ({len(size.members(group))}): {SHARED.get(method, f'`{method}`')}"

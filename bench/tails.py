@@ -11,6 +11,7 @@ Samplers are `primal`, `gpt`, and `mitsuba`: `primal` with Mitsuba's own points 
                reference is noisy most of its pixels are too dark, and ``error`` rewards images that are too dark
     blocks     root of the same error of means over 8x8 pixels; none where it is below what the halves can tell
     energy     mean of the image over the mean of the reference
+    auto       the method that the stack gets by default, in cells of the sampler that `ngpt render` takes by default
 
 References are NAME-WxH-a.exr and -b.exr of the folder; what is missing is rendered there, without shared tails. At
 equal whole time a cell with shared tails is over the errors of its own sampler and method with tails=paths; for the
@@ -39,7 +40,7 @@ from ngpt.measure.metrics import EPSILON, relmse_trimmed, scores, squared_error,
 from ngpt.methods import choose
 
 RAW = "raw"
-SECONDS = (5, 10, 20, 40, 120)
+SECONDS = (5, 10, 20, 40)
 METHODS = {
     "primal": [RAW, "oidn", "ngpt-primal"],
     "gpt": ["wcv", "ngpt-fast", "ngpt-combine", "oidn"],
@@ -102,11 +103,11 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]):
     loaded = load_scene(scene, tuple(map(int, args.size.split("x"))))
     reference = reference_of(loaded, scene, args)
     clean = np.mean([ngpt.reconstruct(half, "oidn").image for half in reference.stacks], axis=0, dtype=np.float64)
+    chosen = plan_sampler(loaded, min(args.spp), None)
     for sampler in args.samplers:
         warm: set[str] = set()
         name, options = ("primal", RIVAL) if sampler == "mitsuba" else (sampler, {})
         for spp in args.spp:
-            chosen = plan_sampler(loaded, spp, None)
             for seed in args.seeds:
                 for tails in args.tails if sampler != "mitsuba" else ["paths"]:
                     values = (scene_name(scene), args.size, sampler, tails, spp, seed)
@@ -121,7 +122,7 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]):
                     stack = render_stack(loaded, spp, seed, name, tails=tails, **options)
                     cell = dict(zip(CELL, values, strict=True)) | {"seconds": processor_seconds() - start}
                     cell |= {"load average": load, "options": stack.attributes.get("ngpt:samplerOptions", "")}
-                    if sampler == chosen.sampler:
+                    if sampler == chosen.sampler and tails == "shared":
                         cell["auto"] = chosen.method or choose(stack)
                     yield cell | {"methods": {name: judged(stack, name, reference, clean) for name in METHODS[sampler]}}
 
@@ -239,8 +240,9 @@ def show(cells: list[dict], groups: dict[str, list[str]]) -> None:
     for tails in sorted({cell["tails"] for cell in cells}):
         print(f"\npipelines after equal whole time, tails={tails}: error and FLIP relative to `primal` with `oidn`")
         table(["scenes", "processor s", *pipelines(), "mitsuba+oidn"], against_oidn(cells, tails, groups))
-        print("\nwhat `ngpt render` and `ngpt denoise` take by default, relative to the best of our pipelines")
-        table(["scenes", *(f"{seconds} s" for seconds in SECONDS)], default_over_best(cells, tails, groups))
+        if tails == "shared":
+            print("\nwhat `ngpt render` and `ngpt denoise` take by default, relative to the best of our pipelines")
+            table(["scenes", *(f"{seconds} s" for seconds in SECONDS)], default_over_best(cells, tails, groups))
     loads = [cell["load average"] for cell in cells]
     print(f"\nload average {min(loads):.1f} to {max(loads):.1f}")
 
@@ -293,27 +295,16 @@ def against_oidn(cells: list[dict], tails: str, groups: dict[str, list[str]]) ->
 
 
 def default_over_best(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> list[list[str]]:
-    """A row for each scene and group: error and FLIP of what is taken by default over the best, at each of ``SECONDS``.
-
-    What is taken depends on the samples; it is that of the most samples that the seconds suffice for.
-    """
-    curves, rows = curves_of(cells, tails), rows_of(cells)
-    taken: dict[str, list[tuple[float, str]]] = {}
-    for cell in cells:
-        if "auto" in cell and cell["tails"] == tails:
-            line = rows[cell["scene"], cell["size"], cell["sampler"], cell["auto"]][cell["spp"]][tails]
-            taken.setdefault(cell["scene"], []).append((line["whole"], f"{cell['sampler']}+{cell['auto']}"))
+    """A row for each scene and group: error and FLIP of the default pipeline over the best, at each of ``SECONDS``."""
+    curves = curves_of(cells, tails)
+    taken = {cell["scene"]: f"{cell['sampler']}+{cell['auto']}" for cell in cells if "auto" in cell}
 
     def ratio(scene: str, value: str, seconds: float) -> tuple[float, str] | None:
         ours = {name: error_at(seconds, curves[scene][name][value]) for name in pipelines() if name in curves[scene]}
         known = {name: found for name, found in ours.items() if found}
-        if scene not in taken:
+        if taken.get(scene) not in known:
             return None
-        fit = [each for each in taken[scene] if each[0] <= seconds] or [min(taken[scene])]
-        mine = known.get(max(fit)[1])
-        if not mine:
-            return None
-        best = min(known.values())
+        mine, best = known[taken[scene]], min(known.values())
         return mine[0] / best[0], joined((mine[1], best[1]))
 
     return [

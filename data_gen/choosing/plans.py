@@ -50,13 +50,9 @@ LONG, LEAST_PIXELS = 200.0, 1 / 16
 # In renders from this size on, a twentieth is enough to compile the kernels of other samplers and to try them: in
 # seconds, and in paths. One or two cores trace a million paths per second.
 _LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
-# What cleans an image without gradients, and why it has none
-_PLAIN_METHOD = "ngpt-primal"
+# What cleans the image of a room, and why
+_ROOM_METHOD = "ngpt-primal"
 _ROOM_REASON = "the camera is in a room, where more samples pay and gradients do not; --sampler gpt renders gradients"
-_FEW_REASON = "gradients do not pay with so few samples; --sampler gpt renders them"
-# Samples up to which gradients do not pay anywhere. At 4 spp they do not, at 64 they do outside of rooms; at 16 spp
-# errors are about equal (docs/lab/worth.md, docs/lab/RESULTS.md).
-_FEW = 8
 # A rival must need this much less time: a choice is not worth changing for what chance could have made.
 _MARGIN = 1.1
 # Whether the camera is in a room is told by so many rays: by the share of them leaving visible surfaces that meet
@@ -150,8 +146,8 @@ def plan(
         first = ranked[0]
         return Plan(first.sampler, first.method, first.shared, left - first.after, _why(ranked, left))
     facts = scene_facts(scene)
-    if method in ("auto", _PLAIN_METHOD) and (reason := why_plain(scene, facts, None)):
-        sampler, method, why = "primal", _PLAIN_METHOD, reason
+    if method in ("auto", _ROOM_METHOD) and in_a_room(scene, facts, None):
+        sampler, method, why = "primal", _ROOM_METHOD, _ROOM_REASON
     else:
         sampler, why = able[0], samplers.choose(facts)[1]
     after = _beside(scene) + _METHOD_SECONDS.get(method, _OTHERS) * _pixels(scene) / 1e6
@@ -170,19 +166,20 @@ def plan_sampler(
 ) -> Plan:
     """The sampler for a render of ``spp`` samples per pixel, or of so many ``seconds``; one of them may be None.
 
-    Where gradients do not pay it is ``primal``, unless they are wanted: see ``why_plain``. Elsewhere the description
-    decides, at no cost, where only one sampler can render the scene, and where the render is too short for a pilot.
-    What a pilot measures changes from run to run, what it chooses hardly; the render itself has the bits of ``--sampler
-    NAME``. Raises NgptError where no sampler with gradients can render the scene, and before anything is tried where
-    the image does not fit into ``memory`` (MiB).
+    In a room it is ``primal``, unless ``gradients`` are wanted: see ``in_a_room``. Elsewhere the description decides,
+    at no cost, where only one sampler can render the scene, and where the render is too short for a pilot. What a pilot
+    measures changes from run to run, what it chooses hardly; the render itself has the bits of ``--sampler NAME``.
+    Raises NgptError where no sampler with gradients can render the scene, and before anything is tried where the image
+    does not fit into ``memory`` (MiB).
     """
     start = time.perf_counter()
     facts = scene_facts(scene)
     sampler, reason = samplers.choose(facts)
     described = Plan(sampler, "", False, seconds, reason)
-    if not gradients and (why := why_plain(scene, facts, spp)):
+    if not gradients and in_a_room(scene, facts, spp):
         # One sample has no variance, which the method needs.
-        return replace(described, sampler="primal", method=_PLAIN_METHOD if spp != 1 else "", reason=why)
+        method = _ROOM_METHOD if spp != 1 else ""
+        return replace(described, sampler="primal", method=method, reason=_ROOM_REASON)
     names = candidates(scene, biased=True)
     if len(names) == 1:
         return described
@@ -209,18 +206,14 @@ def plan_sampler(
     return replace(described, sampler=found[0], reason=found[1], render=left)
 
 
-def why_plain(scene: mi.Scene, facts: Facts, spp: int | None) -> str:
-    """Why ``primal`` and ``ngpt-primal`` leave less error and FLIP than gradients after the same whole time; "" if not.
+def in_a_room(scene: mi.Scene, facts: Facts, spp: int | None) -> bool:
+    """Whether ``primal`` and ``ngpt-primal`` leave less error and FLIP than gradients would, after the same whole time.
 
-    They do in rooms of surfaces, where paths share their tails, and anywhere with few samples (docs/lab/worth.md).
-    Small images are the same to both, and without OIDN gradients clean better.
+    They do in rooms of surfaces, where paths share their tails (docs/lab/worth.md). Small images are the same to both,
+    and without OIDN gradients clean better.
     """
     able = samplers.choose(facts)[0] == "gpt" and not facts.media and not SAMPLERS["primal"].refuses(facts)
-    if not able or not enough(_pixels(scene), spp) or METHODS[_PLAIN_METHOD].missing():
-        return ""
-    if spp is not None and spp <= _FEW:
-        return _FEW_REASON
-    return _ROOM_REASON if enclosed(scene) else ""
+    return able and enough(_pixels(scene), spp) and not METHODS[_ROOM_METHOD].missing() and enclosed(scene)
 
 
 def enclosed(scene: mi.Scene) -> bool:

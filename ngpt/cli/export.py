@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         metavar="FILE.safetensors",
-        help="network that `ngpt train` made; of several files to a .safetensors, the mean",
+        help="network that `ngpt train` made; several files are averaged into a .safetensors file",
     )
     source.add_argument(
         "--method", choices=["l2"], help="a method instead of a network: l2 (default), screened Poisson"

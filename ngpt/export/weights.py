@@ -31,16 +31,15 @@ def write_halves(files: Sequence[str | Path], path: str | Path, overwrite: bool 
         log, training = Path(files[0]).with_name(LOG), header.get("training")
         if log.is_file() and isinstance(training, dict) and "step" in training:
             header["curve"] = curve(entries_of(log), training["step"])
-    write_tensors(path, in_halves(tensors, str(path)), header, overwrite)
+    write_tensors(path, in_halves(tensors, ", ".join(map(str, files))), header, overwrite)
 
 
 def mean(files: Sequence[str | Path]) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The mean of the weights in several files, and a header; a file that is named twice counts twice.
 
-    Networks that were tuned from the same weights can be averaged. The mean with these weights keeps more of what they
-    knew than the tuned network does [Wortsman et al. 2022, "Robust fine-tuning of zero-shot models"]. The header is the
-    first file's, with the training of each file. Raises NgptError for files that hold no weights or another network
-    than the first one.
+    The mean of a network before and after tuning forgets less than the tuned network does [Wortsman et al. 2022,
+    "Robust fine-tuning of zero-shot models"]. The header is the first file's, with the training of each file. Raises NgptError
+    for files that hold no weights of a network for single images, or another network than the first one.
     """
     models, headers = zip(*map(load_weights, files), strict=True)
     for file, model in zip(files, models, strict=True):

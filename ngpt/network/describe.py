@@ -105,7 +105,7 @@ def _training(record: Any) -> dict[str, Any]:
         return {}
     facts = {name: value for name, value in record.items() if isinstance(value, int | float | str)}
     if isinstance(record.get("mean of"), list):
-        facts["mean of"] = f"{len(record['mean of'])} files"
+        facts["mean of"] = f"{len(record['mean of'])} files; all else is of the first one"
     settings = record.get("settings")
     for table, names in _SETTINGS.items():
         values = settings.get(table) if isinstance(settings, dict) else None

@@ -78,7 +78,9 @@ def test_the_mean_of_several_files_counts_a_file_as_often_as_it_is_named(run, tm
         np.testing.assert_allclose(tensor, (2 * first[name] + tuned[name]) / 3, rtol=1e-3, atol=1e-6)
     assert [record["step"] for record in header["training"]["mean of"]] == [STEPS, STEPS, 7]
     assert header["training"]["step"] == STEPS and "curve" not in header
-    assert main(["info", str(output)]) == 0
+    assert load_weights(output)[0].config == CONFIG and export(output, tmp_path / "mean.onnx") == 0
+    capsys.readouterr()
+    assert main(["info", str(tmp_path / "mean.onnx")]) == 0
     assert "3 files" in capsys.readouterr().out
 
 
@@ -88,6 +90,10 @@ def test_means_of_networks_that_differ_are_refused(run, tmp_path, capsys):
     two = ["export", "--weights", str(run), str(tmp_path / "wider.safetensors"), "-o"]
     assert main([*two, str(tmp_path / "mean.safetensors")]) == 1
     assert "wider.safetensors: its network differs" in capsys.readouterr().err
+    header = {"kind": "temporal", "inputs": list(INPUTS), "widths": list(WIDTHS), "training": {}}
+    write_tensors(tmp_path / "t.safetensors", network().state_dict(), header)
+    blends = ["export", "--weights", *[str(tmp_path / "t.safetensors")] * 2, "-o", str(tmp_path / "mean.safetensors")]
+    assert main(blends) == 1 and "holds a temporal, not weights" in capsys.readouterr().err
     assert main([*two, str(tmp_path / "mean.onnx")]) == 2
     assert "is written to a .safetensors file" in capsys.readouterr().err
     assert not list(tmp_path.glob("mean.*"))
@@ -112,7 +118,8 @@ def test_numbers_that_16_bits_cannot_hold_are_refused(tmp_path, capsys, change, 
     change(next(tensor for tensor in model.state_dict().values() if tensor.ndim > 1))
     save_weights(tmp_path / "w.safetensors", model, {})
     assert export(tmp_path / "w.safetensors", tmp_path / "half.safetensors") == 1
-    assert message in capsys.readouterr().err and not (tmp_path / "half.safetensors").exists()
+    said = capsys.readouterr().err
+    assert message in said and "w.safetensors" in said and not (tmp_path / "half.safetensors").exists()
 
 
 @pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "export" / "weights").glob("*.safetensors")))
