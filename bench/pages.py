@@ -90,10 +90,10 @@ def blocks(result: dict[str, Any]) -> dict[tuple[str, str], str]:
     results, readme = "docs/lab/RESULTS.md", "README.md"
     made = {
         (results, "blind"): of_groups(sizes, "blind"),
-        (results, "groups"): of_groups(sizes, *(g for g in sizes[0].groups if g != "blind")),
+        (results, "groups"): of_groups(sizes, *(g for g in sizes[0].groups if g not in ("blind", "all"))),
         (results, "frontier"): "\n\n".join(frontier(size, group) for size in sizes for group in size.drawn()),
         (results, "settings"): "\n\n".join(map(settings, sizes)),
-        (results, "scenes"): "\n\n".join(map(by_scene, sizes)),
+        (results, "scenes"): by_scene(sizes[-1]),
         (results, "worth"): worth(sizes),
         (results, "worth by scene"): "\n\n".join(map(worth_by_scene, sizes)),
         (readme, "errors"): of_groups(sizes, "blind"),
@@ -103,7 +103,8 @@ def blocks(result: dict[str, Any]) -> dict[tuple[str, str], str]:
     }
     for name in ("fast", "combine", "primal"):
         own = tuple(method for method in (*SHARED, *OURS) if method.startswith(f"ngpt-{name}"))
-        made[card(name), "results"] = of_groups(sizes, *sizes[0].groups, methods=own)
+        groups = dict.fromkeys(group for size in reversed(sizes) for group in size.groups if group != "all")
+        made[card(name), "results"] = of_groups(sizes, *groups, methods=own)
     for name in ("combine", "primal"):
         made[card(name), "losses"] = losses(sizes[0], f"ngpt-{name}")
     return made
