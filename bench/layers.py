@@ -175,8 +175,13 @@ def measured(files: Sequence[tuple[GradientStack, np.ndarray]], oidn: bool) -> t
 
 
 def by_layers(rows: list[dict]) -> str:
+    """Markdown: each method with the fewest and with the most layers; ``rows`` are in the order of their numbers."""
     heads = ["layers that it takes", "method", *(f"{n} spp" for n in SPP)]
-    cells = ([", ".join(r["layers"]), f"`{r['method']}`", *(f"{e:.4f}" for e in r["error"])] for r in rows)
+    ends: dict[str, list[dict]] = {}
+    for row in rows:
+        ends.setdefault(row["method"], [row, row])[1] = row
+    shown = [row for row in rows if row in ends[row["method"]]]
+    cells = ([", ".join(r["layers"]), f"`{r['method']}`", *(f"{e:.4f}" for e in r["error"])] for r in shown)
     return "\n".join(markdown_table(heads, cells, 2))
 
 

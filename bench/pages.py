@@ -92,7 +92,7 @@ def blocks(result: dict[str, Any]) -> dict[tuple[str, str], str]:
         (results, "blind"): of_groups(sizes, "blind"),
         (results, "groups"): of_groups(sizes, *(g for g in sizes[0].groups if g not in ("blind", "all"))),
         (results, "frontier"): "\n\n".join(frontier(size, group) for size in sizes for group in size.drawn()),
-        (results, "settings"): "\n\n".join(map(settings, sizes)),
+        (results, "settings"): settings(sizes[-1]),
         (results, "scenes"): by_scene(sizes[-1]),
         (results, "worth"): worth(sizes),
         (results, "worth by scene"): "\n\n".join(map(worth_by_scene, sizes)),

@@ -219,7 +219,7 @@ def runnable(name: str) -> Method:
 
 
 # The best first, by the errors that docs/lab/RESULTS.md has for the layers of a stack. ngpt-primal is not in it: after
-# the same whole time it has 0.73 to 0.92 times OIDN's error in blind rooms, but 1.5 to 2.0 times in simple scenes.
+# the same whole time it has OIDN's error in blind rooms, and more in simple scenes.
 ORDER = ("ngpt-combine", "oidn", "ngpt-fast", "wcv", "l1", "nfor")
 
 
