@@ -96,15 +96,11 @@ def blocks(result: dict[str, Any]) -> dict[tuple[str, str], str]:
         (results, "scenes"): by_scene(sizes[-1]),
         (results, "worth"): worth(sizes),
         (results, "worth by scene"): "\n\n".join(map(worth_by_scene, sizes)),
-        (readme, "errors"): of_groups(sizes, "blind"),
+        (readme, "errors"): of_groups(sizes, "blind", methods=("ngpt-primal-shared", "ngpt-combine", "ngpt-primal")),
         ("docs/methods/methods.md", "errors"): by_method(sizes),
         ("docs/samplers/points.md", "better"): better(sizes),
         (card("combine"), "over primal"): over_primal(sizes),
     }
-    for name in ("fast", "combine", "primal"):
-        own = tuple(method for method in (*SHARED, *OURS) if method.startswith(f"ngpt-{name}"))
-        groups = dict.fromkeys(group for size in reversed(sizes) for group in size.groups if group != "all")
-        made[card(name), "results"] = of_groups(sizes, *groups, methods=own)
     for name in ("combine", "primal"):
         made[card(name), "losses"] = losses(sizes[0], f"ngpt-{name}")
     return made
