@@ -38,8 +38,8 @@ def mean(files: Sequence[str | Path]) -> tuple[dict[str, Tensor], dict[str, Any]
     """The mean of the weights in several files, and a header; a file that is named twice counts twice.
 
     The mean of a network before and after tuning forgets less than the tuned network does [Wortsman et al. 2022,
-    "Robust fine-tuning of zero-shot models"]. The header is the first file's, with the training of each file. Raises NgptError
-    for files that hold no weights of a network for single images, or another network than the first one.
+    "Robust fine-tuning of zero-shot models"]. The header is the first file's, with the training of each file. Raises
+    NgptError for files that hold no weights of a network for single images, or another network than the first one.
     """
     models, headers = zip(*map(load_weights, files), strict=True)
     for file, model in zip(files, models, strict=True):
