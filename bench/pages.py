@@ -29,7 +29,7 @@ RESULT = ROOT / "bench" / "results" / "main.json"
 IMAGES = ROOT / "docs" / "images"
 OURS = ("ngpt-combine", "ngpt-primal", "ngpt-fast")
 # With shared tails, as `ngpt render` renders by default; all others are unbiased
-SHARED = {"ngpt-primal-shared": "`ngpt-primal`, shared tails", "oidn-shared": "`oidn`, shared tails"}
+SHARED = {"ngpt-primal-shared": "`ngpt-primal`, shared tails", "oidn-shared": "`oidn-clean`, shared tails"}
 COMPARED = ("l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal")
 # Groups whose frontiers are shown
 DRAWN = ("blind", "all")
@@ -49,7 +49,7 @@ def main() -> None:
         for folder in args.folders:
             size = kept(json.loads((folder / "results.json").read_text()))
             sizes[tuple(size["size"])] = size
-            for group in DRAWN:
+            for group in Size(size).drawn():
                 if (plot := folder / "plots" / f"frontier-rivals-{group}.svg").is_file():
                     shutil.copyfile(plot, IMAGES / picture(size, group))
         save(RESULT, {"benchmark": "main", "sizes": [sizes[size] for size in sorted(sizes)]})
@@ -148,11 +148,13 @@ def of_groups(sizes: list[Size], *groups: str, methods: tuple[str, ...] = (*SHAR
         for group in (group for group in groups if group in size.groups):
             for method in methods:
                 for rival, text in size.rivals.items():
-                    if not any((group, n, method, rival) in size.means for n in size.counts):
+                    rows = [size.means.get((group, n, method, rival)) for n in size.counts]
+                    if not any(rows):
                         continue
-                    cells = [size.both(size.means.get((group, n, method, rival))) for n in size.counts]
+                    cells = list(map(size.both, rows))
                     won = ", ".join(size.won(group, method, rival, key) for key in ("", " FLIP"))
-                    first = f"{group} ({len(size.members(group))}): {SHARED.get(method, f'`{method}`')}"
+                    scenes = max(row["scenes"] for row in rows if row)
+                    first = f"{group} ({scenes}): {SHARED.get(method, f'`{method}`')}"
                     lines.append(f"| {first} | {text} | {' | '.join(cells)} | {won} |")
         if len(lines) > 2:
             tables.append("\n".join(lines))

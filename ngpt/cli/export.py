@@ -72,11 +72,11 @@ def write(args: argparse.Namespace) -> list[Path]:
 
         models = {args.output: l2_model(args.alpha)}
     else:
-        weights = args.weights[0]
         from ngpt.export.network import network_model, statistics_model
         from ngpt.export.temporal import temporal_model
         from ngpt.network.safetensors import read_tensors
 
+        weights = args.weights[0]
         if read_tensors(weights)[1].get("kind") == "temporal":
             if args.vector:
                 raise NgptError(

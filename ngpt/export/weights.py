@@ -44,7 +44,9 @@ def mean(files: Sequence[str | Path]) -> tuple[dict[str, Tensor], dict[str, Any]
     models, headers = zip(*map(load_weights, files), strict=True)
     for file, model in zip(files, models, strict=True):
         if model.config != models[0].config:
-            raise NgptError(f"{file}: its network differs from that of {files[0]}; give weights of one [model]")
+            raise NgptError(
+                f"{file}: its network differs from the one in {files[0]}; give weights with the same [model]"
+            )
     states = [model.state_dict() for model in models]
     tensors = {name: torch.stack([state[name].double() for state in states]).mean(0).float() for name in states[0]}
     trainings = [header.get("training") for header in headers]

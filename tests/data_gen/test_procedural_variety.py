@@ -37,7 +37,7 @@ for path in sys.argv[1:]:
     mi.set_log_level(mi.LogLevel.Error)
     image = np.array(mi.render(scene, spp=4))
     # Bump maps give Mitsuba some samples that are not finite, with and without media; our films leave them out.
-    print(path, bool(np.isfinite(image).mean() > 0.5 and np.nanmean(image) > 0))
+    print(path, bool(np.isfinite(image).mean() > 0.9 and np.nanmedian(image) > 0))
 """
 
 
@@ -176,7 +176,7 @@ def test_each_kind_renders(tmp_path, monkeypatch):
     """In Mitsuba's scalar variant, which compiles no kernel."""
     paths = []
     cases = [("hair", ""), ("bulbs", ""), ("caustic", ""), ("fine", ""), *(("media", kind) for kind in media.KINDS)]
-    cases += [("partition", ""), ("lamps", ""), ("mirrors", "")]
+    cases += [("mirrors", ""), ("partition", ""), ("lamps", "")]
     for number, (sight, kind) in enumerate(cases):
         folder = tmp_path / f"{sight}{kind}"
         folder.mkdir()

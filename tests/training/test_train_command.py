@@ -196,7 +196,7 @@ def test_models_are_made_anew_with_scene_files_and_without(model, files, tmp_pat
     command = ["bash", ROOT / "scripts/train-model", model, "out", "--set", "run.steps=5"]
     subprocess.run(command, cwd=tmp_path, env={"PATH": "/usr/bin:/bin", "PYTHON": str(python)}, check=True)
     *stages, small, whole = (line.split("\t")[:-1] for line in calls.read_text().splitlines())
-    made, weights, sources = [], [], []
+    made, weights = [], []
     for line in stages:
         if line[0] == "-m":
             made.append(line)
