@@ -111,8 +111,6 @@ def render_adaptive(
     most = None if spp is None else spp * pixels
     work = UnevenRender(sample, sensor, seed, most, budget=budget, stop=stop, report=after_pass, **how)
     report()
-    rounds = rounds_of(sample)
-    rounds.begin(sensor, seed, 0, None)
     work.add(np.ones(pixels, int), whole=True)
     attributes: dict = {}
     took = 0.0
@@ -138,7 +136,6 @@ def render_adaptive(
             if spp is None:
                 total = max(total, math.ceil(needed))
             more = min(more, max(_MARGIN * needed - n.mean(), _SMALLEST * n.mean()))
-        rounds.begin(sensor, seed, int(n.mean()), None)
         work.add(share_out(found.relative * np.sqrt(n), n, more * pixels))
     if seconds is not None:
         watch.progress(math.ceil(seconds), math.ceil(seconds))
@@ -240,6 +237,10 @@ class UnevenRender:
         self.end = None if budget.seconds is None else time.perf_counter() + budget.seconds
         self.passes: list[tuple[int, float]] = []  # blocks and seconds of each
         self.ended = False
+        self.rounds, self.done = rounds_of(sample), 0
+        # The first samples of all pixels come together, and so do the rounds in which an even render has them.
+        for first in (0, BLOCK - 1):
+            self.rounds.begin(sensor, seed, first)
 
     def add(self, blocks: np.ndarray, whole: bool = False) -> None:
         """Renders so many more ``blocks`` of each pixel, (pixels) integers.
@@ -249,7 +250,8 @@ class UnevenRender:
         """
         waiting, level = np.zeros(0, np.uint32), 0
         while True:
-            n = self._at_once(whole)
+            self.rounds.begin(self.sensor, self.seed, max(self.done // self.film.pixels, BLOCK - 1))
+            n = min(self._at_once(whole), self._of_round())
             while len(waiting) < n and level < blocks.max():
                 waiting = np.append(waiting, np.flatnonzero(blocks > level).astype(np.uint32))
                 level += 1
@@ -262,6 +264,11 @@ class UnevenRender:
             self._render(np.sort(waiting[:n]))
             waiting = waiting[n:]
             self.report()
+
+    def _of_round(self) -> int:
+        """Blocks up to the end of the round, which is counted in samples of all pixels."""
+        end = self.rounds.end_of_round(self.done // self.film.pixels)
+        return 1 << 62 if end is None else max(1, -(-(end * self.film.pixels - self.done) // BLOCK))
 
     def _at_once(self, whole: bool) -> int:
         """Blocks of the next pass; 0 where there is no time for one."""
@@ -289,4 +296,5 @@ class UnevenRender:
             self.film.end_pass(BLOCK, some)
         dr.sync_thread()
         self.blocks_left -= len(some)
+        self.done += BLOCK * len(some)
         self.passes.append((len(some), time.perf_counter() - start))

@@ -24,7 +24,8 @@ from data_gen.scenes.cameras import place_of
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import check_scene
-from data_gen.tails.cache import LEAST_MIB, MIB, enough
+from data_gen.tails.cache import LEAST_MIB, MIB
+from data_gen.tails.schedule import enough
 from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
 from ngpt.io.exr import with_channels
 from ngpt.layers import GATHERED
@@ -141,7 +142,8 @@ def render_stack(
             film.forget_pass()
         else:
             made.keep(entry, scene, more, sample)
-    if "tails" in settings and not rounds_of(sample).shares:
+    shares = rounds_of(sample).shares
+    if "tails" in settings and not shares:
         settings["tails"] = "paths"
     done = round(float(film.samples_each.mean()))
     chosen = chosen | known | {"ngpt:spp": done} | options_as_attribute(entry, settings)

@@ -24,7 +24,7 @@ from data_gen.choosing.trials import PIXELS, Pilot, Trial, at_most, candidates, 
 from data_gen.passes import film_within
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.facts import Facts, scene_facts
-from data_gen.tails.cache import enough
+from data_gen.tails.schedule import enough
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS
 from ngpt.system.console import brief

@@ -22,6 +22,7 @@ from __future__ import annotations
 import numpy as np
 
 from data_gen.film.nets import USUAL, law
+from ngpt.shared import box_means
 
 # Pixels of about the same noise: so many groups at most, of so many pixels at least
 _GROUPS, _LEAST = 64, 64
@@ -91,26 +92,3 @@ def _likely(ratio: float, expected: np.ndarray, contrasts: float, pixels: float)
     likelihood = pixels / 2 * (np.log((1 - by_law) / by_law) - contrasts * np.log1p(odds / others))
     weights = USUAL * np.exp(likelihood - likelihood.max())
     return weights / weights.sum()
-
-
-def box_means(image: np.ndarray, size: int) -> np.ndarray:
-    """Means over ``size`` x ``size`` pixels around each of (H, W), mirrored at the edges: SciPy's ``uniform_filter``.
-
-    To the bit; but SciPy takes longer to import than the rest of a small render takes for all of its variances.
-    """
-    if not image.size:  # the differences within a single row or column of pixels
-        return image
-    before = size // 2
-    for axis in (0, 1):
-        lines = np.moveaxis(image, axis, 0).astype(np.float64)
-        lines = np.pad(lines, ((before, size - 1 - before), (0, 0)), mode="symmetric")
-        total = np.zeros(lines.shape[1])
-        for line in lines[:size]:
-            total += line
-        means = np.empty(np.moveaxis(image, axis, 0).shape, image.dtype)
-        means[0] = total / size
-        for i in range(1, len(means)):
-            total += lines[i + size - 1] - lines[i - 1]
-            means[i] = total / size
-        image = np.moveaxis(means, 0, axis)
-    return image

@@ -14,6 +14,7 @@ from data_gen.film.moments import Moments, Strands, accumulate, no_moments, one_
 from data_gen.film.splats import SPLAT_BYTES, Splats
 from data_gen.film.statistics import contrast, statistics
 from ngpt.layers import DIFFERENCES, FEATURE_NOISE
+from ngpt.shared import shared_variance
 from ngpt.stack import GradientStack
 from ngpt.windows import Place
 
@@ -34,9 +35,9 @@ _SPLIT = ("diffuse", "specular")
 # Features whose noise is said in one number, see ``GradientFilm.feature_noise``
 _FEATURES = ("albedo", "normal")
 _WITH_VARIANCE = frozenset({"primal", "caustic", *_SPLIT, *SHIFTS, *_FEATURES})
-# Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 21; and the moments of
+# Per strand: two counts for each of 11 names, double means of 29 channels and sums of squares of 21; and the moments of
 # one name once more.
-_STRAND_BYTES = 10 * 8 + (26 + 21) * 8 + (8 + 6 * 8)
+_STRAND_BYTES = 11 * 8 + (29 + 21) * 8 + (8 + 6 * 8)
 # Per strand, of two sets of earlier samples: single means of 21 channels, and counts of the seven names they belong to,
 # with the number of bits
 _HALVES_BYTES = 2 * 21 * 4 + 7 * 3 * 4
@@ -249,6 +250,11 @@ class GradientFilm:
             # Samplers put it beside a primal without it, whose variance is the one that goes with dx and dy.
             layers["primal"] = layers["primal"] + layers["caustic"]
             variances["caustic_var"] = self._claimed("caustic")
+        if "shared" in layers:
+            if layers["shared"].any():
+                variances["primal_var"] = variances["primal_var"] + shared_variance(layers["shared"])
+            else:  # paths could share, and did not
+                del layers["shared"]
         for layer in _SPLIT:
             if layer in layers:
                 variances[f"{layer}_var"] = self._claimed(layer)

@@ -1,4 +1,14 @@
-"""Which materials may end a path in the cache: those whose light is nearly the same in all directions."""
+"""Which materials let a path end in the cache, and how much of what arrives there they scatter like a matt surface.
+
+The cache knows the light that *arrives* at a surface, weighted by the cosine: its irradiance over π. Every material
+with a diffuse part scatters some of that light as a matt surface of reflectance ρ would,
+
+    f cos θ = ρ cos θ / π + rest.
+
+The path ends for the first term and goes on for the rest: gloss, metal, mirrors, what goes through, and what bumps and
+Fresnel's law change about the diffuse part. Any ρ gives the right mean, and the closer it comes to the material, the
+less is left to go on for. No light is divided by ρ, which may be 0.
+"""
 
 from __future__ import annotations
 
@@ -8,58 +18,90 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.vertex import ByMaterial, materials_of, smallest_roughness
-from data_gen.tails.cache import FINENESS
+from data_gen.paths.vertex import SMOOTH, ByMaterial, consistent, evaluate, event_kind, materials_of
 
-# Gloss that is rougher than this passes for matt beside a diffuse part, where cells are coarsest: its α.
-ROUGH = 0.15
-# What is added to the diffuse reflectance of materials with gloss: what they scatter beside it
-_GLOSS = 0.05
-# The largest share of metal in a principled material
-_MOST_METAL = 0.5
-_METAL = re.compile(r"(?:^|\.)metallic(?:\.value|\.data)?$")
+# The tangent of the angle between the normal and the direction that ρ is read off: as far from a mirror direction as
+# from the horizon
+_TILT = 1.0
+# Flags of whatever else a material may do
+_ELSE = ("Delta", "Delta1D", "Null", "Glossy", "DiffuseTransmission")
+# What disturbs the normal of the material that it wraps
+_BUMPS = re.compile("(Bump|Normal)Map")
 
 
 class Matt:
-    """A table of a scene's materials, by Dr.Jit's number of each.
-
-    A material is *matt* that has a diffuse part, and beside it nothing but gloss of a roughness above ``ROUGH``. Clear
-    plastic is not: what its mirror shows is another thing in each direction, and cached as if it were matt it was the
-    worst bias of all. Nor are masks and holes, and what is inside shape groups, which cannot be listed.
-    """
+    """What the cache needs to know of a scene's materials."""
 
     def __init__(self, scene: mi.Scene):
         bsdfs = materials_of(scene)
-        # Below 0: not matt
-        table = np.full(max(bsdfs, default=0) + 1, -1.0, np.float32)
-        for number, bsdf in bsdfs.items():
-            if is_matt(bsdf):
-                table[number] = smallest_roughness(bsdf) if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) else 0
-        self.any = bool((table >= 0).any())
-        self.α = ByMaterial(mi.Float(table))
+        table = np.zeros(max(bsdfs, default=0) + 1, bool)
+        table[[number for number, bsdf in bsdfs.items() if is_lambertian(bsdf)]] = True
+        # What is inside shape groups is not listed.
+        groups = any(shape.class_name() == "Instance" for shape in scene.shapes())
+        self.any = groups or any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) for bsdf in bsdfs.values())
+        self.nothing_else = ByMaterial(mi.Bool(table))
 
-    def at(self, x: mi.SurfaceInteraction3f, fineness: mi.Float, active: mi.Bool) -> tuple[mi.Bool, mi.Bool]:
-        """Whether the vertices are of such a material, and whether it has gloss that counts at that ``fineness``.
+    def at(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
+        """Whether the material at a vertex has a diffuse part."""
+        return active & mi.has_flag(x.bsdf().flags(), mi.BSDFFlags.DiffuseReflection)
 
-        More gloss counts the finer the cells are, in the end all of it: so its bias vanishes too.
-        """
-        listed, α = self.α.of(x.bsdf(), active)
-        return listed & (α >= 0), listed & (α > 0) & (α < ROUGH * dr.square(fineness / FINENESS))
+    def lambertian(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
+        """Whether it has nothing else: a path that ends there does not go on for a rest."""
+        listed, lambertian = self.nothing_else.of(x.bsdf(), active)
+        return listed & lambertian
 
     def reflectance(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
-        """What light is divided by in the cache, and multiplied with where it is read: above 0, textured."""
-        bsdf = x.bsdf()
-        rho = mi.Color3f(mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(x, active)))
-        return dr.clip(rho + dr.select(self.α.of(bsdf, active)[1] > 0, _GLOSS, 0), 1e-3, 1)
+        """ρ in [0, 1]: π times the diffuse lobe's f in a direction on the side of ``wi``."""
+        context = mi.BSDFContext()
+        # Materials of several lobes leave the others out, but for ``principled``.
+        context.type_mask = mi.BSDFFlags.DiffuseReflection
+        along = mi.Vector2f(x.wi.x, x.wi.y)
+        across = dr.rsqrt(dr.maximum(dr.squared_norm(along), 1e-12)) * along
+        wo = dr.normalize(mi.Vector3f(_TILT * across.x, _TILT * across.y, dr.mulsign(mi.Float(1), x.wi.z)))
+        f = mi.Color3f(mi.unpolarized_spectrum(x.bsdf().eval(context, x, wo, active)))
+        ρ = f * (dr.pi / dr.abs(wo.z))
+        return dr.select(active & dr.isfinite(dr.sum(ρ)), dr.clip(ρ, 0, 1), 0)
 
 
-def is_matt(bsdf: mi.BSDF) -> bool:
-    """Whether a material is matt, see ``Matt``; textures count with their glossiest or most metallic texel."""
+def is_lambertian(bsdf: mi.BSDF) -> bool:
+    """Whether a material scatters as a matt surface, on one side or on both, and not otherwise."""
     flags = bsdf.flags()
-    if any(mi.has_flag(flags, f) for f in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null, mi.BSDFFlags.Transmission)):
-        return False
-    if not mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection) or smallest_roughness(bsdf) <= ROUGH:
-        return False
-    params = mi.traverse(bsdf)
-    metal = (np.array(params[key]) for key in params.keys() if _METAL.search(key))  # noqa: SIM118 - not a dict
-    return all(float(np.max(each)) < _MOST_METAL for each in metal)
+    more = any(mi.has_flag(flags, getattr(mi.BSDFFlags, name)) for name in _ELSE)
+    known = bsdf.class_name() in ("SmoothDiffuse", "TwoSidedBRDF") and not _BUMPS.search(str(bsdf))
+    return known and mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection) and not more
+
+
+def matt_lobe(x: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.Float:
+    """f cos θ of a matt surface of reflectance 1, on the side that the path has come to."""
+    return dr.maximum(dr.mulsign(wo.z, x.wi.z), 0) * dr.inv_pi
+
+
+def evaluate_and_sample(
+    bsdf: mi.BSDFPtr,
+    x: mi.SurfaceInteraction3f,
+    wo: mi.Vector3f,
+    u_lobe: mi.Float,
+    u_direction: mi.Point2f,
+    mixed: mi.Bool,
+) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum]:
+    """As ``data_gen.paths.media.evaluate_and_sample``, but half of the directions of ``mixed`` lanes come by the
+    cosine, as at a matt surface, and all densities are those of both ways together."""
+    by_cosine = mixed & (u_lobe < 0.5)
+    u_lobe = dr.select(mixed, 2 * u_lobe - dr.select(by_cosine, mi.Float(0), 1), u_lobe)
+    f, p, sample, f_p = bsdf.eval_pdf_sample(mi.BSDFContext(), x, wo, u_lobe, u_direction)
+    sample = consistent(bsdf, x, sample, f_p)
+    p = dr.select(mixed, 0.5 * (p + matt_lobe(x, wo)), p)
+
+    side = dr.mulsign(mi.Float(1), x.wi.z)
+    own = mi.warp.square_to_cosine_hemisphere(u_direction)
+    own.z *= side
+    f_own, p_own = evaluate(bsdf, x, own, by_cosine)
+    sample.wo = dr.select(by_cosine, own, sample.wo)
+    sample.eta = dr.select(by_cosine, 1, sample.eta)
+    sample.sampled_type = dr.select(by_cosine, mi.UInt32(+mi.BSDFFlags.DiffuseReflection), sample.sampled_type)
+    p_material = dr.select(by_cosine, p_own, sample.pdf)
+    smooth = event_kind(sample.sampled_type) == SMOOTH
+    both = 0.5 * (p_material + dr.select(smooth, matt_lobe(x, sample.wo), 0))
+    f_p = dr.select(mixed, dr.select(by_cosine, f_own, f_p * p_material) * dr.rcp(dr.maximum(both, 1e-20)), f_p)
+    sample.pdf = dr.select(mixed, both, sample.pdf)
+    return f, p, sample, f_p

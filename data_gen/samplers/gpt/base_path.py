@@ -17,6 +17,7 @@ from data_gen.paths.walk import Sky, roulette
 from data_gen.samplers.gpt.manifold_shift import Chain, advance, no_chain
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.scenes.lamps import Chosen
+from data_gen.tails import matt
 from data_gen.tails.cache import Trail
 
 
@@ -35,7 +36,9 @@ class Path:
     late: mi.Bool  # and has later left a vertex by a mirror, glass or sharp gloss
     chain: Chain | None  # see data_gen.samplers.gpt.manifold_shift; None without that shift
     walks: mi.Bool  # some path of the five may go on from x
-    trail: Trail | None = None  # where paths may end in the cache
+    # Where paths may end in the cache: how far this one has come, and the reflectance for which it has ended at x
+    trail: Trail | None = None
+    ρ: mi.Color3f | None = None
 
     def goes_on(self, plan: Plan, offsets: list) -> mi.Bool:
         """Whether there is another step: as long as the base path lives, or a ghost has company."""
@@ -84,6 +87,10 @@ class Step:
     ends_late: mi.Bool  # the path is late behind x, or behind x1 at the latest
     # See data_gen.samplers.gpt.manifold_shift; L_bsdf and L_caustic hold nothing of that light
     L_followed: mi.Spectrum  # m Le
+    # Of a matt surface of reflectance 1 at x: f m Le V / p, and f / p, survival included. None where no path ends in
+    # the cache
+    E_light: mi.Spectrum | None = None
+    E_p: mi.Float | None = None
 
 
 def begin(plan: Plan, x: mi.SurfaceInteraction3f, place, channel, β: mi.Spectrum) -> Path:
@@ -103,10 +110,14 @@ def begin(plan: Plan, x: mi.SurfaceInteraction3f, place, channel, β: mi.Spectru
     )
 
 
-def base_step(scene, plan: Plan, random, path: Path, offsets: list) -> tuple[Step, Path]:
+def base_step(
+    scene, plan: Plan, random, path: Path, offsets: list, records: mi.Bool | None = None
+) -> tuple[Step, Path]:
     """Samples an emitter and the next vertex from the ``path``'s vertex; returns that step, and the path behind it.
 
-    Random numbers are drawn whether used or not: a replay needs the same ones, whatever its path meets.
+    Random numbers are drawn whether used or not: a replay needs the same ones, whatever its path meets. Where a path
+    ``records`` the light that arrives at the vertex for the cache, it goes on as if the surface were matt and white
+    too, see ``data_gen.samplers.gpt.tails``.
     """
     x, place, space = path.x, path.place, plan.space
 
@@ -122,13 +133,33 @@ def base_step(scene, plan: Plan, random, path: Path, offsets: list) -> tuple[Ste
     light, light_weight, lamp = plan.lights.sample(scene, x, u_light, lit)
     lit &= light.pdf != 0
     # Toward the emitter and along a new direction at once
-    f, p, sample, f_p = media.evaluate_and_sample(bsdf, x, place, x.to_local(light.d), u_lobe, u_direction)
+    to_light, E_light, E_p = x.to_local(light.d), None, None
+    if records is None:
+        f, p, sample, f_p = media.evaluate_and_sample(bsdf, x, place, to_light, u_lobe, u_direction)
+    else:
+        mixed = records & ~plan.matt.lambertian(x, records)
+        f, p, sample, f_p = matt.evaluate_and_sample(bsdf, x, to_light, u_lobe, u_direction, mixed)
+    survival_of_rest = mi.Float(1)
+    if path.ρ is not None:
+        E_light, smooth = matt.matt_lobe(x, to_light), event_kind(sample.sampled_type) == SMOOTH
+        E_p = dr.select(smooth & (sample.pdf > 0), matt.matt_lobe(x, sample.wo) / sample.pdf, 0)
+        # What the cache has answered for already is left out. Of the little that may be left, little is followed.
+        f, survival_of_light = rest(f, path.ρ * E_light)
+        f_p, survival_of_rest = rest(f_p, path.ρ * E_p)
+        followed = u_survival < survival_of_light
+        f = dr.select(followed, f * dr.rcp(dr.maximum(survival_of_light, 1e-20)), 0)
     # No shadow ray toward what lies behind the surface, except for paths that arrive from elsewhere.
-    asked = lit & ((dr.max(f) > 0) | dr.any([y.joined for y in offsets]))
+    asked = dr.max(dr.abs(f)) > 0
+    if records is not None:
+        asked |= records & (E_light > 0)
+    asked = lit & (asked | dr.any([y.joined for y in offsets]))
     T_light, visible = space.sees(x, place, light.p, drawn, asked)
     lit &= visible
     # The sample's share of L (survey, eq. 2), weighted by m against the density p of finding it by BSDF sampling
-    L_light = dr.select(lit, f * light_weight * light_mis(light.delta, light.pdf, p), 0) * T_light
+    Le_light = light_weight * light_mis(light.delta, light.pdf, p)
+    L_light = dr.select(lit, f * Le_light, 0) * T_light
+    if path.ρ is not None:
+        E_light = dr.select(lit, E_light * Le_light, 0) * T_light
 
     # ----------------------- BSDF sampling -----------------------
     found = sample.pdf > 0
@@ -139,7 +170,9 @@ def base_step(scene, plan: Plan, random, path: Path, offsets: list) -> tuple[Ste
 
     # ---------------------- Russian roulette ---------------------
     largest = brightest(path.β * f_p, f_p, offsets)
-    q = roulette(largest, path.depth >= plan.limits.rr_depth, η)
+    if records is not None:
+        largest = dr.maximum(largest, dr.select(records, E_p, 0))
+    q = roulette(largest, path.depth >= plan.limits.rr_depth, η) * survival_of_rest
     survival, walks = dr.rcp(q), (largest > 0) & (u_survival < q)
     goes_on = walks & found
     # All five paths survive together: 1 / q is a factor of each throughput, and cancels in r (survey, eq. 17).
@@ -151,6 +184,8 @@ def base_step(scene, plan: Plan, random, path: Path, offsets: list) -> tuple[Ste
     x1 = space.end(x, segment)
     f_p *= segment.weight
     β1 = path.β * f_p
+    if path.ρ is not None:
+        E_p = dr.select(goes_on, E_p * survival, 0)
     # After a mirror or a hole emitter sampling could not have found x1: p_light = 0, and m = 1.
     Le, p_light = emission(scene, x1, x, goes_on & sky.meets(x1), goes_on & (kind == SMOOTH), plan.lights.places)
     L_bsdf = Le * mis_weight(sample.pdf, p_light)
@@ -204,6 +239,8 @@ def base_step(scene, plan: Plan, random, path: Path, offsets: list) -> tuple[Ste
         L_caustic=L_caustic,
         ends_late=ends_late,
         L_followed=L_followed,
+        E_light=E_light,
+        E_p=E_p,
     )
     behind = Path(
         x=x1,
@@ -218,19 +255,28 @@ def base_step(scene, plan: Plan, random, path: Path, offsets: list) -> tuple[Ste
         chain=chain,
         walks=walks,
         trail=path.trail and path.trail.on(x1, kind == SMOOTH, sample.pdf, goes_on),
+        ρ=None if path.ρ is None else mi.Color3f(0),
     )
     return step, behind
 
 
 def brightest(β1: mi.Spectrum, f_p: mi.Spectrum, offsets: list) -> mi.Float:
     """The throughput of the brightest of all five paths behind a step, by which they survive: so none is starved."""
-    largest = dr.max(β1)
+    largest = dr.max(dr.abs(β1))
     for y in offsets:
         # What an offset path may yet bring to Δ / 2: w β' until it is settled, with its β' of before this step, since
         # its f is not known yet; then w |β' - β|, which is |a| / 2.
         ahead = dr.select(y.apart | y.joined, dr.max(y.β) / (1 + y.r), 0)
         largest = dr.fmax(largest, dr.fmax(ahead, dr.max(dr.abs(y.a * f_p)) / 2))
     return largest
+
+
+def rest(f: mi.Spectrum, ended: mi.Spectrum) -> tuple[mi.Spectrum, mi.Float]:
+    """What is left of ``f`` where ``ended`` of it has been answered for, and the probability to follow it: its size
+    relative to f, so that what is followed weighs as much as f."""
+    left = f - ended
+    size = dr.max(dr.abs(left)) / dr.maximum(dr.max(dr.abs(f)), 1e-20)
+    return left, dr.select(dr.max(ended) > 0, dr.minimum(size, 1), 1)
 
 
 def light_mis(delta: mi.Bool, p_light: mi.Float, p: mi.Float) -> mi.Float:

@@ -134,6 +134,8 @@ class GPT(GradientIntegrator):
         # ------------------------ Samples ----------------------------
         inside = [inside for _, _, inside in shifted]
         values = {"primal": L + Le, "direct": Le}
+        if plan.matt:
+            values["shared"] = to_rgb(paths.shared, ray.wavelengths)
         if plan.caustic:
             values["caustic"] = L_caustic
         values |= features(scene, camera.sensor, camera.random.clone(), ray)

@@ -17,6 +17,12 @@ from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.gpt.tails import feed
 from data_gen.tails import cache as tails
 from data_gen.tails.cache import Cache, Known, Place, joined
+from data_gen.tails.schedule import end_of_round, fineness, first_sample
+
+# Paths that feed the cache, for each path of the image
+SHARE = 1 / 2
+# Paths that feed the cache before its first round, at least
+FEWEST = 1 << 13
 
 # Paths that feed the cache have random numbers of their own: "TAILS".
 _SEED = 0x5441494C53
@@ -40,7 +46,7 @@ class SharedTails:
     """A ``data_gen.passes.SamplePass`` whose paths may end in a cache. The cache changes only between rounds.
 
     ``take`` puts samples into a film, and is given what is known, or None where all paths go on by themselves. ``view``
-    is the integrator. ``cache`` is None before the first pass, and where it does not pay.
+    is the integrator. ``cache`` is None before the first round, and where it does not pay.
     """
 
     def __init__(self, view, plan: Plan, frozen: Frozen, take: Take):
@@ -48,7 +54,7 @@ class SharedTails:
         # No method of this object, which has ``frozen``: there must be no circle.
         self.plan, self.paths = plan, partial(paths, view, plan)
         self.cache: Cache | None = None
-        self.fed = 0
+        self.pays, self.fed, self.pixels, self.until = plan.matt.any, 0, 1, 0
 
     def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
         self.take(self.cache and self.cache.known, camera, film)
@@ -58,53 +64,65 @@ class SharedTails:
         return self.cache is not None
 
     def end_of_round(self, sample: int) -> int | None:
-        return tails.end_of_round(sample) if self.cache else None
+        return self.until if self.pays else None
 
-    def begin(self, sensor: mi.Sensor, seed: int, sample: int, spp: int | None) -> None:
-        """Feeds the cache if this ``sample`` begins a round."""
+    def begin(self, sensor: mi.Sensor, seed: int, sample: int) -> None:
+        """Feeds the cache for all rounds that have begun by this ``sample``, one after the other."""
         if sample == 0:
-            # The light of the layer ``caustic`` is kept apart, where there is such a layer.
-            empty = Cache(tails.fineness(0), 2 if self.plan.caustic else 1) if self.plan.matt.any else None
-            self.cache, self.fed = empty, 0
+            self.pixels = int(dr.prod(mi.ScalarVector2u(sensor.film().crop_size())))
+            self.pays, self.cache, self.fed, self.until = self.plan.matt.any, None, 0, first_sample(self.pixels)
+        while self.pays and sample >= self.until:
+            self.until = end_of_round(self.until, self.pixels)
+            self.next_round(sensor, seed, self.until * self.pixels)
+
+    def next_round(self, sensor: mi.Sensor, seed: int, paths: int) -> None:
+        """Feeds the cache for a round at whose end the image has so many ``paths``."""
+        wanted, size = max(round(SHARE * paths), FEWEST), fineness(paths)
+        parts = [wanted]
         if self.cache is None:
-            return
-        pixels = int(dr.prod(mi.ScalarVector2u(sensor.film().crop_size())))
-        end = tails.end_of_round(sample) if spp is None else min(tails.end_of_round(sample), spp)
-        wanted = max(round(tails.SHARE * end * pixels), tails.FEWEST)
-        fineness = tails.fineness(sample)
-        for part in (round(_FIRST_PART * wanted), wanted) if sample == 0 else (wanted,):
+            parts = [round(_FIRST_PART * wanted), wanted]
+            # The light of the layer ``caustic`` is kept apart, where there is such a layer.
+            self.cache = Cache(size, 2 if self.plan.caustic else 1, corner(self.plan.space.scene, seed))
+        for part in parts:
             while self.fed < part:
                 first = self.fed == 0
                 with recording():
-                    able = self.feed(sensor, seed, pixels, min(part - self.fed, _AT_ONCE))
+                    able = self.feed(sensor, seed, min(part - self.fed, _AT_ONCE))
                 if first and able < _PAYS:
-                    self.cache = None
+                    self.pays, self.cache = False, None
                     return
-                self.cache.settle(fineness)
-        if fineness != self.cache.fineness:
-            self.cache.settle(fineness)
+                self.cache.settle(size)
 
-    def feed(self, sensor: mi.Sensor, seed: int, pixels: int, n: int) -> float:
+    def feed(self, sensor: mi.Sensor, seed: int, n: int) -> float:
         """Has so many paths feed the cache; returns the share of them that come by a place to end."""
         # Spread over the image, row by row: rays side by side are quick.
         number = np.arange(n, dtype=np.int64)
-        some, first = number * pixels // n, self.fed + number % -(-n // pixels)
+        some, first = number * self.pixels // n, self.fed + number % -(-n // self.pixels)
         camera = CameraSamples(sensor, seed ^ _SEED, 1, mi.UInt32(first), 1, mi.UInt32(some))
-        count, records = self.frozen(self.paths, self.cache.known, camera.look((0, 0)))
+        half = mi.UInt32(number % tails.HALVES)
+        count, records = self.frozen(self.paths, self.cache.known, camera.look((0, 0)), half)
         self.fed += n
         lanes = [dr.compress(count > i) for i in range(len(records))]
         there = [(which, record) for which, record in zip(lanes, records, strict=True) if dr.width(which)]
         if there:
             # One by one, the kernels that add them would take longer to begin than to run.
             fields = zip(*([dr.gather(type(v), v, which) for v in record] for which, record in there), strict=True)
-            x, y, z, code, level, *values = map(joined, fields)
-            self.cache.add(Place(mi.Point3f(x, y, z), code, level), values)
+            x, y, z, code, level, halves, *values = map(joined, fields)
+            self.cache.add(Place(mi.Point3f(x, y, z), code, level), halves, values)
         return dr.width(lanes[0]) / n
 
 
-def paths(view, plan: Plan, known: Known, camera: CameraSamples) -> tuple[mi.UInt32, list[list]]:
-    """How many records each path has, and these: place, and light of each sort over reflectance, RGB."""
+def paths(view, plan: Plan, known: Known, camera: CameraSamples, half: mi.UInt32) -> tuple[mi.UInt32, list[list]]:
+    """How many records each path has, and these: place, half of the cache, and light of each sort, RGB."""
     ray, importance, _ = camera.rays()
-    count, records = feed(view, plan, known, camera.random.clone(), (ray, importance))
-    colours = ((each for L in r.L for each in mi.Color3f(L) / r.ρ) for r in records)
-    return count, [[*r.place.p, r.place.code, r.place.level, *its] for r, its in zip(records, colours, strict=True)]
+    count, records = feed(view, plan, known, camera.random.clone(), (ray, importance), half)
+    colours = ([each for E in r.E for each in mi.Color3f(E)] for r in records)
+    return count, [[*r.place.p, r.place.code, r.place.level, half, *its] for r, its in zip(records, colours, strict=True)]
+
+
+def corner(scene: mi.Scene, seed: int) -> tuple[float, float, float]:
+    """The corner of the cells' grid: another one for each seed, so that no wall lies on a border of cells in all."""
+    box = scene.bbox()
+    low, size = np.array(box.min, np.float64), max(box.extents())
+    shift = np.random.default_rng([seed, _SEED]).random(3)
+    return tuple(float(x) for x in low - (0.5 + shift) * size)

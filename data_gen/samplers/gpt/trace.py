@@ -23,6 +23,7 @@ class Traced:
     L: mi.Spectrum  # of base paths, emission that the camera sees directly not included
     Le: mi.Spectrum  # the same emission
     L_caustic: mi.Spectrum  # of the layer ``caustic``
+    shared: mi.Spectrum  # a sample of the error of what comes from the cache
     offsets: list[Offset]
     chain: Chain | None  # what the shift "manifold" has recorded
 
@@ -40,7 +41,8 @@ def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=Non
     first = space.first(view, ray, within, drawn)
     x, β = media.vertex(mi.Ray3f(first.ray), first.hit, first.place), importance * first.weight
     path = begin(plan, x, first.place, drawn.channel if drawn else None, β)
-    path.trail = Trail.to(x) if known else None
+    if known:
+        path.trail, path.ρ = Trail.to(x), mi.Color3f(0)
     # Kept out of the gradients: it has little noise, but its edges would be the strongest of the image.
     if space.media:
         Le = importance * view.lamps_in_fog(scene, space.media, ray, within, drawn.channel)
@@ -56,11 +58,10 @@ def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=Non
             y.Δ = y.β * view.behind_grids(scene, space.media, there) - L_first
             y.A = dr.select(inside, 1, 2) * L_first
         offsets.append(y)
-    L, L_caustic = L + dr.zeros(mi.Spectrum, dr.width(first.hit.t)), dr.zeros(mi.Spectrum, dr.width(first.hit.t))
+    L, L_caustic, shared = (light + dr.zeros(mi.Spectrum, dr.width(x.t)) for light in (L, 0, 0))
+    so_far = Traced(L, Le, L_caustic, shared, offsets, path.chain)
     if plan.limits.max_depth < 2:
-        return Traced(L, Le, L_caustic, offsets, path.chain)
-
-    so_far = Traced(L, Le, L_caustic, offsets, path.chain)
+        return so_far
     # Loop optimisation would record each loop twice, and the kernel be no quicker.
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
         if not plan.replays:
@@ -79,10 +80,11 @@ def go_on(scene, plan: Plan, random, path: Path, so_far: Traced, *, known, first
     if plan.manifold:
         L = L + step.β1 * step.L_followed
     offsets = next_steps(scene, plan, step, so_far.offsets, first)
+    shared = so_far.shared
     if known:
-        path, tail, caustic_tail = end(plan, known, path, offsets)
-        L, L_caustic = L + tail, L_caustic + caustic_tail
-    return path, Traced(L, so_far.Le, L_caustic, offsets, path.chain)
+        path, tail, caustic_tail, error = end(plan, known, path, offsets)
+        L, L_caustic, shared = L + tail, L_caustic + caustic_tail, shared + error
+    return path, Traced(L, so_far.Le, L_caustic, shared, offsets, path.chain)
 
 
 @dr.syntax

@@ -38,7 +38,7 @@ def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places |
     view = SAMPLERS["gpt"].integrator(scene, places=places, caustic=False, tails=tails)
     plan = view.plan(scene)
     frozen = Frozen(scene, plan)
-    of_camera = partial(samples, scene, integrator, partial(our_radiance, view, plan), features)
+    of_camera = partial(our_samples, scene, integrator, view, plan, features)
 
     def take(known: Known | None, camera: CameraSamples, film: GradientFilm) -> None:
         film.put_all(frozen(of_camera, camera.look((0, 0), *QUARTERS), known))
@@ -46,23 +46,34 @@ def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places |
     return sharing(view, plan, frozen, take)
 
 
-def our_radiance(view, plan: Plan, random, ray, medium, active, *, known: Known | None = None) -> mi.Spectrum:
-    """``radiance()`` by the base paths of ``gpt``, which end in what is ``known`` of the cache."""
-    within = mi.MediumPtr(medium) if plan.space.media else None
-    paths = trace(view, plan, random, (ray, mi.Spectrum(1)), [], within, known=known)
-    return paths.L + paths.Le
+def our_samples(scene, integrator, view, plan: Plan, features: bool, camera: CameraSamples, known: Known | None) -> dict:
+    """``samples()`` by the base paths of ``gpt``, which end in what is ``known`` of the cache.
+
+    Where they may, the layer ``shared`` is a sample of the error of what comes from there.
+    """
+    errors = []
+
+    def radiance(random, ray, medium, active) -> mi.Spectrum:
+        within = mi.MediumPtr(medium) if plan.space.media else None
+        paths = trace(view, plan, random, (ray, mi.Spectrum(1)), [], within, known=known)
+        errors.append(paths.shared)
+        return paths.L + paths.Le
+
+    layers = samples(scene, integrator, radiance, features, camera)
+    if plan.matt:
+        ray, importance, _ = camera.rays()
+        layers["shared"] = to_rgb(importance * errors[0], ray.wavelengths)
+    return layers
 
 
-def samples(scene, integrator, radiance, features: bool, camera: CameraSamples, known: Known | None = None) -> dict:
+def samples(scene, integrator, radiance, features: bool, camera: CameraSamples) -> dict:
     """Layers: one sample of ``radiance``, and of features, for each camera sample.
 
-    Where something is ``known`` of a cache, ``radiance`` is given it. Where ``features`` tell what is emission seen
-    directly, that is the mean over a pixel's quarters.
+    Where ``features`` tell what is emission seen directly, that is the mean over a pixel's quarters.
     """
     ray, importance, _ = camera.rays()
     medium, all_lanes = camera.sensor.get_medium(), mi.Bool(True)
-    more = {"known": known} if known else {}
-    L = importance * radiance(camera.random.clone(), ray, medium, all_lanes, **more)
+    L = importance * radiance(camera.random.clone(), ray, medium, all_lanes)
     layers = {}
     if features:
         seen = partial(emission_seen, scene, integrator, medium, active=all_lanes)
