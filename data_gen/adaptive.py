@@ -240,7 +240,7 @@ class UnevenRender:
         self.rounds, self.done = rounds_of(sample), 0
         # The first samples of all pixels come together, and so do the rounds in which an even render has them.
         for first in (0, BLOCK - 1):
-            self.rounds.begin(sensor, seed, first)
+            self.rounds.begin(sensor, seed, first, self.film)
 
     def add(self, blocks: np.ndarray, whole: bool = False) -> None:
         """Renders so many more ``blocks`` of each pixel, (pixels) integers.
@@ -250,7 +250,7 @@ class UnevenRender:
         """
         waiting, level = np.zeros(0, np.uint32), 0
         while True:
-            self.rounds.begin(self.sensor, self.seed, max(self.done // self.film.pixels, BLOCK - 1))
+            self.rounds.begin(self.sensor, self.seed, max(self.done // self.film.pixels, BLOCK - 1), self.film)
             n = min(self._at_once(whole), self._of_round())
             while len(waiting) < n and level < blocks.max():
                 waiting = np.append(waiting, np.flatnonzero(blocks > level).astype(np.uint32))

@@ -51,8 +51,9 @@ class Rounds(Protocol):
 
     shares: bool
 
-    def begin(self, sensor: mi.Sensor, seed: int, sample: int) -> None:
-        """Called before each pass; ``sample`` is the first sample of the pass, and 0 begins another render."""
+    def begin(self, sensor: mi.Sensor, seed: int, sample: int, film: GradientFilm) -> None:
+        """Called before each pass, with what the ``film`` has by then; ``sample`` is the first sample of the pass, and 0
+        begins another render."""
 
     def end_of_round(self, sample: int) -> int | None:
         """The sample before which a pass must end that begins with this ``sample``; None: there is no limit."""
@@ -63,7 +64,7 @@ class _OneRound:
 
     shares = False
 
-    def begin(self, sensor: mi.Sensor, seed: int, sample: int) -> None:
+    def begin(self, sensor: mi.Sensor, seed: int, sample: int, film: GradientFilm) -> None:
         pass
 
     def end_of_round(self, sample: int) -> int | None:
@@ -148,7 +149,7 @@ def render_passes(
 
     report()
     while True:
-        rounds.begin(sensor, seed, film.samples)
+        rounds.begin(sensor, seed, film.samples, film)
         size = growing_block(film.pixels, film.samples, block) if grows else block
         until = (rounds.end_of_round(film.samples) or total) - film.samples
         size = min(size, until)

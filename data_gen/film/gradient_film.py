@@ -313,6 +313,11 @@ class GradientFilm:
             for name, image in images.items()
         }
 
+    def known(self, name: str) -> tuple[np.ndarray, np.ndarray | None]:
+        """The mean and, where there is one, the sample variance of the mean, (H, W, C), of what is put under a name."""
+        _, mean, variance = self._statistics(name)
+        return self._image(mean), None if variance is None else self._image(variance)
+
     def _statistics(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         return statistics(self.moments[name], self.strands, self.batch)
 

@@ -102,11 +102,12 @@ _LOG = logging.getLogger(f"ngpt.{__name__}")
 CELLS, _FULL = 1 << 20, 0.7
 # Places beside each other in the table, in which a cell may be
 _PLACES = 32
-# A cell is trusted once either half has so many records in it, whatever they hold: see ``Cache``.
-LEAST = 8
+# A cell is trusted once either half has so many records in it, whatever they hold: see ``Cache``. Few are enough, since
+# there are about as many paths that read a cell as there are records in it.
+LEAST = 2
 # A cell is torn where the light in its two parts along an axis differs by more than this share of their sum, at the
 # coarsest fineness, and by so many standard errors.
-TORN, _CERTAIN = 0.25, 4.0
+TORN, _CERTAIN, _ENOUGH = 0.2, 1.5, 8
 # The unit in which the light of a record counts for that: 1 is all that a record can have, whatever its light.
 _PARTS = 4095
 # A record may be so many times as bright as the mean of all so far, or have such a part of their light. What is
@@ -255,7 +256,7 @@ class Cache:
         (n, *n_upper), (light, *light_upper) = ([mi.Float(each) for each in part] for part in self.parts)
         most = dr.opaque(mi.Float, TORN * FINENESS / fineness)
         for n1, light1 in zip(n_upper, light_upper, strict=True):
-            n0, both = n - n1, (n1 >= LEAST) & (n - n1 >= LEAST)
+            n0, both = n - n1, (n1 >= _ENOUGH) & (n - n1 >= _ENOUGH)
             mean1, mean0 = (dr.select(both, a / b / _PARTS, 0) for a, b in ((light1, n1), (light - light1, n0)))
             # What lies in [0, 1] has no more variance than that of such a mean where it is 0 or 1.
             variance = mean1 * (1 - mean1) / n1 + mean0 * (1 - mean0) / n0

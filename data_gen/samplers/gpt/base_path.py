@@ -47,6 +47,14 @@ class Path:
 
 
 @dataclass
+class Recording:
+    """What a path records for the cache."""
+
+    any: mi.Bool  # it has a record, and all light that it finds is of use
+    here: mi.Bool  # its newest record is at the current vertex
+
+
+@dataclass
 class Step:
     """What the base path does at its vertex x; x1 is the next one."""
 
@@ -111,13 +119,13 @@ def begin(plan: Plan, x: mi.SurfaceInteraction3f, place, channel, β: mi.Spectru
 
 
 def base_step(
-    scene, plan: Plan, random, path: Path, offsets: list, records: mi.Bool | None = None
+    scene, plan: Plan, random, path: Path, offsets: list, recording: Recording | None = None
 ) -> tuple[Step, Path]:
     """Samples an emitter and the next vertex from the ``path``'s vertex; returns that step, and the path behind it.
 
-    Random numbers are drawn whether used or not: a replay needs the same ones, whatever its path meets. Where a path
-    ``records`` the light that arrives at the vertex for the cache, it goes on as if the surface were matt and white
-    too, see ``data_gen.samplers.gpt.tails``.
+    Random numbers are drawn whether used or not: a replay needs the same ones, whatever its path meets. A path
+    that is ``recording`` goes on from its newest record as if the surface were matt and white too, see
+    ``data_gen.samplers.gpt.tails``.
     """
     x, place, space = path.x, path.place, plan.space
 
@@ -132,12 +140,14 @@ def base_step(
     # Offset paths take over the point on a shared emitter, with shadow rays of their own: Le / p must come without V.
     light, light_weight, lamp = plan.lights.sample(scene, x, u_light, lit)
     lit &= light.pdf != 0
+    if recording:
+        lit &= recording.any
     # Toward the emitter and along a new direction at once
     to_light, E_light, E_p = x.to_local(light.d), None, None
-    if records is None:
+    if recording is None:
         f, p, sample, f_p = media.evaluate_and_sample(bsdf, x, place, to_light, u_lobe, u_direction)
     else:
-        mixed = records & ~plan.matt.lambertian(x, records)
+        mixed = recording.here & ~plan.matt.lambertian(x, recording.here)
         f, p, sample, f_p = matt.evaluate_and_sample(bsdf, x, to_light, u_lobe, u_direction, mixed)
     survival_of_rest = mi.Float(1)
     if path.ρ is not None:
@@ -150,8 +160,8 @@ def base_step(
         f = dr.select(followed, f * dr.rcp(dr.maximum(survival_of_light, 1e-20)), 0)
     # No shadow ray toward what lies behind the surface, except for paths that arrive from elsewhere.
     asked = dr.max(dr.abs(f)) > 0
-    if records is not None:
-        asked |= records & (E_light > 0)
+    if recording:
+        asked |= recording.here & (E_light > 0)
     asked = lit & (asked | dr.any([y.joined for y in offsets]))
     T_light, visible = space.sees(x, place, light.p, drawn, asked)
     lit &= visible
@@ -170,8 +180,8 @@ def base_step(
 
     # ---------------------- Russian roulette ---------------------
     largest = brightest(path.β * f_p, f_p, offsets)
-    if records is not None:
-        largest = dr.maximum(largest, dr.select(records, E_p, 0))
+    if recording:
+        largest = dr.maximum(largest, dr.select(recording.here, E_p, 0))
     q = roulette(largest, path.depth >= plan.limits.rr_depth, η) * survival_of_rest
     survival, walks = dr.rcp(q), (largest > 0) & (u_survival < q)
     goes_on = walks & found

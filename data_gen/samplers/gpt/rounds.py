@@ -16,11 +16,10 @@ from data_gen.paths.frozen import Frozen
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.gpt.tails import feed
 from data_gen.tails import cache as tails
+from data_gen.tails import feeding
 from data_gen.tails.cache import Cache, Known, Place, joined
 from data_gen.tails.schedule import end_of_round, fineness, first_sample
 
-# Paths that feed the cache, for each path of the image
-SHARE = 1 / 2
 # Paths that feed the cache before its first round, at least
 FEWEST = 1 << 13
 
@@ -55,6 +54,7 @@ class SharedTails:
         self.plan, self.paths = plan, partial(paths, view, plan)
         self.cache: Cache | None = None
         self.pays, self.fed, self.pixels, self.until = plan.matt.any, 0, 1, 0
+        self.share = feeding.BEGIN
 
     def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
         self.take(self.cache and self.cache.known, camera, film)
@@ -66,18 +66,20 @@ class SharedTails:
     def end_of_round(self, sample: int) -> int | None:
         return self.until if self.pays else None
 
-    def begin(self, sensor: mi.Sensor, seed: int, sample: int) -> None:
+    def begin(self, sensor: mi.Sensor, seed: int, sample: int, film: GradientFilm) -> None:
         """Feeds the cache for all rounds that have begun by this ``sample``, one after the other."""
         if sample == 0:
             self.pixels = int(dr.prod(mi.ScalarVector2u(sensor.film().crop_size())))
             self.pays, self.cache, self.fed, self.until = self.plan.matt.any, None, 0, first_sample(self.pixels)
+            self.share = feeding.BEGIN
         while self.pays and sample >= self.until:
-            self.until = end_of_round(self.until, self.pixels)
-            self.next_round(sensor, seed, self.until * self.pixels)
+            before, self.until = self.until, end_of_round(self.until, self.pixels)
+            self.share = feeding.share(film, self.fed / self.pixels) or self.share
+            more = round(self.share * (self.until - before) * self.pixels)
+            self.next_round(sensor, seed, max(self.fed + more, FEWEST), fineness(self.until * self.pixels))
 
-    def next_round(self, sensor: mi.Sensor, seed: int, paths: int) -> None:
-        """Feeds the cache for a round at whose end the image has so many ``paths``."""
-        wanted, size = max(round(SHARE * paths), FEWEST), fineness(paths)
+    def next_round(self, sensor: mi.Sensor, seed: int, wanted: int, size: float) -> None:
+        """Feeds the cache until so many paths have done so; its cells get a ``size``, which is their fineness."""
         parts = [wanted]
         if self.cache is None:
             parts = [round(_FIRST_PART * wanted), wanted]

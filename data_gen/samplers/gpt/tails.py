@@ -30,7 +30,7 @@ import mitsuba as mi
 from data_gen.paths import caustic, media
 from data_gen.paths.mis import gradient_weight
 from data_gen.paths.walk import UNLIMITED
-from data_gen.samplers.gpt.base_path import Path, base_step, begin
+from data_gen.samplers.gpt.base_path import Path, Recording, base_step, begin
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.tails.cache import NEAR, Known, Place, Trail
 
@@ -113,7 +113,7 @@ def feed(view, plan: Plan, known: Known, random, camera_ray: tuple, half: mi.UIn
 def walk(scene, plan: Plan, known: Known, random, path: Path, records: list, sign: mi.Float) -> tuple:
     count, fresh, active = mi.UInt32(0), dr.full(mi.Bool, False, dr.width(sign)), path.goes_on(plan, [])
     while dr.hint(active, label="feed", exclude=[known]):
-        step, path = base_step(scene, plan, random, path, [], fresh)
+        step, path = base_step(scene, plan, random, path, [], Recording(count > 0, fresh))
         rough = mi.Bool(True)
         for i in range(RECORDS):
             # The newest record is at the step's vertex, if that has one: there all light is scattered alike.
