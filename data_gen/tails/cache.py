@@ -30,27 +30,14 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths.streams import mixed
 from data_gen.tails.schedule import FINENESS
+from data_gen.tails.table import Place, in_table, key, octahedral
 
 # MiB that the cache takes, and of those a render may use, what makes this little
 MIB, LEAST_MIB = 256, 640
 # A path may end where its spread has reached this share of its way to the first rough surface.
 NEAR = 1 / 8
 HALVES = 2
-
-
-# Directions along an axis of the octahedral map
-_DIRECTIONS = 8
-
-
-@dataclass
-class Place:
-    """A vertex as the cache knows it."""
-
-    p: mi.Point3f  # from the corner of the grid
-    code: mi.UInt32  # direction of the normal on the side that is seen, and what else tells cells apart
-    level: mi.Int32  # cells have the side 2^level
 
 
 @dataclass
@@ -73,41 +60,19 @@ class Trail:
         return Trail(self.reach + dr.select(further, x.t, 0), self.spread + dr.select(there & smooth, wider, 0))
 
 
-def octahedral(n: mi.Vector3f) -> mi.UInt32:
-    """The number of a direction's cell on the sphere. [Meyer et al. 2010, "On floating-point normal vectors"]"""
-    s = dr.rcp(dr.abs(n.x) + dr.abs(n.y) + dr.abs(n.z))
-    u, v = n.x * s, n.y * s
-    folded = n.z < 0
-    u, v = dr.select(folded, (1 - dr.abs(v)) * dr.sign(u), u), dr.select(folded, (1 - dr.abs(u)) * dr.sign(v), v)
-    # Shifted a little, so that axes lie within cells and not between them.
-    i, j = (mi.UInt32(dr.clip((w + 1) * 0.5 * _DIRECTIONS + 0.02, 0, _DIRECTIONS - 1)) for w in (u, v))
-    return i + _DIRECTIONS * j
-
-
-def key(place: Place) -> tuple[mi.UInt32, mi.UInt32, list[mi.Bool]]:
-    """Where in a table the cell may be looked for, what it is known by there, which is never 0, and in which half of
-    the cell the place is along each axis: whether the upper one."""
-    q = place.p * dr.exp2(mi.Float(-place.level))
-    corner = [dr.floor(q[i]) for i in range(3)]
-    x, y, z = (mi.UInt32(mi.Int32(c)) for c in corner)
-    code = place.code + (mi.UInt32(place.level) << 24)
-    h = mixed(x + mixed(y + mixed(z + mixed(code + 0x1234567))))
-    name = mixed(h ^ (x * 0x9E3779B1 + y * 0x85EBCA6B + z * 0xC2B2AE35 + code * 0x27D4EB2F)) | 1
-    return h, name, [q[i] - corner[i] >= 0.5 for i in range(3)]
-
-
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
 # Cells that there is room for, and the share of them that may be taken
 CELLS, _FULL = 1 << 20, 0.7
-# Places beside each other in the table, in which a cell may be
-_PLACES = 32
 # A cell is trusted once either half has so many records in it, whatever they hold: see ``Cache``. Few are enough, since
 # there are about as many paths that read a cell as there are records in it.
-LEAST = 2
+LEAST = 4
+# Paths that feed the cache read only cells with so many in each half, and a share of them make further records there
+# instead: else cells that many of them read would keep the noise of their first few.
+LEAST_TO_FEED, RENEW = 16, 0.25
 # A cell is torn where the light in its two parts along an axis differs by more than this share of their sum, at the
 # coarsest fineness, and by so many standard errors.
-TORN, _CERTAIN, _ENOUGH = 0.2, 1.5, 8
+TORN, _CERTAIN, _ENOUGH = 0.2, 3.0, 4
 # The unit in which the light of a record counts for that: 1 is all that a record can have, whatever its light.
 _PARTS = 4095
 # A record may be so many times as bright as the mean of all so far, or have such a part of their light. What is
@@ -120,8 +85,8 @@ _BITS, _MOST_BITS = 30, 40
 
 @dataclass
 class Known:
-    """What paths may read by cell: the mean of each sort of light, RGB, and 1 where it is trusted, 0 where not; and
-    half of the difference between the two halves of the records, with 0 as the fourth number."""
+    """What paths may read by cell: the mean of each sort of light, RGB, and how many records the smaller half has, 0
+    where the cell is torn; and half of the difference between the two halves, with 0 as the fourth number."""
 
     keys: mi.UInt32
     means: list[mi.Float]
@@ -138,15 +103,16 @@ class Known:
         normal = octahedral(mi.Normal3f(dr.mulsign(x.sh_frame.n, x.wi.z)))
         return Place(mi.Point3f(x.p) - self.corner, normal + (mi.UInt32(kind) << 16), level)
 
-    def look(self, place: Place, active: mi.Bool) -> tuple[list[mi.Color3f], list[mi.Color3f], mi.Bool]:
-        """The light of each sort at a place, half of the difference between both halves, and whether it is trusted."""
+    def look(self, place: Place, least: int, active: mi.Bool) -> tuple[list[mi.Color3f], list[mi.Color3f], mi.Bool]:
+        """The light of each sort at a place, half of the difference between both halves, and whether it is known: by
+        the ``least`` number of records in each half."""
         h, name, _ = key(place)
         slot, found = in_table(self.keys, h, name, active)
         means, differences = (
             [dr.gather(mi.Vector4f, each, slot, found) for each in flat] for flat in (self.means, self.differences)
         )
         means_rgb, differences_rgb = ([mi.Color3f(v.x, v.y, v.z) for v in each] for each in (means, differences))
-        return means_rgb, differences_rgb, found & (means[0].w > 0)
+        return means_rgb, differences_rgb, found & (means[0].w >= least)
 
 
 class Cache:
@@ -165,8 +131,9 @@ class Cache:
         # By half and cell
         self.count = dr.zeros(mi.UInt32, HALVES * CELLS)
         self.sums = [dr.zeros(mi.Int64, HALVES * CELLS) for _ in range(3 * sorts)]
-        # By cell, of all records and of those in the upper part along each axis: how many, and their light in _PARTS
-        self.parts = [[dr.zeros(mi.UInt32, CELLS) for _ in range(4)] for _ in range(2)]
+        # By cell, of all records and of those in the upper part along each axis: how many, and the sums of their light
+        # and of its square, in _PARTS
+        self.parts = [[dr.zeros(mi.UInt32, CELLS) for _ in range(4)] for _ in range(3)]
         self.unit, self.full, self.fineness = 0.0, False, fineness
         # For all records so far: their number, the sum of the light of the brightest colour of each, in units, and how
         # much of it was cut
@@ -208,9 +175,10 @@ class Cache:
         # Relative to the cell's light, or to all light where that is not known: a bright record counts little more.
         here = dr.gather(mi.Vector4f, self.known.means[0], slot, placed)
         usual = dr.select(here.w > 0, dr.maximum(here.x, dr.maximum(here.y, here.z)) / self._unit_or_1(), mean)
-        part = mi.UInt32(_PARTS * brightest / dr.maximum(brightest + dr.maximum(usual, 0), 1e-20))
+        part = brightest / dr.maximum(brightest + dr.maximum(usual, 0), 1e-20)
+        values = (mi.UInt32(1), mi.UInt32(_PARTS * part + 0.5), mi.UInt32(_PARTS * dr.square(part) + 0.5))
         for i, within in enumerate((True, *upper)):
-            for each, value in zip(self.parts, (mi.UInt32(1), part), strict=True):
+            for each, value in zip(self.parts, values, strict=True):
                 dr.scatter_add(each[i], value, slot, placed & within, **direct)
         dr.eval(self.keys, self.count, self.sums, self.parts)
 
@@ -227,7 +195,7 @@ class Cache:
             _LOG.warning("the cache of tails is full (%d cells): %s", cells, what)
         cell, unit = dr.arange(mi.UInt32, CELLS), self._unit_or_1()
         counts = [dr.gather(mi.UInt32, self.count, cell + half * CELLS) for half in range(HALVES)]
-        trusted = (counts[0] >= LEAST) & (counts[1] >= LEAST) & ~self.torn(fineness)
+        records = dr.select(self.torn(fineness), 0, mi.Float(dr.minimum(*counts)))
         # Old values go first, to make room for the new ones.
         self.known.means.clear()
         self.known.differences.clear()
@@ -243,7 +211,7 @@ class Cache:
             )
             mean = [0.5 * (x + y) for x, y in zip(a, b, strict=True)]
             difference = [0.5 * (x - y) for x, y in zip(a, b, strict=True)]
-            dr.scatter(means[sort], mi.Vector4f(*mean, dr.select(trusted, mi.Float(1), 0)), cell)
+            dr.scatter(means[sort], mi.Vector4f(*mean, records), cell)
             dr.scatter(differences[sort], mi.Vector4f(*difference, 0), cell)
         corner = self.known.corner
         self.known = Known(mi.UInt32(self.keys), means, differences, dr.opaque(mi.Float, fineness), corner)
@@ -253,41 +221,24 @@ class Cache:
         """Which cells have other light in one part than in the other. Finer cells are judged more strictly, as their
         light may differ less: so the light that passes through walls vanishes with the size of cells."""
         torn = mi.Bool(False)
-        (n, *n_upper), (light, *light_upper) = ([mi.Float(each) for each in part] for part in self.parts)
+        whole, *uppers = ([mi.Float(each[i]) for each in self.parts] for i in range(4))
         most = dr.opaque(mi.Float, TORN * FINENESS / fineness)
-        for n1, light1 in zip(n_upper, light_upper, strict=True):
-            n0, both = n - n1, (n1 >= _ENOUGH) & (n - n1 >= _ENOUGH)
-            mean1, mean0 = (dr.select(both, a / b / _PARTS, 0) for a, b in ((light1, n1), (light - light1, n0)))
-            # What lies in [0, 1] has no more variance than that of such a mean where it is 0 or 1.
-            variance = mean1 * (1 - mean1) / n1 + mean0 * (1 - mean0) / n0
+        for upper in uppers:
+            lower = [a - b for a, b in zip(whole, upper, strict=True)]
+            (mean1, variance1), (mean0, variance0) = (_mean_and_variance(*part) for part in (upper, lower))
             difference = dr.abs(mean1 - mean0)
-            torn |= both & (difference > most * (mean1 + mean0)) & (difference > _CERTAIN * dr.sqrt(variance))
+            certain = difference > _CERTAIN * dr.sqrt(variance1 + variance0)
+            enough = dr.minimum(upper[0], lower[0]) >= _ENOUGH
+            torn |= enough & certain & (difference > most * (mean1 + mean0))
         return torn
 
 
-def in_table(
-    keys: mi.UInt32, h: mi.UInt32, name: mi.UInt32, active: mi.Bool, *, fill: bool = False
-) -> tuple[mi.UInt32, mi.Bool]:
-    """The places of cells in a table, and which are there; ``fill``: cells that are not there are made.
-
-    All places from ``h`` on up to the first empty one are searched.
-    """
-    last, lanes = dr.width(keys) - 1, dr.width(h)
-
-    def body(i, open, slot, found):
-        at = (h + i) & last
-        if fill:
-            there, made = dr.scatter_cas(keys, mi.UInt32(0), name, at, open)
-            hit, empty = open & (made | (there == name)), mi.Bool(False)
-        else:
-            there = dr.gather(mi.UInt32, keys, at, open)
-            hit, empty = open & (there == name), there == 0
-        return i + 1, open & ~hit & ~empty & (i < _PLACES - 1), dr.select(hit, at, slot), found | hit
-
-    state = (mi.UInt32(0), mi.Bool(active), mi.UInt32(0), dr.full(mi.Bool, False, lanes))
-    how = {"label": "find cells", "mode": "symbolic"}
-    _, _, slot, found = dr.while_loop(state, lambda i, open, slot, found: open, body, **how)
-    return slot, found
+def _mean_and_variance(n: mi.Float, light: mi.Float, squares: mi.Float) -> tuple[mi.Float, mi.Float]:
+    """Of n values, whose sums are given in _PARTS: the mean, and its variance."""
+    mean = light / dr.maximum(_PARTS * n, 1)
+    # No less than what rounding makes of it
+    spread = dr.maximum(squares / dr.maximum(_PARTS * n, 1) - dr.square(mean), 1 / _PARTS)
+    return mean, spread / dr.maximum(n - 1, 1)
 
 
 def joined(parts: Iterable[Any]) -> Any:

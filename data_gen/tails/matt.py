@@ -82,26 +82,26 @@ def evaluate_and_sample(
     wo: mi.Vector3f,
     u_lobe: mi.Float,
     u_direction: mi.Point2f,
-    mixed: mi.Bool,
+    both: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum]:
-    """As ``data_gen.paths.media.evaluate_and_sample``, but half of the directions of ``mixed`` lanes come by the
-    cosine, as at a matt surface, and all densities are those of both ways together."""
-    by_cosine = mixed & (u_lobe < 0.5)
-    u_lobe = dr.select(mixed, 2 * u_lobe - dr.select(by_cosine, mi.Float(0), 1), u_lobe)
+    """As ``data_gen.paths.media.evaluate_and_sample``, but half of the directions of ``both`` lanes come by the cosine,
+    as at a matt surface, and all densities are those of both ways together."""
+    by_cosine = both & (u_lobe < 0.5)
+    u_lobe = dr.select(both, 2 * u_lobe - dr.select(by_cosine, mi.Float(0), 1), u_lobe)
     f, p, sample, f_p = bsdf.eval_pdf_sample(mi.BSDFContext(), x, wo, u_lobe, u_direction)
     sample = consistent(bsdf, x, sample, f_p)
-    p = dr.select(mixed, 0.5 * (p + matt_lobe(x, wo)), p)
+    p = dr.select(both, 0.5 * (p + matt_lobe(x, wo)), p)
 
-    side = dr.mulsign(mi.Float(1), x.wi.z)
     own = mi.warp.square_to_cosine_hemisphere(u_direction)
-    own.z *= side
+    own.z *= dr.mulsign(mi.Float(1), x.wi.z)
     f_own, p_own = evaluate(bsdf, x, own, by_cosine)
     sample.wo = dr.select(by_cosine, own, sample.wo)
     sample.eta = dr.select(by_cosine, 1, sample.eta)
     sample.sampled_type = dr.select(by_cosine, mi.UInt32(+mi.BSDFFlags.DiffuseReflection), sample.sampled_type)
     p_material = dr.select(by_cosine, p_own, sample.pdf)
     smooth = event_kind(sample.sampled_type) == SMOOTH
-    both = 0.5 * (p_material + dr.select(smooth, matt_lobe(x, sample.wo), 0))
-    f_p = dr.select(mixed, dr.select(by_cosine, f_own, f_p * p_material) * dr.rcp(dr.maximum(both, 1e-20)), f_p)
-    sample.pdf = dr.select(mixed, both, sample.pdf)
+    together = 0.5 * (p_material + dr.select(smooth, matt_lobe(x, sample.wo), 0))
+    scattered = dr.select(by_cosine, f_own, f_p * p_material)
+    f_p = dr.select(both, scattered * dr.rcp(dr.maximum(together, 1e-20)), f_p)
+    sample.pdf = dr.select(both, together, sample.pdf)
     return f, p, sample, f_p

@@ -12,8 +12,8 @@ BEGIN = 1 << 14
 # Paths of the image at the end of the first round, or more
 FIRST = 1 << 16
 # The fineness of cells: how many times smaller they are than the spread of a path. It grows slowly with the paths of
-# the image, from so many on, so that bias vanishes with noise.
-FINENESS, _COARSE, _RATE = 16.0, 1 << 22, 1 / 6
+# the image, from so many on. Bias falls with the square of the size of cells, and so at the rate of noise.
+FINENESS, _COARSE, _RATE = 8.0, 1 << 20, 1 / 4
 
 
 def enough(pixels: int, spp: int | None) -> bool:

@@ -147,8 +147,8 @@ def base_step(
     if recording is None:
         f, p, sample, f_p = media.evaluate_and_sample(bsdf, x, place, to_light, u_lobe, u_direction)
     else:
-        mixed = recording.here & ~plan.matt.lambertian(x, recording.here)
-        f, p, sample, f_p = matt.evaluate_and_sample(bsdf, x, to_light, u_lobe, u_direction, mixed)
+        both = recording.here & ~plan.matt.lambertian(x, recording.here)
+        f, p, sample, f_p = matt.evaluate_and_sample(bsdf, x, to_light, u_lobe, u_direction, both)
     survival_of_rest = mi.Float(1)
     if path.ρ is not None:
         E_light, smooth = matt.matt_lobe(x, to_light), event_kind(sample.sampled_type) == SMOOTH

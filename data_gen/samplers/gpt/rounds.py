@@ -17,8 +17,9 @@ from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.gpt.tails import feed
 from data_gen.tails import cache as tails
 from data_gen.tails import feeding
-from data_gen.tails.cache import Cache, Known, Place, joined
+from data_gen.tails.cache import Cache, Known, joined
 from data_gen.tails.schedule import end_of_round, fineness, first_sample
+from data_gen.tails.table import Place
 
 # Paths that feed the cache before its first round, at least
 FEWEST = 1 << 13

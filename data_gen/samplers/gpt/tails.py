@@ -32,7 +32,8 @@ from data_gen.paths.mis import gradient_weight
 from data_gen.paths.walk import UNLIMITED
 from data_gen.samplers.gpt.base_path import Path, Recording, base_step, begin
 from data_gen.samplers.gpt.plan import Plan
-from data_gen.tails.cache import NEAR, Known, Place, Trail
+from data_gen.tails.cache import LEAST, LEAST_TO_FEED, NEAR, RENEW, Known, Trail
+from data_gen.tails.table import Place
 
 # Records that a path may have
 RECORDS = 3
@@ -64,7 +65,7 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
     for y in offsets:
         # A joined path has come from elsewhere, and the rest of what the material does is another one for it.
         able &= ~(y.apart | (y.joined & ~lambertian))
-    sorts, errors, ends = known.look(where, able)
+    sorts, errors, ends = known.look(where, LEAST, able)
     ρ = plan.matt.reflectance(path.x, ends)
     found, *late = [ρ * C for C in sorts]
     found, caustic_found = caustic.split(path.late, found)
@@ -124,9 +125,9 @@ def walk(scene, plan: Plan, known: Known, random, path: Path, records: list, sig
             r.T = dr.select(here, step.E_p * step.segment.weight, r.T * step.f_p)
             r.find(r.T * step.L_bsdf, r.late)
         where, able = place(plan, known, path)
-        sorts, errors, ends = known.look(where, able)
+        sorts, errors, ends = known.look(where, LEAST_TO_FEED, able)
         # The first vertex is where others will end: it has a record in any case.
-        ends &= count > 0
+        ends &= (count > 0) & ((count == RECORDS) | (random.next_1d() >= RENEW))
         ρ = plan.matt.reflectance(path.x, ends)
         fresh = able & ~ends & (count < RECORDS)
         for i in range(RECORDS):
