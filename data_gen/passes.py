@@ -54,7 +54,7 @@ class Rounds(Protocol):
     said: dict[str, Any]
 
     def begin(self, sensor: mi.Sensor, seed: int, sample: int, film: GradientFilm) -> None:
-        """Called before each pass, with what the ``film`` has by then; ``sample`` is the first sample of the pass, and 0
+        """Called before each pass, with what the ``film`` has; ``sample`` is the first sample of the pass, and 0
         begins another render."""
 
     def end_of_round(self, sample: int) -> int | None:

@@ -1,6 +1,7 @@
 """Rooms in which light could leak through what is thinner than a cell of the cache, each a dictionary for Mitsuba."""
 
 import mitsuba as mi
+import numpy as np
 
 from data_gen.scenes.builtin import _box, _camera, _diffuse, _light, _rgb, _room, _sphere, _wall
 
@@ -160,3 +161,45 @@ def varnish():
         **_walls(1.5, 2.4, -1.5, 1.5, 0.3) | {"floor": _wall([0, 0, 0], [0, 1, 0], (3, 3), wood)},
         window=_light([-1.49, 0.6, 0], [1, 0, 0], (1.5, 0.8), (6, 7, 8)),
     )
+
+
+def two_rooms(thick, place, unit, far):
+    """A bright room and one with a seventieth of its light, and a wall so ``thick`` between them, at x = ``place``.
+
+    Lengths are in metres; the scene has them in ``unit`` times that, and is moved by ``far`` metres.
+    """
+    scene = _place(
+        (place, 1.3, 3.4),
+        (place, 1.1, 0),
+        fov=75,
+        **_walls(2.2, 2.4, -2, 2),
+        lamp=_light([place - 1.1, 2.39, -0.3], [0, -1, 0], (0.6, 0.6), (20, 18, 16)),
+        night=_light([place + 1.1, 2.39, -0.3], [0, -1, 0], (0.6, 0.6), (0.27, 0.27, 0.27)),
+        box=_box([place - 1.2, 0.3, -0.8], [0.6, 0.6, 0.6], 0, _grey(0.5)),
+        other=_box([place + 1.2, 0.3, -0.8], [0.6, 0.6, 0.6], 0, _grey(0.5)),
+    )
+    del scene["front"]
+    wall = _box([place, 1.2, 0], [thick, 2.4, 4], 0, _grey()) if thick else None
+    scene["middle"] = wall or _wall([place, 1.2, 0], [1, 0, 0], (4, 2.4), _grey())
+    move = mi.ScalarTransform4f().scale([unit] * 3) @ mi.ScalarTransform4f().translate([far] * 3)
+    for part in scene.values():
+        if isinstance(part, dict) and "to_world" in part and part["type"] != "perspective":
+            part["to_world"] = move @ part["to_world"]
+    origin, target = (list(unit * (np.array(p) + far)) for p in ((place, 1.3, 3.4), (place, 1.1, 0)))
+    scene["sensor"] = _camera(origin, target, 75)
+    return scene
+
+
+def of_material(material):
+    """A room with a lamp, whose floor, back and box are made of a ``material``."""
+    scene = _place(
+        (0, 1.2, 1.4),
+        (0, 0.9, -1.5),
+        fov=80,
+        **_walls(1.5, 2.4, -1.5, 1.5),
+        lamp=_light([0.5, 2.39, 0.2], [0, -1, 0], (0.8, 0.6), (9, 8, 7)),
+        box=_box([-0.6, 0.3, -0.7], [0.6, 0.6, 0.6], 30, material),
+    )
+    for part in ("floor", "back"):
+        scene[part]["bsdf"] = material
+    return scene

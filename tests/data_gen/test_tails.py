@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from tails_scenes import bulb, mirrors
+from tails_scenes import bulb, mirrors, slit
 from unbiased import light_of_gradients, load
 
 import data_gen
@@ -25,6 +25,7 @@ from data_gen.tails.schedule import FINENESS
 from data_gen.tails.table import Place
 from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError, WrongUse
+from ngpt.shared import shared_variance
 
 DIFFUSE = {"type": "diffuse"}
 ROUGH = {"type": "roughconductor", "alpha": 0.4}
@@ -182,6 +183,7 @@ def small_images_share():
     """Small images have a cache from the first sample on."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(schedule, "BEGIN", 1)
+        patch.setattr(schedule, "FIRST", 1 << 13)
         yield
 
 
@@ -235,8 +237,9 @@ def test_where_nothing_is_matt_paths_go_on(renderer):
     assert all(np.array_equal(shared[layer], paths[layer], equal_nan=True) for layer in shared.names)
 
 
-def test_who_shares(renderer, tmp_path):
+def test_who_shares(renderer, monkeypatch, tmp_path):
     """Renders that users ask for, if they are large enough; no others, and none that is to be unbiased."""
+    monkeypatch.setattr(schedule, "BEGIN", 1 << 14)
     scene = load(renderer, "diffuse", (96, 88))
     how = {
         "by default": data_gen.render_scene(scene, 8, sampler="primal").stack,
@@ -246,10 +249,73 @@ def test_who_shares(renderer, tmp_path):
         "of programs": render_stack(scene, 8, 0, "primal"),
     }
     shared = {name for name, stack in how.items() if stack.attributes.get("ngpt:samplerOptions") == "tails=shared"}
-    assert shared == {"by default"}
-    assert np.array_equal(how["unbiased"]["primal"], how["of programs"]["primal"])
+    assert shared == {"by default"} and ("shared" in how["by default"]) and "shared" not in how["few paths"]
+    said = {name: stack.attributes.get("ngpt:tails") for name, stack in how.items()}
+    assert said["by default"] == "on" and said["unbiased"] is None and said["of programs"] is None
+    assert said["few paths"] == "off: there are few paths" and "--memory" in said["little memory"]
+    same = [how[name]["primal"] for name in ("unbiased", "of programs")]
+    assert np.array_equal(*same)
     ngpt.write(tmp_path / "shared.exr", how["by default"])
     assert ngpt.read(tmp_path / "shared.exr").attributes["ngpt:samplerOptions"] == "tails=shared"
+
+
+def test_the_cache_goes_by_paths_alone(renderer):
+    """Whatever ends a render, and whatever its size: rounds double from some ten thousand paths on."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(schedule, "BEGIN", 1 << 14)
+        patch.setattr(schedule, "FIRST", 1 << 16)
+        ends = {}
+        for pixels in (96 * 54, 320 * 180, 640 * 360, 3840 * 2160):
+            sample, ends[pixels] = schedule.first_sample(pixels), []
+            for _ in range(4):
+                sample = schedule.end_of_round(sample, pixels)
+                ends[pixels].append(sample)
+        assert [schedule.first_sample(pixels) for pixels in ends] == [4, 0, 0, 0]
+        assert list(ends.values()) == [[16, 32, 64, 128], [2, 4, 8, 16], [1, 2, 4, 8], [1, 2, 4, 8]]
+
+
+def test_known_samples_and_unknown_have_the_same_bits(renderer):
+    """A render that time may end, and what it is repeated by."""
+    scene = load(renderer, "diffuse", (32, 24))
+    timed = render_stack(scene, 40, 3, "primal", seconds=1e4, tails="shared")
+    again = render_stack(scene, 40, 3, "primal", points="rounds", tails="shared")
+    assert timed.attributes["ngpt:tails"] == "on"
+    assert all(np.array_equal(timed[layer], again[layer], equal_nan=True) for layer in timed.names)
+
+
+def test_light_below_zero_is_light(renderer):
+    """Low suns have negative blue."""
+    scene = builtin.diffuse()
+    for part in scene.values():
+        if isinstance(part, dict) and "emitter" in part:
+            part["emitter"]["radiance"] = {"type": "rgb", "value": [4.0, 2.0, -1.0]}
+    scene = load(renderer, scene, (32, 24))
+    light = {tails: render_stack(scene, 64, 1, "primal", tails=tails) for tails in ("shared", "paths")}
+    shared, whole = (np.mean(s["primal"] - s["direct"], axis=(0, 1), dtype=np.float64) for s in light.values())
+    assert whole[2] < 0 and shared == pytest.approx(whole, rel=0.02)
+
+
+def test_claims_hold_for_pixels_blocks_and_images(renderer):
+    """Real over claimed variance in a room lit through a gap, over sixteen seeds."""
+    scene, size = load(renderer, slit, (32, 24)), 8
+    stacks = [render_stack(scene, 32, seed, "primal", tails="shared") for seed in range(16)]
+    primal, shared, variance = (
+        np.array([s[name] for s in stacks], np.float64) for name in ("primal", "shared", "primal_var")
+    )
+    own = np.maximum(variance - np.array([shared_variance(each) for each in shared]), 0)
+
+    def ratio(side):
+        def blocks(image):
+            return image.reshape(len(image), 24 // side, side, 32 // side, side, 3).mean(axis=(2, 4))
+
+        claimed = (np.square(blocks(shared)) + blocks(own) / side**2).mean(axis=0)
+        return blocks(primal).var(axis=0, ddof=1).sum() / claimed.sum()
+
+    assert 0.6 < ratio(1) < 1.4 and 0.5 < ratio(size) < 1.6
+    # Without what pixels share, blocks claim far too little.
+    means = primal.mean(axis=(1, 2)).var(axis=0, ddof=1).sum()
+    claimed = (np.square(shared.mean(axis=(1, 2))).mean(axis=0) + own.mean(axis=(0, 1, 2)) / (32 * 24)).sum()
+    assert 0.3 < means / claimed < 3
 
 
 @pytest.mark.parametrize(

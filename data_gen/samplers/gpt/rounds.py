@@ -127,7 +127,9 @@ def paths(view, plan: Plan, known: Known, camera: CameraSamples, half: mi.UInt32
     ray, importance, _ = camera.rays()
     count, records = feed(view, plan, known, camera.random.clone(), (ray, importance), half)
     colours = ([each for E in r.E for each in mi.Color3f(E)] for r in records)
-    return count, [[*r.place.p, r.place.code, r.place.level, half, *its] for r, its in zip(records, colours, strict=True)]
+    return count, [
+        [*r.place.p, r.place.code, r.place.level, half, *its] for r, its in zip(records, colours, strict=True)
+    ]
 
 
 def corner(scene: mi.Scene, seed: int) -> tuple[float, float, float]:

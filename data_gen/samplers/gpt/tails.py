@@ -119,7 +119,9 @@ def walk(scene, plan: Plan, known: Known, random, path: Path, records: list, sig
         for i in range(RECORDS):
             # The newest record is at the step's vertex, if that has one: there all light is scattered alike.
             r, here = records[i], fresh & (count == i + 1)
-            r.find(dr.select(here, step.E_light, r.T * step.L_light), caustic.lit_late(rough, r.late, step.x_connectable))
+            r.find(
+                dr.select(here, step.E_light, r.T * step.L_light), caustic.lit_late(rough, r.late, step.x_connectable)
+            )
             # A record is at a vertex that scatters widely, so its path has been rough since.
             _, r.late = caustic.classes(rough, r.late, step.goes_on, step.kind, step.x_connectable)
             r.T = dr.select(here, step.E_p * step.segment.weight, r.T * step.f_p)

@@ -46,7 +46,9 @@ def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places |
     return sharing(view, plan, frozen, take)
 
 
-def our_samples(scene, integrator, view, plan: Plan, features: bool, camera: CameraSamples, known: Known | None) -> dict:
+def our_samples(
+    scene, integrator, view, plan: Plan, features: bool, camera: CameraSamples, known: Known | None
+) -> dict:
     """``samples()`` by the base paths of ``gpt``, which end in what is ``known`` of the cache.
 
     Where they may, the layer ``shared`` is a sample of the error of what comes from there.
