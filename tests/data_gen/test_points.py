@@ -10,7 +10,7 @@ from unbiased import load
 
 from data_gen.film import GradientFilm
 from data_gen.film.claims import box_means, factors
-from data_gen.film.nets import RATES, SHARES, law, split
+from data_gen.film.nets import ODD, RATES, SHARES, law, split
 from data_gen.paths import streams
 from data_gen.paths.streams import sample_streams
 from data_gen.render import render_stack
@@ -192,6 +192,10 @@ def test_claims_are_those_over_seeds(renderer, sampler, scene, size, spp):
             seen = np.var(images, axis=0, ddof=1, dtype=np.float64)
             told = np.mean([stack[f"{layer}_var"] for stack in stacks], axis=0, dtype=np.float64)
             quiet = np.argsort(told.ravel())[: int(0.99 * told.size)]
+            if not told.any():
+                # What photons bring to a scene without caustics
+                assert layer == "caustic" and not seen.any()
+                continue
             assert 0.8 < seen.ravel()[quiet].mean() / told.ravel()[quiet].mean() < 1.25, layer
 
 
@@ -261,6 +265,22 @@ def test_claims_hold_at_any_number_of_samples(renderer, kind, n):
     check_claims([evenly(seed, n, net) for seed in range(8)])
 
 
+@pytest.mark.parametrize("n", [32, 128])
+def test_claims_hold_of_smooth_light_beside_light_found_by_luck(renderer, rng, n):
+    """Smooth light is all but gone at these numbers, and faster than that of steps: the claim was 0.7 of the noise."""
+    pixel, sample = np.divmod(np.arange(EXTENT[0] * EXTENT[1] * n, dtype=np.uint32), n)
+    x, stacks = pixel % EXTENT[0] / EXTENT[0], []
+    for seed in range(6):
+        film = GradientFilm(*EXTENT, net=n)
+        u, v = np.array(sample_streams(seed, mi.UInt32(pixel), mi.UInt32(sample), EXTENT[0], n).next_2d())
+        smooth = np.cos(np.pi * u) * (1 - x) + (2 * v - 1) * x + (2 * u - 1) * (2 * v - 1)
+        light = (1 + x / 2) * smooth + 0.4 * rng.normal(size=len(pixel))
+        film.put("primal", mi.Color3f(mi.Float(light.astype(np.float32))))
+        film.end_pass(n)
+        stacks.append(film.develop())
+    check_claims(stacks)
+
+
 @pytest.mark.parametrize("stack_of", [adaptively, merged])
 def test_claims_hold_where_samples_come_in_parts(renderer, stack_of):
     check_claims([stack_of(seed) for seed in range(10)])
@@ -297,7 +317,7 @@ def test_laws_are_sums_over_pairs_of_samples(net):
     """For any number of samples: the covariances of all pairs, added up one by one."""
 
     def variance_of(m):
-        return SHARES / m + (1 - SHARES) * m**-RATES
+        return SHARES / m + (1 - SHARES) * (ODD if np.log2(m) % 2 else 1) * m**-RATES
 
     def covariance(i, j):
         first, size = (0, net) if i < net else (1 << i.bit_length() - 1,) * 2
@@ -315,8 +335,7 @@ def test_laws_are_sums_over_pairs_of_samples(net):
         claimed = (1 - variance) / (n - 1)
         assert np.allclose(law(n, net).truth, variance / claimed)
         assert np.allclose(law(n, net).seen, np.einsum("i,j,ijr->r", weights, weights, covariances) / claimed)
-        # What is seen tells which law holds.
-        assert (np.diff(law(n, net).seen) < 1e-9).all()
+        assert (law(n, net).seen > 0).all() and (law(n, net).truth > 0).all()
 
 
 # ------------------------- Lamps -------------------------
