@@ -68,7 +68,7 @@ class SharedTails:
     @property
     def said(self) -> dict[str, Any]:
         if self.cache is None:
-            return {TAILS: f"off: {self.off}"}
+            return {TAILS: f"off: {self.off or 'there are few paths'}"}
         return {TAILS: "on", CUT: self.cache.cut / max(self.cache.light, 1)}
 
     def end_of_round(self, sample: int) -> int | None:
