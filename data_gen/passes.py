@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
@@ -47,9 +47,11 @@ class Rounds(Protocol):
     """A ``SamplePass`` that renders in rounds: its samples depend on what earlier rounds have found.
 
     ``shares``  whether they depend on it in the current render
+    ``said``    header attributes that say so
     """
 
     shares: bool
+    said: dict[str, Any]
 
     def begin(self, sensor: mi.Sensor, seed: int, sample: int, film: GradientFilm) -> None:
         """Called before each pass, with what the ``film`` has by then; ``sample`` is the first sample of the pass, and 0
@@ -63,6 +65,7 @@ class _OneRound:
     """Independent samples, which need no rounds."""
 
     shares = False
+    said: dict[str, Any] = {}  # noqa: RUF012 - it stays empty
 
     def begin(self, sensor: mi.Sensor, seed: int, sample: int, film: GradientFilm) -> None:
         pass

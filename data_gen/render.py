@@ -30,6 +30,7 @@ from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
 from ngpt.io.exr import with_channels
 from ngpt.layers import GATHERED
 from ngpt.merging import UNFINISHED
+from ngpt.shared import CUT, TAILS
 from ngpt.stack import GradientStack
 from ngpt.version import __version__
 
@@ -37,6 +38,9 @@ from ngpt.version import __version__
 Newest = Callable[[Callable[[], GradientStack]], None]
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
+
+# The share of light cut from the cache that is said
+_MUCH_CUT = 0.01
 
 
 def render_stack(
@@ -90,7 +94,7 @@ def render_stack(
             without = ", ".join(name for name, other in SAMPLERS.items() if "features" in other.options)
             raise NgptError(f"sampler '{sampler}' always renders features; only '{without}' can leave them out")
         options["features"] = False
-    settings = entry.settings(options)
+    settings, said = entry.settings(options), {}
     if "tails" in settings:
         why_not = why_not_shared(bool(facts.media), settings, mi.variant())
         if facts.integrator != "path":
@@ -98,9 +102,14 @@ def render_stack(
         if why_not and settings["tails"] == "shared":
             raise WrongUse(f"sampler '{sampler}': tails=shared is not possible: {why_not}; leave it out")
         pixels = math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
-        enough_to_share = enough(pixels, budget.spp) and budget.memory >= LEAST_MIB
-        if "tails" not in options and not unbiased and not why_not and enough_to_share:
-            settings["tails"] = "shared"
+        if not enough(pixels, budget.spp):
+            why_not = why_not or "there are few paths"
+        elif budget.memory < LEAST_MIB:
+            why_not = why_not or f"it needs --memory {LEAST_MIB}"
+        if "tails" not in options and not unbiased:
+            said = {TAILS: f"off: {why_not}"} if why_not else {}
+            settings["tails"] = "paths" if why_not else "shared"
+        if settings["tails"] == "shared" and memory >= LEAST_MIB:
             budget = replace(budget, memory=memory - MIB)
     if adaptive is not None:
         check_adaptive(adaptive, entry, settings, spp)
@@ -142,11 +151,14 @@ def render_stack(
             film.forget_pass()
         else:
             made.keep(entry, scene, more, sample)
-    shares = rounds_of(sample).shares
-    if "tails" in settings and not shares:
-        settings["tails"] = "paths"
+    if settings.get("tails") == "shared":
+        rounds = rounds_of(sample)
+        settings["tails"], said = "shared" if rounds.shares else "paths", rounds.said
+        if (cut := said.get(CUT, 0)) > _MUCH_CUT:
+            what = "some paths were so bright that it would have been seen as spots; --unbiased keeps all light"
+            _LOG.warning("the cache of tails has lost %.1f %% of its light: %s", 100 * cut, what)
     done = round(float(film.samples_each.mean()))
-    chosen = chosen | known | {"ngpt:spp": done} | options_as_attribute(entry, settings)
+    chosen = chosen | known | said | {"ngpt:spp": done} | options_as_attribute(entry, settings)
     if failed or (stop() and (spp is None or done < spp)):
         chosen[UNFINISHED] = "failed" if failed else "interrupted"
     stack = stack_of(film, sensor, seed, sampler, start, chosen, diagnostics=diagnostics)

@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+# Header attributes: whether paths shared their tails, and why not; the share of the cache's light that was cut from
+# records which were too bright
+TAILS, CUT = "ngpt:tails", "ngpt:tailsCut"
 # Side of the square of pixels over which the squares of a pixel's variance are averaged
 _AROUND = 5
 # Side of the square blocks whose noise is told

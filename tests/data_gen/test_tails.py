@@ -18,44 +18,43 @@ import ngpt
 from data_gen.adaptive import Adaptive
 from data_gen.render import render_stack
 from data_gen.scenes import builtin
-from data_gen.tails import cache
-from data_gen.tails.cache import Place
-from data_gen.tails.matt import is_matt
+from data_gen.tails import cache, schedule
+from data_gen.tails.cache import LEAST
+from data_gen.tails.matt import is_lambertian
+from data_gen.tails.schedule import FINENESS
+from data_gen.tails.table import Place
 from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError, WrongUse
 
 DIFFUSE = {"type": "diffuse"}
 ROUGH = {"type": "roughconductor", "alpha": 0.4}
-# Materials, and whether a path may end there
+# Materials; whether a path may end there, and whether nothing is left to follow then
 MATERIALS = {
-    "diffuse": (DIFFUSE, True),
-    "two-sided": ({"type": "twosided", "material": DIFFUSE}, True),
-    "bumpy": ({"type": "bumpmap", "bumps": {"type": "checkerboard"}, "material": DIFFUSE}, True),
-    "rough plastic": ({"type": "roughplastic", "alpha": 0.3}, True),
-    "polished plastic": ({"type": "roughplastic", "alpha": 0.1}, False),
-    "plastic": ({"type": "plastic"}, False),
-    "metal": ({"type": "conductor"}, False),
-    "rough metal": (ROUGH, False),
-    "glass": ({"type": "dielectric"}, False),
-    "rough glass": ({"type": "roughdielectric", "alpha": 0.5}, False),
-    "pane": ({"type": "thindielectric"}, False),
-    "principled": ({"type": "principled", "roughness": 0.7}, True),
-    "polished": ({"type": "principled", "roughness": 0.2}, False),
-    "metallic": ({"type": "principled", "roughness": 0.7, "metallic": 0.8}, False),
-    "translucent": ({"type": "principled", "roughness": 0.7, "spec_trans": 0.5}, False),
-    "leaf": ({"type": "principledthin", "roughness": 0.7}, False),
-    "mask": ({"type": "mask", "opacity": 0.5, "material": DIFFUSE}, False),
-    "blend": ({"type": "blendbsdf", "weight": 0.5, "a": DIFFUSE, "b": {"type": "roughplastic", "alpha": 0.3}}, True),
-    "blend with metal": ({"type": "blendbsdf", "weight": 0.5, "a": DIFFUSE, "b": {"type": "conductor"}}, False),
-    "hole": ({"type": "null"}, False),
-    "hair": ({"type": "hair"}, False),
+    "diffuse": (DIFFUSE, True, True),
+    "two-sided": ({"type": "twosided", "material": DIFFUSE}, True, True),
+    "bumpy": ({"type": "bumpmap", "bumps": {"type": "checkerboard"}, "material": DIFFUSE}, True, False),
+    "rough plastic": ({"type": "roughplastic", "alpha": 0.3}, True, False),
+    "plastic": ({"type": "plastic"}, True, False),
+    "metal": ({"type": "conductor"}, False, False),
+    "rough metal": (ROUGH, False, False),
+    "glass": ({"type": "dielectric"}, False, False),
+    "rough glass": ({"type": "roughdielectric", "alpha": 0.5}, False, False),
+    "pane": ({"type": "thindielectric"}, False, False),
+    "principled": ({"type": "principled", "roughness": 0.7}, True, False),
+    "leaf": ({"type": "principledthin", "roughness": 0.7, "diff_trans": 0.5}, True, False),
+    "mask": ({"type": "mask", "opacity": 0.5, "material": DIFFUSE}, True, False),
+    "blend": ({"type": "blendbsdf", "weight": 0.5, "a": DIFFUSE, "b": ROUGH}, True, False),
+    "hole": ({"type": "null"}, False, False),
+    "hair": ({"type": "hair"}, False, False),
 }
 
 
 @pytest.mark.parametrize("name", MATERIALS)
-def test_paths_end_at_matt_materials_alone(renderer, name):
-    material, matt = MATERIALS[name]
-    assert is_matt(renderer.load_dict(material)) == matt
+def test_paths_end_at_diffuse_parts_alone(renderer, name):
+    description, ends, lambertian = MATERIALS[name]
+    material = renderer.load_dict(description)
+    assert mi.has_flag(material.flags(), mi.BSDFFlags.DiffuseReflection) == ends
+    assert is_lambertian(material) == lambertian
 
 
 # Records
@@ -68,58 +67,106 @@ def flat(x, y):
 
 
 def known(records, place):
-    """What a cache of these records knows at a place: RGB, and whether it is trusted."""
-    filled = cache.Cache(16.0)
+    """What a cache of these records knows at a place: RGB, half the difference of its halves, and whether it is known.
+
+    Every other record goes into the second half.
+    """
+    filled = cache.Cache(FINENESS)
     # The unit of sums is by the first records, if it is not given.
     for where, value, unit in records:
         filled.unit = unit or filled.unit
-        filled.add(where, value)
-    filled.settle(16.0)
-    (light,), trusted = filled.known.look(place, mi.Bool(True))
-    return np.array(light, np.float64), np.array(trusted)
+        filled.add(where, dr.arange(mi.UInt32, dr.width(value)) & 1, value)
+    filled.settle(FINENESS)
+    (light,), (difference,), found = filled.known.look(place, LEAST, mi.Bool(True))
+    return np.array(light, np.float64), np.array(difference, np.float64), np.array(found)
 
 
 def test_what_is_known_depends_on_no_order(renderer):
     """The sums are integers, and each cell judges those within it whatever came first."""
     rng = np.random.default_rng(3)
     p, value = rng.random((3, N)).astype(np.float32), rng.exponential(1, (3, N)).astype(np.float32)
-    code, level, order = rng.integers(0, 4, N), rng.integers(-4, -2, N), rng.permutation(N)
+    p[2] *= 0.05
+    code, level, order = rng.integers(0, 4, N), rng.integers(-4, -2, N), rng.permutation(N // 2)
 
-    def part(which):
+    def part(pairs):
+        which = np.stack([2 * pairs, 2 * pairs + 1], axis=1).ravel()
         place = Place(mi.Point3f(p[:, which]), mi.UInt32(code[which]), mi.Int32(level[which]))
         return place, [mi.Float(v[which]) for v in value], 2.0**-26
 
-    everywhere = part(np.arange(N))
-    light, trusted = known([everywhere], everywhere[0])
-    others, also = known([part(which) for which in (order[:7], order[7:5000], order[5000:])], everywhere[0])
-    assert np.array_equal(light, others) and np.array_equal(trusted, also)
-    assert 0.2 < trusted.mean() <= 1
+    everywhere = part(np.arange(N // 2))
+    light, difference, found = known([everywhere], everywhere[0])
+    parts = [part(pairs) for pairs in (order[:7], order[7:5000], order[5000:])]
+    others = known(parts, everywhere[0])
+    assert all(np.array_equal(a, b) for a, b in zip((light, difference, found), others, strict=True))
+    assert 0.2 < found.mean() <= 1
     # The means of exponential numbers are near 1.
-    assert abs(light[:, trusted].mean() - 1) < 0.05
+    assert abs(light[:, found].mean() - 1) < 0.05
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-30, 1e12])
 def test_what_is_known_has_all_the_light(renderer, scale):
-    """Also where one record in thousands brings a tenth of it."""
+    """Also where one record in thousands brings a tenth of it, and where a colour is below 0."""
     u, v, light = np.random.default_rng(1).random((3, N)).astype(np.float32)
     light[5] = 1e3
     place, light = flat(u, v), scale * mi.Float(light)
-    (red, green, blue), trusted = known([(place, [light, 0.5 * light, mi.Float(0)], None)], place)
-    assert trusted.all() and np.allclose(green, 0.5 * red, rtol=1e-4) and not blue.any()
-    # At the edges cells have too few records, and those around answer for them.
-    assert red.sum() == pytest.approx(np.array(light, np.float64).sum(), rel=1e-3)
+    (red, green, blue), _, found = known([(place, [light, 0.5 * light, -0.25 * light], None)], place)
+    assert np.allclose(green, 0.5 * red, rtol=1e-4) and np.allclose(blue, -0.25 * red, rtol=1e-4)
+    # All cells have enough records in both halves, which count alike whatever their numbers.
+    assert found.all() and red.sum() == pytest.approx(np.array(light, np.float64).sum(), rel=0.1)
+
+
+def test_half_the_difference_is_a_sample_of_the_error(renderer):
+    """Its mean square over cells is the mean squared error of what is known."""
+    rng = np.random.default_rng(2)
+    u, v = rng.random((2, 4 * N)).astype(np.float32)
+    place, value = flat(u, v), mi.Float(rng.exponential(1, 4 * N).astype(np.float32))
+    (red, *_), (difference, *_), found = known([(place, [value, value, value], None)], place)
+    cells, first = np.unique(red[found], return_index=True)
+    errors, samples = np.square(cells - 1), np.square(difference[found][first])
+    assert len(cells) > 50 and samples.mean() == pytest.approx(errors.mean(), rel=0.5)
 
 
 # Parts of all light, and how many times the mean a record may bring
-@pytest.mark.parametrize(("parts", "times"), [(200, 3000), (2, N / 2)])
+@pytest.mark.parametrize(("parts", "times"), [(200, cache.MOST), (2, N / 2)])
 def test_one_record_cannot_bring_most_of_the_light(renderer, monkeypatch, parts, times):
     monkeypatch.setattr(cache, "PARTS", parts)
     values = np.ones(N, np.float32)
     values[5] = 1e6
     place = flat(dr.full(mi.Float, 0.5, N), 0.5)
-    (red, green, _), trusted = known([(place, [mi.Float(values), mi.Float(0.5 * values), mi.Float(0)], None)], place)
-    assert trusted[0] and red[0] == pytest.approx((N - 1 + times * values.mean()) / N, rel=1e-3)
-    assert green[0] == pytest.approx(0.5 * red[0], rel=1e-3)
+    (red, green, _), *_ = known([(place, [mi.Float(values), mi.Float(0.5 * values), mi.Float(0)], None)], place)
+    most = max(times, N / parts) * values.mean()
+    assert red[0] == pytest.approx((N - 1 + most) / N, rel=1e-3) and green[0] == pytest.approx(0.5 * red[0], rel=1e-3)
+
+
+def test_light_that_is_cut_is_counted(renderer):
+    filled, values = cache.Cache(FINENESS), np.ones(N, np.float32)
+    values[5] = 1e6
+    filled.add(flat(dr.full(mi.Float, 0.5, N), 0.5), dr.arange(mi.UInt32, N) & 1, [mi.Float(values)] * 3)
+    kept = N - 1 + max(cache.MOST, N / cache.PARTS) * values.mean()
+    assert filled.cut / filled.light == pytest.approx(1 - kept / values.sum(), rel=1e-3)
+
+
+def cell_with_a_wall(at, bright, dark, share=1.0, n=4000):
+    """A cache whose one cell has other light on either side of a wall, found by a ``share`` of its records."""
+    rng = np.random.default_rng(4)
+    x = rng.random(n).astype(np.float32)
+    light = np.where(x < at, bright, dark) * (rng.random(n) < share) * rng.uniform(0.5, 1.5, n)
+    place = Place(mi.Point3f(0.25 * x, 0.1, 0.1), mi.UInt32(0), mi.Int32(-2))
+    filled = cache.Cache(FINENESS)
+    filled.add(place, dr.arange(mi.UInt32, n) & 1, [mi.Float(light.astype(np.float32))] * 3)
+    filled.settle(FINENESS)
+    return int(dr.count(filled.torn(FINENESS))[0]) == 1
+
+
+@pytest.mark.parametrize("at", [0.3, 0.5, 0.7])
+def test_cells_with_a_wall_are_torn(renderer, at):
+    assert cell_with_a_wall(at, 1.0, 0.01) and cell_with_a_wall(at, 0.01, 1.0)
+
+
+def test_other_cells_are_whole(renderer):
+    """Light that changes a little, and light that few records have found, whose parts differ by chance."""
+    assert not cell_with_a_wall(0.5, 1.0, 0.85)
+    assert not any(cell_with_a_wall(0.5, 1.0, 1.0, share=0.01, n=n) for n in (60, 200, 600, 2000))
 
 
 def test_a_full_cache_says_so_and_goes_on(renderer, caplog, monkeypatch):
@@ -128,6 +175,14 @@ def test_a_full_cache_says_so_and_goes_on(renderer, caplog, monkeypatch):
     assert np.isfinite(stack["primal"]).all()
     (line,) = [line for line in caplog.messages if "cache" in line]
     assert "the cache of tails is full" in line and "--unbiased" in line
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_images_share():
+    """Small images have a cache from the first sample on."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(schedule, "BEGIN", 1)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,72 @@
+"""A table of cells: cubes of a grid, apart by what else tells their places apart, found by a hash of both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths.streams import mixed
+
+# Places beside each other in the table, in which a cell may be
+_PLACES = 32
+# Directions along an axis of the octahedral map
+_DIRECTIONS = 8
+
+
+@dataclass
+class Place:
+    """A vertex as the cache knows it."""
+
+    p: mi.Point3f  # from the corner of the grid
+    code: mi.UInt32  # direction of the normal on the side that is seen, and what else tells cells apart
+    level: mi.Int32  # cells have the side 2^level
+
+
+def octahedral(n: mi.Vector3f) -> mi.UInt32:
+    """The number of a direction's cell on the sphere. [Meyer et al. 2010, "On floating-point normal vectors"]"""
+    s = dr.rcp(dr.abs(n.x) + dr.abs(n.y) + dr.abs(n.z))
+    u, v = n.x * s, n.y * s
+    folded = n.z < 0
+    u, v = dr.select(folded, (1 - dr.abs(v)) * dr.sign(u), u), dr.select(folded, (1 - dr.abs(u)) * dr.sign(v), v)
+    # Shifted a little, so that axes lie within cells and not between them.
+    i, j = (mi.UInt32(dr.clip((w + 1) * 0.5 * _DIRECTIONS + 0.02, 0, _DIRECTIONS - 1)) for w in (u, v))
+    return i + _DIRECTIONS * j
+
+
+def key(place: Place) -> tuple[mi.UInt32, mi.UInt32, list[mi.Bool]]:
+    """Where in a table the cell may be looked for, what it is known by there, which is never 0, and in which half of
+    the cell the place is along each axis: whether the upper one."""
+    q = place.p * dr.exp2(mi.Float(-place.level))
+    corner = [dr.floor(q[i]) for i in range(3)]
+    x, y, z = (mi.UInt32(mi.Int32(c)) for c in corner)
+    code = place.code + (mi.UInt32(place.level) << 24)
+    h = mixed(x + mixed(y + mixed(z + mixed(code + 0x1234567))))
+    name = mixed(h ^ (x * 0x9E3779B1 + y * 0x85EBCA6B + z * 0xC2B2AE35 + code * 0x27D4EB2F)) | 1
+    return h, name, [q[i] - corner[i] >= 0.5 for i in range(3)]
+
+
+def in_table(
+    keys: mi.UInt32, h: mi.UInt32, name: mi.UInt32, active: mi.Bool, *, fill: bool = False
+) -> tuple[mi.UInt32, mi.Bool]:
+    """The places of cells in a table, and which are there; ``fill``: cells that are not there are made.
+
+    All places from ``h`` on up to the first empty one are searched.
+    """
+    last, lanes = dr.width(keys) - 1, dr.width(h)
+
+    def body(i, open, slot, found):
+        at = (h + i) & last
+        if fill:
+            there, made = dr.scatter_cas(keys, mi.UInt32(0), name, at, open)
+            hit, empty = open & (made | (there == name)), mi.Bool(False)
+        else:
+            there = dr.gather(mi.UInt32, keys, at, open)
+            hit, empty = open & (there == name), there == 0
+        return i + 1, open & ~hit & ~empty & (i < _PLACES - 1), dr.select(hit, at, slot), found | hit
+
+    state = (mi.UInt32(0), mi.Bool(active), mi.UInt32(0), dr.full(mi.Bool, False, lanes))
+    how = {"label": "find cells", "mode": "symbolic"}
+    _, _, slot, found = dr.while_loop(state, lambda i, open, slot, found: open, body, **how)
+    return slot, found
