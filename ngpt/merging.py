@@ -23,7 +23,7 @@ import numpy as np
 from ngpt.errors import NgptError
 from ngpt.io.exr import pass_through, with_channels
 from ngpt.layers import DIFFERENCES, FEATURE_NOISE, GATHERED
-from ngpt.shared import shared_variance
+from ngpt.shared import CUT, TAILS, shared_variance
 from ngpt.stack import GradientStack
 from ngpt.windows import Place, Window
 
@@ -38,8 +38,6 @@ OPTIONS = "ngpt:samplerOptions"
 # Of these, how a path finds light behind its first steps: in a cache of what other paths found, or by itself, which is
 # the default and so goes without saying.
 SHARED_TAILS, WHOLE_PATHS = "tails=shared", "tails=paths"
-# Attributes: whether the cache was used, or why not; and the share of its light that was cut from too bright records
-TAILS, TAILS_CUT = "ngpt:tails", "ngpt:tailsCut"
 # The most samples of a pixel: headers count them in 32 bits.
 _MOST = 2.0**31
 
@@ -232,9 +230,9 @@ def _tails(stacks: Sequence[GradientStack], spp: Sequence[int]) -> dict[str, Any
     each = (str(stack.attributes.get(TAILS, "")).split("; ") for stack in stacks)
     if told := dict.fromkeys(sentence for part in each for sentence in part if sentence):
         found[TAILS] = "; ".join(told)
-    if any(TAILS_CUT in stack.attributes for stack in stacks):
-        cut = [_number(stack, TAILS_CUT) if TAILS_CUT in stack.attributes else 0.0 for stack in stacks]
-        found[TAILS_CUT] = float(np.average(cut, weights=spp))
+    if any(CUT in stack.attributes for stack in stacks):
+        cut = [_number(stack, CUT) if CUT in stack.attributes else 0.0 for stack in stacks]
+        found[CUT] = float(np.average(cut, weights=spp))
     return found
 
 

@@ -151,6 +151,24 @@ def test_results_keep_the_layer_of_the_input(rng, tmp_path, command):
     assert "relMSE" in command("diff a.exr out.exr").out
 
 
+def test_training_leaves_the_layer_out(rng, tmp_path):
+    """Inputs with and without it are alike, in folders of stacks and in shards."""
+    pytest.importorskip("torch")
+    from full_stack import full_stack
+
+    from ngpt.training.crops import stack_folder
+    from ngpt.training.shards import CropData
+
+    bare = full_stack(16, 16).replace(direct=np.zeros((16, 16, 3)))
+    stacks = [bare.replace(shared=0.1 * smooth(rng, (16, 16))), bare]
+    (tmp_path / "view").mkdir()
+    for name, stack in zip(("1", "2", "reference"), (*stacks, bare), strict=True):
+        ngpt.write(tmp_path / "view" / f"{name}.exr", stack)
+    (crop,) = stack_folder(tmp_path)
+    assert crop.stack(0).names == crop.stack(1).names == bare.names
+    assert "shared" not in CropData(stacks, [1, 1]).tensors()
+
+
 def test_a_layer_of_that_name_in_other_files_is_not_ours():
     colour = ["R", "G", "B", *(f"shared.{c}" for c in "RGB")]
     assert "shared" not in resolve([("", colour)]) and OWN["shared"] == {"primal_var"}

@@ -17,11 +17,11 @@ from ngpt.io.exr import pass_through, read, views_in
 from ngpt.io.resolution import layers_held, propose
 from ngpt.layers import LAYERS
 from ngpt.measure.gains import Gain, gains
-from ngpt.merging import DIAGNOSTICS, TAILS, TAILS_CUT
+from ngpt.merging import DIAGNOSTICS
 from ngpt.methods import METHODS, by_standing, choose
 from ngpt.network.describe import SUFFIXES as NETWORKS
 from ngpt.network.describe import describe
-from ngpt.shared import noise_of_light
+from ngpt.shared import CUT, TAILS, noise_of_light
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console, tell
 from ngpt.system.parts import find_renderer
@@ -215,7 +215,7 @@ def _noise(stack: GradientStack) -> dict:
 def _tails(stack: GradientStack) -> str:
     """What the header says of the cache in which paths end, in words; "" where it says nothing."""
     told = [str(stack.attributes[TAILS])] if TAILS in stack.attributes else []
-    if (cut := stack.number(TAILS_CUT)) is not None:
+    if (cut := stack.number(CUT)) is not None:
         told.append(f"{cut:.3g} of the cache's light was cut from records that were too bright")
     return "; ".join(told)
 
