@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from shots import part_of
 
 import ngpt
 from ngpt.api.uncertainty import noisier
@@ -59,6 +60,20 @@ def test_claims_of_merged_stacks_are_right(rng, parts):
     blocks = [each.reshape(40, 4, 8, 4, 8, 3).mean(axis=(2, 4)) for each in (images, shared)]
     claimed = OWN_VARIANCE / total / 64 + np.mean(blocks[1] ** 2)
     assert np.mean(blocks[0] ** 2) == pytest.approx(claimed, rel=0.12)
+
+
+def test_tiles_keep_what_their_pixels_share(rng):
+    whole = stack_of(rng, 4, 0)
+    left, right = part_of(whole, 0, 0, 16, 32), part_of(whole, 16, 0, 16, 32)
+    merged = merge([left, right])
+    for name in ("primal", "shared"):
+        assert np.array_equal(merged[name], whole[name])
+    # At the seam the squares are averaged over the pixels of both.
+    assert np.allclose(
+        np.delete(merged["primal_var"], np.s_[14:18], 1), np.delete(whole["primal_var"], np.s_[14:18], 1)
+    )
+    own = merged["primal_var"] - shared_variance(merged["shared"])
+    assert np.allclose(np.delete(own, np.s_[14:18], 1), OWN_VARIANCE / 4, rtol=1e-4)
 
 
 def test_headers_of_merged_stacks_say_both_sorts_of_tails(rng):
@@ -132,7 +147,7 @@ def test_info_tells_both_parts_and_what_became_of_the_cache(rng, tmp_path, comma
     held = ngpt.read("a.exr")
     noise = noise_of_light(held["primal"], held["primal_var"], held["shared"])
     assert "noise of the mean light, relative to it:\n  whole image      own " in told
-    assert "shared tails: on; 0.25 of the cache's light was cut from records that were too bright" in told
+    assert "shared tails: on; 25 % of the cache's light was cut from records that were too bright" in told
     report = json.loads(command("info a.exr --json").out)
     told = report["noise of the mean light, relative to it"]
     assert all(told[of] == pytest.approx(noise[of]) for of in noise) and told.keys() == noise.keys()

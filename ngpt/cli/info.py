@@ -216,7 +216,7 @@ def _tails(stack: GradientStack) -> str:
     """What the header says of the cache in which paths end, in words; "" where it says nothing."""
     told = [str(stack.attributes[TAILS])] if TAILS in stack.attributes else []
     if (cut := stack.number(CUT)) is not None:
-        told.append(f"{cut:.3g} of the cache's light was cut from records that were too bright")
+        told.append(f"{100 * cut:.3g} % of the cache's light was cut from records that were too bright")
     return "; ".join(told)
 
 
