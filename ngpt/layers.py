@@ -42,7 +42,7 @@ LAYERS: dict[str, Layer] = {
         Layer("specular_var", RGB, True, "sample variance of the pixel mean of specular"),
         Layer("dx_var", RGB, True, "sample variance of the pixel mean of dx"),
         Layer("dy_var", RGB, True, "sample variance of the pixel mean of dy"),
-        Layer("shared", RGB, False, "a sample of the noise that pixels share: see ngpt.shared"),
+        Layer("shared", RGB, False, "a sample of the noise that pixels share, part of primal_var: see ngpt.shared"),
         Layer("samples", ("N",), True, "base paths of the pixel, where pixels differ in them"),
         Layer("motion", XY, True, "pixels from here to where this point was one frame before: x right, y down, or NaN"),
         Layer("dt", RGB, True, "difference in time: estimates I[p] - I_before[p + motion], without direct; or NaN"),

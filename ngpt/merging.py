@@ -23,6 +23,7 @@ import numpy as np
 from ngpt.errors import NgptError
 from ngpt.io.exr import pass_through, with_channels
 from ngpt.layers import DIFFERENCES, FEATURE_NOISE, GATHERED
+from ngpt.shared import CUT, TAILS, shared_variance
 from ngpt.stack import GradientStack
 from ngpt.windows import Place, Window
 
@@ -34,6 +35,9 @@ DIAGNOSTICS = "diagnostics."
 UNFINISHED = "ngpt:unfinished"
 # Attribute: the sampler's options that are not defaults, with commas between
 OPTIONS = "ngpt:samplerOptions"
+# Of these, how a path finds light behind its first steps: in a cache of what other paths found, or by itself, which is
+# the default and so goes without saying.
+SHARED_TAILS, WHOLE_PATHS = "tails=shared", "tails=paths"
 # The most samples of a pixel: headers count them in 32 bits.
 _MOST = 2.0**31
 
@@ -46,23 +50,26 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     and are left out if all pixels have the same number. Variances of the mean come from the pooled sums, so merged
     stacks of n1 and n2 samples equal the stack of n1 + n2 up to the rounding of float32, with two exceptions. Variances
     of dx and dy combine two independent directions, which a stack no longer separates: their merged value has the same
-    expectation, and differs by about 1 / N of itself. A non-finite sample is missing only in its own pixel; a pixel
-    that lost all samples is NaN and counts nothing. A stack with one sample per pixel has no variances and needs none.
-    ``diagnostics.*`` channels are averaged as layers are.
+    expectation, and differs by about 1 / N of itself. ``shared`` is averaged like the primal, because samples of
+    independent noise add like the noise itself; a stack without it counts as zero. ``primal_var`` then includes the
+    variance of the merged ``shared``, which has the same expectation as that of the parts. A non-finite sample is
+    missing only in its own pixel; a pixel that lost all samples is NaN and counts nothing. A stack with one sample per
+    pixel has no variances and needs none. ``diagnostics.*`` channels are averaged as layers are.
 
     Tiles (``GradientStack.place``) give the smallest rectangle that holds them all, and must fill it. They may overlap;
     those that do not may have the same seed. The difference from a tile's last column or row to the pixel beyond it was
     not sampled: it is NaN if no other tile has it, and counts nothing in a reconstruction.
 
     The result's ``ngpt:seed`` lists all seeds, ``ngpt:spp`` is the mean over pixels of the samples that they have,
-    ``ngpt:seconds`` and ``ngpt:discarded`` are sums, ``ngpt:samplerOptions`` has the options of all stacks,
-    ``ngpt:gathered`` is 1 where any stack has it, ``ngpt:featureNoise`` is the noise of the merged features where all
-    stacks have it, ``ngpt:unfinished`` is left out,
-    and all other attributes come from the first stack. Raises NgptError for fewer than two stacks, stacks that differ
-    in layers or sampler, or are of pictures of different size, tiles that leave pixels out, a seed that occurs twice in
-    one place, missing ``ngpt:spp`` or ``ngpt:seed``, ``samples`` that are negative or not finite, ``ngpt:seconds``,
-    ``ngpt:discarded`` or ``ngpt:featureNoise`` that are no numbers, results of a reconstruction, and channels of
-    unknown meaning.
+    ``ngpt:seconds`` and ``ngpt:discarded`` are sums, ``ngpt:samplerOptions`` has the options of all stacks, and also
+    tails=paths where only some of them have tails=shared, ``ngpt:tails`` says what it says in each stack,
+    ``ngpt:tailsCut`` is the mean over all samples, ``ngpt:gathered`` is 1 where any stack has it, ``ngpt:featureNoise``
+    is the noise of the merged features where all stacks have it, ``ngpt:unfinished`` is left out, and all other
+    attributes come from the first stack. Raises NgptError for fewer than two stacks, stacks that differ in layers or
+    sampler, or are of pictures of different size, tiles that leave pixels out, a seed that occurs twice in one place,
+    missing ``ngpt:spp`` or ``ngpt:seed``, ``samples`` that are negative or not finite, ``ngpt:seconds``,
+    ``ngpt:discarded``, ``ngpt:featureNoise`` or ``ngpt:tailsCut`` that are no numbers, results of a reconstruction, and
+    channels of unknown meaning.
     """
     if len(stacks) < 2:
         raise NgptError(f"merging needs at least two stacks, and got {len(stacks)}")
@@ -76,11 +83,16 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     total = _total(tiles)
     layers = {}
     for name in stacks[0].names:
-        if name not in (*VARIANCES.values(), "samples"):
+        if name not in (*VARIANCES.values(), "samples", "shared"):
             layers[name] = _mean(tiles, {tile: tile.stack[name] for tile in tiles}, name)
+    if any("shared" in stack for stack in stacks):
+        layers["shared"] = _mean(tiles, {tile: _shared(tile.stack) for tile in tiles})
     for name, variance in VARIANCES.items():
         if name in layers and all(variance in tile.stack or tile.spp == 1 for tile in tiles):
             layers[variance] = _variance(tiles, name, variance)
+    if "shared" in layers and "primal_var" in layers:
+        own = np.maximum(layers["primal_var"] - _variance_of_shared(tiles, total), 0)
+        layers["primal_var"] = own + shared_variance(layers["shared"])
     if np.ptp(total):
         layers["samples"] = total
     seeds = dict.fromkeys(seed for stack in stacks for seed in _seeds(stack))
@@ -89,10 +101,7 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
         "ngpt:seed": " ".join(seeds),
     }
     attributes.pop(UNFINISHED, None)
-    # What holds of a part holds of the whole, such as that paths share their tails, which biases it.
-    each = (str(stack.attributes.get(OPTIONS, "")).split(", ") for stack in stacks)
-    if options := dict.fromkeys(option for part in each for option in part if option):
-        attributes[OPTIONS] = ", ".join(options)
+    attributes |= _options(stacks) | _tails(stacks, spp)
     for name in ("ngpt:seconds", "ngpt:discarded"):
         if all(name in stack.attributes for stack in stacks):
             attributes[name] = sum(_number(stack, name) for stack in stacks)
@@ -190,6 +199,43 @@ def _mean(tiles: Sequence[_Tile], values: Mapping[_Tile, np.ndarray], name: str 
         return total / weight
 
 
+def _shared(stack: GradientStack) -> np.ndarray:
+    """The layer ``shared``, (h, w, 3); zeros where paths share nothing."""
+    return stack["shared"] if "shared" in stack else np.zeros((stack.height, stack.width, 3))
+
+
+def _variance_of_shared(tiles: Sequence[_Tile], total: np.ndarray) -> np.ndarray:
+    """How much of the merged ``primal_var`` comes from the noise that the pixels of each tile share, (H, W, 3)."""
+    variance = np.zeros((*total.shape[:2], 3))
+    for tile in tiles:
+        if "shared" in tile.stack:
+            variance[tile.part] += np.square(tile.counts) * shared_variance(tile.stack["shared"])
+    return variance / np.square(np.maximum(total, 1))
+
+
+def _options(stacks: Sequence[GradientStack]) -> dict[str, str]:
+    """The attribute that has the options of all stacks; none where all are defaults."""
+    # What holds of a part holds of the whole, such as that paths share their tails, which biases it.
+    each = [[option for option in str(stack.attributes.get(OPTIONS, "")).split(", ") if option] for stack in stacks]
+    options = dict.fromkeys(option for part in each for option in part)
+    if SHARED_TAILS in options and not all(SHARED_TAILS in part for part in each):
+        options[WHOLE_PATHS] = None
+    return {OPTIONS: ", ".join(options)} if options else {}
+
+
+def _tails(stacks: Sequence[GradientStack], spp: Sequence[int]) -> dict[str, Any]:
+    """The attributes that say how the cache of shared tails was used, where any stack has them."""
+    found: dict[str, Any] = {}
+    # Sentences, not parts of them: a merged stack may be merged again.
+    each = (str(stack.attributes.get(TAILS, "")).split("; ") for stack in stacks)
+    if told := dict.fromkeys(sentence for part in each for sentence in part if sentence):
+        found[TAILS] = "; ".join(told)
+    if any(CUT in stack.attributes for stack in stacks):
+        cut = [_number(stack, CUT) if CUT in stack.attributes else 0.0 for stack in stacks]
+        found[CUT] = float(np.average(cut, weights=spp))
+    return found
+
+
 def _feature_noise(tiles: Sequence[_Tile], total: np.ndarray) -> float:
     """The mean over pixels of the variance of merged features: independent means, weighted by samples."""
     variance = np.zeros(total.shape)
@@ -253,7 +299,7 @@ def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
                 f"{stack.path} was made by sampler '{ours}' and {first.path} by '{theirs}'; their variances cannot be "
                 "merged: name one with --sampler"
             )
-        for name in _means(stack) ^ _means(first):
+        for name in (_means(stack) ^ _means(first)) - {"shared"}:
             has, lacks = (stack, first) if name in _means(stack) else (first, stack)
             raise NgptError(f"{has.path} has '{name}' and {lacks.path} has not; merge stacks with the same layers")
         ours, theirs = (str(s.attributes.get("ngpt:frame")) for s in (stack, first))

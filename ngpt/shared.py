@@ -14,13 +14,42 @@ import numpy as np
 TAILS, CUT = "ngpt:tails", "ngpt:tailsCut"
 # Side of the square of pixels over which the squares of a pixel's variance are averaged
 _AROUND = 5
+# Side of the square blocks whose noise is told
+_BLOCK = 32
 
 
 def shared_variance(shared: np.ndarray) -> np.ndarray:
-    """The variance of each pixel that it shares with others, (H, W, C), of the layer ``shared``, (H, W, C)."""
-    squares = np.square(shared.astype(np.float64))
+    """The variance of each pixel that it shares with others, (H, W, C), of the layer ``shared``, (H, W, C).
+
+    Values that are not finite count as zero.
+    """
+    # The sums of ``box_means`` would carry them on to all pixels that follow.
+    squares = np.square(np.where(np.isfinite(shared), shared, 0).astype(np.float64))
     means = [box_means(squares[..., channel], _AROUND) for channel in range(squares.shape[-1])]
     return np.maximum(np.stack(means, axis=-1), 0)
+
+
+def noise_of_light(primal: np.ndarray, primal_var: np.ndarray, shared: np.ndarray) -> dict[str, dict[str, float]]:
+    """The standard error of the mean light of the whole image, and of blocks of ``_BLOCK`` pixels where there are any.
+
+    Of layers (H, W, C). "own" is what pixels have by themselves, "shared" what they have in common; both are root mean
+    squares over channels and blocks, relative to the mean light of the image. Values that are not finite count as zero.
+    """
+    light, variance, sample = (
+        np.where(np.isfinite(layer), layer, 0).astype(np.float64) for layer in (primal, primal_var, shared)
+    )
+    own, scale = np.maximum(variance - shared_variance(sample), 0), abs(light.mean()) or np.nan
+    found = {}
+    for name, (height, width) in (("whole image", own.shape[:2]), (f"blocks of {_BLOCK}x{_BLOCK}", (_BLOCK, _BLOCK))):
+        rows, columns = own.shape[0] // height, own.shape[1] // width
+        if rows * columns:
+            of_own, of_shared = (
+                layer[: rows * height, : columns * width].reshape(rows, height, columns, width, -1).mean(axis=(1, 3))
+                for layer in (own, sample)
+            )
+            squares = {"own": of_own / (height * width), "shared": of_shared**2}
+            found[name] = {part: float(np.sqrt(square.mean()) / scale) for part, square in squares.items()}
+    return found
 
 
 def box_means(image: np.ndarray, size: int) -> np.ndarray:

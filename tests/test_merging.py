@@ -112,6 +112,7 @@ REFUSED = {
     "no time": ({"seconds": "long"}, "2.exr: attribute 'ngpt:seconds' is 'long', and no number that can be merged"),
     "negative": ({"discarded": -1.0}, "2.exr: attribute 'ngpt:discarded' is -1.0, and no number that can be merged"),
     "noise in words": ({"featureNoise": "low"}, "attribute 'ngpt:featureNoise' is 'low'"),
+    "a share in words": ({"tailsCut": "few"}, "2.exr: attribute 'ngpt:tailsCut' is 'few'"),
 }
 
 

@@ -1,6 +1,7 @@
 """How far a reconstruction may be from the converged image: a standard error for each pixel, for any method.
 
-The method runs a second time, with more noise added to primal, dx, dy and caustic, of the variances of the stack. The
+The method runs a second time, with more noise added to primal, dx, dy and caustic, of the variances of the stack. Noise
+that pixels share is added as the layer ``shared`` has it: a denoiser leaves it in, and removes white noise. The
 change of the image over about 9x9 pixels, times a factor that is measured for each method, is the standard error. How
 good that is, and where it fails: docs/use/uncertainty.md.
 """
@@ -15,6 +16,7 @@ from ngpt.errors import NgptError
 from ngpt.layers import DIFFERENCES
 from ngpt.merging import VARIANCES
 from ngpt.methods import Result, reconstruct
+from ngpt.shared import shared_variance
 from ngpt.stack import GradientStack
 from ngpt.system.late import ndimage
 
@@ -86,7 +88,7 @@ def known_noise(stack: GradientStack) -> np.ndarray:
 
 def noisier(stack: GradientStack) -> GradientStack:
     """The stack with noise added, of the variances that it holds, none where they are not finite; raises NgptError
-    where it lacks them."""
+    where it lacks them. The layer ``shared`` is added as it is, and its variance is not added once more."""
     stack.require("primal_var", why="an estimate of the error")
     for name in ("dx", "dy"):
         if name in stack:
@@ -100,7 +102,13 @@ def noisier(stack: GradientStack) -> GradientStack:
             known = np.maximum(np.nan_to_num(stack[variance], posinf=0.0), 0)
             if name in ("primal", "caustic"):
                 known = np.where(empty_pixels(stack)[..., None], 0, known)
-            layers[name] = stack[name] + np.sqrt(known) * drawn
+            noise = np.sqrt(known) * drawn
+            if name == "primal" and "shared" in stack:
+                own = np.maximum(known - shared_variance(stack["shared"]), 0)
+                noise = np.sqrt(own) * drawn + np.where(
+                    known > 0, np.nan_to_num(stack["shared"], posinf=0, neginf=0), 0
+                )
+            layers[name] = stack[name] + noise
     if "caustic" in layers:
         # The caustic is part of the primal; the noise above covers only the rest of it.
         layers["primal"] = layers["primal"] + (layers["caustic"] - stack["caustic"])

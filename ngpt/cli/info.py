@@ -21,6 +21,7 @@ from ngpt.merging import DIAGNOSTICS
 from ngpt.methods import METHODS, by_standing, choose
 from ngpt.network.describe import SUFFIXES as NETWORKS
 from ngpt.network.describe import describe
+from ngpt.shared import CUT, TAILS, noise_of_light
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console, tell
 from ngpt.system.parts import find_renderer
@@ -28,6 +29,9 @@ from ngpt.training.dataset import summary
 from ngpt.training.run_summary import is_run
 from ngpt.training.run_summary import summary as run_summary
 from ngpt.version import __version__
+
+# Layers that stacks lack for a good reason
+_OPTIONAL = ("error", "motion", "samples", "shared", "dt", "dt_var")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -173,10 +177,10 @@ def stack(stack: GradientStack) -> dict:
             }
             for name, rate in rates.items()
         },
+        "noise of the mean light, relative to it": _noise(stack),
+        "shared tails": _tails(stack),
         "other channels": [name for name in further if name not in rates],
-        "missing": [
-            name for name in LAYERS if name not in stack and name not in ("error", "motion", "samples", "dt", "dt_var")
-        ],
+        "missing": [name for name in LAYERS if name not in stack and name not in _OPTIONAL],
         "proposed": [
             f'--layer {name}="{layer}"' for name, layer in propose(stack.source.view.parts, resolution).items()
         ],
@@ -189,10 +193,31 @@ def stack(stack: GradientStack) -> dict:
         "auto with more": {", ".join(gain.add): _bought(gain) for gain in gains(stack)},
         "attributes": {name: _plain(value) for name, value in sorted(stack.attributes.items())},
     }
-    for name in ("diagnostics", "proposed", "auto with more"):
+    for name in (
+        "diagnostics",
+        "noise of the mean light, relative to it",
+        "shared tails",
+        "proposed",
+        "auto with more",
+    ):
         if not report[name]:
             del report[name]
     return report
+
+
+def _noise(stack: GradientStack) -> dict:
+    """What pixels have of it by themselves, and in common; nothing where they have none in common."""
+    if "shared" not in stack or "primal_var" not in stack:
+        return {}
+    return noise_of_light(stack["primal"], stack["primal_var"], stack["shared"])
+
+
+def _tails(stack: GradientStack) -> str:
+    """What the header says of the cache in which paths end, in words; "" where it says nothing."""
+    told = [str(stack.attributes[TAILS])] if TAILS in stack.attributes else []
+    if (cut := stack.number(CUT)) is not None:
+        told.append(f"{100 * cut:.3g} % of the cache's light was cut from records that were too bright")
+    return "; ".join(told)
 
 
 def _bought(gain: Gain) -> dict:

@@ -29,6 +29,7 @@ OWN: dict[str, set[str]] = {
     "caustic": {"dx", "dy", "caustic_var"},
     "diffuse": {"diffuse_var"},
     "specular": {"specular_var"},
+    "shared": {"primal_var"},
 }
 
 # The first name that a file holds wins, so order is preference. Absent on purpose: pbrt-v4's `Variance` and Mitsuba's
@@ -40,6 +41,7 @@ ALIASES: tuple[Alias, ...] = (
     Alias("caustic", "ngpt", "caustic", "in files of ngpt, or beside dx, dy or caustic_var: elsewhere it is any light"),
     Alias("diffuse", "ngpt", "diffuse", "in files of ngpt, or beside diffuse_var: elsewhere any light, or a colour"),
     Alias("specular", "ngpt", "specular", "in files of ngpt, or beside specular_var: elsewhere it is other light"),
+    Alias("shared", "ngpt", "shared", "in files of ngpt, or beside primal_var: elsewhere it may be anything"),
     Alias("error", "ngpt", "error", "in results: of the reconstruction"),
     Alias("primal", "Cycles", "Noisy Image", "the render before Cycles' own denoiser"),
     Alias("primal", "Cycles", "Combined", "denoised already if Cycles denoised and stored no Noisy Image"),

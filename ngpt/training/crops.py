@@ -85,7 +85,10 @@ class StackCrop:
         self._lit = any("caustic" in stack and bool(stack["caustic"].any()) for stack in held)
 
     def stack(self, k: int) -> GradientStack:
-        return read(str(self._stacks[k]))
+        stack = read(str(self._stacks[k]))
+        # Shards do not have it either: nothing that learns reads it, and augmentation would have to know it.
+        stack.layers.pop("shared", None)
+        return stack
 
     @property
     def reference(self) -> np.ndarray:

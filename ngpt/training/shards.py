@@ -16,6 +16,8 @@ Tensors, N crops of K inputs each, (N, K, H, W, C) unless said otherwise, scene-
     motion                      (N, H, W, 2), optional: the layer of that name, floats, ``FAR`` where it is not known
     spp                         (N, K) samples per pixel, int32
 
+The layer ``shared`` of inputs is left out, because no network reads it.
+
 Pairs, K = 2 inputs that judge each other, have none of the references.
 
 Shots are crops too, one for each frame, in their order; the records of crops number the frames.

@@ -108,8 +108,13 @@ def test_shared_tails_are_as_asked_for_unless_unbiased(tmp_path):
         with pytest.raises(NgptError, match=r"tails shared, not of each path \(--unbiased\)"):
             Asked("box 1", 3, spp=336, **given).left(path)
         assert Asked("box 1", 4, spp=336, **given).left(whole) is None
-    # Whole paths and then shared ones are biased too.
-    assert ngpt.merge([ngpt.read(whole), ngpt.read(path)]).attributes["ngpt:samplerOptions"] == "tails=shared"
+    # Whole paths and then shared ones are biased too, and go on as either.
+    merged = ngpt.merge([ngpt.read(whole), ngpt.read(path)])
+    assert merged.attributes["ngpt:samplerOptions"] == "tails=shared, tails=paths"
+    there(path, samplerOptions="tails=shared, tails=paths")
+    assert Asked("box 1", 3, spp=400).left(path).spp == 64
+    with pytest.raises(NgptError, match=r"tails shared, not of each path \(--unbiased\)"):
+        Asked("box 1", 3, spp=336, unbiased=True).left(path)
 
 
 def test_parts_and_frames_have_seeds_of_their_own(tmp_path):
