@@ -186,7 +186,7 @@ def two_rooms(thick, place, unit, far):
         if isinstance(part, dict) and "to_world" in part and part["type"] != "perspective":
             part["to_world"] = move @ part["to_world"]
     origin, target = (list(unit * (np.array(p) + far)) for p in ((place, 1.3, 3.4), (place, 1.1, 0)))
-    scene["sensor"] = _camera(origin, target, 75)
+    scene["sensor"] = _camera(origin, target, 75) | {"near_clip": 1e-2 * unit, "far_clip": 1e3 * unit}
     return scene
 
 
