@@ -192,11 +192,10 @@ def test_claims_are_those_over_seeds(renderer, sampler, scene, size, spp):
             seen = np.var(images, axis=0, ddof=1, dtype=np.float64)
             told = np.mean([stack[f"{layer}_var"] for stack in stacks], axis=0, dtype=np.float64)
             quiet = np.argsort(told.ravel())[: int(0.99 * told.size)]
-            if not told.any():
-                # What photons bring to a scene without caustics
-                assert layer == "caustic" and not seen.any()
-                continue
-            assert 0.8 < seen.ravel()[quiet].mean() / told.ravel()[quiet].mean() < 1.25, layer
+            real, claimed = (each.ravel()[quiet].mean() for each in (seen, told))
+            # Of light that only the noisiest pixels have, the others have none, to the digits of the stack.
+            none = layer == "caustic" and max(real, claimed) <= 1e-12 * told.max()
+            assert none or 0.8 < real / claimed < 1.25, (layer, real, claimed)
 
 
 def test_noise_of_features_is_that_over_seeds(renderer):
