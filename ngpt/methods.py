@@ -329,6 +329,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     image = enlarged(image, power)
     if matrix is not None:
         image = converted(image, np.linalg.inv(matrix))
+    image = _equal_channels_kept(image, given["primal"])
     seconds = time.perf_counter() - start
     _LOG.info("%s: method %s, %.3g s, options %s", stack.path, name, seconds, values or "none")
     if data.pixels or data.gradients:
@@ -353,6 +354,18 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         unusual(entry.options, {key: value for key, value in values.items() if key != "weights"}),
         () if own else tuple(layer for layer in entry.estimates if layer not in data.known_variances()),
     )
+
+
+def _equal_channels_kept(image: np.ndarray, primal: np.ndarray) -> np.ndarray:
+    """The image (H, W, 3), where channels that are equal in the primal are equal: grey stays grey.
+
+    Methods that look at the three colours together give equal channels different values, since their noise is not what
+    they expect. The mean of such channels has less noise than each.
+    """
+    first = [next(b for b in range(a + 1) if np.array_equal(primal[..., a], primal[..., b], True)) for a in range(3)]
+    if first == [0, 1, 2]:
+        return image
+    return np.stack([image[..., np.equal(first, a)].mean(axis=-1, dtype=np.float64) for a in first], axis=-1)
 
 
 def _known(stack: GradientStack, estimates: tuple[str, ...]) -> GradientStack:

@@ -298,7 +298,7 @@ def _alpha(alpha: np.ndarray, layers: Mapping[str, np.ndarray]) -> np.ndarray:
     """Coverage (H, W, 1) denoised as a grey image, within its own range."""
     features = {name: layers[name] for name in ("albedo", "normal") if name in layers}
     grey = reconstruct(_stack("Denoiser: alpha", np.repeat(alpha, 3, axis=-1), features, "auto", {})).image
-    return np.clip(grey.mean(axis=-1, keepdims=True), alpha.min(), alpha.max())
+    return np.clip(grey[..., :1], alpha.min(), alpha.max())
 
 
 def _layers(where: str, given: Mapping[str, Any], size: tuple[int, int]) -> dict[str, np.ndarray]:

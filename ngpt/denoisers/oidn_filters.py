@@ -12,11 +12,14 @@ from typing import Any
 import numpy as np
 
 from ngpt.errors import NgptError
+from ngpt.io.primaries import BEYOND, TO_WIDE, converted, negative_share
 from ngpt.system.forks import hold_while_forking
 from ngpt.system.limits import limited, processors
 
 # By the names of OIDN's devices in Python.
 DEVICES = {"auto": "Default", "cpu": "CPU", "cuda": "CUDA", "hip": "HIP", "metal": "Metal", "sycl": "SYCL"}
+# Negative light below this share of all light is rounding, and not worth a second run.
+_ROUNDING = 1e-6
 # Filters that are kept: an image and its features, with two qualities, take five.
 _MOST = 8
 
@@ -31,6 +34,9 @@ def filtered(
 ) -> np.ndarray:
     """The result of OIDN's filter "RT", (H, W, 3) float32.
 
+    OIDN takes negative light for 0. So an image with many colours beyond its primaries is denoised in wider ones, which
+    leaves less error than the other way: negative light is denoised by itself and then subtracted.
+
     ``images``    "color", "albedo" and "normal", those there are: (H, W, 3) float32, C-contiguous, of one size
     ``device``    one of ``DEVICES``
     ``weights``   in the place of OIDN's own, as a .tza file holds them
@@ -38,6 +44,27 @@ def filtered(
 
     Raises NgptError with what OIDN says where it cannot.
     """
+
+    def run(colour: np.ndarray | None) -> np.ndarray:
+        return _filtered(images if colour is None else {**images, "color": colour}, device, weights, settings)
+
+    def signs_apart(colour: np.ndarray) -> np.ndarray:
+        negative = np.maximum(-colour, 0)
+        little = negative.sum(dtype=np.float64) <= _ROUNDING * np.abs(colour).sum(dtype=np.float64)
+        return run(colour) if little else run(colour) - run(negative)
+
+    colour = images.get("color")
+    if colour is None or colour.min() >= 0:
+        return run(colour)
+    wide = converted(colour, TO_WIDE)
+    if negative_share(wide) <= BEYOND < negative_share(colour):
+        return converted(signs_apart(wide), np.linalg.inv(TO_WIDE))
+    return signs_apart(colour)
+
+
+def _filtered(
+    images: Mapping[str, np.ndarray], device: str, weights: bytes | None, settings: Mapping[str, Any]
+) -> np.ndarray:
     import mitsuba_oidn
 
     result = np.empty_like(next(iter(images.values())))

@@ -21,7 +21,7 @@ ACES_AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
 ACES_AP1 = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
 # Cone responses of Bradford, in which a white is adapted to another.
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-_BEYOND = 0.01  # of the pixels
+BEYOND = 0.01  # the share of pixels beyond its primaries from which on an image is denoised in others
 _SAME = 1e-4  # of a coordinate; files hold 32-bit floats, and standards four digits
 
 
@@ -49,13 +49,18 @@ def to_rec709(attributes: Mapping[str, Any]) -> np.ndarray | None:
 def inside_rec709(stack: GradientStack) -> np.ndarray | None:
     """``to_rec709`` of a stack, where nearly all of its light is within Rec. 709, else None.
 
-    What is beyond has negative components there, which OIDN takes for 0 (docs/use/from-your-renderer.md has the price).
+    What is beyond has negative components there, which cost OIDN more than other primaries (docs/use/pictures.md).
     """
     matrix = to_rec709(stack.attributes)
     if matrix is None:
         return None
-    beyond = (converted(stack["primal"], matrix) < 0).any(axis=-1) & (stack["primal"] >= 0).all(axis=-1)
-    return matrix if beyond.mean() <= _BEYOND else None
+    inside = np.where((stack["primal"] >= 0).all(axis=-1, keepdims=True), converted(stack["primal"], matrix), 0)
+    return matrix if negative_share(inside) <= BEYOND else None
+
+
+def negative_share(image: np.ndarray) -> float:
+    """The share of pixels (H, W, 3) that have a negative component."""
+    return float((image < 0).any(axis=-1).mean())
 
 
 def converted(image: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
@@ -85,3 +90,7 @@ def _to_xyz(chromaticities: np.ndarray) -> np.ndarray:
         raise ValueError("they span no colours")
     columns = np.stack([x, y, 1 - x - y])
     return columns[:, :3] * np.linalg.solve(columns[:, :3], columns[:, 3] / y[3])
+
+
+# Takes Rec. 709 to ACES AP0, in which no visible colour has negative components.
+TO_WIDE = np.linalg.inv(_conversion(np.array(ACES_AP0)))
