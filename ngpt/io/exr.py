@@ -59,7 +59,7 @@ def read(
     ``isolated`` decodes the file in a process of its own, so that one made to crash the decoder is an NgptError too:
     for files of strangers (``ngpt.io.isolated``).
 
-    Colours stay in the primaries of the file, which its header attribute ``chromaticities`` names.
+    Colours stay in the primaries of the file, which its header names (``ngpt.io.primaries``).
 
     Light that is encoded for displays, as in PNG, is made scene-linear (``ngpt.io.foreign.files``).
 
