@@ -100,7 +100,7 @@ NO_LIGHT = ("crypto", "position", "matte", "mask", "noise", "samples")
 NOISE = ("var", "variance", "mse", "error")
 
 # Attributes that begin so show who wrote a file.
-_WRITERS = {"ngpt:sampler": "ngpt", "vrayInfo": "V-Ray"}
+_WRITERS = {"ngpt:sampler": "ngpt", "vrayInfo": "V-Ray", "generatedBy": "Mitsuba"}
 
 
 def plain(name: str) -> str:
@@ -110,7 +110,8 @@ def plain(name: str) -> str:
 
 def writer_of(attributes: Iterable[str]) -> str:
     """The program that wrote a file with these header attributes, as far as they tell; "" if not."""
-    return next((who for name in attributes for start, who in _WRITERS.items() if name.startswith(start)), "")
+    names = tuple(attributes)
+    return next((who for start, who in _WRITERS.items() for name in names if name.startswith(start)), "")
 
 
 def format_aliases() -> str:

@@ -19,19 +19,19 @@ from ngpt.errors import NgptError
 from ngpt.io.aliases import writer_of
 from ngpt.io.foreign.files import ENCODED, FROM, file_headers, read_file
 from ngpt.io.isolated import read_exr_isolated
-from ngpt.io.layout import StackSource, file_views, gather, is_half, place_of, scatter, taken
+from ngpt.io.layout import StackSource, data_window, file_views, gather, is_half, place_of, scatter, taken
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
 from ngpt.io.primaries import converted, to_rec709
-from ngpt.io.resolution import Found, Resolution, resolve, resolve_alone
+from ngpt.io.resolution import Found, Resolution, channels_like, resolve, resolve_alone
 from ngpt.io.resolution import layers_of_light as find_light
 from ngpt.io.results import MADE_BY, STRUCTURE, image_of, leave_out_old_error, new_header, with_result
 from ngpt.io.views import Part, View, choose_views, views_of
-from ngpt.layers import LAYERS, RGB
+from ngpt.layers import LAYERS, RGB, XYZ
 from ngpt.stack import GradientStack
 from ngpt.system.reading import regular_file
 from ngpt.system.threads import map_parts
 from ngpt.version import __version__
-from ngpt.windows import Place
+from ngpt.windows import Place, put
 
 _LOG = logging.getLogger(__name__)
 
@@ -63,8 +63,10 @@ def read(
 
     Light that is encoded for displays, as in PNG, is made scene-linear (``ngpt.io.foreign.files``).
 
-    Raises NgptError if the file cannot be read, holds no primal, or holds layers of different size or place; and for
-    such a file of a layer.
+    A layer in a part with a data window of its own gets the pixels of the primal, with 0 where it has none.
+
+    Raises NgptError if the file cannot be read, holds no primal, or holds layers without a pixel in common with it; and
+    for a file of a layer of another size or place.
     """
     image = read_exr_isolated(path) if isolated else read_file(path)
     return _stack(image, _one_view(image, view, str(path)), layers, isolated, files, str(path))
@@ -116,18 +118,18 @@ def _stack(
 ) -> GradientStack:
     """The stack of one view of a file."""
     resolution = _resolved(view, layers, (part.header for part in image.parts), path)
-    layers_found = map_parts(lambda found: taken(image, found), resolution.values())
-    arrays = dict(zip(resolution, layers_found, strict=True))
     main = image.parts[resolution["primal"].part]
+    if channels_like(resolution["primal"]) == XYZ:
+        main.header.setdefault("colorInteropID", "lin_ciexyzd65_scene")  # Mitsuba's are relative to D65
+    here = data_window(main)
+    for name, found in resolution.items():
+        there = data_window(image.parts[found.part])
+        if here.common(there) is None:
+            raise NgptError(f"{path}: layer '{name}' is {there} but 'primal' {here}; render them in one picture")
+    layers_found = map_parts(lambda found: taken(image, found, resolution["primal"].part), resolution.values())
+    arrays = dict(zip(resolution, layers_found, strict=True))
     attributes = {name: value for name, value in main.header.items() if name not in STRUCTURE}
     stack = GradientStack(arrays, attributes, StackSource(image, resolution, view), path, place_of(main))
-    for name, found in resolution.items():
-        here, there = main.header["dataWindow"], image.parts[found.part].header["dataWindow"]
-        if not np.array_equal(here, there):
-            raise NgptError(
-                f"{path}: layer '{name}' starts at pixel {_corner(there)} but 'primal' at {_corner(here)}; "
-                "render them with one data window"
-            )
     alone = {name: _read_alone(file, name, stack, main, isolated) for name, file in (files or {}).items()}
     told = ", ".join(f"{name} ({' '.join(found.channels)})" for name, found in resolution.items())
     _LOG.info("%s: %dx%d, %s", path, stack.width, stack.height, told)
@@ -202,7 +204,8 @@ def read_picture(path: str | os.PathLike, isolated: bool = False, view: str | No
     stack = _stack(image, chosen, None, isolated, None, str(path))
     # The picture of a result is beside its input.
     for place in (stack.source.resolution["primal"].part, chosen.first):
-        part, root = image.parts[place], tuple(chosen.channel(place, name) for name in RGB)
+        like = channels_like(stack.source.resolution["primal"])
+        part, root = image.parts[place], tuple(chosen.channel(place, name) for name in like)
         if all(name in part.channels for name in root):
             return Picture(converted(gather(part, root), to_rec709(part.header)), place_of(part))
     return Picture(converted(stack["primal"], to_rec709(stack.attributes)), stack.place)
@@ -317,7 +320,10 @@ def channels_alone(stack: GradientStack) -> dict[str, np.ndarray]:
 
 def layers_of_light(stack: GradientStack) -> dict[str, np.ndarray]:
     """The layers of colour that a stack holds beside the layers of the contract: name -> (H, W, 3) float32."""
-    return {name: gather(part, names) for name, (part, names) in _light(stack).items()}
+    return {
+        name: put(gather(part, names), data_window(part), stack.place.data)
+        for name, (part, names) in _light(stack).items()
+    }
 
 
 def replace_layers_of_light(stack: GradientStack, layers: Mapping[str, np.ndarray]) -> GradientStack:
@@ -327,7 +333,7 @@ def replace_layers_of_light(stack: GradientStack, layers: Mapping[str, np.ndarra
     places = _light(changed)
     for name, values in layers.items():
         part, names = places[name]
-        scatter(part, names, values, is_half(part, names))
+        scatter(part, names, put(values, stack.place.data, data_window(part)), is_half(part, names))
     return changed
 
 

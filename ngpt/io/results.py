@@ -7,13 +7,14 @@ import numpy as np
 import OpenEXR
 
 from ngpt.errors import NgptError
-from ngpt.io.layout import holds, is_half, scatter, taken
+from ngpt.io.layout import as_stored, data_window, holds, is_half, scatter, taken
 from ngpt.io.openexr import ExrImage, ExrPart
-from ngpt.io.resolution import Found, Resolution, layers_of_light
+from ngpt.io.resolution import Found, Resolution, channels_like, layers_of_light
 from ngpt.io.views import View
 from ngpt.layers import LAYERS
 from ngpt.stack import GradientStack
 from ngpt.system.threads import map_parts
+from ngpt.windows import put
 
 # Attributes that describe how a part is stored, rather than what it shows; a stack's attributes are all others.
 STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"} | {
@@ -56,15 +57,17 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
 
     def is_there(name: str) -> bool:
         found = resolution[name]
-        return holds(image.parts[found.part], found.channels, stack[name], found.factors)
+        if as_stored(image, found, main):
+            return holds(image.parts[found.part], found.channels, stack[name])
+        return np.array_equal(taken(image, found, main), stack[name], equal_nan=True)
 
     unchanged = dict(zip(known, map_parts(is_there, known), strict=True))
     for name in stack.names:
         values, half = stack[name], False
         if unchanged.get(name):
             continue
-        # Channels in another renderer's units stay as they are, and ours go beside them.
-        if name in resolution and not resolution[name].factors:
+        # Channels in another renderer's units, or on other pixels, stay as they are, and ours go beside them.
+        if name in resolution and as_stored(image, resolution[name], main):
             part, names = image.parts[resolution[name].part], resolution[name].channels
             half = is_half(part, names) and not LAYERS[name].float_on_disk
         else:
@@ -102,7 +105,8 @@ def with_result(
     """
     primal, alpha = resolution["primal"], resolution.get("alpha")
     source, parts, place = image.parts[primal.part], list(image.parts), view.first
-    root, kept = (tuple(view.channel(place, start + c) for c in "RGB") for start in ("", "primal."))
+    suffixes = channels_like(primal)
+    root, kept = (tuple(view.channel(place, start + c) for c in suffixes) for start in ("", "primal."))
     half = is_half(source, primal.channels)
     moved = primal.part == place and primal.channels == kept
     if moved:
@@ -111,7 +115,7 @@ def with_result(
         shown = primal if _NOISY not in primal.name.lower() and primal.channels != root else None
     values = [source.channels[name] for name in primal.channels]
     if primal.factors:
-        values, half = list(np.moveaxis(taken(image, primal), -1, 0)), False
+        values, half = list(np.moveaxis(taken(image, primal, primal.part), -1, 0)), False
     shows_another = primal.channels not in (root, kept) and any(name in source.channels for name in root)
     if primal.part != place or shows_another:
         parts = [part if part.name else replace(part, name="source") for part in parts]
@@ -122,14 +126,16 @@ def with_result(
         header |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "name": name}
         if view.name:
             header = {key: value for key, value in header.items() if key != "multiView"} | {"view": view.name}
-        root, kept = ("R", "G", "B"), ("primal.R", "primal.G", "primal.B")
+        root, kept = suffixes, tuple(f"primal.{suffix}" for suffix in suffixes)
         # At the end the numbers of the other views' parts stay what they are.
         place = 0 if place == 0 else len(parts)
         parts.insert(place, ExrPart(name, header, {}))
     channels = parts[place].channels
     channels.update(zip(kept, values, strict=True))
     if alpha:
-        channels.setdefault(root[0][:-1] + "A", image.parts[alpha.part].channels[alpha.channels[0]])
+        part = image.parts[alpha.part]
+        pixels_of_alpha = put(part.channels[alpha.channels[0]], data_window(part), data_window(source))
+        channels.setdefault(root[0][:-1] + "A", pixels_of_alpha)
     scatter(parts[place], root, pixels, half)
     if shown and shown.channels != root:
         part = image.parts[shown.part]
