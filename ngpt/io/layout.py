@@ -36,7 +36,8 @@ def file_views(image: ExrImage) -> list[View]:
 
 def place_of(part: ExrPart) -> Place:
     """Where the pixels of a part lie."""
-    return Place(Window.of_box(part.header["dataWindow"]), Window.of_box(part.header["displayWindow"]))
+    windows = (Window.of_box(part.header[name]) for name in ("dataWindow", "displayWindow"))
+    return Place(*windows, float(part.header.get("pixelAspectRatio", 1.0)))
 
 
 def gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:

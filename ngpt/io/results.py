@@ -83,7 +83,8 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
 def new_header(stack: GradientStack) -> dict[str, Any]:
     """The header of the part for a stack that comes from no file."""
     windows = {"dataWindow": stack.place.data.box, "displayWindow": stack.place.display.box}
-    return {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | windows
+    aspect = {} if stack.place.aspect == 1 else {"pixelAspectRatio": stack.place.aspect}
+    return {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | windows | aspect
 
 
 def leave_out_old_error(stack: GradientStack, image: ExrImage) -> None:
