@@ -23,6 +23,7 @@ from ngpt.network.identity import Identity, identify
 from ngpt.network.inputs import ESTIMATED
 from ngpt.network.shipped import OPTIONS, Shipped
 from ngpt.options import Option, as_text, settings, unusual
+from ngpt.panorama import continued, middle, wraps
 from ngpt.repair import Repaired, finite_pixels, repair
 from ngpt.stack import GradientStack
 from ngpt.system.parts import Registry
@@ -285,12 +286,16 @@ def _check_network(method: str, values: dict[str, Any]) -> None:
 
 
 def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result:
-    """Runs a method on a stack and says what it did.
+    """Runs a method on a stack and says what it did. The borders of panoramas are neighbours (``ngpt.panorama``).
 
     ``method`` is ``auto`` or a name in ``METHODS``; ``options`` are the method's own: for l2 and l1 ``alpha``, a number
     or "auto" to derive it from the variances. Raises NgptError for an unknown method or option, missing layers, and a
     primal without any finite pixel.
     """
+    if wraps(stack):
+        result, own = reconstruct(continued(stack), method, **options), repair(stack)
+        image = np.ascontiguousarray(middle(result.image))
+        return replace(result, image=image, repaired=own.pixels, untrusted=own.gradients)
     start = time.perf_counter()
     own = options.get("weights")
     name = method

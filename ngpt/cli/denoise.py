@@ -27,6 +27,7 @@ from ngpt.methods import METHODS, by_standing, check_request, reconstruct
 from ngpt.network.identity import identify
 from ngpt.network.run_onnx import MEMORY
 from ngpt.options import as_text, settings, unusual
+from ngpt.panorama import wrapping
 from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import Network
 from ngpt.stack import GradientStack
@@ -102,6 +103,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="the stacks are the frames of one shot, with motion vectors: blend each frame with the frames before it, "
         "for less flicker. With -m wcv and frames from `ngpt render --dt`: also with the frames after it",
+    )
+    parser.add_argument(
+        "--wrap",
+        action="store_true",
+        help="the images are panoramas: their left and right borders are neighbours. Files with the attribute envmap "
+        "need no --wrap",
     )
     parser.add_argument(
         "--ref",
@@ -237,6 +244,7 @@ def read_frame(
         return Frame(source, target, None, there=True)
     cut = args.skip_existing and not there and target.exists()
     stacks = read_views(source, dict(args.layer), args.untrusted, files, args.view)
+    stacks = [wrapping(stack) for stack in stacks] if args.wrap else stacks
     first, *others = (Frame(source, target, stack, there=there, cut=cut) for stack in stacks)
     if others and (what := one_view_only(target, args, files)):
         raise NgptError(f"{source}: has several views, and {what}; choose one, as in --view {first.view}")
