@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.classical.bases import CLASSICAL
-from ngpt.coverage import kept_within
+from ngpt.coverage import empty_pixels, kept_within
 from ngpt.denoisers import caustic, nfor, nlm, oidn
 from ngpt.errors import NgptError, WrongUse, did_you_mean
 from ngpt.io.primaries import converted, inside_rec709
@@ -326,6 +326,8 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     power = magnitude(stack)
     apart = entry.apart and bool(stack.number(GATHERED))
     data = repair(_known(scaled(stack, power), entry.estimates), gradients="dx" in reads or apart)
+    if "alpha" in stack:
+        data = replace(data, empty=empty_pixels(stack))
     # Extreme values may leave the range of float32 inside; what comes out is checked.
     with np.errstate(over="ignore", invalid="ignore"):
         image = entry.run(data, **values) + data.direct

@@ -55,7 +55,7 @@ def of_half_size(data: Repaired) -> np.ndarray:
     assert data.caustic is not None
     small = {name: halved(layer) for name, layer in data.features.items() if name != "depth"}
     given = halved(data.caustic)
-    found = oidn(replace(data, image=given, direct=np.zeros_like(given), features=small), "noisy", "high")
+    found = oidn(replace(data, image=given, direct=np.zeros_like(given), features=small, empty=None), "noisy", "high")
     # OIDN may go below zero where no light does.
     light = np.maximum(found, min(float(given.min()), 0))
     before, after = given.sum(dtype=np.float64), light.sum(dtype=np.float64)

@@ -30,9 +30,13 @@ _filters: dict[tuple, Any] = {}
 
 
 def filtered(
-    images: Mapping[str, np.ndarray], device: str = "auto", weights: bytes | None = None, **settings: Any
+    images: Mapping[str, np.ndarray],
+    device: str = "auto",
+    weights: bytes | None = None,
+    kind: str = "RT",
+    **settings: Any,
 ) -> np.ndarray:
-    """The result of OIDN's filter "RT", (H, W, 3) float32.
+    """The result of OIDN's filter "RT", or of another ``kind``, (H, W, 3) float32.
 
     OIDN takes negative light for 0. So an image with many colours beyond its primaries is denoised in wider ones, which
     leaves less error than the other way: negative light is denoised by itself and then subtracted.
@@ -46,7 +50,7 @@ def filtered(
     """
 
     def run(colour: np.ndarray | None) -> np.ndarray:
-        return _filtered(images if colour is None else {**images, "color": colour}, device, weights, settings)
+        return _filtered(images if colour is None else {**images, "color": colour}, device, weights, kind, settings)
 
     def signs_apart(colour: np.ndarray) -> np.ndarray:
         negative = np.maximum(-colour, 0)
@@ -54,7 +58,7 @@ def filtered(
         return run(colour) if little else run(colour) - run(negative)
 
     colour = images.get("color")
-    if colour is None or colour.min() >= 0:
+    if colour is None or colour.min() >= 0 or settings.get("directional"):
         return run(colour)
     wide = converted(colour, TO_WIDE)
     if negative_share(wide) <= BEYOND < negative_share(colour):
@@ -63,18 +67,18 @@ def filtered(
 
 
 def _filtered(
-    images: Mapping[str, np.ndarray], device: str, weights: bytes | None, settings: Mapping[str, Any]
+    images: Mapping[str, np.ndarray], device: str, weights: bytes | None, kind: str, settings: Mapping[str, Any]
 ) -> np.ndarray:
     import mitsuba_oidn
 
     result = np.empty_like(next(iter(images.values())))
     # 0: those that it shares with Dr.Jit.
     where = device, processors() if limited() else 0
-    key = (where, weights, tuple(images), result.shape, tuple(settings.items()))
+    key = (where, weights, kind, tuple(images), result.shape, tuple(settings.items()))
     try:
         with _lock:
             # Out of those that are kept until it has worked: one that failed is not used again.
-            made = _filters.pop(key, None) or _made(where, weights, settings)
+            made = _filters.pop(key, None) or _made(where, weights, kind, settings)
             _run(_devices[where], made, images, result)
             # Networks of the user's own are many, and as large as an image.
             if weights is None:
@@ -86,7 +90,7 @@ def _filtered(
     return result
 
 
-def _made(where: tuple[str, int], weights: bytes | None, settings: Mapping[str, Any]) -> Any:
+def _made(where: tuple[str, int], weights: bytes | None, kind: str, settings: Mapping[str, Any]) -> Any:
     """A filter on the device of that name, which has so many threads of its own if it is a processor."""
     import mitsuba_oidn
 
@@ -96,7 +100,7 @@ def _made(where: tuple[str, int], weights: bytes | None, settings: Mapping[str, 
         if threads and device.type == mitsuba_oidn.DeviceType.CPU:
             device.num_threads = threads
         _devices[where] = device
-    made = _devices[where].new_filter("RT")
+    made = _devices[where].new_filter(kind)
     if weights is not None:
         made.set_data("weights", weights)
     for name, value in settings.items():
