@@ -105,6 +105,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "for less flicker. With -m wcv and frames from `ngpt render --dt`: also with the frames after it",
     )
     parser.add_argument(
+        "--into",
+        metavar="LAYER",
+        help="layer that the result replaces beside the root R G B, such as Combined; root: none (default: the layer "
+        "that the noisy image was read from, unless it is called noisy)",
+    )
+    parser.add_argument(
         "--wrap",
         action="store_true",
         help="the images are panoramas: their left and right borders are neighbours. Files with the attribute envmap "
@@ -175,6 +181,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         exposure=args.exposure,
         # One of several frames is not kept elsewhere if the disk is full: the next call makes it again.
         keep=len(pairs) == 1,
+        into=args.into,
     )
     frames: Any
     windows = False
@@ -216,6 +223,12 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
             progress(i, len(pairs))
     if args.temporal and (hint := motion_hint(pairs, reports, args)):
         console.say(hint)
+    # Features that nobody recognized are a loss that the result does not show.
+    overlooked = next((report for report in reports if report.get("proposed")), {"proposed": {}})
+    for name, layer in overlooked["proposed"].items():
+        console.say(
+            f"{overlooked['input']}: '{layer}' looks like {name} and was not used; --layer {name}=\"{layer}\" takes it"
+        )
     failed = sum("error" in report for report in reports)
     skipped = sum("skipped" in report for report in reports)
     if failed and len(pairs) > 1:

@@ -130,7 +130,7 @@ def check_image(target: Path, transform: str) -> None:
 def check_picture(target: Path, args: argparse.Namespace) -> None:
     """For ``ngpt denoise``: raises an error for what is no picture, and for options that no picture has room for."""
     check_image(target, args.transform)
-    for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
+    for option, given in (("--error", args.error), ("--groups", args.groups or args.group), ("--into", args.into)):
         if given:
             raise WrongUse(f"{option} makes layers, and {target} can have none; let it end in .exr")
     if args.skip_existing:

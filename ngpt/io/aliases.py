@@ -103,6 +103,12 @@ NOISE = ("var", "variance", "mse", "error")
 _WRITERS = {"ngpt:sampler": "ngpt", "vrayInfo": "V-Ray", "generatedBy": "Mitsuba"}
 
 
+def is_image(name: str) -> bool:
+    """Whether a layer of that name is what a renderer calls its image, and not the noisy one."""
+    known = {alias.name for alias in ALIASES if alias.layer == "primal"} - {"", "primal", "Noisy Image"}
+    return name.rpartition(".")[2] in known
+
+
 def plain(name: str) -> str:
     """A name in small letters without blanks and underscores."""
     return name.lower().replace(" ", "").replace("_", "")

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ngpt.errors import NgptError
-from ngpt.io.aliases import writer_of
+from ngpt.io.aliases import is_image, writer_of
 from ngpt.io.foreign.files import ENCODED, FROM, file_headers, read_file
 from ngpt.io.isolated import read_exr_isolated
 from ngpt.io.layout import StackSource, data_window, file_views, gather, is_half, place_of, scatter, taken
@@ -24,7 +24,7 @@ from ngpt.io.openexr import ExrImage, ExrPart, write_exr
 from ngpt.io.primaries import converted, to_rec709
 from ngpt.io.resolution import Found, Resolution, channels_like, resolve, resolve_alone
 from ngpt.io.resolution import layers_of_light as find_light
-from ngpt.io.results import MADE_BY, STRUCTURE, image_of, leave_out_old_error, new_header, with_result
+from ngpt.io.results import MADE_BY, STRUCTURE, image_of, leave_out_old_error, new_header, replaced_layer, with_result
 from ngpt.io.views import Part, View, choose_views, views_of
 from ngpt.layers import LAYERS, RGB, XYZ
 from ngpt.stack import GradientStack
@@ -217,6 +217,7 @@ def write(
     like: GradientStack | Sequence[GradientStack] | None = None,
     overwrite: bool = False,
     attributes: Mapping[str, Any] | None = None,
+    into: str | None = None,
 ) -> Path:
     """Writes a stack, a result or an image, and returns its path.
 
@@ -227,7 +228,8 @@ def write(
     of its first part, which is what viewers show, and the input in primal.R/G/B. Should the first part be another than
     the one that holds primal, or show something else in its root, then it stays as it is and a new part goes in front.
     Alpha is copied into the root if the file has it elsewhere. ``image`` also replaces the layer that the input was
-    read from (``ViewLayer.Combined``), which the attribute ``ngpt:pass`` then names; a ``Noisy Image`` stays.
+    read from (``ViewLayer.Combined``), which the attribute ``ngpt:pass`` then names; a ``Noisy Image`` stays. ``into``
+    names another layer to replace, or "root" for none.
 
     Results of the views of one file go together: lists of them, and of their stacks (``read_views``). Each is then the
     root of its view.
@@ -263,13 +265,29 @@ def write(
                 f"{path}: the result is {pixels.shape[1]}x{pixels.shape[0]} but the stack {stack.path} is "
                 f"{stack.width}x{stack.height}; results are written at the size of their stack"
             )
-        made = _result(stack, pixels, made, attributes or {}, str(path))
+        made = _result(stack, pixels, made, attributes or {}, into, str(path))
     assert made is not None
     return write_exr(path, made, overwrite)
 
 
+def layers_of_result(stack: GradientStack, into: str | None = None) -> tuple[list[str], list[str]]:
+    """What ``write`` replaces by a result, the root first, and the layers that are named like images and stay noisy."""
+    if stack.source is None:
+        return ["root"], []
+    origin, source = str(stack.attributes.get("ngpt:pass", "")), stack.source
+    found = replaced_layer(source.resolution, source.view, origin, into, stack.path)
+    written = ["root", found.name] if found else ["root"]
+    images = [name for name in (source.resolution["primal"].name, *_light(stack)) if is_image(name)]
+    return written, [name for name in images if name not in written]
+
+
 def _result(
-    stack: GradientStack, pixels: np.ndarray, base: ExrImage | None, attributes: Mapping[str, Any], path: str
+    stack: GradientStack,
+    pixels: np.ndarray,
+    base: ExrImage | None,
+    attributes: Mapping[str, Any],
+    into: str | None,
+    path: str,
 ) -> ExrImage:
     """The file of a stack, with the results of other views as in ``base``, and ``pixels`` (H, W, 3) as its result."""
     found, resolution, main = image_of(stack, path, base)
@@ -277,7 +295,8 @@ def _result(
     view = stack.source.view if stack.source else file_views(found)[0]
     for name in MADE_BY:
         found.parts[main].header.pop(name, None)
-    result, main = with_result(found, resolution, view, pixels, str(stack.attributes.get("ngpt:pass", "")))
+    shown = replaced_layer(resolution, view, str(stack.attributes.get("ngpt:pass", "")), into, path)
+    result, main = with_result(found, resolution, view, pixels, shown)
     result.parts[main].header.update({**attributes, "ngpt:version": __version__})
     return result
 

@@ -95,13 +95,39 @@ def leave_out_old_error(stack: GradientStack, image: ExrImage) -> None:
             image.parts[place.part].channels.pop(channel, None)
 
 
+def replaced_layer(resolution: Resolution, view: View, origin: str, into: str | None, path: str) -> Found | None:
+    """The layer that holds a result beside the root: who loads that layer wants the image too.
+
+    ``into`` names it, whole or by its tail after a dot; "root" is none. By default it is the layer that the input came
+    from, unless its name says that it is noisy; ``origin`` is its name where the input was moved before.
+
+    Raises NgptError unless ``into`` fits one layer of colour.
+    """
+    primal, others = resolution["primal"], layers_of_light(view.parts, resolution)
+    root, kept = (
+        tuple(view.channel(view.first, start + c) for c in channels_like(primal)) for start in ("", "primal.")
+    )
+    moved = primal.part == view.first and primal.channels == kept
+    own = {} if moved or (primal.part, primal.channels) == (view.first, root) else {primal.name: primal}
+    if into == "root":
+        return None
+    if into is None:
+        if moved:
+            return others.get(origin)
+        return primal if _NOISY not in primal.name.lower() and primal.channels != root else None
+    fitting = [found for name, found in (own | others).items() if f".{name}".endswith(f".{into}")]
+    if len(fitting) != 1:
+        why = "fits several layers" if fitting else "is no layer of colour"
+        raise NgptError(f"{path}: --into: '{into}' {why}; there are: {', '.join(['root', *own, *others])}")
+    return fitting[0]
+
+
 def with_result(
-    image: ExrImage, resolution: Resolution, view: View, pixels: np.ndarray, origin: str = ""
+    image: ExrImage, resolution: Resolution, view: View, pixels: np.ndarray, shown: Found | None
 ) -> tuple[ExrImage, int]:
     """Returns the file with ``pixels`` (H, W, 3) float32 as the root of a view's first part, the input as primal.R/G/B.
 
-    They also replace the layer that the input came from, whose name goes into the header as ``ngpt:pass``: who loads
-    that layer wants the image too. ``origin`` is its name where the input was moved before. The second value is the
+    They also replace the layer ``shown``, whose name goes into the header as ``ngpt:pass``. The second value is the
     index of the part with the result.
     """
     primal, alpha = resolution["primal"], resolution.get("alpha")
@@ -109,11 +135,6 @@ def with_result(
     suffixes = channels_like(primal)
     root, kept = (tuple(view.channel(place, start + c) for c in suffixes) for start in ("", "primal."))
     half = is_half(source, primal.channels)
-    moved = primal.part == place and primal.channels == kept
-    if moved:
-        shown = layers_of_light(view.parts, resolution).get(origin) if origin else None
-    else:
-        shown = primal if _NOISY not in primal.name.lower() and primal.channels != root else None
     values = [source.channels[name] for name in primal.channels]
     if primal.factors:
         values, half = list(np.moveaxis(taken(image, primal, primal.part), -1, 0)), False
@@ -138,8 +159,9 @@ def with_result(
         pixels_of_alpha = put(part.channels[alpha.channels[0]], data_window(part), data_window(source))
         channels.setdefault(root[0][:-1] + "A", pixels_of_alpha)
     scatter(parts[place], root, pixels, half)
-    if shown and shown.channels != root:
+    if shown:
         part = image.parts[shown.part]
-        scatter(part, shown.channels, pixels, is_half(part, shown.channels))
+        there = put(pixels, data_window(source), data_window(part))
+        scatter(part, shown.channels, there, is_half(part, shown.channels))
         parts[place].header["ngpt:pass"] = shown.name
     return ExrImage(parts), place

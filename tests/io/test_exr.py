@@ -161,6 +161,34 @@ def test_cycles_files_get_a_root_to_look_at(tmp_path):
     assert all(same_bits(after[name], before[name]) for name in names)
 
 
+@pytest.mark.parametrize(
+    ("into", "replaced"),
+    [("Combined", "View.Combined"), ("View.Noisy Image", "View.Noisy Image"), ("root", ""), (None, "")],
+)
+def test_into_chooses_the_layer_that_is_replaced(tmp_path, into, replaced, command):
+    layers = {f"View.{name}": [f"View.{name}.{c}" for c in "RGB"] for name in ("Noisy Image", "Combined", "DiffDir")}
+    before = small(*(channel for channels in layers.values() for channel in channels))
+    write_raw(tmp_path / "a.exr", (before,))
+    told = command("denoise a.exr -m primal -o b.exr" + (f" --into '{into}'" if into else "")).err
+    ((_, header, after),) = read_raw(tmp_path / "b.exr")
+    stack = read(tmp_path / "a.exr")
+    write(tmp_path / "c.exr", RESULT, like=stack, into=into)
+    ((_, _, changed),) = read_raw(tmp_path / "c.exr")
+    for name, channels in layers.items():
+        expected = [RESULT[..., i] if name == replaced else before[channel] for i, channel in enumerate(channels)]
+        assert all(same_bits(changed[channel], pixels) for channel, pixels in zip(channels, expected, strict=True))
+    assert header.get("ngpt:pass", "") == replaced and same_bits(after["R"], before["View.Noisy Image.R"])
+    stays = "View.Combined stays as it was (--into Combined replaces it)"
+    assert (stays in told) == (replaced != "View.Combined")
+    assert (f"layers root and {replaced}" in told) == bool(replaced)
+
+
+def test_into_a_layer_that_is_not_there_names_those_that_are(tmp_path):
+    stack = read(write_raw(tmp_path / "a.exr", (small(*ROOT, *(f"a.Combined.{c}" for c in "RGB")),)))
+    with pytest.raises(NgptError, match="'Combine' is no layer of colour; there are: root"):
+        write(tmp_path / "b.exr", RESULT, like=stack, into="Combine")
+
+
 def test_a_primal_in_a_later_part_puts_the_result_in_a_new_first_part(tmp_path):
     parts = [
         (small("Z"), {"compression": OpenEXR.PIZ_COMPRESSION}, "depth"),
