@@ -26,7 +26,7 @@ from ngpt.options import Option, as_text, settings, unusual
 from ngpt.panorama import continued, middle, wraps
 from ngpt.repair import Repaired, finite_pixels, repair
 from ngpt.stack import GradientStack
-from ngpt.system.parts import Registry
+from ngpt.system.parts import Registry, blamed
 
 _LOG = logging.getLogger(__name__)
 
@@ -330,7 +330,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         data = replace(data, empty=empty_pixels(stack))
     # Extreme values may leave the range of float32 inside; what comes out is checked.
     with np.errstate(over="ignore", invalid="ignore"):
-        image = entry.run(data, **values) + data.direct
+        image = _run(name, entry, data, values, stack.path) + data.direct
         if data.caustic is not None:
             image += caustic.denoised(data, by_oidn="denoised" in reads)
     image = enlarged(image, power)
@@ -361,6 +361,16 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         unusual(entry.options, {key: value for key, value in values.items() if key != "weights"}),
         () if own else tuple(layer for layer in entry.estimates if layer not in data.known_variances()),
     )
+
+
+def _run(name: str, entry: Method, data: Repaired, values: Mapping[str, Any], path: str) -> np.ndarray:
+    """What the method returns; what one of another package raises is an NgptError."""
+    try:
+        return entry.run(data, **values)
+    except Exception as error:
+        if name in _OURS or isinstance(error, NgptError):
+            raise
+        raise NgptError(f"{path}: method '{name}' failed: {blamed(error)}") from error
 
 
 def _equal_channels_kept(image: np.ndarray, primal: np.ndarray) -> np.ndarray:
