@@ -174,9 +174,7 @@ def stack(stack: GradientStack) -> dict:
             for name, rate in rates.items()
         },
         "other channels": [name for name in further if name not in rates],
-        "missing": [
-            name for name in LAYERS if name not in stack and name not in ("error", "motion", "samples", "dt", "dt_var")
-        ],
+        "missing": _missing(stack),
         "proposed": [
             f'--layer {name}="{layer}"' for name, layer in propose(stack.source.view.parts, resolution).items()
         ],
@@ -193,6 +191,14 @@ def stack(stack: GradientStack) -> dict:
         if not report[name]:
             del report[name]
     return report
+
+
+def _missing(stack: GradientStack) -> list[str]:
+    """Layers that methods could use: of a file without gradients, which other renderers write, only features."""
+    wanted = [name for name in LAYERS if name not in ("error", "motion", "samples", "dt", "dt_var")]
+    if "dx" not in stack and "ngpt:sampler" not in stack.attributes:
+        wanted = ["albedo", "normal", "depth"]
+    return [name for name in wanted if name not in stack]
 
 
 def _bought(gain: Gain) -> dict:
