@@ -10,14 +10,13 @@ from ngpt.stack import GradientStack
 WRAP = "ngpt:wrap"  # a header attribute, 1: the image wraps
 # Columns that are added on each side. OIDN looks so far around a pixel, and classical methods hardly farther.
 MARGIN = 96
-_LATITUDE_LONGITUDE = 0  # of OpenEXR's ``envmap``
 
 
 def wraps(stack: GradientStack) -> bool:
     """Whether the first column comes after the last: of a panorama that is whole from left to right."""
-    said = stack.attributes.get("envmap")
+    said = stack.attributes.get("envmap", "")
     whole = (stack.place.data.left, stack.width) == (stack.place.display.left, stack.place.display.width)
-    return whole and (stack.attributes.get(WRAP) == 1 or (said is not None and int(said) == _LATITUDE_LONGITUDE))
+    return whole and (stack.attributes.get(WRAP) == 1 or getattr(said, "name", said) == "ENVMAP_LATLONG")
 
 
 def wrapping(stack: GradientStack) -> GradientStack:

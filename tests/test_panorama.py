@@ -57,6 +57,7 @@ def test_what_wraps(panorama):
     stack = GradientStack(panorama)
     assert not wraps(stack) and not wraps(replace(stack, attributes={"envmap": OpenEXR.ENVMAP_CUBE}))
     assert wraps(replace(stack, attributes=LATLONG)) and wraps(replace(stack, attributes={WRAP: 1}))
+    assert not wraps(replace(stack, attributes={"envmap": "of something"}))
     part = Place(Window(0, 0, 160, 48), Window(0, 0, 320, 48))
     assert not wraps(replace(stack, attributes=LATLONG, place=part))
 

@@ -73,8 +73,9 @@ def to_numpy(value: Any, name: str = "the array") -> np.ndarray:
 
 def _detached(value: Any, name: str) -> str:
     """The code that takes gradients off ``value``, called ``name``; "" where nobody expects them of it."""
-    if getattr(value, "requires_grad", False):
-        return f"{name}.detach()" if sys.modules["torch"].is_grad_enabled() else ""
+    torch = sys.modules.get("torch")
+    if torch is not None and isinstance(value, torch.Tensor):
+        return f"{name}.detach()" if value.requires_grad and torch.is_grad_enabled() else ""
     of_drjit = type(value).__module__.startswith("drjit")
     return f"drjit.detach({name})" if of_drjit and sys.modules["drjit"].grad_enabled(value) else ""
 

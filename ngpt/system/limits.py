@@ -58,7 +58,7 @@ def _of_groups(name: str, controller: str) -> list[str]:
     ``controller``  of version 1, where each has a tree of its own; "" for version 2
     """
     try:
-        lines = [line.split(":", 2) for line in _OWN_GROUPS.read_text(encoding="utf-8").splitlines()]
+        lines = [line.split(":", 2) for line in _OWN_GROUPS.read_text(encoding="utf-8", errors="replace").splitlines()]
     except OSError:  # not Linux
         return []
     own = next((path for _, names, path in lines if controller in names.split(",")), None)
