@@ -293,9 +293,9 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     primal without any finite pixel.
     """
     if wraps(stack):
-        result, own = reconstruct(continued(stack), method, **options), repair(stack)
+        result, alone = reconstruct(continued(stack), method, **options), repair(stack)
         image = np.ascontiguousarray(middle(result.image))
-        return replace(result, image=image, repaired=own.pixels, untrusted=own.gradients)
+        return replace(result, image=image, repaired=alone.pixels, untrusted=alone.gradients)
     start = time.perf_counter()
     own = options.get("weights")
     name = method

@@ -224,7 +224,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
     if args.temporal and (hint := motion_hint(pairs, reports, args)):
         console.say(hint)
     # Features that nobody recognized are a loss that the result does not show.
-    overlooked = next((report for report in reports if report.get("proposed")), {"proposed": {}})
+    overlooked: dict = next((report for report in reports if report.get("proposed")), {"proposed": {}})
     for name, layer in overlooked["proposed"].items():
         console.say(
             f"{overlooked['input']}: '{layer}' looks like {name} and was not used; --layer {name}=\"{layer}\" takes it"

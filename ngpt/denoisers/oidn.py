@@ -60,10 +60,11 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
     # With the light sources seen, as a renderer hands it over and OIDN was trained.
     image = np.ascontiguousarray(data.image + data.direct, np.float32)
     clean = bool(features) and auxiliary in ("prefiltered", "clean")
-    filled = image if features or data.empty is None or filter != "image" else mirrored(image, data.empty)
     settings = {**FILTERS[filter], "quality": QUALITIES[quality]} | ({"clean_aux": True} if clean else {})
-    result = filtered({"color": filled, **features}, **settings)
-    return np.where(data.empty[..., None], image, result) - data.direct if filled is not image else result - data.direct
+    empty = None if features or filter != "image" else data.empty
+    if empty is None:
+        return filtered({"color": image, **features}, **settings) - data.direct
+    return np.where(empty[..., None], image, filtered({"color": mirrored(image, empty)}, **settings)) - data.direct
 
 
 def prefiltered(features: Mapping[str, np.ndarray], quality: str) -> dict[str, np.ndarray]:

@@ -36,8 +36,8 @@ def file_views(image: ExrImage) -> list[View]:
 
 def place_of(part: ExrPart) -> Place:
     """Where the pixels of a part lie."""
-    windows = (Window.of_box(part.header[name]) for name in ("dataWindow", "displayWindow"))
-    return Place(*windows, float(part.header.get("pixelAspectRatio", 1.0)))
+    display = Window.of_box(part.header["displayWindow"])
+    return Place(data_window(part), display, float(part.header.get("pixelAspectRatio", 1.0)))
 
 
 def gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:

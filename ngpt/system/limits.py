@@ -46,7 +46,7 @@ def _visible() -> int:
 @cache
 def _quota() -> int | None:
     """How many processors' time the control groups allow, rounded up; None where they set no limit."""
-    found = [text.split() for text in _of_groups("cpu.max", "")]  # microseconds or "max", and of how many
+    found = [(quota, period) for quota, period in map(str.split, _of_groups("cpu.max", ""))]  # microseconds, or "max"
     found += zip(_of_groups("cpu.cfs_quota_us", "cpu"), _of_groups("cpu.cfs_period_us", "cpu"), strict=False)
     limits = [int(quota) / int(period) for quota, period in found if quota.isdecimal()]
     return max(1, math.ceil(min(limits))) if limits else None
@@ -92,7 +92,8 @@ def memory() -> int:
     """Bytes that this process may have: the machine's, or what its limits or its container's leave it."""
     texts = _of_groups("memory.max", "") + _of_groups("memory.limit_in_bytes", "memory")
     limits = [int(text) for text in texts if text.isdecimal()]
-    return min([_physical(), *limits, *([address_space()] if address_space() is not None else [])])
+    own = address_space()
+    return min([_physical(), *limits, *([] if own is None else [own])])
 
 
 def _physical() -> int:
