@@ -1,7 +1,17 @@
-"""``python -m ngpt``."""
+"""``python -m ngpt``, and the command ``ngpt``."""
 
 import sys
 
-from ngpt.cli import main
 
-sys.exit(main())
+def main() -> int:
+    """Runs the command line. Ctrl-C while the command is still being imported is told in one line too."""
+    try:
+        from ngpt.cli import main as run
+    except KeyboardInterrupt:
+        print("ngpt: error: interrupted", file=sys.stderr)
+        return 130
+    return run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -45,6 +45,22 @@ def kept_within(image: np.ndarray, stack: GradientStack) -> np.ndarray:
     return (left + alpha * _around(_over(spread, _around(alpha)))).astype(np.float32)
 
 
+def mirrored(image: np.ndarray, empty: np.ndarray) -> np.ndarray:
+    """The image (H, W, C) with its ``empty`` pixels filled from the covered ones that they would see in a mirror.
+
+    The mirror stands on the covered pixel that is nearest. Where it shows no covered pixel of the same island, that one
+    is taken itself. So each island goes on with light and noise like its own.
+    """
+    if not empty.any() or empty.all():
+        return image
+    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
+    islands = ndimage.label(~empty)[0]
+    limits = np.array(empty.shape)[:, None, None] - 1
+    seen = np.clip(2 * nearest - np.indices(empty.shape), 0, limits)
+    same = islands[tuple(seen)] == islands[tuple(nearest)]
+    return image[tuple(np.where(same, seen, nearest))]
+
+
 def _around(values: np.ndarray) -> np.ndarray:
     """(H, W, C), the sum over a Gaussian window around each pixel."""
     return ndimage.gaussian_filter(values, (_WINDOW, _WINDOW, 0), mode="constant", truncate=3)

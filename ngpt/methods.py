@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.classical.bases import CLASSICAL
-from ngpt.coverage import kept_within
+from ngpt.coverage import empty_pixels, kept_within
 from ngpt.denoisers import caustic, nfor, nlm, oidn
 from ngpt.errors import NgptError, WrongUse, did_you_mean
 from ngpt.io.primaries import converted, inside_rec709
@@ -23,9 +23,10 @@ from ngpt.network.identity import Identity, identify
 from ngpt.network.inputs import ESTIMATED
 from ngpt.network.shipped import OPTIONS, Shipped
 from ngpt.options import Option, as_text, settings, unusual
+from ngpt.panorama import continued, middle, wraps
 from ngpt.repair import Repaired, finite_pixels, repair
 from ngpt.stack import GradientStack
-from ngpt.system.parts import Registry
+from ngpt.system.parts import Registry, blamed
 
 _LOG = logging.getLogger(__name__)
 
@@ -285,12 +286,16 @@ def _check_network(method: str, values: dict[str, Any]) -> None:
 
 
 def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result:
-    """Runs a method on a stack and says what it did.
+    """Runs a method on a stack and says what it did. The borders of panoramas are neighbours (``ngpt.panorama``).
 
     ``method`` is ``auto`` or a name in ``METHODS``; ``options`` are the method's own: for l2 and l1 ``alpha``, a number
     or "auto" to derive it from the variances. Raises NgptError for an unknown method or option, missing layers, and a
     primal without any finite pixel.
     """
+    if wraps(stack):
+        result, alone = reconstruct(continued(stack), method, **options), repair(stack)
+        image = np.ascontiguousarray(middle(result.image))
+        return replace(result, image=image, repaired=alone.pixels, untrusted=alone.gradients)
     start = time.perf_counter()
     own = options.get("weights")
     name = method
@@ -321,14 +326,17 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     power = magnitude(stack)
     apart = entry.apart and bool(stack.number(GATHERED))
     data = repair(_known(scaled(stack, power), entry.estimates), gradients="dx" in reads or apart)
+    if "alpha" in stack:
+        data = replace(data, empty=empty_pixels(stack))
     # Extreme values may leave the range of float32 inside; what comes out is checked.
     with np.errstate(over="ignore", invalid="ignore"):
-        image = entry.run(data, **values) + data.direct
+        image = _run(name, entry, data, values, stack.path) + data.direct
         if data.caustic is not None:
             image += caustic.denoised(data, by_oidn="denoised" in reads)
     image = enlarged(image, power)
     if matrix is not None:
         image = converted(image, np.linalg.inv(matrix))
+    image = _equal_channels_kept(image, given["primal"])
     seconds = time.perf_counter() - start
     _LOG.info("%s: method %s, %.3g s, options %s", stack.path, name, seconds, values or "none")
     if data.pixels or data.gradients:
@@ -353,6 +361,28 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         unusual(entry.options, {key: value for key, value in values.items() if key != "weights"}),
         () if own else tuple(layer for layer in entry.estimates if layer not in data.known_variances()),
     )
+
+
+def _run(name: str, entry: Method, data: Repaired, values: Mapping[str, Any], path: str) -> np.ndarray:
+    """What the method returns; what one of another package raises is an NgptError."""
+    try:
+        return entry.run(data, **values)
+    except Exception as error:
+        if name in _OURS or isinstance(error, NgptError):
+            raise
+        raise NgptError(f"{path}: method '{name}' failed: {blamed(error)}") from error
+
+
+def _equal_channels_kept(image: np.ndarray, primal: np.ndarray) -> np.ndarray:
+    """The image (H, W, 3), where channels that are equal in the primal are equal: grey stays grey.
+
+    Methods that look at the three colours together give equal channels different values, since their noise is not what
+    they expect. The mean of such channels has less noise than each.
+    """
+    first = [next(b for b in range(a + 1) if np.array_equal(primal[..., a], primal[..., b], True)) for a in range(3)]
+    if first == [0, 1, 2]:
+        return image
+    return np.stack([image[..., np.equal(first, a)].mean(axis=-1, dtype=np.float64) for a in first], axis=-1)
 
 
 def _known(stack: GradientStack, estimates: tuple[str, ...]) -> GradientStack:

@@ -31,6 +31,7 @@ class Repaired:
                  by itself and added back; None where there is none
     ``caustic_var``  its variance, (H, W, 3), NaN where not known; None where the stack lacks it
     ``feature_noise``  the variance of albedo or normal, whichever is larger, mean over the image; None: not known
+    ``empty``    (H, W) booleans, the pixels that alpha says hold nothing (``ngpt.coverage``); None where there are none
     ``parts``    diffuse and specular light, finite, and their variances as ``diffuse_var`` and ``specular_var``, NaN
                  where not known; only the ones that the stack holds
     """
@@ -48,6 +49,7 @@ class Repaired:
     caustic: np.ndarray | None = None
     caustic_var: np.ndarray | None = None
     feature_noise: float | None = None
+    empty: np.ndarray | None = None
     parts: dict[str, np.ndarray] = field(default_factory=dict)
 
     def known_variances(self) -> dict[str, np.ndarray]:

@@ -1,6 +1,6 @@
 """The gradient stack: the data type between those who render gradients and those who reconstruct from them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,8 +14,8 @@ from ngpt.windows import Place
 
 
 @dataclass(eq=False, repr=False)
-class GradientStack:
-    """The layers of one rendering, scene-linear, row 0 on top.
+class GradientStack(Mapping[str, np.ndarray]):
+    """The layers of one rendering, scene-linear, row 0 on top: a mapping from their names to arrays.
 
     ``layers`` maps names of the contract (``ngpt.layers.LAYERS``) to C-contiguous float32 arrays (H, W, C): C is 3, and
     1 for depth and alpha. Given are arrays of any real type and memory layout, (H, W) too where C is 1; they are
@@ -82,6 +82,10 @@ class GradientStack:
             layers[name] = array[..., [place[channel] for channel in channels]]
         return cls(layers, dict(attributes or {}))
 
+    # Stacks compare as objects do, and not as mappings: arrays have no one truth value.
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
+
     @property
     def height(self) -> int:
         return next(iter(self.layers.values())).shape[0]
@@ -97,6 +101,16 @@ class GradientStack:
 
     def __contains__(self, name: object) -> bool:
         return name in self.layers
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.layers)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Layer ``name``, or ``default`` if the stack does not hold it."""
+        return self.layers.get(name, default)
 
     def __repr__(self) -> str:
         return f"<{self._title}: {', '.join(self.names)}>"
@@ -132,15 +146,15 @@ class GradientStack:
         if missing:
             needs = f"{why} needs" if why else "no"
             what = f"layer{'s' if len(missing) > 1 else ''} {' and '.join(repr(name) for name in missing)}"
-            remedy = " ".join(f"--layer {name}=NAME" for name in missing)
-            if "dx" in missing and "ngpt:sampler" in self.attributes:
-                remedy += "; sampler 'gpt' renders gradients: `ngpt render --sampler gpt`"
+            remedy = "if the file has it under another name, pass "
+            remedy += " ".join(f"--layer {name}=NAME" for name in missing)
             if "primal_var" in missing:
                 remedy += "; if its renderer writes none, several seeds do: 'With variances' in from-your-renderer.md"
-            raise NgptError(
-                f"{self.path}: {needs} {what}; the stack holds {', '.join(self.names)}; "
-                f"if the file has it under another name, pass {remedy}"
-            )
+            if {"dx", "dy"} & {*missing} and "ngpt:sampler" in self.attributes:
+                remedy = (
+                    f"sampler {self.attributes['ngpt:sampler']} renders no gradients: `ngpt render --sampler gpt` does"
+                )
+            raise NgptError(f"{self.path}: {needs} {what}; the stack holds {', '.join(self.names)}; {remedy}")
 
     def replace(self, **layers: ArrayLike) -> "GradientStack":
         """Returns a stack with these layers replaced or added, and the same attributes, source and place."""
@@ -154,7 +168,7 @@ _DIM = 2.0**-86
 
 def _check_name(name: str, path: str) -> None:
     if name not in LAYERS:
-        meant = did_you_mean(name, LAYERS)
+        meant = did_you_mean(str(name), LAYERS)
         raise NgptError(f"{path}: no layer is called '{name}'; {meant}the layers are {', '.join(LAYERS)}")
 
 

@@ -5,7 +5,7 @@ where their arrays have the same index.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -72,11 +72,13 @@ class Window:
 class Place:
     """Where an image lies: ``data`` is the rectangle of its pixels, ``display`` the one of the whole picture.
 
-    ``data`` may be a part of the picture, reach beyond it (overscan), or both.
+    ``data`` may be a part of the picture, reach beyond it (overscan), or both. ``aspect`` is the width of a pixel over
+    its height, as pictures show it; it says nothing of where pixels lie.
     """
 
     data: Window
     display: Window
+    aspect: float = field(default=1.0, compare=False)
 
     @classmethod
     def whole(cls, width: int, height: int) -> "Place":

@@ -52,6 +52,51 @@ def test_every_method_follows_the_exposure(method):
         assert_alike(reconstruct(times(layers_of(), scale), method).image, scale, expected)
 
 
+def wall_of(colour, noise, caustic=0.0):
+    """A stack of 48x64 pixels of one colour, times ``noise`` (48, 64, 1 or 3); ``caustic`` is the share of photons."""
+    layers = full_layers(*noise.shape[:2])
+    spread = (np.ones((*noise.shape[:2], 3)) * colour * noise).astype(np.float32)
+    layers |= {"primal": spread, "primal_var": spread.var(axis=(0, 1)) + 0 * spread, "albedo": 0.5 + 0 * spread}
+    layers |= {name: np.zeros_like(spread) for name in ("dx", "dy", "normal")}
+    layers |= dict.fromkeys(("dx_var", "dy_var"), 0.01 * layers["primal_var"] + 1e-06)
+    if caustic:
+        layers["caustic"], layers["caustic_var"] = caustic * spread, caustic**2 * layers["primal_var"]
+    return GradientStack.from_arrays(**layers)
+
+
+@pytest.mark.parametrize("colour", [(-0.25, 0.3, 1.0), (-0.5, -0.5, -0.5)])
+@pytest.mark.parametrize("caustic", [0.0, 0.5])
+@every_method
+def test_every_method_keeps_negative_light(method, caustic, colour, rng):
+    """Blue of Rec. 2020 has negative red in Rec. 709; differences of images are negative in all channels."""
+    stack = wall_of(colour, rng.gamma(4, 0.25, (48, 64, 3)), caustic)
+    image = reconstruct(stack, method).image
+    # The L1 norm takes the median of skewed noise for its mean.
+    tolerance = (0.15 if "l1" in method else 0.1) * np.abs(colour).max()
+    assert image.mean(axis=(0, 1)) == pytest.approx(stack["primal"].mean(axis=(0, 1)), abs=tolerance)
+
+
+@every_method
+def test_equal_channels_stay_equal(method, rng):
+    image = reconstruct(wall_of((0.7, 0.7, 0.7), rng.gamma(1, 1, (48, 64, 1))), method).image
+    assert np.ptp(image, axis=-1).max() == 0
+    yellow = reconstruct(wall_of((0.7, 0.7, 0.1), rng.gamma(4, 0.25, (48, 64, 1))), method).image
+    assert np.array_equal(yellow[..., 0], yellow[..., 1]) and yellow[..., 2].mean() == pytest.approx(0.1, rel=0.3)
+
+
+@pytest.mark.skipif("oidn" not in USABLE, reason="OIDN is not installed")
+def test_little_negative_light_costs_oidn_no_other_pixel(rng):
+    """As filters with negative lobes leave it beside a lamp: the other pixels are as without it."""
+    stack = wall_of((0.4, 0.5, 0.6), rng.gamma(4, 0.25, (48, 64, 3)))
+    lobe = stack["primal"].copy()
+    lobe[20:22, 30:32] = -3
+    far = np.ones(lobe.shape[:2], bool)
+    far[12:30, 22:40] = False
+    expected, found = (reconstruct(stack.replace(primal=image), "oidn").image for image in (np.maximum(lobe, 0), lobe))
+    np.testing.assert_allclose(found[far], expected[far], rtol=0.02)
+    assert (found - expected).sum() == pytest.approx(lobe[lobe < 0].sum(), rel=0.25)
+
+
 def blended(scale, corrections):
     """Three frames of a pan, by history."""
     rng, temporal = np.random.default_rng(0), Temporal(corrections)

@@ -83,6 +83,16 @@ def test_the_method_of_the_page(site, stack, command):
     assert "method 'median', option 'size': 'x' is not allowed" in told
 
 
+def test_what_a_method_raises_is_one_line_with_its_place(site, stack, command):
+    install(site, "ngpt-wrong", {"ngpt.methods": {"wrong": "ngpt_wrong:METHOD"}})
+    code = "from ngpt.methods import Method\n\n\ndef run(data):\n    return data.features['colour']\n\n\n"
+    (site / "ngpt_wrong.py").write_text(code + 'METHOD = Method("fails", ("primal",), run, {})\n')
+    told = command("denoise stack.exr -m wrong", 1).err
+    assert f"method 'wrong' failed: KeyError: 'colour' ({site / 'ngpt_wrong.py'}, line 5)\n" in told
+    with pytest.raises(NgptError, match="method 'wrong' failed"):
+        ngpt.denoise(stack, "wrong")
+
+
 def test_the_metric_of_the_page(site, command):
     install_page(site, PAGES["method"])
     assert re.search(r"^bias +0$", command("diff stack.exr stack.exr").out, re.M)

@@ -16,7 +16,7 @@ ngpt.errors ngpt.version
 ngpt.system ngpt.options ngpt.windows ngpt.layers ngpt.testing ngpt.shared
 ngpt.image
 ngpt.stack
-ngpt.io ngpt.repair ngpt.coverage ngpt.magnitude ngpt.renderer
+ngpt.io ngpt.repair ngpt.coverage ngpt.magnitude ngpt.panorama ngpt.renderer
 ngpt.classical ngpt.merging
 ngpt.denoisers
 ngpt.network

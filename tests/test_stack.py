@@ -33,6 +33,18 @@ def test_what_a_stack_holds():
     assert stack["depth"].shape == stack["alpha"].shape == (3, 4, 1)
 
 
+def test_a_stack_is_a_mapping_of_its_layers():
+    stack = GradientStack.from_arrays(dx=image(), primal=image(), path="a.exr")
+    assert list(stack) == list(stack.keys()) == ["primal", "dx"] and len(stack) == 2
+    assert dict(stack).keys() == stack.layers.keys() and {**stack}["dx"] is stack["dx"]
+    assert [name for name, layer in stack.items() if layer is stack[name]] == ["primal", "dx"]
+    assert stack.get("dx") is stack["dx"] and stack.get("dy") is None and stack.get("dy", 3) == 3
+    assert stack == stack and stack != GradientStack(dict(stack)) and len({stack}) == 1
+    for name in (0, None, ("primal", "dx")):
+        with pytest.raises(NgptError, match="no layer is called"):
+            stack[name]
+
+
 def test_numbers_are_numbers():
     stack = GradientStack.from_arrays(primal=image(), attributes={"a": 3, "b": 0.5, "c": np.float32(2)})
     assert [stack.number(name) for name in "abc"] == [3, 0.5, 2] and stack.number("d") is None
@@ -90,8 +102,9 @@ def test_missing_layers_are_named_with_the_remedy():
     assert "a.exr: method 'l1' needs layers 'dx' and 'dy'; the stack holds primal, albedo" in str(caught.value)
     assert "--layer dx=NAME --layer dy=NAME" in str(caught.value) and "sampler" not in str(caught.value)
     stack.attributes["ngpt:sampler"] = "primal"
-    with pytest.raises(NgptError, match="`ngpt render --sampler gpt`"):
-        stack.require("dx", "dy", why="method 'l1'")
+    for missing in (("dx", "dy"), ("dy",)):
+        with pytest.raises(NgptError, match="sampler primal renders no gradients"):
+            stack.require(*missing, why="method 'l1'")
     with pytest.raises(NgptError, match="no layer is called 'gradient'"):
         stack["gradient"]
     stack.require("primal", "albedo")

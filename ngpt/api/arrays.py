@@ -17,6 +17,7 @@ from ngpt.errors import NgptError, did_you_mean
 from ngpt.io.resolution import resolve
 from ngpt.methods import METHODS, by_standing, reconstruct, unknown_method
 from ngpt.options import Value
+from ngpt.panorama import wrapping
 from ngpt.sequence.history import Temporal
 from ngpt.stack import GradientStack
 
@@ -69,6 +70,7 @@ def denoise(
     dx_var: Image | None = None,
     dy_var: Image | None = None,
     caustic_var: Image | None = None,
+    wrap: bool = False,
     **options: Value,
 ) -> Kind: ...
 
@@ -90,6 +92,7 @@ def denoise(
     dx_var: Image | None = None,
     dy_var: Image | None = None,
     caustic_var: Image | None = None,
+    wrap: bool = False,
     **options: Value,
 ) -> Any:
     """The reconstruction of an image or a stack, scene-linear.
@@ -103,6 +106,7 @@ def denoise(
                  space, +x right, +y up, +z toward the viewer (``Denoiser`` converts Mitsuba's normals)
     ``dx``, ``dy``, ``direct``, ``caustic``, ``primal_var``, ``dx_var``, ``dy_var``, ``caustic_var``  further layers of
                  a gradient stack
+    ``wrap``     whether it is a panorama, whose left and right borders are neighbours; a stack may say so itself
     ``options``  of the method, see below
 
     Raises NgptError for shapes and types that do not fit, unknown names, layers that the method lacks, and an image
@@ -118,7 +122,7 @@ def denoise(
     if isinstance(image, GradientStack):
         size = image.height, image.width
         stack = image.replace(**_layers("denoise", given, size)) if given else image
-        return reconstruct(stack, method, **options).image
+        return reconstruct(wrapping(stack) if wrap else stack, method, **options).image
     noisy: Any = image
     if is_bitmap(image) and _names(image):
         held = _by_name(image)
@@ -127,6 +131,7 @@ def denoise(
     pixels = layer("denoise", "image", noisy, (3, 4))
     layers = _layers("denoise", given, pixels.shape[:2])
     stack = _stack("denoise", pixels, layers, method, options)
+    stack = wrapping(stack) if wrap else stack
     return like(_with_alpha(reconstruct(stack, method, **options).image, pixels), image)
 
 
@@ -298,7 +303,7 @@ def _alpha(alpha: np.ndarray, layers: Mapping[str, np.ndarray]) -> np.ndarray:
     """Coverage (H, W, 1) denoised as a grey image, within its own range."""
     features = {name: layers[name] for name in ("albedo", "normal") if name in layers}
     grey = reconstruct(_stack("Denoiser: alpha", np.repeat(alpha, 3, axis=-1), features, "auto", {})).image
-    return np.clip(grey.mean(axis=-1, keepdims=True), alpha.min(), alpha.max())
+    return np.clip(grey[..., :1], alpha.min(), alpha.max())
 
 
 def _layers(where: str, given: Mapping[str, Any], size: tuple[int, int]) -> dict[str, np.ndarray]:

@@ -17,6 +17,7 @@ import numpy as np
 from ngpt.errors import NgptError
 from ngpt.io.exr import layers_of_light, replace_layers_of_light
 from ngpt.methods import METHODS, choose, reconstruct
+from ngpt.panorama import WRAP, wraps
 from ngpt.stack import GradientStack
 
 # How renderers name the image of a group: their own names, the group's in place of the star.
@@ -67,10 +68,12 @@ def denoised(
     rest = stack["primal"] - np.sum(list(light.values()), axis=0, dtype=np.float64)
     if np.nansum(np.abs(rest)) > NEGLIGIBLE * np.nansum(np.abs(stack["primal"]), dtype=np.float64):
         light[""] = rest.astype(np.float32)
-    parts = {
-        name: reconstruct(GradientStack({"primal": group, **features}, path=f"{stack.path}, {name}"), method, **options)
+    wrap = {WRAP: 1} if wraps(stack) else {}
+    stacks = {
+        name: GradientStack({"primal": group, **features}, wrap, path=f"{stack.path}, {name}")
         for name, group in light.items()
     }
+    parts = {name: reconstruct(one, method, **options) for name, one in stacks.items()}
     shared = shares([part.image for part in parts.values()], whole)
     return {name: image for name, image in zip(parts, shared, strict=True) if name}
 

@@ -3,6 +3,7 @@
 No library is imported here: arrays are known by what they can do.
 """
 
+import sys
 from collections.abc import Collection
 from typing import Any, Protocol, TypeVar
 
@@ -43,10 +44,16 @@ def is_bitmap(value: Any) -> bool:
 def to_numpy(value: Any, name: str = "the array") -> np.ndarray:
     """Arrays of any library, from any device, as NumPy's; shared where that is possible.
 
-    Raises NgptError, which begins with ``name``, for what NumPy cannot read, and for bitmaps that are not linear.
+    Raises NgptError, which begins with ``name``, for what NumPy cannot read, for bitmaps that are not linear, and for
+    tensors with gradients, which would end here in silence.
     """
     if isinstance(value, np.ndarray):
         return value
+    if detached := _detached(value, name.rpartition(" ")[2]):
+        raise NgptError(
+            f"{name} carries gradients, and no method passes them on; pass {detached} (docs/use/python.md shows how an "
+            "optimization keeps them)"
+        )
     if is_bitmap(value) and value.srgb_gamma():
         raise NgptError(f"{name} is a bitmap with the curve of displays; pass bitmap.convert(srgb_gamma=False)")
     try:
@@ -62,6 +69,15 @@ def to_numpy(value: Any, name: str = "the array") -> np.ndarray:
         told = " ".join(str(error).split())
         raise NgptError(f"{name} is a {type(value).__name__} that NumPy cannot read: {told}; pass an array") from error
     return array.astype(np.float32) if array.dtype.name == "bfloat16" else array
+
+
+def _detached(value: Any, name: str) -> str:
+    """The code that takes gradients off ``value``, called ``name``; "" where nobody expects them of it."""
+    torch = sys.modules.get("torch")
+    if torch is not None and isinstance(value, torch.Tensor):
+        return f"{name}.detach()" if value.requires_grad and torch.is_grad_enabled() else ""
+    of_drjit = type(value).__module__.startswith("drjit")
+    return f"drjit.detach({name})" if of_drjit and sys.modules["drjit"].grad_enabled(value) else ""
 
 
 def like(image: np.ndarray, example: Any) -> Any:

@@ -7,10 +7,12 @@ images differ; 2 for a call that makes no sense (``WrongUse``); 130 and 143 afte
 """
 
 import argparse
+import os
 import shlex
 import sys
 from collections.abc import Mapping
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from ngpt.errors import NgptError, WrongUse, did_you_mean
@@ -199,6 +201,10 @@ def _work(parser: argparse.ArgumentParser, verbs: Mapping[str, Verb], words: lis
     if unknown:
         meant = did_you_mean(unknown[0].partition("=")[0], args.parser._option_string_actions)
         args.parser.error(f"unrecognized argument '{unknown[0]}'{f'; {meant}' if meant else ''}".rstrip())
+    # Shells leave the tilde of --output=~/it.exr to us.
+    for name in ("output", "out"):
+        if isinstance(path := getattr(args, name, None), str | Path):
+            setattr(args, name, type(path)(os.path.expanduser(path)))
     args.command, verb = f"{program} {shlex.join(words)}", verbs[args.verb]
     try:
         with logged(args.verbose, args.quiet):

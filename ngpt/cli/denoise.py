@@ -27,6 +27,7 @@ from ngpt.methods import METHODS, by_standing, check_request, reconstruct
 from ngpt.network.identity import identify
 from ngpt.network.run_onnx import MEMORY
 from ngpt.options import as_text, settings, unusual
+from ngpt.panorama import wrapping
 from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import Network
 from ngpt.stack import GradientStack
@@ -104,6 +105,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "for less flicker. With -m wcv and frames from `ngpt render --dt`: also with the frames after it",
     )
     parser.add_argument(
+        "--into",
+        metavar="LAYER",
+        help="layer that the result replaces beside the root R G B, such as Combined; root: none (default: the layer "
+        "that the noisy image was read from, unless it is called noisy)",
+    )
+    parser.add_argument(
+        "--wrap",
+        action="store_true",
+        help="the images are panoramas: their left and right borders are neighbours. Files with the attribute envmap "
+        "need no --wrap",
+    )
+    parser.add_argument(
         "--ref",
         metavar="REF",
         help="reference image: print the error in the pixels that both have, as relMSE and as trimmed relMSE, which "
@@ -168,6 +181,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         exposure=args.exposure,
         # One of several frames is not kept elsewhere if the disk is full: the next call makes it again.
         keep=len(pairs) == 1,
+        into=args.into,
     )
     frames: Any
     windows = False
@@ -209,6 +223,12 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
             progress(i, len(pairs))
     if args.temporal and (hint := motion_hint(pairs, reports, args)):
         console.say(hint)
+    # Features that nobody recognized are a loss that the result does not show.
+    overlooked: dict = next((report for report in reports if report.get("proposed")), {"proposed": {}})
+    for name, layer in overlooked["proposed"].items():
+        console.say(
+            f"{overlooked['input']}: '{layer}' looks like {name} and was not used; --layer {name}=\"{layer}\" takes it"
+        )
     failed = sum("error" in report for report in reports)
     skipped = sum("skipped" in report for report in reports)
     if failed and len(pairs) > 1:
@@ -237,6 +257,7 @@ def read_frame(
         return Frame(source, target, None, there=True)
     cut = args.skip_existing and not there and target.exists()
     stacks = read_views(source, dict(args.layer), args.untrusted, files, args.view)
+    stacks = [wrapping(stack) for stack in stacks] if args.wrap else stacks
     first, *others = (Frame(source, target, stack, there=there, cut=cut) for stack in stacks)
     if others and (what := one_view_only(target, args, files)):
         raise NgptError(f"{source}: has several views, and {what}; choose one, as in --view {first.view}")

@@ -12,11 +12,12 @@ from ngpt.cli.reference import Errors
 from ngpt.errors import WrongUse
 from ngpt.image.pictures import write_picture
 from ngpt.image.transforms import shown
-from ngpt.io.exr import write
+from ngpt.io.exr import layers_of_result, write
 from ngpt.io.foreign.pfm import write_pfm
 from ngpt.io.framenames import named, number_of, varies
 from ngpt.io.frames import RESULT_SUFFIX
 from ngpt.io.primaries import converted, to_rec709
+from ngpt.io.resolution import propose
 from ngpt.methods import METHODS, Result
 from ngpt.stack import GradientStack
 from ngpt.system.files import save
@@ -50,9 +51,17 @@ class Frame(NamedTuple):
 
 
 def write_frame(
-    frame: Frame, overwrite: bool, transform: str = "standard", exposure: float | str = 0.0, keep: bool = False
+    frame: Frame,
+    overwrite: bool,
+    transform: str = "standard",
+    exposure: float | str = 0.0,
+    keep: bool = False,
+    into: str | None = None,
 ) -> dict:
-    """Writes the result, with ``keep`` elsewhere where it must, and returns what there is to report."""
+    """Writes the result, with ``keep`` elsewhere where it must, and returns what there is to report.
+
+    ``into``  as of ``ngpt.write``
+    """
     source, target, stack, result, errors, groups, there, cut, over_time, reason, others = frame
     report: dict[str, Any] = {"input": str(source), "output": str(target)}
     if there or stack is None or result is None:
@@ -62,7 +71,7 @@ def write_frame(
     def save_to(path: Path, overwrite: bool) -> None:
         if path.suffix.lower() == ".exr":
             views = [(one.result.image, one.stack) for one in (frame, *others) if one.result and one.stack]
-            write(path, [image for image, _ in views], [of for _, of in views], overwrite, made)
+            write(path, [image for image, _ in views], [of for _, of in views], overwrite, made, into)
         elif path.suffix.lower() == ".pfm":
             write_pfm(path, converted(result.image, to_rec709(stack.attributes)), overwrite)
         else:
@@ -89,6 +98,13 @@ def write_frame(
     }
     if result.error is not None:
         report["pixels without standard error"] = int(np.isnan(result.error).any(axis=-1).sum())
+    if target.suffix.lower() == ".exr":
+        report["layers"], report["noisy layers"] = layers_of_result(stack, into)
+    if stack.source is not None:
+        found = propose(stack.source.view.parts, stack.source.resolution)
+        report |= {
+            "proposed": {name: found[name] for name in ("albedo", "normal") if name in found and name not in stack}
+        }
     report |= {"views": [one.view for one in (frame, *others)]} if frame.view else {}
     report |= {"why no history": reason} if reason else {}
     report |= {"in place of": "a file that was not whole"} if cut else {}
@@ -105,6 +121,11 @@ def describe(report: dict) -> str:
     if report["weights"] and report["method"] not in METHODS:
         text += f", sha256 {report['weights']['sha256'][:12]}"
     text += f", {report['seconds']:.2f} s"
+    if len(report.get("layers", ())) > 1:
+        text += f", layers {' and '.join(report['layers'])}"
+    if report.get("noisy layers"):
+        name = report["noisy layers"][0]
+        text += f", {name} stays as it was (--into {name.rpartition('.')[2]} replaces it)"
     if report.get("views"):
         text += f", views {', '.join(report['views'])}"
     if report["repaired"]:

@@ -45,7 +45,8 @@ def motion_hint(pairs: Sequence[tuple[Path, Path]], reports: Sequence[dict], arg
     stack = read_views(pairs[-1][0], dict(args.layer), args.untrusted, view=args.view)[0]
     proposed = propose(stack.source.view.parts, stack.source.resolution).get("motion") if stack.source else None
     found = f"; if these lead to the next frame, y up: --layer motion={proposed}" if proposed else ""
-    return f"--temporal: without the layer 'motion' each frame is denoised by itself{found}; see docs, shots.md#motion"
+    lack = "--temporal: without the layer 'motion' each frame is denoised by itself"
+    return f"{lack}{found}; see docs, from-your-renderer.md#motion"
 
 
 def one_view_only(target: Path, args: argparse.Namespace, files: Mapping[str, str]) -> str:

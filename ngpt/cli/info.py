@@ -180,7 +180,7 @@ def stack(stack: GradientStack) -> dict:
         "noise of the mean light, relative to it": _noise(stack),
         "shared tails": _tails(stack),
         "other channels": [name for name in further if name not in rates],
-        "missing": [name for name in LAYERS if name not in stack and name not in _OPTIONAL],
+        "missing": _missing(stack),
         "proposed": [
             f'--layer {name}="{layer}"' for name, layer in propose(stack.source.view.parts, resolution).items()
         ],
@@ -218,6 +218,14 @@ def _tails(stack: GradientStack) -> str:
     if (cut := stack.number(CUT)) is not None:
         told.append(f"{100 * cut:.3g} % of the cache's light was cut from records that were too bright")
     return "; ".join(told)
+
+
+def _missing(stack: GradientStack) -> list[str]:
+    """Layers that methods could use: of a file without gradients, which other renderers write, only features."""
+    wanted = [name for name in LAYERS if name not in _OPTIONAL]
+    if "dx" not in stack and "ngpt:sampler" not in stack.attributes:
+        wanted = ["albedo", "normal", "depth"]
+    return [name for name in wanted if name not in stack]
 
 
 def _bought(gain: Gain) -> dict:

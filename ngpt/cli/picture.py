@@ -8,7 +8,7 @@ import numpy as np
 from ngpt.cli.arguments import add_force, add_view, number, output_file
 from ngpt.cli.streams import standard_input
 from ngpt.errors import WrongUse
-from ngpt.image.display import auto_exposure
+from ngpt.image.display import auto_exposure, squared
 from ngpt.image.pictures import PICTURES, SHOTS, check_kind, write_picture, write_shot
 from ngpt.image.transforms import TRANSFORMS, check_transform, shown
 from ngpt.io.exr import read_picture
@@ -81,7 +81,8 @@ def shot(args: argparse.Namespace, folder: str, target: Path, console: Console) 
         for done, file in enumerate(files):
             progress(done, len(files))
             pixels, place = read_picture(file, view=args.view)
-            yield file, shown(put(pixels, place.data, place.display), args.transform, stops)
+            whole = squared(put(pixels, place.data, place.display), place.aspect)
+            yield file, shown(whole, args.transform, stops)
         progress(len(files), len(files))
 
     with console.progress("pictures", "frames") as progress:
@@ -105,8 +106,11 @@ def write_each(folder: Path, pictures, overwrite: bool) -> None:
 
 
 def in_picture(image: np.ndarray, place: Place) -> np.ndarray:
-    """What the display window shows of an image (H, W, 3): all but overscan. An image beside it is shown whole."""
-    return image[seen(place).within(place.data)]
+    """What the display window shows of an image (H, W, 3): all but overscan. An image beside it is shown whole.
+
+    Pixels become as wide as they are high.
+    """
+    return squared(image[seen(place).within(place.data)], place.aspect)
 
 
 def seen(place: Place) -> Window:
@@ -126,7 +130,7 @@ def check_image(target: Path, transform: str) -> None:
 def check_picture(target: Path, args: argparse.Namespace) -> None:
     """For ``ngpt denoise``: raises an error for what is no picture, and for options that no picture has room for."""
     check_image(target, args.transform)
-    for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
+    for option, given in (("--error", args.error), ("--groups", args.groups or args.group), ("--into", args.into)):
         if given:
             raise WrongUse(f"{option} makes layers, and {target} can have none; let it end in .exr")
     if args.skip_existing:

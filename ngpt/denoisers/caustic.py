@@ -55,9 +55,9 @@ def of_half_size(data: Repaired) -> np.ndarray:
     assert data.caustic is not None
     small = {name: halved(layer) for name, layer in data.features.items() if name != "depth"}
     given = halved(data.caustic)
-    found = oidn(replace(data, image=given, direct=np.zeros_like(given), features=small), "noisy", "high")
-    # OIDN may go below zero; there is no negative light.
-    light = np.maximum(found, 0)
+    found = oidn(replace(data, image=given, direct=np.zeros_like(given), features=small, empty=None), "noisy", "high")
+    # OIDN may go below zero where no light does.
+    light = np.maximum(found, min(float(given.min()), 0))
     before, after = given.sum(dtype=np.float64), light.sum(dtype=np.float64)
     if before > 0 and after > 0:
         light *= np.float32(min(before / after, MOST))

@@ -22,22 +22,23 @@ def nlm(data: Repaired) -> np.ndarray:
     """Joint non-local means of scikit-image: patches compared in log radiance, albedo and normal, radiance averaged.
 
     [Buades et al. 2005, "A non-local algorithm for image denoising"; features as in Rousselle et al. 2013, "Robust
-    denoising using feature and color information".] The patches are 5x5 in a window of 19x19 pixels. Negative
-    radiance, which logarithms do not take, counts as none.
+    denoising using feature and color information".] The patches are 5x5 in a window of 19x19 pixels. The
+    logarithm of negative radiance is that of its size, with its sign.
     """
     if missing():
         raise NgptError(f"method 'nlm': {missing()}")
     from skimage.restoration import denoise_nl_means
 
-    image = np.maximum(data.image, 0).astype(np.float64)
-    scale = float(np.median(image[image > 0])) if (image > 0).any() else 1.0
-    encoded = np.log1p(image / scale)
+    image = data.image.astype(np.float64)
+    size = np.abs(image)
+    scale = float(np.median(size[size > 0])) if size.any() else 1.0
+    encoded = np.copysign(np.log1p(size / scale), image)
     assert data.noise is not None
-    deviations = np.sqrt(np.maximum(np.nan_to_num(data.noise), 0)) / (scale + image)
+    deviations = np.sqrt(np.maximum(np.nan_to_num(data.noise), 0)) / (scale + size)
     sigma = float(deviations.mean(dtype=np.float64))
     # The image itself travels along, too small to count in the distance: its means are of radiance, not of logarithms,
     # which would darken it.
-    tiny = 1e-6 / max(float(image.max()), 1e-30)
+    tiny = 1e-6 / max(float(size.max()), 1e-30)
     bandwidth = max(_NLM_BANDWIDTH * sigma, 1e-6)
     guides = [bandwidth * weight * data.features[name] for name, weight in _NLM_FEATURES.items()]
     stacked = np.concatenate([encoded, *guides, tiny * image], axis=-1)

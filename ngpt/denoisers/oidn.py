@@ -2,9 +2,11 @@
 
 from collections.abc import Mapping
 from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 
+from ngpt.coverage import mirrored
 from ngpt.denoisers.oidn_filters import filtered
 from ngpt.errors import NgptError
 from ngpt.options import Option
@@ -13,9 +15,18 @@ from ngpt.system.install import package_command
 
 AUXILIARY = ("prefiltered", "clean", "noisy", "none")
 QUALITIES = {"high": "High", "balanced": "Balanced", "fast": "Fast"}
+# What OIDN's filter and its settings are.
+FILTERS: dict[str, dict[str, Any]] = {
+    "image": {"hdr": True},
+    "lightmap": {"kind": "RTLightmap"},
+    "directional": {"kind": "RTLightmap", "directional": True},
+}
 
 OPTIONS = {
     "auxiliary": Option("prefiltered", "what OIDN is told of albedo and normal", choices=AUXILIARY),
+    "filter": Option(
+        "image", "OIDN's for images, or for lightmaps of light or of coefficients in [-1, 1]", choices=tuple(FILTERS)
+    ),
     "quality": Option("high", "of its network: less is quicker", choices=tuple(QUALITIES)),
 }
 
@@ -24,7 +35,7 @@ def missing() -> str:
     return "" if find_spec("mitsuba_oidn") else f"OIDN is not installed: {package_command('mitsuba-oidn')}"
 
 
-def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
+def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") -> np.ndarray:
     """Intel Open Image Denoise, its filter "RT" for HDR images, with albedo, or albedo and normal, where there are any.
 
     OIDN takes no normals without albedo: they are left out then.
@@ -33,9 +44,15 @@ def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
                    them as clean, which its documentation recommends for the best quality; "clean" marks them as clean
                    as they are; "noisy" does not; "none" leaves them out
     ``quality``    "high", "balanced" or "fast", for the image and for features that are denoised first
+    ``filter``     one of ``FILTERS``: "lightmap" and "directional" are OIDN's for lightmaps, which take no features
+
+    Without features, empty pixels become what the covered ones beside them would be in a mirror: OIDN would darken the
+    borders of the islands of a lightmap, and let their light leak from one to the other.
     """
     require_oidn()
     features = {}
+    if filter != "image":
+        auxiliary = "none"
     if auxiliary == "prefiltered":
         features = prefiltered(data.features, quality)
     elif auxiliary != "none":
@@ -43,8 +60,11 @@ def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
     # With the light sources seen, as a renderer hands it over and OIDN was trained.
     image = np.ascontiguousarray(data.image + data.direct, np.float32)
     clean = bool(features) and auxiliary in ("prefiltered", "clean")
-    images = {"color": image, **features}
-    return filtered(images, hdr=True, clean_aux=clean, quality=QUALITIES[quality]) - data.direct
+    settings = {**FILTERS[filter], "quality": QUALITIES[quality]} | ({"clean_aux": True} if clean else {})
+    empty = None if features or filter != "image" else data.empty
+    if empty is None:
+        return filtered({"color": image, **features}, **settings) - data.direct
+    return np.where(empty[..., None], image, filtered({"color": mirrored(image, empty)}, **settings)) - data.direct
 
 
 def prefiltered(features: Mapping[str, np.ndarray], quality: str) -> dict[str, np.ndarray]:

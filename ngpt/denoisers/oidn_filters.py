@@ -12,11 +12,14 @@ from typing import Any
 import numpy as np
 
 from ngpt.errors import NgptError
+from ngpt.io.primaries import BEYOND, TO_WIDE, converted, negative_share
 from ngpt.system.forks import hold_while_forking
 from ngpt.system.limits import limited, processors
 
 # By the names of OIDN's devices in Python.
 DEVICES = {"auto": "Default", "cpu": "CPU", "cuda": "CUDA", "hip": "HIP", "metal": "Metal", "sycl": "SYCL"}
+# Negative light below this share of all light is rounding, and not worth a second run.
+_ROUNDING = 1e-6
 # Filters that are kept: an image and its features, with two qualities, take five.
 _MOST = 8
 
@@ -27,9 +30,16 @@ _filters: dict[tuple, Any] = {}
 
 
 def filtered(
-    images: Mapping[str, np.ndarray], device: str = "auto", weights: bytes | None = None, **settings: Any
+    images: Mapping[str, np.ndarray],
+    device: str = "auto",
+    weights: bytes | None = None,
+    kind: str = "RT",
+    **settings: Any,
 ) -> np.ndarray:
-    """The result of OIDN's filter "RT", (H, W, 3) float32.
+    """The result of OIDN's filter "RT", or of another ``kind``, (H, W, 3) float32.
+
+    OIDN takes negative light for 0. So an image with many colours beyond its primaries is denoised in wider ones, which
+    leaves less error than the other way: negative light is denoised by itself and then subtracted.
 
     ``images``    "color", "albedo" and "normal", those there are: (H, W, 3) float32, C-contiguous, of one size
     ``device``    one of ``DEVICES``
@@ -38,16 +48,37 @@ def filtered(
 
     Raises NgptError with what OIDN says where it cannot.
     """
+
+    def run(colour: np.ndarray | None) -> np.ndarray:
+        return _filtered(images if colour is None else {**images, "color": colour}, device, weights, kind, settings)
+
+    def signs_apart(colour: np.ndarray) -> np.ndarray:
+        negative = np.maximum(-colour, 0)
+        little = negative.sum(dtype=np.float64) <= _ROUNDING * np.abs(colour).sum(dtype=np.float64)
+        return run(colour) if little else run(colour) - run(negative)
+
+    colour = images.get("color")
+    if colour is None or colour.min() >= 0 or settings.get("directional"):
+        return run(colour)
+    wide = converted(colour, TO_WIDE)
+    if negative_share(wide) <= BEYOND < negative_share(colour):
+        return converted(signs_apart(wide), np.linalg.inv(TO_WIDE))
+    return signs_apart(colour)
+
+
+def _filtered(
+    images: Mapping[str, np.ndarray], device: str, weights: bytes | None, kind: str, settings: Mapping[str, Any]
+) -> np.ndarray:
     import mitsuba_oidn
 
     result = np.empty_like(next(iter(images.values())))
     # 0: those that it shares with Dr.Jit.
     where = device, processors() if limited() else 0
-    key = (where, weights, tuple(images), result.shape, tuple(settings.items()))
+    key = (where, weights, kind, tuple(images), result.shape, tuple(settings.items()))
     try:
         with _lock:
             # Out of those that are kept until it has worked: one that failed is not used again.
-            made = _filters.pop(key, None) or _made(where, weights, settings)
+            made = _filters.pop(key, None) or _made(where, weights, kind, settings)
             _run(_devices[where], made, images, result)
             # Networks of the user's own are many, and as large as an image.
             if weights is None:
@@ -59,7 +90,7 @@ def filtered(
     return result
 
 
-def _made(where: tuple[str, int], weights: bytes | None, settings: Mapping[str, Any]) -> Any:
+def _made(where: tuple[str, int], weights: bytes | None, kind: str, settings: Mapping[str, Any]) -> Any:
     """A filter on the device of that name, which has so many threads of its own if it is a processor."""
     import mitsuba_oidn
 
@@ -69,7 +100,7 @@ def _made(where: tuple[str, int], weights: bytes | None, settings: Mapping[str, 
         if threads and device.type == mitsuba_oidn.DeviceType.CPU:
             device.num_threads = threads
         _devices[where] = device
-    made = _devices[where].new_filter("RT")
+    made = _devices[where].new_filter(kind)
     if weights is not None:
         made.set_data("weights", weights)
     for name, value in settings.items():

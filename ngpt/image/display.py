@@ -18,6 +18,8 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
 ERROR_EPSILON = 1e-2  # keeps the relative error of black pixels finite; of an image at automatic exposure
 ERROR_RANGE = (1e-4, 1.0)  # relative squared error at the two ends of the heat table: 1 % and 100 %
 
+MOST_ASPECT = 16.0  # of pixels: what a header says beyond it is nonsense
+
 # "inferno" of Smith and van der Walt at nine even steps: lightness grows evenly, and it survives colour blindness.
 _INFERNO = ("000004", "210c4a", "57106e", "8a226a", "bc3754", "e45a31", "f98e09", "f9cb35", "fcffa4")
 _DIVERGING = ("9ecbff", "2f7fd6", "777777", "d9772b", "ffd09a")  # negative blue, zero grey, positive orange
@@ -47,6 +49,18 @@ def to_display8(image: np.ndarray, transform: Callable[[np.ndarray], np.ndarray]
     out[np.isposinf(image).any(axis=2)] = 255
     out[np.isnan(image).any(axis=2)] = MAGENTA
     return out
+
+
+def squared(image: np.ndarray, aspect: float) -> np.ndarray:
+    """An image (H, W, C) with square pixels, of pixels whose width is ``aspect`` times their height.
+
+    They are repeated, so that a picture only becomes larger.
+    """
+    if not (1 / MOST_ASPECT <= aspect <= MOST_ASPECT) or aspect == 1:
+        return image
+    axis, factor = (1, aspect) if aspect > 1 else (0, 1 / aspect)
+    length = round(image.shape[axis] * factor)
+    return image.take(((np.arange(length) + 0.5) / factor).astype(int), axis)
 
 
 def auto_exposure(reference: np.ndarray) -> float:

@@ -102,7 +102,13 @@ NO_LIGHT = ("crypto", "position", "matte", "mask", "noise", "samples")
 NOISE = ("var", "variance", "mse", "error")
 
 # Attributes that begin so show who wrote a file.
-_WRITERS = {"ngpt:sampler": "ngpt", "vrayInfo": "V-Ray"}
+_WRITERS = {"ngpt:sampler": "ngpt", "vrayInfo": "V-Ray", "generatedBy": "Mitsuba"}
+
+
+def is_image(name: str) -> bool:
+    """Whether a layer of that name is what a renderer calls its image, and not the noisy one."""
+    known = {alias.name for alias in ALIASES if alias.layer == "primal"} - {"", "primal", "Noisy Image"}
+    return name.rpartition(".")[2] in known
 
 
 def plain(name: str) -> str:
@@ -112,7 +118,8 @@ def plain(name: str) -> str:
 
 def writer_of(attributes: Iterable[str]) -> str:
     """The program that wrote a file with these header attributes, as far as they tell; "" if not."""
-    return next((who for name in attributes for start, who in _WRITERS.items() if name.startswith(start)), "")
+    names = tuple(attributes)
+    return next((who for start, who in _WRITERS.items() for name in names if name.startswith(start)), "")
 
 
 def format_aliases() -> str:

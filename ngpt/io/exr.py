@@ -16,22 +16,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ngpt.errors import NgptError
-from ngpt.io.aliases import writer_of
+from ngpt.io.aliases import is_image, writer_of
 from ngpt.io.foreign.files import ENCODED, FROM, file_headers, read_file
 from ngpt.io.isolated import read_exr_isolated
-from ngpt.io.layout import StackSource, file_views, gather, is_half, place_of, scatter, taken
+from ngpt.io.layout import StackSource, data_window, file_views, gather, is_half, place_of, scatter, taken
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
 from ngpt.io.primaries import converted, to_rec709
-from ngpt.io.resolution import Found, Resolution, resolve, resolve_alone
+from ngpt.io.resolution import Found, Resolution, channels_like, resolve, resolve_alone
 from ngpt.io.resolution import layers_of_light as find_light
-from ngpt.io.results import MADE_BY, STRUCTURE, image_of, leave_out_old_error, new_header, with_result
+from ngpt.io.results import MADE_BY, STRUCTURE, image_of, leave_out_old_error, new_header, replaced_layer, with_result
 from ngpt.io.views import Part, View, choose_views, views_of
-from ngpt.layers import LAYERS, RGB
+from ngpt.layers import LAYERS, RGB, XYZ
 from ngpt.stack import GradientStack
 from ngpt.system.reading import regular_file
 from ngpt.system.threads import map_parts
 from ngpt.version import __version__
-from ngpt.windows import Place
+from ngpt.windows import Place, put
 
 _LOG = logging.getLogger(__name__)
 
@@ -59,12 +59,14 @@ def read(
     ``isolated`` decodes the file in a process of its own, so that one made to crash the decoder is an NgptError too:
     for files of strangers (``ngpt.io.isolated``).
 
-    Colours stay in the primaries of the file, which its header attribute ``chromaticities`` names.
+    Colours stay in the primaries of the file, which its header names (``ngpt.io.primaries``).
 
     Light that is encoded for displays, as in PNG, is made scene-linear (``ngpt.io.foreign.files``).
 
-    Raises NgptError if the file cannot be read, holds no primal, or holds layers of different size or place; and for
-    such a file of a layer.
+    A layer in a part with a data window of its own gets the pixels of the primal, with 0 where it has none.
+
+    Raises NgptError if the file cannot be read, holds no primal, or holds layers without a pixel in common with it; and
+    for a file of a layer of another size or place.
     """
     image = read_exr_isolated(path) if isolated else read_file(path)
     return _stack(image, _one_view(image, view, str(path)), layers, isolated, files, str(path))
@@ -116,18 +118,18 @@ def _stack(
 ) -> GradientStack:
     """The stack of one view of a file."""
     resolution = _resolved(view, layers, (part.header for part in image.parts), path)
-    layers_found = map_parts(lambda found: taken(image, found), resolution.values())
-    arrays = dict(zip(resolution, layers_found, strict=True))
     main = image.parts[resolution["primal"].part]
+    if channels_like(resolution["primal"]) == XYZ:
+        main.header.setdefault("colorInteropID", "lin_ciexyzd65_scene")  # Mitsuba's are relative to D65
+    here = data_window(main)
+    for name, found in resolution.items():
+        there = data_window(image.parts[found.part])
+        if here.common(there) is None:
+            raise NgptError(f"{path}: layer '{name}' is {there} but 'primal' {here}; render them in one picture")
+    layers_found = map_parts(lambda found: taken(image, found, resolution["primal"].part), resolution.values())
+    arrays = dict(zip(resolution, layers_found, strict=True))
     attributes = {name: value for name, value in main.header.items() if name not in STRUCTURE}
     stack = GradientStack(arrays, attributes, StackSource(image, resolution, view), path, place_of(main))
-    for name, found in resolution.items():
-        here, there = main.header["dataWindow"], image.parts[found.part].header["dataWindow"]
-        if not np.array_equal(here, there):
-            raise NgptError(
-                f"{path}: layer '{name}' starts at pixel {_corner(there)} but 'primal' at {_corner(here)}; "
-                "render them with one data window"
-            )
     alone = {name: _read_alone(file, name, stack, main, isolated) for name, file in (files or {}).items()}
     told = ", ".join(f"{name} ({' '.join(found.channels)})" for name, found in resolution.items())
     _LOG.info("%s: %dx%d, %s", path, stack.width, stack.height, told)
@@ -202,7 +204,8 @@ def read_picture(path: str | os.PathLike, isolated: bool = False, view: str | No
     stack = _stack(image, chosen, None, isolated, None, str(path))
     # The picture of a result is beside its input.
     for place in (stack.source.resolution["primal"].part, chosen.first):
-        part, root = image.parts[place], tuple(chosen.channel(place, name) for name in RGB)
+        like = channels_like(stack.source.resolution["primal"])
+        part, root = image.parts[place], tuple(chosen.channel(place, name) for name in like)
         if all(name in part.channels for name in root):
             return Picture(converted(gather(part, root), to_rec709(part.header)), place_of(part))
     return Picture(converted(stack["primal"], to_rec709(stack.attributes)), stack.place)
@@ -214,6 +217,7 @@ def write(
     like: GradientStack | Sequence[GradientStack] | None = None,
     overwrite: bool = False,
     attributes: Mapping[str, Any] | None = None,
+    into: str | None = None,
 ) -> Path:
     """Writes a stack, a result or an image, and returns its path.
 
@@ -224,7 +228,8 @@ def write(
     of its first part, which is what viewers show, and the input in primal.R/G/B. Should the first part be another than
     the one that holds primal, or show something else in its root, then it stays as it is and a new part goes in front.
     Alpha is copied into the root if the file has it elsewhere. ``image`` also replaces the layer that the input was
-    read from (``ViewLayer.Combined``), which the attribute ``ngpt:pass`` then names; a ``Noisy Image`` stays.
+    read from (``ViewLayer.Combined``), which the attribute ``ngpt:pass`` then names; a ``Noisy Image`` stays. ``into``
+    names another layer to replace, or "root" for none.
 
     Results of the views of one file go together: lists of them, and of their stacks (``read_views``). Each is then the
     root of its view.
@@ -260,13 +265,29 @@ def write(
                 f"{path}: the result is {pixels.shape[1]}x{pixels.shape[0]} but the stack {stack.path} is "
                 f"{stack.width}x{stack.height}; results are written at the size of their stack"
             )
-        made = _result(stack, pixels, made, attributes or {}, str(path))
+        made = _result(stack, pixels, made, attributes or {}, into, str(path))
     assert made is not None
     return write_exr(path, made, overwrite)
 
 
+def layers_of_result(stack: GradientStack, into: str | None = None) -> tuple[list[str], list[str]]:
+    """What ``write`` replaces by a result, the root first, and the layers that are named like images and stay noisy."""
+    if stack.source is None:
+        return ["root"], []
+    origin, source = str(stack.attributes.get("ngpt:pass", "")), stack.source
+    found = replaced_layer(source.resolution, source.view, origin, into, stack.path)
+    written = ["root", found.name] if found else ["root"]
+    images = [name for name in (source.resolution["primal"].name, *_light(stack)) if is_image(name)]
+    return written, [name for name in images if name not in written]
+
+
 def _result(
-    stack: GradientStack, pixels: np.ndarray, base: ExrImage | None, attributes: Mapping[str, Any], path: str
+    stack: GradientStack,
+    pixels: np.ndarray,
+    base: ExrImage | None,
+    attributes: Mapping[str, Any],
+    into: str | None,
+    path: str,
 ) -> ExrImage:
     """The file of a stack, with the results of other views as in ``base``, and ``pixels`` (H, W, 3) as its result."""
     found, resolution, main = image_of(stack, path, base)
@@ -274,7 +295,8 @@ def _result(
     view = stack.source.view if stack.source else file_views(found)[0]
     for name in MADE_BY:
         found.parts[main].header.pop(name, None)
-    result, main = with_result(found, resolution, view, pixels, str(stack.attributes.get("ngpt:pass", "")))
+    shown = replaced_layer(resolution, view, str(stack.attributes.get("ngpt:pass", "")), into, path)
+    result, main = with_result(found, resolution, view, pixels, shown)
     result.parts[main].header.update({**attributes, "ngpt:version": __version__})
     return result
 
@@ -317,7 +339,10 @@ def channels_alone(stack: GradientStack) -> dict[str, np.ndarray]:
 
 def layers_of_light(stack: GradientStack) -> dict[str, np.ndarray]:
     """The layers of colour that a stack holds beside the layers of the contract: name -> (H, W, 3) float32."""
-    return {name: gather(part, names) for name, (part, names) in _light(stack).items()}
+    return {
+        name: put(gather(part, names), data_window(part), stack.place.data)
+        for name, (part, names) in _light(stack).items()
+    }
 
 
 def replace_layers_of_light(stack: GradientStack, layers: Mapping[str, np.ndarray]) -> GradientStack:
@@ -327,7 +352,7 @@ def replace_layers_of_light(stack: GradientStack, layers: Mapping[str, np.ndarra
     places = _light(changed)
     for name, values in layers.items():
         part, names = places[name]
-        scatter(part, names, values, is_half(part, names))
+        scatter(part, names, put(values, stack.place.data, data_window(part)), is_half(part, names))
     return changed
 
 

@@ -4,10 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ngpt.errors import NgptError
 from ngpt.io.openexr import ExrImage, ExrPart
 from ngpt.io.resolution import Found, Resolution
 from ngpt.io.views import Part, View, views_of
-from ngpt.windows import Place, Window
+from ngpt.windows import Place, Window, put
 
 _HALF_MAX = 65504.0
 _HALF_NORMAL_MIN = 2.0**-14
@@ -35,7 +36,8 @@ def file_views(image: ExrImage) -> list[View]:
 
 def place_of(part: ExrPart) -> Place:
     """Where the pixels of a part lie."""
-    return Place(Window.of_box(part.header["dataWindow"]), Window.of_box(part.header["displayWindow"]))
+    display = Window.of_box(part.header["displayWindow"])
+    return Place(data_window(part), display, float(part.header.get("pixelAspectRatio", 1.0)))
 
 
 def gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:
@@ -50,18 +52,26 @@ def gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:
     return layer
 
 
-def taken(image: ExrImage, found: Found) -> np.ndarray:
-    """A layer of a file, (H, W, C) float32."""
+def taken(image: ExrImage, found: Found, main: int) -> np.ndarray:
+    """A layer of a file, (H, W, C) float32, on the pixels of part ``main``: 0 where its own part has none."""
     layer = gather(image.parts[found.part], found.channels)
+    layer = put(layer, data_window(image.parts[found.part]), data_window(image.parts[main]))
     return layer * np.asarray(found.factors, np.float32) if found.factors else layer
 
 
-def holds(part: ExrPart, names: tuple[str, ...], values: np.ndarray, factors: tuple[float, ...] = ()) -> bool:
+def data_window(part: ExrPart) -> Window:
+    return Window.of_box(part.header["dataWindow"])
+
+
+def as_stored(image: ExrImage, found: Found, main: int) -> bool:
+    """Whether the channels of a layer are what ``taken`` makes of them, without factors and on the same pixels."""
+    return not found.factors and data_window(image.parts[found.part]) == data_window(image.parts[main])
+
+
+def holds(part: ExrPart, names: tuple[str, ...], values: np.ndarray) -> bool:
     """Whether the channels ``names`` are ``values`` (H, W, C), of those that are float32 bit for bit."""
     if values.dtype != np.float32:
         return False
-    if factors:
-        return np.array_equal(gather(part, names) * np.asarray(factors, np.float32), values, equal_nan=True)
     return values.shape[:2] == part.channels[names[0]].shape and all(
         np.array_equal(part.channels[name].astype(np.float32, copy=False).view(np.uint32), bits)
         for name, bits in zip(names, np.moveaxis(values.view(np.uint32), -1, 0), strict=True)
@@ -69,7 +79,13 @@ def holds(part: ExrPart, names: tuple[str, ...], values: np.ndarray, factors: tu
 
 
 def scatter(part: ExrPart, names: tuple[str, ...], values: np.ndarray, half: bool) -> None:
-    """Puts ``values`` (H, W, C) into the channels ``names``: as half if asked to and half can hold them, else float."""
+    """Puts ``values`` (H, W, C) into the channels ``names``: as half if asked to and half can hold them, else float.
+
+    Raises NgptError for colours where one channel stands for all.
+    """
+    grey = np.broadcast_to(values[..., :1], values.shape)
+    if len({*names}) < len(names) and not np.array_equal(values, grey, equal_nan=True):
+        raise NgptError(f"channel '{names[0]}' is luminance, and the image has colours: write it without its stack")
     if half:
         peak = np.abs(values[np.isfinite(values)]).max(initial=0.0)
         half = peak <= _HALF_MAX and not 0.0 < peak < _HALF_NORMAL_MIN

@@ -1,9 +1,12 @@
-"""Which red, green and blue a file means: its header's ``chromaticities``; and linear Rec. 709, in which it is shown.
+"""Which red, green and blue a file means, by its header; and linear Rec. 709, in which it is shown.
 
-By OpenEXR's rule a file without the attribute is of Rec. 709: https://openexr.com/en/latest/TechnicalIntroduction.html
+The attributes that tell, the first of which wins: ``acesImageContainerFlag`` (SMPTE ST 2065-4), ``colorInteropID`` (the
+names of the Color Interop Forum), ``chromaticities`` and ``oiio:ColorSpace`` (OpenImageIO). By OpenEXR's rule a file
+without them is of Rec. 709: https://openexr.com/en/latest/TechnicalIntroduction.html
 """
 
 import logging
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,15 +16,30 @@ from ngpt.stack import GradientStack
 
 _LOG = logging.getLogger(__name__)
 
-ATTRIBUTE = "chromaticities"
 # x, y of red, green, blue and white.
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 REC2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
+P3_D65 = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
+ADOBE_RGB = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
+XYZ_D65 = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.3127, 0.3290)  # told by name alone: it means CIE's own units
 ACES_AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
 ACES_AP1 = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
+# Names of linear spaces, in small letters and digits alone.
+_NAMES = {
+    REC709: "linrec709scene linrec709 linsrgb linearrec709 linearrec709srgb linearsrgb utilitylinearrec709",
+    REC2020: "linrec2020scene linrec2020 linearrec2020 utilitylinearrec2020",
+    P3_D65: "linp3d65scene linp3d65 linearp3d65 utilitylinearp3d65",
+    ADOBE_RGB: "linadobergbscene linadobergb linearadobergb utilitylinearadobergb",
+    XYZ_D65: "linciexyzd65scene",
+    ACES_AP0: "linap0scene linap0 aces20651 acesaces20651",
+    ACES_AP1: "linap1scene linap1 acescg acesacescg",
+}
+_SPACES = {name: primaries for primaries, names in _NAMES.items() for name in names.split()}
+# Names that tell no primaries.
+_NO_SPACE = ("", "unknown", "data", "raw", "linear", "scenelinear")
 # Cone responses of Bradford, in which a white is adapted to another.
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-_BEYOND = 0.01  # of the pixels
+BEYOND = 0.01  # the share of pixels beyond its primaries from which on an image is denoised in others
 _SAME = 1e-4  # of a coordinate; files hold 32-bit floats, and standards four digits
 
 
@@ -31,9 +49,11 @@ def to_rec709(attributes: Mapping[str, Any]) -> np.ndarray | None:
     None where it is of Rec. 709 already, where it does not say what it is of, and where what it says is nonsense, of
     which the log has a warning. White becomes white: where the two differ, by Bradford's adaptation.
     """
-    found = attributes.get(ATTRIBUTE)
+    found = _primaries(attributes)
     if found is None:
         return None
+    if found is XYZ_D65:
+        return np.linalg.inv(_to_xyz(np.array(REC709)))
     try:
         values = np.asarray(found, np.float64).ravel()
         if values.shape != (8,) or not np.isfinite(values).all():
@@ -46,16 +66,37 @@ def to_rec709(attributes: Mapping[str, Any]) -> np.ndarray | None:
         return None
 
 
+def _primaries(attributes: Mapping[str, Any]) -> Any:
+    """x, y of the primaries and white that a header tells, as they are in it; None where it tells none."""
+    if attributes.get("acesImageContainerFlag") == 1:
+        return ACES_AP0
+    for name in ("colorInteropID", "chromaticities", "oiio:ColorSpace"):
+        said = attributes.get(name)
+        if name == "chromaticities" and said is not None:
+            return said
+        plain = re.sub("[^a-z0-9]", "", str(said or "").lower())
+        if plain in _SPACES:
+            return _SPACES[plain]
+        if plain not in _NO_SPACE:
+            _LOG.warning("%s '%s' is left out of account: ngpt knows no linear space of that name", name, said)
+    return None
+
+
 def inside_rec709(stack: GradientStack) -> np.ndarray | None:
     """``to_rec709`` of a stack, where nearly all of its light is within Rec. 709, else None.
 
-    What is beyond has negative components there, which OIDN takes for 0 (docs/use/from-your-renderer.md has the price).
+    What is beyond has negative components there, which cost OIDN more than other primaries (docs/use/pictures.md).
     """
     matrix = to_rec709(stack.attributes)
     if matrix is None:
         return None
-    beyond = (converted(stack["primal"], matrix) < 0).any(axis=-1) & (stack["primal"] >= 0).all(axis=-1)
-    return matrix if beyond.mean() <= _BEYOND else None
+    inside = np.where((stack["primal"] >= 0).all(axis=-1, keepdims=True), converted(stack["primal"], matrix), 0)
+    return matrix if negative_share(inside) <= BEYOND else None
+
+
+def negative_share(image: np.ndarray) -> float:
+    """The share of pixels (H, W, 3) that have a negative component."""
+    return float((image < 0).any(axis=-1).mean())
 
 
 def converted(image: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
@@ -85,3 +126,7 @@ def _to_xyz(chromaticities: np.ndarray) -> np.ndarray:
         raise ValueError("they span no colours")
     columns = np.stack([x, y, 1 - x - y])
     return columns[:, :3] * np.linalg.solve(columns[:, :3], columns[:, 3] / y[3])
+
+
+# Takes Rec. 709 to ACES AP0, in which no visible colour has negative components.
+TO_WIDE = np.linalg.inv(_conversion(np.array(ACES_AP0)))

@@ -102,7 +102,7 @@ def resolve(
                 found[layer.name] = match
         if layer.name == "primal":
             if "primal" not in overrides and ("primal" not in found or found["primal"][:2] in _features(groups)):
-                lone = _lone(groups)
+                lone = _of_other_channels(groups, writer) or _lone(groups)
                 if lone is None:
                     raise _no_primal(groups, path)
                 found["primal"] = lone
@@ -290,6 +290,24 @@ def _features(groups: list[_Group]) -> set[tuple[int, tuple[str, ...]]]:
     return {found[:2] for found in _distinct(LAYERS["primal"], named)}
 
 
+def _of_other_channels(groups: list[_Group], writer: str) -> Found | None:
+    """The image of a file without R G B: of luminance, one channel Y that stands for all three, or Mitsuba's X Y Z."""
+    for name in ("primal", ""):
+        for group in (group for group in groups if group.name == name):
+            there = group.channels.keys() & {*RGB, *XYZ, "RY", "BY"}
+            if there == {"Y"}:
+                return Found(group.part, 3 * (group.channels["Y"],), name)
+            if there == {*XYZ} and writer == "Mitsuba":
+                return Found(group.part, tuple(group.channels[suffix] for suffix in XYZ), name)
+    return None
+
+
+def channels_like(found: Found) -> tuple[str, ...]:
+    """What the channels of an image like that one are called: R G B, or as in ``_of_other_channels``."""
+    suffixes = tuple(channel.rpartition(".")[2] for channel in found.channels)
+    return suffixes if suffixes in (("Y", "Y", "Y"), XYZ) else RGB
+
+
 def _lone(groups: list[_Group]) -> Found | None:
     """The only layer of colour that could be the primal, whatever its name."""
     features = _features(groups)
@@ -350,7 +368,7 @@ def _complete(layer: Layer, group: _Group) -> tuple[str, ...]:
 def _no_primal(groups: list[_Group], path: str) -> NgptError:
     root: set[str] = set().union(*(group.channels for group in groups if group.name == ""))
     if "Y" in root and not root & set(RGB):
-        held = "luminance and chroma (channels Y RY BY)" if {"RY", "BY"} <= root else "luminance (channel Y)"
+        held = "luminance and chroma (channels Y RY BY)" if {"RY", "BY"} <= root else "channel Y beside others"
         return NgptError(f"{path}: holds {held} but no colours R G B; save the image with channels R G B")
     return NgptError(
         f"{path}: no primal image (root R G B, or a layer such as primal, Noisy Image or Combined); "

@@ -7,13 +7,14 @@ import numpy as np
 import OpenEXR
 
 from ngpt.errors import NgptError
-from ngpt.io.layout import holds, is_half, scatter, taken
+from ngpt.io.layout import as_stored, data_window, holds, is_half, scatter, taken
 from ngpt.io.openexr import ExrImage, ExrPart
-from ngpt.io.resolution import Found, Resolution, layers_of_light
+from ngpt.io.resolution import Found, Resolution, channels_like, layers_of_light
 from ngpt.io.views import View
 from ngpt.layers import LAYERS
 from ngpt.stack import GradientStack
 from ngpt.system.threads import map_parts
+from ngpt.windows import put
 
 # Attributes that describe how a part is stored, rather than what it shows; a stack's attributes are all others.
 STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"} | {
@@ -56,15 +57,17 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
 
     def is_there(name: str) -> bool:
         found = resolution[name]
-        return holds(image.parts[found.part], found.channels, stack[name], found.factors)
+        if as_stored(image, found, main):
+            return holds(image.parts[found.part], found.channels, stack[name])
+        return np.array_equal(taken(image, found, main), stack[name], equal_nan=True)
 
     unchanged = dict(zip(known, map_parts(is_there, known), strict=True))
     for name in stack.names:
         values, half = stack[name], False
         if unchanged.get(name):
             continue
-        # Channels in another renderer's units stay as they are, and ours go beside them.
-        if name in resolution and not resolution[name].factors:
+        # Channels in another renderer's units, or on other pixels, stay as they are, and ours go beside them.
+        if name in resolution and as_stored(image, resolution[name], main):
             part, names = image.parts[resolution[name].part], resolution[name].channels
             half = is_half(part, names) and not LAYERS[name].float_on_disk
         else:
@@ -80,7 +83,8 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
 def new_header(stack: GradientStack) -> dict[str, Any]:
     """The header of the part for a stack that comes from no file."""
     windows = {"dataWindow": stack.place.data.box, "displayWindow": stack.place.display.box}
-    return {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | windows
+    aspect = {} if stack.place.aspect == 1 else {"pixelAspectRatio": stack.place.aspect}
+    return {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | windows | aspect
 
 
 def leave_out_old_error(stack: GradientStack, image: ExrImage) -> None:
@@ -91,27 +95,49 @@ def leave_out_old_error(stack: GradientStack, image: ExrImage) -> None:
             image.parts[place.part].channels.pop(channel, None)
 
 
+def replaced_layer(resolution: Resolution, view: View, origin: str, into: str | None, path: str) -> Found | None:
+    """The layer that holds a result beside the root: who loads that layer wants the image too.
+
+    ``into`` names it, whole or by its tail after a dot; "root" is none. By default it is the layer that the input came
+    from, unless its name says that it is noisy; ``origin`` is its name where the input was moved before.
+
+    Raises NgptError unless ``into`` fits one layer of colour.
+    """
+    primal, others = resolution["primal"], layers_of_light(view.parts, resolution)
+    root, kept = (
+        tuple(view.channel(view.first, start + c) for c in channels_like(primal)) for start in ("", "primal.")
+    )
+    moved = primal.part == view.first and primal.channels == kept
+    own = {} if moved or (primal.part, primal.channels) == (view.first, root) else {primal.name: primal}
+    if into == "root":
+        return None
+    if into is None:
+        if moved:
+            return others.get(origin)
+        return primal if _NOISY not in primal.name.lower() and primal.channels != root else None
+    fitting = [found for name, found in (own | others).items() if f".{name}".endswith(f".{into}")]
+    if len(fitting) != 1:
+        why = "fits several layers" if fitting else "is no layer of colour"
+        raise NgptError(f"{path}: --into: '{into}' {why}; there are: {', '.join(['root', *own, *others])}")
+    return fitting[0]
+
+
 def with_result(
-    image: ExrImage, resolution: Resolution, view: View, pixels: np.ndarray, origin: str = ""
+    image: ExrImage, resolution: Resolution, view: View, pixels: np.ndarray, shown: Found | None
 ) -> tuple[ExrImage, int]:
     """Returns the file with ``pixels`` (H, W, 3) float32 as the root of a view's first part, the input as primal.R/G/B.
 
-    They also replace the layer that the input came from, whose name goes into the header as ``ngpt:pass``: who loads
-    that layer wants the image too. ``origin`` is its name where the input was moved before. The second value is the
+    They also replace the layer ``shown``, whose name goes into the header as ``ngpt:pass``. The second value is the
     index of the part with the result.
     """
     primal, alpha = resolution["primal"], resolution.get("alpha")
     source, parts, place = image.parts[primal.part], list(image.parts), view.first
-    root, kept = (tuple(view.channel(place, start + c) for c in "RGB") for start in ("", "primal."))
+    suffixes = channels_like(primal)
+    root, kept = (tuple(view.channel(place, start + c) for c in suffixes) for start in ("", "primal."))
     half = is_half(source, primal.channels)
-    moved = primal.part == place and primal.channels == kept
-    if moved:
-        shown = layers_of_light(view.parts, resolution).get(origin) if origin else None
-    else:
-        shown = primal if _NOISY not in primal.name.lower() and primal.channels != root else None
     values = [source.channels[name] for name in primal.channels]
     if primal.factors:
-        values, half = list(np.moveaxis(taken(image, primal), -1, 0)), False
+        values, half = list(np.moveaxis(taken(image, primal, primal.part), -1, 0)), False
     shows_another = primal.channels not in (root, kept) and any(name in source.channels for name in root)
     if primal.part != place or shows_another:
         parts = [part if part.name else replace(part, name="source") for part in parts]
@@ -122,17 +148,20 @@ def with_result(
         header |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "name": name}
         if view.name:
             header = {key: value for key, value in header.items() if key != "multiView"} | {"view": view.name}
-        root, kept = ("R", "G", "B"), ("primal.R", "primal.G", "primal.B")
+        root, kept = suffixes, tuple(f"primal.{suffix}" for suffix in suffixes)
         # At the end the numbers of the other views' parts stay what they are.
         place = 0 if place == 0 else len(parts)
         parts.insert(place, ExrPart(name, header, {}))
     channels = parts[place].channels
     channels.update(zip(kept, values, strict=True))
     if alpha:
-        channels.setdefault(root[0][:-1] + "A", image.parts[alpha.part].channels[alpha.channels[0]])
+        part = image.parts[alpha.part]
+        pixels_of_alpha = put(part.channels[alpha.channels[0]], data_window(part), data_window(source))
+        channels.setdefault(root[0][:-1] + "A", pixels_of_alpha)
     scatter(parts[place], root, pixels, half)
-    if shown and shown.channels != root:
+    if shown:
         part = image.parts[shown.part]
-        scatter(part, shown.channels, pixels, is_half(part, shown.channels))
+        there = put(pixels, data_window(source), data_window(part))
+        scatter(part, shown.channels, there, is_half(part, shown.channels))
         parts[place].header["ngpt:pass"] = shown.name
     return ExrImage(parts), place

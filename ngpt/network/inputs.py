@@ -116,7 +116,9 @@ class Oidn:
 
     def of_base(self, base: np.ndarray) -> np.ndarray:
         """OIDN's image of a reconstruction, (H, W, 3) float32; both without direct emission."""
-        return oidn(replace(self._with_clean_features, image=base), "clean", "fast")
+        # A base swings below zero beside edges. OIDN takes that for 0; negative light of the primal it keeps.
+        least = min(float(self._data.image.min()), 0) - self._data.direct
+        return oidn(replace(self._with_clean_features, image=np.maximum(base, least)), "clean", "fast")
 
     @cached_property
     def _with_clean_features(self) -> Repaired:

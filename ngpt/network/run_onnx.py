@@ -171,7 +171,8 @@ class Network:
             windows = [np.s_[y : y + rows, x : x + columns] for _, _, y, x in group]
             feed = {name: np.stack([planes(layers[name][window]) for window in windows]) for name in names}
             feed |= dict.fromkeys(self.apart, np.zeros_like(feed["primal"]))
-            results = self._run(session, feed | {"statistics": shared})
+            last = first + batch >= len(pieces)
+            results = self._run(session, feed | {"statistics": shared}, last)
             for (inner_y, inner_x, y, x), result in zip(group, results, strict=True):
                 part = result[:, inner_y.start - y : inner_y.stop - y, inner_x.start - x : inner_x.stop - x]
                 image[inner_y, inner_x] = np.moveaxis(part, 0, -1)
@@ -189,10 +190,14 @@ class Network:
             "allow more (--memory, ulimit -v)"
         )
 
-    def _run(self, session, feed: dict[str, np.ndarray]) -> np.ndarray:
+    def _run(self, session, feed: dict[str, np.ndarray], last: bool) -> np.ndarray:
+        """The output of one run. The ``last`` of an image gives its memory back, which ONNX Runtime would keep."""
+        options = runtime().RunOptions()
+        if last and self.device == "cpu":
+            options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
         try:
             feed = {name: values.astype(self.types[name], copy=False) for name, values in feed.items()}
-            result = session.run([self.output], feed)[0]
+            result = session.run([self.output], feed, options)[0]
         except Exception as error:
             if isinstance(error, MemoryError) or "allocate memory" in str(error) or "bad_alloc" in str(error):
                 raise _OutOfMemory(

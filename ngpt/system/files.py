@@ -101,12 +101,14 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
 
     The temporary file keeps the suffix of ``path`` (writers choose the format by it), is flushed to disk before the
     rename, and is removed when the block fails, so nobody ever sees half a file under the final name. The block has to
-    write into that file, not replace it. A process that is killed leaves its temporary file behind, hidden; the next
-    one that writes into the folder removes it, on Windows when it is a day old.
+    write into that file, not replace it. A link stays a link: the file that it leads to is written. A process that is
+    killed leaves its temporary file behind, hidden; the next one that writes into the folder removes it, on Windows
+    when it is a day old.
 
     Raises NgptError when the file cannot be written; of several writers of one new file all but the first.
     """
     path = check_output(path, overwrite)
+    path = Path(os.path.realpath(path)) if path.is_symlink() else path
     temporary = handle = None
     try:
         _sweep(path.parent.absolute())

@@ -1,8 +1,10 @@
 """What this process may use: memory, address space, processors. Systems that set no such limit are asked for none."""
 
 import ctypes
+import math
 import os
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 from ngpt.errors import WrongUse
@@ -22,13 +24,51 @@ _most: int | None = None
 _ASSUMED = 2**34
 
 
+# Where Linux shows the control groups of containers, and which of them this process is in.
+_GROUPS, _OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+
+
 def processors() -> int:
     """Processors that this process may run on, at most ``limit_threads``; the machine's where the system does not say.
 
+    Containers may have less time of processors than these have: then as many as that time is of.
+
     So many threads work at once: NumPy's, SciPy's, ONNX Runtime's, OIDN's and OpenEXR's.
     """
-    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(own, _most or own)
+    own = _visible()
+    return min(own, _most or own, _quota() or own)
+
+
+def _visible() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@cache
+def _quota() -> int | None:
+    """How many processors' time the control groups allow, rounded up; None where they set no limit."""
+    found = [(quota, period) for quota, period in map(str.split, _of_groups("cpu.max", ""))]  # microseconds, or "max"
+    found += zip(_of_groups("cpu.cfs_quota_us", "cpu"), _of_groups("cpu.cfs_period_us", "cpu"), strict=False)
+    limits = [int(quota) / int(period) for quota, period in found if quota.isdecimal()]
+    return max(1, math.ceil(min(limits))) if limits else None
+
+
+def _of_groups(name: str, controller: str) -> list[str]:
+    """What the files of that name say, in all control groups that this process is in, from its own up.
+
+    ``controller``  of version 1, where each has a tree of its own; "" for version 2
+    """
+    try:
+        lines = [line.split(":", 2) for line in _OWN_GROUPS.read_text(encoding="utf-8", errors="replace").splitlines()]
+    except OSError:  # not Linux
+        return []
+    own = next((path for _, names, path in lines if controller in names.split(",")), None)
+    if own is None:
+        return []
+    root = _GROUPS / controller
+    # In a container the path may be the host's, and the group is the root itself.
+    folders = [root / own.strip("/"), *(root / own.strip("/")).parents]
+    files = [folder / name for folder in folders if folder == root or root in folder.parents]
+    return [file.read_text(encoding="ascii").strip() for file in files if file.is_file()]
 
 
 def limit_threads(most: int) -> None:
@@ -44,13 +84,16 @@ def limit_threads(most: int) -> None:
 
 
 def limited() -> bool:
-    return _most is not None
+    """Whether ``processors`` are fewer than libraries that count for themselves would take."""
+    return _most is not None or processors() < _visible()
 
 
 def memory() -> int:
-    """Bytes that this process may have: the machine's, or what its limits leave it."""
-    physical, limit = _physical(), address_space()
-    return physical if limit is None else min(physical, limit)
+    """Bytes that this process may have: the machine's, or what its limits or its container's leave it."""
+    texts = _of_groups("memory.max", "") + _of_groups("memory.limit_in_bytes", "memory")
+    limits = [int(text) for text in texts if text.isdecimal()]
+    own = address_space()
+    return min([_physical(), *limits, *([] if own is None else [own])])
 
 
 def _physical() -> int:

@@ -4,6 +4,7 @@ Anyone can also add methods, samplers, losses and metrics: each registry is a ``
 """
 
 import sys
+import traceback
 from collections.abc import Container, Iterator
 from importlib.util import find_spec
 from typing import Any, TypeVar
@@ -40,6 +41,14 @@ def loaded(point: Any) -> Any:
         return point.load()
     except Exception as error:
         raise NgptError(f"{_owner(point)} cannot be imported: {type(error).__name__}: {error}") from error
+
+
+def blamed(error: Exception) -> str:
+    """What a function of another package raised, and the last of its own lines that it came from."""
+    own = traceback.extract_tb(error.__traceback__)[1:]
+    last = next((frame for frame in reversed(own) if frame.filename == own[0].filename), None)
+    where = f" ({last.filename}, line {last.lineno})" if last else ""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}{where}"
 
 
 def brought(group: str) -> Iterator[Any]:

@@ -39,9 +39,10 @@ def template(
     ``others``  further parameters of a table by name: meaning and default
     """
     given = tomllib.loads(text)
-    heads = [match.start() for match in re.finditer(_HEAD, text, re.M)]
+    # Comments right above a head belong to it.
+    heads = [match.start() for match in re.finditer(rf"(?:^#.*\n)*{_HEAD}", text, re.M)]
     sections = [text[start:end] for start, end in zip([0, *heads], [*heads, len(text)], strict=True)]
-    present = [match[1] if (match := re.match(_HEAD, section, re.M)) else "" for section in sections]
+    present = [match[1] if (match := re.search(_HEAD, section, re.M)) else "" for section in sections]
     for table, kind in tables.items():
         if kind and table not in present:
             sections.append(f"[{table}]\n")

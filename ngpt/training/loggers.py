@@ -39,7 +39,9 @@ class TensorBoard:
 class WeightsAndBiases:
     """A run of the project ``settings.run.wandb``: numbers and settings, no code, no pictures, no weights.
 
-    A run that goes on keeps its id. Raises NgptError where wandb is not installed.
+    A run that goes on keeps its id. Its steps are a number among the others, for W&B drops what comes with an earlier
+    step of its own than the last: all that follows a kill. Raises NgptError where wandb is not installed or cannot
+    begin, for want of a key or a network.
     """
 
     def __init__(self, out: Path, settings: Settings):
@@ -51,18 +53,25 @@ class WeightsAndBiases:
                 f"`{package_command('wandb')}`"
             ) from error
         record = read_json(out / RECORD) if (out / RECORD).is_file() else {}
-        self._run = wandb.init(
-            project=settings.run.wandb,
-            name=out.absolute().name,
-            id=record.get("id"),
-            resume="allow",
-            dir=str(out),
-            config=published(settings),
-            settings=wandb.Settings(disable_git=True, disable_code=True, console="off"),
-        )
+        try:
+            self._run = wandb.init(
+                project=settings.run.wandb,
+                name=out.absolute().name,
+                id=record.get("id"),
+                resume="allow",
+                dir=str(out),
+                config=published(settings),
+                settings=wandb.Settings(disable_git=True, disable_code=True, console="off"),
+            )
+        except Exception as error:  # its own, and whatever its network raises
+            raise NgptError(
+                f"run.wandb = '{settings.run.wandb}': {' '.join(str(error).split())[:200]}; `wandb login`, set "
+                "WANDB_MODE=offline, or leave it out"
+            ) from error
+        self._run.define_metric("*", step_metric="step")
 
     def log(self, step: int, values: dict[str, float]) -> None:
-        self._run.log(values, step=step)
+        self._run.log({"step": step, **values})
 
 
 def loggers(out: Path, step: int, settings: Settings) -> list[Logger]:

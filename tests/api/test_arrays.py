@@ -51,12 +51,28 @@ def test_numpy(layers, features, dtype, channels):
 @pytest.mark.parametrize("dtype", ["bfloat16", "float64"])
 def test_torch(layers, features, dtype):
     torch = pytest.importorskip("torch")
-    image = torch.tensor(with_alpha(layers["primal"]), requires_grad=True).to(getattr(torch, dtype))
+    image = torch.tensor(with_alpha(layers["primal"])).to(getattr(torch, dtype))
     result = ngpt.denoise(image, **{name: torch.tensor(feature) for name, feature in features.items()})
     assert isinstance(result, torch.Tensor) and result.dtype == image.dtype and result.shape == image.shape
     assert result.device == image.device and torch.equal(result[..., 3], image[..., 3])
     expected = ngpt.denoise(image.detach().float().numpy(), **features)
     assert torch.equal(result, torch.tensor(expected).to(image.dtype))
+
+
+def test_gradients_of_torch_do_not_end_in_silence(layers):
+    torch = pytest.importorskip("torch")
+    image = torch.tensor(layers["primal"], requires_grad=True)
+    with pytest.raises(NgptError, match=r"denoise: image carries gradients.*; pass image\.detach\(\)"):
+        ngpt.denoise(image, "primal")
+    with pytest.raises(NgptError, match=r"pass albedo\.detach\(\)"):
+        ngpt.Denoiser((26, 18), albedo=True, method="primal")(image.detach(), image)
+    with torch.no_grad():
+        assert torch.equal(ngpt.denoise(image, "primal"), image)
+    # As docs/use/python.md has it.
+    clean = image + (ngpt.denoise(image.detach(), "oidn") - image).detach()
+    assert torch.allclose(clean, ngpt.denoise(image.detach(), "oidn"), atol=1e-5)
+    clean.sum().backward()
+    assert torch.equal(image.grad, torch.ones_like(image))
 
 
 def test_torch_on_a_graphics_card(layers, features):
@@ -77,6 +93,10 @@ def test_dr_jit(renderer, layers, features):
         result = ngpt.denoise(tensor(image), **{name: mi.TensorXf(feature) for name, feature in features.items()})
         assert type(result) is tensor and result.shape == image.shape
         assert np.allclose(result.numpy(), expected, rtol=0.02, atol=0.01)
+    tracked = mi.TensorXf(image)
+    dr.enable_grad(tracked)
+    with pytest.raises(NgptError, match=r"pass drjit\.detach\(image\)"):
+        ngpt.denoise(tracked)
     further = {name: layers[name] for name in ("dx", "dy")}
     made = ngpt.denoise(mi.TensorXf(layers["primal"]), "l2", **further, alpha=0.1).numpy()
     assert np.array_equal(made, ngpt.denoise(layers["primal"], "l2", **further, alpha=0.1))

@@ -14,9 +14,10 @@ from data_gen.dataset.config import Config as DataConfig
 from data_gen.dataset.config import read_config as read_data
 from ngpt.evaluation.config import Config as EvaluationConfig
 from ngpt.evaluation.config import read_config as read_evaluation
+from ngpt.system.templates import template
 from ngpt.training.loss import make_loss
 from ngpt.training.parameters import TABLES, tables_of
-from ngpt.training.settings import read_settings
+from ngpt.training.settings import RunSettings, read_settings
 
 KINDS = {"train": configs.TRAINING, "dataset": configs.DATASET, "evaluate": configs.EVALUATION}
 READERS = {"train": read_settings, "dataset": read_data, "evaluate": read_evaluation}
@@ -65,6 +66,14 @@ def test_it_is_the_configuration_and_offers_all_that_could_be_set(verb, name, tm
         assert make_loss(everything.loss).settings == make_loss(given.loss).settings
         everything, given = replace(everything, loss={}), replace(given, loss={})
     assert everything == given
+
+
+def test_what_is_said_of_a_table_stays_above_it():
+    text = "steps = 3\n\n[run]\nlog = 1\n\n# Of its own.\n[variants.mine]\nmethod = 2\n"
+    made = template(text, {"": None, "run": RunSettings, "variants": None})
+    assert "\n\n# Of its own.\n[variants.mine]\nmethod = 2\n" in made and made.index("# save =") < made.index(
+        "# Of its"
+    )
 
 
 @pytest.mark.parametrize("verb", KINDS)

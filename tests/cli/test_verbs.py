@@ -6,7 +6,9 @@ import runpy
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+from exr_files import write_raw
 
 from ngpt.cli import all_verbs, main
 from ngpt.system import parts
@@ -114,3 +116,24 @@ def test_without_the_renderer_it_is_told_what_is_missing(status, line, tmp_path,
     assert run.stderr.endswith(
         f"rendering needs the package data_gen, which is not installed; `{install_command('render')}`\n"
     )
+
+
+@pytest.mark.parametrize("name", ["CShading_Albedo", "Info: Diffuse filter", "FinalImageBaseColor"])
+def test_layers_that_look_like_features_are_not_passed_over_in_silence(tmp_path, name, command):
+    """As Corona, Octane and Unreal call them, which names of layers nobody fixes."""
+    pixels = np.full((6, 8), 0.5, np.float32)
+    write_raw(tmp_path / "a.exr", (dict.fromkeys(("R", "G", "B", *(f"{name}.{c}" for c in "RGB")), pixels),))
+    told = command("denoise a.exr -m nfor -o b.exr").err
+    assert f"a.exr: '{name}' looks like albedo and was not used; --layer albedo=\"{name}\" takes it" in told
+    told = command(f"denoise a.exr -m nfor -o c.exr --layer 'albedo={name}'").err
+    assert "looks like" not in told
+
+
+def test_a_tilde_after_an_equals_sign_is_the_home_folder(tmp_path, monkeypatch, command):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "home").mkdir()
+    write_raw(tmp_path / "a.exr", ({c: np.full((6, 8), 0.5, np.float32) for c in "RGB"},))
+    command("picture a.exr --output=~/a.png")
+    command("denoise a.exr -m primal --output=~/b.exr")
+    assert sorted(path.name for path in (tmp_path / "home").iterdir()) == ["a.png", "b.exr"]
+    assert not (tmp_path / "~").exists()

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from exr_files import write_raw
 
 from ngpt.cli import main
 from ngpt.errors import NgptError
@@ -16,6 +17,25 @@ from ngpt.image.transforms import TRANSFORMS, _aces, shown
 from ngpt.io.exr import write
 from ngpt.io.primaries import ACES_AP1, converted, to_rec709
 from ngpt.stack import GradientStack
+
+
+@pytest.mark.parametrize(("aspect", "size"), [(2.0, (52, 18)), (0.5, (26, 36)), (1e3, (26, 18)), (1.0, (26, 18))])
+def test_pixels_that_are_not_square_are_shown_at_their_width(tmp_path, image, aspect, size, command):
+    flat = np.full_like(image, 0.5)
+    flat[:, :13] = 0.1
+    write_raw(tmp_path / "a.exr", (dict.fromkeys("RGB", flat[..., 0]), {"pixelAspectRatio": aspect}))
+    command("picture a.exr -o a.png")
+    command("denoise a.exr -m primal -o b.png")
+    command("denoise a.exr -m primal -o c.exr")
+    command("picture c.exr -o c.png")
+    with opened("a.png") as picture:
+        pixels = np.asarray(picture)
+        assert picture.size == size
+    left, right = pixels[:, : size[0] // 2 - 1, 0], pixels[:, size[0] // 2 + 1 :, 0]
+    assert np.ptp(left) == np.ptp(right) == 0 and left[0, 0] < right[0, 0]
+    for other in ("b.png", "c.png"):
+        with opened(other) as picture:
+            assert np.array_equal(np.asarray(picture), pixels)
 
 
 @pytest.fixture

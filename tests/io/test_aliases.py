@@ -129,7 +129,7 @@ def test_overrides_beat_aliases_match_tails_and_settle_only_their_own_layer():
         (names("a.RGB", "fog.RGB"), {}, 'holds "a" (R G B), "fog" (R G B); name it with --layer primal="NAME"'),
         (names("N.XYZ", "albedo.RGB"), {}, "no primal image"),
         (names("CryptoObject00.rgba", "worldPosition.RGB", "beauty_var.RGB"), {}, "no primal image"),
-        (["Y", "A"], {}, "holds luminance (channel Y) but no colour"),
+        ([*"XYZ"], {}, "holds channel Y beside others but no colours R G B"),
         (["Y", "RY", "BY"], {}, "holds luminance and chroma (channels Y RY BY) but no colours R G B"),
         ([], {}, "no primal image"),
         (names("RGB"), {"colour": "x"}, "no layer is called 'colour'; use one of primal, direct, caustic, dx"),

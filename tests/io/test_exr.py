@@ -161,6 +161,34 @@ def test_cycles_files_get_a_root_to_look_at(tmp_path):
     assert all(same_bits(after[name], before[name]) for name in names)
 
 
+@pytest.mark.parametrize(
+    ("into", "replaced"),
+    [("Combined", "View.Combined"), ("View.Noisy Image", "View.Noisy Image"), ("root", ""), (None, "")],
+)
+def test_into_chooses_the_layer_that_is_replaced(tmp_path, into, replaced, command):
+    layers = {f"View.{name}": [f"View.{name}.{c}" for c in "RGB"] for name in ("Noisy Image", "Combined", "DiffDir")}
+    before = small(*(channel for channels in layers.values() for channel in channels))
+    write_raw(tmp_path / "a.exr", (before,))
+    told = command("denoise a.exr -m primal -o b.exr" + (f" --into '{into}'" if into else "")).err
+    ((_, header, after),) = read_raw(tmp_path / "b.exr")
+    stack = read(tmp_path / "a.exr")
+    write(tmp_path / "c.exr", RESULT, like=stack, into=into)
+    ((_, _, changed),) = read_raw(tmp_path / "c.exr")
+    for name, channels in layers.items():
+        expected = [RESULT[..., i] if name == replaced else before[channel] for i, channel in enumerate(channels)]
+        assert all(same_bits(changed[channel], pixels) for channel, pixels in zip(channels, expected, strict=True))
+    assert header.get("ngpt:pass", "") == replaced and same_bits(after["R"], before["View.Noisy Image.R"])
+    stays = "View.Combined stays as it was (--into Combined replaces it)"
+    assert (stays in told) == (replaced != "View.Combined")
+    assert (f"layers root and {replaced}" in told) == bool(replaced)
+
+
+def test_into_a_layer_that_is_not_there_names_those_that_are(tmp_path):
+    stack = read(write_raw(tmp_path / "a.exr", (small(*ROOT, *(f"a.Combined.{c}" for c in "RGB")),)))
+    with pytest.raises(NgptError, match="'Combine' is no layer of colour; there are: root"):
+        write(tmp_path / "b.exr", RESULT, like=stack, into="Combine")
+
+
 def test_a_primal_in_a_later_part_puts_the_result_in_a_new_first_part(tmp_path):
     parts = [
         (small("Z"), {"compression": OpenEXR.PIZ_COMPRESSION}, "depth"),
@@ -277,19 +305,66 @@ def test_nothing_is_overwritten_unasked(tmp_path):
     assert same_bits(read(path)["primal"], RESULT * 2)
 
 
-def test_layers_in_parts_of_other_size_or_place_are_refused(tmp_path):
-    larger = {name: np.zeros((4, 4), np.float32) for name in "XYZ"}
-    for normal, header, expected in (
-        (
-            small("X", "Y", "Z"),
-            {"dataWindow": window(5, 0, 3, 2)},
-            r"starts at pixel \(5, 0\) but 'primal' at \(0, 0\)",
-        ),
-        (larger, {"displayWindow": window(0, 0, 3, 2)}, "is 4x4 but 'primal' is 3x2"),
-    ):
-        path = write_raw(tmp_path / "a.exr", (small(*ROOT), {}, "rgb"), (normal, header, "N"))
-        with pytest.raises(NgptError, match=f"a.exr: layer 'normal' {expected}"):
-            read(path)
+def test_a_layer_without_a_pixel_of_the_picture_is_refused(tmp_path):
+    parts = (small(*ROOT), {}, "rgb"), (small("X", "Y", "Z"), {"dataWindow": window(5, 0, 3, 2)}, "N")
+    with pytest.raises(NgptError, match=r"a.exr: layer 'normal' is 3x2 at \(5, 0\) but 'primal' 3x2 at \(0, 0\)"):
+        read(write_raw(tmp_path / "a.exr", *parts))
+
+
+def test_parts_with_windows_of_their_own_are_filled_up_with_zeros(tmp_path, rng):
+    """As compositors and Arnold cut them: to where there is anything, and to overscan."""
+    display = {"displayWindow": window(0, 0, 8, 6)}
+    image, normal, albedo, mask = (
+        {name: rng.random(size).astype(np.float32) for name in names}
+        for size, names in (((6, 8), ROOT), ((3, 2), "XYZ"), ((8, 10), ROOT), ((2, 2), "A"))
+    )
+    path = write_raw(
+        tmp_path / "a.exr",
+        (image, display, "rgb"),
+        (normal, display | {"dataWindow": window(3, 1, 2, 3)}, "N"),
+        (albedo, display | {"dataWindow": window(-1, -1, 10, 8)}, "albedo"),
+        (mask, display | {"dataWindow": window(6, 0, 2, 2)}, "A"),
+    )
+    stack = read(path)
+    expected = np.zeros((6, 8, 3), np.float32)
+    expected[1:4, 3:5] = np.stack(list(normal.values()), axis=-1)
+    assert np.array_equal(stack["normal"], expected)
+    assert np.array_equal(stack["albedo"], np.stack(list(albedo.values()), axis=-1)[1:7, 1:9])
+    assert np.array_equal(stack["alpha"][:2, 6:, 0], mask["A"]) and stack["alpha"].sum() == pytest.approx(
+        mask["A"].sum()
+    )
+    # Parts stay as they are in results; layers that are changed go beside them.
+    result = write(tmp_path / "b.exr", stack["primal"], like=stack.replace(normal=-expected))
+    held = {name: channels for name, _, channels in read_raw(result)}
+    assert all(same_bits(held["N"][name], normal[name]) for name in "XYZ") and held["rgb"]["A"].shape == (6, 8)
+    assert np.array_equal(read(result)["normal"], -expected)
+
+
+# What Mitsuba's films write with the pixel formats `luminance` and `xyz`.
+@pytest.mark.parametrize(("names", "header"), [("Y", {}), ("XYZ", {"generatedBy": "Mitsuba version 3.9.1"})])
+def test_images_of_other_channels_are_written_as_they_came(tmp_path, rng, names, header):
+    channels = {name: rng.uniform(0.2, 1, (6, 8)).astype(np.float16) for name in names}
+    path = write_raw(tmp_path / "a.exr", (channels | {"A": np.ones((6, 8), np.float16)}, header))
+    stack = read(path)
+    assert (
+        np.array_equal(stack["primal"], np.stack([channels[n] for n in (names * 3)[:3]], axis=-1)) and "alpha" in stack
+    )
+    result = write(tmp_path / "b.exr", 2 * stack["primal"], like=stack)
+    ((_, _, held),) = read_raw(result)
+    assert held.keys() == {*names, "A", *(f"primal.{name}" for name in names)}
+    assert all(same_bits(held[f"primal.{n}"], channels[n]) and same_bits(held[n], 2 * channels[n]) for n in names)
+    again = read(result)
+    assert np.array_equal(again["primal"], stack["primal"])
+    np.testing.assert_allclose(ngpt.read_image(result), 2 * ngpt.read_image(path), rtol=2e-3)
+    ((_, _, held),) = read_raw(write(tmp_path / "c.exr", again["primal"], like=again))
+    assert held.keys() == {*names, "A", *(f"primal.{name}" for name in names)}
+    if names == "XYZ":
+        white = {"X": np.full((1, 1), 0.9505, "f4"), "Y": np.ones((1, 1), "f4"), "Z": np.full((1, 1), 1.0891, "f4")}
+        seen = ngpt.read_image(write_raw(tmp_path / "white.exr", (white, header)))
+        np.testing.assert_allclose(seen, 1, atol=1e-3)
+    else:
+        with pytest.raises(NgptError, match="channel 'Y' is luminance, and the image has colours"):
+            write(tmp_path / "d.exr", stack["primal"] * [1, 2, 3], like=stack)
 
 
 def test_uint_channels_are_read_as_numbers(tmp_path):

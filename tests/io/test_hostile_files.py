@@ -109,10 +109,10 @@ def test_more_than_half_of_the_memory_is_not_decoded(tmp_path, monkeypatch):
     assert "its 3 channels take 0.0 GiB, more than half of" in refused(path)
 
 
-@pytest.mark.parametrize("name", ["RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB", "HTJ2K256"])
+@pytest.mark.parametrize("name", [name for name in OpenEXR.Compression.__members__ if not name.startswith("NUM")])
 def test_what_compresses_best_is_no_bomb(tmp_path, name):
     """Bounds on how much a byte may stand for hold for black images, which are the smallest."""
-    header = {"compression": getattr(OpenEXR, f"{name}_COMPRESSION")}
+    header = {"compression": getattr(OpenEXR, name)}
     for dtype in (np.float16, np.float32, np.uint32):
         black = {channel: np.zeros((512, 512), dtype) for channel in "RGB"}
         image = read_exr(write_raw(tmp_path / "a.exr", (black, header)))

@@ -48,6 +48,47 @@ def test_what_says_nothing_or_nonsense_is_left_as_it_is(caplog):
         caplog.clear()
 
 
+def test_xyz_is_what_the_standard_says():
+    matrix = to_rec709({"colorInteropID": "lin_ciexyzd65_scene"})
+    expected = [[3.2410, -1.5374, -0.4986], [-0.9692, 1.8760, 0.0416], [0.0556, -0.2040, 1.0570]]  # IEC 61966-2-1
+    np.testing.assert_allclose(matrix, expected, atol=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        ({"colorInteropID": "lin_ap1_scene"}, ACES_AP1),
+        ({"colorInteropID": "lin_ap1_scene", "chromaticities": REC2020}, ACES_AP1),
+        ({"colorInteropID": "lin_rec709_scene", "chromaticities": REC2020}, REC709),
+        ({"colorInteropID": "unknown", "chromaticities": REC2020}, REC2020),
+        ({"acesImageContainerFlag": 1, "chromaticities": REC709}, ACES_AP0),
+        ({"acesImageContainerFlag": 0}, REC709),
+        ({"oiio:ColorSpace": "ACEScg"}, ACES_AP1),
+        ({"oiio:ColorSpace": "Linear Rec.2020", "chromaticities": ACES_AP0}, ACES_AP0),
+        ({"oiio:ColorSpace": "scene_linear"}, REC709),
+    ],
+)
+def test_color_spaces_are_read_by_name(header, expected, caplog):
+    found, right = to_rec709(header), to_rec709({"chromaticities": expected})
+    assert (found is None) == (right is None) and (found is None or np.array_equal(found, right))
+    assert not caplog.records
+
+
+def test_names_of_spaces_that_are_unknown_are_said(tmp_path, image, caplog):
+    header = {"colorInteropID": "srgb_rec709_scene", "oiio:ColorSpace": "my film"}
+    write(tmp_path / "a.exr", GradientStack.from_arrays(primal=image, attributes=header))
+    assert np.array_equal(read_image(tmp_path / "a.exr"), image)
+    for name in header.values():
+        assert f"'{name}' is left out of account" in caplog.text
+
+
+def test_a_named_space_is_shown_as_its_chromaticities_are(tmp_path, image):
+    there = of(ACES_AP1, image)["primal"]
+    named = GradientStack.from_arrays(primal=there, attributes={"colorInteropID": "lin_ap1_scene"})
+    write(tmp_path / "a.exr", named)
+    np.testing.assert_allclose(read_image(tmp_path / "a.exr"), image, atol=2e-6)
+
+
 @pytest.mark.parametrize("primaries", [ACES_AP0, REC2020])
 def test_a_result_is_in_the_primaries_of_its_file(tmp_path, image, primaries):
     write(tmp_path / "stack.exr", of(primaries, image, albedo=image))

@@ -4,6 +4,7 @@ Blender's (5.0.1, by ``blender_scene.py``, which says how), as a user gets them 
 LuxCore's (2.11.2, 16 samples per pixel), a file for each buffer.
 """
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,10 @@ def test_what_cycles_denoised_is_not_denoised_again():
     assert np.isclose(both["primal"], noisy["primal"], rtol=1e-3, atol=1e-3).mean() > 0.99
     chosen = ngpt.read(FILES / "blender-denoised.exr", layers={"primal": "ViewLayer.Combined"})["primal"]
     assert np.abs(chosen - noisy["primal"]).mean() > 0.01
+
+
+def test_of_a_file_with_all_features_nothing_is_said_to_be_missing(command):
+    assert json.loads(command(f"info {FILES / 'blender-parts.exr'} --json").out)["missing"] == []
 
 
 def test_motion_leads_to_the_frame_before():

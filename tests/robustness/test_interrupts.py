@@ -53,6 +53,20 @@ def test_an_interrupt_during_import_is_one_line():
     assert (run.returncode, run.stderr) == (130, "ngpt: error: interrupted\n")
 
 
+def test_an_interrupt_before_the_command_is_there_is_one_line():
+    code = (
+        "import sys\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, *rest):\n"
+        "        if name == 'argparse': raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "from ngpt.__main__ import main\n"
+        "sys.exit(main())"
+    )
+    run = complete([sys.executable, "-c", code])
+    assert (run.returncode, run.stderr) == (130, "ngpt: error: interrupted\n")
+
+
 def test_a_second_sigterm_discards_them():
     from data_gen.session import stop_on_ctrl_c
 

@@ -42,6 +42,20 @@ def test_overwrites_only_when_told(tmp_path):
     assert path.read_text() == "hours"
 
 
+def test_links_stay_links(tmp_path):
+    (tmp_path / "real").mkdir()
+    file, link, dangling = tmp_path / "real" / "a.txt", tmp_path / "link.txt", tmp_path / "new.txt"
+    file.write_text("old")
+    link.symlink_to(file)
+    dangling.symlink_to(tmp_path / "real" / "b.txt")
+    with pytest.raises(NgptError, match="--force"):
+        hours_of_work(link)
+    hours_of_work(link, overwrite=True)
+    hours_of_work(dangling)
+    assert link.is_symlink() and file.read_text() == "hours"
+    assert dangling.is_symlink() and (tmp_path / "real" / "b.txt").read_text() == "hours"
+
+
 def test_a_file_that_another_writer_finished_meanwhile_is_kept(tmp_path):
     path = tmp_path / "a.txt"
     with pytest.raises(NgptError, match="exists already"), atomic_output(path) as temporary:

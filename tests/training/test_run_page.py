@@ -16,6 +16,7 @@ from ngpt.errors import NgptError
 from ngpt.network import safetensors
 from ngpt.system import configs
 from ngpt.training import images
+from ngpt.training.loggers import loggers
 from ngpt.training.run_record import write_record
 
 CROPS = [SyntheticCrop(f"<scene> {i}", i) for i in range(4)]
@@ -115,11 +116,24 @@ def test_the_page_fits_a_telephone_and_no_rule_is_broken(browser, finished):
 
 
 def test_numbers_go_to_weights_and_biases_where_that_is_asked_for(tmp_path, monkeypatch):
-    calls, sent = [], []
+    calls, sent, axes = [], [], []
+
+    class Theirs:
+        """Drops steps before the last, as W&B does, unless they are a number among the others."""
+
+        last = 0
+
+        def log(self, values, step=None):
+            if step is None or step >= Theirs.last:
+                Theirs.last = step or Theirs.last
+                sent.append((values.get("step", step), values))
+
+        def define_metric(self, name, step_metric):
+            axes.append((name, step_metric))
 
     def init(**given):
         calls.append(given)
-        return SimpleNamespace(log=lambda values, step: sent.append((step, values)))
+        return Theirs()
 
     fake = SimpleNamespace(init=init, Settings=lambda **given: given)
     monkeypatch.setitem(sys.modules, "wandb", fake)
@@ -134,7 +148,15 @@ def test_numbers_go_to_weights_and_biases_where_that_is_asked_for(tmp_path, monk
     more.resume()
     more.run()
     assert calls[1]["id"] == calls[0]["id"] and len(calls[0]["id"]) == 16
-    # What is not installed is said before the first step.
+    assert axes == 2 * [("*", "step")] and sent[-1][0] == 3
+    # After a kill it goes on from an earlier step than the last that it told.
+    logger = loggers(tmp_path / "mine", 2, more.settings)[-1]
+    logger.log(2, {"loss": 0.5})
+    assert sent[-1] == (2, {"step": 2, "loss": 0.5})
+    # Without a key, and what is not installed, is said before the first step.
+    fake.init = lambda **given: (_ for _ in ()).throw(RuntimeError("api_key not configured\n(no-tty)"))
+    with pytest.raises(NgptError, match=r"run\.wandb = 'kitchens': api_key not configured \(no-tty\); `wandb login`"):
+        made(tmp_path / "keyless", wandb="kitchens").run()
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(NgptError, match=r"run\.wandb = 'kitchens': wandb is not installed; .*pip install wandb"):
         made(tmp_path / "lacking", wandb="kitchens").run()

@@ -1,0 +1,42 @@
+"""Images of 360 degrees: their left and right borders are neighbours, so methods see them continued on both sides.
+
+An image is one if its header says so: by OpenEXR's ``envmap`` for latitude and longitude, or by our ``ngpt:wrap``.
+"""
+
+import numpy as np
+
+from ngpt.stack import GradientStack
+
+WRAP = "ngpt:wrap"  # a header attribute, 1: the image wraps
+# Columns that are added on each side. OIDN looks so far around a pixel, and classical methods hardly farther.
+MARGIN = 96
+
+
+def wraps(stack: GradientStack) -> bool:
+    """Whether the first column comes after the last: of a panorama that is whole from left to right."""
+    said = stack.attributes.get("envmap", "")
+    whole = (stack.place.data.left, stack.width) == (stack.place.display.left, stack.place.display.width)
+    return whole and (stack.attributes.get(WRAP) == 1 or getattr(said, "name", said) == "ENVMAP_LATLONG")
+
+
+def wrapping(stack: GradientStack) -> GradientStack:
+    """The stack of an image that wraps, whatever its header says."""
+    return GradientStack(stack.layers, stack.attributes | {WRAP: 1}, stack.source, stack.path, stack.place)
+
+
+def continued(stack: GradientStack) -> GradientStack:
+    """The stack (H, W) as one that does not wrap, (H, W + 2 MARGIN), with the image's other side beside each border.
+
+    Differences between the last column and the first are not known, and count as lost ones do.
+    """
+    columns = np.arange(-MARGIN, stack.width + MARGIN) % stack.width
+    layers = {name: stack[name][:, columns] for name in stack.names}
+    if "dx" in stack:
+        layers["dx"][:, columns == stack.width - 1] = np.nan
+    attributes = {name: value for name, value in stack.attributes.items() if name not in ("envmap", WRAP)}
+    return GradientStack(layers, attributes, stack.source, stack.path)
+
+
+def middle(image: np.ndarray) -> np.ndarray:
+    """(H, W, C) of an image that belongs to what ``continued`` made."""
+    return image[:, MARGIN:-MARGIN]
