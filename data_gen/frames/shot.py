@@ -20,7 +20,7 @@ from data_gen.samplers import FRAME_SAMPLERS, FrameSampler
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.geometry import Geometry
 from data_gen.scenes.load import load_scene
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, stop_if_interrupted
 from ngpt.merging import UNFINISHED
 from ngpt.stack import GradientStack
 
@@ -216,7 +216,12 @@ def render_shot(
                     stack = render_stack(scene, spp, own, sampler, progress=progress(frame), **options)
                 except Unfinished as error:
                     stack, failed = error.stack, error
-                motion, shift, _ = _motion(scene, now, before)
+                try:
+                    motion, shift, _ = _motion(scene, now, before)
+                except Exception as error:  # the frame has all its samples, which are not lost
+                    stop_if_interrupted(error)
+                    failed, (motion, shift, _) = error, _motion(scene, now, None)
+                    stack.attributes[UNFINISHED] = "failed"
             before, last = now, frame
         done = i + 1
         stack = _placed(stack, frame, previous, motion + np.asarray(shift, np.float32))
