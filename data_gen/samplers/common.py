@@ -24,7 +24,7 @@ from data_gen.scenes.cameras import check_camera
 from data_gen.scenes.facts import Facts, scene_facts
 from data_gen.scenes.integrators import own_estimate
 from data_gen.scenes.lamps import Places, weighed
-from data_gen.scenes.load import path_depths, reference_integrator
+from data_gen.scenes.load import check_scene, path_depths, reference_integrator
 from ngpt.layers import LAYERS
 from ngpt.options import written
 
@@ -131,6 +131,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
 
     def render_film(self, scene, sensor, seed: int, spp: int) -> GradientFilm:
         check_camera(sensor)
+        check_scene(scene)
         limits = {
             "lane_bytes": self.entry.lane_bytes,
             "batch": self.entry.batch,

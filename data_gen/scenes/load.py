@@ -15,6 +15,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.scenes.bounds import mend_bounds
 from data_gen.scenes.builtin import SCENES, no_scene
 from data_gen.scenes.cameras import sensor_number
 from data_gen.scenes.integrators import check_integrator, followed
@@ -67,8 +68,12 @@ def load_scene(
 
 
 def check_scene(scene: object) -> mi.Scene:
-    """The scene, where it is one of the current variant. Raises NgptError for what has to be loaded first."""
+    """The scene, where it is one of the current variant, with right bounding boxes: see ``bounds``.
+
+    Raises NgptError for what has to be loaded first.
+    """
     if isinstance(scene, mi.Scene):
+        mend_bounds(scene)
         return scene
     kind = type(scene).__name__
     if isinstance(scene, dict):
