@@ -1,8 +1,8 @@
 """Bounding boxes of meshes that Mitsuba has merged: it leaves out rectangles.
 
-``mi.load_file`` and ``mi.load_dict`` merge meshes of one material (``optimize=True``). The box of the result then lacks
-each rectangle among them (Mitsuba 3.9), and with it the box of the scene. Light from far away starts on a sphere around
-that box: where the sphere is too small, sun and sky pass through walls.
+``mi.load_file`` and ``mi.load_dict`` merge meshes of one material (``optimize=True``), and ``load_scene`` does. The box
+of the result then lacks each rectangle among them (Mitsuba 3.9), and so does the box of the scene. Light from far away
+starts on a sphere around that box: where the sphere is too small, sun and sky pass through walls.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from data_gen.scenes.geometry import Mesh, geometry, vertices_name
+from data_gen.scenes.geometry import vertices_name
 from ngpt.errors import NgptError
 
 
@@ -35,12 +35,10 @@ def mend_bounds(scene: mi.Scene) -> None:
 
 
 def bounded(shape: mi.Shape) -> bool:
-    """Whether the box of a mesh contains all its vertices that are finite."""
-    found, box = geometry(shape), shape.bbox()
-    if not isinstance(found, Mesh):
-        return True
-    finite = found.vertices[np.isfinite(found.vertices).all(axis=1)]
-    return bool((finite >= np.array(box.min)).all() and (finite <= np.array(box.max)).all())
+    """Whether the box of a mesh contains all its vertices; numbers that are NaN do not count."""
+    params, box = mi.traverse(shape), shape.bbox()
+    corners = np.array(params[vertices_name(params)]).reshape(-1, 3)
+    return not ((corners < np.array(box.min)).any() or (corners > np.array(box.max)).any())
 
 
 def _compute_again(shape: mi.Shape) -> None:

@@ -62,6 +62,7 @@ def load_scene(
         raise NgptError(f"{name}: describes a {type(scene).__name__}, not a whole scene")
     if not scene.sensors():
         raise NgptError(f"{name}: the scene has no sensor (camera)")
+    mend_bounds(scene)
     if size is not None:
         set_film_size(scene, size)
     return scene
@@ -150,16 +151,16 @@ def reference_integrator(scene: mi.Scene) -> mi.SamplingIntegrator:
 
 
 # The plugins that read meshes, and their settings that change normals
-_MESHES = ("obj", "ply", "serialized")
+_MESHES = ("obj", "ply", "serialized", "cube", "rectangle")
 _NORMALS = ("face_normals", "flip_normals")
 
 
 def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int | str | None) -> object:
     """What ``mi.load_file`` gives, with no sensor but the one of that number or id, where one is named.
 
-    Where ``merged``, meshes of one material that neither shine nor bound a medium are one, and lose their names. Merged
-    as Mitsuba would (``optimize=True``), shapes and emitters come in another order each time, and with them other bits;
-    here they have the file's order, each group the place of its first mesh.
+    Where ``merged``, equal materials are one, and so are meshes of one material that neither shine nor bound a medium:
+    they lose their names. Merged as Mitsuba would (``optimize=True``), shapes and emitters come in another order each
+    time, and with them other bits; here they have the file's order, each group the place of its first mesh.
     """
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
@@ -170,10 +171,12 @@ def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int |
         state = mi.parser.parse_file(config, path, **parameters)
         mi.parser.transform_all(config, state)
         if state.root.props.plugin_name() == "scene":
-            if merged:
-                _merge(state)
             if sensor is not None:
                 _keep(state, sensor, path)
+            if merged:
+                # Exporters repeat a material in each shape. Equal ones become the first of them.
+                mi.parser.transform_merge_equivalent(config, state)
+                _merge(state)
         return mi.parser.instantiate(config, state)
 
 
@@ -184,18 +187,25 @@ def _merge(state: mi.parser.ParserState) -> None:
         if isinstance(reference, mi.Properties.ResolvedReference) and (key := _group(state, reference.index())):
             groups.setdefault(key, []).append(name)
     for names in groups.values():
-        if len(names) == 1:
-            continue
-        node = mi.parser.SceneNode()
-        node.type, node.props = mi.ObjectType.Shape, mi.Properties("merge")
-        for i, name in enumerate(names):
-            node.props[f"mesh_{i}"] = scene[name]
-        state.nodes.append(node)
-        # The list may have moved.
+        merged = _in_pairs(state, [scene[name] for name in names])
+        # The list of nodes may have moved.
         scene = state.root.props
-        scene[names[0]] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
+        scene[names[0]] = merged
         for name in names[1:]:
             del scene[name]
+
+
+def _in_pairs(state: mi.parser.ParserState, meshes: list) -> mi.Properties.ResolvedReference:
+    """One mesh of all: each is copied as often as they can be halved, and not once for each that is added."""
+    if len(meshes) == 1:
+        return meshes[0]
+    node = mi.parser.SceneNode()
+    node.type, node.props = mi.ObjectType.Shape, mi.Properties("merge")
+    middle = len(meshes) // 2
+    for i, half in enumerate((meshes[:middle], meshes[middle:])):
+        node.props[f"mesh_{i}"] = _in_pairs(state, half)
+    state.nodes.append(node)
+    return mi.Properties.ResolvedReference(len(state.nodes) - 1)
 
 
 def _keep(state: mi.parser.ParserState, sensor: int | str, path: str) -> None:
