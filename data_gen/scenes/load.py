@@ -1,8 +1,4 @@
-"""Scenes: loaded from a Mitsuba file or built in, with errors that say what is wrong.
-
-Meshes of scene files are merged by material: each shape is a case of its own in the kernels, which Dr.Jit records
-before the first ray. A room of 800 meshes takes seconds for that, a tenth of it once meshes of one material are one.
-"""
+"""Scenes: loaded from a Mitsuba file or built in, with errors that say what is wrong."""
 
 from __future__ import annotations
 
@@ -10,7 +6,6 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -19,6 +14,7 @@ from data_gen.scenes.bounds import mend_bounds
 from data_gen.scenes.builtin import SCENES, no_scene
 from data_gen.scenes.cameras import sensor_number
 from data_gen.scenes.integrators import check_integrator, followed
+from data_gen.scenes.merge import merge
 from ngpt.errors import NgptError, stop_if_interrupted
 
 # Threads that it takes to load any scene
@@ -150,17 +146,11 @@ def reference_integrator(scene: mi.Scene) -> mi.SamplingIntegrator:
     return followed(integrator)
 
 
-# The plugins that read meshes, and their settings that change normals
-_MESHES = ("obj", "ply", "serialized", "cube", "rectangle")
-_NORMALS = ("face_normals", "flip_normals")
-
-
 def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int | str | None) -> object:
     """What ``mi.load_file`` gives, with no sensor but the one of that number or id, where one is named.
 
-    Where ``merged``, equal materials are one, and so are meshes of one material that neither shine nor bound a medium:
-    they lose their names. Merged as Mitsuba would (``optimize=True``), shapes and emitters come in another order each
-    time, and with them other bits; here they have the file's order, each group the place of its first mesh.
+    Where ``merged``, meshes are as ``data_gen.scenes.merge`` has them. Merged as Mitsuba would (``optimize=True``),
+    shapes and emitters come in another order each time, and with them other bits.
     """
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
@@ -174,38 +164,8 @@ def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int |
             if sensor is not None:
                 _keep(state, sensor, path)
             if merged:
-                # Exporters repeat a material in each shape. Equal ones become the first of them.
-                mi.parser.transform_merge_equivalent(config, state)
-                _merge(state)
+                merge(config, state)
         return mi.parser.instantiate(config, state)
-
-
-def _merge(state: mi.parser.ParserState) -> None:
-    scene = state.root.props
-    groups: dict[Any, list[str]] = {}
-    for name, reference in scene.items():
-        if isinstance(reference, mi.Properties.ResolvedReference) and (key := _group(state, reference.index())):
-            groups.setdefault(key, []).append(name)
-    for names in groups.values():
-        merged = _in_pairs(state, [scene[name] for name in names])
-        # The list of nodes may have moved.
-        scene = state.root.props
-        scene[names[0]] = merged
-        for name in names[1:]:
-            del scene[name]
-
-
-def _in_pairs(state: mi.parser.ParserState, meshes: list) -> mi.Properties.ResolvedReference:
-    """One mesh of all: each is copied as often as they can be halved, and not once for each that is added."""
-    if len(meshes) == 1:
-        return meshes[0]
-    node = mi.parser.SceneNode()
-    node.type, node.props = mi.ObjectType.Shape, mi.Properties("merge")
-    middle = len(meshes) // 2
-    for i, half in enumerate((meshes[:middle], meshes[middle:])):
-        node.props[f"mesh_{i}"] = _in_pairs(state, half)
-    state.nodes.append(node)
-    return mi.Properties.ResolvedReference(len(state.nodes) - 1)
 
 
 def _keep(state: mi.parser.ParserState, sensor: int | str, path: str) -> None:
@@ -221,15 +181,6 @@ def _keep(state: mi.parser.ParserState, sensor: int | str, path: str) -> None:
         for number, name in enumerate(found):
             if number != kept:
                 del scene[name]
-
-
-def _group(state: mi.parser.ParserState, number: int) -> tuple | None:
-    """What meshes that become one have in common; None for a node that stays as it is."""
-    props = state.nodes[number].props
-    parts = [part.index() for _, part in props.items() if isinstance(part, mi.Properties.ResolvedReference)]
-    if props.plugin_name() not in _MESHES or len(parts) != 1 or state.nodes[parts[0]].type != mi.ObjectType.BSDF:
-        return None
-    return (*parts, *(bool(props.get(name, False)) for name in _NORMALS))
 
 
 @contextmanager

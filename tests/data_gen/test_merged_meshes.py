@@ -108,23 +108,51 @@ def test_equal_materials_are_one_and_shapes_keep_the_order_of_the_file(renderer,
 
 def test_many_meshes_are_merged_in_pairs(renderer, tmp_path, monkeypatch):
     """Each is copied as often as they can be halved. One after the other, the time grows with the square."""
-    from data_gen.scenes import load
+    from data_gen.scenes import merge
 
     (tmp_path / "it.ply").write_text(quad(0))
     path = tmp_path / "scene.xml"
     path.write_text(
         INLINE.format(bsdf("red", ".7,.2,.2") + 33 * shape("it", '<ref id="red"/>').replace(' id="it"', ""))
     )
-    parts, known = [], load._merge
+    halves, known = [], merge._in_pairs
 
-    def spied(state):
-        known(state)
-        parts.extend(len(node.props.keys()) for node in state.nodes if node.props.plugin_name() == "merge")
+    def spied(state, meshes):
+        halves.append(len(meshes))
+        return known(state, meshes)
 
-    monkeypatch.setattr(load, "_merge", spied)
+    monkeypatch.setattr(merge, "_in_pairs", spied)
     (only,) = load_scene(str(path)).shapes()
     assert only.primitive_count() == 66
-    assert parts == 32 * [2]
+    assert sorted(halves) == sorted([1] * 33 + [2] * 16 + [3] + [4] * 7 + [5] + [8] * 3 + [9, 16, 17, 33])
+
+
+GROUP = """<shape type="shapegroup" id="group">{}</shape>
+<shape type="instance"><ref id="group"/><transform name="to_world"><translate x="-3"/></transform></shape>
+<shape type="instance"><ref id="group"/><transform name="to_world"><rotate y="1" angle="40"/><scale x="2"/></transform>
+</shape>"""
+
+
+def test_instances_of_small_groups_are_meshes(renderer, tmp_path, monkeypatch):
+    """And so they share the shape of their material, which is recorded once, not once for each."""
+    import mitsuba as mi
+
+    path = tmp_path / "scene.xml"
+    (tmp_path / "it.ply").write_text(quad(0.5, smooth=True))
+    smooth = shape("it", bsdf("green", ".2,.7,.2"))
+    path.write_text(INLINE.format(GROUP.format(inline(0) + smooth) + inline(3)))
+    views = mi.load_dict({"type": "aov", "aovs": "n:sh_normal,g:geo_normal,u:uv,d:depth,a:albedo"})
+    images = []
+    for merged, kinds in ((True, ["Mesh", "Mesh"]), (False, ["Instance", "Instance", "Cube"])):
+        scene = load_scene(str(path), merged=merged)
+        assert [shape.class_name() for shape in scene.shapes()] == kinds
+        images.append(np.array(mi.render(scene, integrator=views, spp=4, seed=1)))
+    assert images[0][..., 0].max() > 0 and np.allclose(*images, atol=1e-4)
+    ball = inline(1, "sphere")
+    for inside, most in ((inline(0), 1000), (inline(0) + ball, 1 << 24)):
+        monkeypatch.setattr("data_gen.scenes.merge._MOST_BYTES", most)
+        path.write_text(INLINE.format(GROUP.format(inside)))
+        assert [shape.class_name() for shape in load_scene(str(path)).shapes()] == ["Instance"] * 2
 
 
 def test_it_is_the_same_scene(renderer, scene_file):
