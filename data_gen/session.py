@@ -99,6 +99,7 @@ def render_scene(
     from data_gen.choosing.trials import Pilot
     from data_gen.render import check_limits, render_stack
     from data_gen.scenes.cameras import sensor_names
+    from data_gen.scenes.dark import warn_if_black, warn_without_lamps
 
     memory = DEFAULT_MEMORY if memory is None else memory
     if spp is None and seconds is None and error is None:
@@ -112,6 +113,7 @@ def render_scene(
     if sensor is None and len(scene.sensors()) > 1:
         names = sensor_names([camera.id() for camera in scene.sensors()])
         said(f"there are {len(scene.sensors())} sensors ({names}), and none is named: 0 is rendered")
+    warn_without_lamps(scene)
     plan = None
     if sharing is None and sampler == "auto":
         pilot = Pilot(said=said, stop=stop, unbiased=unbiased)
@@ -138,6 +140,7 @@ def render_scene(
         unbiased=unbiased,
         **options,
     )
+    warn_if_black(scene, stack["primal"])
     if plan is None:
         used = stack.attributes["ngpt:sampler"]
         plan = plans.Plan(used, method or "", sharing is not None, seconds, "as it was asked for")

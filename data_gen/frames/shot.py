@@ -17,10 +17,11 @@ from data_gen.frames.motion import Snapshot, depth, motion_vectors, seen, snapsh
 from data_gen.frames.time_differences import difference, light
 from data_gen.render import options_as_attribute, render_stack, stack_of
 from data_gen.samplers import FRAME_SAMPLERS, FrameSampler
+from data_gen.scenes.dark import warn_without_lamps
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.geometry import Geometry
 from data_gen.scenes.load import load_scene
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, stop_if_interrupted
 from ngpt.merging import UNFINISHED
 from ngpt.stack import GradientStack
 
@@ -113,6 +114,8 @@ class Shot:
             self._scene = self._shapes = None
             gc.collect()  # two scenes in memory would make kernels larger
             self._scene = load_scene(name, self.size, wanted[1], merged=False, sensor=self.sensor)
+            if self._loaded is None:
+                warn_without_lamps(self._scene)
             self._loaded = wanted
         scene = self._scene
         if self.update is not None:
@@ -216,7 +219,12 @@ def render_shot(
                     stack = render_stack(scene, spp, own, sampler, progress=progress(frame), **options)
                 except Unfinished as error:
                     stack, failed = error.stack, error
-                motion, shift, _ = _motion(scene, now, before)
+                try:
+                    motion, shift, _ = _motion(scene, now, before)
+                except Exception as error:  # the frame has all its samples, which are not lost
+                    stop_if_interrupted(error)
+                    failed, (motion, shift, _) = error, _motion(scene, now, None)
+                    stack.attributes[UNFINISHED] = "failed"
             before, last = now, frame
         done = i + 1
         stack = _placed(stack, frame, previous, motion + np.asarray(shift, np.float32))

@@ -107,6 +107,8 @@ class CameraSamples:
             return dr.gather(type(value), value, lanes) if dr.width(value) > 1 else value
 
         some = copy(self)
+        if self.seen:
+            some.seen = {shift: tuple(dr.gather(type(v), v, lanes) for v in seen) for shift, seen in self.seen.items()}
         some.random = self.random.at(lanes)
         some.position, some.lens, some.time, some.wavelength = map(
             gather, (self.position, self.lens, self.time, self.wavelength)

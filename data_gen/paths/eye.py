@@ -10,6 +10,55 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.paths.camera import CameraSamples
+from data_gen.scenes.cameras import camera_name
+
+
+@dataclass
+class ThinLens:
+    """Mitsuba's camera ``thinlens`` in our terms: Dr.Jit 1.5 does not find its arrays, and records no function amid
+    which it is asked."""
+
+    radius: mi.Float
+    focus: mi.Float
+    # The place on the film, in [0, 1]² of the crop window, is ``scale`` (x, y) / z + ``shift`` in the camera's space.
+    scale: mi.Vector2f
+    shift: mi.Vector2f
+
+    @classmethod
+    def of(cls, sensor: mi.Sensor) -> ThinLens:
+        params, film = mi.traverse(sensor), sensor.film()
+        fov, radius, focus = (float(np.ravel(params[n])[0]) for n in ("x_fov", "aperture_radius", "focus_distance"))
+        frustum = film.size(), film.crop_size(), film.crop_offset(), fov, sensor.near_clip(), sensor.far_clip()
+        matrix = np.array(mi.perspective_projection(*frustum).matrix, np.float64).reshape(4, 4)
+        (sx, _, x, _), (_, sy, y, _) = (matrix / matrix[3, 2])[:2]
+        radius, focus, sx, sy, x, y = (dr.opaque(mi.Float, float(number)) for number in (radius, focus, sx, sy, x, y))
+        return cls(radius, focus, mi.Vector2f(sx, sy), mi.Vector2f(x, y))
+
+    def on_lens(self, lens: mi.Point2f) -> mi.Point3f:
+        """The place ``lens`` in the camera's space."""
+        disk = mi.warp.square_to_uniform_disk_concentric(lens) * self.radius
+        return mi.Point3f(disk.x, disk.y, 0)
+
+    def toward(self, to_world, si: mi.Interaction3f, lens: mi.Point2f, size: mi.Vector2f) -> mi.DirectionSample3f:
+        """``sample_direction`` of the camera, as far as ``Eye`` uses it."""
+        place = self.on_lens(lens)
+        d = mi.Vector3f(to_world.inverse() @ si.p - place)
+        focused = place + d * (self.focus / d.z)
+        to = dr.zeros(mi.DirectionSample3f, dr.width(si.p))
+        to.p, to.n = to_world @ place, dr.normalize(to_world @ mi.Vector3f(0, 0, 1))
+        way = mi.Vector3f(to.p - si.p)
+        to.dist = dr.norm(way)
+        to.d = way / to.dist
+        to.uv = (mi.Point2f(focused.x, focused.y) / focused.z * self.scale + self.shift) * size
+        return to
+
+    def ray(self, to_world, uv: mi.Point2f, lens: mi.Point2f, *, near: mi.Float, far: mi.Float, time) -> mi.Ray3f:
+        """``sample_ray`` of the camera through the place ``uv`` in [0, 1]² of the film."""
+        place, slope = self.on_lens(lens), (uv - self.shift) / self.scale
+        d = dr.normalize(mi.Vector3f(slope.x, slope.y, 1) * self.focus - mi.Vector3f(place))
+        ray = mi.Ray3f(to_world @ mi.Point3f(place + d * (near / d.z)), dr.normalize(to_world @ d))
+        ray.time, ray.maxt = time, (far - near) / d.z
+        return ray
 
 
 @dataclass
@@ -23,6 +72,7 @@ class Eye:
     near: mi.Float  # along its axis, where what it sees begins,
     far: mi.Float  # and ends
     area: mi.Float  # of the film, at distance 1
+    thin: ThinLens | None = None  # for such a camera; None where it can be asked
 
     @classmethod
     def of(cls, camera: CameraSamples) -> Eye:
@@ -30,7 +80,9 @@ class Eye:
         sensor = camera.sensor
         numbers = (sensor.near_clip(), sensor.far_clip(), film_area(sensor))
         planes_and_area = (dr.opaque(mi.Float, number) for number in numbers)
-        return cls(sensor, camera.lens, camera.time, camera.wavelength, *planes_and_area)
+        # In spectral variants nothing is recorded once, and rays have wavelengths.
+        thin = ThinLens.of(sensor) if camera_name(sensor) == "thinlens" and not mi.is_spectral else None
+        return cls(sensor, camera.lens, camera.time, camera.wavelength, *planes_and_area, thin)
 
     @property
     def size(self) -> mi.ScalarVector2u:
@@ -46,6 +98,9 @@ class Eye:
 
     def ray(self, uv: mi.Point2f, lens: mi.Point2f) -> mi.Ray3f:
         """Through the place ``uv`` on the film, in pixels, and the place ``lens`` on the lens."""
+        if self.thin:
+            where, planes = uv / mi.Vector2f(self.size), {"near": self.near, "far": self.far}
+            return self.thin.ray(self.sensor.world_transform(), where, lens, **planes, time=self.time)
         return self.sensor.sample_ray(self.time, self.wavelength, uv / mi.Vector2f(self.size), lens)[0]
 
     def toward(self, si: mi.Interaction3f, lens: mi.Point2f, active: mi.Bool | bool = True) -> tuple:
@@ -56,7 +111,10 @@ class Eye:
         film's area at distance 1. Mitsuba 3.9's own importance is 0 in the part of the film that an offset of the
         principal point adds, and its thin lens sees what is before the near plane.
         """
-        to, _ = self.sensor.sample_direction(si, lens, active)
+        if self.thin:
+            to = self.thin.toward(self.sensor.world_transform(), si, lens, mi.Vector2f(self.size))
+        else:
+            to, _ = self.sensor.sample_direction(si, lens, active)
         cos = -dr.dot(to.n, to.d)
         deep = cos * to.dist
         importance = dr.rcp(self.area * cos * dr.square(deep))

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.spectrum import reflectance_to_rgb
-from data_gen.scenes.facts import media_of
+from data_gen.scenes.facts import media_of, shapes_of
 
 # A longer chain of mirrors is cut: the features of what it shows are unknown then, as for a path that escapes.
 MAX_SPECULAR_VERTICES = 32
@@ -34,7 +34,7 @@ def features(scene, sensor, sampler, ray: mi.RayDifferential3f) -> dict[str, mi.
     )
     found = si.is_valid()
     normal = si.sh_frame.n
-    if any(shape.bsdf() is not None and shape.bsdf().class_name() in _TURNS_NORMALS for shape in scene.shapes()):
+    if any(shape.bsdf() is not None and shape.bsdf().class_name() in _TURNS_NORMALS for shape in shapes_of(scene)):
         aov = mi.load_dict({"type": "aov", "aovs": "normal:sh_normal"})
         normal = mi.Normal3f(aov.sample(scene, sampler.clone(), mi.RayDifferential3f(last), active=found)[2])
     # The shading frame has no side; the layer has the normal on the side of the incoming ray.

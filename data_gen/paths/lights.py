@@ -183,10 +183,22 @@ def emission_in_pixel(
     """
     if not any(visible(emitter) for emitter in scene.emitters()):
         return Le
-    for shift in QUARTERS:
-        ray, importance, _ = camera.rays(shift)
-        Le = Le + importance * emission(ray)
-    return Le / 4
+    seen = [camera.rays(shift)[:2] for shift in QUARTERS]
+    return _sum_of([(mi.Ray3f(ray), importance) for ray, importance in seen], Le, emission) / 4
+
+
+def _sum_of(seen: list[tuple[mi.Ray3f, mi.Spectrum]], Le: mi.Spectrum, emission: Callable) -> mi.Spectrum:
+    """Le, and what rays of some importance meet. In a loop, ``emission`` is recorded once: it asks all shapes."""
+    kind = type(Le)
+
+    def add(i: mi.UInt32, Le: mi.Spectrum) -> tuple[mi.UInt32, mi.Spectrum]:
+        ray, importance = seen[0]
+        for number, (other, weight) in enumerate(seen[1:], 1):
+            ray, importance = dr.select(i == number, other, ray), dr.select(i == number, weight, importance)
+        return i + 1, kind(Le + importance * emission(ray))
+
+    # Without dr.syntax, whose state would hold the rays: what no round changes has Dr.Jit record the loop again.
+    return dr.while_loop((mi.UInt32(0), Le), lambda i, Le: i < len(seen), add)[1]
 
 
 def visible(emitter: mi.Emitter) -> bool:

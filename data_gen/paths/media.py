@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.paths.vertex import consistent, evaluate
-from data_gen.scenes.facts import media_of
+from data_gen.scenes.facts import media_of, shapes_of
 
 
 @dataclass
@@ -37,7 +37,7 @@ class Media:
 
     def __init__(self, scene: mi.Scene):
         self.grids = any(not medium.is_homogeneous() for medium in media_of(scene))
-        matched = {dr_number(shape): index_matched(shape) for shape in scene.shapes()}
+        matched = {dr_number(shape): index_matched(shape) for shape in shapes_of(scene)}
         table = np.zeros(max(matched, default=0) + 1, bool)
         table[list(matched)] = list(matched.values())
         self.boundaries = bool(table.any())

@@ -21,10 +21,10 @@ from data_gen.paths.media import Media
 from data_gen.paths.walk import Limits
 from data_gen.samplers.registry import SAMPLERS, Sampler, by_plugin, find
 from data_gen.scenes.cameras import check_camera
-from data_gen.scenes.facts import Facts, scene_facts
+from data_gen.scenes.facts import Facts, scene_facts, shapes_of
 from data_gen.scenes.integrators import own_estimate
 from data_gen.scenes.lamps import Places, weighed
-from data_gen.scenes.load import path_depths, reference_integrator
+from data_gen.scenes.load import check_scene, path_depths, reference_integrator
 from ngpt.layers import LAYERS
 from ngpt.options import written
 
@@ -37,7 +37,7 @@ def loses_light(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> bool:
     """
     if integrator.class_name() != "PathIntegrator" or scene.environment() or integrator.hide_emitters:
         return False
-    return any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in scene.shapes() if shape.bsdf())
+    return any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in shapes_of(scene) if shape.bsdf())
 
 
 def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[..., mi.Spectrum]:
@@ -131,6 +131,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
 
     def render_film(self, scene, sensor, seed: int, spp: int) -> GradientFilm:
         check_camera(sensor)
+        check_scene(scene)
         limits = {
             "lane_bytes": self.entry.lane_bytes,
             "batch": self.entry.batch,

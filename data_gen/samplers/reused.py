@@ -5,6 +5,7 @@ Small images, such as crops of a training set, take less time to render than to 
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import mitsuba as mi
@@ -12,6 +13,9 @@ import mitsuba as mi
 from data_gen.passes import SamplePass
 from data_gen.paths.frozen import leaves
 from data_gen.samplers.registry import Sampler
+from ngpt.errors import stop_if_interrupted
+
+_LOG = logging.getLogger(f"ngpt.{__name__}")
 
 # Numbers of a film that the arrays of a camera hold, and no kernel
 _IN_ARRAYS = ("film.size", "film.crop_offset")
@@ -32,18 +36,37 @@ class Made:
         return entry.make(scene, **options)
 
     def keep(self, entry: Sampler, scene: mi.Scene, options: dict[str, Any], sample: SamplePass) -> None:
-        """To be called after a render. Samplers that know the view, or remember passes, are not kept."""
-        if not entry.even and "places" not in options:
+        """To be called after a render. Samplers that know the view, or remember passes, are not kept.
+
+        Whatever fails here does not fail the render, which has all its samples: the next one makes its own sampler.
+        """
+        if entry.even or "places" in options:
+            return
+        try:
             self._kept[entry.name] = (_key(scene, options), sample)
+        except Exception as error:
+            stop_if_interrupted(error)
+            _LOG.warning("the sampler is not kept for the next render: %s: %s", type(error).__name__, error)
 
 
 def _key(scene: mi.Scene, options: dict[str, Any]) -> tuple:
     """What a recorded kernel depends on, except arrays of the camera: numbers by value, arrays by identity."""
     camera = scene.sensors()[0]
-    of_scene, of_camera = ({key: params[key] for key in params.keys()} for params in map(mi.traverse, (scene, camera)))  # noqa: SIM118
+    of_scene, of_camera = map(_values, (scene, camera))
     numbers = {key: value for key, value in of_camera.items() if not leaves(value) and key not in _IN_ARRAYS}
     others = {key: value for key, value in of_scene.items() if not key.startswith(f"{camera.id()}.")}
     return options, camera.class_name(), {key: _Same(value) for key, value in (numbers | others).items()}
+
+
+def _values(thing: mi.Object) -> dict[str, Any]:
+    """The parameters of a scene or a camera by name.
+
+    ``mi.SceneParameters`` fails where one is None, as ``sigma_a`` of hair is that has its colour from melanin.
+    """
+    found = mi.traverse(thing).properties.items()
+    return {
+        name: value if kind is None else mi.get_property(value, kind, node) for name, (value, kind, node, _) in found
+    }
 
 
 class _Same:

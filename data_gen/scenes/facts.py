@@ -37,7 +37,7 @@ def scene_facts(scene: mi.Scene, sensor: mi.Sensor | None = None, integrator: mi
     media = media_of(scene)
     names = {medium.id() or medium.class_name() for medium in media}
     grids = any(not medium.is_homogeneous() for medium in media)
-    hair = any(_has_hair(shape.bsdf()) for shape in scene.shapes())
+    hair = any(_has_hair(shape.bsdf()) for shape in shapes_of(scene))
     reference = None if integrator is None else followed(integrator)
     return Facts(
         "path" if reference is None else plugin_name(reference),
@@ -49,6 +49,12 @@ def scene_facts(scene: mi.Scene, sensor: mi.Sensor | None = None, integrator: mi
         spectral=spectral(),
         hides=bool(getattr(reference, "hide_emitters", False)),
     )
+
+
+def shapes_of(scene: mi.Scene) -> list[mi.Shape]:
+    """All shapes of a scene, with those that only instances show, of which Mitsuba lists none."""
+    groups = (shape for shape in objects_in(scene, mi.Shape) if shape.class_name() == "ShapeGroupPlugin")
+    return [*scene.shapes(), *(shape for group in groups for shape in objects_in(group, mi.Shape))]
 
 
 def _has_hair(bsdf: mi.BSDF | None) -> bool:
@@ -66,7 +72,7 @@ def integrator_name(scene: mi.Scene) -> str:
 def media_of(scene: mi.Scene) -> list[mi.Medium]:
     """All media of a scene, the camera's included."""
     found = [scene.sensors()[0].get_medium()]
-    for shape in scene.shapes():
+    for shape in shapes_of(scene):
         if shape.is_medium_transition():
             found += [shape.interior_medium(), shape.exterior_medium()]
     return [medium for medium in found if medium is not None]

@@ -45,8 +45,10 @@ def weighed(scene: mi.Scene, lamps: str, by_place: bool = False) -> Iterator[Pla
     if lamps == "uniform" or len(emitters) < 2 or len(set(before)) > 1:
         yield None
         return
-    weights = lamp_weights(scene)
-    places = lamp_places(scene, weights) if by_place and len(emitters) >= MANY else None
+    many = by_place and len(emitters) >= MANY
+    found = _pilot(scene, _PATHS_BY_PLACE if many else _PATHS)
+    weights = lamp_weights(scene, found)
+    places = lamp_places(scene, weights, found) if many else None
     _set(scene, weights)
     try:
         yield places
@@ -63,16 +65,16 @@ def _set(scene: mi.Scene, weights) -> None:
     scene.parameters_changed()
 
 
-def lamp_weights(scene: mi.Scene) -> np.ndarray:
+def lamp_weights(scene: mi.Scene, found: Found | None = None) -> np.ndarray:
     """The share of each lamp in the choice, in the order of ``scene.emitters()``; they sum to 1.
 
-    The same for the same scene and camera.
+    The same for the same scene and camera. ``found`` is what a pilot has found, by at least ``_PATHS`` paths.
     """
     n = len(scene.emitters())
-    lamp, L, _ = _pilot(scene, _PATHS)
+    found = (found or _pilot(scene, _PATHS)).first(_PATHS)
     roots = np.zeros(n)
     for each in range(n):
-        squares = np.sort(np.square(L[lamp == each]))
+        squares = np.sort(np.square(found.L[found.lamp == each]))
         squares = squares[: max(1, int(len(squares) * (1 - _TRIM)))]
         roots[each] = np.sqrt(squares.mean()) if len(squares) else 0
     if not roots.sum() > 0:
@@ -80,20 +82,20 @@ def lamp_weights(scene: mi.Scene) -> np.ndarray:
     return (1 - _FLOOR) * roots / roots.sum() + _FLOOR / n
 
 
-def lamp_places(scene: mi.Scene, weights: np.ndarray) -> Places | None:
+def lamp_places(scene: mi.Scene, weights: np.ndarray, found: Found) -> Places | None:
     """How often each lamp is chosen by place, beside ``weights`` of the whole scene; None where that does not pay."""
-    share, table = promised(scene, weights)
+    share, table = promised(found, weights)
     return Places(scene, table) if table and share < PROMISE else None
 
 
-def promised(scene: mi.Scene, weights: np.ndarray) -> tuple[float, Table | None]:
+def promised(found: Found, weights: np.ndarray) -> tuple[float, Table | None]:
     """What choosing by place promises to leave of the variance of direct light, and by what table.
 
     One half of a pilot's samples tells how often each lamp is chosen, and the other how much better that is. Where the
     pilot meets nothing there is no table.
     """
-    lamp, L, at = _pilot(scene, _PATHS_BY_PLACE)
-    squares, half = np.square(L), np.random.default_rng(0).random(len(L)) < 0.5
+    lamp, squares, at = found.lamp, np.square(found.L), found.at
+    half = np.random.default_rng(0).random(len(lamp)) < 0.5
     if half.all() or not half.any():
         return 1.0, None
     p = learn(lamp[half], squares[half], at[half], weights).of(lamp, at)
@@ -101,46 +103,83 @@ def promised(scene: mi.Scene, weights: np.ndarray) -> tuple[float, Table | None]
     return by_place / as_before if as_before > 0 else 1.0, learn(lamp, squares, at, weights)
 
 
-def _pilot(scene: mi.Scene, paths: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Samples of lamps at the first vertices of camera paths: each one's number, what it brings, and the vertex (N, 3).
+@dataclass
+class Found:
+    """Samples of lamps at the first vertices of a pilot's paths, (N) each: the number of the ``lamp``, what it brings
+    (``L``), the vertex ``at``, (N, 3), and the number of the ``path``."""
 
-    What it brings counts by its weight beside BSDF sampling: lamps that are large, or close, count for less.
+    lamp: np.ndarray
+    L: np.ndarray
+    at: np.ndarray
+    path: np.ndarray
+
+    def first(self, paths: int) -> Found:
+        """Of the first so many paths: what a pilot of no more would have found."""
+        some = self.path < paths
+        return Found(self.lamp[some], self.L[some], self.at[some], self.path[some])
+
+
+def _pilot(scene: mi.Scene, paths: int) -> Found:
+    """Samples of lamps by so many paths.
+
+    What a lamp brings counts by its weight beside BSDF sampling: lamps that are large, or close, count for less.
     """
-    n = len(scene.emitters())
-    lane = dr.arange(mi.UInt32, paths)
-    random = mi.PCG32(paths, 0x1A3B)
-    sensor = scene.sensors()[0]
-
-    def pair() -> mi.Point2f:
-        return mi.Point2f(random.next_float32(), random.next_float32())
-
+    random, sensor = mi.PCG32(paths, 0x1A3B), scene.sensors()[0]
+    wavelength, film, lens = random.next_float32(), _pair(random), _pair(random)
     # Meters on shapes have no other way to sample a ray.
-    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), random.next_float32(), pair(), pair())
-    ray, active, found = mi.Ray3f(ray), dr.full(mi.Bool, True, paths), []
-    emitters = scene.emitters_dr()
-    for vertex in range(_VERTICES):
-        dr.eval(ray, active, random)
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), wavelength, film, lens)
+    ray = mi.Ray3f(ray)
+    dr.eval(ray, random)
+    index, L, at, there = _walk(scene, ray, random, dr.opaque(mi.UInt32, len(scene.emitters())), paths)
+    met = np.array(there) > 0
+    return Found(
+        np.array(index)[met],
+        np.array(L, np.float64)[met],
+        np.array(at).reshape(-1, 3)[met],
+        np.tile(np.arange(paths), _VERTICES)[met],
+    )
+
+
+def _walk(scene: mi.Scene, ray: mi.Ray3f, random: mi.PCG32, lamps: mi.UInt32, paths: int) -> tuple:
+    """Lamp, light, place and existence of the vertices of ``paths``, one vertex of all after the other.
+
+    A loop is recorded twice, however many vertices there are. With many lamps each recording takes seconds.
+    """
+    n, lane, emitters = _VERTICES * paths, dr.arange(mi.UInt32, paths), scene.emitters_dr()
+    of_lamp, of_light, of_there = dr.zeros(mi.UInt32, n), dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n)
+    of_place = dr.zeros(mi.Float, 3 * n)
+
+    def step(ray: mi.Ray3f, random: mi.PCG32, vertex: mi.UInt32, active: mi.Bool) -> tuple:
         si = scene.ray_intersect(ray, active)
         active = active & si.is_valid()
         # As if all were grey and matt: so no material is compiled for the pilot, which would take longer than the rest.
         side = mi.Frame3f(dr.mulsign(si.n, dr.dot(si.n, -ray.d)))
         # Each lamp as often as the others, at vertices all over the image
-        index = (lane + dr.opaque(mi.UInt32, vertex * 0x9E37)) % dr.opaque(mi.UInt32, n)
-        emitter = dr.gather(mi.EmitterPtr, emitters, index)
-        light, radiance = emitter.sample_direction(si, pair(), active)
+        index = (lane + vertex * 0x9E37) % lamps
+        emitter = dr.gather(mi.EmitterPtr, emitters, index, active)
+        light, radiance = emitter.sample_direction(si, _pair(random), active)
         cos = dr.maximum(dr.dot(side.n, light.d), 0)
         # Over all colours: a red lamp has as much noise in one channel as a white lamp has in each.
         L = dr.sqrt(dr.mean(dr.square(mi.unpolarized_spectrum(radiance)))) * cos
-        L *= dr.select(light.delta, 1, dr.rcp(1 + dr.square(cos * dr.inv_pi * n / light.pdf)))
+        L *= dr.select(light.delta, 1, dr.rcp(1 + dr.square(cos * dr.inv_pi * mi.Float(lamps) / light.pdf)))
         lit = active & (light.pdf > 0) & (L > 0)
         lit &= ~scene.ray_test(si.spawn_ray_to(light.p), lit)
-        L = dr.select(lit & dr.isfinite(L), L, 0)
-        ray = si.spawn_ray(side.to_world(mi.warp.square_to_cosine_hemisphere(pair())))
-        dr.eval(L, ray, active, random)
-        there = np.array(active)
-        found.append((np.array(index)[there], np.array(L, np.float64)[there], np.array(si.p).T[there]))
-    lamp, L, at = (np.concatenate(each) for each in zip(*found, strict=True))
-    return lamp, L, at
+        place = vertex * paths + lane
+        dr.scatter(of_lamp, index, place, active)
+        dr.scatter(of_light, dr.select(lit & dr.isfinite(L), L, 0), place, active)
+        dr.scatter(of_there, mi.UInt32(1), place, active)
+        for axis, coordinate in enumerate(si.p):
+            dr.scatter(of_place, coordinate, 3 * place + axis, active)
+        ray = si.spawn_ray(side.to_world(mi.warp.square_to_cosine_hemisphere(_pair(random))))
+        return ray, random, vertex + 1, active & (vertex + 1 < _VERTICES)
+
+    begin = (ray, random, dr.zeros(mi.UInt32, paths), dr.full(mi.Bool, True, paths))
+    dr.while_loop(begin, lambda ray, random, vertex, active: active, step)
+    return of_lamp, of_light, of_place, of_there
+
+
+def _pair(random: mi.PCG32) -> mi.Point2f:
+    return mi.Point2f(random.next_float32(), random.next_float32())
 
 
 # Cells along each axis of the finest grid, and of the coarser ones that it goes by, down to the whole scene

@@ -1,8 +1,4 @@
-"""Scenes: loaded from a Mitsuba file or built in, with errors that say what is wrong.
-
-Meshes of scene files are merged by material: each shape is a case of its own in the kernels, which Dr.Jit records
-before the first ray. A room of 800 meshes takes seconds for that, a tenth of it once meshes of one material are one.
-"""
+"""Scenes: loaded from a Mitsuba file or built in, with errors that say what is wrong."""
 
 from __future__ import annotations
 
@@ -10,14 +6,15 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.scenes.bounds import mend_bounds
 from data_gen.scenes.builtin import SCENES, no_scene
 from data_gen.scenes.cameras import sensor_number
 from data_gen.scenes.integrators import check_integrator, followed
+from data_gen.scenes.merge import merge
 from ngpt.errors import NgptError, stop_if_interrupted
 
 # Threads that it takes to load any scene
@@ -61,14 +58,19 @@ def load_scene(
         raise NgptError(f"{name}: describes a {type(scene).__name__}, not a whole scene")
     if not scene.sensors():
         raise NgptError(f"{name}: the scene has no sensor (camera)")
+    mend_bounds(scene)
     if size is not None:
         set_film_size(scene, size)
     return scene
 
 
 def check_scene(scene: object) -> mi.Scene:
-    """The scene, where it is one of the current variant. Raises NgptError for what has to be loaded first."""
+    """The scene, where it is one of the current variant, with right bounding boxes: see ``bounds``.
+
+    Raises NgptError for what has to be loaded first.
+    """
     if isinstance(scene, mi.Scene):
+        mend_bounds(scene)
         return scene
     kind = type(scene).__name__
     if isinstance(scene, dict):
@@ -144,17 +146,11 @@ def reference_integrator(scene: mi.Scene) -> mi.SamplingIntegrator:
     return followed(integrator)
 
 
-# The plugins that read meshes, and their settings that change normals
-_MESHES = ("obj", "ply", "serialized")
-_NORMALS = ("face_normals", "flip_normals")
-
-
 def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int | str | None) -> object:
     """What ``mi.load_file`` gives, with no sensor but the one of that number or id, where one is named.
 
-    Where ``merged``, meshes of one material that neither shine nor bound a medium are one, and lose their names. Merged
-    as Mitsuba would (``optimize=True``), shapes and emitters come in another order each time, and with them other bits;
-    here they have the file's order, each group the place of its first mesh.
+    Where ``merged``, meshes are as ``data_gen.scenes.merge`` has them. Merged as Mitsuba would (``optimize=True``),
+    shapes and emitters come in another order each time, and with them other bits.
     """
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
@@ -165,32 +161,11 @@ def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int |
         state = mi.parser.parse_file(config, path, **parameters)
         mi.parser.transform_all(config, state)
         if state.root.props.plugin_name() == "scene":
-            if merged:
-                _merge(state)
             if sensor is not None:
                 _keep(state, sensor, path)
+            if merged:
+                merge(config, state)
         return mi.parser.instantiate(config, state)
-
-
-def _merge(state: mi.parser.ParserState) -> None:
-    scene = state.root.props
-    groups: dict[Any, list[str]] = {}
-    for name, reference in scene.items():
-        if isinstance(reference, mi.Properties.ResolvedReference) and (key := _group(state, reference.index())):
-            groups.setdefault(key, []).append(name)
-    for names in groups.values():
-        if len(names) == 1:
-            continue
-        node = mi.parser.SceneNode()
-        node.type, node.props = mi.ObjectType.Shape, mi.Properties("merge")
-        for i, name in enumerate(names):
-            node.props[f"mesh_{i}"] = scene[name]
-        state.nodes.append(node)
-        # The list may have moved.
-        scene = state.root.props
-        scene[names[0]] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
-        for name in names[1:]:
-            del scene[name]
 
 
 def _keep(state: mi.parser.ParserState, sensor: int | str, path: str) -> None:
@@ -206,15 +181,6 @@ def _keep(state: mi.parser.ParserState, sensor: int | str, path: str) -> None:
         for number, name in enumerate(found):
             if number != kept:
                 del scene[name]
-
-
-def _group(state: mi.parser.ParserState, number: int) -> tuple | None:
-    """What meshes that become one have in common; None for a node that stays as it is."""
-    props = state.nodes[number].props
-    parts = [part.index() for _, part in props.items() if isinstance(part, mi.Properties.ResolvedReference)]
-    if props.plugin_name() not in _MESHES or len(parts) != 1 or state.nodes[parts[0]].type != mi.ObjectType.BSDF:
-        return None
-    return (*parts, *(bool(props.get(name, False)) for name in _NORMALS))
 
 
 @contextmanager

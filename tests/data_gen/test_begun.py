@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from unbiased import load, same
 
 import ngpt
 from ngpt.errors import NgptError
@@ -218,6 +219,39 @@ def test_a_pass_that_fails_takes_none_before_it_along(renderer, command, monkeyp
     with pytest.raises(RuntimeError):
         command(f"{GPT} --spp 64 -o none.exr")
     assert not Path("none.exr").exists()
+
+
+def test_nothing_that_comes_after_the_last_sample_takes_the_image_along(renderer, command, monkeypatch):
+    from data_gen.frames import shot
+    from data_gen.samplers import reused
+
+    def gone(*arguments):
+        raise RuntimeError("gone")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(reused, "_key", gone)  # whether the next render may have the sampler
+        command("render diffuse --size 16x12 --spp 4 --sampler primal -o it.exr")
+    command("render diffuse --size 16x12 --spp 4 --sampler primal -o same.exr")
+    same(ngpt.read("it.exr"), ngpt.read("same.exr"))
+    with monkeypatch.context() as patched:
+        patched.setattr(shot, "motion_vectors", gone)
+        told = command("render diffuse --size 16x12 --spp 4 --sampler primal --frames 0:2 -o f{frame}.exr", 1)
+    assert "frame 0: gone; f0.exr has the samples done before" in told
+    frame = ngpt.read("f0.exr")
+    assert frame.attributes["ngpt:unfinished"] == "failed" and frame["primal"].mean() > 0.1
+
+
+def test_hair_with_the_colour_of_melanin_is_rendered(renderer):
+    """Of its parameters one is None, which Mitsuba's own list of them cannot give."""
+    from stress_scenes import hair
+
+    from data_gen.render import render_stack
+    from data_gen.samplers import reused
+
+    scene, made = load(renderer, hair, (16, 12)), reused.Made()
+    first, second = (render_stack(scene, 2, 0, "primal", made=made) for _ in range(2))
+    assert first["primal"].mean() > 0.1 and "primal" in made._kept
+    same(first, second)
 
 
 def test_what_was_rendered_is_kept_where_it_cannot_be_written(renderer, command, monkeypatch):

@@ -129,6 +129,14 @@ def test_the_importance_of_a_camera_is_the_density_of_its_rays(renderer, view):
     assert np.allclose(np.array(importance), 1 / (pixel * width * height * cos**3 * distance**2), rtol=2e-3)
 
 
+def test_our_rays_of_a_thin_lens_are_those_of_mitsuba(renderer):
+    samples, _, eye = eye_of(renderer, CAMERAS["thin lens"]()["sensor"])
+    ours = eye.ray(samples.position, samples.lens)
+    theirs, _ = eye.sensor.sample_ray(samples.time, samples.wavelength, samples.position * samples.steps, samples.lens)
+    for name in ("o", "d", "maxt", "time"):
+        assert np.allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-4, atol=1e-5), name
+
+
 @pytest.mark.parametrize("kind", ["perspective", "thinlens"])
 def test_what_the_near_plane_cuts_away_hides_nothing(renderer, kind):
     mi = renderer

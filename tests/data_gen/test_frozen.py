@@ -90,10 +90,11 @@ def test_passes_of_any_size_are_recorded_once(renderer, recordings, caplog, samp
     assert recordings.of == {"samples": 1} and not caplog.records, others
 
 
-@pytest.mark.parametrize("sampler", ["bdpt", "gbdpt"])
-def test_paths_from_both_ends_are_recorded_once(renderer, recordings, sampler):
+@pytest.mark.parametrize("scene", ["diffuse", "lens"])
+@pytest.mark.parametrize("sampler", ["bdpt", "gbdpt", "vcm"])
+def test_paths_from_both_ends_are_recorded_once(renderer, recordings, sampler, scene):
     others = [load(renderer, textured_lamp, (4, 4))]
-    render(renderer, load(renderer, "diffuse", (16, 12)), sampler, [1] * 5)
+    render(renderer, load(renderer, scene, (16, 12)), sampler, [1] * 5)
     # Where two arrays happen to be of one width, a function is recorded again.
     assert len(others) == 1 and len(recordings.of) <= recordings.total() <= len(recordings.of) + 1
 

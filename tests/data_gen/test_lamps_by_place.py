@@ -13,7 +13,8 @@ from references import references
 from renders import dr, mi
 from unbiased import FAR, assert_unbiased, load, render_ours
 
-from data_gen.paths.lights import Lights, emission, replay_lamp, shared_emission
+from data_gen.paths.camera import QUARTERS, CameraSamples
+from data_gen.paths.lights import Lights, emission, emission_in_pixel, replay_lamp, shared_emission
 from data_gen.paths.vertex import seen_from
 from data_gen.scenes.lamps import Places, Table, weighed
 
@@ -33,7 +34,7 @@ def by_any_places(monkeypatch):
     """Renders choose lamps by such a table, with however few lamps."""
     from data_gen.scenes import lamps
 
-    monkeypatch.setattr(lamps, "lamp_places", lambda scene, weights: any_places(scene))
+    monkeypatch.setattr(lamps, "lamp_places", lambda scene, weights, found: any_places(scene))
     monkeypatch.setattr(lamps, "MANY", 2)
 
 
@@ -102,6 +103,31 @@ def test_taken_for_many_lamps_that_the_scene_leaves_open(renderer):
     assert not places_of(lambda scene: scene["lamp_3"]["emitter"].update(sampling_weight=0.0))
     assert not places_of(lambda scene: scene.update(gallery()))  # each lights up all of it
     assert not places_of(lambda scene: [scene.pop(f"lamp_{number}") for number in range(9)])
+
+
+def test_one_pilot_serves_both_and_its_vertices_are_a_loop(renderer, monkeypatch):
+    """With thousands of lamps each vertex that is recorded takes seconds."""
+    from data_gen.scenes import lamps
+
+    scene, drawn, pair = load(renderer, lambda: gallery(low=True), (8, 8)), [], lamps._pair
+    small = lamps._pilot(scene, 1 << 10)
+    monkeypatch.setattr(lamps, "_pair", lambda random: (drawn.append(1), pair(random))[1])
+    monkeypatch.setattr(lamps, "_PATHS_BY_PLACE", 1 << 12)
+    monkeypatch.setattr(lamps, "_PATHS", 1 << 10)
+    first = lamps._pilot(scene, 1 << 12).first(1 << 10)
+    for name in ("lamp", "L", "at", "path"):
+        assert np.array_equal(getattr(first, name), getattr(small, name)), name
+    drawn.clear()
+    with weighed(scene, "power", by_place=True):
+        assert len(drawn) <= 6  # two for the camera, and two for each recording of a vertex: Dr.Jit makes two of a loop
+
+
+def test_what_a_pixel_sees_of_lamps_is_recorded_once(renderer):
+    scene, calls = load(renderer, gallery, (8, 8)), []
+    camera = CameraSamples(scene.sensors()[0], 0, 1)
+    Le = emission_in_pixel(scene, camera, dr.zeros(renderer.Spectrum, 64), lambda ray: calls.append(1) or ray.d)
+    rays = [camera.rays(shift)[0].d for shift in QUARTERS]
+    assert len(calls) == 1 and np.allclose(Le, np.array(sum(rays)) / 4, atol=1e-6)
 
 
 def nearly(one, other, good, most=2e-3):

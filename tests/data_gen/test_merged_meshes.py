@@ -74,6 +74,87 @@ def test_meshes_of_one_material_are_one(renderer, scene_file):
     assert kept[0].is_emitter() and kept[1].is_medium_transition() and len(merged.emitters()) == 2
 
 
+INLINE = """<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/>
+<sensor type="perspective"><float name="fov" value="60"/><transform name="to_world">
+<lookat origin="2,1,9" target="0,0,0" up="0,1,0"/></transform>
+<film type="hdrfilm"><integer name="width" value="48"/><integer name="height" value="12"/></film></sensor>{}</scene>"""
+
+
+def inline(x, kind="cube", color=".7,.2,.2", more=""):
+    """A shape with a material of its own, as exporters write it; one that is turned shows its sides."""
+    place = f'<transform name="to_world"><scale value=".4"/><rotate y="1" angle="30"/><translate x="{x}"/></transform>'
+    return f'<shape type="{kind}"><bsdf type="twosided">{bsdf(f"m{x}", color)}</bsdf>{place}{more}</shape>'
+
+
+def test_equal_materials_are_one_and_shapes_keep_the_order_of_the_file(renderer, tmp_path):
+    import mitsuba as mi
+
+    path, green = tmp_path / "scene.xml", ".2,.7,.2"
+    lamp = '<emitter type="area"><rgb name="radiance" value="2"/></emitter>'
+    shapes = [inline(-4), inline(-3, color=green), inline(-2, "rectangle"), inline(-1, "sphere"), inline(0)]
+    shapes += [inline(1, "rectangle", green), inline(2, more=lamp), inline(3, "rectangle"), inline(4, color="0,0,.1")]
+    path.write_text(INLINE.format("".join(shapes)))
+    views = mi.load_dict({"type": "aov", "aovs": "n:sh_normal,g:geo_normal,u:uv,d:depth,a:albedo"})
+    images = []
+    for merged in (True, False):
+        scene = load_scene(str(path), merged=merged)
+        assert np.allclose(scene.bbox().min, (-4.546, -0.4, -0.546), atol=1e-3)
+        images.append(np.array(mi.render(scene, integrator=views, spp=4, seed=1)))
+        if merged:
+            # Red: two cubes and two rectangles. Green: a cube and a rectangle. The sphere, the lamp, the last cube
+            assert [shape.primitive_count() for shape in scene.shapes()] == [28, 14, 1, 12, 12]
+    assert images[0][..., 0].max() > 0 and np.allclose(*images, atol=1e-5)
+
+
+def test_many_meshes_are_merged_in_pairs(renderer, tmp_path, monkeypatch):
+    """Each is copied as often as they can be halved. One after the other, the time grows with the square."""
+    from data_gen.scenes import merge
+
+    (tmp_path / "it.ply").write_text(quad(0))
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        INLINE.format(bsdf("red", ".7,.2,.2") + 33 * shape("it", '<ref id="red"/>').replace(' id="it"', ""))
+    )
+    halves, known = [], merge._in_pairs
+
+    def spied(state, meshes):
+        halves.append(len(meshes))
+        return known(state, meshes)
+
+    monkeypatch.setattr(merge, "_in_pairs", spied)
+    (only,) = load_scene(str(path)).shapes()
+    assert only.primitive_count() == 66
+    assert sorted(halves) == sorted([1] * 33 + [2] * 16 + [3] + [4] * 7 + [5] + [8] * 3 + [9, 16, 17, 33])
+
+
+GROUP = """<shape type="shapegroup" id="group">{}</shape>
+<shape type="instance"><ref id="group"/><transform name="to_world"><translate x="-3"/></transform></shape>
+<shape type="instance"><ref id="group"/><transform name="to_world"><rotate y="1" angle="40"/><scale x="2"/></transform>
+</shape>"""
+
+
+def test_instances_of_small_groups_are_meshes(renderer, tmp_path, monkeypatch):
+    """And so they share the shape of their material, which is recorded once, not once for each."""
+    import mitsuba as mi
+
+    path = tmp_path / "scene.xml"
+    (tmp_path / "it.ply").write_text(quad(0.5, smooth=True))
+    smooth = shape("it", bsdf("green", ".2,.7,.2"))
+    path.write_text(INLINE.format(GROUP.format(inline(0) + smooth) + inline(3)))
+    views = mi.load_dict({"type": "aov", "aovs": "n:sh_normal,g:geo_normal,u:uv,d:depth,a:albedo"})
+    images = []
+    for merged, kinds in ((True, ["Mesh", "Mesh"]), (False, ["Instance", "Instance", "Cube"])):
+        scene = load_scene(str(path), merged=merged)
+        assert [shape.class_name() for shape in scene.shapes()] == kinds
+        images.append(np.array(mi.render(scene, integrator=views, spp=4, seed=1)))
+    assert images[0][..., 0].max() > 0 and np.allclose(*images, atol=1e-4)
+    ball = inline(1, "sphere")
+    for inside, most in ((inline(0), 1000), (inline(0) + ball, 1 << 24)):
+        monkeypatch.setattr("data_gen.scenes.merge._MOST_BYTES", most)
+        path.write_text(INLINE.format(GROUP.format(inside)))
+        assert [shape.class_name() for shape in load_scene(str(path)).shapes()] == ["Instance"] * 2
+
+
 def test_it_is_the_same_scene(renderer, scene_file):
     import mitsuba as mi
 

@@ -28,7 +28,7 @@ import mitsuba as mi
 from data_gen.film import GradientFilm
 from data_gen.film.splats import Splats
 from data_gen.passes import SamplePass
-from data_gen.paths.camera import CameraSamples
+from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.paths.eye import Sight
 from data_gen.paths.features import features
 from data_gen.paths.frozen import Frozen
@@ -87,6 +87,7 @@ class BDPT(GradientIntegrator):
     def sample_pass(self, frozen: Frozen, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
         """Takes one path from the camera and one from a light for each camera sample."""
         splats = film.splats("primal") if plan.joins else None
+        camera.look((0, 0), *QUARTERS)
         values, sums = frozen(self.samples, plan, camera, sums=splats and splats.zeros)
         if splats:
             splats.take(sums)

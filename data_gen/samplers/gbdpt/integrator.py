@@ -37,7 +37,7 @@ import numpy as np
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.film.splats import Splats
 from data_gen.passes import SamplePass
-from data_gen.paths.camera import CameraSamples, in_packets
+from data_gen.paths.camera import QUARTERS, CameraSamples, in_packets
 from data_gen.paths.eye import Eye, Sight
 from data_gen.paths.features import features
 from data_gen.paths.frozen import Frozen
@@ -74,6 +74,7 @@ class GBDPT(BDPT):
         n, sums = dr.width(camera.pixel), None
         if plan.joins:
             sums = lambda: (splats["primal"].zeros(), Worth.nothing(n, plan.longest))  # noqa: E731
+        camera.look((0, 0), *SHIFTS.values(), *QUARTERS)
         values, Δ, inside, marks, bent, sums = frozen(self.samples, plan, camera, sums=sums)
         if plan.joins:
             splats["primal"].take(sums[0])
