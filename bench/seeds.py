@@ -10,8 +10,7 @@ The sampler is `primal`. Scenes are files, built-in names, or generator:SEED:SIG
                variances, and the square of the mean of the layer ``shared`` as a mean over seeds
     blocks     real over claimed variance of 8x8 and of 32x32 pixels: of the sums over all blocks, and the median. It is
                below 1 for whole paths, because points in Z order let neighbours make up for each other
-    error      relMSE after `oidn`, by two halves of a reference, without the worst 0.1 % of the pixels: geometric mean,
-               median and worst of the seeds
+    error      after `oidn`, as ``steady`` of ``bench.tails``: geometric mean, median and worst of the seeds
     seconds    of processors, of the render and of OIDN
 
 In the table the error at equal whole time is over the curve of whole paths, geometric means over seeds; marks are those
@@ -34,11 +33,20 @@ import numpy as np
 
 import ngpt
 from bench.common import blocks, metadata, renderer, save
-from bench.tails import TAILS, WARM_SPP, digits, marked, processor_seconds, reference_of, table
+from bench.tails import (
+    TAILS,
+    WARM_SPP,
+    clean_image,
+    digits,
+    marked,
+    processor_seconds,
+    reference_of,
+    steady_error,
+    table,
+)
 from ngpt.evaluation.config import scene_name
 from ngpt.evaluation.curves import error_at
 from ngpt.measure.averages import geometric_mean
-from ngpt.measure.metrics import relmse_trimmed
 
 SIDES = (8, 32)
 HEAD = ["scene", "spp", "tails", "light", "least .. most", "deviation", *(f"{n}x{n}, median" for n in SIDES)]
@@ -109,6 +117,7 @@ def measured(scene: str, args: argparse.Namespace):
     with opened(scene) as (name, file):
         loaded = load_scene(file, tuple(map(int, args.size.split("x"))))
         reference = reference_of(loaded, name, args)
+        clean = clean_image(reference)
         for tails in ["shared"] if args.code else TAILS:
             ngpt.reconstruct(render_stack(loaded, WARM_SPP, 0, "primal", tails=tails), "oidn")
             label = f"{tails}, {args.code}" if args.code else tails
@@ -119,7 +128,7 @@ def measured(scene: str, args: argparse.Namespace):
                     stack = render_stack(loaded, spp, seed, "primal", tails=tails)
                     image = ngpt.reconstruct(stack, "oidn").image
                     seconds.append(processor_seconds() - start)
-                    found.append(relmse_trimmed(image, *reference.images))
+                    found.append(steady_error(image, reference, clean))
                     layers.append({each: stack[each] for each in ("primal", "primal_var", "shared") if each in stack})
                 light = [each["primal"].mean(dtype=float) / reference.mean.mean(dtype=float) for each in layers]
                 cell = {"scene": name, "size": args.size, "spp": spp, "tails": label, "seeds": len(seconds)}

@@ -102,7 +102,7 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]):
     gc.collect()
     loaded = load_scene(scene, tuple(map(int, args.size.split("x"))))
     reference = reference_of(loaded, scene, args)
-    clean = np.mean([ngpt.reconstruct(half, "oidn").image for half in reference.stacks], axis=0, dtype=np.float64)
+    clean = clean_image(reference)
     chosen = plan_sampler(loaded, min(args.spp), None)
     for sampler in args.samplers:
         warm: set[str] = set()
@@ -154,16 +154,26 @@ def judged(stack: ngpt.GradientStack, method: str, reference: Reference, clean: 
     seconds = processor_seconds() - start if method != RAW else 0.0
     names = ["relMSE trimmed", *(["FLIP"] if method != RAW else [])]
     found = scores(names, image, *reference.images)
-    steady = (squared_error(image, *halves) / (clean**2 + EPSILON) for halves in (reference.images, (clean,)))
     coarse = relmse_trimmed(*(blocks(each.astype(np.float64)) for each in (image, *reference.images)))
     return {
         "seconds": seconds,
         "error": found["relMSE trimmed"],
-        "steady": trimmed_mean(*steady, share=0.001),
+        "steady": steady_error(image, reference, clean),
         "FLIP": found.get("FLIP"),
         "blocks": coarse**0.5 if coarse > 0 else None,
         "energy": float(image.mean(dtype=np.float64) / reference.mean.mean(dtype=np.float64)),
     }
+
+
+def clean_image(reference: Reference) -> np.ndarray:
+    """The denoised reference, (H, W, 3) double precision."""
+    return np.mean([ngpt.reconstruct(half, "oidn").image for half in reference.stacks], axis=0, dtype=np.float64)
+
+
+def steady_error(image: np.ndarray, reference: Reference, clean: np.ndarray) -> float:
+    """relMSE by both halves of the reference, relative to the ``clean`` one, without the worst 0.1 % by that."""
+    each = (squared_error(image, *halves) / (clean**2 + EPSILON) for halves in (reference.images, (clean,)))
+    return trimmed_mean(*each, share=0.001)
 
 
 def rows_of(cells: list[dict]) -> dict[tuple, dict[int, dict[str, dict]]]:
