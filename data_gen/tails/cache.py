@@ -157,8 +157,8 @@ class Cache:
         brightest = dr.select(good, dr.minimum(largest * scale, 2.0**_MOST_BITS), 0)
         self.records += int(dr.count(good)[0])
         self.light += int(dr.sum(mi.Int64(brightest + 0.5))[0])
-        mean = self.light / max(self.records, 1)
-        most = dr.opaque(mi.Float, max(MOST, self.records / PARTS) * mean)
+        mean = dr.opaque(mi.Float, self.light / max(self.records, 1))
+        most = mean * dr.opaque(mi.Float, max(MOST, self.records / PARTS))
         self.cut += int(dr.sum(mi.Int64(dr.maximum(brightest - most, 0)))[0])
         scale = scale * dr.minimum(1, most / dr.maximum(brightest, 1))
         limit = 2.0**_MOST_BITS
@@ -174,8 +174,9 @@ class Cache:
         dr.scatter_add(self.count, mi.UInt32(1), of_half, placed, **direct)
         # Relative to the cell's light, or to all light where that is not known: a bright record counts little more.
         here = dr.gather(mi.Vector4f, self.known.means[0], slot, placed)
-        usual = dr.select(here.w > 0, dr.maximum(here.x, dr.maximum(here.y, here.z)) / self._unit_or_1(), mean)
-        part = brightest / dr.maximum(brightest + dr.maximum(usual, 0), 1e-20)
+        brightest_here = dr.maximum(here.x, dr.maximum(here.y, here.z)) / self._unit_or_1()
+        usual = dr.maximum(dr.select(here.w > 0, brightest_here, mean), 1e-20)
+        part = brightest / (brightest + usual)
         values = (mi.UInt32(1), mi.UInt32(_PARTS * part + 0.5), mi.UInt32(_PARTS * dr.square(part) + 0.5))
         for i, within in enumerate((True, *upper)):
             for each, value in zip(self.parts, values, strict=True):
