@@ -60,7 +60,7 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
     # With the light sources seen, as a renderer hands it over and OIDN was trained.
     image = np.ascontiguousarray(data.image + data.direct, np.float32)
     clean = bool(features) and auxiliary in ("prefiltered", "clean")
-    settings = {**FILTERS[filter], "quality": QUALITIES[quality]} | ({"clean_aux": True} if clean else {})
+    settings = {**FILTERS[filter], "quality": QUALITIES[quality]} | ({"clean_aux": clean} if filter == "image" else {})
     empty = None if features or filter != "image" else data.empty
     if empty is None:
         return filtered({"color": image, **features}, **settings) - data.direct
