@@ -30,11 +30,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.streams import mixed
 from data_gen.tails.schedule import FINENESS
 from data_gen.tails.table import Place, in_table, key, octahedral
 
 # MiB that the cache takes, and of those a render may use, what makes this little
-MIB, LEAST_MIB = 256, 640
+MIB, LEAST_MIB = 320, 640
 # A path may end where its spread has reached this share of its way to the first rough surface.
 NEAR = 1 / 8
 HALVES = 2
@@ -63,7 +64,7 @@ class Trail:
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
 # Cells that there is room for, and the share of them that may be taken
-CELLS, _FULL = 1 << 20, 0.7
+CELLS, _FULL = 1 << 20, 0.5
 # A cell is trusted once either half has so many records in it, whatever they hold: see ``Cache``. Few are enough, since
 # there are about as many paths that read a cell as there are records in it.
 LEAST = 4
@@ -72,7 +73,7 @@ LEAST = 4
 LEAST_TO_FEED, RENEW = 16, 0.25
 # A cell is torn where the light in its two parts along an axis differs by more than this share of their sum, at the
 # coarsest fineness, and by so many standard errors.
-TORN, _CERTAIN, _ENOUGH = 0.2, 3.0, 4
+TORN, _CERTAIN, _ENOUGH = 0.2, 2.5, 3
 # The unit in which the light of a record counts for that: 1 is all that a record can have, whatever its light.
 _PARTS = 4095
 # A record may be so many times as bright as the mean of all so far, or have such a part of their light. What is
@@ -80,13 +81,14 @@ _PARTS = 4095
 MOST, PARTS = 3000, 200
 # The light of the brightest record of the first round, and the brightest light that can be represented, in units of
 # sums, both as powers of two
-_BITS, _MOST_BITS = 30, 40
+_BITS, _MOST_BITS = 24, 40
 
 
 @dataclass
 class Known:
-    """What paths may read by cell: the mean of each sort of light, RGB, and how many records the smaller half has, 0
-    where the cell is torn; and half of the difference between the two halves, with 0 as the fourth number."""
+    """What paths may read by cell: the mean of each sort of light, RGB, and how many records the smaller half has; and
+    half of the difference between the two halves, with 1 where the first half says that the cell is torn, plus 2 where
+    the second one does."""
 
     keys: mi.UInt32
     means: list[mi.Float]
@@ -103,16 +105,35 @@ class Known:
         normal = octahedral(mi.Normal3f(dr.mulsign(x.sh_frame.n, x.wi.z)))
         return Place(mi.Point3f(x.p) - self.corner, normal + (mi.UInt32(kind) << 16), level)
 
-    def look(self, place: Place, least: int, active: mi.Bool) -> tuple[list[mi.Color3f], list[mi.Color3f], mi.Bool]:
-        """The light of each sort at a place, half of the difference between both halves, and whether it is known: by
-        the ``least`` number of records in each half."""
+    def look(
+        self, place: Place, least: int, active: mi.Bool, half: mi.UInt32 | None = None
+    ) -> tuple[list[mi.Color3f], list[mi.Color3f], mi.Bool]:
+        """The light of each sort at a place, a sample of its error, and whether it is known, by the ``least`` number of
+        records in each half; to all, or to paths that feed a ``half``.
+
+        What one half has found says nothing of whether its own light may be read, only of the other half's: else cells
+        that have found rare light would look torn, and light would be lost. So where just one half says that a cell
+        is torn, the light of that one is read every other time, and else the path goes on.
+        """
         h, name, _ = key(place)
         slot, found = in_table(self.keys, h, name, active)
         means, differences = (
             [dr.gather(mi.Vector4f, each, slot, found) for each in flat] for flat in (self.means, self.differences)
         )
-        means_rgb, differences_rgb = ([mi.Color3f(v.x, v.y, v.z) for v in each] for each in (means, differences))
-        return means_rgb, differences_rgb, found & (means[0].w >= least)
+        torn = mi.UInt32(differences[0].w)
+        known = found & (means[0].w >= least) & (torn < 3)
+        mean, error = ([mi.Color3f(v.x, v.y, v.z) for v in each] for each in (means, differences))
+        if half is None:
+            # Every other time, by the digits of the place
+            known &= (torn == 0) | (mixed(dr.reinterpret_array(mi.UInt32, place.p.x)) & 1 == 0)
+            which = torn
+        else:
+            # The other half has the other bit.
+            known &= (torn >> (1 - half)) & 1 == 0
+            which = half + 1
+        sign = dr.select(which == 0, mi.Float(0), dr.select(which == 1, 1, -1))
+        light = [m + sign * e for m, e in zip(mean, error, strict=True)]
+        return light, [dr.select(which == 0, e, 0) for e in error], known
 
 
 class Cache:
@@ -131,9 +152,9 @@ class Cache:
         # By half and cell
         self.count = dr.zeros(mi.UInt32, HALVES * CELLS)
         self.sums = [dr.zeros(mi.Int64, HALVES * CELLS) for _ in range(3 * sorts)]
-        # By cell, of all records and of those in the upper part along each axis: how many, and the sums of their light
-        # and of its square, in _PARTS
-        self.parts = [[dr.zeros(mi.UInt32, CELLS) for _ in range(4)] for _ in range(3)]
+        # By half and cell, of all records and of those in the upper part along each axis: how many, and the sums of
+        # their light and of its square, in _PARTS
+        self.parts = [[dr.zeros(mi.UInt32, HALVES * CELLS) for _ in range(4)] for _ in range(3)]
         self.unit, self.full, self.fineness = 0.0, False, fineness
         # For all records so far: their number, the sum of the light of the brightest colour of each, in units, and how
         # much of it was cut
@@ -173,14 +194,14 @@ class Cache:
             dr.scatter_add(each, count, of_half, placed, **direct)
         dr.scatter_add(self.count, mi.UInt32(1), of_half, placed, **direct)
         # Relative to the cell's light, or to all light where that is not known: a bright record counts little more.
-        here = dr.gather(mi.Vector4f, self.known.means[0], slot, placed)
-        brightest_here = dr.maximum(here.x, dr.maximum(here.y, here.z)) / self._unit_or_1()
-        usual = dr.maximum(dr.select(here.w > 0, brightest_here, mean), 1e-20)
+        here = [dr.gather(mi.Vector4f, each, slot, placed) for each in self.known.means]
+        brightest_here = sum(dr.maximum(v.x, dr.maximum(v.y, v.z)) for v in here) / self._unit_or_1()
+        usual = dr.maximum(dr.select(here[0].w > 0, brightest_here, mean), 1e-20)
         part = brightest / (brightest + usual)
         values = (mi.UInt32(1), mi.UInt32(_PARTS * part + 0.5), mi.UInt32(_PARTS * dr.square(part) + 0.5))
         for i, within in enumerate((True, *upper)):
             for each, value in zip(self.parts, values, strict=True):
-                dr.scatter_add(each[i], value, slot, placed & within, **direct)
+                dr.scatter_add(each[i], value, of_half, placed & within, **direct)
         dr.eval(self.keys, self.count, self.sums, self.parts)
 
     def _unit_or_1(self) -> mi.Float:
@@ -196,7 +217,10 @@ class Cache:
             _LOG.warning("the cache of tails is full (%d cells): %s", cells, what)
         cell, unit = dr.arange(mi.UInt32, CELLS), self._unit_or_1()
         counts = [dr.gather(mi.UInt32, self.count, cell + half * CELLS) for half in range(HALVES)]
-        records = dr.select(self.torn(fineness), 0, mi.Float(dr.minimum(*counts)))
+        records, torn = mi.Float(dr.minimum(*counts)), self.torn(fineness)
+        torn = dr.select(dr.gather(mi.Bool, torn, cell), mi.Float(1), 0) + dr.select(
+            dr.gather(mi.Bool, torn, cell + CELLS), mi.Float(2), 0
+        )
         # Old values go first, to make room for the new ones.
         self.known.means.clear()
         self.known.differences.clear()
@@ -213,14 +237,17 @@ class Cache:
             mean = [0.5 * (x + y) for x, y in zip(a, b, strict=True)]
             difference = [0.5 * (x - y) for x, y in zip(a, b, strict=True)]
             dr.scatter(means[sort], mi.Vector4f(*mean, records), cell)
-            dr.scatter(differences[sort], mi.Vector4f(*difference, 0), cell)
+            dr.scatter(differences[sort], mi.Vector4f(*difference, torn), cell)
         corner = self.known.corner
         self.known = Known(mi.UInt32(self.keys), means, differences, dr.opaque(mi.Float, fineness), corner)
         dr.eval(self.known.keys, means, differences)
 
     def torn(self, fineness: float) -> mi.Bool:
-        """Which cells have other light in one part than in the other. Finer cells are judged more strictly, as their
-        light may differ less: so the light that passes through walls vanishes with the size of cells."""
+        """By half and cell: where a half has found other light in one part of the cell than in the other.
+
+        Finer cells are judged more strictly, as their light may differ less: so the light that passes through walls
+        vanishes with the size of cells.
+        """
         torn = mi.Bool(False)
         whole, *uppers = ([mi.Float(each[i]) for each in self.parts] for i in range(4))
         most = dr.opaque(mi.Float, TORN * FINENESS / fineness)

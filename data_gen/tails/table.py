@@ -9,8 +9,8 @@ import mitsuba as mi
 
 from data_gen.paths.streams import mixed
 
-# Places beside each other in the table, in which a cell may be
-_PLACES = 32
+# Places beside each other in the table, in which a cell may be: so many that each cell finds one, whatever comes first
+_PLACES = 512
 # Directions along an axis of the octahedral map
 _DIRECTIONS = 8
 

@@ -76,6 +76,8 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
         y.Δ = y.Δ + dr.select(y.joined, joined, y.a) * found
     path.walks = path.walks & ~(ends & lambertian)
     path.ρ = ρ
+    # Where it goes on, it does so as the paths that feed the cache do: they have a record here.
+    path.trail.spread = dr.select(able & ~ends, 0, path.trail.spread)
     return path, path.β * found, path.β * caustic_found, path.β * ρ * sum(errors)
 
 
@@ -107,12 +109,12 @@ def feed(view, plan: Plan, known: Known, random, camera_ray: tuple, half: mi.UIn
     # What is late is not so from the camera on, but from each record on.
     whole = replace(plan, caustic=False)
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
-        return walk(scene, whole, known, random, path, none, mi.Float(1) - 2 * mi.Float(half))
+        return walk(scene, whole, known, random, path, none, half)
 
 
 @dr.syntax
-def walk(scene, plan: Plan, known: Known, random, path: Path, records: list, sign: mi.Float) -> tuple:
-    count, fresh, active = mi.UInt32(0), dr.full(mi.Bool, False, dr.width(sign)), path.goes_on(plan, [])
+def walk(scene, plan: Plan, known: Known, random, path: Path, records: list, half: mi.UInt32) -> tuple:
+    count, fresh, active = mi.UInt32(0), dr.full(mi.Bool, False, dr.width(half)), path.goes_on(plan, [])
     while dr.hint(active, label="feed", exclude=[known]):
         step, path = base_step(scene, plan, random, path, [], Recording(count > 0, fresh))
         rough = mi.Bool(True)
@@ -127,15 +129,15 @@ def walk(scene, plan: Plan, known: Known, random, path: Path, records: list, sig
             r.T = dr.select(here, step.E_p * step.segment.weight, r.T * step.f_p)
             r.find(r.T * step.L_bsdf, r.late)
         where, able = place(plan, known, path)
-        sorts, errors, ends = known.look(where, LEAST_TO_FEED, able)
+        sorts, _, ends = known.look(where, LEAST_TO_FEED, able, half)
         # The first vertex is where others will end: it has a record in any case.
         ends &= (count > 0) & ((count == RECORDS) | (random.next_1d() >= RENEW))
         ρ = plan.matt.reflectance(path.x, ends)
         fresh = able & ~ends & (count < RECORDS)
         for i in range(RECORDS):
             r, this = records[i], fresh & (count == i)
-            for C, error, late in zip(sorts, errors, (r.late, mi.Bool(True)), strict=False):
-                r.find(dr.select(ends, r.T * ρ * (C + sign * error), 0), late)
+            for C, late in zip(sorts, (r.late, mi.Bool(True)), strict=False):
+                r.find(dr.select(ends, r.T * ρ * C, 0), late)
             r.late = r.late & ~this
             r.place = dr.select(this, where, r.place)
         count = dr.select(fresh, count + 1, count)
