@@ -15,6 +15,7 @@ from data_gen.adaptive import Adaptive, check_adaptive, render_adaptive
 from data_gen.begun import Unfinished
 from data_gen.budget import DEFAULT_MEMORY, Budget, Progress, Watch
 from data_gen.film import GradientFilm
+from data_gen.film.gradient_film import bytes_of_shared
 from data_gen.passes import render_passes, rounds_of
 from data_gen.samplers import SAMPLERS, choose, find
 from data_gen.samplers.registry import Entry, own
@@ -110,7 +111,7 @@ def render_stack(
             said = {TAILS: f"off: {why_not}"} if why_not else {}
             settings["tails"] = "paths" if why_not else "shared"
         if settings["tails"] == "shared" and memory >= LEAST_MIB:
-            budget = replace(budget, memory=memory - MIB)
+            budget = replace(budget, memory=memory - MIB - bytes_of_shared(pixels) // 2**20)
     if adaptive is not None:
         check_adaptive(adaptive, entry, settings, spp)
     _LOG.info("sampler %s, options %s", sampler, options_as_attribute(entry, settings) or "as by default")

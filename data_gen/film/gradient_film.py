@@ -35,9 +35,11 @@ _SPLIT = ("diffuse", "specular")
 # Features whose noise is said in one number, see ``GradientFilm.feature_noise``
 _FEATURES = ("albedo", "normal")
 _WITH_VARIANCE = frozenset({"primal", "caustic", *_SPLIT, *SHIFTS, *_FEATURES})
-# Per strand: two counts for each of 11 names, double means of 29 channels and sums of squares of 21; and the moments of
+# Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 21; and the moments of
 # one name once more.
-_STRAND_BYTES = 11 * 8 + (29 + 21) * 8 + (8 + 6 * 8)
+_STRAND_BYTES = 10 * 8 + (26 + 21) * 8 + (8 + 6 * 8)
+# Per strand, of the layer ``shared``, which few films have: two counts, double means
+_SHARED_BYTES = 8 + 3 * 8
 # Per strand, of two sets of earlier samples: single means of 21 channels, and counts of the seven names they belong to,
 # with the number of bits
 _HALVES_BYTES = 2 * 21 * 4 + 7 * 3 * 4
@@ -374,6 +376,11 @@ class GradientFilm:
 
     def _image(self, columns: np.ndarray) -> np.ndarray:
         return columns.reshape(self.height, self.width, -1)
+
+
+def bytes_of_shared(pixels: int) -> int:
+    """What the layer ``shared`` of so many pixels takes."""
+    return _SHARED_BYTES * (1 << (max(pixels, _STRANDS) - 1).bit_length())
 
 
 def _components(value) -> list:
