@@ -98,7 +98,7 @@ class Record:
 def feed(view, plan: Plan, known: Known, random, camera_ray: tuple, half: mi.UInt32) -> tuple[mi.UInt32, list[Record]]:
     """Paths that feed a ``half`` of the cache, from a camera ray and its importance: how many records each has, and
     these."""
-    (ray, importance), space, scene = camera_ray, plan.space, plan.space.scene
+    (ray, importance), space = camera_ray, plan.space
     first = space.first(view, ray, None, space.begin(random))
     x = media.vertex(mi.Ray3f(first.ray), first.hit, first.place)
     path = begin(plan, x, first.place, None, importance * first.weight)
@@ -109,11 +109,12 @@ def feed(view, plan: Plan, known: Known, random, camera_ray: tuple, half: mi.UIn
     # What is late is not so from the camera on, but from each record on.
     whole = replace(plan, caustic=False)
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
-        return walk(scene, whole, known, random, path, none, half)
+        return walk(whole, known, random, path, none, half)
 
 
 @dr.syntax
-def walk(scene, plan: Plan, known: Known, random, path: Path, records: list, half: mi.UInt32) -> tuple:
+def walk(plan: Plan, known: Known, random, path: Path, records: list, half: mi.UInt32) -> tuple:
+    scene = plan.space.scene
     count, fresh, active = mi.UInt32(0), dr.full(mi.Bool, False, dr.width(half)), path.goes_on(plan, [])
     while dr.hint(active, label="feed", exclude=[known]):
         step, path = base_step(scene, plan, random, path, [], Recording(count > 0, fresh))

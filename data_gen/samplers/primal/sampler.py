@@ -38,7 +38,7 @@ def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places |
     view = SAMPLERS["gpt"].integrator(scene, places=places, caustic=False, tails=tails)
     plan = view.plan(scene)
     frozen = Frozen(scene, plan)
-    of_camera = partial(our_samples, scene, integrator, view, plan, features)
+    of_camera = partial(our_samples, view, plan, integrator=integrator, features=features)
 
     def take(known: Known | None, camera: CameraSamples, film: GradientFilm) -> None:
         film.put_all(frozen(of_camera, camera.look((0, 0), *QUARTERS), known))
@@ -46,9 +46,7 @@ def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places |
     return sharing(view, plan, frozen, take)
 
 
-def our_samples(
-    scene, integrator, view, plan: Plan, features: bool, camera: CameraSamples, known: Known | None
-) -> dict:
+def our_samples(view, plan: Plan, camera: CameraSamples, known: Known | None, *, integrator, features: bool) -> dict:
     """``samples()`` by the base paths of ``gpt``, which end in what is ``known`` of the cache.
 
     Where they may, the layer ``shared`` is a sample of the error of what comes from there.
@@ -61,7 +59,7 @@ def our_samples(
         errors.append(paths.shared)
         return paths.L + paths.Le
 
-    layers = samples(scene, integrator, radiance, features, camera)
+    layers = samples(plan.space.scene, integrator, radiance, features, camera)
     if plan.matt:
         ray, importance, _ = camera.rays()
         layers["shared"] = to_rgb(importance * errors[0], ray.wavelengths)
