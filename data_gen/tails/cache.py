@@ -198,9 +198,9 @@ class Cache:
         brightest_here = sum(dr.maximum(v.x, dr.maximum(v.y, v.z)) for v in here) / self._unit_or_1()
         usual = dr.maximum(dr.select(here[0].w > 0, brightest_here, mean), 1e-20)
         part = brightest / (brightest + usual)
-        values = (mi.UInt32(1), mi.UInt32(_PARTS * part + 0.5), mi.UInt32(_PARTS * dr.square(part) + 0.5))
+        statistics = (mi.UInt32(1), mi.UInt32(_PARTS * part + 0.5), mi.UInt32(_PARTS * dr.square(part) + 0.5))
         for i, within in enumerate((True, *upper)):
-            for each, value in zip(self.parts, values, strict=True):
+            for each, value in zip(self.parts, statistics, strict=True):
                 dr.scatter_add(each[i], value, of_half, placed & within, **direct)
         dr.eval(self.keys, self.count, self.sums, self.parts)
 

@@ -34,7 +34,7 @@ def share(film: GradientFilm, fed: float) -> float | None:
         return None
     light, variance = film.known("primal")
     shared, _ = film.known("shared")
-    if not np.isfinite(variance).any():
+    if variance is None or not np.isfinite(variance).any():
         return None
     weight = np.isfinite(light) & np.isfinite(variance)
     light, variance, shared = (_blocks(np.where(weight, each, 0)) for each in (light, variance, shared))

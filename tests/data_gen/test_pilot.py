@@ -135,7 +135,7 @@ def test_rooms_are_rendered_without_gradients(renderer, monkeypatch):
     monkeypatch.setitem(plans.METHODS, "ngpt-primal", replace(plans.METHODS["ngpt-primal"], missing=lambda: ""))
     assert chosen("glossy", (128, 64), 8) == room
     assert chosen("glossy", (256, 256), 1) == ("primal", "")
-    assert chosen("glossy", (128, 64), 7) == chosen("glossy", (128, 64), 8, gradients=True) == ("gpt", "")
+    assert chosen("glossy", (128, 64), 2) == chosen("glossy", (128, 64), 8, gradients=True) == ("gpt", "")
     for open_scene in ("diffuse", "environment", "lens", "haze"):
         assert chosen(open_scene, (128, 64), 8) == ("gpt", "")
     plan = plans.plan(load(renderer, "glossy", (128, 64)), 5.0)

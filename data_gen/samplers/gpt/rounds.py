@@ -59,7 +59,7 @@ class SharedTails:
         self.off, self.fed, self.pixels, self.until, self.share = "", 0, 1, 0, feeding.BEGIN
 
     def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
-        self.take(self.cache and self.cache.known, camera, film)
+        self.take(self.cache.known if self.cache else None, camera, film)
 
     @property
     def shares(self) -> bool:
