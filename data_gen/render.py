@@ -95,7 +95,8 @@ def render_stack(
             without = ", ".join(name for name, other in SAMPLERS.items() if "features" in other.options)
             raise NgptError(f"sampler '{sampler}' always renders features; only '{without}' can leave them out")
         options["features"] = False
-    settings, said = entry.settings(options), {}
+    settings = entry.settings(options)
+    said: dict[str, Any] = {}
     if "tails" in settings:
         why_not = why_not_shared(bool(facts.media), settings, mi.variant())
         if facts.integrator != "path":

@@ -207,7 +207,7 @@ def render_shot(
                     "samplers that reuse frames need crop windows of one size; only move them"
                 )
             # What cannot be rendered, for lack of memory for example, is refused before motion is computed.
-            failed = None
+            failed: Exception | None = None
             if remembering is not None:
                 remembering.begin(scene)
                 motion, shift, what = _motion(scene, now, before)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -143,7 +144,9 @@ def base_step(
     if recording:
         lit &= recording.any
     # Toward the emitter and along a new direction at once
-    to_light, E_light, E_p = x.to_local(light.d), None, None
+    to_light = x.to_local(light.d)
+    E_light: Any = None
+    E_p: Any = None
     if recording is None:
         f, p, sample, f_p = media.evaluate_and_sample(bsdf, x, place, to_light, u_lobe, u_direction)
     else:

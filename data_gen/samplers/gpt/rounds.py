@@ -137,4 +137,5 @@ def corner(scene: mi.Scene, seed: int) -> tuple[float, float, float]:
     box = scene.bbox()
     low, size = np.array(box.min, np.float64), max(box.extents())
     shift = np.random.default_rng([seed, _SEED]).random(3)
-    return tuple(float(x) for x in low - (0.5 + shift) * size)
+    x, y, z = low - (0.5 + shift) * size
+    return float(x), float(y), float(z)
