@@ -52,13 +52,18 @@ def filtered(
     def run(colour: np.ndarray | None) -> np.ndarray:
         return _filtered(images if colour is None else {**images, "color": colour}, device, weights, kind, settings)
 
+    def negative(colour: np.ndarray) -> np.ndarray | None:
+        """The negative light of an image, if it is more than rounding."""
+        light = np.maximum(-colour, 0)
+        much = light.sum(dtype=np.float64) > _ROUNDING * np.abs(colour).sum(dtype=np.float64)
+        return light if much else None
+
     def signs_apart(colour: np.ndarray) -> np.ndarray:
-        negative = np.maximum(-colour, 0)
-        little = negative.sum(dtype=np.float64) <= _ROUNDING * np.abs(colour).sum(dtype=np.float64)
-        return run(colour) if little else run(colour) - run(negative)
+        light = negative(colour)
+        return run(colour) if light is None else run(colour) - run(light)
 
     colour = images.get("color")
-    if colour is None or colour.min() >= 0 or settings.get("directional"):
+    if colour is None or settings.get("directional") or negative(colour) is None:
         return run(colour)
     wide = converted(colour, TO_WIDE)
     if negative_share(wide) <= BEYOND < negative_share(colour):

@@ -22,12 +22,3 @@ def fast(library):
 @pytest.fixture(scope="session")
 def primal(library):
     return Network(library, PRIMAL)
-
-
-def pytest_collection_modifyitems(items):
-    """Hosts know nothing yet of light below 0, which ``ngpt denoise`` keeps since November 28."""
-    import pytest
-
-    for item in items:
-        if "wide-oidn_host-ngpt-combine" in item.nodeid:
-            item.add_marker(pytest.mark.xfail(reason="hosts do not keep light below 0", strict=False))
