@@ -52,7 +52,7 @@ def scene_facts(scene: mi.Scene, sensor: mi.Sensor | None = None, integrator: mi
 
 
 def shapes_of(scene: mi.Scene) -> list[mi.Shape]:
-    """All shapes of a scene, with those that only instances show, of which Mitsuba lists none."""
+    """All shapes of a scene. Mitsuba does not list those that only instances show; they are here too."""
     groups = (shape for shape in objects_in(scene, mi.Shape) if shape.class_name() == "ShapeGroupPlugin")
     return [*scene.shapes(), *(shape for group in groups for shape in objects_in(group, mi.Shape))]
 

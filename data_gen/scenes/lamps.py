@@ -114,7 +114,7 @@ class Found:
     path: np.ndarray
 
     def first(self, paths: int) -> Found:
-        """Of the first so many paths: what a pilot of no more would have found."""
+        """What a pilot of only the first so many paths would have found."""
         some = self.path < paths
         return Found(self.lamp[some], self.L[some], self.at[some], self.path[some])
 

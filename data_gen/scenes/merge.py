@@ -75,7 +75,7 @@ def _copy(state: mi.parser.ParserState, name: str, meshes: Sequence[int]) -> Non
 
 
 def _bytes_of(mesh: mi.Properties) -> int:
-    """Of its file; of a mesh without one about as much as in memory."""
+    """The bytes of its file; of a mesh without a file, about what it takes in memory."""
     file = Path(str(mi.file_resolver().resolve(mesh["filename"]))) if "filename" in mesh else None
     return file.stat().st_size if file is not None and file.is_file() else 1 << 10
 

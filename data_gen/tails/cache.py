@@ -155,7 +155,7 @@ class Cache:
         # By half and cell, of all records and of those in the upper part along each axis: how many, and the sums of
         # their light and of its square, in _PARTS
         self.parts = [[dr.zeros(mi.UInt32, HALVES * CELLS) for _ in range(4)] for _ in range(3)]
-        self.unit, self.full, self.fineness = 0.0, False, fineness
+        self.unit, self.full = 0.0, False
         # For all records so far: their number, the sum of the light of the brightest colour of each, in units, and how
         # much of it was cut
         self.records = self.light = self.cut = 0
@@ -209,7 +209,6 @@ class Cache:
 
     def settle(self, fineness: float) -> None:
         """Rebuilds what is known from all records so far; from here on cells have this ``fineness``."""
-        self.fineness = fineness
         cells = int(dr.count(self.keys != 0)[0])
         if cells > _FULL * CELLS and not self.full:
             self.full = True
@@ -262,7 +261,7 @@ class Cache:
 
 
 def _mean_and_variance(n: mi.Float, light: mi.Float, squares: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Of n values, whose sums are given in _PARTS: the mean, and its variance."""
+    """The mean of n values and the variance of that mean, from their sums in _PARTS."""
     mean = light / dr.maximum(_PARTS * n, 1)
     # No less than what rounding makes of it
     spread = dr.maximum(squares / dr.maximum(_PARTS * n, 1) - dr.square(mean), 1 / _PARTS)

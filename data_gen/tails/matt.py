@@ -85,7 +85,7 @@ def evaluate_and_sample(
     both: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum]:
     """As ``data_gen.paths.media.evaluate_and_sample``, but half of the directions of ``both`` lanes come by the cosine,
-    as at a matt surface, and all densities are those of both ways together."""
+    as at a matt surface. Each density is the mean of both ways."""
     by_cosine = both & (u_lobe < 0.5)
     u_lobe = dr.select(both, 2 * u_lobe - dr.select(by_cosine, mi.Float(0), 1), u_lobe)
     f, p, sample, f_p = bsdf.eval_pdf_sample(mi.BSDFContext(), x, wo, u_lobe, u_direction)

@@ -1,6 +1,6 @@
 """Which red, green and blue a file means, by its header; and linear Rec. 709, in which it is shown.
 
-The attributes that tell, the first of which wins: ``acesImageContainerFlag`` (SMPTE ST 2065-4), ``colorInteropID`` (the
+These attributes tell; the first that is there wins: ``acesImageContainerFlag`` (SMPTE ST 2065-4), ``colorInteropID`` (the
 names of the Color Interop Forum), ``chromaticities`` and ``oiio:ColorSpace`` (OpenImageIO). By OpenEXR's rule a file
 without them is of Rec. 709: https://openexr.com/en/latest/TechnicalIntroduction.html
 """

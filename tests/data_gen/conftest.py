@@ -65,3 +65,14 @@ def command(command):
         return errors
 
     return run
+
+
+@pytest.fixture(scope="module")
+def small_images_share():
+    """Small images have a cache from the first sample on."""
+    from data_gen.tails import schedule
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(schedule, "BEGIN", 1)
+        patch.setattr(schedule, "FIRST", 1 << 13)
+        yield

@@ -27,6 +27,8 @@ from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError, WrongUse
 from ngpt.shared import shared_variance
 
+pytestmark = pytest.mark.usefixtures("small_images_share")
+
 DIFFUSE = {"type": "diffuse"}
 ROUGH = {"type": "roughconductor", "alpha": 0.4}
 # Materials; whether a path may end there, and whether nothing is left to follow then
@@ -176,15 +178,6 @@ def test_a_full_cache_says_so_and_goes_on(renderer, caplog, monkeypatch):
     assert np.isfinite(stack["primal"]).all()
     (line,) = [line for line in caplog.messages if "cache" in line]
     assert "the cache of tails is full" in line and "--unbiased" in line
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_images_share():
-    """Small images have a cache from the first sample on."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(schedule, "BEGIN", 1)
-        patch.setattr(schedule, "FIRST", 1 << 13)
-        yield
 
 
 @pytest.fixture(scope="module")

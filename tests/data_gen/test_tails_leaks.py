@@ -14,16 +14,9 @@ from data_gen.samplers.gpt import rounds
 from data_gen.tails import cache, schedule
 from data_gen.tails.schedule import FINENESS, fineness
 
+pytestmark = pytest.mark.usefixtures("small_images_share")
+
 BLOCK = 4
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_images_share():
-    """Small images have a cache from the first sample on."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(schedule, "BEGIN", 1)
-        patch.setattr(schedule, "FIRST", 1 << 13)
-        yield
 
 
 @lru_cache
