@@ -1,8 +1,8 @@
 """Which red, green and blue a file means, by its header; and linear Rec. 709, in which it is shown.
 
-These attributes tell; the first that is there wins: ``acesImageContainerFlag`` (SMPTE ST 2065-4), ``colorInteropID`` (the
-names of the Color Interop Forum), ``chromaticities`` and ``oiio:ColorSpace`` (OpenImageIO). By OpenEXR's rule a file
-without them is of Rec. 709: https://openexr.com/en/latest/TechnicalIntroduction.html
+These attributes tell; the first that is there wins: ``acesImageContainerFlag`` (SMPTE ST 2065-4), ``colorInteropID``
+(the names of the Color Interop Forum), ``chromaticities`` and ``oiio:ColorSpace`` (OpenImageIO). By OpenEXR's rule a
+file without them is of Rec. 709: https://openexr.com/en/latest/TechnicalIntroduction.html
 """
 
 import logging
