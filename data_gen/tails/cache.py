@@ -32,7 +32,7 @@ import mitsuba as mi
 
 from data_gen.paths.streams import mixed
 from data_gen.tails.schedule import FINENESS
-from data_gen.tails.table import Place, in_table, key, octahedral
+from data_gen.tails.table import Grid, Place, in_table, key, octahedral
 
 # MiB that the cache takes, and of those a render may use, what makes this little
 MIB, LEAST_MIB = 320, 640
@@ -94,7 +94,7 @@ class Known:
     means: list[mi.Float]
     differences: list[mi.Float]
     fineness: mi.Float
-    corner: mi.Point3f
+    grid: Grid
 
     def place_of(self, x: mi.SurfaceInteraction3f, spread: mi.Float, kind: mi.UInt32 | int) -> Place:
         """Where vertex ``x`` lies among the cells that are ``fineness`` times smaller than the ``spread``.
@@ -103,7 +103,7 @@ class Known:
         """
         level = mi.Int32(dr.floor(dr.log2(dr.maximum(spread / self.fineness, 1e-20))))
         normal = octahedral(mi.Normal3f(dr.mulsign(x.sh_frame.n, x.wi.z)))
-        return Place(mi.Point3f(x.p) - self.corner, normal + (mi.UInt32(kind) << 16), level)
+        return Place(self.grid.place_of(x.p, level), normal + (mi.UInt32(kind) << 16), level)
 
     def look(
         self, place: Place, least: int, active: mi.Bool, half: mi.UInt32 | None = None
@@ -144,10 +144,9 @@ class Cache:
     cells would lose light: see docs/samplers/tails.md. A *torn* cell is not trusted either: one whose two parts along
     an axis have other light, as where a wall goes through it. Paths go on from there by themselves.
 
-    ``corner`` is the corner of the grid: a point beyond which the scene lies.
     """
 
-    def __init__(self, fineness: float, sorts: int = 1, corner: tuple[float, float, float] = (0.0, 0.0, 0.0)):
+    def __init__(self, fineness: float, sorts: int = 1, grid: Grid | None = None):
         self.keys = dr.zeros(mi.UInt32, CELLS)
         # By half and cell
         self.count = dr.zeros(mi.UInt32, HALVES * CELLS)
@@ -160,8 +159,8 @@ class Cache:
         # much of it was cut
         self.records = self.light = self.cut = 0
         means, differences = ([dr.zeros(mi.Float, 4 * CELLS) for _ in range(sorts)] for _ in range(2))
-        at = mi.Point3f(*(dr.opaque(mi.Float, x) for x in corner))
-        self.known = Known(self.keys, means, differences, dr.opaque(mi.Float, fineness), at)
+        grid = grid or Grid.at()
+        self.known = Known(self.keys, means, differences, dr.opaque(mi.Float, fineness), grid)
         dr.make_opaque(self.keys, self.count, self.sums, self.parts, means, differences)
 
     def add(self, place: Place, half: mi.UInt32, values: list[mi.Float]) -> None:
@@ -237,8 +236,8 @@ class Cache:
             difference = [0.5 * (x - y) for x, y in zip(a, b, strict=True)]
             dr.scatter(means[sort], mi.Vector4f(*mean, records), cell)
             dr.scatter(differences[sort], mi.Vector4f(*difference, torn), cell)
-        corner = self.known.corner
-        self.known = Known(mi.UInt32(self.keys), means, differences, dr.opaque(mi.Float, fineness), corner)
+        fineness = dr.opaque(mi.Float, fineness)
+        self.known = Known(mi.UInt32(self.keys), means, differences, fineness, self.known.grid)
         dr.eval(self.known.keys, means, differences)
 
     def torn(self, fineness: float) -> mi.Bool:

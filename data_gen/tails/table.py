@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -19,9 +20,29 @@ _DIRECTIONS = 8
 class Place:
     """A vertex as the cache knows it."""
 
-    p: mi.Point3f  # from the corner of the grid
+    p: mi.Point3f  # from the origin of the grid of its level
     code: mi.UInt32  # direction of the normal on the side that is seen, and what else tells cells apart
     level: mi.Int32  # cells have the side 2^level
+
+
+@dataclass
+class Grid:
+    """Where cells lie: ``origin``, and by how much of a cell's edge the grid of each level is shifted from there.
+
+    Near the origin floats are the finest. A camera there sees small cells beside it, however large the scene is.
+    """
+
+    origin: mi.Point3f
+    shift: mi.Vector3f
+
+    @classmethod
+    def at(cls, origin: Sequence[float] = (0.0, 0.0, 0.0), shift: Sequence[float] = (0.0, 0.0, 0.0)) -> Grid:
+        # Opaque: they would be compiled into kernels, new ones for every seed.
+        point, vector = ([dr.opaque(mi.Float, float(x)) for x in each] for each in (origin, shift))
+        return cls(mi.Point3f(*point), mi.Vector3f(*vector))
+
+    def place_of(self, p: mi.Point3f, level: mi.Int32) -> mi.Point3f:
+        return mi.Point3f(mi.Vector3f(p - self.origin) + self.shift * dr.exp2(mi.Float(level)))
 
 
 def octahedral(n: mi.Vector3f) -> mi.UInt32:

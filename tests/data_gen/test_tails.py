@@ -289,9 +289,9 @@ def test_light_below_zero_is_light(renderer):
 
 
 def test_claims_hold_for_pixels_blocks_and_images(renderer):
-    """Real over claimed variance in a room lit through a gap, over sixteen seeds."""
+    """Real over claimed variance in a room lit through a gap. With 32 seeds the ratio of blocks is known within a fifth."""
     scene, size = load(renderer, slit, (32, 24)), 8
-    stacks = [render_stack(scene, 32, seed, "primal", tails="shared") for seed in range(16)]
+    stacks = [render_stack(scene, 32, seed, "primal", tails="shared") for seed in range(32)]
     primal, shared, variance = (
         np.array([s[name] for s in stacks], np.float64) for name in ("primal", "shared", "primal_var")
     )
@@ -304,11 +304,11 @@ def test_claims_hold_for_pixels_blocks_and_images(renderer):
         claimed = (np.square(blocks(shared)) + blocks(own) / side**2).mean(axis=0)
         return blocks(primal).var(axis=0, ddof=1).sum() / claimed.sum()
 
-    assert 0.6 < ratio(1) < 1.4 and 0.5 < ratio(size) < 1.6
+    assert 0.8 < ratio(1) < 1.25 and 0.6 < ratio(size) < 1.7
     # Without what pixels share, blocks claim far too little.
     means = primal.mean(axis=(1, 2)).var(axis=0, ddof=1).sum()
     claimed = (np.square(shared.mean(axis=(1, 2))).mean(axis=0) + own.mean(axis=(0, 1, 2)) / (32 * 24)).sum()
-    assert 0.3 < means / claimed < 3
+    assert 0.4 < means / claimed < 2.3
 
 
 @pytest.mark.parametrize(

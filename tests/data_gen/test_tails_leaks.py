@@ -148,6 +148,18 @@ def test_dark_rooms_stay_dark(renderer, monkeypatch, wall):
     assert shared.mean() / paths.mean() == pytest.approx(1, abs=0.01)
 
 
+def test_a_large_scene_has_small_cells(renderer, monkeypatch):
+    """Cells lie about the camera, where floats are fine: far from there, two rooms would be in one cell."""
+    monkeypatch.setattr(schedule, "FIRST", 1 << 16)
+    rooms = two_rooms(0.02, 0.0, 1, 0)
+    plain = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1e3]).scale(1e8)}
+    near, far = (
+        images(load(renderer, scene, (64, 36)), "shared", 64, range(4))[:, :, 38:].mean()
+        for scene in (rooms, rooms | {"plain": plain})
+    )
+    assert far == pytest.approx(near, rel=0.03)
+
+
 def test_odd_images(renderer):
     """Images of one pixel, of part of a picture, and without light."""
 

@@ -20,7 +20,7 @@ from data_gen.tails import cache as tails
 from data_gen.tails import feeding
 from data_gen.tails.cache import Cache, Known, joined
 from data_gen.tails.schedule import end_of_round, fineness, first_sample
-from data_gen.tails.table import Place
+from data_gen.tails.table import Grid, Place
 from ngpt.shared import CUT, TAILS
 
 # Paths that feed the cache before its first round, at least
@@ -92,7 +92,7 @@ class SharedTails:
         if self.cache is None:
             parts = [round(_FIRST_PART * wanted), wanted]
             # The light of the layer ``caustic`` is kept apart, where there is such a layer.
-            self.cache = Cache(size, 2 if self.plan.caustic else 1, corner(self.plan.space.scene, seed))
+            self.cache = Cache(size, 2 if self.plan.caustic else 1, grid(sensor, seed))
         for part in parts:
             while self.fed < part:
                 first = self.fed == 0
@@ -132,10 +132,7 @@ def paths(view, plan: Plan, known: Known, camera: CameraSamples, half: mi.UInt32
     ]
 
 
-def corner(scene: mi.Scene, seed: int) -> tuple[float, float, float]:
-    """The corner of the cells' grid: another one for each seed, so that no wall lies on a border of cells in all."""
-    box = scene.bbox()
-    low, size = np.array(box.min, np.float64), max(box.extents())
-    shift = np.random.default_rng([seed, _SEED]).random(3)
-    x, y, z = low - (0.5 + shift) * size
-    return float(x), float(y), float(z)
+def grid(sensor: mi.Sensor, seed: int) -> Grid:
+    """The cells' grid about a camera: another one for each seed, so that no wall lies on a border of cells in all."""
+    origin = np.array(sensor.world_transform().translation(), np.float64).ravel()
+    return Grid.at(origin, np.random.default_rng([seed, _SEED]).random(3))
