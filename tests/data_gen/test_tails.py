@@ -289,7 +289,7 @@ def test_light_below_zero_is_light(renderer):
 
 
 def test_claims_hold_for_pixels_blocks_and_images(renderer):
-    """Real over claimed variance in a room lit through a gap. With 32 seeds the ratio of blocks is known within a fifth."""
+    """Real over claimed variance in a room lit through a gap. 32 seeds know the ratio of blocks within a fifth."""
     scene, size = load(renderer, slit, (32, 24)), 8
     stacks = [render_stack(scene, 32, seed, "primal", tails="shared") for seed in range(32)]
     primal, shared, variance = (
