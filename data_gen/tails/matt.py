@@ -40,6 +40,7 @@ class Matt:
         groups = any(shape.class_name() == "Instance" for shape in scene.shapes())
         self.any = groups or any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) for bsdf in bsdfs.values())
         self.nothing_else = ByMaterial(mi.Bool(table))
+        self.plain = Plain(bsdfs)
 
     def at(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
         """Whether the material at a vertex has a diffuse part."""
@@ -52,15 +53,45 @@ class Matt:
 
     def reflectance(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
         """ρ in [0, 1]: π times the diffuse lobe's f in a direction on the side of ``wi``."""
-        context = mi.BSDFContext()
-        # Materials of several lobes leave the others out, but for ``principled``.
-        context.type_mask = mi.BSDFFlags.DiffuseReflection
-        along = mi.Vector2f(x.wi.x, x.wi.y)
-        across = dr.rsqrt(dr.maximum(dr.squared_norm(along), 1e-12)) * along
-        wo = dr.normalize(mi.Vector3f(_TILT * across.x, _TILT * across.y, dr.mulsign(mi.Float(1), x.wi.z)))
-        f = mi.Color3f(mi.unpolarized_spectrum(x.bsdf().eval(context, x, wo, active)))
-        ρ = f * (dr.pi / dr.abs(wo.z))
-        return dr.select(active & dr.isfinite(dr.sum(ρ)), dr.clip(ρ, 0, 1), 0)
+        known, ρ = self.plain.of(x, active)
+        return dr.select(known, ρ, reflectance(x.bsdf(), x, active & ~known))
+
+
+class Plain:
+    """ρ of the materials that have one for each side: matt ones without a texture. A table is quicker than to ask
+    them."""
+
+    def __init__(self, bsdfs: dict[int, mi.BSDF]):
+        # By material and side: RGB, and 1 where it is known
+        table = np.zeros((max(bsdfs, default=0) + 1, 2, 4), np.float32)
+        x = dr.zeros(mi.SurfaceInteraction3f, 2)
+        x.wi = mi.Vector3f(0, 0, mi.Float([1, -1]))
+        for number, bsdf in bsdfs.items():
+            if is_lambertian(bsdf) and is_constant(bsdf):
+                table[number, :, :3] = np.array(reflectance(bsdf, x, mi.Bool(True))).T
+                table[number, :, 3] = 1
+        # Opaque: the numbers may be others in each process, and the kernel is to be the same.
+        self.size, self.table = dr.opaque(mi.UInt32, len(table)), mi.Float(table.ravel())
+        dr.eval(self.table)
+
+    def of(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Bool, mi.Color3f]:
+        number = dr.reinterpret_array(mi.UInt32, x.bsdf())
+        row = 2 * number + dr.select(x.wi.z < 0, mi.UInt32(1), 0)
+        v = dr.gather(mi.Vector4f, self.table, row, active & (number < self.size))
+        return v.w > 0, mi.Color3f(v.x, v.y, v.z)
+
+
+def reflectance(bsdf: mi.BSDF | mi.BSDFPtr, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
+    """ρ as a material itself says it."""
+    context = mi.BSDFContext()
+    # Materials of several lobes leave the others out, but for ``principled``.
+    context.type_mask = mi.BSDFFlags.DiffuseReflection
+    along = mi.Vector2f(x.wi.x, x.wi.y)
+    across = dr.rsqrt(dr.maximum(dr.squared_norm(along), 1e-12)) * along
+    wo = dr.normalize(mi.Vector3f(_TILT * across.x, _TILT * across.y, dr.mulsign(mi.Float(1), x.wi.z)))
+    f = mi.Color3f(mi.unpolarized_spectrum(bsdf.eval(context, x, wo, active)))
+    ρ = f * (dr.pi / dr.abs(wo.z))
+    return dr.select(active & dr.isfinite(dr.sum(ρ)), dr.clip(ρ, 0, 1), 0)
 
 
 def is_lambertian(bsdf: mi.BSDF) -> bool:
@@ -69,6 +100,12 @@ def is_lambertian(bsdf: mi.BSDF) -> bool:
     more = any(mi.has_flag(flags, getattr(mi.BSDFFlags, name)) for name in _ELSE)
     known = bsdf.class_name() in ("SmoothDiffuse", "TwoSidedBRDF") and not _BUMPS.search(str(bsdf))
     return known and mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection) and not more
+
+
+def is_constant(bsdf: mi.BSDF) -> bool:
+    """Whether a matt material has no texture: all that it knows of itself is a reflectance."""
+    keys = list(mi.traverse(bsdf).keys())
+    return bool(keys) and all(key.split(".")[-2:] == ["reflectance", "value"] for key in keys)
 
 
 def matt_lobe(x: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.Float:
