@@ -50,13 +50,11 @@ class Aim:
 
 
 class Holes:
-    """The materials of a scene that light goes straight through, by a share that they know."""
+    """Materials that light goes straight through, by a share that they know."""
 
     def __init__(self, bsdfs: list[mi.BSDF]):
-        materials = {dr_number(bsdf): bsdf for bsdf in bsdfs}
-        table = [False] * (max(materials, default=0) + 1)
-        for number, bsdf in materials.items():
-            table[number] = knows(bsdf)
+        numbers = {dr_number(bsdf) for bsdf in bsdfs}
+        table = [number in numbers for number in range(max(numbers) + 1)]
         self.known = ByMaterial(mi.Bool(table))
 
     def passed(self, bsdf: mi.BSDFPtr, kind: mi.UInt32) -> mi.Bool:
@@ -74,7 +72,7 @@ class Holes:
     def of(cls, scene: mi.Scene, passed: Callable[[mi.Shape], bool]) -> Holes | None:
         """The holes of a scene, but in shapes that are ``passed``; None where there are none."""
         bsdfs = (shape.bsdf() for shape in shapes_of(scene) if not passed(shape))
-        some = [bsdf for bsdf in bsdfs if bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)]
+        some = [bsdf for bsdf in bsdfs if bsdf is not None and has_holes(bsdf) and knows(bsdf)]
         return cls(some) if some else None
 
     @dr.syntax
@@ -93,8 +91,10 @@ class Holes:
         return T
 
 
+def has_holes(bsdf: mi.BSDF) -> bool:
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+
+
 def knows(bsdf: mi.BSDF) -> bool:
     """Whether the share that goes straight through is known: bump and normal maps around a mask say that it is 0."""
-    if not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null):
-        return True
-    return bsdf.class_name() in _KNOWN and all(map(knows, objects_in(bsdf, mi.BSDF)))
+    return not has_holes(bsdf) or bsdf.class_name() in _KNOWN and all(map(knows, objects_in(bsdf, mi.BSDF)))
