@@ -22,6 +22,7 @@ _MIRRORS = ("conductor", "dielectric", "thindielectric")
 _POINTS = ("point", "spot", "directional", "projector")
 # What light goes through and is focussed by, so that no connection finds it behind
 _LENSES = ("dielectric", "roughdielectric")
+_SHARP = ("conductor", "dielectric")
 
 
 def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
@@ -155,6 +156,9 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
             lines.append(
                 f"glass where other light is hard to find, too: photons and paths from both ends in one: {able}"
             )
+    tiny = points or any("sunsky" in name for name in plugins["Emitter"])
+    if tiny and any(name in plugins["BSDF"] for name in _SHARP) and (able := _finding(facts, "caustics", True)):
+        lines.append(f"lamps without size, or a sun, meet smooth glass or mirrors: what these make of it needs {able}")
     if facts.grids and (able := _finding(facts, "grids")):
         lines.append(f"media whose density varies: photons are gathered in them by {able}")
     if facts.media and points and not SAMPLERS["gpt"].refuses(facts):

@@ -100,6 +100,7 @@ def render_scene(
     from data_gen.render import check_limits, render_stack
     from data_gen.scenes.cameras import sensor_names
     from data_gen.scenes.dark import warn_if_black, warn_without_lamps
+    from data_gen.scenes.lost import warn_of_lost_light
 
     memory = DEFAULT_MEMORY if memory is None else memory
     if spp is None and seconds is None and error is None:
@@ -125,6 +126,7 @@ def render_scene(
         chosen(plan)
         sampler, seconds = plan.sampler, plan.render
         sharing = Adaptive() if plan.shared else None
+    warn_of_lost_light(scene, sampler)
     stack = render_stack(
         scene,
         spp,

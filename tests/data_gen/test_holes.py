@@ -33,9 +33,9 @@ def test_what_does_not_know_its_share_is_no_hole(renderer):
     mask = {"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse"}}
     flat = {"type": "rgb", "value": [0.5, 0.5, 1.0]}
     known = [mask, {"type": "null"}, {"type": "thindielectric"}, mask | {"nested": {"type": "dielectric"}}]
-    known += [{"type": "blendbsdf", "a": mask, "b": {"type": "diffuse"}}, {"type": "diffuse"}]
+    known += [{"type": "blendbsdf", "weight": 0.5, "a": mask, "b": {"type": "diffuse"}}, {"type": "diffuse"}]
     unknown = [{"type": "normalmap", "normalmap": flat, "bsdf": mask}]
-    unknown += [{"type": "blendbsdf", "a": unknown[0], "b": {"type": "diffuse"}}]
+    unknown += [{"type": "blendbsdf", "weight": 0.5, "a": unknown[0], "b": {"type": "diffuse"}}]
     assert [knows(renderer.load_dict(bsdf)) for bsdf in (*known, *unknown)] == [True] * len(known) + [False, False]
 
     def holes(bsdf):
