@@ -156,9 +156,7 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
             lines.append(
                 f"glass where other light is hard to find, too: photons and paths from both ends in one: {able}"
             )
-    tiny = points or any("sunsky" in name for name in plugins["Emitter"])
-    if tiny and any(name in plugins["BSDF"] for name in _SHARP) and (able := _finding(facts, "caustics", True)):
-        lines.append(f"lamps without size, or a sun, meet smooth glass or mirrors: what these make of it needs {able}")
+    lines += _of_tiny_lamps(plugins, facts)
     if facts.grids and (able := _finding(facts, "grids")):
         lines.append(f"media whose density varies: photons are gathered in them by {able}")
     if facts.media and points and not SAMPLERS["gpt"].refuses(facts):
@@ -172,6 +170,15 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
     if not plugins["Emitter"]:
         lines.append("lights: none, so the image will be black")
     return lines
+
+
+def _of_tiny_lamps(plugins: dict[str, Counter], facts: Facts) -> list[str]:
+    tiny = any(name in _POINTS or "sunsky" in name for name in plugins["Emitter"])
+    if not (tiny and any(name in plugins["BSDF"] for name in _SHARP)):
+        return []
+    able = _finding(facts, "caustics", and_hidden_lamps=True)
+    what = "lamps without size, or a sun, meet smooth glass or mirrors: what these make of it"
+    return [f"{what} needs {able}" if able else f"{what} is found by no sampler that renders this scene"]
 
 
 def _finding(facts: Facts, light: str, and_hidden_lamps: bool = False) -> str:

@@ -97,4 +97,4 @@ def has_holes(bsdf: mi.BSDF) -> bool:
 
 def knows(bsdf: mi.BSDF) -> bool:
     """Whether the share that goes straight through is known: bump and normal maps around a mask say that it is 0."""
-    return not has_holes(bsdf) or bsdf.class_name() in _KNOWN and all(map(knows, objects_in(bsdf, mi.BSDF)))
+    return not has_holes(bsdf) or (bsdf.class_name() in _KNOWN and all(map(knows, objects_in(bsdf, mi.BSDF))))

@@ -18,7 +18,18 @@ BUILTIN = ["diffuse", "glossy", "environment", "lens"]
 PATHS = [*BUILTIN, "glass", "hidden_lamp", "plenty", "leaf", "fog", "within_fog", "caustics", "under_the_sky"]
 PATHS += ["courtyard"]
 QUICK = {*BUILTIN, "glass", "hidden_lamp", "plenty", "leaf", "within_fog", "caustics", "courtyard", "sky", "areas"}
-QUICK |= {"curtains", "few_edges", "panels", "everything", "gallery: flat", "haze", "colours", "colours by mis", "before_the_sky", "lamp_alone"}
+QUICK |= {
+    "curtains",
+    "few_edges",
+    "panels",
+    "everything",
+    "gallery: flat",
+    "haze",
+    "colours",
+    "colours by mis",
+    "before_the_sky",
+    "lamp_alone",
+}
 QUICK |= {"coloured_smoke", "far plane, media True", "lit by all, fog False", "courtyard to 2", "courtyard to 3"}
 QUICK |= {f"{view}, media False" for view in ("principal point", "near plane", "principal point, crop")}
 # Of these ``path`` finds hardly any light, or none: references are by ``bdpt``.

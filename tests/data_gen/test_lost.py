@@ -39,6 +39,19 @@ def test_it_is_said_before_the_render(renderer, command, tmp_path, ball, lamp, s
     assert said != IN_GLASS or "--sampler vcm finds it" in told
 
 
+@pytest.mark.parametrize(("rows", "bent"), [(6, True), (30, False)])
+def test_lamps_of_few_faces_with_smooth_normals_are_named(renderer, rows, bent):
+    """Mitsuba's issue 1952: densities of such lamps are those of another normal than samples."""
+    from lamps_scenes import bowl
+    from unbiased import load
+
+    from data_gen.scenes.lost import _is_bent
+
+    lamp = bowl([0, 0, 0], 0.25, rows) | {"emitter": {"type": "area", "radiance": 4.0}}
+    scene = load(renderer, {"type": "scene", "lamp": lamp})
+    assert list(map(_is_bent, scene.emitters())) == [bent]
+
+
 def test_info_says_it_too(tmp_path):
     (tmp_path / "it.xml").write_text(SCENE.format(ball=GLASS, lamp=POINT))
     (line,) = (line for line in inspect_scene(str(tmp_path / "it.xml"))["plan"] if "without size, or a sun" in line)
