@@ -97,10 +97,10 @@ def render_scene(
     from data_gen.adaptive import Adaptive
     from data_gen.choosing import plans
     from data_gen.choosing.trials import Pilot
+    from data_gen.inspect import warn_of_lost_light
     from data_gen.render import check_limits, render_stack
     from data_gen.scenes.cameras import sensor_names
     from data_gen.scenes.dark import warn_if_black, warn_without_lamps
-    from data_gen.scenes.lost import warn_of_lost_light
 
     memory = DEFAULT_MEMORY if memory is None else memory
     if spp is None and seconds is None and error is None:

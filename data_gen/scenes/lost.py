@@ -1,17 +1,12 @@
-"""Light that a sampler cannot find, or not rightly: said in one line before a render."""
+"""Lamps whose light is hard to find, or wrong, and what in a scene makes it so."""
 
 from __future__ import annotations
-
-import logging
 
 import mitsuba as mi
 import numpy as np
 
-from data_gen.samplers.registry import FRAME_SAMPLERS, SAMPLERS, choose
-from data_gen.scenes.facts import scene_facts, shapes_of
+from data_gen.scenes.facts import shapes_of
 from data_gen.scenes.integrators import objects_in
-
-_LOG = logging.getLogger(f"ngpt.{__name__}")
 
 _SHARP = ("SmoothConductor", "SmoothDielectric")
 # Lamps smaller than this share of the scene's diagonal are met by hardly any path.
@@ -22,70 +17,44 @@ _SUN = "Sunsky"
 _BENT = 0.97
 
 
-def warn_of_lost_light(scene: mi.Scene, sampler: str) -> None:
-    """Says which light of the scene the sampler does not find, and which one does."""
-    facts = scene_facts(scene)
-    if facts.integrator not in ("path", "volpath", "volpathmis"):
-        return
-    sampler = choose(facts)[0] if sampler == "auto" else sampler
-    entry = FRAME_SAMPLERS.get(sampler) or SAMPLERS[sampler]
-    if not getattr(entry, "finds", ()) and (reason := sharp_lights(scene)):
-        able = [name for name, entry in SAMPLERS.items() if _finds_all(entry) and not entry.refuses(facts)]
-        remedy = f"--sampler {able[0]} finds it" if able else "no sampler that renders this scene finds it"
-        _LOG.warning("%s: '%s' does not find most of what these make of their light; %s", reason, sampler, remedy)
-    if facts.integrator == "path" and (lost := entry.loses) and without_size(scene) and holes(scene):
-        _LOG.warning("of lamps without size, '%s' loses light %s; --sampler gpt, or primal, finds it", sampler, lost)
-    if bent := next(filter(_is_bent, scene.emitters()), None):
-        _LOG.warning(
-            "lamp%s has few faces and smooth normals, which Mitsuba %s samples by one normal and weighs by another: "
-            "light beside it is wrong by up to 4 %%; give the lamp face_normals=true",
-            f" '{name}'" if (name := bent.get_shape().id()) else "",
-            mi.__version__,
-        )
-
-
-def _finds_all(entry) -> bool:
-    return "caustics" in entry.finds and "hidden lamps" in entry.finds and entry.standing == "use"
-
-
-def sharp_lights(scene: mi.Scene) -> str:
+def behind_sharp(scene: mi.Scene) -> str:
     """Which lamps hardly a path from the camera meets behind the scene's glass or mirrors; "" if there are none."""
     if not any(_is_sharp(shape.bsdf()) for shape in shapes_of(scene)):
         return ""
     if without_size(scene):
-        return "lamps without size meet smooth glass or mirrors"
-    return "tiny lamps meet smooth glass or mirrors" if any(map(_is_tiny, _lamps(scene))) else ""
+        return "lamps without size"
+    whole = float(np.linalg.norm(np.array(scene.bbox().extents())))
+    return "tiny lamps" if any(_is_tiny(emitter, whole) for emitter in scene.emitters()) else ""
 
 
 def without_size(scene: mi.Scene) -> bool:
     return any(mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta) for emitter in scene.emitters())
 
 
-def holes(scene: mi.Scene) -> bool:
+def has_holes(scene: mi.Scene) -> bool:
     """Whether light goes straight through something, media apart."""
     bsdfs = (shape.bsdf() for shape in shapes_of(scene) if not shape.is_medium_transition())
     return any(bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
 
 
-def _lamps(scene: mi.Scene) -> list[tuple[mi.Emitter, float]]:
-    """All emitters, and the size of each over the scene's; 1 of what is infinitely far away."""
-    whole, found = float(np.linalg.norm(np.array(scene.bbox().extents()))), []
-    for emitter in scene.emitters():
-        on_shape = mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
-        box = emitter.get_shape().bbox() if on_shape else None
-        found.append((emitter, float(np.linalg.norm(np.array(box.extents()))) / whole if box else 1.0))
-    return found
+def bent_lamp(scene: mi.Scene) -> mi.Shape | None:
+    """A lamp whose vertex normals are far from those of its faces.
+
+    Mitsuba samples it by one normal and weighs it by another: its issue 1952.
+    """
+    return next(filter(_is_bent, (shape for shape in scene.shapes() if shape.is_emitter())), None)
 
 
-def _is_tiny(lamp: tuple[mi.Emitter, float]) -> bool:
-    emitter, size = lamp
-    return size < _TINY or _SUN in emitter.class_name()
-
-
-def _is_bent(emitter: mi.Emitter) -> bool:
-    """Whether it is a mesh with vertex normals that are far from those of its faces."""
+def _is_tiny(emitter: mi.Emitter, whole: float) -> bool:
+    if _SUN in emitter.class_name():
+        return True
     shape = emitter.get_shape() if mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) else None
-    if shape is None or not shape.is_mesh() or not shape.has_vertex_normals():
+    return shape is not None and float(np.linalg.norm(np.array(shape.bbox().extents()))) < _TINY * whole
+
+
+def _is_bent(shape: mi.Shape) -> bool:
+    # A rectangle is a mesh too, but has no table of faces.
+    if not shape.is_mesh() or not shape.has_vertex_normals() or shape.class_name() == "Rectangle":
         return False
     params = mi.traverse(shape)
     faces = np.array(params["faces"]).reshape(-1, 3)

@@ -1,5 +1,6 @@
 """Scenes of light through masks and panes, from lamps with a size and without."""
 
+import mitsuba as mi
 from data_gen_scenes import _diffuse, _light, _rgb, _room, _scene, _sphere, _two, _wall
 
 _BESIDE = ([0.3, 1.25, 3.9], [0, 0.9, 0], 50)
@@ -32,3 +33,11 @@ def curtains(depth=-1):
 def few_edges():
     """Of paths that end while they are among the holes."""
     return curtains(4)
+
+
+def curtains_in_fog():
+    """The same, in a box of fog."""
+    air = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 0.3}
+    place = mi.ScalarTransform4f().translate([0, 1.2, 0]).scale([1.4, 1.15, 1.45])
+    scene = curtains() | {"box": {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": air}}
+    return scene | {"integrator": {"type": "volpath", "max_depth": -1}}
