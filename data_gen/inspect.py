@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,19 +10,23 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from data_gen.samplers import SAMPLERS, by_standing, choose
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, by_standing, choose
 from data_gen.scenes.builtin import SCENES, no_scene
-from data_gen.scenes.facts import Facts, polarised, spectral
+from data_gen.scenes.facts import Facts, polarised, scene_facts, spectral
 from data_gen.scenes.integrators import AROUND, lack, same_image
 from data_gen.scenes.load import complaint
+from data_gen.scenes.lost import behind_sharp, bent_lamp, has_holes, without_size
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS
+
+_LOG = logging.getLogger(f"ngpt.{__name__}")
 
 _KINDS = ("Integrator", "Sensor", "Film", "Shape", "BSDF", "Emitter", "Medium", "Texture")
 _MIRRORS = ("conductor", "dielectric", "thindielectric")
 _POINTS = ("point", "spot", "directional", "projector")
 # What light goes through and is focussed by, so that no connection finds it behind
 _LENSES = ("dielectric", "roughdielectric")
+_SHARP = ("conductor", "dielectric")
 
 
 def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
@@ -155,6 +160,7 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
             lines.append(
                 f"glass where other light is hard to find, too: photons and paths from both ends in one: {able}"
             )
+    lines += _of_tiny_lamps(plugins, facts)
     if facts.grids and (able := _finding(facts, "grids")):
         lines.append(f"media whose density varies: photons are gathered in them by {able}")
     if facts.media and points and not SAMPLERS["gpt"].refuses(facts):
@@ -170,8 +176,41 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
     return lines
 
 
+def _of_tiny_lamps(plugins: dict[str, Counter], facts: Facts) -> list[str]:
+    tiny = any(name in _POINTS or "sunsky" in name for name in plugins["Emitter"])
+    if not (tiny and any(name in plugins["BSDF"] for name in _SHARP)):
+        return []
+    able = _finding(facts, "caustics", and_hidden_lamps=True)
+    what = "lamps without size, or a sun, meet smooth glass or mirrors: what these make of it"
+    return [f"{what} needs {able}" if able else f"{what} is found by no sampler that renders this scene"]
+
+
 def _finding(facts: Facts, light: str, and_hidden_lamps: bool = False) -> str:
     """The arguments that name samplers, studies left out, which can render the scene and find such light."""
     able = {name: s for name, s in SAMPLERS.items() if s.standing != "study" and not s.refuses(facts)}
     found = [n for n, s in able.items() if light in s.finds and ("hidden lamps" in s.finds) == and_hidden_lamps]
     return ", ".join(f"`--sampler {name}`" for name in found)
+
+
+def warn_of_lost_light(scene: mi.Scene, sampler: str) -> None:
+    """Says before a render which light of the scene the sampler does not find, and which one does."""
+    facts = scene_facts(scene)
+    if facts.integrator not in ("path", "volpath", "volpathmis"):
+        return
+    sampler = choose(facts)[0] if sampler == "auto" else sampler
+    entry = FRAME_SAMPLERS.get(sampler) or SAMPLERS[sampler]
+    if not getattr(entry, "finds", ()) and (lamps := behind_sharp(scene)):
+        able = _finding(facts, "caustics", and_hidden_lamps=True).replace("`", "").split(", ")[0]
+        remedy = f"{able} finds it" if able else "no sampler that renders this scene finds it"
+        what = "smooth glass or mirrors: what these make of their light"
+        _LOG.warning("%s meet %s, '%s' hardly finds; %s", lamps, what, sampler, remedy)
+    if facts.integrator == "path" and entry.loses and without_size(scene) and has_holes(scene):
+        remedy = "--sampler gpt, or primal, finds it"
+        _LOG.warning("of lamps without size, '%s' loses light %s; %s", sampler, entry.loses, remedy)
+    if lamp := bent_lamp(scene):
+        _LOG.warning(
+            "lamp%s has few faces and smooth normals; Mitsuba %s samples it by one normal and weighs it by another, so "
+            "light beside it is wrong by up to 4 %%: give it face_normals=true",
+            f" '{lamp.id()}'" if lamp.id() else "",
+            mi.__version__,
+        )

@@ -97,6 +97,7 @@ def render_scene(
     from data_gen.adaptive import Adaptive
     from data_gen.choosing import plans
     from data_gen.choosing.trials import Pilot
+    from data_gen.inspect import warn_of_lost_light
     from data_gen.render import check_limits, render_stack
     from data_gen.scenes.cameras import sensor_names
     from data_gen.scenes.dark import warn_if_black, warn_without_lamps
@@ -125,6 +126,7 @@ def render_scene(
         chosen(plan)
         sampler, seconds = plan.sampler, plan.render
         sharing = Adaptive() if plan.shared else None
+    warn_of_lost_light(scene, sampler)
     stack = render_stack(
         scene,
         spp,

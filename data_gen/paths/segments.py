@@ -23,6 +23,7 @@ import mitsuba as mi
 
 from data_gen.paths import collisions
 from data_gen.paths.collisions import Collisions
+from data_gen.paths.holes import Holes
 from data_gen.paths.media import Media, Place, beyond, depth, end_of, extinction, onward, pick, shortened
 
 
@@ -123,15 +124,15 @@ def cross(passes, trace, ray, medium, reach, *, active, target):
 def see(media: Media, trace, ray, medium, reach, *, channel, key, active) -> tuple:
     """T along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary: in grids an estimate.
 
-    Returns T, that surface, and the last piece of the ray.
+    Returns T, that surface, the last piece of the ray, and the medium there.
     """
     if not media.grids:
-        τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active=active, target=None)
-        return dr.exp(-τ), hit, ray
+        τ, hit, ray, medium = cross(media.passes, trace, ray, medium, reach, active=active, target=None)
+        return dr.exp(-τ), hit, ray, medium
     # Ratio tracking: at each collision of the majorant what is null goes on.
     every = {"channel": channel, "key": key, "scale": mi.Float(1), "most": mi.UInt32(0xFFFFFFFF), "target": None}
-    τ, hit, ray, _, _, N = collisions.cross(media.passes, trace, ray, medium, reach, **every, active=active)
-    return dr.exp(-τ) * N, hit, ray
+    τ, hit, ray, medium, _, N = collisions.cross(media.passes, trace, ray, medium, reach, **every, active=active)
+    return dr.exp(-τ) * N, hit, ray, medium
 
 
 def clear_view(media: Media, trace, ray, medium, channel, active) -> tuple:
@@ -156,8 +157,33 @@ def transmittance(
     medium, reach = place.toward(x, ray.d), dr.norm(target - ray.o)
     if not media.boundaries and not media.grids:
         return dr.select(scene.ray_test(ray, active), 0, dr.exp(-depth(extinction(medium, ray), reach)))
-    T, hit, _ = see(media, next_surface(scene), ray, medium, reach, channel=channel, key=key, active=active)
+    T, hit, _, _ = see(media, next_surface(scene), ray, medium, reach, channel=channel, key=key, active=active)
     return dr.select(active & hit.is_valid(), 0, T)
+
+
+@dr.syntax
+def through_holes(
+    scene, media: Media, x, place: Place, target: mi.Point3f, *, holes: Holes, most, channel, key, active: mi.Bool
+) -> mi.Spectrum:
+    """``transmittance()`` where there may be ``most`` holes on the way."""
+    trace, ray = next_surface(scene), x.spawn_ray_to(target)
+    medium, left, going = mi.MediumPtr(place.toward(x, ray.d)), mi.UInt32(most), mi.Bool(active)
+    T = dr.select(active, mi.Spectrum(1), 0)
+    while dr.hint(going, label="holes"):
+        reach = dr.norm(target - ray.o)
+        piece, hit, last, there = see(media, trace, ray, medium, reach, channel=channel, key=key, active=going)
+        T = dr.select(going, mi.Spectrum(T * piece), T)
+        going &= hit.is_valid()
+        si = hit.compute_surface_interaction(last, mi.RayFlags.All, going)
+        T = dr.select(going, mi.Spectrum(T * dr.select(left > 0, holes.share(si, going), 0)), T)
+        going &= dr.max(T) > 0
+        left = dr.select(going, left - 1, left)
+        ray = si.spawn_ray_to(target)
+        medium = dr.select(si.is_medium_transition(), si.target_medium(ray.d), there)
+        if dr.hint(key is not None, mode="scalar"):
+            # Another piece has other collisions.
+            key = mi.sample_tea_32(key, mi.UInt32(left))[0]
+    return T
 
 
 def reconnect(scene, media: Media, y, place: Place, ray, *, x1, base: Segment, channel, active) -> tuple:

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import media, segments
+from data_gen.paths.holes import Holes
 from data_gen.paths.media import Media, Place, index_matched
 from data_gen.paths.segments import Numbers, Segment
 
@@ -35,6 +36,7 @@ class Space:
 
     def __init__(self, scene: mi.Scene):
         self.scene = scene
+        self.holes = Holes.of(scene, self.passed)  # None where there are none
 
     def passed(self, shape: mi.Shape) -> bool:
         return False
@@ -56,9 +58,17 @@ class Space:
     def end(self, x, segment: Segment) -> mi.SurfaceInteraction3f:
         return media.vertex(segment.ray, segment.hit, segment.place)
 
-    def sees(self, x, place: Place | None, target: mi.Point3f, drawn: Drawn | None, active) -> tuple[Any, mi.Bool]:
-        """Transmittance from vertex ``x`` to the point ``target`` of an emitter, and whether anything comes through."""
-        return 1, ~self.scene.ray_test(x.spawn_ray_to(target), active)
+    def sees(
+        self, x, place: Place | None, target: mi.Point3f, drawn: Drawn | None, active, *, most: Any
+    ) -> tuple[Any, mi.Bool]:
+        """Transmittance from vertex ``x`` to the point ``target`` of an emitter, and whether anything comes through.
+
+        There may be ``most`` holes on the way.
+        """
+        if self.holes is None:
+            return 1, ~self.scene.ray_test(x.spawn_ray_to(target), active)
+        T = self.holes.transmittance(self.scene, x.spawn_ray_to(target), target, most, active)
+        return T, dr.max(T) > 0
 
     def reconnect(
         self, y, place: Place | None, ray, x1, base: Segment, drawn: Drawn | None, *, active
@@ -102,9 +112,15 @@ class Filled(Space):
         x1.t = dr.select(x1.is_valid(), dr.norm(x1.p - x.p), x1.t)
         return x1
 
-    def sees(self, x, place: Place, target: mi.Point3f, drawn: Drawn, active) -> tuple[mi.Spectrum, mi.Bool]:
+    def sees(
+        self, x, place: Place, target: mi.Point3f, drawn: Drawn, active, *, most: Any
+    ) -> tuple[mi.Spectrum, mi.Bool]:
         numbers = {"channel": drawn.channel, "key": drawn.light}
-        T = segments.transmittance(self.scene, self.media, x, place, target, **numbers, active=active)
+        if self.holes is None:
+            T = segments.transmittance(self.scene, self.media, x, place, target, **numbers, active=active)
+        else:
+            way = {"holes": self.holes, "most": most} | numbers
+            T = segments.through_holes(self.scene, self.media, x, place, target, **way, active=active)
         return T, dr.max(T) > 0
 
     def reconnect(

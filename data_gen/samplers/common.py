@@ -33,9 +33,13 @@ def loses_light(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> bool:
     """Whether the integrator is ``path`` in a scene where that is biased.
 
     ``path`` returns 0 for a path that escapes after passing only holes, even if emitter sampling has lit it where the
-    material of a mask is partly there. Scenes with an environment are not affected.
+    material of a mask is partly there; scenes with an environment are not affected. What lamps without size send
+    through holes it never finds.
     """
-    if integrator.class_name() != "PathIntegrator" or scene.environment() or integrator.hide_emitters:
+    if integrator.class_name() != "PathIntegrator":
+        return False
+    found = scene.environment() or integrator.hide_emitters
+    if found and not any(mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta) for emitter in scene.emitters()):
         return False
     return any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in shapes_of(scene) if shape.bsdf())
 

@@ -59,6 +59,7 @@ class Entry:
     # What the user should know about rendering, by subject: "transport" and "noise"; "mirrors" and "media" where a
     # scene has them
     notes: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    loses: str = field(default="", kw_only=True)  # which light of lamps without size it loses at holes; "": none
 
     def __post_init__(self) -> None:
         if self.standing not in STANDINGS:

@@ -115,4 +115,8 @@ def first_radius(default: float) -> Option:
     return Option(default, meaning, range=(1e-6, 1e6))
 
 
+# Which light of lamps without size a sampler loses
+THROUGH_HOLES = "that comes through masks and thin panes"
+BETWEEN_HOLES = "that comes through one hole and is seen through another"
+
 IN_MIRRORS = "followed from the camera and from the lights, caustics seen in them too"

@@ -6,6 +6,7 @@ from itertools import product
 import bdpt_scenes
 import camera_cases
 import data_gen_scenes as scenes
+import hole_scenes
 import lamps_scenes
 import media_scenes
 import split_scenes
@@ -17,7 +18,18 @@ BUILTIN = ["diffuse", "glossy", "environment", "lens"]
 PATHS = [*BUILTIN, "glass", "hidden_lamp", "plenty", "leaf", "fog", "within_fog", "caustics", "under_the_sky"]
 PATHS += ["courtyard"]
 QUICK = {*BUILTIN, "glass", "hidden_lamp", "plenty", "leaf", "within_fog", "caustics", "courtyard", "sky", "areas"}
-QUICK |= {"panels", "everything", "gallery: flat", "haze", "colours", "colours by mis", "before_the_sky", "lamp_alone"}
+QUICK |= {
+    "curtains",
+    "few_edges",
+    "panels",
+    "everything",
+    "gallery: flat",
+    "haze",
+    "colours",
+    "colours by mis",
+    "before_the_sky",
+    "lamp_alone",
+}
 QUICK |= {"coloured_smoke", "far plane, media True", "lit by all, fog False", "courtyard to 2", "courtyard to 3"}
 QUICK |= {f"{view}, media False" for view in ("principal point", "near plane", "principal point, crop")}
 # Of these ``path`` finds hardly any light, or none: references are by ``bdpt``.
@@ -36,7 +48,7 @@ def of(name):
     """A built-in scene by its name, or a function of one of our modules."""
     if name in BUILTIN:
         return name
-    rooms = (scenes, bdpt_scenes, media_scenes, split_scenes)
+    rooms = (scenes, bdpt_scenes, media_scenes, split_scenes, hole_scenes)
     return next(getattr(room, name) for room in rooms if hasattr(room, name))
 
 
@@ -50,6 +62,7 @@ def in_rgb():
     yield from ((f"courtyard to {depth}", scenes.limited(depth), SMALL) for depth in (2, 3))
     yield from ((f"moved {place}", at_place(*place), (24, 24)) for place in PLACES)
     yield "panels", scenes.panels, (24, 24)
+    yield from (("curtains", of("curtains"), LARGE), ("few_edges", of("few_edges"), SMALL))
     yield from ((name, name, (12, 8)) for name in ("diffuse", "glossy"))
     yield from ((f"lit by all, fog {fog}", partial(lamps_scenes.lit_by, fog=fog), (48, 32)) for fog in (False, True))
     for view, media in product(camera_cases.RENDERED, (False, True)):

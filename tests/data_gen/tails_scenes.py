@@ -203,3 +203,22 @@ def of_material(material):
     for part in ("floor", "back"):
         scene[part]["bsdf"] = material
     return scene
+
+
+def first_sunset():
+    """A closed room with a window, lit by a sun 2 degrees high: its blue is negative, and the sky's red is little."""
+    wall, place = _grey(0.7), mi.ScalarTransform4f()
+    room = {
+        "floor": _wall([0, 0, 0], [0, 0, 1], (4, 4), wall),
+        "ceiling": _wall([0, 0, 3], [0, 0, -1], (4, 4), wall),
+        "back": _wall([-2, 0, 1.5], [1, 0, 0], (3, 4), wall),
+        "near": _wall([0, -2, 1.5], [0, 1, 0], (4, 3), wall),
+        "far": _wall([0, 2, 1.5], [0, -1, 0], (4, 3), wall),
+    }
+    around = {"left": (-1.4, 1.5, 1.2, 3), "right": (1.4, 1.5, 1.2, 3), "low": (0, 0.45, 1.6, 0.9)}
+    for name, (y, z, wide, high) in (around | {"high": (0, 2.6, 1.6, 0.8)}).items():
+        room[f"window {name}"] = _wall([2, y, z], [-1, 0, 0], (high, wide), wall)
+    sky = {"type": "sunsky", "sun_direction": [0.999391, 0.15, 0.0348995], "turbidity": 3.0}
+    scene = _place((0, 0, 0), (1, 0, 0), 75, **room, sky=sky)
+    scene["sensor"]["to_world"] = place.look_at([1.7, -1.6, 1.5], [-1.5, 1.2, 1.2], [0, 0, 1])
+    return scene

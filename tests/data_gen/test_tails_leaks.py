@@ -6,7 +6,20 @@ from functools import lru_cache, partial
 import mitsuba as mi
 import numpy as np
 import pytest
-from tails_scenes import SIZE, contact, corner_box, door, shade, sheet, shelf, slit, thin_wall, two_rooms, varnish
+from tails_scenes import (
+    SIZE,
+    contact,
+    corner_box,
+    door,
+    first_sunset,
+    shade,
+    sheet,
+    shelf,
+    slit,
+    thin_wall,
+    two_rooms,
+    varnish,
+)
 from unbiased import REFERENCES, load
 
 from data_gen.render import render_stack
@@ -174,3 +187,11 @@ def test_odd_images(renderer):
         shared, paths = (images(scene, tails, 64, [0]).mean() for tails in ("shared", "paths"))
         assert shared == pytest.approx(paths, rel=0.1)
     assert images(room(lit=False), "shared", 16, [0]).max() == 0
+
+
+def test_a_first_sunset_keeps_its_red(renderer):
+    """Light of a sun so low has a negative blue: when the cache dropped such light, a fifth of the red was lost."""
+    shared, paths = (images(load(mi, first_sunset, SIZE), tails, 128, range(4)) for tails in ("shared", "paths"))
+    light, error = ([f(x.mean(axis=(1, 2)), axis=0) for x in (shared, paths)] for f in (np.mean, np.std))
+    assert light[1][0] > 10 * light[1][2], "no sunset"
+    assert np.all(abs(light[0] / light[1] - 1)[:2] < 0.03 + 2 * error[0][:2] / light[1][:2]), light

@@ -65,16 +65,21 @@ def render_references(mi, scene, batches=24, spp=256):
 
 
 def right_integrator(mi, scene):
-    """The scene's own, or ``prb`` where ``path`` is wrong: where there are holes and no environment.
+    """The scene's own, or another where ``path`` is wrong: where there are holes.
 
     ``path`` is black for paths that go through holes alone and then meet nothing, although emitters lit the material
     around the holes (docs/use/rendering.md). ``prb`` is as Mitsuba's authors differentiate it, and has no such rule.
+    Neither finds what lamps without size send through holes: ``straight_on`` does.
     """
+    import straight_on
+
     from data_gen.scenes.load import path_depths
 
     integrator = scene.integrator()
     holes = any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in scene.shapes() if shape.bsdf())
     own = integrator.class_name() == "PathIntegrator" and not integrator.hide_emitters
+    if holes and own and any(mi.has_flag(lamp.flags(), mi.EmitterFlags.Delta) for lamp in scene.emitters()):
+        return straight_on.integrator(mi, **path_depths(integrator))
     if holes and own and scene.environment() is None:
         return mi.load_dict({"type": "prb", **path_depths(integrator)})
     return integrator

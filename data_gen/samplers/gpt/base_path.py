@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import caustic, media
+from data_gen.paths.holes import Aim
 from data_gen.paths.lights import emission
 from data_gen.paths.mis import mis_weight
 from data_gen.paths.segments import Segment
@@ -37,6 +38,7 @@ class Path:
     late: mi.Bool  # and has later left a vertex by a mirror, glass or sharp gloss
     chain: Chain | None  # see data_gen.samplers.gpt.manifold_shift; None without that shift
     walks: mi.Bool  # some path of the five may go on from x
+    aim: Aim | None = None  # in which it has come to x; None in scenes without holes
     # Where paths may end in the cache: how far this one has come, and the reflectance for which it has ended at x
     trail: Trail | None = None
     ρ: mi.Color3f | None = None
@@ -96,6 +98,10 @@ class Step:
     ends_late: mi.Bool  # the path is late behind x, or behind x1 at the latest
     # See data_gen.samplers.gpt.manifold_shift; L_bsdf and L_caustic hold nothing of that light
     L_followed: mi.Spectrum  # m Le
+    more: mi.UInt32 | int  # edges that may follow behind x1
+    # In scenes with holes: whether x was one, and in which aim the path is behind x
+    passed: mi.Bool | None = None
+    aim: Aim | None = None
     # Of a matt surface of reflectance 1 at x: f m Le V / p, and f / p, survival included. None where no path ends in
     # the cache
     E_light: mi.Spectrum | None = None
@@ -116,6 +122,7 @@ def begin(plan: Plan, x: mi.SurfaceInteraction3f, place, channel, β: mi.Spectru
         late=mi.Bool(False),
         chain=no_chain(dr.width(x.t)) if plan.manifold else None,
         walks=mi.Bool(True),
+        aim=Aim.of_camera(x.p) if plan.space.holes else None,
     )
 
 
@@ -166,7 +173,8 @@ def base_step(
     if recording:
         asked |= recording.here & (E_light > 0)
     asked = lit & (asked | dr.any([y.joined for y in offsets]))
-    T_light, visible = space.sees(x, place, light.p, drawn, asked)
+    more = plan.limits.max_depth - path.depth - 1
+    T_light, visible = space.sees(x, place, light.p, drawn, asked, most=more)
     lit &= visible
     # The sample's share of L (survey, eq. 2), weighted by m against the density p of finding it by BSDF sampling
     Le_light = light_weight * light_mis(light.delta, light.pdf, p)
@@ -199,9 +207,14 @@ def base_step(
     β1 = path.β * f_p
     if path.ρ is not None:
         E_p = dr.select(goes_on, E_p * survival, 0)
-    # After a mirror or a hole emitter sampling could not have found x1: p_light = 0, and m = 1.
-    Le, p_light = emission(scene, x1, x, goes_on & sky.meets(x1), goes_on & (kind == SMOOTH), plan.lights.places)
-    L_bsdf = Le * mis_weight(sample.pdf, p_light)
+    # After a mirror emitter sampling could not have found x1: p_light = 0, and m = 1.
+    aim, passed, seen_by, sampled, p_x1 = None, None, x, kind == SMOOTH, sample.pdf
+    if path.aim is not None:
+        passed = space.holes.passed(bsdf, kind)
+        aim = path.aim.behind(passed, x, kind, sample.pdf)
+        seen_by, sampled, p_x1 = aim.seen_by(x), dr.isfinite(aim.p), aim.p
+    Le, p_light = emission(scene, x1, seen_by, goes_on & sky.meets(x1), goes_on & sampled, plan.lights.places)
+    L_bsdf = Le * mis_weight(p_x1, p_light)
 
     # ------------------- The layer ``caustic`` -------------------
     x_connectable = plan.materials.connectable(bsdf) | media.scatters(place)
@@ -252,6 +265,9 @@ def base_step(
         L_caustic=L_caustic,
         ends_late=ends_late,
         L_followed=L_followed,
+        more=more,
+        passed=passed,
+        aim=aim,
         E_light=E_light,
         E_p=E_p,
     )
@@ -267,6 +283,7 @@ def base_step(
         late=late,
         chain=chain,
         walks=walks,
+        aim=aim,
         trail=path.trail and path.trail.on(x1, kind == SMOOTH, sample.pdf, goes_on),
         ρ=None if path.ρ is None else mi.Color3f(0),
     )

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import caustic, media, shift
+from data_gen.paths.holes import Aim
 from data_gen.paths.lights import emission, replay_lamp, replay_light, shared_emission
 from data_gen.paths.mis import gradient_weight, mis_weight
 from data_gen.paths.segments import Segment
@@ -36,6 +37,8 @@ class Offset:
     w2: mi.Float  # settled: 2 w of all that follows
     A: mi.Spectrum  # 2 w C(x) / p(x), the base path's part of Δ, so far
     failed: mi.Bool  # the base path went on to where no offset path corresponds to it
+    # In scenes with holes: its own aim; settled: ``p`` of it, which is the base path's from the next scattering on
+    aim: Aim | None = None
 
 
 @dataclass
@@ -59,6 +62,7 @@ class Move:
     r: mi.Float  # p' |J| / p
     sky: Sky
     rough: mi.Bool
+    aim: Aim | None
     L_bsdf: mi.Spectrum
     reaches: mi.Bool  # there is a next vertex
     good: mi.Bool
@@ -92,6 +96,7 @@ def start(plan: Plan, base: Path, first: Segment, importance: mi.Spectrum, insid
         w2=dr.select(ended, w2_ended, dr.select(inside, mi.Float(0), 2)),
         A=mi.Spectrum(none),
         failed=mi.Bool(False) if plan.replays else ended,
+        aim=Aim.of_camera(base.x.p) if plan.space.holes else None,
     )
 
 
@@ -121,7 +126,7 @@ def next_steps(scene, plan: Plan, step: Step, offsets: list[Offset], first: bool
         some = (replace(y, hit=None, place=None, apart=None, sky=None, rough=None) for y in offsets)
         now = dr.while_loop((mi.UInt32(0), *some), lambda i, *_: joined & (i < count), join, label="joined paths")[1:]
         offsets = [
-            replace(y, joined=z.joined, a=z.a, Δ=z.Δ, w2=z.w2, A=z.A, failed=z.failed)
+            replace(y, joined=z.joined, a=z.a, Δ=z.Δ, w2=z.w2, A=z.A, failed=z.failed, aim=z.aim)
             for y, z in zip(offsets, now, strict=True)
         ]
     if first or plan.replays:
@@ -139,6 +144,12 @@ def settle(step: Step, offsets: list[Offset]) -> None:
         y.Δ = y.Δ + y.a * C
         y.A = y.A + y.w2 * step.β * C
         y.a = y.a * step.f_p
+        if y.aim is not None:
+            # But for m, where both have come straight on through holes from where one had arrived from elsewhere.
+            β1 = y.a + y.w2 * step.β1  # 2 w β'
+            m = mis_weight(y.aim.p, step.p_light) - mis_weight(step.aim.p, step.p_light)
+            y.Δ = y.Δ + dr.select(step.passed & (dr.max(dr.abs(β1)) > 0), β1 * step.Le * m, 0)
+            y.aim = Aim(y.aim.o, dr.select(step.passed | y.apart | y.joined, y.aim.p, step.aim.p))
 
 
 def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
@@ -186,6 +197,7 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
         w2=dr.select(apart | joined, 0, w2),
         A=path.A + w2_light * step.β * step.L_light + w2 * step.β1 * step.L_bsdf,
         failed=path.failed | (step.goes_on & ~step.ends_late & (r1 == 0)),
+        aim=move.aim,
     )
 
 
@@ -207,7 +219,7 @@ def replayed_light(scene, plan: Plan, step: Step, path: Offset, own: Own) -> tup
     f, p = media.evaluate_vertex(bsdf, y, own.place, y.to_local(light.d), lit)
     # A shadow ray where there is something to be shadowed
     L_light = f * light.weight
-    T, visible = plan.space.sees(y, own.place, light.target, step.drawn, dr.max(L_light) > 0)
+    T, visible = plan.space.sees(y, own.place, light.target, step.drawn, dr.max(L_light) > 0, most=step.more)
     # Each path has its own m: from y, the emitter is found with other densities than from x.
     L_light = dr.select(visible, L_light, 0) * (T * light_mis(light.delta, light.p, p))
     if plan.caustic:
@@ -218,7 +230,7 @@ def replayed_light(scene, plan: Plan, step: Step, path: Offset, own: Own) -> tup
 def no_move(path: Offset) -> Move:
     """The move of a path that neither reconnects nor parts: rejected, with β' = 0 and r = 0."""
     f_p, r, L_bsdf, none = mi.Spectrum(0), mi.Float(0), mi.Spectrum(0), mi.Bool(False)
-    return Move(path.ray, path.hit, path.place, f_p, r, path.sky, path.rough, L_bsdf, reaches=none, good=none)
+    return Move(path.ray, path.hit, path.place, f_p, r, path.sky, path.rough, path.aim, L_bsdf, reaches=none, good=none)
 
 
 def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
@@ -255,6 +267,7 @@ def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
         r=J * p / step.p * T_c,
         sky=Sky(mi.Bool(True)),
         rough=mi.Bool(plan.caustic),
+        aim=move.aim and Aim(mi.Point3f(y.p), p),
         L_bsdf=Le * mis_weight(p, p_light),
         reaches=reaches,
         good=~occluded,
@@ -279,8 +292,12 @@ def part(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
     segment = plan.space.fly(y, own.place, y.spawn_ray(y.to_world(leaves.wo)), step.drawn, found)
     y1 = plan.space.end(y, segment)
     reaches = found & y1.is_valid()
-    seen, smooth = reaches | (found & sky.seen), found & (kind == SMOOTH)
-    Le, p_light = emission(scene, y1, y, seen, smooth, plan.lights.places)
+    seen, sampled = reaches | (found & sky.seen), found & (kind == SMOOTH)
+    aim, seen_by, p_y1 = None, y, leaves.p
+    if move.aim is not None:
+        aim = move.aim.behind(plan.space.holes.passed(own.bsdf, kind), y, kind, leaves.p)
+        seen_by, sampled, p_y1 = aim.seen_by(y), found & dr.isfinite(aim.p), aim.p
+    Le, p_light = emission(scene, y1, seen_by, seen, sampled, plan.lights.places)
 
     # ----------------- Would it be shifted back? -----------------
     # Reject what would not be, or the weights of the pair would not sum to 1 (survey, section 3.5).
@@ -301,7 +318,8 @@ def part(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
         r=leaves.r,
         sky=sky,
         rough=rough,
-        L_bsdf=Le * mis_weight(leaves.p, p_light),
+        aim=aim,
+        L_bsdf=Le * mis_weight(p_y1, p_light),
         reaches=reaches,
         good=allowed & inverts,
     )
@@ -341,4 +359,5 @@ def step_joined(step: Step, path: Offset) -> Offset:
         w2=dr.select(path.joined, w2, path.w2),
         A=dr.select(path.joined, A, path.A),
         failed=path.failed | (path.joined & step.goes_on & ~(good & (r1 > 0))),
+        aim=path.aim and Aim(path.aim.o, dr.select(path.joined, p, path.aim.p)),
     )

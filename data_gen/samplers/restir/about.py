@@ -3,7 +3,7 @@
 import math
 
 from data_gen.samplers.registry import FrameSampler, Option, register
-from data_gen.samplers.shared import CONNECTABLE, SURFACES
+from data_gen.samplers.shared import CONNECTABLE, SURFACES, THROUGH_HOLES
 
 register(
     FrameSampler(
@@ -11,6 +11,7 @@ register(
         "gradients of paths that are reused from frame to frame (shots)",
         "data_gen.samplers.restir.sampler",
         refusals=SURFACES,
+        loses=THROUGH_HOLES,
         options={
             "history": Option(32.0, "frames that a reservoir can count for", range=(1, math.inf)),
             "gradients": Option(

@@ -2,7 +2,7 @@
 
 from data_gen.samplers.gbdpt.about import SPLATTING_BYTES
 from data_gen.samplers.registry import Option, Sampler, register
-from data_gen.samplers.shared import CONNECTABLE, SURFACES, hidden_emitters, spectra
+from data_gen.samplers.shared import CONNECTABLE, SURFACES, THROUGH_HOLES, hidden_emitters, spectra
 
 register(
     Sampler(
@@ -11,6 +11,7 @@ register(
         "data_gen.samplers.studies.gpt_tiles",
         standing="study",
         refusals=(*SURFACES, spectra, hidden_emitters),
+        loses=THROUGH_HOLES,
         notes={
             "transport": "paths are shared in tiles where materials are rough",
             "noise": "correlated within tiles, which denoisers of independent noise do not expect",
@@ -46,6 +47,7 @@ register(
         "data_gen.samplers.studies.split",
         standing="study",
         refusals=(*SURFACES, hidden_emitters),
+        loses=THROUGH_HOLES,
         notes={"transport": "split by the lobe of the first scattering event"},
         gradients=False,
     )

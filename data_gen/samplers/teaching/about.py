@@ -1,7 +1,7 @@
 """The entries of ``gpt-basic`` and ``gpt-simple``."""
 
 from data_gen.samplers.registry import Sampler, register
-from data_gen.samplers.shared import SURFACES, hidden_emitters, mirrors
+from data_gen.samplers.shared import SURFACES, THROUGH_HOLES, hidden_emitters, mirrors
 
 register(
     Sampler(
@@ -12,6 +12,7 @@ register(
             "transport": "replayed as a whole",
             "media": "replayed with everything else; albedo counts them, normal and depth do not",
         },
+        loses=THROUGH_HOLES,
         rank=9,
         lane_bytes=320,  # five paths that are recorded as one function: all that they return is there at once
     )

@@ -78,6 +78,9 @@ QUICK = [
     Case("gpt", "glass", (FAR,)),
     Case("gpt", "lens", (FAR,)),
     Case("gpt", "hidden_lamp", (FAR,)),
+    # Lamps with a size and without behind masks and panes, also where paths may not go on behind them
+    Case("gpt", "curtains", (FAR,)),
+    Case("gpt", "few_edges", (FAR,), size=SMALL, spp=64),
     # All that is not a mirror is connectable: paths reconnect where they hardly can.
     Case("gpt", "plenty", (1,), {"roughness_threshold": 0.0}),
     Case("gpt", "caustics", (FAR,), {"shift": "manifold"}),

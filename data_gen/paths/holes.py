@@ -1,0 +1,100 @@
+"""Holes: what of a surface lets light go straight on, weakened, as masks and thin panes do.
+
+A path that meets a hole passes it by chance, at a vertex of its own (``vertex.NULL``). A ray toward an emitter goes
+straight on and is weakened by T, as in Mitsuba's ``volpath``. Both techniques find the same light, so holes leave the
+density unchanged with which the direction through them was sampled. Each hole counts in ``max_depth``, as in ``path``,
+whichever technique passes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths.vertex import NULL, SMOOTH, ByMaterial, dr_number
+from data_gen.scenes.facts import shapes_of
+from data_gen.scenes.integrators import objects_in
+
+# Materials that know how much goes straight through, if those within them do
+_KNOWN = ("MaskBSDF", "Null", "ThinDielectric", "BlendBSDF")
+
+
+@dataclass
+class Aim:
+    """From where a path has come straight on, and the density ``p`` of its direction there.
+
+    ``p`` is infinite where no sampled emitter is in competition: from the camera, and behind mirrors.
+    """
+
+    o: mi.Point3f
+    p: mi.Float
+
+    @classmethod
+    def of_camera(cls, o: mi.Point3f) -> Aim:
+        return cls(mi.Point3f(o), dr.full(mi.Float, dr.inf, dr.width(o)))
+
+    def behind(self, passed: mi.Bool, x: mi.SurfaceInteraction3f, kind: mi.UInt32, p: mi.Float) -> Aim:
+        """Behind vertex ``x``, left by an event of that ``kind`` and density, which may have ``passed`` a hole."""
+        return Aim(
+            dr.select(passed, self.o, x.p), dr.select(passed, self.p, dr.select(kind == SMOOTH, p, mi.Float(dr.inf)))
+        )
+
+    def seen_by(self, x: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
+        """``x`` moved to where the path has come from, for densities of sampling emitters."""
+        there = mi.SurfaceInteraction3f(x)
+        there.p = mi.Point3f(self.o)
+        return there
+
+
+class Holes:
+    """Materials that light goes straight through, by a share that they know."""
+
+    def __init__(self, bsdfs: list[mi.BSDF]):
+        numbers = {dr_number(bsdf) for bsdf in bsdfs}
+        table = [number in numbers for number in range(max(numbers) + 1)]
+        self.known = ByMaterial(mi.Bool(table))
+
+    def passed(self, bsdf: mi.BSDFPtr, kind: mi.UInt32) -> mi.Bool:
+        """Whether an event of that ``kind`` goes through a hole as rays toward emitters do."""
+        return (kind == NULL) & self.known.of(bsdf)[1]
+
+    def share(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
+        """What goes straight through at ``si``; 0 where nothing does, or the material does not know."""
+        bsdf = si.bsdf()
+        listed, known = self.known.of(bsdf, active)
+        known &= listed
+        return mi.Spectrum(dr.select(known, bsdf.eval_null_transmission(si, known), 0))
+
+    @classmethod
+    def of(cls, scene: mi.Scene, passed: Callable[[mi.Shape], bool]) -> Holes | None:
+        """The holes of a scene, but in shapes that are ``passed``; None where there are none."""
+        bsdfs = (shape.bsdf() for shape in shapes_of(scene) if not passed(shape))
+        some = [bsdf for bsdf in bsdfs if bsdf is not None and has_holes(bsdf) and knows(bsdf)]
+        return cls(some) if some else None
+
+    @dr.syntax
+    def transmittance(self, scene, ray: mi.Ray3f, target: mi.Point3f, most, active: mi.Bool) -> mi.Spectrum:
+        """T along ``ray`` to the ``target``; 0 where it is blocked, or leads through more than ``most`` holes."""
+        ray, left, going = mi.Ray3f(ray), mi.UInt32(most), mi.Bool(active)
+        T = dr.select(active, mi.Spectrum(1), 0)
+        while dr.hint(going, label="holes"):
+            hit = scene.ray_intersect_preliminary(ray, active=going)
+            going &= hit.is_valid()
+            si = hit.compute_surface_interaction(ray, mi.RayFlags.All, going)
+            T = dr.select(going, mi.Spectrum(T * dr.select(left > 0, self.share(si, going), 0)), T)
+            going &= dr.max(T) > 0
+            left = dr.select(going, left - 1, left)
+            ray = si.spawn_ray_to(target)
+        return T
+
+
+def has_holes(bsdf: mi.BSDF) -> bool:
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+
+
+def knows(bsdf: mi.BSDF) -> bool:
+    """Whether the share that goes straight through is known: bump and normal maps around a mask say that it is 0."""
+    return not has_holes(bsdf) or (bsdf.class_name() in _KNOWN and all(map(knows, objects_in(bsdf, mi.BSDF))))

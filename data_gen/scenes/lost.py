@@ -1,0 +1,70 @@
+"""Lamps whose light is hard to find, or wrong, and what in a scene makes it so."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from data_gen.scenes.facts import shapes_of
+from data_gen.scenes.integrators import objects_in
+
+_SHARP = ("SmoothConductor", "SmoothDielectric")
+# Lamps smaller than this share of the scene's diagonal are met by hardly any path.
+_TINY = 1 / 500
+# By the part of its class's name that all kinds of it have: the disk of a sun fills 7e-5 of a hemisphere.
+_SUN = "Sunsky"
+# Vertex normals are far from those of faces below this mean cosine, of 14 degrees.
+_BENT = 0.97
+
+
+def behind_sharp(scene: mi.Scene) -> str:
+    """Which lamps hardly a path from the camera meets behind the scene's glass or mirrors; "" if there are none."""
+    if not any(_is_sharp(shape.bsdf()) for shape in shapes_of(scene)):
+        return ""
+    if without_size(scene):
+        return "lamps without size"
+    whole = float(np.linalg.norm(np.array(scene.bbox().extents())))
+    return "tiny lamps" if any(_is_tiny(emitter, whole) for emitter in scene.emitters()) else ""
+
+
+def without_size(scene: mi.Scene) -> bool:
+    return any(mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta) for emitter in scene.emitters())
+
+
+def has_holes(scene: mi.Scene) -> bool:
+    """Whether light goes straight through something, media apart."""
+    bsdfs = (shape.bsdf() for shape in shapes_of(scene) if not shape.is_medium_transition())
+    return any(bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
+
+
+def bent_lamp(scene: mi.Scene) -> mi.Shape | None:
+    """A lamp whose vertex normals are far from those of its faces.
+
+    Mitsuba samples it by one normal and weighs it by another: its issue 1952.
+    """
+    return next(filter(_is_bent, (shape for shape in scene.shapes() if shape.is_emitter())), None)
+
+
+def _is_tiny(emitter: mi.Emitter, whole: float) -> bool:
+    if _SUN in emitter.class_name():
+        return True
+    shape = emitter.get_shape() if mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) else None
+    return shape is not None and float(np.linalg.norm(np.array(shape.bbox().extents()))) < _TINY * whole
+
+
+def _is_bent(shape: mi.Shape) -> bool:
+    # A rectangle is a mesh too, but has no table of faces.
+    if not shape.is_mesh() or not shape.has_vertex_normals() or shape.class_name() == "Rectangle":
+        return False
+    params = mi.traverse(shape)
+    faces = np.array(params["faces"]).reshape(-1, 3)
+    p, n = (np.array(params[f"vertex_{name}"], np.float64).reshape(-1, 3)[faces] for name in ("positions", "normals"))
+    across = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    area = np.linalg.norm(across, axis=-1)
+    cosines = np.einsum("fi,fvi->fv", across / np.maximum(area, 1e-30)[:, None], n).mean(axis=-1)
+    return bool(area.sum() > 0 and (np.abs(cosines) * area).sum() < _BENT * area.sum())
+
+
+def _is_sharp(bsdf: mi.BSDF | None) -> bool:
+    """Whether it is a mirror or clear glass, or one within it."""
+    return bsdf is not None and (bsdf.class_name() in _SHARP or any(map(_is_sharp, objects_in(bsdf, mi.BSDF))))
