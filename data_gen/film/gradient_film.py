@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -13,10 +13,15 @@ from data_gen.film import claims
 from data_gen.film.moments import Moments, Strands, accumulate, no_moments, one_more, put_back, taken
 from data_gen.film.splats import SPLAT_BYTES, Splats
 from data_gen.film.statistics import contrast, statistics
+from data_gen.film.subpixels import Subpixels, bytes_each
 from ngpt.layers import DIFFERENCES, FEATURE_NOISE
 from ngpt.shared import shared_variance
 from ngpt.stack import GradientStack
+from ngpt.subpixels import SUBPIXELS, means
 from ngpt.windows import Place
+
+if TYPE_CHECKING:
+    from data_gen.paths.camera import CameraSamples
 
 # What samplers shift paths by, (x, y) in pixels, y down: each difference of the contract, and back. The film keeps the
 # differences "neighbour - base" at the base pixel and combines both directions when it develops.
@@ -65,9 +70,12 @@ class GradientFilm:
     ``data_gen.film.claims``. If samples of a pass share photons, reservoirs or the state of a chain, or lanes splat
     onto other pixels, the film is made with ``batches``: each pass is one batch, a pixel's value is its mean over the
     batch, and variances are computed over batches. Batches are weighted by their samples: the last one may have fewer.
+
+    With ``subpixels`` K > 1 the film also keeps what denoisers read by K x K subpixels of each pixel
+    (``ngpt.subpixels``). Each pass is then announced by ``begin_pass``. Batches have no subpixels.
     """
 
-    def __init__(self, width: int, height: int, batches: bool = False, net: int = 0):
+    def __init__(self, width: int, height: int, batches: bool = False, net: int = 0, subpixels: int = 1):
         self.width, self.height, self.batches, self.net = width, height, batches, net
         self.pixels = width * height
         self.strands = 1 if batches else max(1, _STRANDS // self.pixels)
@@ -79,10 +87,18 @@ class GradientFilm:
         self._blocks_each = np.zeros(0, np.int64)
         # Dr.Jit gives each array the next power of two of bytes.
         bytes_each = _STRAND_BYTES + (_BATCH_BYTES if batches else 0) + (_HALVES_BYTES if net else 0)
-        self.bytes = bytes_each * (1 << (self.pixels * self.strands - 1).bit_length())
+        self.bytes = (bytes_each + bytes_of_subpixels(subpixels)) * (1 << (self.pixels * self.strands - 1).bit_length())
+        self.subpixels = subpixels
+        self._fine = Subpixels(self.pixels, self.strands, subpixels) if subpixels > 1 else None
+        self._cell: mi.UInt32 | None = None
         self.moments: dict[str, Moments] = {}
         self._pass: dict[str, tuple] = {}
         self._splats: dict[str, Splats] = {}
+
+    def begin_pass(self, camera: CameraSamples) -> None:
+        """Takes note of the subpixels that the samples of the next pass lie in, where the film has any."""
+        if self._fine:
+            self._cell = camera.cells(self.subpixels)
 
     def put(self, name: str, value, active: bool | mi.Bool = True) -> None:
         """Adds the samples of one pass.
@@ -129,10 +145,13 @@ class GradientFilm:
             return
         values, self._pass = self._pass, {}
         splats, self._splats = self._splats, {}
+        cell, self._cell = self._cell, None
+        if self._fine and cell is None:
+            raise ValueError("a film with subpixels is told of each pass by begin_pass()")
         # Reading single lanes evaluates an array: without this, each would trace the paths again.
-        dr.eval(values)
+        dr.eval(values, cell)
         if some is not None:
-            self._add_some(values, block, some)
+            self._add_some(values, block, some, cell)
             return
         if self.counts is not None:
             raise ValueError("pixels have samples in different numbers: say which pixels the blocks are of")
@@ -156,14 +175,16 @@ class GradientFilm:
                 # One by one: the old moments and the new ones are in memory together.
                 dr.eval(new)
                 self.moments[name] = new
+            if self._fine:
+                self._fine.add(values, cell, strands, dr.arange(mi.UInt32, self.pixels * self.strands))
         self.samples += spp
         self.blocks += spp // block
 
     def forget_pass(self) -> None:
         """Leaves out what was put since the last pass ended: it was broken off."""
-        self._pass, self._splats = {}, {}
+        self._pass, self._splats, self._cell = {}, {}, None
 
-    def _add_some(self, values: dict, block: int | None, some: np.ndarray) -> None:
+    def _add_some(self, values: dict, block: int | None, some: np.ndarray, cell: mi.UInt32 | None) -> None:
         """Adds the samples of a pass whose blocks belong to ``some`` pixels."""
         if self.batches or not block:
             raise ValueError("passes of some pixels have blocks of independent samples")
@@ -190,6 +211,8 @@ class GradientFilm:
             new = accumulate(taken(old, place), components, active, strands)
             dr.eval(new)
             self.moments[name] = put_back(old, new, place)
+        if self._fine:
+            self._fine.add(values, cell, strands, place)
         self.counts[pixels] += blocks * block
         self._blocks_each[pixels] += blocks
 
@@ -275,7 +298,12 @@ class GradientFilm:
         if (noise := self.feature_noise) is not None:
             known[FEATURE_NOISE] = noise
         where = {} if place is None else {"place": place}
-        return GradientStack(self.develop(), known | dict(attributes or {}), **where)
+        layers, fine = self.develop(), {}
+        if self._fine:
+            known[SUBPIXELS] = self.subpixels
+            fine = self._fine.develop(self.width, self.height)
+            layers |= {name: means(layer, self.subpixels) for name, layer in fine.items()}
+        return GradientStack(layers, known | dict(attributes or {}), fine=fine, **where)
 
     @property
     def feature_noise(self) -> float | None:
@@ -376,6 +404,11 @@ class GradientFilm:
 
     def _image(self, columns: np.ndarray) -> np.ndarray:
         return columns.reshape(self.height, self.width, -1)
+
+
+def bytes_of_subpixels(k: int) -> int:
+    """What a strand takes for K x K subpixels, those of light in ``caustic`` included."""
+    return bytes_each(k, caustic=True)
 
 
 def bytes_of_shared(pixels: int) -> int:

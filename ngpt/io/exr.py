@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ngpt.errors import NgptError
+from ngpt.io import fine
 from ngpt.io.aliases import is_image, writer_of
 from ngpt.io.foreign.files import ENCODED, FROM, file_headers, read_file
 from ngpt.io.isolated import read_exr_isolated
@@ -68,8 +69,9 @@ def read(
     Raises NgptError if the file cannot be read, holds no primal, or holds layers without a pixel in common with it; and
     for a file of a layer of another size or place.
     """
-    image = read_exr_isolated(path) if isolated else read_file(path)
-    return _stack(image, _one_view(image, view, str(path)), layers, isolated, files, str(path))
+    image, subpixels = _opened(path, isolated)
+    stack = _stack(image, _one_view(image, view, str(path)), layers, isolated, files, str(path))
+    return _with_fine(stack, subpixels)
 
 
 def read_views(
@@ -80,11 +82,20 @@ def read_views(
     view: str | None = None,
 ) -> list[GradientStack]:
     """As ``read``, a stack for each view of the file, or for the one that is named; one for a file without views."""
-    image = read_exr_isolated(path) if isolated else read_file(path)
+    image, subpixels = _opened(path, isolated)
     found = choose_views(file_views(image), view, str(path))
     if len(found) == 1:
-        return [_stack(image, found[0], layers, isolated, files, str(path))]
+        return [_with_fine(_stack(image, found[0], layers, isolated, files, str(path)), subpixels)]
     return [_stack(image, one, layers, isolated, files, f"{path}, view {one.name}") for one in found]
+
+
+def _opened(path: str | os.PathLike, isolated: bool) -> tuple[ExrImage, ExrPart | None]:
+    """All that a file holds but its subpixels, and the part that has these."""
+    return fine.apart(read_exr_isolated(path) if isolated else read_file(path))
+
+
+def _with_fine(stack: GradientStack, part: ExrPart | None) -> GradientStack:
+    return stack if part is None else replace(stack, fine=fine.subpixels_of(part, stack))
 
 
 def _one_view(image: ExrImage, wanted: str | None, path: str) -> View:
@@ -151,6 +162,7 @@ def _views_in(path: str | os.PathLike) -> tuple[list[View], list[dict[str, str]]
     """The views of a file, and the attributes of its parts that are texts."""
     with regular_file(Path(path)) as file:
         headers = file_headers(file, str(path))
+    headers = [part for i, part in enumerate(headers) if not (i and fine.is_fine(part.name, part.attributes))]
     parts = [Part(part.name, list(part.channels), part.text("view"), part.texts("multiView")) for part in headers]
     return views_of(parts), [{name: part.text(name) for name in part.attributes} for part in headers]
 
@@ -197,7 +209,7 @@ def read_picture(path: str | os.PathLike, isolated: bool = False, view: str | No
     ``read`` takes for the primal. ``view`` is one of a stereo file, by default the first. Unlike there, light of other
     primaries is converted to linear Rec. 709 (``ngpt.io.primaries``): pictures are looked at and compared.
     """
-    image = read_exr_isolated(path) if isolated else read_file(path)
+    image, _ = _opened(path, isolated)
     part, chosen = image.parts[0], _one_view(image, view, str(path))
     if view is None and all(name in part.channels for name in RGB):
         return Picture(converted(gather(part, RGB), to_rec709(part.header)), place_of(part))
@@ -220,6 +232,8 @@ def write(
     into: str | None = None,
 ) -> Path:
     """Writes a stack, a result or an image, and returns its path.
+
+    Subpixels, where there are any, are one more part, ``fine``, of a stack and of a result (``ngpt.io.fine``).
 
     A stack is written as the file it was read from with its layers and attributes brought up to date (they are never
     removed), or else as one scanline part at its ``place``, compressed with ZIP, primal in the root R G B.
@@ -250,7 +264,7 @@ def write(
             raise NgptError(f"{path}: `like` goes with an image, not with a stack; pass one of the two")
         result, _, main = image_of(image, str(path))
         result.parts[main].header.update({**(attributes or {}), "ngpt:version": __version__})
-        return write_exr(path, result, overwrite)
+        return write_exr(path, fine.with_subpixels(result, main, image), overwrite)
     if like is None:
         return write(path, GradientStack.from_arrays(path=str(path), primal=image), None, overwrite, attributes)
     pairs: list[tuple[Any, GradientStack]] = [(image, like)] if isinstance(like, GradientStack) else []
@@ -298,7 +312,7 @@ def _result(
     shown = replaced_layer(resolution, view, str(stack.attributes.get("ngpt:pass", "")), into, path)
     result, main = with_result(found, resolution, view, pixels, shown)
     result.parts[main].header.update({**attributes, "ngpt:version": __version__})
-    return result
+    return fine.with_subpixels(result, main, stack)
 
 
 def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> GradientStack:

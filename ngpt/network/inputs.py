@@ -112,13 +112,16 @@ class Oidn:
     @cached_property
     def of_primal(self) -> np.ndarray:
         """(H, W, 3) float32 without direct emission."""
+        # Of subpixels, with features as they are: networks only read the image that becomes of it.
+        if self._data.fine:
+            return oidn(self._data, "auto", "high")
         return oidn(self._with_clean_features, "clean", "high")
 
     def of_base(self, base: np.ndarray) -> np.ndarray:
         """OIDN's image of a reconstruction, (H, W, 3) float32; both without direct emission."""
         # A base swings below zero beside edges. OIDN takes that for 0; negative light of the primal it keeps.
         least = min(float(self._data.image.min()), 0) - self._data.direct
-        return oidn(replace(self._with_clean_features, image=np.maximum(base, least)), "clean", "fast")
+        return oidn(replace(self._with_clean_features, image=np.maximum(base, least), fine={}), "clean", "fast")
 
     @cached_property
     def _with_clean_features(self) -> Repaired:
