@@ -3,8 +3,8 @@
     python -m bench.subpixels living-room/scene.xml generator:20261211:partition --references FOLDER
 
 The sampler is `primal`, with shared tails where they work. A scene, number of samples and seed is rendered once, with
-as many subpixels as any way needs; fewer are their means. Scenes and references are as of `bench.seeds`. Ways to denoise are in WAYS.
-Each cell has, of each way:
+as many subpixels as any way needs; fewer are their means. Scenes and references are as of `bench.seeds`. Ways to
+denoise are in WAYS. Each cell has, of each way:
 
     seconds  of processors, warmed up
     error    relMSE by two halves of a reference, without the worst 0.1 % of the pixels; FLIP is over their mean
@@ -92,7 +92,11 @@ def measured(name: str, file: str, args: argparse.Namespace, known: set[tuple]):
 
 def with_subpixels(stack: GradientStack, k: int) -> GradientStack:
     """The stack with the means of its subpixels, so that K is ``k``."""
-    fine = {name: means(layer, subpixels(stack.fine, stack.width) // k) for name, layer in stack.fine.items()} if k > 1 else {}
+    fine = (
+        {name: means(layer, subpixels(stack.fine, stack.width) // k) for name, layer in stack.fine.items()}
+        if k > 1
+        else {}
+    )
     return replace(stack, fine=fine)
 
 

@@ -109,7 +109,7 @@ def test_what_are_no_subpixels_is_refused(rng, wrong):
         "layer": stack.fine | {"depth": stack.fine["primal"]},
         "no primal": {"albedo": stack.fine["albedo"]},
     }[wrong]
-    with pytest.raises(NgptError, match="1.exr: the subpixels"):
+    with pytest.raises(NgptError, match=r"1\.exr: the subpixels"):
         replace(stack, fine=fine)
 
 

@@ -23,6 +23,7 @@ from ngpt.io.isolated import read_exr_isolated
 from ngpt.io.layout import StackSource, data_window, file_views, gather, is_half, place_of, scatter, taken
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
 from ngpt.io.primaries import converted, to_rec709
+from ngpt.io.reduced import REDUCED, reduced
 from ngpt.io.resolution import Found, Resolution, channels_like, resolve, resolve_alone
 from ngpt.io.resolution import layers_of_light as find_light
 from ngpt.io.results import MADE_BY, STRUCTURE, image_of, leave_out_old_error, new_header, replaced_layer, with_result
@@ -230,6 +231,8 @@ def write(
     overwrite: bool = False,
     attributes: Mapping[str, Any] | None = None,
     into: str | None = None,
+    *,
+    reduce: int = 1,
 ) -> Path:
     """Writes a stack, a result or an image, and returns its path.
 
@@ -252,6 +255,8 @@ def write(
     below 6.1e-5). Gradients, variances and depth are written as float. An ``image`` without ``like`` is written as
     float R G B.
 
+    With ``reduce`` K, a result is written with K x K pixels as one (``ngpt.io.reduced`` has the rules).
+
     ``attributes`` go into the header beside the attributes of the stack; ``Result.attributes`` say what made a result.
     If the stack is itself a result, the attributes on how it was made (``MADE_BY``) are left out of the new result, and
     so is the layer ``error`` that was read with it. A new layer ``error`` (``like=stack.replace(error=...)``) is
@@ -267,10 +272,14 @@ def write(
         return write_exr(path, fine.with_subpixels(result, main, image), overwrite)
     if like is None:
         return write(path, GradientStack.from_arrays(path=str(path), primal=image), None, overwrite, attributes)
+    if reduce != 1:
+        attributes = {**(attributes or {}), REDUCED: reduce}
     pairs: list[tuple[Any, GradientStack]] = [(image, like)] if isinstance(like, GradientStack) else []
     pairs = pairs or list(zip(image, like, strict=True))  # type: ignore[arg-type]
     # The first view may get a part in front of all others, which then have other numbers.
     pairs.sort(key=lambda pair: pair[1].source is None or pair[1].source.view.first == 0)
+    if reduce != 1:
+        pairs = [(one, replace(stack, fine={})) for one, stack in pairs]
     made: ExrImage | None = None
     for one, stack in pairs:
         pixels = GradientStack.from_arrays(path=str(path), primal=one)["primal"]
@@ -281,6 +290,8 @@ def write(
             )
         made = _result(stack, pixels, made, attributes or {}, into, str(path))
     assert made is not None
+    if reduce != 1:
+        made = reduced(made, reduce, [stack for _, stack in pairs])
     return write_exr(path, made, overwrite)
 
 

@@ -35,7 +35,9 @@ def is_fine(name: str, attributes: Mapping) -> bool:
 def apart(image: ExrImage) -> tuple[ExrImage, ExrPart | None]:
     """A file without its subpixels, and their part."""
     fine = next((part for part in image.parts[1:] if is_fine(part.name, part.header)), None)
-    return (image, None) if fine is None else (ExrImage([part for part in image.parts if part is not fine]), fine)
+    if fine is None:
+        return image, None
+    return ExrImage([part for part in image.parts if part is not fine]), fine
 
 
 def subpixels_of(part: ExrPart, stack: GradientStack) -> dict[str, np.ndarray]:
