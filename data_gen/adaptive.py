@@ -225,7 +225,7 @@ class UnevenRender:
         lane_bytes: int = LANE_BYTES,
         report: Callable[[], None] = lambda: None,
         points: str = "sobol",
-        subpixels: int = 1,
+        **kind: Any,
     ):
         width, height = (int(n) for n in sensor.film().crop_size())
         self.net = first_round(points, None)
@@ -233,7 +233,7 @@ class UnevenRender:
         self.blocks_left = (most or 1 << 62) // BLOCK
         lane_bytes += bytes_of_rays(sensor)
         room = BLOCK * lane_bytes // height
-        self.film = film_of(width, height, budget.memory, room, net=self.net, subpixels=subpixels)
+        self.film = film_of(width, height, budget.memory, room, net=self.net, **kind)
         # Raises NgptError where not even one row's worth fits.
         self.at_once = lanes_within(budget.memory, self.film, BLOCK * width, lane_bytes) // BLOCK
         self.end = None if budget.seconds is None else time.perf_counter() + budget.seconds

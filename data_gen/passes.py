@@ -93,7 +93,7 @@ def render_passes(
     lane_bytes: int = LANE_BYTES,
     batch: int = 0,
     points: str = "sobol",
-    subpixels: int = 1,
+    **kind: Any,
 ) -> GradientFilm:
     """Calls ``sample`` with the camera samples of pass after pass, and returns the film it filled.
 
@@ -108,8 +108,8 @@ def render_passes(
     other: each pass is one block of so many samples per pixel, and the film's variances are computed over passes. Such
     a ``sample`` may keep a state from pass to pass; ``CameraSamples.first`` gives its position.
 
-    A ``sample`` may come in ``Rounds``; no pass crosses the end of a round. The film keeps so many ``subpixels``, or as
-    many as fit, see ``film_within``.
+    A ``sample`` may come in ``Rounds``; no pass crosses the end of a round. The ``kind`` of film, its ``subpixels``
+    and whether it has ``gradients``, is as in ``film_within``.
 
     Raises NgptError where one block of samples does not fit into the memory.
     """
@@ -119,9 +119,7 @@ def render_passes(
     lane_bytes = getattr(sample, "lane_bytes", lane_bytes)
     instead = getattr(sample, "instead", _nothing)
     net = first_round(points, spp)
-    film, block, most = film_within(
-        budget.memory, sensor, total, lane_bytes, batch, instead, net=net, subpixels=subpixels
-    )
+    film, block, most = film_within(budget.memory, sensor, total, lane_bytes, batch, instead, net=net, **kind)
     grows = points == "rounds" and not batch
     start = now = time.perf_counter()
     done: list[tuple[int, float]] = []
@@ -228,20 +226,18 @@ def film_within(
     instead: Callable[[int], str] = _nothing,
     *,
     net: int = ROUND,
-    subpixels: int = 1,
+    **kind: Any,
 ) -> tuple[GradientFilm, int, int]:
     """An empty film for ``spp`` samples per pixel, samples of a block, and how many blocks may make a pass.
 
-    ``instead`` is as in ``blocks_within``, ``net`` as in ``CameraSamples``. The film keeps as many of the ``subpixels``
-    as there is room for, and a warning says so where these are fewer.
+    ``instead`` is as in ``blocks_within``, ``net`` as in ``CameraSamples``. Of the ``kind`` of film, which
+    are further parameters of its own, it keeps fewer ``subpixels`` where there is no room, and a warning says so.
     Raises NgptError where one block of samples does not fit into ``memory``.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     block = batch or block_of_samples(width * height)
     lane_bytes += bytes_of_rays(sensor)
-    film = film_of(
-        width, height, memory, lane_bytes * min(block, spp), batches=bool(batch), net=net, subpixels=subpixels
-    )
+    film = film_of(width, height, memory, lane_bytes * min(block, spp), batches=bool(batch), net=net, **kind)
     most = blocks_within(memory, film, min(block, spp), lane_bytes, instead)
     return film, block, 1 if batch else most
 

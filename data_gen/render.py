@@ -18,7 +18,7 @@ from data_gen.film import GradientFilm
 from data_gen.film.gradient_film import bytes_of_shared
 from data_gen.passes import render_passes, rounds_of
 from data_gen.samplers import SAMPLERS, choose, find
-from data_gen.samplers.registry import Entry, own
+from data_gen.samplers.registry import Entry, Sampler, own
 from data_gen.samplers.reused import Made
 from data_gen.samplers.shared import why_not_shared
 from data_gen.scenes.cameras import place_of
@@ -137,7 +137,7 @@ def render_stack(
         settings["points"] = "rounds"
     watch = Watch(progress, stop, look)
     how: dict[str, Any] = {"lane_bytes": entry.lane_bytes, "points": settings.get("points", "independent")}
-    how["subpixels"] = kept
+    how |= {"gradients": entry.film_of_gradients, "subpixels": kept}
     with weighed(scene, settings["lamps"], entry.by_place) as places:
         more |= own(settings) | ({"places": places} if places else {})
         made = made or Made()
@@ -206,7 +206,7 @@ def stack_of(
     return with_channels(stack, film.diagnose()) if diagnostics else stack
 
 
-def subpixels_of(entry: Entry, asked: int | str, spp: int | None) -> int:
+def subpixels_of(entry: Sampler, asked: int | str, spp: int | None) -> int:
     """K of the K x K subpixels that a render keeps; raises WrongUse where it cannot have those that are asked for."""
     if asked != "auto" and asked not in CHOICES:
         raise WrongUse(f"{asked} subpixels: choose one of {', '.join(map(str, CHOICES))}, auto")

@@ -13,7 +13,7 @@ from data_gen.film import claims
 from data_gen.film.moments import Moments, Strands, accumulate, no_moments, one_more, put_back, taken
 from data_gen.film.splats import SPLAT_BYTES, Splats
 from data_gen.film.statistics import contrast, statistics
-from data_gen.film.subpixels import Subpixels, bytes_each
+from data_gen.film.subpixels import Subpixels, bytes_of_subpixels
 from ngpt.layers import DIFFERENCES, FEATURE_NOISE
 from ngpt.shared import shared_variance
 from ngpt.stack import GradientStack
@@ -43,11 +43,14 @@ _WITH_VARIANCE = frozenset({"primal", "caustic", *_SPLIT, *SHIFTS, *_FEATURES})
 # Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 21; and the moments of
 # one name once more.
 _STRAND_BYTES = 10 * 8 + (26 + 21) * 8 + (8 + 6 * 8)
+# Without gradients: 5 names, 13 channels, 9 sums of squares. They are fewer, and the more subpixels fit.
+_STRAND_BYTES_WITHOUT = 5 * 8 + (13 + 9) * 8 + (8 + 6 * 8)
 # Per strand, of the layer ``shared``, which few films have: two counts, double means
 _SHARED_BYTES = 8 + 3 * 8
 # Per strand, of two sets of earlier samples: single means of 21 channels, and counts of the seven names they belong to,
 # with the number of bits
 _HALVES_BYTES = 2 * 21 * 4 + 7 * 3 * 4
+_HALVES_BYTES_WITHOUT = 2 * 9 * 4 + 3 * 3 * 4
 # Per pixel, of a pass that is one batch: the mean over the batch, splats and their sums, of one name.
 _BATCH_BYTES = 3 * 8 + 3 * SPLAT_BYTES + 4 + 3 * 8
 # Pixels that tell the mean noise of features well enough
@@ -73,9 +76,19 @@ class GradientFilm:
 
     With ``subpixels`` K > 1 the film also keeps what denoisers read by K x K subpixels of each pixel
     (``ngpt.subpixels``). Each pass is then announced by ``begin_pass``. Batches have no subpixels.
+
+    ``bytes`` are what it takes at most; less where it is said that no ``gradients`` will be put.
     """
 
-    def __init__(self, width: int, height: int, batches: bool = False, net: int = 0, subpixels: int = 1):
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        batches: bool = False,
+        net: int = 0,
+        subpixels: int = 1,
+        gradients: bool = True,
+    ):
         self.width, self.height, self.batches, self.net = width, height, batches, net
         self.pixels = width * height
         self.strands = 1 if batches else max(1, _STRANDS // self.pixels)
@@ -86,8 +99,10 @@ class GradientFilm:
         self.counts: np.ndarray | None = None
         self._blocks_each = np.zeros(0, np.int64)
         # Dr.Jit gives each array the next power of two of bytes.
-        bytes_each = _STRAND_BYTES + (_BATCH_BYTES if batches else 0) + (_HALVES_BYTES if net else 0)
-        self.bytes = (bytes_each + bytes_of_subpixels(subpixels)) * (1 << (self.pixels * self.strands - 1).bit_length())
+        own, halves = (_STRAND_BYTES, _HALVES_BYTES) if gradients else (_STRAND_BYTES_WITHOUT, _HALVES_BYTES_WITHOUT)
+        bytes_each = own + (_BATCH_BYTES if batches else 0) + (halves if net else 0)
+        bytes_each += bytes_of_subpixels(subpixels, caustic=gradients)
+        self.bytes = bytes_each * (1 << (self.pixels * self.strands - 1).bit_length())
         self.subpixels = subpixels
         self._fine = Subpixels(self.pixels, self.strands, subpixels) if subpixels > 1 else None
         self._cell: mi.UInt32 | None = None
@@ -404,11 +419,6 @@ class GradientFilm:
 
     def _image(self, columns: np.ndarray) -> np.ndarray:
         return columns.reshape(self.height, self.width, -1)
-
-
-def bytes_of_subpixels(k: int) -> int:
-    """What a strand takes for K x K subpixels, those of light in ``caustic`` included."""
-    return bytes_each(k, caustic=True)
 
 
 def bytes_of_shared(pixels: int) -> int:

@@ -100,6 +100,6 @@ class Subpixels:
         return mean
 
 
-def bytes_each(k: int, caustic: bool) -> int:
+def bytes_of_subpixels(k: int, caustic: bool) -> int:
     """What a strand takes for K x K subpixels; ``caustic``: whether light may be put by that name."""
     return k * k * (BYTES + (BYTES_OF_CAUSTIC if caustic else 0)) if k > 1 else 0
