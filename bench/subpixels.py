@@ -9,6 +9,8 @@ denoise are in WAYS. Each cell has, of each way:
     seconds  of processors, warmed up
     error    relMSE by two halves of a reference, without the worst 0.1 % of the pixels; FLIP is over their mean
 
+and the noise of features, with whether that is little beside the image's (``ngpt.denoisers.clean``).
+
 In the table all are over those of ``BASE``: medians over seeds.
 """
 
@@ -23,9 +25,12 @@ import ngpt
 from bench.common import metadata, renderer, save
 from bench.seeds import opened
 from bench.tails import processor_seconds, reference_of
+from ngpt.denoisers.clean import features_are_clean
 from ngpt.evaluation.references import Reference
+from ngpt.layers import FEATURE_NOISE
 from ngpt.measure.averages import geometric_mean, median
 from ngpt.measure.metrics import scores
+from ngpt.repair import repair
 from ngpt.stack import GradientStack
 from ngpt.subpixels import means, subpixels
 
@@ -87,7 +92,8 @@ def measured(name: str, file: str, args: argparse.Namespace, known: set[tuple]):
             if not warm:
                 warm = bool([judged(stack, way, reference) for way in args.ways])
             ways = {way: judged(stack, way, reference) for way in args.ways}
-            yield dict(zip(CELL, place, strict=True)) | {"seconds": seconds, "ways": ways}
+            noise = {"feature noise": stack.number(FEATURE_NOISE), "clean": features_are_clean(repair(stack))}
+            yield dict(zip(CELL, place, strict=True)) | {"seconds": seconds, "ways": ways} | noise
 
 
 def with_subpixels(stack: GradientStack, k: int) -> GradientStack:

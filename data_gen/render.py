@@ -33,7 +33,7 @@ from ngpt.layers import GATHERED
 from ngpt.merging import UNFINISHED
 from ngpt.shared import CUT, TAILS
 from ngpt.stack import GradientStack
-from ngpt.subpixels import CHOICES, best
+from ngpt.subpixels import CHOICES, SUBPIXELS, best
 from ngpt.version import __version__
 
 # Called after each pass of a render with a function that makes the stack of the samples done by then
@@ -170,6 +170,9 @@ def render_stack(
     if failed or (stop() and (spp is None or done < spp)):
         chosen[UNFINISHED] = "failed" if failed else "interrupted"
     stack = stack_of(film, sensor, seed, sampler, start, chosen, diagnostics=diagnostics)
+    if subpixels == "auto" and best(done) == 1 and stack.fine:  # it was ended early
+        stack = replace(stack, fine={})
+        del stack.attributes[SUBPIXELS]
     if failed:
         raise Unfinished(str(failed) or type(failed).__name__, stack) from failed
     return stack

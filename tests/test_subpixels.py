@@ -171,7 +171,7 @@ def edge(rng, k=2, noise=0.3):
     normal = stored("normal", np.where(left, [0.0, 0, 1], [1.0, 0, 0]))
     fine = {"primal": noisy, "albedo": albedo, "normal": normal}
     layers = {name: means(layer, k) for name, layer in fine.items()}
-    return GradientStack(layers, fine=fine)
+    return GradientStack(layers, {"ngpt:featureNoise": 0.0}, fine=fine)
 
 
 @needs_oidn
@@ -181,10 +181,14 @@ def test_oidn_takes_means_of_what_it_makes_of_subpixels(rng):
     for how in ("noisy", "clean", "prefiltered", "none"):
         expected = means(reconstruct(large, "oidn", auxiliary=how).image, 2)
         assert np.allclose(reconstruct(stack, "oidn", auxiliary=how).image, expected, atol=1e-6)
-    assert np.array_equal(reconstruct(stack, "oidn").image, reconstruct(stack, "oidn-noisy").image)
+    assert np.array_equal(reconstruct(stack, "oidn").image, reconstruct(stack, "oidn-clean").image)
     # Without subpixels it is what it was.
     plain = replace(stack, fine={})
     assert np.array_equal(reconstruct(plain, "oidn").image, reconstruct(plain, "oidn", auxiliary="prefiltered").image)
+    # And so it is where features have noise, or may have.
+    for attributes in ({"ngpt:featureNoise": 0.1}, {}):
+        noisy = replace(stack, attributes=attributes)
+        assert np.array_equal(reconstruct(noisy, "oidn").image, reconstruct(plain, "oidn").image)
 
 
 @needs_oidn
@@ -193,7 +197,7 @@ def test_exposure_of_subpixels(rng, power):
     stack = edge(rng)
     scale = np.float32(2.0**power)
     layers = stack.layers | {"primal": scale * stack["primal"]}
-    scaled = GradientStack(layers, fine=stack.fine | {"primal": scale * stack.fine["primal"]})
+    scaled = GradientStack(layers, stack.attributes, fine=stack.fine | {"primal": scale * stack.fine["primal"]})
     image, other = reconstruct(stack, "oidn").image, reconstruct(scaled, "oidn").image
     assert np.allclose(other / scale, image, rtol=0.01, atol=1e-3)
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.coverage import mirrored
+from ngpt.denoisers.clean import features_are_clean
 from ngpt.denoisers.oidn_filters import filtered
 from ngpt.errors import NgptError
 from ngpt.options import Option
@@ -26,7 +27,7 @@ FILTERS: dict[str, dict[str, Any]] = {
 OPTIONS = {
     "auxiliary": Option(
         "auto",
-        "what OIDN is told of albedo and normal; auto: prefiltered, or noisy where it has subpixels",
+        "what OIDN is told of albedo and normal; auto: clean for subpixels, else prefiltered",
         choices=("auto", *AUXILIARY),
     ),
     "filter": Option(
@@ -45,12 +46,14 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
 
     OIDN takes no normals without albedo: they are left out then.
 
-    Where there are subpixels, these are denoised, and the image is their means: see ``ngpt.subpixels``.
+    Where there are subpixels (``ngpt.subpixels``), these are denoised, and the image is their means. With "auto" they
+    are only where features are clean: noisy ones, as behind a lens, would have to be prefiltered, which takes four
+    times as long, and without that subpixels have more error than pixels (docs/lab/log).
 
     ``auxiliary``  how OIDN uses the features: "prefiltered" denoises them with its own models first and then marks
                    them as clean, which its documentation recommends for the best quality; "clean" marks them as clean
-                   as they are; "noisy" does not; "none" leaves them out; "auto" is "prefiltered", and "noisy" for
-                   subpixels, which takes a seventh of the time and loses less than subpixels gain (docs/lab/log)
+                   as they are; "noisy" does not; "none" leaves them out; "auto" is "clean" for
+                   subpixels, and else "prefiltered"
     ``quality``    "high", "balanced" or "fast", for the image and for features that are denoised first
     ``filter``     one of ``FILTERS``: "lightmap" and "directional" are OIDN's for lightmaps, which take no features
 
@@ -62,13 +65,14 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
     # With the light sources seen, as a renderer hands it over and OIDN was trained.
     image, layers = data.image + data.direct, data.features
     k = subpixels(data.fine, image.shape[1]) if filter == "image" else 1
-    if k > 1:
-        image, layers = data.fine["primal"], data.fine
-    image = np.ascontiguousarray(image, np.float32)
     if filter != "image":
         auxiliary = "none"
     elif auxiliary == "auto":
-        auxiliary = "noisy" if k > 1 else "prefiltered"
+        auxiliary = "clean" if k > 1 and (not data.features or features_are_clean(data)) else "prefiltered"
+        k = k if auxiliary == "clean" else 1
+    if k > 1:
+        image, layers = data.fine["primal"], data.fine
+    image = np.ascontiguousarray(image, np.float32)
     if auxiliary == "prefiltered":
         features = prefiltered(layers, quality)
     elif auxiliary != "none":

@@ -57,7 +57,7 @@ def reduced_place(place: Place, k: int) -> Place:
 
 def cut_pixels(place: Place, k: int) -> str:
     """Says which windows are no multiple of K, so that rows or columns at their borders are left out; "" if none is."""
-    told = []
+    told: list[str] = []
     for name, window in (("data", place.data), ("display", place.display)):
         small = reduced_window(window, k)
         whole = Window(k * small.left, k * small.top, k * small.width, k * small.height)

@@ -146,7 +146,10 @@ def test_what_auto_keeps(renderer):
     scene = load(renderer, "diffuse", SIZE)
     many = render_stack(scene, 32, 3, "primal", subpixels="auto")
     assert many.attributes["ngpt:subpixels"] == 2
-    assert not render_stack(scene, 2, 3, "primal", subpixels="auto").fine
+    assert not render_stack(scene, 8, 3, "primal", subpixels="auto").fine
+    early = render_stack(scene, None, 3, "primal", subpixels="auto", seconds=60, stop=lambda: True)
+    if early.attributes["ngpt:spp"] < 32:
+        assert not early.fine and "ngpt:subpixels" not in early.attributes
     assert not render_stack(scene, 32, 3, "gpt", subpixels="auto").fine
     assert not render_stack(scene, 4, 3, "bdpt", subpixels="auto").fine
 
