@@ -7,6 +7,7 @@ the same number of them where the number of samples is a multiple of K², and th
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -20,6 +21,13 @@ BYTES = 3 * (4 + 3 * 8)
 BYTES_OF_CAUSTIC = 4 + 3 * 8
 # What is put under these names is summed. ``caustic`` is light that is not in what is put as ``primal``.
 SUMMED = (*FINE, "caustic")
+
+
+class Celled(Protocol):
+    """Samples that know where they are, such as ``data_gen.paths.camera.CameraSamples``."""
+
+    def cells(self, k: int) -> mi.UInt32:
+        """Which of the K x K subpixels of its pixel each sample is in, counted row by row."""
 
 
 @dataclass
