@@ -159,7 +159,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def subpixels(text: str) -> int | str:
     """K of the K x K subpixels of a pixel, or "auto"."""
-    choices = {"auto": "auto", **{str(k): k for k in CHOICES}}
+    choices: dict[str, int | str] = {"auto": "auto", **{str(k): k for k in CHOICES}}
     if text not in choices:
         raise argparse.ArgumentTypeError(
             f"'{text}' subpixels cannot be kept; write {', '.join(map(str, CHOICES))}, or auto"
