@@ -203,7 +203,7 @@ def test_what_is_smaller_than_a_block_is_refused(rng, tmp_path, command):
 
 def test_gradients_and_motion_of_unknown_unit_are_refused(rng, tmp_path):
     zeros = np.zeros((4, 4, 3), np.float32)
-    with pytest.raises(NgptError, match=r"has dx, dy, differences between its own pixels.*--subpixels"):
+    with pytest.raises(NgptError, match=r"has dx, dy, differences between its pixels.*--subpixels"):
         write(tmp_path / "a.exr", zeros, like=GradientStack({"primal": zeros, "dx": zeros, "dy": zeros}), reduce=2)
     path = file_of(tmp_path / "large.exr", picture(rng) | {"velocity.R": np.ones((6, 8), np.float32)})
     with pytest.raises(NgptError, match=r"channel 'velocity.R' looks like motion vectors.*--layer motion="):
