@@ -21,7 +21,7 @@ import numpy as np
 from data_gen import passes
 from data_gen.budget import LANE_BYTES, Budget, Watch
 from data_gen.film import GradientFilm
-from data_gen.passes import PACKET, SamplePass, foretold, lanes_within, recording, rounds_of
+from data_gen.passes import PACKET, SamplePass, film_of, foretold, lanes_within, recording, rounds_of
 from data_gen.paths.camera import CameraSamples, bytes_of_rays
 from data_gen.paths.streams import first_round
 from data_gen.samplers import SAMPLERS, Sampler
@@ -225,13 +225,15 @@ class UnevenRender:
         lane_bytes: int = LANE_BYTES,
         report: Callable[[], None] = lambda: None,
         points: str = "sobol",
+        **kind: Any,
     ):
         width, height = (int(n) for n in sensor.film().crop_size())
         self.net = first_round(points, None)
-        self.film = GradientFilm(width, height, net=self.net)
         self.sample, self.sensor, self.seed, self.stop, self.report = sample, sensor, seed, stop, report
         self.blocks_left = (most or 1 << 62) // BLOCK
         lane_bytes += bytes_of_rays(sensor)
+        room = BLOCK * lane_bytes // height
+        self.film = film_of(width, height, budget.memory, room, net=self.net, **kind)
         # Raises NgptError where not even one row's worth fits.
         self.at_once = lanes_within(budget.memory, self.film, BLOCK * width, lane_bytes) // BLOCK
         self.end = None if budget.seconds is None else time.perf_counter() + budget.seconds
@@ -292,6 +294,7 @@ class UnevenRender:
         first = mi.UInt32(np.repeat(self.film.samples_each[pixels], blocks) + BLOCK * within)
         with recording():
             camera = CameraSamples(self.sensor, self.seed, BLOCK, first, BLOCK, mi.UInt32(some), net=self.net)
+            self.film.begin_pass(camera)
             self.sample(camera, self.film)
             self.film.end_pass(BLOCK, some)
         dr.sync_thread()

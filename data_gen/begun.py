@@ -24,6 +24,7 @@ from ngpt.io.results import MADE_BY
 from ngpt.io.whole import finished
 from ngpt.merging import DIAGNOSTICS, OPTIONS, UNFINISHED, merge
 from ngpt.stack import GradientStack
+from ngpt.subpixels import SUBPIXELS
 from ngpt.system.files import save
 from ngpt.windows import Window
 
@@ -84,6 +85,7 @@ class Rest:
     error: float | None
     sampler: str
     adaptive: str = ""  # the method that samples are shared out for
+    subpixels: int = 1  # of a pixel: K for K x K
 
     def method(self, asked: str | None) -> str | None:
         """What samples are shared out for; None where they are not."""
@@ -91,7 +93,7 @@ class Rest:
 
     def options(self, seed: int) -> dict[str, Any]:
         """Options of ``render_scene`` and ``render_frames`` for the rest of a render asked for with ``seed``."""
-        given = {"spp": self.spp, "seconds": self.seconds, "sampler": self.sampler}
+        given = {"spp": self.spp, "seconds": self.seconds, "sampler": self.sampler, "subpixels": self.subpixels}
         return given | {"seed": part_seed(seed, self.parts)}
 
 
@@ -112,6 +114,7 @@ class Asked:
     unbiased: bool = False  # paths must not share what they find
     variant: str = ""  # of Mitsuba; "": its colours are not compared
     diagnostics: bool = False
+    subpixels: int | str = "auto"
 
     def left(self, path: Path) -> Rest | None:
         """What is left to render of the stack in a file, None where nothing is.
@@ -149,6 +152,7 @@ class Asked:
             None if self.error is None or even else 1 / math.sqrt(self.error**-2 - reached**-2),
             sampler,
             "" if even else str(attributes.get("ngpt:adaptive", self.adaptive)),
+            int(_number(attributes, SUBPIXELS)) or 1,
         )
 
     def done(self, path: Path) -> bool:
@@ -174,6 +178,7 @@ class Asked:
         entry = FRAME_SAMPLERS.get(self.sampler) or own
         wanted = _options(entry.unusual(entry.settings(self.options))) - _EITHER if entry else options
         unbiased = self.unbiased or self.options.get("tails") == "paths"
+        kept = int(_number(attributes, SUBPIXELS)) or 1
         theirs_shared, ours_shared = self._sharing(attributes, len(seeds))
         colours = _colours(str(attributes.get("software", "")).rpartition(" ")[2])
         for what, theirs, asked in (
@@ -185,6 +190,7 @@ class Asked:
             ("options", options, wanted),
             ("tails", "shared", "of each path (--unbiased)" if unbiased and "tails=shared" in named else "shared"),
             ("samples", theirs_shared, ours_shared),
+            ("subpixels", kept, kept if self.subpixels == "auto" else self.subpixels),
             ("colours", colours, _colours(self.variant) if colours and self.variant else colours),
         ):
             if theirs != asked:
@@ -220,7 +226,7 @@ def begun_stack(path: Path) -> GradientStack:
     layers = {name: found[name] for name in found.names if name != "error"}
     attributes = {name: value for name, value in found.attributes.items() if name not in MADE_BY}
     further = {name: channel for name, channel in pass_through(found).items() if name.startswith(DIAGNOSTICS)}
-    stack = GradientStack(layers, attributes, path=found.path, place=found.place)
+    stack = GradientStack(layers, attributes, path=found.path, place=found.place, fine=found.fine)
     return with_channels(stack, further) if further else stack
 
 

@@ -93,6 +93,7 @@ def render_passes(
     lane_bytes: int = LANE_BYTES,
     batch: int = 0,
     points: str = "sobol",
+    **kind: Any,
 ) -> GradientFilm:
     """Calls ``sample`` with the camera samples of pass after pass, and returns the film it filled.
 
@@ -107,7 +108,8 @@ def render_passes(
     other: each pass is one block of so many samples per pixel, and the film's variances are computed over passes. Such
     a ``sample`` may keep a state from pass to pass; ``CameraSamples.first`` gives its position.
 
-    A ``sample`` may come in ``Rounds``; no pass crosses the end of a round.
+    A ``sample`` may come in ``Rounds``; no pass crosses the end of a round. The ``kind`` of film, its ``subpixels``
+    and whether it has ``gradients``, is as in ``film_within``.
 
     Raises NgptError where one block of samples does not fit into the memory.
     """
@@ -117,7 +119,7 @@ def render_passes(
     lane_bytes = getattr(sample, "lane_bytes", lane_bytes)
     instead = getattr(sample, "instead", _nothing)
     net = first_round(points, spp)
-    film, block, most = film_within(budget.memory, sensor, total, lane_bytes, batch, instead, net=net)
+    film, block, most = film_within(budget.memory, sensor, total, lane_bytes, batch, instead, net=net, **kind)
     grows = points == "rounds" and not batch
     start = now = time.perf_counter()
     done: list[tuple[int, float]] = []
@@ -161,7 +163,10 @@ def render_passes(
             break
         begin = now
         with recording(), compilation() as compiled:
-            sample(CameraSamples(sensor, seed, n, film.samples, min(n, size), net=net), film)
+            camera = CameraSamples(sensor, seed, n, film.samples, min(n, size), net=net)
+            film.begin_pass(camera)
+            sample(camera, film)
+            del camera
             film.end_pass(min(n, size))
             dr.sync_thread()
         now = time.perf_counter()
@@ -221,17 +226,38 @@ def film_within(
     instead: Callable[[int], str] = _nothing,
     *,
     net: int = ROUND,
+    **kind: Any,
 ) -> tuple[GradientFilm, int, int]:
     """An empty film for ``spp`` samples per pixel, samples of a block, and how many blocks may make a pass.
 
-    ``instead`` is as in ``blocks_within``, ``net`` as in ``CameraSamples``.
+    ``instead`` is as in ``blocks_within``, ``net`` as in ``CameraSamples``. Of the ``kind`` of film, which
+    are further parameters of its own, it keeps fewer ``subpixels`` where there is no room, and a warning says so.
     Raises NgptError where one block of samples does not fit into ``memory``.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
-    film = GradientFilm(width, height, batches=bool(batch), net=net)
-    block = batch or block_of_samples(film.pixels)
-    most = blocks_within(memory, film, min(block, spp), lane_bytes + bytes_of_rays(sensor), instead)
+    block = batch or block_of_samples(width * height)
+    lane_bytes += bytes_of_rays(sensor)
+    film = film_of(width, height, memory, lane_bytes * min(block, spp), batches=bool(batch), net=net, **kind)
+    most = blocks_within(memory, film, min(block, spp), lane_bytes, instead)
     return film, block, 1 if batch else most
+
+
+def film_of(width: int, height: int, memory: int, pixel_bytes: int, *, subpixels: int = 1, **how: Any) -> GradientFilm:
+    """A film with so many subpixels, or as many as leave room for a pass that takes ``pixel_bytes`` a pixel."""
+    k = subpixels
+    while True:
+        film = GradientFilm(width, height, subpixels=k, **how)
+        pixels = 1 << (film.pixels - 1).bit_length()
+        if k == 1 or film.bytes + pixel_bytes * pixels <= memory * 2**20:
+            break
+        k //= 2
+    if k < subpixels:
+        kept = f"{k}x{k} are kept" if k > 1 else "none are kept"
+        _LOG.warning(
+            "%dx%d subpixels of %dx%d pixels do not fit into %d MiB of memory: %s; more memory (--memory) holds them",
+            *(subpixels, subpixels, width, height, memory, kept),
+        )
+    return film
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from data_gen.film import GradientFilm
 from data_gen.film.gradient_film import bytes_of_shared
 from data_gen.passes import render_passes, rounds_of
 from data_gen.samplers import SAMPLERS, choose, find
-from data_gen.samplers.registry import Entry, own
+from data_gen.samplers.registry import Entry, Sampler, own
 from data_gen.samplers.reused import Made
 from data_gen.samplers.shared import why_not_shared
 from data_gen.scenes.cameras import place_of
@@ -33,6 +33,7 @@ from ngpt.layers import GATHERED
 from ngpt.merging import UNFINISHED
 from ngpt.shared import CUT, TAILS
 from ngpt.stack import GradientStack
+from ngpt.subpixels import CHOICES, SUBPIXELS, best
 from ngpt.version import __version__
 
 # Called after each pass of a render with a function that makes the stack of the samples done by then
@@ -60,6 +61,7 @@ def render_stack(
     adaptive: Adaptive | None = None,
     made: Made | None = None,
     unbiased: bool = True,
+    subpixels: int | str = 1,
     **options: Any,
 ) -> GradientStack:
     """Renders a stack from the scene's first sensor.
@@ -74,6 +76,8 @@ def render_stack(
 
     Without ``unbiased``, samplers with the option ``tails`` let paths share what they find, where that works and pays
     (``data_gen.tails``). The attribute ``ngpt:samplerOptions`` then contains ``tails=shared``.
+
+    With ``subpixels`` K, 2 or 4, or where "auto" finds them of use, the stack has K x K subpixels (``ngpt.subpixels``).
 
     Renders of one scene that are given the same object ``made`` share their samplers, where that is possible.
 
@@ -115,6 +119,7 @@ def render_stack(
             budget = replace(budget, memory=memory - MIB - bytes_of_shared(pixels) // 2**20)
     if adaptive is not None:
         check_adaptive(adaptive, entry, settings, spp)
+    kept = subpixels_of(entry, subpixels, spp)
     _LOG.info("sampler %s, options %s", sampler, options_as_attribute(entry, settings) or "as by default")
     start = time.perf_counter()
     more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
@@ -132,6 +137,7 @@ def render_stack(
         settings["points"] = "rounds"
     watch = Watch(progress, stop, look)
     how: dict[str, Any] = {"lane_bytes": entry.lane_bytes, "points": settings.get("points", "independent")}
+    how |= {"gradients": entry.film_of_gradients, "subpixels": kept}
     with weighed(scene, settings["lamps"], entry.by_place) as places:
         more |= own(settings) | ({"places": places} if places else {})
         made = made or Made()
@@ -164,6 +170,9 @@ def render_stack(
     if failed or (stop() and (spp is None or done < spp)):
         chosen[UNFINISHED] = "failed" if failed else "interrupted"
     stack = stack_of(film, sensor, seed, sampler, start, chosen, diagnostics=diagnostics)
+    if subpixels == "auto" and best(done) == 1 and stack.fine:  # it was ended early
+        stack = replace(stack, fine={})
+        del stack.attributes[SUBPIXELS]
     if failed:
         raise Unfinished(str(failed) or type(failed).__name__, stack) from failed
     return stack
@@ -198,6 +207,22 @@ def stack_of(
     }
     stack = film.stack(attributes | more, place_of(sensor))
     return with_channels(stack, film.diagnose()) if diagnostics else stack
+
+
+def subpixels_of(entry: Sampler, asked: int | str, spp: int | None) -> int:
+    """K of the K x K subpixels that a render keeps; raises WrongUse where it cannot have those that are asked for."""
+    if asked != "auto" and asked not in CHOICES:
+        raise WrongUse(f"{asked} subpixels: choose one of {', '.join(map(str, CHOICES))}, auto")
+    if not entry.batch:
+        # With gradients, networks combine images that they were trained to find without subpixels.
+        return int(asked) if asked != "auto" else 1 if entry.gradients else best(spp)
+    if asked in ("auto", 1):
+        return 1
+    able = ", ".join(name for name, other in SAMPLERS.items() if not other.batch)
+    raise WrongUse(
+        f"sampler '{entry.name}' puts light on any pixel and has no subpixels: leave --subpixels out, or name one of: "
+        f"{able}"
+    )
 
 
 def check_limits(budget: Budget, seed: int, sampler: str, ends: bool = False) -> None:

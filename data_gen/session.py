@@ -58,6 +58,7 @@ def render_scene(
     diagnostics: bool = False,
     unbiased: bool = False,
     gradients: bool = False,
+    subpixels: int | str = "auto",
     variant: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     stop: Callable[[], bool] = lambda: False,
@@ -82,6 +83,8 @@ def render_scene(
     ``unbiased``    turns off the cache that paths share. The cache lowers the noise of most renders and adds a small
                     bias: see docs/samplers/tails.md
     ``gradients``   whether the stack must have dx and dy, also where a sampler without them leaves less error ("auto")
+    ``subpixels``   2 or 4: keeps 2x2 or 4x4 subpixels of each pixel, for denoisers; 1: none; "auto": where they are
+                    known to help (docs/use/subpixels.md)
     ``variant``     variant of Mitsuba; by default the current one, or llvm_ad_rgb if none is set
     ``progress``    called with (samples done, spp), or whole (seconds gone, seconds)
     ``stop``        asked after each pass whether to end there: the stack holds the samples done by then. See
@@ -140,6 +143,7 @@ def render_scene(
         diagnostics=diagnostics,
         adaptive=sharing,
         unbiased=unbiased,
+        subpixels=subpixels,
         **options,
     )
     warn_if_black(scene, stack["primal"])
@@ -168,6 +172,7 @@ def render_frames(
     memory: int | None = None,
     diagnostics: bool = False,
     unbiased: bool = False,
+    subpixels: int | str = "auto",
     variant: str | None = None,
     skip: Callable[[int], bool] = lambda frame: False,
     stop: Callable[[], bool] = lambda: False,
@@ -220,7 +225,9 @@ def render_frames(
         camera = read_gltf_camera(camera, fps) if animated else read_camera_path(camera)
     options |= {"seconds": seconds, "memory": memory, "stop": stop, "diagnostics": diagnostics, "progress": progress}
     if not remembers:
-        options["unbiased"] = unbiased
+        options |= {"unbiased": unbiased, "subpixels": subpixels}
+    elif subpixels not in ("auto", 1):
+        raise WrongUse(f"sampler '{sampler}' reuses earlier frames and has no subpixels: leave --subpixels out")
     found = render_shot(
         Shot(describe, size, camera, sensor=sensor), frames, spp, seed, dt, skip=skip, sampler=sampler, **options
     )

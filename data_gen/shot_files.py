@@ -138,7 +138,7 @@ def asked_of(scene: str, frame: int, **arguments: Any) -> Asked:
     given |= {"--fps": str(its.fps), "--dt": str(its.dt)}
     given |= {} if its.sensor is None else {"--sensor": str(its.sensor)}
     name = scene_name(filled(scene, frame), given, None if its.camera is None else str(its.camera))
-    same = ("seed", "sampler", "options", "size", "seconds", "unbiased", "diagnostics")
+    same = ("seed", "sampler", "options", "size", "seconds", "unbiased", "diagnostics", "subpixels")
     known = {field: getattr(its, field) for field in same}
     return Asked(name, spp=spp, frame=frame, variant=its.variant or DEFAULT_VARIANT, **known)
 

@@ -11,6 +11,7 @@ dim that its square could underflow to 0.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -81,7 +82,10 @@ def scaled(stack: GradientStack, power: int) -> GradientStack:
             changed[name] = np.where(layer == 0, np.float32(np.nan), variance) if lost else variance
         elif name in LIGHT and power:
             changed[name] = enlarged(layer, -power)
-    return stack.replace(**changed) if changed else stack
+    if not changed:
+        return stack
+    fine = stack.fine | ({"primal": enlarged(stack.fine["primal"], -power)} if stack.fine and power else {})
+    return replace(stack.replace(**changed), fine=fine)
 
 
 def enlarged(light: np.ndarray, power: int) -> np.ndarray:

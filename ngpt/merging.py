@@ -13,6 +13,7 @@ differences too, whose two directions may have samples in different numbers.
 Stacks that lie in different places of one picture are tiles: each counts in its own pixels.
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
@@ -25,7 +26,10 @@ from ngpt.io.exr import pass_through, with_channels
 from ngpt.layers import DIFFERENCES, FEATURE_NOISE, GATHERED
 from ngpt.shared import CUT, TAILS, shared_variance
 from ngpt.stack import GradientStack
+from ngpt.subpixels import SUBPIXELS, means, merged, subpixels
 from ngpt.windows import Place, Window
+
+_LOG = logging.getLogger(__name__)
 
 # Layers with a variance, and the layers that hold it.
 VARIANCES = {name: f"{name}_var" for name in ("primal", "dx", "dy", "caustic", "diffuse", "specular", "dt")}
@@ -54,7 +58,8 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     independent noise add like the noise itself; a stack without it counts as zero. ``primal_var`` then includes the
     variance of the merged ``shared``, which has the same expectation as that of the parts. A non-finite sample is
     missing only in its own pixel; a pixel that lost all samples is NaN and counts nothing. A stack with one sample per
-    pixel has no variances and needs none. ``diagnostics.*`` channels are averaged as layers are.
+    pixel has no variances and needs none. ``diagnostics.*`` channels are averaged as layers are. So are subpixels, if
+    all stacks have the same number of them; else they are left out with a warning.
 
     Tiles (``GradientStack.place``) give the smallest rectangle that holds them all, and must fill it. They may overlap;
     those that do not may have the same seed. The difference from a tile's last column or row to the pixel beyond it was
@@ -85,6 +90,9 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     for name in stacks[0].names:
         if name not in (*VARIANCES.values(), "samples", "shared"):
             layers[name] = _mean(tiles, {tile: tile.stack[name] for tile in tiles}, name)
+    fine = _subpixels(tiles)
+    k = subpixels(fine, canvas.width)
+    layers |= {name: means(layer, k) for name, layer in fine.items()}
     if any("shared" in stack for stack in stacks):
         layers["shared"] = _mean(tiles, {tile: _shared(tile.stack) for tile in tiles})
     for name, variance in VARIANCES.items():
@@ -101,6 +109,8 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
         "ngpt:seed": " ".join(seeds),
     }
     attributes.pop(UNFINISHED, None)
+    attributes.pop(SUBPIXELS, None)
+    attributes |= {SUBPIXELS: k} if fine else {}
     attributes |= _options(stacks) | _tails(stacks, spp)
     for name in ("ngpt:seconds", "ngpt:discarded"):
         if all(name in stack.attributes for stack in stacks):
@@ -112,7 +122,7 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
         attributes[FEATURE_NOISE] = _feature_noise(tiles, total)
     place = Place(canvas, stacks[0].place.display)
     layers = {name: layer.astype(np.float32) for name, layer in layers.items()}
-    merged = GradientStack(layers, attributes, place=place)
+    merged = GradientStack(layers, attributes, place=place, fine=fine)
     further = {tile: pass_through(tile.stack) for tile in tiles}
     names = further[tiles[0]]
     if not names:
@@ -197,6 +207,20 @@ def _mean(tiles: Sequence[_Tile], values: Mapping[_Tile, np.ndarray], name: str 
         weight[tile.part] += w
     with np.errstate(invalid="ignore", divide="ignore"):
         return total / weight
+
+
+def _subpixels(tiles: Sequence[_Tile]) -> dict[str, np.ndarray]:
+    """The subpixels of all tiles: means weighted by the samples of their pixels. None where not all have the same."""
+    each = {tile.stack.path: subpixels(tile.stack.fine, tile.stack.width) for tile in tiles}
+    ks = {subpixels(tile.stack.fine, tile.stack.width) for tile in tiles}
+    if ks == {1}:
+        return {}
+    names = [name for name in tiles[0].stack.fine if all(name in tile.stack.fine for tile in tiles)]
+    if len(ks) > 1 or "primal" not in names:
+        told = ", ".join(f"{path} has {f'{k}x{k}' if k > 1 else 'none'}" for path, k in each.items())
+        _LOG.warning("the subpixels are left out, since not all stacks have the same: %s", told)
+        return {}
+    return merged([(tile.stack.fine, tile.counts, tile.part) for tile in tiles], names, tiles[0].canvas.size)
 
 
 def _shared(stack: GradientStack) -> np.ndarray:

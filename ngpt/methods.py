@@ -322,7 +322,8 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     given, matrix = stack, inside_rec709(stack) if entry.rec709 else None
     if matrix is not None:
         light = {name: converted(stack[name], matrix) for name in ("primal", "direct", "caustic") if name in stack}
-        stack = stack.replace(**light)
+        fine = stack.fine | ({"primal": converted(stack.fine["primal"], matrix)} if stack.fine else {})
+        stack = replace(stack.replace(**light), fine=fine)
     power = magnitude(stack)
     apart = entry.apart and bool(stack.number(GATHERED))
     data = repair(_known(scaled(stack, power), entry.estimates), gradients="dx" in reads or apart)

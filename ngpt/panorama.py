@@ -6,6 +6,7 @@ An image is one if its header says so: by OpenEXR's ``envmap`` for latitude and 
 import numpy as np
 
 from ngpt.stack import GradientStack
+from ngpt.subpixels import subpixels
 
 WRAP = "ngpt:wrap"  # a header attribute, 1: the image wraps
 # Columns that are added on each side. OIDN looks so far around a pixel, and classical methods hardly farther.
@@ -21,7 +22,7 @@ def wraps(stack: GradientStack) -> bool:
 
 def wrapping(stack: GradientStack) -> GradientStack:
     """The stack of an image that wraps, whatever its header says."""
-    return GradientStack(stack.layers, stack.attributes | {WRAP: 1}, stack.source, stack.path, stack.place)
+    return GradientStack(stack.layers, stack.attributes | {WRAP: 1}, stack.source, stack.path, stack.place, stack.fine)
 
 
 def continued(stack: GradientStack) -> GradientStack:
@@ -34,7 +35,10 @@ def continued(stack: GradientStack) -> GradientStack:
     if "dx" in stack:
         layers["dx"][:, columns == stack.width - 1] = np.nan
     attributes = {name: value for name, value in stack.attributes.items() if name not in ("envmap", WRAP)}
-    return GradientStack(layers, attributes, stack.source, stack.path)
+    k = subpixels(stack.fine, stack.width)
+    wide = (k * columns[:, None] + np.arange(k)).ravel()
+    fine = {name: np.ascontiguousarray(layer[:, wide]) for name, layer in stack.fine.items()}
+    return GradientStack(layers, attributes, stack.source, stack.path, fine=fine)
 
 
 def middle(image: np.ndarray) -> np.ndarray:

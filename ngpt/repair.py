@@ -8,6 +8,7 @@ import numpy as np
 from ngpt.errors import NgptError
 from ngpt.layers import FEATURE_NOISE
 from ngpt.stack import GradientStack
+from ngpt.subpixels import spread, subpixels
 from ngpt.system.late import ndimage
 
 # Sides of the blocks from which the insides of holes are filled: powers of it. Tiles of networks begin at multiples.
@@ -32,6 +33,7 @@ class Repaired:
     ``caustic_var``  its variance, (H, W, 3), NaN where not known; None where the stack lacks it
     ``feature_noise``  the variance of albedo or normal, whichever is larger, mean over the image; None: not known
     ``empty``    (H, W) booleans, the pixels that alpha says hold nothing (``ngpt.coverage``); None where there are none
+    ``fine``     primal, albedo and normal by subpixels (``ngpt.subpixels``), finite; empty where there are none
     ``parts``    diffuse and specular light, finite, and their variances as ``diffuse_var`` and ``specular_var``, NaN
                  where not known; only the ones that the stack holds
     """
@@ -50,6 +52,7 @@ class Repaired:
     caustic_var: np.ndarray | None = None
     feature_noise: float | None = None
     empty: np.ndarray | None = None
+    fine: dict[str, np.ndarray] = field(default_factory=dict)
     parts: dict[str, np.ndarray] = field(default_factory=dict)
 
     def known_variances(self) -> dict[str, np.ndarray]:
@@ -93,6 +96,8 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
     noise = _where(known, variance_of_primal(stack, gradients)) if "primal_var" in stack else None
     said = stack.number(FEATURE_NOISE)
     apart: dict[str, Any] = {"parts": _parts(stack, good), "feature_noise": said if said is None or said >= 0 else None}
+    if stack.fine:
+        apart["fine"] = _finite_subpixels(stack, image + direct, features)
     if caustic is not None and gradients:
         variance = _where(good, stack["caustic_var"]) if "caustic_var" in stack else None
         apart |= {"caustic": caustic, "caustic_var": variance}
@@ -149,6 +154,19 @@ def finite_pixels(layer: np.ndarray) -> np.ndarray:
     """Where all channels of (H, W, C) are finite; at once if all are, since short last axes are slow to look along."""
     good = np.isfinite(layer)
     return np.ones(layer.shape[:2], bool) if good.all() else good.all(axis=-1)
+
+
+def _finite_subpixels(
+    stack: GradientStack, image: np.ndarray, features: dict[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """The subpixels of a stack; those that are not finite have the value of their pixel in the repaired layers."""
+    k = subpixels(stack.fine, stack.width)
+    fine = {}
+    for name, layer in stack.fine.items():
+        good = finite_pixels(layer)
+        pixels = image if name == "primal" else features[name]
+        fine[name] = layer if good.all() else np.where(good[..., None], layer, spread(pixels, k))
+    return fine
 
 
 def _finite(layer: np.ndarray) -> np.ndarray:

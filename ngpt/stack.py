@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from ngpt.errors import NgptError, did_you_mean
 from ngpt.image.notebook import stack_html
 from ngpt.layers import LAYERS
+from ngpt.subpixels import check
 from ngpt.windows import Place
 
 
@@ -27,7 +28,7 @@ class GradientStack(Mapping[str, np.ndarray]):
     ``attributes`` are the header attributes beyond those that OpenEXR itself needs, ``ngpt:spp`` and the like.
     ``source`` is the file the stack was read from (``ngpt.io.layout.StackSource``), for what passes through it.
     ``path`` is for messages. ``place`` is where the pixels lie in the whole picture; by default, and where it is
-    of another size, they are all of it.
+    of another size, they are all of it. ``fine`` are the layers of subpixels, where there are any (``ngpt.subpixels``).
 
     Raises NgptError for unknown layers, types that are not real numbers, wrong shapes, layers that differ in size,
     images without pixels, and finite numbers that float32 cannot hold.
@@ -38,6 +39,7 @@ class GradientStack(Mapping[str, np.ndarray]):
     source: Any = None
     path: str = "stack"
     place: Place = None  # type: ignore[assignment]
+    fine: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.layers:
@@ -49,6 +51,7 @@ class GradientStack(Mapping[str, np.ndarray]):
             _check_size(self.path, name, array.shape, first, self.layers[first].shape)
         if self.place is None or self.place.data.size != (self.width, self.height):
             self.place = Place.whole(self.width, self.height)
+        check(self.fine, self.width, self.height, self.path)
 
     @classmethod
     def from_arrays(
@@ -157,9 +160,13 @@ class GradientStack(Mapping[str, np.ndarray]):
             raise NgptError(f"{self.path}: {needs} {what}; the stack holds {', '.join(self.names)}; {remedy}")
 
     def replace(self, **layers: ArrayLike) -> "GradientStack":
-        """Returns a stack with these layers replaced or added, and the same attributes, source and place."""
+        """Returns a stack with these layers replaced or added, and the same attributes, source and place.
+
+        It has no subpixels where one of their layers is replaced: they are not those of the new one.
+        """
         new = {name: np.asarray(array) for name, array in layers.items()}
-        return GradientStack({**self.layers, **new}, self.attributes, self.source, self.path, self.place)
+        fine = {} if self.fine.keys() & new.keys() else self.fine
+        return GradientStack({**self.layers, **new}, self.attributes, self.source, self.path, self.place, fine)
 
 
 # Where the largest variance is below this, float32 would lose digits of those that are 2^-40 of it.

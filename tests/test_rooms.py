@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 # open in ngpt or data_gen.
 FLOORS = """
 ngpt.errors ngpt.version
-ngpt.system ngpt.options ngpt.windows ngpt.layers ngpt.testing ngpt.shared
+ngpt.system ngpt.options ngpt.windows ngpt.layers ngpt.testing ngpt.shared ngpt.subpixels
 ngpt.image
 ngpt.stack
 ngpt.io ngpt.repair ngpt.coverage ngpt.magnitude ngpt.panorama ngpt.renderer

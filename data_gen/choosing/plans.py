@@ -241,7 +241,9 @@ def _pixels(scene: mi.Scene) -> int:
 def _check_memory(scene: mi.Scene, sampler: str, spp: int | None, memory: int) -> None:
     """Raises NgptError where the image itself, not the pilot's, does not fit into ``memory`` (MiB)."""
     entry = SAMPLERS[sampler]
-    film_within(memory, scene.sensors()[0], spp or 1 << 31, entry.lane_bytes, entry.batch)
+    film_within(
+        memory, scene.sensors()[0], spp or 1 << 31, entry.lane_bytes, entry.batch, gradients=entry.film_of_gradients
+    )
 
 
 def simple(sampler: str) -> str:

@@ -61,7 +61,7 @@ def denoising_of(args: argparse.Namespace) -> Denoising | None:
 
 def asked(args: argparse.Namespace) -> dict[str, Any]:
     """What ``render_scene`` and ``render_frames`` both take, by their names."""
-    names = ("spp", "seed", "sampler", "sensor", "size", "memory", "diagnostics", "unbiased", "variant")
+    names = ("spp", "seed", "sampler", "sensor", "size", "memory", "diagnostics", "unbiased", "variant", "subpixels")
     options = dict(args.option)
     check_options(args.sampler, options)  # so that none of them goes by another's name
     given = {name: getattr(args, name) for name in names}
@@ -99,6 +99,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
         unbiased=args.unbiased,
         variant=args.variant or DEFAULT_VARIANT,
         diagnostics=args.diagnostics,
+        subpixels=args.subpixels,
     )
     if args.skip_existing:
         output.check_skipping()

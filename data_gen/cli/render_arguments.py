@@ -22,6 +22,7 @@ from ngpt.cli.arguments import (
 from ngpt.cli.picture import IMAGES, add_look
 from ngpt.errors import WrongUse
 from ngpt.methods import METHODS
+from ngpt.subpixels import CHOICES
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -99,6 +100,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="trace all paths to their end, without the shared cache of light: no bias, more noise",
     )
     parser.add_argument(
+        "--subpixels",
+        type=subpixels,
+        default="auto",
+        metavar="K",
+        help="keep 1, 2x2 or 4x4 subpixels of each pixel, of which OIDN makes a better image: 1, 2, 4, auto "
+        "(where they are known to help; default)",
+    )
+    parser.add_argument(
         "--diagnostics",
         action="store_true",
         help="also write the rates of failed shifts and of discarded values, as channels",
@@ -146,6 +155,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--skip-existing", action="store_true", help="skip finished images and continue unfinished ones"
     )
     add_json(parser)
+
+
+def subpixels(text: str) -> int | str:
+    """K of the K x K subpixels of a pixel, or "auto"."""
+    choices: dict[str, int | str] = {"auto": "auto", **{str(k): k for k in CHOICES}}
+    if text not in choices:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' subpixels cannot be kept; write {', '.join(map(str, CHOICES))}, or auto"
+        )
+    return choices[text]
 
 
 # More than anyone renders; a typing error must not fill the memory.

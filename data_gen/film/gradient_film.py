@@ -13,9 +13,11 @@ from data_gen.film import claims
 from data_gen.film.moments import Moments, Strands, accumulate, no_moments, one_more, put_back, taken
 from data_gen.film.splats import SPLAT_BYTES, Splats
 from data_gen.film.statistics import contrast, statistics
+from data_gen.film.subpixels import Celled, Subpixels, bytes_of_subpixels
 from ngpt.layers import DIFFERENCES, FEATURE_NOISE
 from ngpt.shared import shared_variance
 from ngpt.stack import GradientStack
+from ngpt.subpixels import SUBPIXELS, means
 from ngpt.windows import Place
 
 # What samplers shift paths by, (x, y) in pixels, y down: each difference of the contract, and back. The film keeps the
@@ -38,11 +40,14 @@ _WITH_VARIANCE = frozenset({"primal", "caustic", *_SPLIT, *SHIFTS, *_FEATURES})
 # Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 21; and the moments of
 # one name once more.
 _STRAND_BYTES = 10 * 8 + (26 + 21) * 8 + (8 + 6 * 8)
+# Without gradients: 5 names, 13 channels, 9 sums of squares. They are fewer, and the more subpixels fit.
+_STRAND_BYTES_WITHOUT = 5 * 8 + (13 + 9) * 8 + (8 + 6 * 8)
 # Per strand, of the layer ``shared``, which few films have: two counts, double means
 _SHARED_BYTES = 8 + 3 * 8
 # Per strand, of two sets of earlier samples: single means of 21 channels, and counts of the seven names they belong to,
 # with the number of bits
 _HALVES_BYTES = 2 * 21 * 4 + 7 * 3 * 4
+_HALVES_BYTES_WITHOUT = 2 * 9 * 4 + 3 * 3 * 4
 # Per pixel, of a pass that is one batch: the mean over the batch, splats and their sums, of one name.
 _BATCH_BYTES = 3 * 8 + 3 * SPLAT_BYTES + 4 + 3 * 8
 # Pixels that tell the mean noise of features well enough
@@ -65,9 +70,22 @@ class GradientFilm:
     ``data_gen.film.claims``. If samples of a pass share photons, reservoirs or the state of a chain, or lanes splat
     onto other pixels, the film is made with ``batches``: each pass is one batch, a pixel's value is its mean over the
     batch, and variances are computed over batches. Batches are weighted by their samples: the last one may have fewer.
+
+    With ``subpixels`` K > 1 the film also keeps what denoisers read by K x K subpixels of each pixel
+    (``ngpt.subpixels``). Each pass is then announced by ``begin_pass``. Batches have no subpixels.
+
+    ``bytes`` are what it takes at most; less where it is said that no ``gradients`` will be put.
     """
 
-    def __init__(self, width: int, height: int, batches: bool = False, net: int = 0):
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        batches: bool = False,
+        net: int = 0,
+        subpixels: int = 1,
+        gradients: bool = True,
+    ):
         self.width, self.height, self.batches, self.net = width, height, batches, net
         self.pixels = width * height
         self.strands = 1 if batches else max(1, _STRANDS // self.pixels)
@@ -78,11 +96,21 @@ class GradientFilm:
         self.counts: np.ndarray | None = None
         self._blocks_each = np.zeros(0, np.int64)
         # Dr.Jit gives each array the next power of two of bytes.
-        bytes_each = _STRAND_BYTES + (_BATCH_BYTES if batches else 0) + (_HALVES_BYTES if net else 0)
+        own, halves = (_STRAND_BYTES, _HALVES_BYTES) if gradients else (_STRAND_BYTES_WITHOUT, _HALVES_BYTES_WITHOUT)
+        bytes_each = own + (_BATCH_BYTES if batches else 0) + (halves if net else 0)
+        bytes_each += bytes_of_subpixels(subpixels, caustic=gradients)
         self.bytes = bytes_each * (1 << (self.pixels * self.strands - 1).bit_length())
+        self.subpixels = subpixels
+        self._fine = Subpixels(self.pixels, self.strands, subpixels) if subpixels > 1 else None
+        self._cell: mi.UInt32 | None = None
         self.moments: dict[str, Moments] = {}
         self._pass: dict[str, tuple] = {}
         self._splats: dict[str, Splats] = {}
+
+    def begin_pass(self, camera: Celled) -> None:
+        """Takes note of the subpixels that the samples of the next pass lie in, where the film has any."""
+        if self._fine:
+            self._cell = camera.cells(self.subpixels)
 
     def put(self, name: str, value, active: bool | mi.Bool = True) -> None:
         """Adds the samples of one pass.
@@ -129,10 +157,13 @@ class GradientFilm:
             return
         values, self._pass = self._pass, {}
         splats, self._splats = self._splats, {}
+        cell, self._cell = self._cell, None
+        if self._fine and cell is None:
+            raise ValueError("a film with subpixels is told of each pass by begin_pass()")
         # Reading single lanes evaluates an array: without this, each would trace the paths again.
-        dr.eval(values)
+        dr.eval(values, cell)
         if some is not None:
-            self._add_some(values, block, some)
+            self._add_some(values, block, some, cell)
             return
         if self.counts is not None:
             raise ValueError("pixels have samples in different numbers: say which pixels the blocks are of")
@@ -156,14 +187,16 @@ class GradientFilm:
                 # One by one: the old moments and the new ones are in memory together.
                 dr.eval(new)
                 self.moments[name] = new
+            if self._fine:
+                self._fine.add(values, cell, strands, dr.arange(mi.UInt32, self.pixels * self.strands))
         self.samples += spp
         self.blocks += spp // block
 
     def forget_pass(self) -> None:
         """Leaves out what was put since the last pass ended: it was broken off."""
-        self._pass, self._splats = {}, {}
+        self._pass, self._splats, self._cell = {}, {}, None
 
-    def _add_some(self, values: dict, block: int | None, some: np.ndarray) -> None:
+    def _add_some(self, values: dict, block: int | None, some: np.ndarray, cell: mi.UInt32 | None) -> None:
         """Adds the samples of a pass whose blocks belong to ``some`` pixels."""
         if self.batches or not block:
             raise ValueError("passes of some pixels have blocks of independent samples")
@@ -190,6 +223,8 @@ class GradientFilm:
             new = accumulate(taken(old, place), components, active, strands)
             dr.eval(new)
             self.moments[name] = put_back(old, new, place)
+        if self._fine:
+            self._fine.add(values, cell, strands, place)
         self.counts[pixels] += blocks * block
         self._blocks_each[pixels] += blocks
 
@@ -275,7 +310,12 @@ class GradientFilm:
         if (noise := self.feature_noise) is not None:
             known[FEATURE_NOISE] = noise
         where = {} if place is None else {"place": place}
-        return GradientStack(self.develop(), known | dict(attributes or {}), **where)
+        layers, fine = self.develop(), {}
+        if self._fine:
+            known[SUBPIXELS] = self.subpixels
+            fine = self._fine.develop(self.width, self.height)
+            layers |= {name: means(layer, self.subpixels) for name, layer in fine.items()}
+        return GradientStack(layers, known | dict(attributes or {}), fine=fine, **where)
 
     @property
     def feature_noise(self) -> float | None:

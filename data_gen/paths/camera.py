@@ -100,6 +100,16 @@ class CameraSamples:
         self.time = mi.Float(self.sensor.shutter_open() + self.sensor.shutter_open_time() * self.random.next_1d())
         self.wavelength = self.random.next_1d()
 
+    def cells(self, k: int) -> mi.UInt32:
+        """Which of the K x K subpixels of its pixel each sample is in, counted row by row.
+
+        By its place in the pixel as it was drawn: ``position`` is rounded to what is left of digits beside the column.
+        """
+        place = sample_streams(self.seed, self.pixel, self.sample, int(self.size.x), self.net).next_2d()
+        size = dr.opaque(mi.UInt32, k)
+        x, y = (dr.minimum(mi.UInt32(c * mi.Float(size)), size - 1) for c in (place.x, place.y))
+        return y * size + x
+
     def at(self, lanes: mi.UInt32) -> CameraSamples:
         """The samples of only these ``lanes``, as far as rays and random numbers go."""
 

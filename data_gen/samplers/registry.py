@@ -149,6 +149,11 @@ class Sampler(Entry):
         return self.integrator(scene, **options).prepare(scene)
 
     @property
+    def film_of_gradients(self) -> bool:
+        """Whether its film may need room for more than colour and features: studies put what they like."""
+        return self.gradients or bool(self.batch) or self.standing == "study"
+
+    @property
     def even(self) -> bool:
         """Whether all pixels must have as many samples."""
         return bool(self.batch) or self.together

@@ -18,6 +18,7 @@ from ngpt.merging import VARIANCES
 from ngpt.methods import Result, reconstruct
 from ngpt.shared import shared_variance
 from ngpt.stack import GradientStack
+from ngpt.subpixels import means, spread, subpixels
 from ngpt.system.late import ndimage
 
 SPREAD = 2.6  # pixels, the standard deviation of the window over which the change is averaged: as large as 9x9 pixels
@@ -112,7 +113,29 @@ def noisier(stack: GradientStack) -> GradientStack:
     if "caustic" in layers:
         # The caustic is part of the primal; the noise above covers only the rest of it.
         layers["primal"] = layers["primal"] + (layers["caustic"] - stack["caustic"])
-    return stack.replace(**layers)
+    if not stack.fine or "primal" not in layers:
+        return stack.replace(**layers)
+    k = subpixels(stack.fine, stack.width)
+    fine = _noisier_subpixels(stack, layers["primal"] - stack["primal"], rng, k)
+    layers["primal"] = means(fine["primal"], k)
+    return replace(stack.replace(**layers), fine=fine)
+
+
+def _noisier_subpixels(
+    stack: GradientStack, noise: np.ndarray, rng: np.random.Generator, k: int
+) -> dict[str, np.ndarray]:
+    """The subpixels with so much ``noise`` of their pixels, and beside it noise of their own, whose means are 0.
+
+    The variance of a subpixel is K² times its pixel's, without what pixels share.
+    """
+    variance = np.maximum(np.nan_to_num(stack["primal_var"], posinf=0.0), 0)
+    if "shared" in stack:
+        variance = np.maximum(variance - shared_variance(stack["shared"]), 0)
+    variance = np.where(empty_pixels(stack)[..., None], 0, variance)
+    drawn = rng.standard_normal(stack.fine["primal"].shape, np.float32)
+    drawn -= spread(means(drawn, k), k)
+    own = spread(k * np.sqrt(variance), k) * drawn
+    return stack.fine | {"primal": (stack.fine["primal"] + spread(noise, k) + own).astype(np.float32)}
 
 
 def change(image: np.ndarray, other: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:

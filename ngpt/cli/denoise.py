@@ -22,6 +22,7 @@ from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_views
 from ngpt.io.foreign.files import first_attributes
 from ngpt.io.frames import RESULT_SUFFIX, is_shot, remarks
+from ngpt.io.reduced import REDUCED, check_reducible, smaller
 from ngpt.io.whole import finished
 from ngpt.methods import METHODS, by_standing, check_request, reconstruct
 from ngpt.network.identity import identify
@@ -105,6 +106,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "for less flicker. With -m wcv and frames from `ngpt render --dt`: also with the frames after it",
     )
     parser.add_argument(
+        "--reduce",
+        type=arguments.positive,
+        default=1,
+        metavar="K",
+        help="for images rendered K times as large as wanted: denoise them so, and make one pixel of each K x K. 2, "
+        "with a quarter of the samples, keeps edges best",
+    )
+    parser.add_argument(
         "--into",
         metavar="LAYER",
         help="layer that the result replaces beside the root R G B, such as Combined; root: none (default: the layer "
@@ -182,6 +191,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         # One of several frames is not kept elsewhere if the disk is full: the next call makes it again.
         keep=len(pairs) == 1,
         into=args.into,
+        reduce=args.reduce,
     )
     frames: Any
     windows = False
@@ -258,6 +268,8 @@ def read_frame(
     cut = args.skip_existing and not there and target.exists()
     stacks = read_views(source, dict(args.layer), args.untrusted, files, args.view)
     stacks = [wrapping(stack) for stack in stacks] if args.wrap else stacks
+    for stack in stacks if args.reduce > 1 else []:
+        check_reducible(stack, args.reduce)
     first, *others = (Frame(source, target, stack, there=there, cut=cut) for stack in stacks)
     if others and (what := one_view_only(target, args, files)):
         raise NgptError(f"{source}: has several views, and {what}; choose one, as in --view {first.view}")
@@ -268,6 +280,7 @@ def _check_result(source: Path, target: Path, args: argparse.Namespace) -> None:
     """Raises NgptError where a result was made of another stack, or with other settings than are asked for."""
     result, stack = first_attributes(target), first_attributes(source)
     asked: dict[str, Any] = {name: stack.get(name) for name in ("ngpt:spp", "ngpt:seed") if name in stack}
+    asked[REDUCED] = args.reduce if args.reduce > 1 else None
     asked["ngpt:temporal"] = result.get("ngpt:temporal", "asked for") if args.temporal else None
     if args.method in METHODS and not args.weights:
         options = METHODS[args.method].options
@@ -315,7 +328,12 @@ def compute_frame(
         over_time, reason = {"ngpt:temporal": "history", "ngpt:history": history.share}, history.reason
         if isinstance(history.corrections, Network):
             over_time["ngpt:historyWeights"] = str(identify(history.corrections.path))
-    errors = reference.errors(result.image, stack) if reference is not None else None
+    errors = None
+    if reference is not None:
+        image, place = smaller(result.image, stack.place, args.reduce)
+        errors = reference.errors(
+            image, GradientStack({"primal": image}, stack.attributes, path=stack.path, place=place)
+        )
     if groups:
         parts = lightgroups.denoised(stack, groups, result.image, args.method, **options)
         stack = lightgroups.with_groups(stack, parts)

@@ -17,6 +17,7 @@ from ngpt.io.foreign.pfm import write_pfm
 from ngpt.io.framenames import named, number_of, varies
 from ngpt.io.frames import RESULT_SUFFIX
 from ngpt.io.primaries import converted, to_rec709
+from ngpt.io.reduced import cut_pixels, smaller
 from ngpt.io.resolution import propose
 from ngpt.methods import METHODS, Result
 from ngpt.stack import GradientStack
@@ -57,25 +58,28 @@ def write_frame(
     exposure: float | str = 0.0,
     keep: bool = False,
     into: str | None = None,
+    *,
+    reduce: int = 1,
 ) -> dict:
     """Writes the result, with ``keep`` elsewhere where it must, and returns what there is to report.
 
-    ``into``  as of ``ngpt.write``
+    ``into``, ``reduce``  as of ``ngpt.write``
     """
     source, target, stack, result, errors, groups, there, cut, over_time, reason, others = frame
     report: dict[str, Any] = {"input": str(source), "output": str(target)}
     if there or stack is None or result is None:
         return report | {"skipped": True}
     made = {**result.attributes, **over_time}
+    image, place = smaller(result.image, stack.place, reduce)
 
     def save_to(path: Path, overwrite: bool) -> None:
         if path.suffix.lower() == ".exr":
             views = [(one.result.image, one.stack) for one in (frame, *others) if one.result and one.stack]
-            write(path, [image for image, _ in views], [of for _, of in views], overwrite, made, into)
+            write(path, [image for image, _ in views], [of for _, of in views], overwrite, made, into, reduce=reduce)
         elif path.suffix.lower() == ".pfm":
-            write_pfm(path, converted(result.image, to_rec709(stack.attributes)), overwrite)
+            write_pfm(path, converted(image, to_rec709(stack.attributes)), overwrite)
         else:
-            light = in_picture(converted(result.image, to_rec709(stack.attributes)), stack.place)
+            light = in_picture(converted(image, to_rec709(stack.attributes)), place)
             write_picture(path, shown(light, transform, exposed(exposure, light)), overwrite)
 
     if keep:
@@ -89,8 +93,8 @@ def write_frame(
         "estimated": list(result.estimated),
         "version": __version__,
         "seconds": result.seconds,
-        "width": stack.width,
-        "height": stack.height,
+        "width": image.shape[1],
+        "height": image.shape[0],
         "repaired": result.repaired,
         "untrusted": result.untrusted,
         "standard error": result.error is not None,
@@ -107,6 +111,8 @@ def write_frame(
         }
     report |= {"views": [one.view for one in (frame, *others)]} if frame.view else {}
     report |= {"why no history": reason} if reason else {}
+    if reduce > 1:
+        report |= {"reduced by": reduce} | ({"cut": told} if (told := cut_pixels(stack.place, reduce)) else {})
     report |= {"in place of": "a file that was not whole"} if cut else {}
     report |= {name: over_time[f"ngpt:{name}"] for name in ("temporal", "history") if f"ngpt:{name}" in over_time}
     if errors is not None:
@@ -128,6 +134,9 @@ def describe(report: dict) -> str:
         text += f", {name} stays as it was (--into {name.rpartition('.')[2]} replaces it)"
     if report.get("views"):
         text += f", views {', '.join(report['views'])}"
+    if "reduced by" in report:
+        text += f", {report['reduced by']}x{report['reduced by']} pixels as one: {report['width']}x{report['height']}"
+        text += f" ({report['cut']})" if "cut" in report else ""
     if report["repaired"]:
         text += f", repaired {report['repaired']} pixels"
     if report["untrusted"]:

@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 
 from ngpt.coverage import mirrored
+from ngpt.denoisers.clean import features_are_clean
 from ngpt.denoisers.oidn_filters import filtered
 from ngpt.errors import NgptError
 from ngpt.options import Option
 from ngpt.repair import Repaired
+from ngpt.subpixels import means, spread, subpixels
 from ngpt.system.install import package_command
 
 AUXILIARY = ("prefiltered", "clean", "noisy", "none")
@@ -23,7 +25,11 @@ FILTERS: dict[str, dict[str, Any]] = {
 }
 
 OPTIONS = {
-    "auxiliary": Option("prefiltered", "what OIDN is told of albedo and normal", choices=AUXILIARY),
+    "auxiliary": Option(
+        "auto",
+        "what OIDN is told of albedo and normal; auto: clean for subpixels, else prefiltered",
+        choices=("auto", *AUXILIARY),
+    ),
     "filter": Option(
         "image", "OIDN's for images, or for lightmaps of light or of coefficients in [-1, 1]", choices=tuple(FILTERS)
     ),
@@ -40,9 +46,14 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
 
     OIDN takes no normals without albedo: they are left out then.
 
+    Where there are subpixels (``ngpt.subpixels``), these are denoised, and the image is their means. With "auto" they
+    are only where features are clean: noisy ones, as behind a lens, would have to be prefiltered, which takes four
+    times as long, and without that subpixels have more error than pixels (docs/lab/log).
+
     ``auxiliary``  how OIDN uses the features: "prefiltered" denoises them with its own models first and then marks
                    them as clean, which its documentation recommends for the best quality; "clean" marks them as clean
-                   as they are; "noisy" does not; "none" leaves them out
+                   as they are; "noisy" does not; "none" leaves them out; "auto" is "clean" for
+                   subpixels, and else "prefiltered"
     ``quality``    "high", "balanced" or "fast", for the image and for features that are denoised first
     ``filter``     one of ``FILTERS``: "lightmap" and "directional" are OIDN's for lightmaps, which take no features
 
@@ -51,20 +62,31 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
     """
     require_oidn()
     features = {}
+    # With the light sources seen, as a renderer hands it over and OIDN was trained.
+    image, layers = data.image + data.direct, data.features
+    k = subpixels(data.fine, image.shape[1]) if filter == "image" else 1
     if filter != "image":
         auxiliary = "none"
+    elif auxiliary == "auto":
+        auxiliary = "clean" if k > 1 and (not data.features or features_are_clean(data)) else "prefiltered"
+        k = k if auxiliary == "clean" else 1
+    if k > 1:
+        image, layers = data.fine["primal"], data.fine
+    image = np.ascontiguousarray(image, np.float32)
     if auxiliary == "prefiltered":
-        features = prefiltered(data.features, quality)
+        features = prefiltered(layers, quality)
     elif auxiliary != "none":
-        features = _in_range(data.features)
-    # With the light sources seen, as a renderer hands it over and OIDN was trained.
-    image = np.ascontiguousarray(data.image + data.direct, np.float32)
+        features = _in_range(layers)
     clean = bool(features) and auxiliary in ("prefiltered", "clean")
     settings = {**FILTERS[filter], "quality": QUALITIES[quality]} | ({"clean_aux": clean} if filter == "image" else {})
     empty = None if features or filter != "image" else data.empty
     if empty is None:
-        return filtered({"color": image, **features}, **settings) - data.direct
-    return np.where(empty[..., None], image, filtered({"color": mirrored(image, empty)}, **settings)) - data.direct
+        denoised = filtered({"color": image, **features}, **settings)
+        return (means(denoised, k) if k > 1 else denoised) - data.direct
+    if k > 1:
+        empty = spread(empty, k)
+    image = np.where(empty[..., None], image, filtered({"color": mirrored(image, empty)}, **settings))
+    return (means(image, k) if k > 1 else image) - data.direct
 
 
 def prefiltered(features: Mapping[str, np.ndarray], quality: str) -> dict[str, np.ndarray]:

@@ -16,12 +16,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ngpt.errors import NgptError
+from ngpt.io import fine
 from ngpt.io.aliases import is_image, writer_of
 from ngpt.io.foreign.files import ENCODED, FROM, file_headers, read_file
 from ngpt.io.isolated import read_exr_isolated
 from ngpt.io.layout import StackSource, data_window, file_views, gather, is_half, place_of, scatter, taken
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
 from ngpt.io.primaries import converted, to_rec709
+from ngpt.io.reduced import REDUCED, reduced
 from ngpt.io.resolution import Found, Resolution, channels_like, resolve, resolve_alone
 from ngpt.io.resolution import layers_of_light as find_light
 from ngpt.io.results import MADE_BY, STRUCTURE, image_of, leave_out_old_error, new_header, replaced_layer, with_result
@@ -68,8 +70,9 @@ def read(
     Raises NgptError if the file cannot be read, holds no primal, or holds layers without a pixel in common with it; and
     for a file of a layer of another size or place.
     """
-    image = read_exr_isolated(path) if isolated else read_file(path)
-    return _stack(image, _one_view(image, view, str(path)), layers, isolated, files, str(path))
+    image, subpixels = _opened(path, isolated)
+    stack = _stack(image, _one_view(image, view, str(path)), layers, isolated, files, str(path))
+    return _with_fine(stack, subpixels)
 
 
 def read_views(
@@ -80,11 +83,20 @@ def read_views(
     view: str | None = None,
 ) -> list[GradientStack]:
     """As ``read``, a stack for each view of the file, or for the one that is named; one for a file without views."""
-    image = read_exr_isolated(path) if isolated else read_file(path)
+    image, subpixels = _opened(path, isolated)
     found = choose_views(file_views(image), view, str(path))
     if len(found) == 1:
-        return [_stack(image, found[0], layers, isolated, files, str(path))]
+        return [_with_fine(_stack(image, found[0], layers, isolated, files, str(path)), subpixels)]
     return [_stack(image, one, layers, isolated, files, f"{path}, view {one.name}") for one in found]
+
+
+def _opened(path: str | os.PathLike, isolated: bool) -> tuple[ExrImage, ExrPart | None]:
+    """All that a file holds but its subpixels, and the part that has these."""
+    return fine.apart(read_exr_isolated(path) if isolated else read_file(path))
+
+
+def _with_fine(stack: GradientStack, part: ExrPart | None) -> GradientStack:
+    return stack if part is None else replace(stack, fine=fine.subpixels_of(part, stack))
 
 
 def _one_view(image: ExrImage, wanted: str | None, path: str) -> View:
@@ -151,6 +163,7 @@ def _views_in(path: str | os.PathLike) -> tuple[list[View], list[dict[str, str]]
     """The views of a file, and the attributes of its parts that are texts."""
     with regular_file(Path(path)) as file:
         headers = file_headers(file, str(path))
+    headers = [part for i, part in enumerate(headers) if not (i and fine.is_fine(part.name, part.attributes))]
     parts = [Part(part.name, list(part.channels), part.text("view"), part.texts("multiView")) for part in headers]
     return views_of(parts), [{name: part.text(name) for name in part.attributes} for part in headers]
 
@@ -197,7 +210,7 @@ def read_picture(path: str | os.PathLike, isolated: bool = False, view: str | No
     ``read`` takes for the primal. ``view`` is one of a stereo file, by default the first. Unlike there, light of other
     primaries is converted to linear Rec. 709 (``ngpt.io.primaries``): pictures are looked at and compared.
     """
-    image = read_exr_isolated(path) if isolated else read_file(path)
+    image, _ = _opened(path, isolated)
     part, chosen = image.parts[0], _one_view(image, view, str(path))
     if view is None and all(name in part.channels for name in RGB):
         return Picture(converted(gather(part, RGB), to_rec709(part.header)), place_of(part))
@@ -218,8 +231,12 @@ def write(
     overwrite: bool = False,
     attributes: Mapping[str, Any] | None = None,
     into: str | None = None,
+    *,
+    reduce: int = 1,
 ) -> Path:
     """Writes a stack, a result or an image, and returns its path.
+
+    Subpixels, where there are any, are one more part, ``fine``, of a stack and of a result (``ngpt.io.fine``).
 
     A stack is written as the file it was read from with its layers and attributes brought up to date (they are never
     removed), or else as one scanline part at its ``place``, compressed with ZIP, primal in the root R G B.
@@ -238,6 +255,8 @@ def write(
     below 6.1e-5). Gradients, variances and depth are written as float. An ``image`` without ``like`` is written as
     float R G B.
 
+    With ``reduce`` K, a result is written with K x K pixels as one (``ngpt.io.reduced`` has the rules).
+
     ``attributes`` go into the header beside the attributes of the stack; ``Result.attributes`` say what made a result.
     If the stack is itself a result, the attributes on how it was made (``MADE_BY``) are left out of the new result, and
     so is the layer ``error`` that was read with it. A new layer ``error`` (``like=stack.replace(error=...)``) is
@@ -250,13 +269,17 @@ def write(
             raise NgptError(f"{path}: `like` goes with an image, not with a stack; pass one of the two")
         result, _, main = image_of(image, str(path))
         result.parts[main].header.update({**(attributes or {}), "ngpt:version": __version__})
-        return write_exr(path, result, overwrite)
+        return write_exr(path, fine.with_subpixels(result, main, image), overwrite)
     if like is None:
         return write(path, GradientStack.from_arrays(path=str(path), primal=image), None, overwrite, attributes)
+    if reduce != 1:
+        attributes = {**(attributes or {}), REDUCED: reduce}
     pairs: list[tuple[Any, GradientStack]] = [(image, like)] if isinstance(like, GradientStack) else []
     pairs = pairs or list(zip(image, like, strict=True))  # type: ignore[arg-type]
     # The first view may get a part in front of all others, which then have other numbers.
     pairs.sort(key=lambda pair: pair[1].source is None or pair[1].source.view.first == 0)
+    if reduce != 1:
+        pairs = [(one, replace(stack, fine={})) for one, stack in pairs]
     made: ExrImage | None = None
     for one, stack in pairs:
         pixels = GradientStack.from_arrays(path=str(path), primal=one)["primal"]
@@ -267,6 +290,8 @@ def write(
             )
         made = _result(stack, pixels, made, attributes or {}, into, str(path))
     assert made is not None
+    if reduce != 1:
+        made = reduced(made, reduce, [stack for _, stack in pairs])
     return write_exr(path, made, overwrite)
 
 
@@ -298,7 +323,7 @@ def _result(
     shown = replaced_layer(resolution, view, str(stack.attributes.get("ngpt:pass", "")), into, path)
     result, main = with_result(found, resolution, view, pixels, shown)
     result.parts[main].header.update({**attributes, "ngpt:version": __version__})
-    return result
+    return fine.with_subpixels(result, main, stack)
 
 
 def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> GradientStack:

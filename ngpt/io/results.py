@@ -23,7 +23,7 @@ STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWind
 # Attributes that say what made a result; the stack's own attributes are others, and stay.
 MADE_BY = (
     *("ngpt:method", "ngpt:weights", "ngpt:options", "ngpt:estimated", "ngpt:reconstructSeconds"),
-    *("ngpt:temporal", "ngpt:history", "ngpt:historyWeights", "ngpt:pass"),
+    *("ngpt:temporal", "ngpt:history", "ngpt:historyWeights", "ngpt:pass", "ngpt:reduced"),
 )
 # A primal with this in its name says itself that it is noisy: nobody takes it for the image.
 _NOISY = "noisy"

@@ -21,6 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from ngpt.classical.bases import BASES, CLASSICAL
+from ngpt.denoisers import clean
 from ngpt.denoisers.oidn import oidn, prefiltered
 from ngpt.errors import NgptError
 from ngpt.network.estimates import with_variances
@@ -35,12 +36,8 @@ LAYERS = (
 # Images made by another denoiser: of the primal, and of the base.
 DENOISED = ("denoised", "denoised_base")
 
-# Features are clean enough to be taken as they are if their variance is at most this share of the primal's relative
-# one. Their variance by itself does not tell: at 7e-4 prefiltering is worth a fifth of the error in simple scenes, as
-# their images have little noise, and at 2e-3 nothing in rooms (docs/lab/log).
-CLEAN = 0.003
-# A share of the mean: light below its square root is dark, and its relative variance counts less.
-_DARK = 1e-3
+# By which features are clean enough to be taken as they are
+CLEAN, _DARK = clean.CLEAN, clean.DARK
 
 # The inputs that are no layers of a stack, but made of them.
 MADE = ("base", *DENOISED)
@@ -112,31 +109,24 @@ class Oidn:
     @cached_property
     def of_primal(self) -> np.ndarray:
         """(H, W, 3) float32 without direct emission."""
-        return oidn(self._with_clean_features, "clean", "high")
+        # Of subpixels, where OIDN makes a better image of them.
+        if self._data.fine and clean.features_are_clean(self._data):
+            return oidn(self._data, "clean", "high")
+        return oidn(replace(self._with_clean_features, fine={}), "clean", "high")
 
     def of_base(self, base: np.ndarray) -> np.ndarray:
         """OIDN's image of a reconstruction, (H, W, 3) float32; both without direct emission."""
         # A base swings below zero beside edges. OIDN takes that for 0; negative light of the primal it keeps.
         least = min(float(self._data.image.min()), 0) - self._data.direct
-        return oidn(replace(self._with_clean_features, image=np.maximum(base, least)), "clean", "fast")
+        return oidn(replace(self._with_clean_features, image=np.maximum(base, least), fine={}), "clean", "fast")
 
     @cached_property
     def _with_clean_features(self) -> Repaired:
-        if features_are_clean(self._data):
+        if clean.features_are_clean(self._data):
             return self._data
         # "high" takes more than twice as long and makes networks no better.
         features = prefiltered(self._data.features, "balanced")
         return replace(self._data, features=self._data.features | features)
-
-
-def features_are_clean(data: Repaired) -> bool:
-    """Whether the noise of albedo and normal is known, and little beside the image's, see ``CLEAN``."""
-    if data.feature_noise is None or data.noise is None:
-        return data.feature_noise == 0
-    light = data.image.mean(axis=-1, dtype=np.float64)
-    variance = np.nan_to_num(data.noise.mean(axis=-1, dtype=np.float64), posinf=0)
-    relative = variance / (light**2 + _DARK * light.mean() ** 2 + 1e-300)
-    return data.feature_noise <= CLEAN * float(relative.mean())
 
 
 def denoised(by_oidn: Oidn, base: np.ndarray | None, names: Collection[str]) -> dict[str, np.ndarray]:

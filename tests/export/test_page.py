@@ -18,6 +18,7 @@ from hosts import HOSTS, VECTOR, agree, node, node_modules, read_layers, repeate
 import ngpt
 from ngpt.cli import main
 from ngpt.methods import reconstruct
+from ngpt.subpixels import means
 
 LETTERS = {"normal": "XYZ", "depth": "Z"}
 
@@ -69,6 +70,15 @@ def test_the_reader_gives_the_bits_that_were_written(tmp_path, rng):
         assert (answer["width"], answer["height"]) == (29, 37) and set(answer["layers"]) == {"primal", "dx", "albedo"}
         assert same_bits(answer["layers"]["primal"], primal) and same_bits(answer["layers"]["dx"], dx)
         np.testing.assert_array_equal(answer["layers"]["albedo"], half.astype(np.float32))
+
+
+def test_the_reader_ignores_subpixels(tmp_path, rng):
+    fine = rng.random((10, 14, 3)).astype(np.float32)
+    stack = ngpt.GradientStack({"primal": means(fine, 2)}, fine={"primal": fine})
+    (answer,) = read_in_node(ngpt.write(tmp_path / "a.exr", stack))
+    assert set(answer["layers"]) == {"primal"} and same_bits(
+        answer["layers"]["primal"], stack["primal"].transpose(2, 0, 1)
+    )
 
 
 def test_the_reader_says_what_it_cannot_read(tmp_path, rng):

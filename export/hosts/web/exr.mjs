@@ -39,6 +39,7 @@ async function readChannels(buffer) {
   // Where all chunks begin comes before all of them.
   for (const part of parts) part.offsets = Array.from({length: Math.ceil(part.height / part.lines)}, () => file.long());
   for (const part of parts) {
+    if (part !== parts[0] && part.name === "fine") continue;  // subpixels, which no network here reads
     if (part.width !== width || part.height !== height) throw new Error("its parts differ in size");
     for (const channel of part.channels) {
       // A part that is called as a layer needs no prefix in its channels.

@@ -1,0 +1,79 @@
+"""Subpixels in files: one more part, ``fine``, which readers that do not know it may ignore.
+
+It holds R G B, ``albedo.R/G/B`` and ``normal.X/Y/Z`` in K times the data window of the pixels, K in ``ngpt:subpixels``.
+The display window is the one of the pixels: OpenEXR wants it to be the same in all parts of a file.
+"""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import OpenEXR
+
+from ngpt.io.layout import data_window, gather, scatter
+from ngpt.io.openexr import ExrImage, ExrPart
+from ngpt.layers import LAYERS, RGB
+from ngpt.stack import GradientStack
+from ngpt.subpixels import FINE, HALF, SUBPIXELS, belong
+from ngpt.windows import Window
+
+_LOG = logging.getLogger(__name__)
+
+PART = "fine"
+# What the part of the pixels is called beside it, where it has no name: parts of a file with several have one.
+_PIXELS = "stack"
+# Attributes that OpenEXR wants to be the same in all parts of a file
+_COMMON = ("displayWindow", "pixelAspectRatio", "timeCode", "chromaticities")
+
+
+def is_fine(name: str, attributes: Mapping) -> bool:
+    """Whether a part of this name and with these attributes holds subpixels."""
+    return name == PART and SUBPIXELS in attributes
+
+
+def apart(image: ExrImage) -> tuple[ExrImage, ExrPart | None]:
+    """A file without its subpixels, and their part."""
+    fine = next((part for part in image.parts[1:] if is_fine(part.name, part.header)), None)
+    if fine is None:
+        return image, None
+    return ExrImage([part for part in image.parts if part is not fine]), fine
+
+
+def subpixels_of(part: ExrPart, stack: GradientStack) -> dict[str, np.ndarray]:
+    """The subpixels in a part, of the pixels of a stack; none, with a warning, where they are of other pixels."""
+    data, window = stack.place.data, data_window(part)
+    k = part.header[SUBPIXELS]
+    if not isinstance(k, int) or k < 2 or window != _window(data, k):
+        _LOG.warning(
+            "%s: part '%s' has %s and '%s' %s, which are no subpixels of %s; they are left out",
+            *(stack.path, PART, window, SUBPIXELS, k, data),
+        )
+        return {}
+    names = {name: _channels(name) for name in FINE}
+    held = {name: gather(part, its) for name, its in names.items() if all(c in part.channels for c in its)}
+    return held if "primal" in held and belong(held, stack.layers, stack.path) else {}
+
+
+def with_subpixels(image: ExrImage, main: int, stack: GradientStack) -> ExrImage:
+    """The file of a stack, whose pixels are in part ``main``, with its subpixels, if it has any."""
+    header = image.parts[main].header
+    if not stack.fine:
+        header.pop(SUBPIXELS, None)
+        return image
+    k = stack.fine["primal"].shape[1] // stack.width
+    header[SUBPIXELS] = k
+    own = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, SUBPIXELS: k}
+    own["dataWindow"] = _window(stack.place.data, k).box
+    part = ExrPart(PART, own | {name: header[name] for name in _COMMON if name in header}, {})
+    for name, layer in stack.fine.items():
+        scatter(part, _channels(name), layer, half=name in HALF)
+    return ExrImage([*(each if each.name else replace(each, name=_PIXELS) for each in image.parts), part])
+
+
+def _channels(name: str) -> tuple[str, ...]:
+    return RGB if name == "primal" else tuple(f"{name}.{channel}" for channel in LAYERS[name].channels)
+
+
+def _window(data: Window, k: int) -> Window:
+    return Window(k * data.left, k * data.top, k * data.width, k * data.height)

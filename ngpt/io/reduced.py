@@ -1,0 +1,269 @@
+"""Files made smaller: each K x K pixels become one, by rules that keep every channel what it is.
+
+| channels | rule |
+|---|---|
+| colours, light, albedo, alpha, masks, mist, all others | mean of the values that are finite |
+| normals | mean, as ours are: not of length 1 on edges |
+| depth | least that is above 0, and 0 where all are 0: no distance lies between two surfaces |
+| positions, texture coordinates | those of the pixel with that depth; without depth in their part, of the first |
+| ids: whole numbers, and ``IndexOB``, ``IndexMA`` and the like | the most frequent, of equal ones the first |
+| Cryptomatte | coverages of an id are added up and divided by K²; the ranks that there are keep the largest |
+| motion vectors | mean over K, for they count pixels |
+| variances of the pixel mean (``*_var``) | mean over K² |
+| ``samples`` | sum |
+
+Refused are gradients, since differences between large pixels are none between small ones; motion vectors of unknown
+unit; and Cryptomatte of half floats, whose ids are lost.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ngpt.errors import NgptError, WrongUse
+from ngpt.io.aliases import LOOKS, NOISE, plain
+from ngpt.io.layout import data_window
+from ngpt.io.openexr import ExrImage, ExrPart
+from ngpt.stack import GradientStack
+from ngpt.windows import Place, Window
+
+# Header attribute of a result: K
+REDUCED = "ngpt:reduced"
+
+# Ends of the names of layers, in small letters without blanks and underscores
+_IDS = ("indexob", "indexma", "objectid", "materialid", "objectindex", "materialindex", "id")
+_PLACES = ("position", "uv", "texcoord", "p", "pref", "pworld")
+# Cryptomatte's ranks: NAME00.R is an id, NAME00.G its coverage, NAME00.B the next id.
+_RANK = re.compile(r"(.*)(\d\d)\.([RGBArgba])")
+_DEEPEST = "Z"
+
+
+def reduced_window(window: Window, k: int) -> Window:
+    """The window of the pixels that are made of K x K pixels of this one; those that are cut at its borders are left
+    out. Raises NgptError where none is whole."""
+    left, top = -(-window.left // k), -(-window.top // k)
+    width, height = (window.left + window.width) // k - left, (window.top + window.height) // k - top
+    if width < 1 or height < 1:
+        raise NgptError(f"{window} has no whole block of {k}x{k} pixels; reduce by less")
+    return Window(left, top, width, height)
+
+
+def reduced_place(place: Place, k: int) -> Place:
+    return Place(reduced_window(place.data, k), reduced_window(place.display, k), place.aspect)
+
+
+def cut_pixels(place: Place, k: int) -> str:
+    """Says which windows are no multiple of K, so that rows or columns at their borders are left out; "" if none is."""
+    told: list[str] = []
+    for name, window in (("data", place.data), ("display", place.display)):
+        small = reduced_window(window, k)
+        whole = Window(k * small.left, k * small.top, k * small.width, k * small.height)
+        if whole != window and f"window {window}" not in " ".join(told):
+            told.append(f"{name} window {window} is no multiple of {k}: {whole} of it is taken")
+    return "; ".join(told)
+
+
+def smaller(image: np.ndarray, place: Place, k: int) -> tuple[np.ndarray, Place]:
+    """An image (H, W, 3) at a place with each K x K pixels as one, and where that lies."""
+    return (image, place) if k == 1 else (reduced_layer(image, place.data, k), reduced_place(place, k))
+
+
+def reduced_layer(layer: np.ndarray, window: Window, k: int) -> np.ndarray:
+    """Means of the finite values of a layer (H, W, C) of that window, float32."""
+    return np.stack([_mean(_blocks(layer[..., c], window, k)) for c in range(layer.shape[-1])], axis=-1)
+
+
+def check_reducible(stack: GradientStack, k: int) -> None:
+    """Raises NgptError for a stack that cannot be made K times smaller."""
+    if k < 2:
+        raise WrongUse(f"images are reduced by 2 or more, not by {k}")
+    if gradients := [name for name in ("dx", "dy", "dt") if name in stack]:
+        raise NgptError(
+            f"{stack.path}: has {', '.join(gradients)}, differences between its pixels and not between larger ones; "
+            "leave --reduce out, and render with --subpixels instead"
+        )
+    try:
+        reduced_place(stack.place, k)
+    except NgptError as error:
+        raise NgptError(f"{stack.path}: {error}") from error
+
+
+def reduced(image: ExrImage, k: int, stacks: Sequence[GradientStack]) -> ExrImage:
+    """The file with each K x K pixels as one, of the ``stacks`` of its views; raises NgptError for what has no rule.
+
+    Tiles keep their size in pixels.
+    """
+    known: dict[int, str] = {}
+    for stack in stacks:
+        check_reducible(stack, k)
+        if stack.source is not None:
+            for name, found in stack.source.resolution.items():
+                part = stack.source.image.parts[found.part]
+                known |= {id(part.channels[channel]): name for channel in found.channels if channel in part.channels}
+    headers = [part.header for part in image.parts]
+    listed = [
+        str(header[key])
+        for header in headers
+        for key in header
+        if key.startswith("cryptomatte/") and key.endswith("/name")
+    ]
+    return ExrImage([_reduced_part(part, k, known, listed, stacks[0].path) for part in image.parts])
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Blocks of the channels of a part, and the names of their layers in the contract."""
+
+    blocks: dict[str, np.ndarray]
+    layers: dict[str, str]
+    k: int
+
+    def nearest(self) -> np.ndarray:
+        """Which pixel of each block is nearest, (h, w); the first where there is no depth."""
+        depth = next((self.blocks[name] for name in self.blocks if _kind(name, self.layers[name]) == "depth"), None)
+        if depth is None:
+            return np.zeros(next(iter(self.blocks.values())).shape[:2], int)
+        return np.argmin(np.where(np.isfinite(depth) & (depth > 0), depth, np.inf), axis=-1)
+
+
+def _reduced_part(part: ExrPart, k: int, known: dict[int, str], listed: list[str], path: str) -> ExrPart:
+    window = data_window(part)
+    crypto = _cryptomattes(part, listed)
+    layers = {name: known.get(id(channel), "") for name, channel in part.channels.items()}
+    whole = _Part({name: _blocks(channel, window, k) for name, channel in part.channels.items()}, layers, k)
+    channels: dict[str, np.ndarray] = {}
+    nearest: np.ndarray | None = None
+    ranked = {name for names in crypto.values() for name in names}
+    for name, blocks in whole.blocks.items():
+        if name in ranked:
+            continue
+        kind = _kind(name, layers[name]) if blocks.dtype.kind != "u" else "id"
+        if kind == "unknown motion":
+            raise NgptError(
+                f"{path}: channel '{name}' looks like motion vectors, and their unit is not known; name them: "
+                '--layer motion="X,Y" in pixels of the large image, or leave the layer out'
+            )
+        if kind == "place":
+            nearest = whole.nearest() if nearest is None else nearest
+            values = np.take_along_axis(blocks, nearest[..., None], axis=-1)[..., 0]
+        else:
+            values = _RULES[kind](blocks)
+        with np.errstate(over="ignore"):
+            channels[name] = np.ascontiguousarray(values, part.channels[name].dtype)
+    for layer, names in crypto.items():
+        if len(names) % 2:
+            raise NgptError(f"{path}: Cryptomatte '{layer}' has {len(names)} channels, and ids and coverages are pairs")
+        if any(part.channels[name].dtype != np.float32 for name in names):
+            raise NgptError(f"{path}: Cryptomatte '{layer}' is not of 32-bit floats, so its ids are lost; render it so")
+        channels |= _ranks(names, whole.blocks)
+    own = {name: channels[name] for name in part.channels}
+    display = reduced_window(Window.of_box(part.header["displayWindow"]), k)
+    header = part.header | {"dataWindow": reduced_window(window, k).box, "displayWindow": display.box}
+    return replace(part, header=header, channels=own)
+
+
+def _blocks(channel: np.ndarray, window: Window, k: int) -> np.ndarray:
+    """(h, w, K²): the values of each block, row by row."""
+    small = reduced_window(window, k)
+    x, y = k * small.left - window.left, k * small.top - window.top
+    inside = channel[y : y + k * small.height, x : x + k * small.width]
+    return inside.reshape(small.height, k, small.width, k).swapaxes(1, 2).reshape(small.height, small.width, k * k)
+
+
+def _kind(channel: str, layer: str) -> str:
+    """By which rule a channel is reduced; ``layer`` is its name in the contract, "" if it has none there."""
+    if layer in ("depth", "motion", "samples"):
+        return layer
+    if layer.endswith("_var"):
+        return "variance"
+    if layer:
+        return "mean"
+    own, _, suffix = channel.rpartition(".")
+    name = plain(own.rpartition(".")[2])
+    if plain(suffix) == _DEEPEST.lower() and name in ("", "depth", "z"):
+        return "depth"
+    if name in ("depth", "zfiltered") or plain(channel) in ("depth", "z"):
+        return "depth"
+    if any(look in name for look in LOOKS["motion"]):
+        return "unknown motion"
+    if name in _IDS or plain(suffix) in _IDS:
+        return "id"
+    if name in _PLACES:
+        return "place"
+    return "variance" if name.endswith(NOISE[:2]) and name not in NOISE else "mean"
+
+
+def _mean(blocks: np.ndarray) -> np.ndarray:
+    values = blocks.astype(np.float64)
+    good = np.isfinite(values)
+    if good.all():
+        return values.mean(axis=-1).astype(np.float32)
+    with np.errstate(invalid="ignore"):
+        return (np.where(good, values, 0).sum(axis=-1) / good.sum(axis=-1)).astype(np.float32)
+
+
+def _depth(blocks: np.ndarray) -> np.ndarray:
+    values = np.where(np.isfinite(blocks) & (blocks > 0), blocks, np.inf).min(axis=-1)
+    # What is infinitely far stays so, where no pixel says 0.
+    return np.where(np.isfinite(values), values, np.where((blocks == 0).any(axis=-1), 0, blocks[..., 0]))
+
+
+def _most_frequent(blocks: np.ndarray) -> np.ndarray:
+    """The value that most pixels of each block have, bit for bit; of equal ones the first."""
+    votes = (blocks[..., :, None] == blocks[..., None, :]).sum(axis=-1)
+    return np.take_along_axis(blocks, np.argmax(votes, axis=-1)[..., None], axis=-1)[..., 0]
+
+
+_RULES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "mean": _mean,
+    "depth": _depth,
+    "id": _most_frequent,
+    "motion": lambda blocks: _mean(blocks) / np.float32(blocks.shape[-1] ** 0.5),
+    "variance": lambda blocks: _mean(blocks) / np.float32(blocks.shape[-1]),
+    "samples": lambda blocks: blocks.sum(axis=-1, dtype=np.float64),
+}
+
+
+def _cryptomattes(part: ExrPart, listed: list[str]) -> dict[str, list[str]]:
+    """Name of each Cryptomatte in a part -> its channels, id and coverage in turn, by rank.
+
+    They are those that headers have ``listed``, and what is called so without.
+    """
+    found: dict[str, dict[tuple[int, int], str]] = {}
+    for channel in part.channels:
+        match = _RANK.fullmatch(channel)
+        if match and (match[1] in listed or "crypto" in plain(match[1])):
+            found.setdefault(match[1], {})[int(match[2]), "rgba".index(match[3].lower())] = channel
+    return {name: [ranks[key] for key in sorted(ranks)] for name, ranks in found.items()}
+
+
+def _ranks(names: Sequence[str], blocks: dict[str, Any]) -> dict[str, np.ndarray]:
+    """The ids and coverages of a Cryptomatte: all of a block, added up by id, the largest first.
+
+    Ids are compared and kept as bits. Coverage beyond the ranks that there are is lost, as in any Cryptomatte.
+    """
+    ids = np.concatenate([blocks[name].view(np.uint32) for name in names[::2]], axis=-1)
+    coverage = np.concatenate([blocks[name] for name in names[1::2]], axis=-1).astype(np.float64)
+    pixels = blocks[names[0]].shape[-1]
+    # The same id is in several places: all of it is added to the first of them.
+    order = np.argsort(ids, axis=-1, kind="stable")
+    ids, coverage = (np.take_along_axis(each, order, axis=-1) for each in (ids, coverage))
+    starts = np.ones(ids.shape, bool)
+    starts[..., 1:] = ids[..., 1:] != ids[..., :-1]
+    total = coverage.cumsum(axis=-1)
+    ends = np.ones(ids.shape, bool)
+    ends[..., :-1] = starts[..., 1:]
+    # The sum of a run, at its end: what there is by then less what there was before it began.
+    before = np.maximum.accumulate(np.where(starts, total - coverage, -np.inf), axis=-1)
+    each = np.where(ends, total - before, 0.0) / pixels
+    order = np.argsort(-each, axis=-1, kind="stable")[..., : len(names) // 2]
+    ids, each = (np.take_along_axis(values, order, axis=-1) for values in (ids, each))
+    ids = np.where(each > 0, ids, 0)
+    result = {}
+    for rank in range(len(names) // 2):
+        result[names[2 * rank]] = np.ascontiguousarray(ids[..., rank]).view(np.float32)
+        result[names[2 * rank + 1]] = np.ascontiguousarray(each[..., rank], np.float32)
+    return result
