@@ -78,7 +78,7 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
 
     def render(name: str, spp: int, seed: int, **more) -> GradientStack:
         more = {"sampler": "gpt"} | more
-        return kept.stack(f"{name}-{spp}-{seed}", lambda: render_stack(scene, spp, seed, **more))
+        return kept.stack(f"{name}-{spp}-{seed}", lambda: render_stack(scene, spp, seed, unbiased=True, **more))
 
     half = {"spp": args.reference_spp // 2, "sampler": "primal", "with_features": False}
     halves = [render("reference", seed=_REFERENCE | i, **half)["primal"] for i in range(2)]
@@ -107,7 +107,7 @@ def bench_costs(path: str, args: argparse.Namespace) -> dict:
     scene, seeds = load_scene(path, tuple(args.timed_size)), itertools.count()
     options: dict[str, dict] = {"gpt": {}} | {f"adaptive {m}": {"adaptive": Adaptive(None, m)} for m in OF}
     calls = {
-        name: lambda more=more: render_stack(scene, args.spp, next(seeds), "gpt", **more)
+        name: lambda more=more: render_stack(scene, args.spp, next(seeds), "gpt", unbiased=True, **more)
         for name, more in options.items()
     }
     return {"size": list(args.timed_size), "spp": args.spp} | measure(calls, args.repeats, time.process_time)

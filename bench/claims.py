@@ -70,7 +70,7 @@ def samples_of(scene: Any, spp: int, seed: int, sampler: str, **options: Any) ->
 
     before, passes.GradientFilm = passes.GradientFilm, Recorded
     try:
-        render_stack(scene, spp, seed, sampler, **options)
+        render_stack(scene, spp, seed, sampler, unbiased=True, **options)
     finally:
         passes.GradientFilm = before
     return {name: np.concatenate(each, axis=1) for name, each in parts.items()}
@@ -108,7 +108,9 @@ def every(scene: Any, size: tuple[int, int], sampler: str, points: str, numbers:
     from data_gen.render import render_stack
     from ngpt import GradientStack, reconstruct
 
-    references = [render_stack(scene, 1024, 900 + i, sampler)["primal"].astype(np.float64) for i in (0, 1)]
+    references = [
+        render_stack(scene, 1024, 900 + i, sampler, unbiased=True)["primal"].astype(np.float64) for i in (0, 1)
+    ]
     scale = np.square(np.mean(references, axis=0)) + 1e-2
     found: dict[int, dict] = {}
     by_net: dict[int, list[int]] = {}
@@ -180,7 +182,7 @@ def main() -> None:
         scene = load_scene(os.fspath(name), size)
         for spp in args.spp:
             options = {"points": args.points} | ({} if args.tails == "paths" else {"tails": args.tails})
-            stacks = [render_stack(scene, spp, s, args.sampler, **options) for s in range(args.seeds)]
+            stacks = [render_stack(scene, spp, s, args.sampler, unbiased=True, **options) for s in range(args.seeds)]
             found = real_over_claimed([stack.layers for stack in stacks])
             texts = [f"{found[layer][0]:.2f}, {found[layer][1]:.2f}" if layer in found else "-" for layer in LAYERS]
             print(f"| `{scene_name(name)}`, {spp} | {' | '.join(texts)} |", flush=True)

@@ -85,7 +85,7 @@ def rendered(
 
     def make() -> GradientStack:
         load_scene, render_stack = renderer()
-        return render_stack(load_scene(str(scene), (width, height)), spp, seed, sampler, **options)
+        return render_stack(load_scene(str(scene), (width, height)), spp, seed, sampler, unbiased=True, **options)
 
     width, height = size
     how = "".join(f"-{name}={value:g}" for name, value in options.items())

@@ -91,7 +91,7 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
     scene = load_scene(path, tuple(args.size))
     kept = Kept(args.cache / "{}-{}x{}".format(scene_name(path), *args.size))
     trials = {}
-    for name in args.samplers or candidates(scene):
+    for name in args.samplers or dict.fromkeys([*candidates(scene), *candidates(scene, gradients=True)]):
         limit = DEAREST * trials[first].seconds if (first := next(iter(trials), None)) else math.inf
         if (trial := _trial(kept, scene, name, limit)) is not None:
             trials[name] = trial
@@ -101,10 +101,10 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
     def render(key: str, name: str, spp: int, seed: int, **more) -> GradientStack:
         def make() -> GradientStack:
             if name not in compiled:
-                render_stack(scene, 1, seed, name)
+                render_stack(scene, 1, seed, name, unbiased=True)
                 compiled.add(name)
             start = time.process_time()
-            stack = render_stack(scene, spp, seed, name, **more)
+            stack = render_stack(scene, spp, seed, name, unbiased=True, **more)
             stack.attributes["bench:seconds"] = time.process_time() - start
             return stack
 

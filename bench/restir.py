@@ -124,7 +124,7 @@ def compare(args: argparse.Namespace, scene: str, shot: str, cost: dict) -> dict
     from data_gen.frames.shot import render_shot
 
     camera = shot_of(args.folder, scene, shot, args.size)
-    reference = {"sampler": "primal", "with_features": False}
+    reference = {"sampler": "primal", "with_features": False, "unbiased": True}
     wanted = range(args.skip, args.frames)
     references = [
         stack
@@ -135,12 +135,19 @@ def compare(args: argparse.Namespace, scene: str, shot: str, cost: dict) -> dict
     stacks, noise = {}, {}
     for name, options in RIVALS.items():
         spp = max(2, round(args.chains * cost["restir"]["processor"] / cost[name]["processor"]))
-        stacks[name] = [stack for _, stack in render_shot(camera, range(args.frames), spp, 1, **options)]
+        stacks[name] = [stack for _, stack in render_shot(camera, range(args.frames), spp, 1, unbiased=True, **options)]
         last = stacks[name][-1]
         if name == "gpt":
             # Elsewhere caustics are in the differences.
             *_, (_, last) = render_shot(
-                camera, range(args.frames), 64, 5, skip=lambda f: f != args.frames - 1, sampler="gpt", caustic=False
+                camera,
+                range(args.frames),
+                64,
+                5,
+                skip=lambda f: f != args.frames - 1,
+                sampler="gpt",
+                caustic=False,
+                unbiased=True,
             )
         noise[name] = {"spp": spp} | {n: spread(last, n) * last.attributes["ngpt:spp"] for n in ("primal", "dx", "dy")}
     for name, row in noise.items():

@@ -110,22 +110,29 @@ def bench_scene(scene_file: str, name: str, args: argparse.Namespace) -> dict | 
         dr.sync_thread()
 
     compiled = {"path": compile_seconds(lambda: path(0))}
-    compiled["gpt"] = compile_seconds(lambda: render_stack(scene, args.spp, 0))
+    compiled["gpt"] = compile_seconds(lambda: render_stack(scene, args.spp, 0, unbiased=True))
     seconds: dict[str, list[float]] = {"path": [], "gpt": []}
     for seed in range(args.repeats):
         start = time.perf_counter()
         path(seed)
         between = time.perf_counter()
-        render_stack(scene, args.timing_spp, seed)
+        render_stack(scene, args.timing_spp, seed, unbiased=True)
         seconds["path"].append(between - start)
         seconds["gpt"].append(time.perf_counter() - between)
     ratios = [ours / theirs for ours, theirs in zip(seconds["gpt"], seconds["path"], strict=True)]
     cost = summary(ratios)
     spp = max(1, round(args.spp * cost["median"]))
-    stacks = [render_stack(scene, args.spp, seed) for seed in range(args.repeats)]
+    stacks = [render_stack(scene, args.spp, seed, unbiased=True) for seed in range(args.repeats)]
     file = args.cache / f"{name}-reference-{size[0]}x{size[1]}-{args.reference_seconds:g}s.exr"
-    reference = kept(file, lambda: render_stack(scene, None, REFERENCE_SEED, "primal", seconds=args.reference_seconds))
-    errors = {"path": [render_stack(scene, spp, EQUAL_TIME_SEED + i, "primal")["primal"] for i in range(args.repeats)]}
+    reference = kept(
+        file, lambda: render_stack(scene, None, REFERENCE_SEED, "primal", seconds=args.reference_seconds, unbiased=True)
+    )
+    errors = {
+        "path": [
+            render_stack(scene, spp, EQUAL_TIME_SEED + i, "primal", unbiased=True)["primal"]
+            for i in range(args.repeats)
+        ]
+    }
     solver = {}
     for method in METHODS:
         results = [reconstruct(stack, method) for stack in stacks]

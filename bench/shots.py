@@ -148,7 +148,7 @@ def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path)
         target = {frame: folder / kind / f"{frame:04d}.exr" for frame in frames}
         missing = [frame for frame, file in target.items() if not file.exists()]
         moving = shot_of(args.folder, scene, shot, args.size)
-        for frame, stack in render_shot(moving, frames, skip=lambda f, m=missing: f not in m, **options):
+        for frame, stack in render_shot(moving, frames, skip=lambda f, m=missing: f not in m, unbiased=True, **options):
             ngpt.write(target[frame], stack)
     return ("without" if args.pairs else "in"), "in", "ref", "plain" if args.plain else ""
 

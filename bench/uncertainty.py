@@ -77,7 +77,9 @@ def images(scene: str, spp: int, args: argparse.Namespace) -> list[GradientStack
     def make(count: int, sampler: str, seed: int) -> GradientStack:
         load_scene, render_stack = renderer()
         at = Path(scene) / "scene.xml"
-        return render_stack(load_scene(str(at) if at.exists() else scene, tuple(args.size)), count, seed, sampler)
+        return render_stack(
+            load_scene(str(at) if at.exists() else scene, tuple(args.size)), count, seed, sampler, unbiased=True
+        )
 
     found = [kept(args.cache / file, lambda how=how: make(*how)) for file, *how in files]
     return [found[0], merge(found[1:]), *found[1:]] if args.halves else found

@@ -9,7 +9,6 @@ means over about 9x9 pixels, relative to the light there, keep this bias small.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen import passes
-from data_gen.budget import LANE_BYTES, Budget, Watch
+from data_gen.budget import LANE_BYTES, Budget, Watch, wall
 from data_gen.film import GradientFilm
 from data_gen.passes import PACKET, SamplePass, film_of, foretold, lanes_within, recording, rounds_of
 from data_gen.paths.camera import CameraSamples, bytes_of_rays
@@ -93,13 +92,12 @@ def render_adaptive(
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     pixels = width * height
-    spp, seconds, stop, start = budget.spp, budget.seconds, watch.stop, time.perf_counter()
-    total = spp or LEAST
+    spp, seconds, stop, clock = budget.spp, budget.seconds, watch.stop, budget.clock
+    total, start = spp or LEAST, clock()
 
     def report() -> None:
         if seconds is not None:
-            limit = math.ceil(seconds)
-            watch.progress(min(limit, int(time.perf_counter() - start)), limit)
+            watch.progress(*passes.progress_of_time(clock() - start, seconds))
         else:
             done = int(work.film.samples_each.mean())
             watch.progress(min(done, total), total)
@@ -115,17 +113,17 @@ def render_adaptive(
     attributes: dict = {}
     took = 0.0
     while not (work.ended or stop()):
-        begin = time.perf_counter()
+        begin = clock()
         if seconds is not None and begin - start > seconds:
             break
         n, stack = work.film.samples_each, work.film.stack()
         method = adaptive.chosen_by(stack)
         if seconds is not None:
-            took = took or seconds_to_assess(stack, method)
-            if time.perf_counter() - start + took > seconds:
+            took = took or seconds_to_assess(stack, method, clock)
+            if clock() - start + took > seconds:
                 break
         found = assess(stack, method)
-        took = time.perf_counter() - begin
+        took = clock() - begin
         attributes = {"ngpt:adaptive": found.method}
         more = n.mean()
         if adaptive.error is not None:
@@ -138,7 +136,8 @@ def render_adaptive(
             more = min(more, max(_MARGIN * needed - n.mean(), _SMALLEST * n.mean()))
         work.add(share_out(found.relative * np.sqrt(n), n, more * pixels))
     if seconds is not None:
-        watch.progress(math.ceil(seconds), math.ceil(seconds))
+        early = adaptive.error is not None and attributes.get("ngpt:error", math.inf) <= adaptive.error
+        watch.progress(*passes.end_of_time(clock() - start, seconds, early))
     elif not stop():
         watch.progress(total, total)
     return work.film, attributes
@@ -167,7 +166,7 @@ def assess(stack: GradientStack, method: str) -> Assessment:
     return Assessment(np.sqrt(np.square(around).mean(axis=-1)).ravel(), error, result.method)
 
 
-def seconds_to_assess(stack: GradientStack, method: str) -> float:
+def seconds_to_assess(stack: GradientStack, method: str, clock: Callable[[], float] = wall) -> float:
     """What ``assess`` is expected to take, from a part in the middle of the image; 0 where that is most of it."""
     if stack.width * stack.height < 4 * _PART**2:
         return 0.0
@@ -175,9 +174,9 @@ def seconds_to_assess(stack: GradientStack, method: str) -> float:
     for side in (_PART // 4, _PART):  # The first time, networks are loaded.
         rows, columns = (slice(max(0, (n - side) // 2), (n + side) // 2) for n in (stack.height, stack.width))
         part = GradientStack({name: stack[name][rows, columns] for name in stack.names}, stack.attributes)
-        start = time.perf_counter()
+        start = clock()
         assess(part, method)
-        seconds = (time.perf_counter() - start) * (stack.width * stack.height) / (part.width * part.height)
+        seconds = (clock() - start) * (stack.width * stack.height) / (part.width * part.height)
     return seconds
 
 
@@ -236,7 +235,8 @@ class UnevenRender:
         self.film = film_of(width, height, budget.memory, room, net=self.net, **kind)
         # Raises NgptError where not even one row's worth fits.
         self.at_once = lanes_within(budget.memory, self.film, BLOCK * width, lane_bytes) // BLOCK
-        self.end = None if budget.seconds is None else time.perf_counter() + budget.seconds
+        self.clock = budget.clock
+        self.end = None if budget.seconds is None else self.clock() + budget.seconds
         self.passes: list[tuple[int, float]] = []  # blocks and seconds of each
         self.ended = False
         self.rounds, self.done = rounds_of(sample), 0
@@ -281,14 +281,14 @@ class UnevenRender:
         n = max(1, min(self.at_once, int(max(passes.PASS_SECONDS - begin, 3 * begin) / each)))
         if whole or self.end is None:
             return n
-        left = self.end - time.perf_counter()
+        left = self.end - self.clock()
         # Two thirds of the time left, since a pass may take longer than others did; all of it where that is too little.
         most = int((2 / 3 * left - begin) / each)
         return min(n, most if most > 0 else int(left > begin + each))
 
     def _render(self, some: np.ndarray) -> None:
         """One block of each of ``some`` pixels, ascending; of a pixel that is there more than once, so many."""
-        start = time.perf_counter()
+        start = self.clock()
         pixels, starts, blocks = np.unique(some, return_index=True, return_counts=True)
         within = np.arange(len(some)) - np.repeat(starts, blocks)
         first = mi.UInt32(np.repeat(self.film.samples_each[pixels], blocks) + BLOCK * within)
@@ -300,4 +300,4 @@ class UnevenRender:
         dr.sync_thread()
         self.blocks_left -= len(some)
         self.done += BLOCK * len(some)
-        self.passes.append((len(some), time.perf_counter() - start))
+        self.passes.append((len(some), self.clock() - start))

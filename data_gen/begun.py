@@ -32,6 +32,8 @@ from ngpt.windows import Window
 SCENE, TIME = "ngpt:scene", "ngpt:time"
 # Options that a render decides on, where nobody else does: points by the number of samples, tails by what pays
 _EITHER = {"points=rounds", "points=sobol", "tails=shared", "tails=paths"}
+# And one that "auto" decides on
+_NO_FEATURES = "features=false"
 # Parts of a variant's name that say where and how precisely it computes, and nothing of the light
 _MACHINES = {"scalar", "llvm", "cuda", "metal", "ad", "double"}
 # The fraction of the time asked for that is too little to go on for
@@ -86,6 +88,7 @@ class Rest:
     sampler: str
     adaptive: str = ""  # the method that samples are shared out for
     subpixels: int = 1  # of a pixel: K for K x K
+    features: bool = True
 
     def method(self, asked: str | None) -> str | None:
         """What samples are shared out for; None where they are not."""
@@ -94,7 +97,7 @@ class Rest:
     def options(self, seed: int) -> dict[str, Any]:
         """Options of ``render_scene`` and ``render_frames`` for the rest of a render asked for with ``seed``."""
         given = {"spp": self.spp, "seconds": self.seconds, "sampler": self.sampler, "subpixels": self.subpixels}
-        return given | {"seed": part_seed(seed, self.parts)}
+        return given | {"seed": part_seed(seed, self.parts)} | ({} if self.features else {"features": False})
 
 
 @dataclass(frozen=True)
@@ -153,6 +156,7 @@ class Asked:
             sampler,
             "" if even else str(attributes.get("ngpt:adaptive", self.adaptive)),
             int(_number(attributes, SUBPIXELS)) or 1,
+            _NO_FEATURES not in _options(str(attributes.get(OPTIONS, ""))),
         )
 
     def done(self, path: Path) -> bool:
@@ -172,7 +176,7 @@ class Asked:
         if self.frame is not None and self.sampler not in FRAME_SAMPLERS:
             ours = [frame_seed(seed, self.frame) for seed in ours]
         named = _options(str(attributes.get(OPTIONS, "")))
-        options = named - _EITHER
+        options = named - _EITHER - ({_NO_FEATURES} if self.sampler == "auto" else set())
         # What the file's sampler is called with if any will do; one from another package may be missing here.
         own = SAMPLERS.get(sampler) if self.sampler in ("auto", sampler) else None
         entry = FRAME_SAMPLERS.get(self.sampler) or own

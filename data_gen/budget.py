@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -17,13 +18,19 @@ LANE_BYTES = 256
 Progress = Callable[[int, int], None]
 
 
+def wall() -> float:
+    """The clock on the wall, in seconds."""
+    return time.perf_counter()
+
+
 @dataclass(frozen=True)
 class Budget:
     """What a render may spend. Of ``spp`` and ``seconds`` whichever is reached first ends it."""
 
     spp: int | None = None  # base paths per pixel; None: as many as time allows
-    seconds: float | None = None  # of wall-clock time, compilation of kernels included; None: no limit
+    seconds: float | None = None  # of the clock, compilation of kernels included; None: no limit
     memory: int = DEFAULT_MEMORY  # MiB for paths and film
+    clock: Callable[[], float] = wall  # or time.process_time, which other work on the machine hardly moves
 
     def check(self, ends: bool = False) -> None:
         """Raises WrongUse for what no scene could be rendered with; ``ends``: something else ends the render."""

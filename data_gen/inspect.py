@@ -10,7 +10,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, by_standing, choose
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, SIMPLE, by_standing, described
 from data_gen.scenes.builtin import SCENES, no_scene
 from data_gen.scenes.facts import Facts, polarised, scene_facts, spectral
 from data_gen.scenes.integrators import AROUND, lack, same_image
@@ -29,12 +29,19 @@ _LENSES = ("dielectric", "roughdielectric")
 _SHARP = ("conductor", "dielectric")
 
 
+# What depth of field means for samplers with gradients and without
+_LENS_NOTES = {
+    True: "base and offset paths share their lens samples",
+    False: "images are made without albedo and normal where the lens blurs them",
+}
+
+
 def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
     """Counts a scene's plugins by kind and says how it would be sampled; arguments are as in ``load_scene``.
 
     Returns {"plugins": {kind: {plugin: count}}, "sensors": a line for each, "size": (width, height) or None where the
     scene leaves it to Mitsuba, "media": names, "lens": whether there is depth of field, "shutter": seconds it is open,
-    "sampler": name, "plan": lines of text}.
+    "sampler": name, "method": name or "auto", "plan": lines of text}.
     """
     config = mi.parser.ParserConfig(mi.variant())
     try:
@@ -72,7 +79,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         spectral=spectral(),
         hides=hides,
     )
-    sampler, reason = choose(facts)
+    sampler, method, reason = described(facts)
     still = f"Mitsuba {mi.__version__} has no animation"
     return {
         "plugins": {kind.lower(): dict(counts.most_common()) for kind, counts in plugins.items() if counts},
@@ -82,14 +89,15 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         "lens": lens,
         "shutter": shutter,
         "sampler": sampler,
+        "method": method or "auto",
         "plan": [
             f"{sampler}: {SAMPLERS[sampler].summary}",
             f"because {reason}",
-            *(["in a room it is 'primal': rays tell, once the scene is loaded"] * (sampler == "gpt" and not media)),
+            *(["in a long render a pilot tries samplers for hidden lamps"] * ((sampler, method) == SIMPLE)),
             *([unable] if unable else SAMPLERS[sampler].notes_on(facts)),
             *([f"integrator '{integrator}': the image of '{followed}' is rendered"] * (integrator != followed)),
             *_contents(plugins, facts),
-            *(["depth of field: base and offset paths share their lens samples"] * lens),
+            *([f"depth of field: {_LENS_NOTES[SAMPLERS[sampler].gradients]}"] * lens),
             *([f"shutter: open for {shutter:g} s and sampled, but nothing moves: {still}"] * (shutter > 0)),
         ],
     }
@@ -197,7 +205,7 @@ def warn_of_lost_light(scene: mi.Scene, sampler: str) -> None:
     facts = scene_facts(scene)
     if facts.integrator not in ("path", "volpath", "volpathmis"):
         return
-    sampler = choose(facts)[0] if sampler == "auto" else sampler
+    sampler = described(facts)[0] if sampler == "auto" else sampler
     entry = FRAME_SAMPLERS.get(sampler) or SAMPLERS[sampler]
     if not getattr(entry, "finds", ()) and (lamps := behind_sharp(scene)):
         able = _finding(facts, "caustics", and_hidden_lamps=True).replace("`", "").split(", ")[0]

@@ -121,15 +121,15 @@ def render_passes(
     net = first_round(points, spp)
     film, block, most = film_within(budget.memory, sensor, total, lane_bytes, batch, instead, net=net, **kind)
     grows = points == "rounds" and not batch
-    start = now = time.perf_counter()
+    start = now = budget.clock()
     done: list[tuple[int, float]] = []
 
     def report(finished: bool = False) -> None:
         if seconds is None:
             watch.progress(film.samples, total)
         else:
-            limit = math.ceil(seconds)
-            watch.progress(limit if finished else min(limit - 1, int(now - start)), limit)
+            far = end_of_time(now - start, seconds, film.samples >= total) if finished else None
+            watch.progress(*far or progress_of_time(now - start, seconds))
 
     def next_pass(size: int) -> int:
         """Samples of the next pass, with blocks of ``size`` samples; 0 for none."""
@@ -161,7 +161,7 @@ def render_passes(
         n = next_pass(size)
         if n == 0:
             break
-        begin = now
+        begin, wall = now, time.perf_counter()
         with recording(), compilation() as compiled:
             camera = CameraSamples(sensor, seed, n, film.samples, min(n, size), net=net)
             film.begin_pass(camera)
@@ -169,17 +169,30 @@ def render_passes(
             del camera
             film.end_pass(min(n, size))
             dr.sync_thread()
-        now = time.perf_counter()
+        now, wall = budget.clock(), time.perf_counter() - wall
         first = ", kernels compiled or loaded" if not done else ""
         _LOG.debug("pass of %d samples per pixel, %.3g s%s", n, now - begin, first)
-        done.append((n, max(now - begin - sum(compiled), 1e-6)))
+        # Kernels say how long they were compiled by the wall clock.
+        done.append((n, max((now - begin) * (1 - sum(compiled) / max(wall, 1e-9)), 1e-6)))
         watch.look(film)
-        now = time.perf_counter()
+        now = budget.clock()
         if n % size or film.samples >= total or watch.stop():
             break
         report()
     report(finished=True)
     return film
+
+
+def progress_of_time(gone: float, seconds: float) -> tuple[int, int]:
+    """What is reported of a render with a time limit: whole seconds gone, and in all."""
+    limit = math.ceil(seconds)
+    return min(limit - 1, int(gone)), limit
+
+
+def end_of_time(gone: float, seconds: float, early: bool) -> tuple[int, int]:
+    """The same at its end; one that was there ``early`` took no more seconds than are gone."""
+    limit = math.ceil(seconds)
+    return (limit := max(1, min(limit, math.ceil(gone))) if early else limit), limit
 
 
 def growing_block(pixels: int, done: int, block: int) -> int:
@@ -314,13 +327,11 @@ def lanes_within(
     instead: Callable[[int], str] = _nothing,
 ) -> int:
     """How many lanes a pass may have; raises NgptError where it is less than ``lanes``, see ``blocks_within``."""
-    # Dr.Jit gives each array the next power of two of bytes.
     available = min((memory * 2**20 - film.bytes) // lane_bytes, _MOST_LANES)
     most = 1 << (available.bit_length() - 1) if available > 0 else 0
     if most < lanes:
-        width = 1 << (lanes - 1).bit_length()
-        needed = -(-(film.bytes + lane_bytes * width) // 2**20)
-        other = instead((memory * 2**20 - film.bytes) // width)
+        needed = least_memory(film, lanes, lane_bytes)
+        other = instead((memory * 2**20 - film.bytes) // _allocated(lanes))
         there = machine_memory() // 2**20
         remedy = "render a smaller image" if needed > there else f"pass --memory {needed}, or render a smaller image"
         limit = f"this machine has {there} MiB" if needed > there else f"{memory} MiB are allowed"
@@ -329,3 +340,13 @@ def lanes_within(
             f"{remedy}{other}"
         )
     return most
+
+
+def least_memory(film: GradientFilm, lanes: int, lane_bytes: int = LANE_BYTES) -> int:
+    """MiB that the film and a pass of so many lanes need."""
+    return -(-(film.bytes + lane_bytes * _allocated(lanes)) // 2**20)
+
+
+def _allocated(lanes: int) -> int:
+    """Dr.Jit gives each array the next power of two of bytes."""
+    return 1 << (lanes - 1).bit_length()

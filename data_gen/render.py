@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,20 +12,17 @@ import mitsuba as mi
 
 from data_gen.adaptive import Adaptive, check_adaptive, render_adaptive
 from data_gen.begun import Unfinished
-from data_gen.budget import DEFAULT_MEMORY, Budget, Progress, Watch
+from data_gen.budget import DEFAULT_MEMORY, Budget, Progress, Watch, wall
 from data_gen.film import GradientFilm
-from data_gen.film.gradient_film import bytes_of_shared
 from data_gen.passes import render_passes, rounds_of
 from data_gen.samplers import SAMPLERS, choose, find
 from data_gen.samplers.registry import Entry, Sampler, own
 from data_gen.samplers.reused import Made
-from data_gen.samplers.shared import why_not_shared
+from data_gen.samplers.sharing import sharing_of
 from data_gen.scenes.cameras import place_of
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import check_scene
-from data_gen.tails.cache import LEAST_MIB, MIB
-from data_gen.tails.schedule import enough
 from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
 from ngpt.io.exr import with_channels
 from ngpt.layers import GATHERED
@@ -53,6 +49,7 @@ def render_stack(
     progress: Progress = lambda done, total: None,
     *,
     seconds: float | None = None,
+    clock: Callable[[], float] = wall,
     memory: int = DEFAULT_MEMORY,
     stop: Callable[[], bool] = lambda: False,
     newest: Newest = lambda stack: None,
@@ -60,22 +57,23 @@ def render_stack(
     with_features: bool = True,
     adaptive: Adaptive | None = None,
     made: Made | None = None,
-    unbiased: bool = True,
+    unbiased: bool = False,
     subpixels: int | str = 1,
     **options: Any,
 ) -> GradientStack:
     """Renders a stack from the scene's first sensor.
 
-    What ``data_gen.render_scene`` has too is as there; ``options`` may be strings. With ``diagnostics`` the images of
-    ``data_gen.film.GradientFilm.diagnose()`` are further channels. Without ``with_features`` the stack holds only the
-    primal; only sampler "primal" can do without features. The scene's reconstruction filter is not used: the pixels of
-    a stack, and so their differences, are box-filtered.
+    What ``data_gen.render_scene`` has too is as there; ``options`` may be strings; ``seconds`` are of the ``clock``.
+    With ``diagnostics`` the images of ``data_gen.film.GradientFilm.diagnose()`` are further channels. Without
+    ``with_features`` the stack holds only the primal; only sampler "primal" can do without features. The scene's
+    reconstruction filter is not used: the pixels of a stack, and so their differences, are box-filtered.
 
     With ``adaptive``, pixels get different numbers of samples, which the layer ``samples`` contains: see
     ``data_gen.adaptive``. ``spp`` and ``ngpt:spp`` are then means over pixels.
 
-    Without ``unbiased``, samplers with the option ``tails`` let paths share what they find, where that works and pays
-    (``data_gen.tails``). The attribute ``ngpt:samplerOptions`` then contains ``tails=shared``.
+    Unless it is ``unbiased``, samplers with the option ``tails`` let paths share what they find, where that works and
+    pays (``data_gen.tails``): the default of all doors, which are this function, ``render_scene``, `ngpt render` and
+    our plugins. The attribute ``ngpt:samplerOptions`` then contains ``tails=shared``.
 
     With ``subpixels`` K, 2 or 4, or where "auto" finds them of use, the stack has K x K subpixels (``ngpt.subpixels``).
 
@@ -88,7 +86,7 @@ def render_stack(
     Raises Unfinished, which has the stack of the samples done by then, where a later pass fails; and NgptError for
     options that do not exist or make no sense, and for a scene that the sampler cannot render.
     """
-    budget = Budget(spp, seconds, memory)
+    budget = Budget(spp, seconds, memory, clock)
     check_limits(budget, seed, sampler, adaptive is not None and adaptive.error is not None)
     facts = scene_facts(check_scene(scene))
     if sampler == "auto":
@@ -102,26 +100,19 @@ def render_stack(
     settings = entry.settings(options)
     said: dict[str, Any] = {}
     if "tails" in settings:
-        why_not = why_not_shared(bool(facts.media), settings, mi.variant())
-        if facts.integrator != "path":
-            why_not = f"the integrator is '{facts.integrator}', and only paths of 'path' do"
-        if why_not and settings["tails"] == "shared":
-            raise WrongUse(f"sampler '{sampler}': tails=shared is not possible: {why_not}; leave it out")
-        pixels = math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
-        if not enough(pixels, budget.spp):
-            why_not = why_not or "there are few paths"
-        elif budget.memory < LEAST_MIB:
-            why_not = why_not or f"it needs --memory {LEAST_MIB}"
+        sharing = sharing_of(scene.sensors()[0], entry, facts, settings, budget)
         if "tails" not in options and not unbiased:
-            said = {TAILS: f"off: {why_not}"} if why_not else {}
-            settings["tails"] = "paths" if why_not else "shared"
-        if settings["tails"] == "shared" and memory >= LEAST_MIB:
-            budget = replace(budget, memory=memory - MIB - bytes_of_shared(pixels) // 2**20)
+            said = {TAILS: f"off: {sharing.not_now}"} if sharing.not_now else {}
+            settings["tails"] = "paths" if sharing.not_now else "shared"
+        if settings["tails"] == "shared":
+            if sharing.never:
+                raise WrongUse(f"sampler '{sampler}': tails=shared is not possible: {sharing.never}; leave it out")
+            budget = sharing.rest
     if adaptive is not None:
         check_adaptive(adaptive, entry, settings, spp)
     kept = subpixels_of(entry, subpixels, spp)
     _LOG.info("sampler %s, options %s", sampler, options_as_attribute(entry, settings) or "as by default")
-    start = time.perf_counter()
+    start, begun = time.perf_counter(), clock()
     more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
     sensor = scene.sensors()[0]
     chosen: dict[str, Any] = {}
@@ -144,7 +135,7 @@ def render_stack(
         sample = made.sampler(entry, scene, more)
         # However long it took to weigh the lamps, the render is begun.
         if seconds is not None:
-            budget = replace(budget, seconds=max(seconds - (time.perf_counter() - start), 1e-3))
+            budget = replace(budget, seconds=max(seconds - (clock() - begun), 1e-3))
         failed = None
         try:
             if adaptive is None:

@@ -32,7 +32,8 @@ def load(source: str, size: tuple[int, int]) -> mi.Scene:
 def render(scene: mi.Scene, options: Options, spp: int | None, seed: int, *, seconds: float | None) -> GradientStack:
     from data_gen.render import render_stack
 
-    return render_stack(scene, spp, seed, seconds=seconds, **options)
+    # References and what is compared are unbiased, unless a row's options name tails=shared.
+    return render_stack(scene, spp, seed, seconds=seconds, unbiased=True, **options)
 
 
 def warm_up(scene: mi.Scene, options: Options) -> GradientStack:

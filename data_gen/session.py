@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import logging
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from data_gen.backend import DEFAULT_VARIANT, use_variant
-from data_gen.budget import DEFAULT_MEMORY, Budget
+from data_gen.budget import DEFAULT_MEMORY, Budget, wall
 from data_gen.frames.pattern import filled
 from data_gen.samplers import FRAME_SAMPLERS, check_options
 from ngpt.errors import NgptError, WrongUse
@@ -51,6 +52,7 @@ def render_scene(
     parameters: Mapping[str, str] | None = None,
     sensor: int | str | None = None,
     seconds: float | None = None,
+    cpu_seconds: float | None = None,
     adaptive: bool = False,
     error: float | None = None,
     method: str | None = None,
@@ -58,6 +60,7 @@ def render_scene(
     diagnostics: bool = False,
     unbiased: bool = False,
     gradients: bool = False,
+    needs_features: bool = True,
     subpixels: int | str = "auto",
     variant: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -73,6 +76,7 @@ def render_scene(
     ``sensor``      number or id of the sensor to render, for a file; None: the first
     ``spp``         base paths per pixel (32 if nothing else ends the render); with ``adaptive`` their mean
     ``seconds``     wall-clock time, compilation included; with ``method`` the time of pilot, render and method together
+    ``cpu_seconds`` as ``seconds``, but processor time of this process, on all cores: other work hardly changes it
     ``adaptive``    more samples where the error of the result is large
     ``error``       as ``adaptive``, until the result is expected to have this relative error (0.05: 5 %)
     ``method``      the method that will denoise the stack: samples go by its error. With only ``seconds``, a pilot
@@ -83,6 +87,7 @@ def render_scene(
     ``unbiased``    turns off the cache that paths share. The cache lowers the noise of most renders and adds a small
                     bias: see docs/samplers/tails.md
     ``gradients``   whether the stack must have dx and dy, also where a sampler without them leaves less error ("auto")
+    ``needs_features``  False: albedo, normal and depth may be missing where a lens blurs them, so they do not pay
     ``subpixels``   2 or 4: keeps 2x2 or 4x4 subpixels of each pixel, for denoisers; 1: none; "auto": where they are
                     known to help (docs/use/subpixels.md)
     ``variant``     variant of Mitsuba; by default the current one, or llvm_ad_rgb if none is set
@@ -106,6 +111,9 @@ def render_scene(
     from data_gen.scenes.dark import warn_if_black, warn_without_lamps
 
     memory = DEFAULT_MEMORY if memory is None else memory
+    clock = wall
+    if cpu_seconds is not None:
+        seconds, clock = _of_processors(cpu_seconds, seconds), time.process_time
     if spp is None and seconds is None and error is None:
         spp = DEFAULT_SPP
     by_itself = sampler == "auto" and seconds is not None and spp is None
@@ -119,16 +127,20 @@ def render_scene(
         said(f"there are {len(scene.sensors())} sensors ({names}), and none is named: 0 is rendered")
     warn_without_lamps(scene)
     plan = None
-    if sharing is None and sampler == "auto":
-        pilot = Pilot(said=said, stop=stop, unbiased=unbiased)
-        if method is None or seconds is None:
+    if sampler == "auto":
+        pilot = Pilot(clock, said, stop, unbiased)
+        if sharing is not None:
+            plan = plans.plan_adaptive(scene, sharing, seconds, gradients=gradients)
+        elif method is None or seconds is None:
             plan = plans.plan_sampler(scene, spp, seconds, memory, pilot, gradients=gradients)
         else:
             plan = plans.plan(scene, seconds, method, memory, pilot)
+        plan = plan if needs_features else plans.without_features(scene, plan)
+        options |= plan.options
         _LOG.info("plan: sampler %s, method %s: %s", plan.sampler, plan.method or "any", plan.reason)
         chosen(plan)
         sampler, seconds = plan.sampler, plan.render
-        sharing = Adaptive() if plan.shared else None
+        sharing = sharing or (Adaptive() if plan.shared else None)
     warn_of_lost_light(scene, sampler)
     stack = render_stack(
         scene,
@@ -137,6 +149,7 @@ def render_scene(
         sampler,
         progress,
         seconds=seconds,
+        clock=clock,
         memory=memory,
         stop=stop,
         newest=newest,
@@ -265,6 +278,17 @@ def _loaded(
     if size is not None or parameters or sensor is not None:
         raise NgptError("size, parameters and sensor of a loaded scene are fixed; give them to data_gen.load_scene")
     return scene
+
+
+def _of_processors(cpu_seconds: float, seconds: float | None) -> float:
+    """The processor seconds; raises WrongUse where they cannot end a render."""
+    import mitsuba as mi
+
+    if seconds is not None:
+        raise WrongUse("--cpu-time and --time are two limits of time; give one of them")
+    if not mi.variant().startswith("llvm"):
+        raise WrongUse(f"--cpu-time: variant '{mi.variant()}' does not render on processors; give --time")
+    return cpu_seconds
 
 
 def _sharing(adaptive: bool, error: float | None, method: str | None, by_itself: bool) -> Adaptive | None:

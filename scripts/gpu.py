@@ -271,7 +271,9 @@ def renderer(scale, sampler: str, size=(32, 24), **options) -> dict[str, tuple[f
             except NgptError:
                 continue
             begun = time.perf_counter()
-            sides.append([render_stack(scene, 16, first + seed, sampler, **options) for seed in range(8)])
+            sides.append(
+                [render_stack(scene, 16, first + seed, sampler, unbiased=True, **options) for seed in range(8)]
+            )
             print(f"{name} by {variant}: {time.perf_counter() - begun:.1f} s for 8 renders")
             break
     largest = float(np.abs(sides[1][0]["primal"]).max())

@@ -27,7 +27,7 @@ from ngpt.stack import GradientStack
 # The best of each kind of stack at some number of samples; what is not here is behind one of them, or far slower.
 # The most frequent winners come first: where time is short, the others are not measured.
 WITH_GRADIENTS = ("ngpt-combine", "ngpt-fast", "wcv", "l1")
-WITHOUT = ("ngpt-primal", "oidn", "primal")
+WITHOUT = ("oidn", "ngpt-primal", "primal")
 # These numbers come from python -m bench.pipelines on scenes that are not ``--apart``.
 # The usual exponents of the error as a power of the samples, for methods that use gradients and for denoisers; the
 # weight of the pilot in an exponent, and the steepest and flattest exponents allowed
@@ -142,15 +142,15 @@ def measure(
     """The pipelines of trials by name of sampler: every method that runs here on every stack that it can use.
 
     ``methods`` restricts the methods of each sampler. With ``shared``, samples are also distributed adaptively, else
-    only evenly. Each sampler gets at least one method, and further ones as long as it ``goes_on``.
+    only evenly. The first sampler gets at least one method, and all else is measured as long as it ``goes_on``.
     """
     witnesses = Witnesses.of(trials)
-    found = []
+    found: list[Pipeline] = []
     for name, trial in trials.items():
         halves = [merge(trial.stacks[:2]), merge(trial.stacks[2:])]
         need = None
-        for i, method in enumerate((methods or methods_for)(name)):
-            if i and not goes_on():
+        for method in (methods or methods_for)(name):
+            if found and not goes_on():
                 break
             single, double, after = [], [], []
             for half in range(2):

@@ -10,33 +10,31 @@ samplers has found.
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 
 from data_gen import samplers
+from data_gen.adaptive import Adaptive
 from data_gen.budget import DEFAULT_MEMORY
+from data_gen.choosing.look import features_pay
 from data_gen.choosing.pipelines import Pipeline, choose, measure, methods_for
 from data_gen.choosing.trials import PIXELS, Pilot, Trial, at_most, candidates, try_all
 from data_gen.passes import film_within
 from data_gen.samplers import SAMPLERS
-from data_gen.scenes.facts import Facts, scene_facts
-from data_gen.tails.schedule import enough
+from data_gen.scenes.facts import scene_facts
 from ngpt.errors import NgptError
-from ngpt.methods import METHODS
+from ngpt.methods import METHODS, runnable
 from ngpt.system.console import brief
 
-# The shares of the time that all trials of samplers may take, and that trials and methods may take, for an image; and
-# the share for a render, where only the quickest method is measured
-SHARE, SHARE_WITH_METHODS = 0.2, 0.3
-_SHARE_OF_RENDER = 0.15
-# Seconds for an image below which a pilot costs more than it could gain. The trials of gpt and primal on the smallest
-# images take 3.0 to 13.5 processor seconds (diffuse, glossy, coffee, dining-room), the methods about 4. On a machine
-# where they do not fit into a fifth of this time, their time is lost.
-LEAST_SECONDS = 40.0
+# The share of the time that a pilot may take, and the part of it for trials of samplers where it tries methods too
+SHARE, _TRIALS = 0.1, 2 / 3
+# Below so many seconds, or paths where a number of samples is given, a pilot costs more than it could gain: a tenth of
+# them is enough to compile the kernels of other samplers and to try them. One or two cores trace a million paths per
+# second. Two trials on the smallest images take 3.0 to 13.5 processor seconds, with their methods about 4 more.
+LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
 # What `ngpt denoise` takes beside the method, and `ngpt render` to write the stack: for the process to begin, and to
 # write a million pixels, read them and write the image
 _BEGINS, _FILES = 0.8, 3.7
@@ -46,18 +44,10 @@ _GROWS = 0.9
 # Seconds for a million pixels, on two cores, of methods that no pilot has measured; of methods that are not listed
 _METHOD_SECONDS, _OTHERS = {"auto": 18.0, "ngpt-combine": 18.0, "ngpt-primal": 7.0, "oidn": 8.0}, 3.0
 # Seconds from which on the pilot's images are as large as they ever are, and the least share of that
-LONG, LEAST_PIXELS = 200.0, 1 / 16
-# In renders from this size on, a twentieth is enough to compile the kernels of other samplers and to try them: in
-# seconds, and in paths. One or two cores trace a million paths per second.
-_LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
-# What cleans the image of a room, and why
-_ROOM_METHOD = "ngpt-primal"
-_ROOM_REASON = "the camera is in a room, where more samples pay and gradients do not; --sampler gpt renders gradients"
-# A rival must need this much less time: a choice is not worth changing for what chance could have made.
-_MARGIN = 1.1
-# Whether the camera is in a room is told by so many rays: by the share of them leaving visible surfaces that meet
-# another surface, 0.96 to 1 in five rooms, 0.14 to 0.82 around objects and in open boxes (docs/lab/worth.md).
-_RAYS, _IN_ROOMS = 1 << 12, 0.9
+LONG, LEAST_PIXELS = 400.0, 1 / 16
+# A rival must need this much less time, or leave this much less error: a choice is not worth changing for what chance
+# could have made. The error of an image is expected less well, and its choice was seen to be wrong by 1.6 times.
+_MARGIN, _MARGIN_OF_ERROR = 1.1, 1.6
 
 
 @dataclass(frozen=True)
@@ -67,6 +57,7 @@ class Plan:
     shared: bool  # whether samples are adaptive
     render: float | None  # seconds for the render, without pilot and method; None: as long as it takes
     reason: str  # a line for the user
+    options: Mapping[str, Any] = field(default_factory=dict)  # of the sampler
 
 
 def explore(
@@ -79,24 +70,25 @@ def explore(
     patient: bool = False,
 ) -> list[Pipeline]:
     """The pipelines of a scene, for an image of its size; see ``plan``, which chooses of them. None where no trial fits
-    into the time; ``patient``, the first sampler has a trial and a method however long they take.
+    into the time; ``patient``, the first sampler has a trial and a method however long they take, and the one for
+    gradients is tried too.
 
     ``after`` of them is all that follows the render: its file, a process that reads it, the method, the image's file.
     """
     start = pilot.clock()
-    able = _able(scene, method)
+    able = _able(scene, method, gradients_too=patient)
     _check_memory(scene, able[0], None, memory)
     pixels = round(PIXELS * min(1.0, max((seconds / LONG) ** 2, LEAST_PIXELS)))
     with at_most(scene, pixels) as scale:
-        first = math.inf if patient else SHARE * seconds
-        trials = try_all(scene, able, lambda _: SHARE * seconds, first, pilot)
+        share = SHARE * _TRIALS * seconds
+        trials = try_all(scene, able, lambda _: share, math.inf if patient else share, pilot)
     if not trials or pilot.stop():
         return []
     found = measure(
         trials,
         pilot.clock,
         lambda sampler: methods_for(sampler, method),
-        goes_on=lambda: pilot.clock() - start < SHARE_WITH_METHODS * seconds and not pilot.stop(),
+        goes_on=lambda: pilot.clock() - start < SHARE * seconds and not pilot.stop(),
     )
     grows = scale**_GROWS
     return [
@@ -110,11 +102,15 @@ def _beside(scene: mi.Scene) -> float:
     return _BEGINS + _FILES * _pixels(scene) / 1e6
 
 
-def _able(scene: mi.Scene, method: str) -> list[str]:
-    """The samplers to try, whose stacks the method can use: the one that the description stands for first."""
-    names = candidates(scene)
-    turns = sorted(dict.fromkeys([*names, "primal"]), key=lambda name: (name != names[0], name != "primal"))
-    able = [name for name in turns if methods_for(name, method)]
+def _able(scene: mi.Scene, method: str, gradients_too: bool = False) -> list[str]:
+    """The samplers to try, whose stacks the method can use: the one that the description stands for first.
+
+    ``gradients_too``: also the one that would stand there for gradients.
+    """
+    needs_gradients = method != "auto" and "dx" in runnable(method).needs
+    names = candidates(scene, gradients=needs_gradients)
+    names += candidates(scene, gradients=True)[:1] if gradients_too else []
+    able = [name for name in dict.fromkeys(names) if methods_for(name, method)]
     if not able:
         raise NgptError(f"method '{method}' cannot use what the samplers of this scene render; name another, or auto")
     return able
@@ -130,11 +126,11 @@ def plan(
     """How to use so many ``seconds`` of the pilot's clock, which include the pilot and the method.
 
     Only the given ``method`` is considered, unless it is "auto". The pilot tries the sampler that the scene's
-    description stands for, then ``primal``, then all other unbiased samplers that ``--sampler auto`` compares, as far
-    as they fit into a fifth of the time, compilation included. The less time, the smaller are its images. If there is
-    no time for a pilot, or if the pilot finds that nothing fits, the description decides, and the render takes the
-    remaining time. The measurements change from run to run. Raises NgptError for a method that does not run here or
-    cannot use any of the stacks.
+    description stands for, then the other unbiased samplers that ``--sampler auto`` compares, as far as they fit into a
+    tenth of the time, compilation and methods included. The less time, the smaller are its images. Another sampler is
+    chosen only if it is expected to leave clearly less error. If there is no time for a pilot, or if the pilot finds
+    that nothing fits, the description decides, and the render takes the remaining time. The measurements change from
+    run to run. Raises NgptError for a method that does not run here or cannot use any of the stacks.
     """
     start = pilot.clock()
     able = _able(scene, method)
@@ -143,13 +139,13 @@ def plan(
         whole = explore(scene, seconds, method, memory, pilot)
     left = seconds - (pilot.clock() - start)
     if ranked := choose(whole, left):
-        first = ranked[0]
+        first = best_image(ranked, able[0], left)
+        ranked.sort(key=lambda p: p is not first)
         return Plan(first.sampler, first.method, first.shared, left - first.after, _why(ranked, left))
     facts = scene_facts(scene)
-    if method in ("auto", _ROOM_METHOD) and in_a_room(scene, facts, None):
-        sampler, method, why = "primal", _ROOM_METHOD, _ROOM_REASON
-    else:
-        sampler, why = able[0], samplers.choose(facts)[1]
+    sampler, its_method, why = samplers.described(facts, SAMPLERS[able[0]].gradients)
+    if method == "auto":
+        method = its_method or "auto"
     after = _beside(scene) + _METHOD_SECONDS.get(method, _OTHERS) * _pixels(scene) / 1e6
     # However slow the method may be here, half of the time is rendered.
     return Plan(sampler, method, False, max(left - after, left / 2, 1e-3), f"{why}; there is no time for a pilot")
@@ -166,25 +162,21 @@ def plan_sampler(
 ) -> Plan:
     """The sampler for a render of ``spp`` samples per pixel, or of so many ``seconds``; one of them may be None.
 
-    In a room it is ``primal``, unless ``gradients`` are wanted: see ``in_a_room``. Elsewhere the description decides,
-    at no cost, where only one sampler can render the scene, and where the render is too short for a pilot. What a pilot
-    measures changes from run to run, what it chooses hardly; the render itself has the bits of ``--sampler NAME``.
-    Raises NgptError where no sampler with gradients can render the scene, and before anything is tried where the image
-    does not fit into ``memory`` (MiB).
+    The description decides, at no cost, where only one sampler can render the scene, and where the render is too short
+    for a pilot; ``gradients``: only samplers that render them are considered. What a pilot measures changes from run to
+    run, what it chooses hardly; the render itself has the bits of ``--sampler NAME``. Raises NgptError where no sampler
+    with gradients can render the scene, and before anything is tried where the image does not fit into ``memory``
+    (MiB).
     """
-    start = time.perf_counter()
+    start = pilot.clock()
     facts = scene_facts(scene)
-    sampler, reason = samplers.choose(facts)
-    described = Plan(sampler, "", False, seconds, reason)
-    if not gradients and in_a_room(scene, facts, spp):
-        # One sample has no variance, which the method needs.
-        method = _ROOM_METHOD if spp != 1 else ""
-        return replace(described, sampler="primal", method=method, reason=_ROOM_REASON)
-    names = candidates(scene, biased=True)
+    sampler, method, reason = samplers.described(facts, gradients)
+    described = Plan(sampler, method, False, seconds, reason)
+    names = candidates(scene, biased=True, gradients=gradients)
     if len(names) == 1:
         return described
     short = spp is not None and spp * _pixels(scene) < _LEAST_PATHS
-    if short or (seconds is not None and seconds < _LEAST_SECONDS):
+    if short or (seconds is not None and seconds < LEAST_SECONDS):
         return replace(described, reason=f"{reason}; the render is too short to try others")
     _check_memory(scene, sampler, spp, memory)
     longest = math.inf if seconds is None else seconds
@@ -196,42 +188,31 @@ def plan_sampler(
                 return 0.0
             return min(math.inf if spp is None else trials[sampler].seconds * spp * scale, longest)
 
-        budget = lambda trials: _SHARE_OF_RENDER * whole(trials)  # noqa: E731
-        trials = try_all(scene, names, budget, _SHARE_OF_RENDER * longest, pilot)
+        budget = lambda trials: SHARE * whole(trials)  # noqa: E731
+        trials = try_all(scene, names, budget, SHARE * longest, pilot)
     found = (sampler, reason)
     if sampler in trials and not pilot.stop():
         found = best_of(measure(trials, methods=lambda name: [simple(name)], shared=False), whole(trials) / scale)
     # However long the pilot took, the render is begun.
-    left = None if seconds is None else max(seconds - (time.perf_counter() - start), 1e-3)
-    return replace(described, sampler=found[0], reason=found[1], render=left)
+    left = None if seconds is None else max(seconds - (pilot.clock() - start), 1e-3)
+    method = method if found[0] == sampler else ""
+    return replace(described, sampler=found[0], method=method, reason=found[1], render=left)
 
 
-def in_a_room(scene: mi.Scene, facts: Facts, spp: int | None) -> bool:
-    """Whether ``primal`` and ``ngpt-primal`` leave less error and FLIP than gradients would, after the same whole time.
-
-    They do in rooms of surfaces, where paths share their tails (docs/lab/worth.md). Small images are the same to both,
-    and without OIDN gradients clean better.
-    """
-    able = samplers.choose(facts)[0] == "gpt" and not facts.media and not SAMPLERS["primal"].refuses(facts)
-    return able and enough(_pixels(scene), spp) and not METHODS[_ROOM_METHOD].missing() and enclosed(scene)
+def plan_adaptive(scene: mi.Scene, adaptive: Adaptive, seconds: float | None, *, gradients: bool = False) -> Plan:
+    """The plan for samples that are shared out: by the description, and by the ``adaptive`` method if one is named."""
+    named = adaptive.method if adaptive.method != "auto" else ""
+    gradients = gradients or bool(named and "dx" in runnable(named).needs)
+    sampler, method, reason = samplers.described(scene_facts(scene), gradients)
+    return Plan(sampler, named or method, True, seconds, reason)
 
 
-def enclosed(scene: mi.Scene) -> bool:
-    """Whether nearly all light that reaches what the camera sees comes from other surfaces.
-
-    Rays go through random pixels, and continue from where they hit in directions sampled by the cosine. Windows without
-    glass count as open. The rays are always the same. It takes 0.15 processor seconds.
-    """
-    random = mi.PCG32(_RAYS)
-    pairs = (mi.Point2f(random.next_float32(), random.next_float32()) for _ in range(3))
-    sensor = scene.sensors()[0]
-    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, next(pairs), next(pairs))
-    seen = scene.ray_intersect(ray)
-    normal = dr.select(dr.dot(seen.n, ray.d) > 0, -seen.n, seen.n)
-    away = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(next(pairs)))
-    again = scene.ray_test(seen.spawn_ray(away), seen.is_valid())
-    hits, others = (int(dr.count(mask)[0]) for mask in (seen.is_valid(), seen.is_valid() & again))
-    return others > _IN_ROOMS * max(hits, 1)
+def without_features(scene: mi.Scene, plan: Plan) -> Plan:
+    """The plan for an image that nothing is made of but by its method: features stay only where they pay."""
+    if (plan.sampler, plan.method) != samplers.SIMPLE or features_pay(scene):
+        return plan
+    why = "the lens blurs albedo and normal, which are left out"
+    return replace(plan, options={"features": False}, reason=f"{plan.reason}; {why}")
 
 
 def _pixels(scene: mi.Scene) -> int:
@@ -248,7 +229,18 @@ def _check_memory(scene: mi.Scene, sampler: str, spp: int | None, memory: int) -
 
 def simple(sampler: str) -> str:
     """The method by which samplers are compared where nothing says which one will run."""
-    return "wcv" if SAMPLERS[sampler].gradients else "primal"
+    if SAMPLERS[sampler].gradients:
+        return "wcv"
+    able = not SAMPLERS[sampler].biased and not METHODS["oidn"].missing()
+    return "oidn" if able else "primal"
+
+
+def best_image(ranked: Sequence[Pipeline], default: str, seconds: float) -> Pipeline:
+    """The first of pipelines in the order of their errors, but the first of sampler ``default`` unless that is clearly
+    worse."""
+    own = next((p for p in ranked if p.sampler == default), ranked[0])
+    errors = [p.expected(p.samples(seconds)) for p in (ranked[0], own)]
+    return own if errors[1] < _MARGIN_OF_ERROR * errors[0] else ranked[0]
 
 
 def best_of(pipelines: Sequence[Pipeline], seconds: float) -> tuple[str, str]:
@@ -287,7 +279,8 @@ def _why(ranked: Sequence[Pipeline], seconds: float) -> str:
     errors: dict[str, tuple[float, Pipeline]] = {}
     for p in ranked:
         errors.setdefault(p.sampler, (p.expected(p.samples(seconds)), p))
-    (least, _), *others = errors.values()
-    what = f"expected to leave an error of {brief(math.sqrt(least))}"
+    (least, first), *others = errors.values()
+    low, high = (brief(math.sqrt(error)) for error in first.likely(first.samples(seconds)))
+    what = f"expected to leave an error of {brief(math.sqrt(least))} (in eight of ten cases {low} to {high})"
     rivals = [f"{brief(math.sqrt(e))} by sampler '{p.sampler}' and method '{p.method}'" for e, p in others]
     return f"{what}, and {', '.join(rivals)}" if rivals else what

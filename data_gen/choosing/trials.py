@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.render import render_stack
-from data_gen.samplers import SAMPLERS, choose
+from data_gen.samplers import SAMPLERS, SIMPLE, described
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.load import set_film_size
 from ngpt.errors import NgptError
@@ -60,16 +60,18 @@ class Pilot:
     unbiased: bool = False  # as in ``data_gen.render.render_stack``
 
 
-def candidates(scene: mi.Scene, biased: bool = False) -> list[str]:
+def candidates(scene: mi.Scene, biased: bool = False, gradients: bool = False) -> list[str]:
     """Samplers that could render the scene: the one that its description stands for, then the ones to compare it with.
 
-    With ``biased``, biased samplers are included and come last.
+    Where that is the simple way, the others are only those that find light that it hardly finds. With ``biased``,
+    biased samplers are included and come last; ``gradients``: only samplers that render them.
     """
     facts = scene_facts(scene)
-    first, _ = choose(facts)
+    first, method, _ = described(facts, gradients)
     if math.prod(int(n) for n in scene.sensors()[0].film().crop_size()) < _LEAST_PIXELS:
         return [first]
     able = [s for s in SAMPLERS.values() if s.name != first and s.tried and not s.refuses(facts)]
+    able = [s for s in able if (s.finds or (first, method) != SIMPLE) and (s.gradients or not gradients)]
     return [first] + [s.name for kind in (False, True)[: 1 + biased] for s in able if s.biased == kind]
 
 

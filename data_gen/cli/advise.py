@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 # More are not advised.
 LARGEST_SPP = 1 << 20
+# What an advice may take, in seconds
+_LONGEST = 60.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -56,7 +58,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(args.variant or DEFAULT_VARIANT)
-    from data_gen.choosing.plans import LEAST_SECONDS, LONG, SHARE_WITH_METHODS, explore
+    from data_gen.choosing.plans import LEAST_SECONDS, SHARE, explore
     from data_gen.choosing.trials import Pilot
     from data_gen.scenes.load import load_scene
 
@@ -64,7 +66,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     scene = load_scene(args.scene, args.size, dict(args.define), sensor=args.sensor)
     # Its own time is not part of the time that it advises on, but no more than that. On a machine that is too busy for
     # it the first sampler is tried all the same, on a small image, and no other.
-    whole = LONG if args.seconds is None else min(max(args.seconds / SHARE_WITH_METHODS, LEAST_SECONDS), LONG)
+    longest = _LONGEST / SHARE
+    whole = longest if args.seconds is None else min(max(args.seconds / SHARE, LEAST_SECONDS), longest)
     seen = explore(scene, whole, pilot=Pilot(said=console.say), patient=True)
     if not seen:
         raise NgptError(f"{args.scene}: no sampler can render it; `ngpt info` says what it holds")

@@ -86,10 +86,12 @@ def demo_scene(name: str, args: argparse.Namespace, folder: Path, console: Conso
     targets = {label: check_output(folder / f"{name}_{label}.exr", args.force) for label in ("stack", "ref", *methods)}
     scene = load_scene(name, args.size)
     with console.progress(f"{name}: stack", "spp", begins=KERNELS) as progress:
-        stack = render_stack(scene, args.spp, progress=progress)
+        stack = render_stack(scene, args.spp, progress=progress, unbiased=True)
     # Another seed than the stack's: a reference must not share its noise.
     with console.progress(f"{name}: reference", "spp", begins=KERNELS) as progress:
-        reference = render_stack(scene, args.reference_spp, seed=1, sampler="primal", progress=progress)["primal"]
+        reference = render_stack(scene, args.reference_spp, seed=1, sampler="primal", progress=progress, unbiased=True)[
+            "primal"
+        ]
     write(targets["stack"], stack, overwrite=args.force)
     write(targets["ref"], reference, overwrite=args.force)
     entries = []

@@ -28,6 +28,7 @@ from ngpt.methods import choose
 from ngpt.system.console import Console
 from ngpt.system.interrupts import Interrupt
 from ngpt.system.limits import limit_threads
+from ngpt.system.text import by_names
 
 # A render explains why it was late if it took this many times its time for at most this many samples per pixel.
 _LATE, _FEW = 1.2, 16
@@ -84,8 +85,9 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
     for file in {target, output.stack}:
         output_file(file, args)
     given, begun, there = asked(args), None, output.stack.exists()
-    how = {"adaptive": args.adaptive, "error": args.error, "method": args.method}
-    wanted = args.spp or (DEFAULT_SPP if args.time is None and args.error is None else None)
+    how = {"adaptive": args.adaptive, "error": args.error, "method": args.method, "cpu_seconds": args.cpu_time}
+    limits = (args.time, args.cpu_time, args.error)
+    wanted = args.spp or (DEFAULT_SPP if limits == (None, None, None) else None)
     whole = Asked(
         scene_name(args.scene, dict(args.define) | ({"--sensor": args.sensor} if args.sensor else {})),
         args.seed,
@@ -102,6 +104,8 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
         subpixels=args.subpixels,
     )
     if args.skip_existing:
+        if args.cpu_time:
+            raise WrongUse("--skip-existing: no file says how much processor time it took; give --time or --spp")
         output.check_skipping()
     if args.skip_existing and finished(output.stack):
         rest = whole.left(output.stack)
@@ -126,7 +130,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
         how = f"{', adaptive samples' if plan.shared else ''}, method '{plan.method}'" if plan.method else ""
         console.say(f"{args.scene}: sampler '{plan.sampler}'{how}: {plan.reason}")
 
-    unit = "s" if args.time else "spp"
+    unit = "s" if args.time or args.cpu_time else "spp"
     looking = onlookers(args.live, args.scene, args.command, console, unit)
     with (
         closing(looking),
@@ -151,6 +155,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
                 chosen=chosen,
                 said=console.say,
                 gradients=denoising is not None and denoising.needs_gradients,
+                needs_features=denoising is None or denoising.method not in ("auto", "oidn"),
                 **how,
                 **given,
             )
@@ -182,9 +187,10 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
             f"{args.scene}: it took longer than {args.time:g} s: kernels and a least pass ({done} spp) are not quicker "
             "on this machine now; a smaller --size is"
         )
-    if denoising is None and "ngpt:for" in stack.attributes:
+    if denoising is None and by_names(str(target)) == str(target):
         # Another than it is for where that needs variances, which one sample per pixel has not.
-        console.say(f"then: ngpt denoise {shlex.quote(str(target))}, which takes method '{choose(stack)}'")
+        then = f"then: ngpt denoise {shlex.quote(str(target))}, which takes method '{choose(stack)}'"
+        console.say(f"{target} is a stack, with its noise; {then}")
     if args.json:
         kept = {"stack": str(output.kept)} if output.kept else {}
         print_json(report_of(stack, target, made) | {"layers": stack.names} | kept)
@@ -192,8 +198,9 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
 
 
 def shot(args: argparse.Namespace, denoising: Denoising | None, console: Console) -> int:
-    if args.live:
-        raise WrongUse("--live is for single images; leave it out with --frames")
+    for option, asked_for in {"--live": args.live, "--cpu-time": args.cpu_time}.items():
+        if asked_for:
+            raise WrongUse(f"{option} is for single images; leave it out with --frames")
     if args.adaptive or args.error is not None or args.method is not None:
         raise WrongUse("--adaptive, --error and --for are for single images; leave them out with --frames")
     if args.threads and args.cluster:

@@ -17,6 +17,7 @@ from ngpt.cli.arguments import (
     natural,
     part,
     positive,
+    relative,
     size,
 )
 from ngpt.cli.picture import IMAGES, add_look
@@ -47,11 +48,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--keep", metavar="STACK", help="also write the stack, where the output is an image")
     add_look(parser)
     parser.add_argument("--spp", type=positive, help=f"samples (paths) per pixel (default: {DEFAULT_SPP})")
-    parser.add_argument(
+    limit = parser.add_mutually_exclusive_group()
+    limit.add_argument(
         "--time",
         type=duration,
         metavar="SECONDS",
         help="render for this long, with kernel compilation; with --spp, whichever is reached first",
+    )
+    limit.add_argument(
+        "--cpu-time",
+        type=duration,
+        metavar="SECONDS",
+        help="as --time, but in processor time, all cores together, which other work on the machine hardly changes",
     )
     parser.add_argument(
         "--adaptive",
@@ -60,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--error",
-        type=float,
+        type=relative,
         metavar="E",
         help="as --adaptive, until the result is expected to have this relative error (0.05: 5 %%)",
     )

@@ -121,7 +121,9 @@ def render_input(config: Config, scene, spp: int, seed: int, uneven: bool, made:
     from data_gen.render import render_stack
 
     adaptive = Adaptive() if uneven else None
-    stack = render_stack(scene, spp, seed, config.sampler, adaptive=adaptive, made=made, **config.options)
+    stack = render_stack(
+        scene, spp, seed, config.sampler, adaptive=adaptive, made=made, unbiased=True, **config.options
+    )
     if config.adaptive and "samples" not in stack:
         stack = stack.replace(samples=np.full((stack.height, stack.width, 1), spp, np.float32))
     return stack
@@ -223,7 +225,7 @@ def _crop(
         return CropData([stack for stack, _ in cleaned], counts), told
     clock = time.perf_counter()
     spp, method = -(-config.reference_spp // HALVES), config.reference_method
-    options = {"made": made, **config.unbiased_options}
+    options = {"made": made, "unbiased": True, **config.unbiased_options}
     halves = [render_stack(scene, spp, seed, config.sampler, **options) for seed in seeds[-HALVES:]]
     converged = merge(halves)
     reference, caustic = references(converged, method)

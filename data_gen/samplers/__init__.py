@@ -22,12 +22,14 @@ import data_gen.samplers.restir.about
 from data_gen.samplers.registry import (
     FRAME_SAMPLERS,
     SAMPLERS,
+    SIMPLE,
     FrameSampler,
     Option,
     Sampler,
     by_standing,
     check_options,
     choose,
+    described,
     find,
     register,
 )

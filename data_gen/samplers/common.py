@@ -20,6 +20,7 @@ from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.media import Media
 from data_gen.paths.walk import Limits
 from data_gen.samplers.registry import SAMPLERS, Sampler, by_plugin, find
+from data_gen.samplers.sharing import sharing_of
 from data_gen.scenes.cameras import check_camera
 from data_gen.scenes.facts import Facts, scene_facts, shapes_of
 from data_gen.scenes.integrators import own_estimate
@@ -78,6 +79,8 @@ class GradientIntegrator(mi.SamplingIntegrator):
         # Of the sampler, whose ``entry`` in the registry says which options there are, and what it refuses
         self.name = by_plugin(props.plugin_name()).name
         self.options = self.entry.settings({name: props[name] for name in self.entry.options if name in props})
+        # Whether the user decides on them: what the option says is else decided anew for each render
+        self.given_tails = "tails" in self.entry.options and "tails" in props
         # Whether the film counts failed shifts, where the sampler ``diagnoses`` them
         self.diagnostics = props.get("diagnostics", False)
         if not self.nested:
@@ -142,7 +145,17 @@ class GradientIntegrator(mi.SamplingIntegrator):
             "points": self.options.get("points", "independent"),
         }
         with weighed(scene, self.options["lamps"], self.entry.by_place) as self.places:
-            return render_passes(self.prepare(scene, sensor), sensor, seed, Budget(spp), **limits)
+            budget = self.share_tails(scene, sensor, Budget(spp))
+            return render_passes(self.prepare(scene, sensor), sensor, seed, budget, **limits)
+
+    def share_tails(self, scene: mi.Scene, sensor: mi.Sensor, budget: Budget) -> Budget:
+        """Decides whether paths share their tails, of a plugin that leaves it open; returns what the rest may spend."""
+        if "tails" not in self.options:
+            return budget
+        found = sharing_of(sensor, self.entry, self.facts(scene, sensor), self.options, budget)
+        if not self.given_tails:
+            self.options["tails"] = "paths" if found.not_now else "shared"
+        return found.rest if self.options["tails"] == "shared" else budget
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """Renders all layers: see ``mitsuba.Integrator.render()`` for the parameters."""

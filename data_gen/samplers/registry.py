@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from data_gen.budget import LANE_BYTES
 from ngpt.errors import NgptError, WrongUse, did_you_mean
+from ngpt.methods import METHODS
 from ngpt.options import STANDINGS, Option, as_text, settings, unusual
 from ngpt.system.parts import Registry
 
@@ -208,8 +209,25 @@ def find(name: str, facts: Facts | None = None) -> Sampler:
     return sampler
 
 
+# Samples without gradients, and OIDN: nothing that takes longer to compile, to render or to explain is taken instead
+# of it unless that was measured to be better.
+SIMPLE = ("primal", "oidn")
+
+
+def described(facts: Facts, gradients: bool = False) -> tuple[str, str, str]:
+    """The sampler of "auto" in `ngpt render`, from the description only, the method for its stacks, and why.
+
+    The method is "" where the layers decide. It is the simple way unless there are media, where gradients pay, unless
+    they are asked for, and unless OIDN is missing, without which gradients clean better.
+    """
+    sampler, reason = choose(facts)
+    if gradients or facts.media or METHODS[SIMPLE[1]].missing():
+        return sampler, "", reason
+    return *SIMPLE, "there are no media, so more samples pay more than gradients; --sampler gpt renders gradients"
+
+
 def choose(facts: Facts) -> tuple[str, str]:
-    """The sampler that "auto" stands for, from the description only, and why."""
+    """The sampler with gradients that "auto" stands for, from the description only, and why."""
     reasons: list[str] = []
     for sampler in sorted(SAMPLERS.values(), key=lambda sampler: sampler.rank):
         if not sampler.rank:

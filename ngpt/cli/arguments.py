@@ -161,6 +161,16 @@ def duration(text: str) -> float:
     return number(text, lambda seconds: 0 < seconds < math.inf, "is not a positive number of seconds")
 
 
+def relative(text: str) -> float:
+    """A number, or an error that has it for a percentage: 5% is 0.05."""
+    try:
+        return float(text)
+    except ValueError:
+        percent = re.fullmatch(r"(\d+(?:\.\d*)?) ?%", text)
+        remedy = f"; write {float(percent[1]) / 100:g}" if percent else "; write 0.05 for 5 %"
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number{remedy}") from None
+
+
 def number(text: str, fits: Callable[[float], bool], refusal: str) -> float:
     """The number in a text. Texts without one, and numbers that do not fit, are an error that ends in ``refusal``."""
     try:

@@ -30,6 +30,8 @@ from ngpt.training.run_summary import is_run
 from ngpt.training.run_summary import summary as run_summary
 from ngpt.version import __version__
 
+# Letters of an attribute that are printed: manifests of Cryptomatte may have a million
+_LETTERS = 200
 # Layers that stacks lack for a good reason
 _OPTIONAL = ("error", "motion", "samples", "shared", "dt", "dt_var")
 
@@ -241,18 +243,22 @@ def show(report: dict, as_json: bool) -> None:
         if isinstance(value, dict):
             tell(f"{name}:")
             for key, item in value.items():
-                text = (
-                    "  ".join(f"{k} {_number(v)}" for k, v in item.items()) if isinstance(item, dict) else _number(item)
-                )
+                parts = [f"{k} {_number(v)}" for k, v in item.items()] if isinstance(item, dict) else [_number(item)]
+                text = _shortened("  ".join(parts)) if name == "attributes" else "  ".join(parts)
                 _fitted(f"  {key:16} {text}", indent=4)
         elif isinstance(value, list) and value and isinstance(value[0], str) and max(map(len, value)) > 30:
             tell(f"{name}:")
             for item in value:
                 _fitted(f"  {item}", indent=4)
         else:
-            _fitted(
-                f"{name}: {', '.join(map(str, value)) if isinstance(value, list | tuple) else _number(value)}", indent=2
-            )
+            text = ", ".join(map(str, value)) or "none" if isinstance(value, list | tuple) else _number(value)
+            _fitted(f"{name}: {text}", indent=2)
+
+
+def _shortened(text: str) -> str:
+    if len(text) <= _LETTERS:
+        return text
+    return f"{text[:_LETTERS]}... ({len(text)} letters; --json prints all)"
 
 
 def _fitted(line: str, indent: int) -> None:

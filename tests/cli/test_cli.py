@@ -73,6 +73,18 @@ def test_info_on_a_file(stack_file, command):
     assert "depth" in report["missing"] and "channels dx.R dx.G dx.B" in command("info s.exr").out
 
 
+def test_info_prints_no_long_attribute_as_a_whole(stack_file, command):
+    """Manifests of Cryptomatte have a million letters."""
+    manifest = json.dumps({f"object{n}": f"{n:08x}" for n in range(1000)})
+    stack_file()
+    stack = ngpt.read("s.exr")
+    stack.attributes["cryptomatte/de21ea2/manifest"] = manifest
+    ngpt.write("s.exr", stack, overwrite=True)
+    (line,) = (line for line in command("info s.exr").out.splitlines() if "manifest" in line)
+    assert manifest[:100] in line and len(line) < 300 and f"({len(manifest)} letters; --json prints all)" in line
+    assert json.loads(command("info s.exr --json").out)["attributes"]["cryptomatte/de21ea2/manifest"] == manifest
+
+
 def imported_by(folder, *lines):
     """The packages that take long to import, of those that commands have imported in the end."""
     slow = "{'torch', 'mitsuba', 'drjit', 'skimage', 'scipy', 'rich', 'data_gen.samplers.photons.integrator'}"
@@ -100,7 +112,7 @@ def test_a_render_imports_its_own_sampler_alone(renderer, tmp_path):
 
 
 def test_render_tells_what_it_does_and_what_it_made(renderer, command):
-    output, errors = command("render diffuse -o s.exr --spp 4 --size 16x12 --json")
+    output, errors = command("render diffuse -o s.exr --spp 4 --size 16x12 --sampler gpt --json")
     assert json.loads(output)["layers"][:4] == ["primal", "direct", "dx", "dy"]
     # No terminal here: plain lines, first and last among them.
     assert "render diffuse: 0/4 spp" in errors and "render diffuse: 4/4 spp" in errors

@@ -177,7 +177,7 @@ def stacks_of(scene, sampler, batches, spp):
         options = {"photons": 1 if sampler.endswith(("beams", "planes")) else 8, "radius": 0.6}
     if np.prod(scene.sensors()[0].film().crop_size()) == 1:
         spp *= 8 if getattr(SAMPLERS.get(sampler), "batch", 0) else 128
-    return [render_stack(scene, spp, seed, sampler, **options).layers for seed in range(batches)]
+    return [render_stack(scene, spp, seed, sampler, unbiased=True, **options).layers for seed in range(batches)]
 
 
 def last_frame(scene, entry, seed, spp, frames=3):

@@ -91,7 +91,7 @@ def images(values, chains):
 
 def rendered_by_gpt(scene):
     """The same layers of independent renders of gpt, (renders, H, W, 3)."""
-    stacks = [render_stack(scene, 48, seed, "gpt", caustic=False).layers for seed in range(900, 908)]
+    stacks = [render_stack(scene, 48, seed, "gpt", caustic=False, unbiased=True).layers for seed in range(900, 908)]
     layers = {name: np.stack([stack[name] for stack in stacks]) for name in ("primal", "direct", "dx", "dy")}
     layers["primal"] = layers["path"] = layers["primal"] - layers.pop("direct")
     return layers

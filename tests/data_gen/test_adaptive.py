@@ -1,6 +1,7 @@
 """Samples shared out by the error of the result: ``ngpt render --adaptive`` and ``--error``."""
 
 import json
+import time
 from functools import cache
 from itertools import count
 
@@ -25,7 +26,7 @@ SIZE = (24, 16)
 
 def render(mi, spp, seed=0, scene="glossy", sampler="gpt", error=None, method="wcv", **options):
     scene = load(mi, scene, SIZE) if isinstance(scene, str) else scene
-    return render_stack(scene, spp, seed, sampler, adaptive=Adaptive(error, method), **options)
+    return render_stack(scene, spp, seed, sampler, adaptive=Adaptive(error, method), unbiased=True, **options)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +36,9 @@ def converged(renderer):
     @cache
     def images(scene):
         loaded = load(renderer, scene, (48, 32))
-        return [render_stack(loaded, 512, 100 + i, "primal", with_features=False)["primal"] for i in range(2)]
+        return [
+            render_stack(loaded, 512, 100 + i, "primal", with_features=False, unbiased=True)["primal"] for i in range(2)
+        ]
 
     return images
 
@@ -71,7 +74,7 @@ def test_the_mean_number_is_kept_and_passes_are_not_seen(renderer, monkeypatch):
 def test_time_is_kept(renderer, monkeypatch):
     """On a clock that a look at it takes forward, whatever the machine is at."""
     looks = count()
-    monkeypatch.setattr(adaptive.time, "perf_counter", lambda: 0.05 * next(looks))
+    monkeypatch.setattr(time, "perf_counter", lambda: 0.05 * next(looks))
     stack = render(renderer, None, 3, load(renderer, "diffuse", SIZE), seconds=2.0)
     assert 1.0 < 0.05 * next(looks) < 2.5
     assert stack.attributes["ngpt:spp"] >= 16
@@ -101,12 +104,12 @@ def test_what_a_choice_takes_is_known_ahead(renderer, monkeypatch):
     scene = load(renderer, "diffuse", (100, 80))
     # A clock on which all takes long: nothing is begun when time is over.
     clock = count()
-    monkeypatch.setattr(adaptive.time, "perf_counter", lambda: float(next(clock)))
+    monkeypatch.setattr(time, "perf_counter", lambda: float(next(clock)))
     stack = render(renderer, None, 0, scene, "primal", method="primal", seconds=0.1)
     assert not calls and stack.attributes["ngpt:spp"] == 16
     stack = GradientStack({"primal": np.ones((80, 100, 3), np.float32)})
     # And one on which the method takes 20 us a pixel.
-    monkeypatch.setattr(adaptive.time, "perf_counter", lambda: 2e-5 * sum(calls))
+    monkeypatch.setattr(time, "perf_counter", lambda: 2e-5 * sum(calls))
     assert adaptive.seconds_to_assess(stack, "primal") == pytest.approx(0.16) and calls == [100, 1600]
     assert adaptive.seconds_to_assess(GradientStack({"primal": stack["primal"][:79, :80]}), "primal") == 0.0
 
@@ -115,7 +118,7 @@ def test_samples_go_where_the_error_is(renderer, converged):
     """The same number makes a better image, by the method they were meant for."""
     scene, halves, errors = load(renderer, "glossy", (48, 32)), converged("glossy"), []
     for seed in range(3):
-        stacks = (render_stack(scene, 96, seed, "gpt"), render(renderer, 96, seed, scene))
+        stacks = (render_stack(scene, 96, seed, "gpt", unbiased=True), render(renderer, 96, seed, scene))
         errors.append([relmse_trimmed(reconstruct(stack, "wcv").image, *halves) for stack in stacks])
     even, adaptive = np.mean(errors, axis=0)
     assert adaptive < 0.95 * even
@@ -129,7 +132,7 @@ def test_samples_that_choose_hardly_bias_the_mean(renderer, monkeypatch):
         return adaptive.Assessment(np.sqrt(stack["primal_var"].sum(axis=-1)).ravel(), 1.0, method)
 
     scene = load(renderer, "glossy", SIZE)
-    light = render_stack(scene, 8192, 99, "primal", with_features=False)["primal"].mean()
+    light = render_stack(scene, 8192, 99, "primal", with_features=False, unbiased=True)["primal"].mean()
 
     def bias():
         """In the mean over renders, and its standard error."""

@@ -1,6 +1,8 @@
 """``ngpt advise``: by a pilot of this scene, for a time or an error."""
 
 import json
+import time
+from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import ngpt
 
 pytest.importorskip("mitsuba")
 
-from data_gen.choosing import pipelines, plans
+from data_gen.choosing import pipelines, plans, trials
 from data_gen.choosing.pipelines import Pipeline, usual_fall
 from data_gen.choosing.trials import Pilot
 from data_gen.scenes.load import load_scene
@@ -59,7 +61,7 @@ def test_the_pilot_takes_no_longer_than_the_time_it_advises_on(renderer, advice,
     asked = []
 
     def explore(scene, seconds, **options):
-        asked.append(seconds * plans.SHARE_WITH_METHODS)
+        asked.append(seconds * plans.SHARE)
         assert options["patient"]
         return [Pipeline("primal", "primal", 16, 0.02, -1.0, 0.001, 0.0)]
 
@@ -68,13 +70,13 @@ def test_the_pilot_takes_no_longer_than_the_time_it_advises_on(renderer, advice,
     for goal in ("--seconds 1", "--seconds 40", "--seconds 900", "--error 0.01"):
         advice(goal)
     # Kernels take some seconds whatever is to be advised on.
-    assert asked == pytest.approx([12, 40, 60, 60])
+    assert asked == pytest.approx([10, 40, 60, 60])
 
 
 def test_on_a_busy_machine_one_sampler_is_tried_and_no_more(renderer, monkeypatch):
     """Every look at the clock is a second late: nothing fits, and the first trial ends all the same."""
     scene, seconds = load_scene("diffuse", (48, 32)), count()
-    monkeypatch.setattr(plans, "candidates", lambda scene: ["gpt", "bdpt"])
+    monkeypatch.setattr(plans, "candidates", lambda scene, **_: ["gpt", "bdpt"])
     found = plans.explore(scene, 30.0, pilot=Pilot(lambda: float(next(seconds))), patient=True)
     assert {p.sampler for p in found} == {"gpt"} and len(found) == 1
     assert plans.explore(scene, 30.0, pilot=Pilot(lambda: float(next(seconds)))) == []
@@ -112,10 +114,12 @@ def test_the_commands_of_a_pilot_run_as_printed(seen, command):
 
 def test_a_pilot_advises(renderer, advice, monkeypatch):
     """Whatever it may be: a row for each method of each sampler that was tried."""
-    monkeypatch.setattr(plans, "candidates", lambda scene: ["gpt"])
+    monkeypatch.setattr(plans, "candidates", lambda scene, **_: ["gpt", "primal"])
     monkeypatch.setattr(pipelines, "WITH_GRADIENTS", ("wcv", "l1"))
     monkeypatch.setattr(pipelines, "WITHOUT", ("primal",))
-    rows = advice("--seconds 100")  # of no more samples than a render may have
+    # By a clock that a busy machine does not hurry, and of no more samples than a render may have
+    monkeypatch.setattr(trials, "Pilot", partial(Pilot, lambda: time.perf_counter() / 100))
+    rows = advice("--seconds 1")
     assert {(row["sampler"], row["method"]) for row in rows} == {("gpt", "wcv"), ("gpt", "l1"), ("primal", "primal")}
     assert all(row["error"] > 0 and row["spp"] > 100 for row in rows)
 

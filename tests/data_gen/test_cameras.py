@@ -160,7 +160,7 @@ def rendered(mi, sensor):
     to_world = mi.ScalarTransform4f().look_at([0, 0, -1], [0.5, 0.3, 0], [0, 1, 0]).scale(20)
     wall = {"type": "rectangle", "to_world": to_world}
     scene = {"type": "scene", "sensor": sensor, "light": {"type": "constant"}, "wall": wall}
-    return render_stack(load(mi, scene), 4, sampler="primal")
+    return render_stack(load(mi, scene), 4, sampler="primal", unbiased=True)
 
 
 @pytest.mark.parametrize("kind", ["perspective", "thinlens", "orthographic"])

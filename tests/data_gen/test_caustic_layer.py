@@ -56,10 +56,12 @@ def test_classes(renderer):
 
 def test_gradients_have_less_noise_for_it(renderer):
     scene = load(renderer, "glossy", (64, 64))
-    without, with_layer = (render_stack(scene, 32, 0, "gpt", caustic=caustic) for caustic in (False, True))
+    without, with_layer = (
+        render_stack(scene, 32, 0, "gpt", caustic=caustic, unbiased=True) for caustic in (False, True)
+    )
     assert "caustic" not in without and "caustic_var" not in without
     assert with_layer["primal"].mean() == pytest.approx(without["primal"].mean(), rel=0.02)
     for name in ("dx_var", "dy_var"):
         assert with_layer[name].mean() < 0.7 * without[name].mean()
     # Nor is there one where no path can be of it.
-    assert "caustic" not in render_stack(load(renderer, "diffuse", (8, 8)), 2)
+    assert "caustic" not in render_stack(load(renderer, "diffuse", (8, 8)), 2, unbiased=True)

@@ -21,7 +21,7 @@ def features_of(mi, size=(33, 33), spp=4, **objects):
     scene = {"type": "scene", "sensor": camera(mi), "light": {"type": "constant"}, "integrator": {"type": "path"}}
     scene = load(mi, scene | objects)
     set_film_size(scene, size)
-    return render_stack(scene, spp, sampler="primal")
+    return render_stack(scene, spp, sampler="primal", unbiased=True)
 
 
 def sphere(bsdf, **parameters):

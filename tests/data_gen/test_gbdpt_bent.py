@@ -338,7 +338,7 @@ def test_what_is_bent_is_shifted_by_a_kernel_of_its_own(renderer, monkeypatch):
     # Not frozen: what is counted is no argument, so a recorded kernel would count in its first pass only.
     plain = lambda f, *args, sums=None: evaluated(f)(*args, *([sums()] if sums else []))  # noqa: E731
     monkeypatch.setattr(integrator, "Frozen", lambda *_: plain)
-    stack = render_stack(load(renderer, by_a_wall, (32, 32)), 64, 3, "gbdpt")
+    stack = render_stack(load(renderer, by_a_wall, (32, 32)), 64, 3, "gbdpt", unbiased=True)
     first, again = (int(np.array(found[bent])[0]) for bent in (False, True))
     # 293 and 39 of 1120 where the vertex before was another's.
     assert stack["primal"].any() and first == again > 1000, (first, again)

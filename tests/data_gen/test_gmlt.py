@@ -98,7 +98,7 @@ def test_numbers_that_do_not_change_make_the_same_path(monkeypatch, chains):
     monkeypatch.setattr(chains, "small_step", lambda x, u: x)
     monkeypatch.setattr(chains, "acceptance", counted)
     monkeypatch.setattr(chains, "LARGE_STEPS", 0.3)
-    render_stack(load(mi, "glossy", SIZE), 8, 1, "gmlt")
+    render_stack(load(mi, "glossy", SIZE), 8, 1, "gmlt", unbiased=True)
     same, steps = np.array(counts, np.float64)
     assert steps >= 3 * 8 * SIZE[0] * SIZE[1]
     # Large steps lead to paths of other values, but for some that end with those of a candidate
@@ -116,7 +116,7 @@ def test_chains_accept_enough(renderer, monkeypatch):
         return rates[-1]
 
     monkeypatch.setattr(integrator, "run", noted)
-    render_stack(load(mi, "diffuse", SIZE), 8, 0, "gmlt")
+    render_stack(load(mi, "diffuse", SIZE), 8, 0, "gmlt", unbiased=True)
     assert 0.6 < np.array(rates[0]).mean() < 0.98
 
 
@@ -126,6 +126,6 @@ def test_light_through_a_door_ajar(renderer):
     ajar = Path(__file__).parents[2] / "bench" / "scenes" / "ajar" / "scene.xml"
     scene = load_scene(str(ajar), (16, 16), {"wall": "2.6"})  # 30 cm
     references = render_references(renderer, scene, 24, 2048)
-    stacks = [render_stack(scene, 32, seed, "gmlt")["primal"] for seed in range(16)]
+    stacks = [render_stack(scene, 32, seed, "gmlt", unbiased=True)["primal"] for seed in range(16)]
     result = z_test(np.stack(stacks), references)
     assert result.passed, result

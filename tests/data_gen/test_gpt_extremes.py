@@ -10,7 +10,7 @@ from data_gen.render import render_stack
 
 
 def render(scene, size=(24, 24), spp=32):
-    return render_stack(load(mi, scene, size), spp, sampler="gpt")
+    return render_stack(load(mi, scene, size), spp, sampler="gpt", unbiased=True)
 
 
 def check_sane(stack, most=1.5):

@@ -13,7 +13,9 @@ from data_gen.scenes.builtin import _light
 def test_light_moves_from_the_layer_to_the_gradients(renderer):
     """The same paths: the image is the same, and the light in it; most of the layer's has a copy now."""
     scene = load(renderer, caustics, (32, 32))
-    layer, followed = (render_stack(scene, 64, 3, "gpt", shift=shift) for shift in ("replay", "manifold"))
+    layer, followed = (
+        render_stack(scene, 64, 3, "gpt", shift=shift, unbiased=True) for shift in ("replay", "manifold")
+    )
     assert np.allclose(layer["primal"], followed["primal"], rtol=1e-5, atol=1e-6)
     assert followed["caustic"].mean() < 0.3 * layer["caustic"].mean()
     assert (followed["caustic"] <= layer["caustic"] * (1 + 1e-5) + 1e-6).all()
@@ -26,7 +28,8 @@ def test_less_noise_than_replay(renderer):
     del description["glass"]
     scene = load(renderer, description, (48, 48))
     plain, layer, followed = (
-        render_stack(scene, 128, 3, "gpt", **options) for options in ({"caustic": False}, {}, {"shift": "manifold"})
+        render_stack(scene, 128, 3, "gpt", unbiased=True, **options)
+        for options in ({"caustic": False}, {}, {"shift": "manifold"})
     )
     for name in ("dx_var", "dy_var"):
         # Beside what all other light contributes
@@ -74,10 +77,10 @@ def test_scenes_without_mirrors_have_the_same_kernels(renderer):
     scene = load(renderer, "diffuse", (8, 8))
 
     def kernels(**options):
-        render_stack(scene, 1, 0, "gpt", **options)
+        render_stack(scene, 1, 0, "gpt", unbiased=True, **options)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            render_stack(scene, 1, 0, "gpt", **options)
+            render_stack(scene, 1, 0, "gpt", unbiased=True, **options)
             return [kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel]
 
     assert kernels() and kernels() == kernels(shift="manifold")

@@ -2,6 +2,7 @@
 
 import io
 import sys
+import time
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from ngpt.system.interrupts import Interrupt
 
 pytest.importorskip("mitsuba")
 
+import data_gen
 from data_gen import begun, outputs, passes
 from data_gen import render as rendering
 from data_gen.choosing import plans
@@ -95,6 +97,17 @@ def test_the_method_of_a_pilot_is_run_and_its_error_reached(renderer, command, m
     assert "'nfor' is expected to have an error" in said and "which takes method 'nfor'" in said
 
 
+def test_a_budget_of_processor_time(renderer, command, monkeypatch):
+    """It ends the render, by the clock of this process; nobody gives two."""
+    asked = []
+    monkeypatch.setattr(rendering, "render_passes", lambda *args, **how: asked.append(args[3]) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        command(f"{GPT} --cpu-time 2.5 -o it.exr")
+    assert asked[0].clock is time.process_time and 2 < asked[0].seconds <= 2.5 and asked[0].spp is None
+    with pytest.raises(NgptError, match="give one of them"):
+        data_gen.render_scene("diffuse", seconds=1.0, cpu_seconds=1.0)
+
+
 def test_the_line_on_what_comes_next_names_the_method_that_it_takes(renderer, command, monkeypatch):
     """One sample per pixel has no variances, so not every method that a render is for can clean it."""
     planned(monkeypatch, "gpt", "wcv", False, None)
@@ -168,6 +181,11 @@ def test_a_render_goes_on_and_its_image_is_made_anew(renderer, command, kept):
         ("-o - --frames 0:2", "standard output is one file for several frames"),
         ("-o - --json", "--json also wants standard output"),
         ("-o a.exr --for wcv", "--for needs --adaptive or --error"),
+        ("-o a.exr --error 5%", "'5%' is not a number; write 0.05"),
+        ("-o a.exr --error little", "'little' is not a number; write 0.05 for 5 %"),
+        ("-o a.exr --cpu-time 9 --time 9", "not allowed with argument"),
+        ("-o a.exr --cpu-time 9 --skip-existing", "no file says how much processor time it took"),
+        ("-o {frame}.exr --cpu-time 9 --frames 0:2", "--cpu-time is for single images"),
         ("-o {frame}.exr --error 0.1 --frames 0:2", "--adaptive, --error and --for are for single images"),
         ("-o a.exr --camera x.json", "--frames"),
         ("-o a.exr -D a={frame}", "changes from frame to frame"),

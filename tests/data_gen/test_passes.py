@@ -13,10 +13,12 @@ from ngpt.errors import NgptError
 pytest.importorskip("mitsuba")
 
 from data_gen import passes
+from data_gen import render as rendering
 from data_gen.adaptive import Adaptive
-from data_gen.budget import Budget
+from data_gen.budget import Budget, Watch
 from data_gen.film import GradientFilm
-from data_gen.passes import blocks_within, foretold, render_passes
+from data_gen.passes import blocks_within, film_within, foretold, render_passes
+from data_gen.paths.streams import first_round
 from data_gen.render import render_stack
 from data_gen.scenes.load import set_film_size
 
@@ -24,10 +26,10 @@ from data_gen.scenes.load import set_film_size
 def test_large_images_with_small_blocks(renderer, monkeypatch):
     scene = load(renderer, "glossy", (33, 21))
     monkeypatch.setattr(passes, "_BLOCK_LANES", 33 * 21 * 5)
-    whole = render_stack(scene, 14, 7)
+    whole = render_stack(scene, 14, 7, unbiased=True)
     assert passes.block_of_samples(33 * 21) == 4
     monkeypatch.setattr(passes, "PASS_SECONDS", 1e-9)
-    same(whole, render_stack(scene, 14, 7))
+    same(whole, render_stack(scene, 14, 7, unbiased=True))
 
 
 def test_passes_do_not_move_blocks_within_packets(renderer):
@@ -38,15 +40,15 @@ def test_passes_do_not_move_blocks_within_packets(renderer):
 
 def test_time_is_kept_and_its_samples_are_those_of_spp(renderer):
     scene = load(renderer, "diffuse", (64, 48))
-    render_stack(scene, 1)
+    render_stack(scene, 1, unbiased=True)
     calls = []
-    stack = render_stack(scene, None, 3, progress=lambda *call: calls.append(call), seconds=1.5)
+    stack = render_stack(scene, None, 3, progress=lambda *call: calls.append(call), seconds=1.5, unbiased=True)
     assert calls[0] == (0, 2) and calls[-1] == (2, 2)
     spp = stack.attributes["ngpt:spp"]
     assert spp > 1
-    same(stack, render_stack(scene, spp, 3, points="rounds", sampler="gpt"))
-    assert render_stack(scene, 2, seconds=100).attributes["ngpt:spp"] == 2
-    assert render_stack(scene, None, seconds=1e-6).attributes["ngpt:spp"] >= 1  # at least something
+    same(stack, render_stack(scene, spp, 3, points="rounds", sampler="gpt", unbiased=True))
+    assert render_stack(scene, 2, seconds=100, unbiased=True).attributes["ngpt:spp"] == 2
+    assert render_stack(scene, None, seconds=1e-6, unbiased=True).attributes["ngpt:spp"] >= 1  # at least something
 
 
 class Fake:
@@ -89,6 +91,21 @@ def test_time_is_kept_whatever_a_sample_takes(renderer, monkeypatch, begin, each
     assert again.blocks == fake.blocks and sum(fake.blocks) == film.samples
 
 
+def test_processor_time_buys_as_much_on_a_busy_machine(renderer, monkeypatch):
+    """Of four seconds on the wall this process gets one."""
+    sensor = load(renderer, "diffuse", (128, 64)).sensors()[0]
+    fake = Fake(renderer, monkeypatch, 0, 0.4, 8)
+    render_passes(fake, sensor, 0, Budget(seconds=10, clock=lambda: fake.now / 4), points="rounds")
+    assert 32 <= fake.now <= 48
+
+
+def test_what_ends_before_its_time_says_so(renderer, monkeypatch):
+    sensor, calls = load(renderer, "diffuse", (128, 64)).sensors()[0], []
+    fake = Fake(renderer, monkeypatch, 0, 0.5)
+    render_passes(fake, sensor, 0, Budget(16, 60), Watch(lambda *call: calls.append(call)), points="rounds")
+    assert calls[0] == (0, 60) and calls[-1] == (8, 8)
+
+
 def test_the_time_of_a_pass_is_foretold():
     assert foretold([(100, 3.0)]) == (0.0, 0.03)
     # The first compiles.
@@ -109,9 +126,9 @@ def test_what_takes_longer_than_the_time_is_rendered_once(renderer, monkeypatch)
 
 def test_stopping_keeps_the_samples_done(renderer):
     scene = load(renderer, "diffuse", (256, 256))
-    stack = render_stack(scene, 1 << 20, 3, "primal", stop=lambda: True, points="rounds")
+    stack = render_stack(scene, 1 << 20, 3, "primal", stop=lambda: True, points="rounds", unbiased=True)
     assert 1 <= stack.attributes["ngpt:spp"] < 100
-    same(stack, render_stack(scene, stack.attributes["ngpt:spp"], 3, "primal", points="rounds"))
+    same(stack, render_stack(scene, stack.attributes["ngpt:spp"], 3, "primal", points="rounds", unbiased=True))
 
 
 def test_sizes_that_memory_cannot_hold(renderer, monkeypatch):
@@ -120,14 +137,46 @@ def test_sizes_that_memory_cannot_hold(renderer, monkeypatch):
     # More than a machine has is no advice.
     monkeypatch.setattr(passes, "machine_memory", lambda: 2**34)
     with pytest.raises(NgptError, match=r"need \d+ MiB .*, and this machine has 16384 MiB; render a smaller image$"):
-        render_stack(scene, 1)
+        render_stack(scene, 1, unbiased=True)
     monkeypatch.setattr(passes, "machine_memory", lambda: 2**44)
     with pytest.raises(NgptError, match=r"20000x10000 pixels need \d+ MiB .*, and 6144 MiB .* pass --memory \d+"):
-        render_stack(scene, 1)
+        render_stack(scene, 1, unbiased=True)
     set_film_size(scene, (40, 30))
     with pytest.raises(NgptError, match=r"pass --memory (\d+)") as error:
-        render_stack(scene, 1, memory=1)
-    assert render_stack(scene, 1, memory=int(str(error.value).split("--memory ")[1].split(",")[0]))
+        render_stack(scene, 1, memory=1, unbiased=True)
+    assert render_stack(scene, 1, memory=int(str(error.value).split("--memory ")[1].split(",")[0]), unbiased=True)
+
+
+class Begun(Exception):
+    """A render has begun, with so many MiB for film and paths."""
+
+
+def test_what_fits_into_some_memory_fits_into_more(renderer, monkeypatch):
+    """The cache of tails is there where film and paths fit beside it, and what an error names is enough."""
+    scene = load(renderer, "diffuse", (4, 4))
+    set_film_size(scene, (640, 360))
+
+    def begin(sample, sensor, seed, budget, watch, **how):
+        film_within(budget.memory, sensor, budget.spp, how["lane_bytes"], net=first_round(how["points"], budget.spp))
+        raise Begun(budget.memory)
+
+    def left(memory):
+        try:
+            render_stack(scene, 16, sampler="gpt", memory=memory)
+        except Begun as begun:
+            return begun.args[0]
+        except NgptError as error:
+            named.add(int(str(error).split("--memory ")[1].split(",")[0]))
+        return 0
+
+    named: set[int] = set()
+    monkeypatch.setattr(rendering, "render_passes", begin)
+    found = {memory: left(memory) for memory in range(40, 1400, 40)}
+    (least,) = named
+    whole, shared = ([m for m, rest in found.items() if rest and (rest < m) == cached] for cached in (False, True))
+    assert min(found) < least <= min(whole) and max(whole) < min(shared)
+    assert sorted([*whole, *shared]) == [m for m in found if m >= least]
+    assert left(least) == least and left(least - 1) == 0
 
 
 def adaptive(error=None, method="wcv", **options):
@@ -161,11 +210,11 @@ def adaptive(error=None, method="wcv", **options):
 )
 def test_refusals(renderer, options, message):
     with pytest.raises(NgptError, match=message):
-        render_stack(load(renderer, "diffuse", (4, 4)), **{"spp": 1} | options)
+        render_stack(load(renderer, "diffuse", (4, 4)), unbiased=True, **{"spp": 1} | options)
 
 
 def test_a_million_samples_of_one_pixel(renderer):
-    stack = render_stack(load(renderer, "diffuse", (1, 1)), 1 << 20, sampler="primal")
+    stack = render_stack(load(renderer, "diffuse", (1, 1)), 1 << 20, sampler="primal", unbiased=True)
     assert stack.attributes["ngpt:spp"] == 1 << 20
     assert np.allclose(np.linalg.norm(stack["normal"]), 1, atol=1)
     assert (stack["primal_var"] < 1e-4 * stack["primal"] ** 2).all()

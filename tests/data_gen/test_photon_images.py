@@ -160,10 +160,10 @@ def test_it_converges(renderer, sampler, name, size, photons, least):
         reference = references(renderer, known, (size, size)).mean(axis=0)
     else:
         options, counts = {"radius": 2.0}, (4, 16, 64, 256)
-        reference = render_stack(scene, 768, REFERENCES, "ppm", photons=4, radius=1.0)["primal"]
+        reference = render_stack(scene, 768, REFERENCES, "ppm", photons=4, radius=1.0, unbiased=True)["primal"]
 
     def error(n):
-        x = render_stack(scene, n, 0, sampler, **options)["primal"]
+        x = render_stack(scene, n, 0, sampler, unbiased=True, **options)["primal"]
         return np.mean((x - reference) ** 2 / (reference**2 + 0.01))
 
     slope, _ = np.polyfit(np.log(counts), np.log([error(n) for n in counts]), 1)
@@ -193,7 +193,7 @@ def behind_panes(max_depth):
 
 
 def test_a_lamp_behind_two_panes_is_three_edges_away(renderer):
-    stacks = [render_stack(load(renderer, behind_panes(depth), (4, 4)), 4, 0, "ppm") for depth in (2, 3)]
+    stacks = [render_stack(load(renderer, behind_panes(depth), (4, 4)), 4, 0, "ppm", unbiased=True) for depth in (2, 3)]
     assert [stack["primal"].any() for stack in stacks] == [False, True]
 
 
@@ -307,7 +307,7 @@ def test_there_are_copies_and_differences_have_little_noise(
     """No z-test asks for that: a sampler that rejects every shift is unbiased."""
     scene, sampler = load(renderer, named(name), (size, size)), by_planes_alone(sampler)
     if fails:
-        stack = render_stack(scene, 2, 0, sampler, diagnostics=True, **options)
+        stack = render_stack(scene, 2, 0, sampler, diagnostics=True, unbiased=True, **options)
         assert pass_through(stack)["diagnostics.shiftFailures"].mean() < fails
     gained = gain(passes(scene, 8, 1, sampler, **options))
     assert gained[0] > mean and gained[1] > median, gained

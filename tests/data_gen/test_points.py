@@ -112,7 +112,7 @@ def test_points_take_noise_away(renderer):
     """Of pixels, and more of blocks; that they take no light, see ``laws``."""
     scene, found = load(renderer, "diffuse", (24, 16)), []
     for points in ("sobol", "independent"):
-        stacks = [render_stack(scene, 16, seed, "gpt", points=points) for seed in range(16)]
+        stacks = [render_stack(scene, 16, seed, "gpt", points=points, unbiased=True) for seed in range(16)]
         found.append({name: np.array([stack[name] for stack in stacks], np.float64) for name in ("primal", "dx")})
     for layer, most, of_blocks in (("primal", 0.9, 0.75), ("dx", 0.98, np.inf)):
         images = [layers[layer] for layers in found]
@@ -130,9 +130,9 @@ def test_a_render_by_time_can_be_had_again_by_its_number_of_samples(renderer):
         calls.append(1)
         return len(calls) > 1
 
-    timed = render_stack(scene, None, 2, "gpt", seconds=60, stop=stop)
+    timed = render_stack(scene, None, 2, "gpt", seconds=60, stop=stop, unbiased=True)
     assert timed.attributes["ngpt:samplerOptions"] == "points=rounds"
-    again = render_stack(scene, timed.attributes["ngpt:spp"], 2, "gpt", points="rounds")
+    again = render_stack(scene, timed.attributes["ngpt:spp"], 2, "gpt", points="rounds", unbiased=True)
     assert all(np.array_equal(timed[layer], again[layer], equal_nan=True) for layer in again.names)
 
 
@@ -184,7 +184,7 @@ def test_box_means_are_those_of_scipy_to_the_bit(renderer, rng, shape, kind):
 )
 def test_claims_are_those_over_seeds(renderer, sampler, scene, size, spp):
     scene, options = load(renderer, scene, size), {"features": False} if sampler == "primal" else {}
-    stacks = [render_stack(scene, spp, seed, sampler, **options) for seed in range(16)]
+    stacks = [render_stack(scene, spp, seed, sampler, unbiased=True, **options) for seed in range(16)]
     for layer in ("primal", "dx", "dy", "caustic"):
         if layer in stacks[0].names:
             part = "caustic" if layer == "primal" and "caustic" in stacks[0].names else None
@@ -200,13 +200,13 @@ def test_claims_are_those_over_seeds(renderer, sampler, scene, size, spp):
 
 def test_noise_of_features_is_that_over_seeds(renderer):
     scene = load(renderer, "lens", (64, 40))
-    stacks = [render_stack(scene, 16, seed, "primal") for seed in range(8)]
+    stacks = [render_stack(scene, 16, seed, "primal", unbiased=True) for seed in range(8)]
     seen = max(np.var([s[name] for s in stacks], axis=0, ddof=1).mean() for name in ("albedo", "normal"))
     told = np.mean([stack.attributes["ngpt:featureNoise"] for stack in stacks])
     assert 0.5 < seen / told < 2
     assert merge(stacks).attributes["ngpt:featureNoise"] == pytest.approx(told / 8)
     for spp, options in ((16, {"features": False}), (1, {})):
-        assert "ngpt:featureNoise" not in render_stack(scene, spp, 0, "primal", **options).attributes
+        assert "ngpt:featureNoise" not in render_stack(scene, spp, 0, "primal", unbiased=True, **options).attributes
 
 
 EXTENT = 48, 32
@@ -394,7 +394,10 @@ def test_weights_that_a_scene_gives_are_honoured(renderer):
 def test_lamps_take_noise_away_and_no_light(renderer, sampler):
     scene, found = load(renderer, room()), []
     for lamps in ("power", "uniform"):
-        stacks = [render_stack(scene, 16, seed, sampler, points="independent", lamps=lamps) for seed in range(16)]
+        stacks = [
+            render_stack(scene, 16, seed, sampler, points="independent", lamps=lamps, unbiased=True)
+            for seed in range(16)
+        ]
         found.append(np.array([stack["primal"] for stack in stacks], np.float64).mean(axis=-1))
     better, before = (np.median(images.var(axis=0, ddof=1)) for images in found)
     assert better < 0.6 * before
@@ -437,10 +440,10 @@ def test_light_of_a_lamp_that_is_chosen_never_is_found_or_refused(renderer, ligh
     # Of what gathers photons alone
     if "photons" in SAMPLERS[sampler].options:
         with pytest.raises(NgptError, match=f"'{sampler}' .*'hidden' has sampling_weight 0; give it a positive"):
-            render_stack(scene, 1, 0, sampler)
+            render_stack(scene, 1, 0, sampler, unbiased=True)
         return
     spp = 3 if SAMPLERS[sampler].batch == 1 else 16
-    means = np.array([render_stack(scene, spp, seed, sampler)["primal"].mean() for seed in range(8)])
+    means = np.array([render_stack(scene, spp, seed, sampler, unbiased=True)["primal"].mean() for seed in range(8)])
     z = (means.mean() - light_of_box.mean()) / np.sqrt((means.var(ddof=1) + light_of_box.var(ddof=1)) / 8)
     # About p = 0.001 of so few images
     assert abs(z) < 5 and abs(means.mean() / light_of_box.mean() - 1) < 0.1
@@ -448,6 +451,6 @@ def test_light_of_a_lamp_that_is_chosen_never_is_found_or_refused(renderer, ligh
 
 def test_a_point_that_is_chosen_never_is_off(renderer):
     description = box(1.0) | {"point": {"type": "point", "position": [0, 0, 0], "sampling_weight": 0.0}}
-    without = render_stack(load(renderer, box(1.0)), 64, 0, "ppm", lamps="uniform")["primal"].mean()
-    found = render_stack(load(renderer, description), 64, 0, "ppm")["primal"].mean()
+    without = render_stack(load(renderer, box(1.0)), 64, 0, "ppm", lamps="uniform", unbiased=True)["primal"].mean()
+    found = render_stack(load(renderer, description), 64, 0, "ppm", unbiased=True)["primal"].mean()
     assert found == pytest.approx(without, rel=0.05)

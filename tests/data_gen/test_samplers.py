@@ -90,15 +90,15 @@ def test_a_toy_is_found_by_all_that_ask(renderer, capsys, tmp_path):
         find("toy", Facts("spectral", ()))
     scene = load(renderer, "diffuse", (6, 4))
     with pytest.raises(NgptError, match="sampler 'toy' has no option 'loud'; it has: share"):
-        render_stack(scene, 1, sampler="toy", loud=True)
+        render_stack(scene, 1, sampler="toy", loud=True, unbiased=True)
     with pytest.raises(NgptError, match="sampler 'toy' always renders features; only 'primal'"):
-        render_stack(scene, 1, sampler="toy", with_features=False)
+        render_stack(scene, 1, sampler="toy", with_features=False, unbiased=True)
     target = tmp_path / "toy.exr"
     line = ["render", "diffuse", "--size", "6x4", "--spp", "4", "--sampler", "toy", "-o", str(target)]
     assert main([*line, "-O", "share=1.5"]) == 2
     assert "option 'share': '1.5' is not allowed; it takes a number from 0 to 1" in capsys.readouterr().err
     assert main([*line, "-O", "share=0.25"]) == 0
-    by_command, by_python = ngpt.read(target), render_stack(scene, 4, sampler="toy", share=0.25)
+    by_command, by_python = ngpt.read(target), render_stack(scene, 4, sampler="toy", share=0.25, unbiased=True)
     assert by_command.attributes["ngpt:sampler"] == "toy"
     assert by_command.attributes["ngpt:samplerOptions"] == by_python.attributes["ngpt:samplerOptions"] == "share=0.25"
     same(by_command, by_python)

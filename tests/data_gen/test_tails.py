@@ -230,10 +230,18 @@ def test_where_nothing_is_diffuse_paths_go_on(renderer):
     assert all(np.array_equal(shared[layer], paths[layer], equal_nan=True) for layer in shared.names)
 
 
+PLUGINS = {"open": {"max_depth": 8}, "whole": {"max_depth": 8, "tails": "paths"}}
+
+
 def test_who_shares(renderer, monkeypatch, tmp_path):
-    """Renders that users ask for, if they are large enough; no others, and none that is to be unbiased."""
+    """Renders that are large enough, by whichever door, and none that is to be unbiased."""
     monkeypatch.setattr(schedule, "BEGIN", 1 << 14)
     scene = load(renderer, "diffuse", (96, 88))
+    plugins = {how: renderer.load_dict({"type": "gpt", **how_of}) for how, how_of in PLUGINS.items()}
+    images = {how: np.array(plugin.render(scene, spp=8))[..., :3] for how, plugin in plugins.items()}
+    assert {how: plugin.options["tails"] for how, plugin in plugins.items()} == {"open": "shared", "whole": "paths"}
+    for how, unbiased in (("open", False), ("whole", True)):
+        assert np.array_equal(images[how], render_stack(scene, 8, 0, "gpt", unbiased=unbiased)["primal"])
     how = {
         "by default": data_gen.render_scene(scene, 8, sampler="primal").stack,
         "unbiased": data_gen.render_scene(scene, 8, sampler="primal", unbiased=True).stack,
@@ -242,11 +250,12 @@ def test_who_shares(renderer, monkeypatch, tmp_path):
         "of programs": render_stack(scene, 8, 0, "primal"),
     }
     shared = {name for name, stack in how.items() if stack.attributes.get("ngpt:samplerOptions") == "tails=shared"}
-    assert shared == {"by default"} and ("shared" in how["by default"]) and "shared" not in how["few paths"]
+    assert shared == {"by default", "of programs"}
+    assert "shared" in how["by default"] and "shared" not in how["few paths"]
     said = {name: stack.attributes.get("ngpt:tails") for name, stack in how.items()}
-    assert said["by default"] == "on" and said["unbiased"] is None and said["of programs"] is None
+    assert said["by default"] == "on" and said["unbiased"] is None
     assert said["few paths"] == "off: there are few paths" and "--memory" in said["little memory"]
-    same = [how[name]["primal"] for name in ("unbiased", "of programs")]
+    same = [how[name]["primal"] for name in ("by default", "of programs")]
     assert np.array_equal(*same)
     ngpt.write(tmp_path / "shared.exr", how["by default"])
     assert ngpt.read(tmp_path / "shared.exr").attributes["ngpt:samplerOptions"] == "tails=shared"

@@ -41,7 +41,7 @@ def whole(description, size=SIZE, spp=512, seeds=6):
 def images(scene, tails, spp, seeds):
     """Independent images, (seeds, H, W, 3) float64."""
     options = {"tails": tails, "with_features": False}
-    stacks = [render_stack(scene, spp, seed, "primal", **options) for seed in seeds]
+    stacks = [render_stack(scene, spp, seed, "primal", unbiased=True, **options) for seed in seeds]
     assert all(("tails=shared" in s.attributes["ngpt:samplerOptions"]) == (tails == "shared") for s in stacks)
     return np.stack([s["primal"] for s in stacks]).astype(np.float64)
 

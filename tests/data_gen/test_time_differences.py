@@ -73,7 +73,7 @@ def test_of_a_camera_at_rest_it_is_that_of_the_pixels(renderer, monkeypatch):
     paired = Estimates(shot, 16, 16).dt
 
     def frames(frame, seed):
-        layers = render_stack(shot.at(frame), 64, seed, "gpt-basic", points="independent").layers
+        layers = render_stack(shot.at(frame), 64, seed, "gpt-basic", points="independent", unbiased=True).layers
         return layers["primal"] - layers["direct"]
 
     later, earlier = (np.stack([frames(i, seed) for seed in range(8 * i, 8 * i + 8)]) for i in (1, 0))

@@ -34,7 +34,7 @@ def uneven(rng):
 @pytest.mark.parametrize("sampler", ["primal", "gpt", "gpt-basic", "gpt-simple"])
 def test_even_counts_are_the_render_of_ever(renderer, sampler):
     scene = load(renderer, "diffuse", SIZE)
-    even = render_stack(scene, 48, 3, sampler, points="independent")
+    even = render_stack(scene, 48, 3, sampler, points="independent", unbiased=True)
     same(render(renderer, scene, np.full(PIXELS, 2), 3, sampler), even)
 
 
@@ -46,7 +46,7 @@ def test_each_pixel_has_the_bits_of_its_own_samples(renderer, rng, points, of_ev
     counts = 16 * (1 + blocks.reshape(SIZE[::-1]))
     assert np.array_equal(layers["samples"][..., 0], counts)
     for n in np.unique(counts):
-        even, here = render_stack(scene, int(n), 3, "gpt", points=of_even), counts == n
+        even, here = render_stack(scene, int(n), 3, "gpt", points=of_even, unbiased=True), counts == n
         assert np.array_equal(layers["primal"][here], even["primal"][here])
         if points == "sobol":
             continue

@@ -197,12 +197,12 @@ def test_pairs_that_merging_completes_are_the_same_from_both_ends(copies, t):
 def test_the_light_of_photons_is_a_layer_of_its_own(renderer):
     """With the least radius there is hardly any; the image is the sum, and each part has a variance."""
     scene = load(renderer, SCENES["glass"], (24, 16))
-    wide, least = (render_stack(scene, 8, 3, "vcm", radius=radius) for radius in (2.0, 1e-5))
+    wide, least = (render_stack(scene, 8, 3, "vcm", radius=radius, unbiased=True) for radius in (2.0, 1e-5))
     assert wide.attributes[GATHERED] == 1 and {"caustic_var", "primal_var"} <= set(wide.names)
     share = [stack["caustic"].mean() / stack["primal"].mean() for stack in (wide, least)]
     assert share[0] > 0.02 and share[1] < 1e-3
     assert (wide["primal"] >= wide["caustic"] - 1e-4).all() and (wide["caustic_var"] > 0).any()
-    assert GATHERED not in render_stack(scene, 2, 3, "bdpt").attributes
+    assert GATHERED not in render_stack(scene, 2, 3, "bdpt", unbiased=True).attributes
 
 
 # ------------------------- Where nothing merges -------------------------
@@ -212,7 +212,7 @@ def test_where_nothing_merges_it_is_bdpt(renderer):
     """With a radius of nearly nothing: the same paths from the same random numbers, one by one."""
     scene = load(renderer, SCENES["glass"], (24, 16))
     ours, theirs = (
-        light_of_gradients(render_stack(scene, 8, 3, name, **options).layers)
+        light_of_gradients(render_stack(scene, 8, 3, name, unbiased=True, **options).layers)
         for name, options in (("vcm", {"radius": 1e-5}), ("bdpt", {}))
     )
     # A ray that grazes an edge may go another way where its neighbours are others.

@@ -53,7 +53,7 @@ def render_ours(scene, sampler, batches=16, spp=64, pixels=1, seed=0, **options)
     from data_gen.render import render_stack
 
     with far_shifts(pixels):
-        return [render_stack(scene, spp, seed + i, sampler, **options).layers for i in range(batches)]
+        return [render_stack(scene, spp, seed + i, sampler, unbiased=True, **options).layers for i in range(batches)]
 
 
 def render_references(mi, scene, batches=24, spp=256):
@@ -140,7 +140,11 @@ def failed_shifts(scene, name, spp=16):
 
     if not SAMPLERS[name].diagnoses:
         return 0.0
-    return float(pass_through(render_stack(scene, spp, 0, name, diagnostics=True))["diagnostics.shiftFailures"].mean())
+    return float(
+        pass_through(render_stack(scene, spp, 0, name, diagnostics=True, unbiased=True))[
+            "diagnostics.shiftFailures"
+        ].mean()
+    )
 
 
 def assert_unbiased(stacks, references, level=0.01, pixels=1, about=""):

@@ -83,7 +83,7 @@ class GPT(GradientIntegrator):
         super().__init__(props)
         self.roughness_threshold, self.shift = self.options["roughness_threshold"], self.options["shift"]
         self.reuse, self.caustic = self.options["reuse"], self.options["caustic"]
-        self.volumes, self.shared = props.get("volumes", False), self.options["tails"] == "shared"
+        self.volumes = props.get("volumes", False)
         self.follows = "volpath" if self.volumes else "path"
         if self.shift == "manifold" and (self.reuse or not self.caustic):
             raise NgptError("gpt: shift 'manifold' needs the layer 'caustic', and cannot be combined with 'reuse'")
@@ -91,6 +91,11 @@ class GPT(GradientIntegrator):
     @classmethod
     def parameters(cls, scene: mi.Scene) -> dict[str, Any]:
         return super().parameters(scene) | {"volumes": integrator_name(scene) in VOLUMETRIC}
+
+    # No attribute: it is decided anew for each render of a plugin.
+    @property
+    def shared(self) -> bool:
+        return self.options["tails"] == "shared"
 
     def facts(self, scene: mi.Scene, sensor: mi.Sensor) -> Facts:
         found = super().facts(scene, sensor)

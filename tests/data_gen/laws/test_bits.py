@@ -35,26 +35,26 @@ def test_the_same_seed_gives_the_same_bits_whatever_the_passes(renderer, monkeyp
     batch, size = SAMPLERS[name].batch, (7, 5)
     scene = scene_for(renderer, name, size)
     spp = 3 * batch + 1 if not full else 20 if batch == 1 else 150
-    whole, calls = render_stack(scene, spp, 7, name), []
-    same(whole, render_stack(scene, spp, 7, name))
+    whole, calls = render_stack(scene, spp, 7, name, unbiased=True), []
+    same(whole, render_stack(scene, spp, 7, name, unbiased=True))
     split_passes(monkeypatch, size[0] * size[1] * 40)
-    same(whole, render_stack(scene, spp, 7, name, lambda done, total: calls.append((done, total))))
+    same(whole, render_stack(scene, spp, 7, name, lambda done, total: calls.append((done, total)), unbiased=True))
     if batch:
         assert len(calls) == 1 + -(-spp // batch)
     else:
         # 40 samples are two blocks of 16; what is left over at the end is a pass of its own.
         assert calls == [(n, 150) for n in (0, 32, 48, 64, 80, 96, 112, 128, 144, 150)]
-    assert not np.array_equal(whole["primal"], render_stack(scene, spp, 8, name)["primal"])
+    assert not np.array_equal(whole["primal"], render_stack(scene, spp, 8, name, unbiased=True)["primal"])
 
 
 @pytest.mark.parametrize(("name", "scene", "spp", "options"), MORE)
 def test_options_give_the_same_bits_whatever_the_passes(renderer, monkeypatch, name, scene, spp, options):
     scene, calls = load(renderer, scene, (16, 12)), []
-    whole = render_stack(scene, spp, 5, name, **options)
+    whole = render_stack(scene, spp, 5, name, unbiased=True, **options)
     split_passes(monkeypatch)
-    same(whole, render_stack(scene, spp, 5, name, lambda *call: calls.append(call), **options))
+    same(whole, render_stack(scene, spp, 5, name, lambda *call: calls.append(call), unbiased=True, **options))
     assert whole["primal"].any() and len(calls) > 2
-    assert not np.array_equal(whole["primal"], render_stack(scene, spp, 6, name, **options)["primal"])
+    assert not np.array_equal(whole["primal"], render_stack(scene, spp, 6, name, unbiased=True, **options)["primal"])
 
 
 @pytest.mark.parametrize(("name", "full"), cases())
@@ -63,11 +63,11 @@ def test_memory_stays_within_its_budget(renderer, name, full):
     spp = 5 * batch if not full else 8 if batch == 1 else 100
     # Photons with copies along rays, and whole paths that are recorded as one function, need more for any pass at all.
     memory = 60 if batch == 1 or name == "gpt-basic" else 40
-    whole = render_stack(scene, spp, 1, name)
+    whole = render_stack(scene, spp, 1, name, unbiased=True)
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
     before = dr.detail.malloc_watermark(dr.JitBackend.LLVM)
-    stack = render_stack(scene, spp, 1, name, lambda *call: calls.append(call), memory=memory)
+    stack = render_stack(scene, spp, 1, name, lambda *call: calls.append(call), memory=memory, unbiased=True)
     assert dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before < memory * 2**20
     assert len(calls) > 5
     same(whole, stack)

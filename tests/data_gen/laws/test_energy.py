@@ -35,7 +35,7 @@ def in_media(name):
 
 
 def render(mi, name, scene, batches=1):
-    return render_stack(load(mi, scene, (8, 8)), batches * (SAMPLERS[name].batch or 4), 0, name)
+    return render_stack(load(mi, scene, (8, 8)), batches * (SAMPLERS[name].batch or 4), 0, name, unbiased=True)
 
 
 @pytest.mark.parametrize("name", [name if name in NAMES else slow(name) for name in SAMPLERS])

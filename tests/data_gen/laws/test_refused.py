@@ -64,7 +64,7 @@ TABLE = [
 @pytest.mark.parametrize(("sampler", "scene", "options", "message"), TABLE)
 def test_refused(renderer, sampler, scene, options, message):
     with pytest.raises(NgptError, match=message) as refusal:
-        render_stack(load(renderer, scene, (8, 8)), 64 if options else 1, sampler=sampler, **options)
+        render_stack(load(renderer, scene, (8, 8)), 64 if options else 1, sampler=sampler, unbiased=True, **options)
     assert sampler in str(refusal.value)
 
 
@@ -82,10 +82,10 @@ def test_where_there_are_no_media_points_on_surfaces_do():
 def test_maps_larger_than_memory_are_refused_with_what_fits(renderer, sampler, option, memory):
     scene = load(renderer, "diffuse", (128, 128))
     with pytest.raises(NgptError, match=rf"pass --memory \d+, or .* or no more than -O {option}=\d+") as caught:
-        render_stack(scene, 1, 0, sampler, memory=memory, **{option: 64})
+        render_stack(scene, 1, 0, sampler, memory=memory, unbiased=True, **{option: 64})
     words = str(caught.value)
     fits, needed = int(words.rsplit("=", 1)[1]), int(words.split("--memory ")[1].split(",")[0])
     assert 1 < fits < 64 and needed > memory
-    render_stack(scene, 1, 0, sampler, memory=memory, **{option: fits})
+    render_stack(scene, 1, 0, sampler, memory=memory, unbiased=True, **{option: fits})
     with pytest.raises(NgptError, match=r"render a smaller image$"):
-        render_stack(scene, 1, 0, sampler, memory=20)
+        render_stack(scene, 1, 0, sampler, memory=20, unbiased=True)

@@ -1,0 +1,55 @@
+"""Whether the paths of a render share a cache of their tails: one rule, for ``render_stack`` and for our plugins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import mitsuba as mi
+
+from data_gen.budget import Budget
+from data_gen.film import GradientFilm
+from data_gen.film.gradient_film import bytes_of_shared
+from data_gen.passes import block_of_samples, least_memory
+from data_gen.paths.camera import bytes_of_rays
+from data_gen.paths.streams import first_round
+from data_gen.samplers.registry import Entry
+from data_gen.samplers.shared import why_not_shared
+from data_gen.scenes.facts import Facts
+from data_gen.tails.cache import LEAST_MIB, MIB
+from data_gen.tails.schedule import enough
+
+
+class Sharing(NamedTuple):
+    """``never``  why no paths with these options can share their tails in this scene, "" if they can
+    ``not_now``  why those of this render should not, or cannot, "" if they should
+    ``rest``     the budget without what the cache takes
+    """
+
+    never: str
+    not_now: str
+    rest: Budget
+
+
+def sharing_of(sensor: mi.Sensor, entry: Entry, facts: Facts, settings: Mapping[str, Any], budget: Budget) -> Sharing:
+    """Whether a render may share, of a sampler with the option ``tails``.
+
+    What fits into some memory must fit into more: the cache is there only where film and paths fit beside it.
+    """
+    never = why_not_shared(bool(facts.media), settings, mi.variant())
+    if facts.integrator != "path":
+        never = f"the integrator is '{facts.integrator}', and only paths of 'path' do"
+    net = first_round(settings.get("points", "independent"), budget.spp)
+    film = GradientFilm(*(int(n) for n in sensor.film().crop_size()), net=net)
+    own = MIB + bytes_of_shared(film.pixels) // 2**20
+    lanes = film.pixels * min(block_of_samples(film.pixels), budget.spp or 1 << 31)
+    needed = max(LEAST_MIB, own + least_memory(film, lanes, entry.lane_bytes + bytes_of_rays(sensor)))
+    not_now = never
+    if not enough(film.pixels, budget.spp):
+        not_now = not_now or "there are few paths"
+    if budget.memory < needed:
+        not_now = not_now or f"it needs --memory {needed}"
+    # Whoever insists on the cache where memory is too little for both has it beside what the rest may use.
+    beside = 0 if budget.memory < needed else own
+    return Sharing(never, not_now, replace(budget, memory=budget.memory - beside))
