@@ -34,6 +34,7 @@ class Repaired:
     ``empty``    (H, W) booleans, the pixels that alpha says hold nothing (``ngpt.coverage``); None where there are none
     ``parts``    diffuse and specular light, finite, and their variances as ``diffuse_var`` and ``specular_var``, NaN
                  where not known; only the ones that the stack holds
+    ``by_oidn``  OIDN's images of this (``ngpt.network.inputs.Oidn``), for methods that read them; None: not made yet
     """
 
     image: np.ndarray
@@ -51,6 +52,7 @@ class Repaired:
     feature_noise: float | None = None
     empty: np.ndarray | None = None
     parts: dict[str, np.ndarray] = field(default_factory=dict)
+    by_oidn: Any = None
 
     def known_variances(self) -> dict[str, np.ndarray]:
         """The variances of image, dx and dy that the stack holds, by the names of its layers; see ``variances``."""
