@@ -157,21 +157,23 @@ def test_who_takes_it_out(method, monkeypatch):
         assert told == 2 * expected
 
 
+@pytest.mark.parametrize("known", [{}, {FEATURE_NOISE: 0.0}])
 @pytest.mark.parametrize("method", ["ngpt-combine", "ngpt-primal"])
-def test_oidn_runs_once_for_it(method, monkeypatch):
-    """Beside the image and, of networks with gradients, the base: three runs, and not one more."""
+def test_oidn_runs_once_for_it(method, known, monkeypatch):
+    """Beside the image and, of networks with gradients, the base: three runs, and two for noisy features of all."""
     pytest.importorskip("mitsuba_oidn")
     runs = []
     real = oidn.filtered
 
     def filtered(images, *args, **given):
-        runs.append((given["quality"], images["color"].shape[:2]))
+        runs.append((given["quality"], *images.keys() & {"color"}, *next(iter(images.values())).shape[:2]))
         return real(images, *args, **given)
 
     monkeypatch.setattr(oidn, "filtered", filtered)
-    ngpt.denoise(GradientStack(LIT.layers, {FEATURE_NOISE: 0.0}), method)
-    gradients = [("Fast", SIZE), ("High", SIZE)] if method == "ngpt-combine" else []
-    assert sorted(runs) == [*gradients, ("High", SIZE)]
+    ngpt.denoise(GradientStack(LIT.layers, known), method)
+    features = [] if known else 2 * [("Balanced", *SIZE)]
+    gradients = [("Fast", "color", *SIZE), ("High", "color", *SIZE)] if method == "ngpt-combine" else []
+    assert sorted(runs) == [*features, *gradients, ("High", "color", *SIZE)]
 
 
 def test_by_oidn_the_light_stays():

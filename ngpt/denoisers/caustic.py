@@ -10,8 +10,8 @@ Pixels exchange less light the more their surfaces differ, and the more they dif
 Photons are the same case: neighbouring pixels gather the same ones, and OIDN takes their blotches for detail, but the
 variance tells them. So method `oidn` leaves them to the diffusion (``ngpt.layers.GATHERED``).
 
-Methods from gradients that call OIDN anyway take its image of this light (``ngpt.network.inputs.Oidn``): what OIDN takes
-for noise is given back by one factor for the whole image (docs/lab/log).
+Methods from gradients that call OIDN anyway take its image of this light (``ngpt.network.inputs.Oidn``): what OIDN
+takes for noise is given back by one factor for the whole image (docs/lab/log).
 """
 
 import numpy as np
