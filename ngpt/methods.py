@@ -20,7 +20,7 @@ from ngpt.io.primaries import converted, inside_rec709
 from ngpt.layers import GATHERED
 from ngpt.magnitude import enlarged, magnitude, scaled
 from ngpt.network.identity import Identity, identify
-from ngpt.network.inputs import ESTIMATED
+from ngpt.network.inputs import DENOISED, ESTIMATED, Oidn
 from ngpt.network.shipped import OPTIONS, Shipped
 from ngpt.options import Option, as_text, settings, unusual
 from ngpt.panorama import continued, middle, wraps
@@ -329,11 +329,13 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     data = repair(_known(scaled(stack, power), entry.estimates), gradients="dx" in reads or apart)
     if "alpha" in stack:
         data = replace(data, empty=empty_pixels(stack))
+    if set(DENOISED) & set(reads):
+        data = replace(data, by_oidn=Oidn(data))
     # Extreme values may leave the range of float32 inside; what comes out is checked.
     with np.errstate(over="ignore", invalid="ignore"):
         image = _run(name, entry, data, values, stack.path) + data.direct
         if data.caustic is not None:
-            image += caustic.denoised(data, by_oidn="denoised" in reads)
+            image += data.by_oidn.of_caustic if data.by_oidn else caustic.denoised(data)
     image = enlarged(image, power)
     if matrix is not None:
         image = converted(image, np.linalg.inv(matrix))

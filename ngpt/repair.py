@@ -36,6 +36,7 @@ class Repaired:
     ``fine``     primal, albedo and normal by subpixels (``ngpt.subpixels``), finite; empty where there are none
     ``parts``    diffuse and specular light, finite, and their variances as ``diffuse_var`` and ``specular_var``, NaN
                  where not known; only the ones that the stack holds
+    ``by_oidn``  OIDN's images of this (``ngpt.network.inputs.Oidn``), for methods that read them; None: not made yet
     """
 
     image: np.ndarray
@@ -54,6 +55,7 @@ class Repaired:
     empty: np.ndarray | None = None
     fine: dict[str, np.ndarray] = field(default_factory=dict)
     parts: dict[str, np.ndarray] = field(default_factory=dict)
+    by_oidn: Any = None
 
     def known_variances(self) -> dict[str, np.ndarray]:
         """The variances of image, dx and dy that the stack holds, by the names of its layers; see ``variances``."""

@@ -128,10 +128,10 @@ typedef int (*ngpt_progress)(void *user, double fraction);
 NGPT_API ngpt_status ngpt_run(ngpt_job *job, int width, int height, int memory, ngpt_progress progress, void *user);
 
 /* Only for networks that correct another denoiser, which read "denoised": makes what that is to be given, those of
- * "oidn_primal", "oidn_albedo", "oidn_normal", "oidn_base", "oidn_caustic", "oidn_caustic_albedo" and
- * "oidn_caustic_normal" that are set as outputs. Call it, then the denoiser, then set "denoised" (and "denoised_base",
- * "denoised_caustic", and oidn_base as "base"), and call `ngpt_run`, which takes over the statistics. It works on the
- * whole image at once, and takes up to 700 bytes a pixel. */
+ * "oidn_primal", "oidn_albedo", "oidn_normal", "oidn_base" and "oidn_caustic" that are set as outputs. Call it, then
+ * the denoiser, then set "denoised" (and "denoised_base", "denoised_caustic", and oidn_base as "base"), and call
+ * `ngpt_run`, which takes over the statistics. It works on the whole image at once, and takes up to 700 bytes a
+ * pixel. */
 NGPT_API ngpt_status ngpt_prepare(ngpt_job *job, int width, int height, ngpt_progress progress, void *user);
 
 #ifdef __cplusplus

@@ -10,16 +10,13 @@ Pixels exchange less light the more their surfaces differ, and the more they dif
 Photons are the same case: neighbouring pixels gather the same ones, and OIDN takes their blotches for detail, but the
 variance tells them. So method `oidn` leaves them to the diffusion (``ngpt.layers.GATHERED``).
 
-Methods from gradients that call OIDN anyway take its image of this light at half the size, which has less error where
-the light has edges; what it takes for noise is given back by one factor for the whole image (docs/lab/log).
+Methods from gradients that call OIDN anyway take its image of this light (``ngpt.network.inputs.Oidn``): what OIDN
+takes for noise is given back by one factor for the whole image (docs/lab/log).
 """
-
-from dataclasses import replace
 
 import numpy as np
 
 from ngpt.denoisers.diffusion import diffused
-from ngpt.denoisers.oidn import oidn
 from ngpt.repair import Repaired
 
 # OIDN's image becomes brighter by at most this factor, to hold the light that there was. A larger one would make
@@ -29,15 +26,9 @@ LOUDEST = 1e30  # variances of light of at most 1 are less, or as good as that
 FARTHEST = 1e-6  # depths below this share of the largest one are alike
 
 
-def denoised(data: Repaired, by_oidn: bool = False) -> np.ndarray:
-    """What is added to a reconstruction of ``data.image``: ``data.caustic``, (H, W, 3) float32, with less noise.
-
-    ``by_oidn``  whether OIDN makes it, and not the diffusion; raises NgptError where it is not installed
-    """
+def denoised(data: Repaired) -> np.ndarray:
+    """What is added to a reconstruction of ``data.image``: ``data.caustic``, (H, W, 3) float32, with less noise."""
     assert data.caustic is not None
-    if by_oidn:
-        height, width = data.caustic.shape[:2]
-        return doubled(of_half_size(data))[:height, :width]
     scale = float(np.abs(data.caustic).max())
     light = _planes(data.caustic) / np.float32(scale)
     # Where the variance is not known, the estimate counts as pure noise.
@@ -50,35 +41,12 @@ def denoised(data: Repaired, by_oidn: bool = False) -> np.ndarray:
     return np.ascontiguousarray(np.moveaxis(light, 0, -1)) * np.float32(scale)
 
 
-def of_half_size(data: Repaired) -> np.ndarray:
-    """OIDN's image of ``data.caustic``, (⌈H / 2⌉, ⌈W / 2⌉, 3), with as much light, see ``MOST``."""
-    assert data.caustic is not None
-    small = {name: halved(layer) for name, layer in data.features.items() if name != "depth"}
-    given = halved(data.caustic)
-    found = oidn(replace(data, image=given, direct=np.zeros_like(given), features=small, empty=None), "noisy", "high")
+def given_back(found: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """What OIDN has made of ``light``, with as much light as there was, see ``MOST``; both (H, W, 3)."""
     # OIDN may go below zero where no light does.
-    light = np.maximum(found, min(float(given.min()), 0))
-    before, after = given.sum(dtype=np.float64), light.sum(dtype=np.float64)
-    if before > 0 and after > 0:
-        light *= np.float32(min(before / after, MOST))
-    return light
-
-
-def halved(layer: np.ndarray) -> np.ndarray:
-    """The means (⌈H / 2⌉, ⌈W / 2⌉, C) of 2x2 pixels; sides of odd length have their last pixels twice."""
-    height, width, channels = layer.shape
-    layer = np.pad(layer, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-    return layer.reshape(-(-height // 2), 2, -(-width // 2), 2, channels).mean(axis=(1, 3), dtype=np.float32)
-
-
-def doubled(image: np.ndarray) -> np.ndarray:
-    """Bilinear at twice the size, (2 H, 2 W, C); the mean stays."""
-    for axis in (0, 1):
-        lines = np.moveaxis(image, axis, 0)
-        wide = np.concatenate([lines[:1], lines, lines[-1:]])
-        both = np.stack([0.25 * wide[:-2] + 0.75 * lines, 0.75 * lines + 0.25 * wide[2:]], axis=1)
-        image = np.moveaxis(both.reshape(-1, *lines.shape[1:]), 0, axis)
-    return np.ascontiguousarray(image)
+    found = np.maximum(found, min(float(light.min()), 0))
+    before, after = light.sum(dtype=np.float64), found.sum(dtype=np.float64)
+    return found * np.float32(min(before / after, MOST)) if before > 0 and after > 0 else found
 
 
 def _surfaces(features: dict[str, np.ndarray], size: tuple[int, int]) -> np.ndarray:

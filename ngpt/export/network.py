@@ -45,12 +45,10 @@ def statistics_model(weights: str | Path, name: str) -> onnx.ModelProto:
 
 def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
     """What a host may want to know, by key; CONTRACT.md explains them."""
-    seen, light = reach(model), REACH if model.config.reads_gradients else 0
-    # Another denoiser's image of ``caustic`` is made from blocks of 2x2 pixels, so tiles begin at even pixels.
-    step = max(model.alignment, 2)
+    seen, light = reach(model), REACH if "caustic_var" in layers(model.config) else 0
 
     def overlap(*pixels: int) -> str:
-        return str(-(-max(pixels) // step) * step)
+        return str(-(-max(pixels) // model.alignment) * model.alignment)
 
     return {
         "version": __version__,
@@ -59,7 +57,7 @@ def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
         "layout": "NCHW, float32, row 0 on top, scene-linear",
         "gradient": "forward: dx[y, x] = I[y, x + 1] - I[y, x], last column 0; dy alike",
         "normal": "camera space, +x right, +y up, +z toward the viewer",
-        "alignment": str(step),
+        "alignment": str(model.alignment),
         "overlap": overlap(seen + _base_reach(model), light),
         "overlap with base": overlap(seen, light),
         "bytes per pixel": str(bytes_per_pixel(model)),

@@ -57,7 +57,8 @@ def example_layers() -> dict[str, np.ndarray]:
     )
     layers["caustic"], layers["caustic_var"] = spark, spark**2 / 2
     layers["primal"] += spark
-    others = {"denoised": 1.02 * clean + layers["direct"], "denoised_base": 0.99 * clean + layers["direct"]}
+    others = {"denoised_caustic": 0.5 * spark, "denoised_base": 0.99 * clean + layers["direct"]}
+    others["denoised"] = 1.02 * clean + layers["direct"] + others["denoised_caustic"]
     _damage(layers)
     return {name: np.ascontiguousarray(layer[None], np.float32) for name, layer in (others | layers).items()}
 

@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from ngpt.classical.bases import BASES, CLASSICAL
-from ngpt.denoisers import clean
+from ngpt.denoisers import caustic, clean
 from ngpt.denoisers.oidn import oidn, prefiltered
 from ngpt.errors import NgptError
 from ngpt.network.estimates import with_variances
@@ -72,7 +72,7 @@ def gather(
     Raises NgptError where the stack lacks layers they are made of, and where OIDN is needed and not installed.
     """
     wanted = needs(names, base)
-    by_oidn = Oidn(data)
+    by_oidn = data.by_oidn or Oidn(data)
     if estimate and data.dx is not None and set(ESTIMATED) & set(wanted) - data.known_variances().keys():
         # OIDN's image is the better guide, but is there only for networks that read it anyway.
         guide = by_oidn.of_primal if set(DENOISED) & set(names) else CLASSICAL["l1"](data)
@@ -99,6 +99,9 @@ def base_image(data: Repaired, base: str) -> np.ndarray:
 class Oidn:
     """OIDN's images of one frame, by features that it takes for clean, which are prefiltered, once, unless they are.
 
+    OIDN sees all light of the primal, as it was trained. What it makes of ``caustic`` alone is taken out of its image
+    for networks, and added again to what they return: so light that OIDN finds in both is as sharp as in its image.
+
     The primal is denoised by OIDN's largest network, with which the combination has 8 % less error than with smaller
     ones, the base by its smallest: larger ones change the combination by less than 1 % in rooms (docs/lab/log).
     """
@@ -108,17 +111,32 @@ class Oidn:
 
     @cached_property
     def of_primal(self) -> np.ndarray:
-        """(H, W, 3) float32 without direct emission."""
-        # Of subpixels, where OIDN makes a better image of them.
-        if self._data.fine and clean.features_are_clean(self._data):
-            return oidn(self._data, "clean", "high")
-        return oidn(replace(self._with_clean_features, fine={}), "clean", "high")
+        """(H, W, 3) float32 without direct emission and ``of_caustic``."""
+        image = self._of_all_light
+        return image if self._data.caustic is None else image - self.of_caustic
+
+    @cached_property
+    def of_caustic(self) -> np.ndarray:
+        """What is added to a reconstruction of the data's ``image``, (H, W, 3) float32: its ``caustic``."""
+        light = self._data.caustic
+        assert light is not None
+        alone = replace(self._with_clean_features, image=light, direct=np.zeros_like(light), fine={})
+        return caustic.given_back(oidn(alone, "clean", "high"), light)
 
     def of_base(self, base: np.ndarray) -> np.ndarray:
         """OIDN's image of a reconstruction, (H, W, 3) float32; both without direct emission."""
         # A base swings below zero beside edges. OIDN takes that for 0; negative light of the primal it keeps.
         least = min(float(self._data.image.min()), 0) - self._data.direct
         return oidn(replace(self._with_clean_features, image=np.maximum(base, least), fine={}), "clean", "fast")
+
+    @property
+    def _of_all_light(self) -> np.ndarray:
+        data = self._with_clean_features
+        # OIDN makes a better image of subpixels only where their features are clean (docs/lab/log).
+        data = data if clean.features_are_clean(self._data) else replace(data, fine={})
+        if data.caustic is not None:
+            data = replace(data, image=data.image + data.caustic)
+        return oidn(data, "clean", "high")
 
     @cached_property
     def _with_clean_features(self) -> Repaired:

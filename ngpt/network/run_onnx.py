@@ -35,7 +35,7 @@ DEVICES = {
 _FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(double)": np.float64}
 
 # Layers that are taken out before a network sees the others.
-_APART = ("direct", "caustic", "caustic_var")
+_APART = ("direct", "caustic", "caustic_var", "denoised_caustic")
 
 Progress = Callable[[int, int], None]
 

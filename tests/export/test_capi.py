@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from capi import MISSING_LAYER, OK, PRIMAL, WEIGHTS, Job, Network, agree, example, in_python, place, result, those
 
-from ngpt.denoisers import caustic
 from ngpt.methods import reconstruct
 from ngpt.network.inputs import DENOISED, Oidn, base_image, denoised
 from ngpt.repair import repair
@@ -35,21 +34,23 @@ def test_a_network_that_corrects_another_denoiser(library):
     layers = {name: layer for name, layer in example(60, 150).items() if "denoised" not in name}
     data = repair(stack_of(layers))
     made = base_image(data, "wcv")
-    expected = {"oidn_primal": data.image + data.direct, "oidn_base": made + data.direct}
+    expected = {"oidn_primal": data.image + data.caustic + data.direct, "oidn_base": made + data.direct}
     expected |= {"oidn_albedo": data.features["albedo"], "oidn_normal": data.features["normal"]}
-    expected["oidn_caustic"] = caustic.halved(data.caustic).repeat(2, 0).repeat(2, 1)
+    expected["oidn_caustic"] = data.caustic
     job = Job(network, those(network, layers))
     images = {name: np.zeros_like(image) for name, image in expected.items()}
     for name, image in images.items():
         assert job.set_output(name, *place(image)) == OK, job.message()
-    assert job.run() == MISSING_LAYER and "denoised, denoised_base" in job.message()
+    assert job.run() == MISSING_LAYER and "denoised, denoised_base, denoised_caustic" in job.message()
     assert job.prepare() == OK, job.message()
+    # Most of it is 0.
     assert np.allclose(images["oidn_caustic"], expected.pop("oidn_caustic"), rtol=1e-5, atol=1e-6)
     for name, image in expected.items():
         agree(images[name], image)
-    other = {name: image + data.direct for name, image in denoised(Oidn(data), made, DENOISED).items()}
-    other |= {"base": images["oidn_base"], "denoised_caustic": np.zeros_like(data.caustic)}
-    other["denoised_caustic"][::2, ::2] = caustic.of_half_size(data)
+    by_oidn = Oidn(data)
+    other = {name: image + data.direct for name, image in denoised(by_oidn, made, DENOISED).items()}
+    other |= {"base": images["oidn_base"], "denoised_caustic": by_oidn.of_caustic}
+    other["denoised"] += by_oidn.of_caustic
     for name, image in other.items():
         assert job.set_layer(name, *place(image)) == OK, job.message()
     expected_image = reconstruct(stack_of(layers), "ngpt-combine").image

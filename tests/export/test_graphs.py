@@ -13,9 +13,8 @@ from onnx.reference import ReferenceEvaluator
 from onnx.reference.op_run import OpRun
 
 from ngpt.classical.leastsquares import robust_mean
-from ngpt.denoisers import caustic as numpy_caustic
 from ngpt.export.builder import FLOAT, Graph, choose, op, repeat
-from ngpt.export.graphs import caustic, transfer, variances
+from ngpt.export.graphs import transfer, variances
 from ngpt.export.graphs.model import _OperatorsOfHeads
 from ngpt.network import transfer as torch_transfer
 from ngpt.network.heads import Direct, Kernels, Mixture, Pyramid, Residual
@@ -45,17 +44,6 @@ def test_transfer_is_exact_to_rounding(name):
     x = np.concatenate([-x, x])
     expected = getattr(torch_transfer, name)(torch.from_numpy(x)).numpy()
     assert np.allclose(evaluate(getattr(transfer, name), x), expected, rtol=1e-6, atol=0)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (2, 3), (7, 6), (8, 10)])
-def test_half_the_size_and_back_as_by_numpy(size):
-    image = np.random.default_rng(0).random((1, 3, *size), np.float32)
-    half, whole = evaluate(lambda x: (caustic.halved(x), caustic.doubled(caustic.halved(x))), image)
-    expected = numpy_caustic.halved(image[0].transpose(1, 2, 0))
-    doubled = numpy_caustic.doubled(expected)[: size[0], : size[1]]
-    assert half.shape == whole.shape == image.shape
-    assert np.allclose(half[0, :, ::2, ::2], expected.transpose(2, 0, 1), rtol=1e-6)
-    assert np.allclose(whole[0], doubled.transpose(2, 0, 1), rtol=1e-5)
 
 
 @pytest.mark.parametrize("values", [[0.0], [1, 2, 3], [1] * 500 + [1e12], [1e30, 1e30, 0], [0] * 300 + [5]])

@@ -20,7 +20,6 @@ from networks import ALL, GRAPHED, plain, untrained
 from scipy.ndimage import uniform_filter
 
 from export.__main__ import main
-from ngpt.denoisers import caustic
 from ngpt.export.network import network_model, statistics_model
 from ngpt.export.vector import quiet
 from ngpt.methods import reconstruct
@@ -136,18 +135,17 @@ def assert_close(ours, theirs, tolerance=1e-4):
 @pytest.fixture
 def other_denoiser(monkeypatch):
     """In OIDN's place, which is not everywhere: a blur. Returns the images of it that a network may be given."""
-    for module in (inputs, caustic):
-        monkeypatch.setattr(module, "oidn", lambda data, *_: uniform_filter(data.image, (3, 3, 1)))
+    monkeypatch.setattr(inputs, "oidn", lambda data, *_: uniform_filter(data.image, (3, 3, 1)))
 
     def images(layers, config):
         data = repair(stack_of(layers), config.reads_gradients)
         base = inputs.base_image(data, config.base) if config.base else None
-        made = inputs.denoised(inputs.Oidn(data), base, config.layers)
-        made = {name: planes(image + data.direct) for name, image in made.items()}
-        if data.caustic is not None:
-            made["denoised_caustic"] = np.full_like(layers["caustic"], np.nan)
-            made["denoised_caustic"][..., ::2, ::2] = planes(caustic.of_half_size(data))
-        return made
+        by_oidn = inputs.Oidn(data)
+        light = np.zeros_like(data.image) if data.caustic is None else by_oidn.of_caustic
+        made = {name: image + data.direct for name, image in inputs.denoised(by_oidn, base, config.layers).items()}
+        if "denoised" in made:
+            made["denoised"] += light
+        return {name: planes(image) for name, image in (made | {"denoised_caustic": light}).items()}
 
     return images
 
@@ -180,7 +178,8 @@ def test_the_shipped_file_is_that_of_the_shipped_weights(fast, layers, tolerance
 @pytest.mark.parametrize("name", ["ngpt-fast", "ngpt-combine", "ngpt-primal"])
 def test_an_export_of_today_gives_what_the_shipped_file_gives(name):
     layers = noisy(37, 53)
-    layers |= {other: k * layers["primal"] for other, k in (("denoised", 0.98), ("denoised_base", 0.99))}
+    others = ("denoised", 0.98), ("denoised_base", 0.99), ("denoised_caustic", 0.1)
+    layers |= {other: k * layers["primal"] for other, k in others}
     models = exported(FAST.with_name(f"{name}.safetensors")), WEIGHTS / f"{name}.onnx"
     today, shipped = (run(session(model), layers) for model in models)
     assert np.abs(today - shipped).max() <= 1e-6 * shipped.max()

@@ -14,6 +14,7 @@
 #include <list>
 #include <map>
 #include <ngpt.h>
+#include <numeric>
 
 using Image = std::vector<float>;  // pixels of three floats
 using Images = std::map<std::string, Image>;
@@ -33,13 +34,12 @@ public:
         return empty ? feature : filtered({{name, feature}}, false, OIDN_QUALITY_BALANCED);
     }
 
-    // An image, "color", with features that count as clean, or do not: of all pixels, or of every `step`th of both axes.
-    Image filtered(Images images, bool clean, OIDNQuality quality, int step = 1) {
+    // An image, "color", with features that count as clean, or a feature by itself.
+    Image filtered(Images images, bool clean, OIDNQuality quality) {
         OIDNFilter filter = oidnNewFilter(device_, "RT");
         Image output(images.begin()->second.size());
         const auto set = [&](const char *name, Image &image) {
-            oidnSetSharedFilterImage(filter, name, image.data(), OIDN_FORMAT_FLOAT3, (width_ + step - 1) / step,
-                                     (height_ + step - 1) / step, 0, 12 * step, 12 * step * width_);
+            oidnSetSharedFilterImage(filter, name, image.data(), OIDN_FORMAT_FLOAT3, width_, height_, 0, 0, 0);
         };
         for (auto &[name, image] : images) set(name.c_str(), image);
         set("output", output);
@@ -63,12 +63,15 @@ private:
     }
 };
 
-// The light at even pixels, of which there is none below 0.
-double light(const Image &image, int width) {
-    double sum = 0;
-    for (size_t i = 0; i < image.size(); i++)
-        if (i / 3 % width % 2 == 0 && i / 3 / width % 2 == 0) sum += std::max(image[i], 0.0f);
-    return sum;
+// What OIDN has made of `light`, with what it took for noise given back, and nothing below zero where no light is.
+Image given_back(Image found, const Image &light) {
+    const float least = std::min(0.0f, *std::min_element(light.begin(), light.end()));
+    for (float &value : found) value = std::max(value, least);
+    const auto sum = [](const Image &image) { return std::accumulate(image.begin(), image.end(), 0.0); };
+    const double before = sum(light), after = sum(found);
+    if (before > 0 && after > 0)
+        for (float &value : found) value *= float(std::min(before / after, 4.0));
+    return found;
 }
 
 int main(int count, char **arguments) try {
@@ -93,7 +96,7 @@ int main(int count, char **arguments) try {
         check(ngpt_set_layer(job, name, layers.back().data(), NGPT_FLOAT, channels, plane, 4, 4 * width));
     }
     Images made;
-    for (const char *name : {"primal", "albedo", "normal", "base", "caustic", "caustic_albedo", "caustic_normal"}) {
+    for (const char *name : {"primal", "albedo", "normal", "base", "caustic"}) {
         Image image(size_t(3) * width * height);
         if (ngpt_set_output(job, (std::string("oidn_") + name).c_str(), image.data(), NGPT_FLOAT, 3, 0, 0, 0) == NGPT_OK)
             made[name] = std::move(image);
@@ -115,13 +118,11 @@ int main(int count, char **arguments) try {
         give("denoised_base", denoised("base", OIDN_QUALITY_FAST));
         give("base", made["base"]);
     }
-    if (const double before = light(made["caustic"], width); before > 0) {
-        Image found = oidn.filtered({{"color", made["caustic"]}, {"albedo", made["caustic_albedo"]},
-                                     {"normal", made["caustic_normal"]}}, false, OIDN_QUALITY_HIGH, 2);
-        // What OIDN took for noise is given back.
-        const double after = light(found, width);
-        for (float &value : found) value *= after > 0 ? float(std::min(before / after, 4.0)) : 1;
-        give("denoised_caustic", found);
+    if (made.count("caustic")) {
+        // Most images have no such light.
+        const Image &light = made["caustic"];
+        const bool dark = std::all_of(light.begin(), light.end(), [](float x) { return x == 0; });
+        give("denoised_caustic", dark ? light : given_back(denoised("caustic", OIDN_QUALITY_HIGH), light));
     }
     Image image(size_t(3) * width * height);
     check(ngpt_set_output(job, "image", image.data(), NGPT_FLOAT, 3, 0, 0, 0));

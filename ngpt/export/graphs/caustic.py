@@ -79,22 +79,3 @@ def _surfaces(layers: Mapping[str, Value], depth: Value) -> Value:
     if "depth" in layers:
         planes.append(op.Log(op.Max(layers["depth"], depth * FARTHEST + 1e-37)))
     return op.Concat(*planes, axis=1) if planes else channels(layers["caustic"], 0, 1) * 0.0
-
-
-def halved(layer: Value) -> Value:
-    """The means of 2x2 pixels, in each of the four; sides of odd length have their last pixels twice."""
-    size = op.Shape(layer, start=2, end=4)
-    padded = op.Pad(layer, op.Concat([0, 0], op.Mod(size, [2, 2]), axis=0), None, [2, 3], mode="edge")
-    means = op.AveragePool(padded, kernel_shape=[2, 2], strides=[2, 2])
-    return _twice(means, size, mode="nearest", nearest_mode="floor", coordinate_transformation_mode="asymmetric")
-
-
-def doubled(light: Value) -> Value:
-    """An image by what its even pixels hold, bilinear; light is not negative."""
-    size = op.Shape(light, start=2, end=4)
-    even = op.Slice(op.Max(light, 0.0), [0, 0], size, [2, 3], [2, 2])
-    return _twice(even, size, mode="linear")
-
-
-def _twice(image: Value, size: Value, **how: str) -> Value:
-    return op.Slice(op.Resize(image, None, np.array([1, 1, 2, 2], np.float32), **how), [0, 0], size, [2, 3])

@@ -5,10 +5,8 @@
             -> image
 
 All of it is float32, whatever the network is in. Images come and go with the emission that the camera sees directly,
-and with the light that gradients hold nothing of.
+and with the light that gradients hold nothing of: another denoiser's image of it, or else what a diffusion makes of it.
 """
-
-from functools import partial
 
 import numpy as np
 import onnx
@@ -27,6 +25,8 @@ from ngpt.network.model import DARK, HUGE, WINDOW
 _VARIANCES = ("primal_var", "dx_var", "dy_var")
 # Light that may be apart, and its variance.
 _APART = ("caustic", "caustic_var")
+# Another denoiser's image of that light, which its image of the primal includes.
+_FOUND = "denoised_caustic"
 
 
 class _OperatorsOfHeads(Operators):
@@ -47,9 +47,11 @@ class _OperatorsOfHeads(Operators):
 def layers(config: ModelConfig) -> tuple[str, ...]:
     """The inputs of the graph of such a model, in order."""
     needed = ("direct", *config.needs, *config.layers)
-    if config.reads_gradients or "primal_var" in needed:
+    if by_denoiser(config):
+        needed += ("caustic", _FOUND)
+    elif config.reads_gradients or "primal_var" in needed:
         needed += _APART
-    return tuple(name for name in (LAYERS[0], "direct", *LAYERS[1:], *_APART, *DENOISED) if name in needed)
+    return tuple(name for name in (LAYERS[0], "direct", *LAYERS[1:], *_APART, *DENOISED, _FOUND) if name in needed)
 
 
 def optional(config: ModelConfig) -> tuple[str, ...]:
@@ -58,7 +60,7 @@ def optional(config: ModelConfig) -> tuple[str, ...]:
 
 
 def by_denoiser(config: ModelConfig) -> bool:
-    """Whether another denoiser's image of ``caustic`` may take the place of the diffusion."""
+    """Whether another denoiser's image of ``caustic`` takes the place of the diffusion."""
     return config.reads_gradients and any(name in config.layers for name in DENOISED)
 
 
@@ -96,13 +98,10 @@ def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto
         logarithm = base + (logarithm - base) * share
     bounded = op.Min(op.Max(logarithm, signed_log(low / scale)), signed_log(high / scale))
     image = signed_exp(bounded) * scale + data.direct
-    if config.reads_gradients:
-        light = partial(caustic.spread, data.layers, depth)
-        if by_denoiser(config):
-            found = graph.input("denoised_caustic", ("tiles", 3, "light_height", "light_width"), np.zeros((1, 3, 0, 0)))
-            image += choose(op.Equal(op.Size(found), 0), light, lambda: caustic.doubled(found), IMAGE)
-        else:
-            image += light()
+    if by_denoiser(config):
+        image += data.layers[_FOUND]
+    elif config.reads_gradients:
+        image += caustic.spread(data.layers, depth)
     graph.output("image", image, IMAGE)
     return graph
 
@@ -118,14 +117,13 @@ def statistics(config: ModelConfig) -> Graph:
     shared = _statistics(config, data)
     graph.output("statistics", shared, (5,))
     if denoised:
-        graph.output("oidn_primal", data.layers["primal"] + data.direct, IMAGE)
+        light = data.layers["primal"]
+        if by_denoiser(config):
+            light += data.layers["caustic"]
+            graph.output("oidn_caustic", op.Identity(data.layers["caustic"]), IMAGE)
+        graph.output("oidn_primal", light + data.direct, IMAGE)
         graph.output("oidn_albedo", op.Clip(data.layers["albedo"], 0.0, 1.0), IMAGE)
         graph.output("oidn_normal", op.Identity(data.layers["normal"]), IMAGE)
-    if by_denoiser(config):
-        albedo = op.Clip(caustic.halved(data.layers["albedo"]), 0.0, 1.0)
-        graph.output("oidn_caustic", caustic.halved(data.layers["caustic"]), IMAGE)
-        graph.output("oidn_caustic_albedo", albedo, IMAGE)
-        graph.output("oidn_caustic_normal", caustic.halved(data.layers["normal"]), IMAGE)
     if "denoised_base" in denoised:
         scale, _, _, _, mean = _numbers(shared)
         graph.output("oidn_base", _base(data, scale, mean) * scale + data.direct, IMAGE)
@@ -142,6 +140,8 @@ def _repaired(raw: dict[str, Value], config: ModelConfig) -> Repaired:
     for name in DENOISED:
         if name in data.layers:
             data.layers[name] = clean(raw[name] - data.direct)
+    if "denoised" in data.layers and _FOUND in data.layers:
+        data.layers["denoised"] = clean(data.layers["denoised"] - data.layers[_FOUND])
     return data
 
 
