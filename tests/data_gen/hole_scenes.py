@@ -17,7 +17,8 @@ def curtains(depth=-1):
     return _scene(
         depth,
         _BESIDE,
-        **_room(1.5, _diffuse(0.5, 0.45, 0.4)),
+        # Gloss: the density of a direction depends on where a path comes from.
+        **_room(1.5, {"type": "roughconductor", "alpha": 0.25, "specular_reflectance": 0.6}),
         sky={"type": "constant", "radiance": 0.05},
         sun={"type": "directional", "direction": [0.25, -1, -0.6], "irradiance": _rgb(3, 2.5, 2)},
         bulb={"type": "point", "position": [-1.0, 1.9, 0.9], "intensity": _rgb(1, 1.5, 2)},

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hole_scenes import curtains
+from hole_scenes import curtains, curtains_in_fog
 from unbiased import load, render_ours
 
 pytest.importorskip("mitsuba")
@@ -44,3 +44,12 @@ def test_what_does_not_know_its_share_is_no_hole(renderer):
 
     # Where there are none, nothing of them is compiled.
     assert holes(mask) and holes({"type": "diffuse"}) is None and holes(unknown[0]) is None
+
+
+@pytest.mark.slow
+def test_in_fog(renderer):
+    """Rays go on through masks, panes and the boundaries of media, in the medium that is behind each."""
+    scene = load(renderer, curtains_in_fog, (16, 16))
+    theirs = np.stack([np.array(renderer.render(scene, spp=256, seed=1000 + i)) for i in range(12)])
+    ours = np.stack([stack["primal"] for stack in render_ours(scene, "gpt", 12, 64)])
+    assert z_test(ours, theirs).passed
