@@ -135,7 +135,7 @@ def test_a_plan_fits_into_the_time_and_leaves_the_scene_as_it_was(renderer, monk
 def test_stop_ends_a_pilot_and_the_render_begins(renderer, monkeypatch):
     scene = load(renderer, "diffuse", (48, 32))
     told = []
-    found = plans.plan(scene, 200.0, pilot=Pilot(said=told.append, stop=lambda: len(told) > 1))
+    found = plans.plan(scene, 4000.0, pilot=Pilot(said=told.append, stop=lambda: len(told) > 1))
     assert [line.split(";")[0] for line in told] == ["pilot: trying 'primal'", "pilot: trying 'bdpt'"]
     assert (found.sampler, found.method) == ("primal", "oidn") and found.render > 0
 
