@@ -29,6 +29,7 @@ from ngpt.errors import NgptError, WrongUse
 from ngpt.measure.metrics import EPSILON, trimmed_mean
 from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
+from ngpt.subpixels import cropped, subpixels
 from ngpt.system.late import ndimage
 
 # Samples of a pixel come in blocks of a packet of rays, so that no pixel's bits depend on which others are rendered.
@@ -173,7 +174,9 @@ def seconds_to_assess(stack: GradientStack, method: str, clock: Callable[[], flo
     seconds = 0.0
     for side in (_PART // 4, _PART):  # The first time, networks are loaded.
         rows, columns = (slice(max(0, (n - side) // 2), (n + side) // 2) for n in (stack.height, stack.width))
-        part = GradientStack({name: stack[name][rows, columns] for name in stack.names}, stack.attributes)
+        fine = stack.fine and cropped(stack.fine, (rows, columns), subpixels(stack.fine, stack.width))
+        layers = {name: stack[name][rows, columns] for name in stack.names}
+        part = GradientStack(layers, stack.attributes, fine=fine)
         start = clock()
         assess(part, method)
         seconds = (clock() - start) * (stack.width * stack.height) / (part.width * part.height)

@@ -60,6 +60,18 @@ def stored(name: str, layer: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(layer, np.float32)
 
 
+def cropped(fine: Mapping[str, np.ndarray], window: tuple[slice, slice], k: int) -> dict[str, np.ndarray]:
+    """The K x K subpixels of the pixels in these rows and columns."""
+    rows_and_columns = within(window, k)
+    return {name: np.ascontiguousarray(layer[rows_and_columns]) for name, layer in fine.items()}
+
+
+def within(window: tuple[slice, slice], k: int) -> tuple[slice, slice]:
+    """The rows and columns of the K x K subpixels of such pixels."""
+    rows, columns = (slice(k * part.start, k * part.stop) for part in window)
+    return rows, columns
+
+
 Part = tuple[Mapping[str, np.ndarray], np.ndarray, tuple[slice, slice]]
 
 
@@ -73,7 +85,7 @@ def merged(parts: Sequence[Part], names: Sequence[str], size: tuple[int, int]) -
     for name in names:
         total, weight = (np.zeros((k * size[1], k * size[0], 3)) for _ in range(2))
         for fine, counts, rows_and_columns in parts:
-            where = tuple(slice(k * part.start, k * part.stop) for part in rows_and_columns)
+            where = within(rows_and_columns, k)
             w = spread(counts, k) * ~np.isnan(fine[name])
             total[where] += np.where(w > 0, w * fine[name].astype(np.float64), 0)
             weight[where] += w

@@ -14,7 +14,7 @@ from data_gen.film.gradient_film import bytes_of_shared
 from data_gen.passes import block_of_samples, least_memory
 from data_gen.paths.camera import bytes_of_rays
 from data_gen.paths.streams import first_round
-from data_gen.samplers.registry import Entry
+from data_gen.samplers.registry import Sampler
 from data_gen.samplers.shared import why_not_shared
 from data_gen.scenes.facts import Facts
 from data_gen.tails.cache import LEAST_MIB, MIB
@@ -23,7 +23,7 @@ from data_gen.tails.schedule import enough
 
 class Sharing(NamedTuple):
     """``never``  why no paths with these options can share their tails in this scene, "" if they can
-    ``not_now``  why those of this render should not, or cannot, "" if they should
+    ``not_now``  why the paths of this render should not or cannot share them, "" if they should
     ``rest``     the budget without what the cache takes
     """
 
@@ -32,7 +32,7 @@ class Sharing(NamedTuple):
     rest: Budget
 
 
-def sharing_of(sensor: mi.Sensor, entry: Entry, facts: Facts, settings: Mapping[str, Any], budget: Budget) -> Sharing:
+def sharing_of(sensor: mi.Sensor, entry: Sampler, facts: Facts, settings: Mapping[str, Any], budget: Budget) -> Sharing:
     """Whether a render may share, of a sampler with the option ``tails``.
 
     What fits into some memory must fit into more: the cache is there only where film and paths fit beside it.
@@ -41,7 +41,7 @@ def sharing_of(sensor: mi.Sensor, entry: Entry, facts: Facts, settings: Mapping[
     if facts.integrator != "path":
         never = f"the integrator is '{facts.integrator}', and only paths of 'path' do"
     net = first_round(settings.get("points", "independent"), budget.spp)
-    film = GradientFilm(*(int(n) for n in sensor.film().crop_size()), net=net)
+    film = GradientFilm(*(int(n) for n in sensor.film().crop_size()), net=net, gradients=entry.film_of_gradients)
     own = MIB + bytes_of_shared(film.pixels) // 2**20
     lanes = film.pixels * min(block_of_samples(film.pixels), budget.spp or 1 << 31)
     needed = max(LEAST_MIB, own + least_memory(film, lanes, entry.lane_bytes + bytes_of_rays(sensor)))

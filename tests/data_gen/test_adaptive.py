@@ -13,6 +13,7 @@ import ngpt
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
+from ngpt.subpixels import means
 
 pytest.importorskip("mitsuba")
 
@@ -112,6 +113,17 @@ def test_what_a_choice_takes_is_known_ahead(renderer, monkeypatch):
     monkeypatch.setattr(time, "perf_counter", lambda: 2e-5 * sum(calls))
     assert adaptive.seconds_to_assess(stack, "primal") == pytest.approx(0.16) and calls == [100, 1600]
     assert adaptive.seconds_to_assess(GradientStack({"primal": stack["primal"][:79, :80]}), "primal") == 0.0
+
+
+def test_what_a_choice_takes_includes_subpixels(renderer, monkeypatch):
+    parts = []
+    monkeypatch.setattr(adaptive, "assess", lambda stack, method: parts.append(stack))
+    monkeypatch.setattr(adaptive, "_PART", 40)
+    y, x = np.mgrid[:160, :200].astype(np.float32)
+    fine = {"primal": np.repeat((1000 * y + x)[..., None], 3, axis=-1)}
+    adaptive.seconds_to_assess(GradientStack({"primal": means(fine["primal"], 2)}, fine=fine), "oidn")
+    assert [part.fine["primal"].shape for part in parts] == [(20, 20, 3), (80, 80, 3)]
+    assert all(np.array_equal(means(part.fine["primal"], 2), part["primal"]) for part in parts)
 
 
 def test_samples_go_where_the_error_is(renderer, converged):
