@@ -36,6 +36,8 @@ from bench.common import blocks, metadata, renderer, save
 from bench.tails import (
     TAILS,
     WARM_SPP,
+    add_references,
+    check_references,
     clean_image,
     digits,
     marked,
@@ -56,8 +58,7 @@ HEAD += ["error", "median", "worst", "worst / median", "whole s", "error at equa
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="none: only the table")
-    parser.add_argument("--references", type=Path, metavar="FOLDER")
-    parser.add_argument("--reference-spp", type=int, default=256, help="of each half that is made")
+    add_references(parser)
     parser.add_argument("--variant")
     parser.add_argument("--size", default="320x180")
     parser.add_argument("--spp", type=int, nargs="+", default=[16, 64])
@@ -67,8 +68,9 @@ def main() -> None:
     parser.add_argument("--code", default="", help=argparse.SUPPRESS)
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/seeds.json"))
     args = parser.parse_args()
-    if args.scenes and (not args.references or min(args.seeds, args.paths_seeds) < 2):
-        parser.error("give the folder of --references, and two seeds or more")
+    check_references(parser, args)
+    if args.scenes and min(args.seeds, args.paths_seeds) < 2:
+        parser.error("give two seeds or more")
     result = {"benchmark": "seeds", "metadata": metadata("mitsuba", "drjit", "mitsuba-oidn"), "cells": []}
     if args.output.exists():
         result["cells"] = json.loads(args.output.read_text())["cells"]

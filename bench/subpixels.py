@@ -11,7 +11,7 @@ denoise are in WAYS. Each cell has, of each way:
 
 and the noise of features, with whether that is little beside the image's (``ngpt.denoisers.clean``).
 
-In the table all are over those of ``BASE``: medians over seeds.
+The table divides each value by that of ``BASE`` and gives medians over seeds.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from typing import Any
 import ngpt
 from bench.common import metadata, renderer, save
 from bench.seeds import opened
-from bench.tails import processor_seconds, reference_of
+from bench.tails import add_references, check_references, processor_seconds, reference_of
 from ngpt.denoisers.clean import features_are_clean
 from ngpt.evaluation.references import Reference
 from ngpt.layers import FEATURE_NOISE
@@ -52,16 +52,14 @@ CELL = ("scene", "size", "spp", "seed")
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="none: only the table")
-    parser.add_argument("--references", type=Path, metavar="FOLDER")
-    parser.add_argument("--reference-spp", type=int, default=256, help="of each half that is made")
+    add_references(parser)
     parser.add_argument("--size", default="320x180")
     parser.add_argument("--spp", type=int, nargs="+", default=[4, 8, 16, 32, 64, 128])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--ways", nargs="+", default=list(WAYS), choices=list(WAYS))
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/subpixels.json"))
     args = parser.parse_args()
-    if args.scenes and not args.references:
-        parser.error("give the folder of --references")
+    check_references(parser, args)
     cells = json.loads(args.output.read_text())["cells"] if args.output.exists() else []
     result = {"benchmark": "subpixels", "metadata": metadata("mitsuba", "drjit", "mitsuba-oidn"), "cells": cells}
     known = {tuple(cell[name] for name in CELL) for cell in cells}

@@ -58,11 +58,20 @@ WARM_SPP = 9
 CELL = ("scene", "size", "sampler", "tails", "spp", "seed")
 
 
+def add_references(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--references", type=Path, metavar="FOLDER")
+    parser.add_argument("--reference-spp", type=int, default=256, help="of each half that is made")
+
+
+def check_references(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    if args.scenes and not args.references:
+        parser.error("give the folder of --references")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="files or built-in names; none: only the tables")
-    parser.add_argument("--references", type=Path, metavar="FOLDER")
-    parser.add_argument("--reference-spp", type=int, default=256, help="of each half that is made")
+    add_references(parser)
     parser.add_argument("--size", default="640x360")
     parser.add_argument("--tails", nargs="+", default=list(TAILS), choices=list(TAILS))
     parser.add_argument("--samplers", nargs="+", default=list(METHODS), choices=list(METHODS))
@@ -71,8 +80,7 @@ def main() -> None:
     parser.add_argument("--groups", nargs="*", default=[], metavar="NAME=SCENE,...", help="scenes to take means over")
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/tails.json"))
     args = parser.parse_args()
-    if args.scenes and not args.references:
-        parser.error("give the folder of --references")
+    check_references(parser, args)
     result = {
         "benchmark": "tails",
         "metadata": metadata("mitsuba", "drjit", "mitsuba-oidn", "onnxruntime"),

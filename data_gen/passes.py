@@ -128,8 +128,8 @@ def render_passes(
         if seconds is None:
             watch.progress(film.samples, total)
         else:
-            far = end_of_time(now - start, seconds, film.samples >= total) if finished else None
-            watch.progress(*far or progress_of_time(now - start, seconds))
+            gone, early = now - start, film.samples >= total
+            watch.progress(*(end_of_time(gone, seconds, early) if finished else progress_of_time(gone, seconds)))
 
     def next_pass(size: int) -> int:
         """Samples of the next pass, with blocks of ``size`` samples; 0 for none."""
@@ -166,6 +166,7 @@ def render_passes(
             camera = CameraSamples(sensor, seed, n, film.samples, min(n, size), net=net)
             film.begin_pass(camera)
             sample(camera, film)
+            # The film takes the pass with nothing else in memory.
             del camera
             film.end_pass(min(n, size))
             dr.sync_thread()
@@ -190,9 +191,11 @@ def progress_of_time(gone: float, seconds: float) -> tuple[int, int]:
 
 
 def end_of_time(gone: float, seconds: float, early: bool) -> tuple[int, int]:
-    """The same at its end; one that was there ``early`` took no more seconds than are gone."""
+    """What is reported when such a render ends: all of its seconds, or only those gone if it ended ``early``."""
     limit = math.ceil(seconds)
-    return (limit := max(1, min(limit, math.ceil(gone))) if early else limit), limit
+    if early:
+        limit = max(1, min(limit, math.ceil(gone)))
+    return limit, limit
 
 
 def growing_block(pixels: int, done: int, block: int) -> int:
@@ -260,8 +263,7 @@ def film_of(width: int, height: int, memory: int, pixel_bytes: int, *, subpixels
     k = subpixels
     while True:
         film = GradientFilm(width, height, subpixels=k, **how)
-        pixels = 1 << (film.pixels - 1).bit_length()
-        if k == 1 or film.bytes + pixel_bytes * pixels <= memory * 2**20:
+        if k == 1 or least_memory(film, film.pixels, pixel_bytes) <= memory:
             break
         k //= 2
     if k < subpixels:

@@ -8,7 +8,8 @@ import numpy as np
 
 _PIXELS = 1 << 12
 # Above this share of noise in the variance of features, they do not pay. Outdoors they cost as much as half to all of
-# the rest of a sample. Measured at equal time: product shots with .03 have 1.1 to 1.25 times the error with features.
+# the rest of a sample. A product shot with .03 had 1.1 times the error with features, after 1.1 times the seconds
+# (docs/start/which-sampler.md).
 _NOISE = 0.01
 
 

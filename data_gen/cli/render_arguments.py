@@ -112,8 +112,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=subpixels,
         default="auto",
         metavar="K",
-        help="keep 1, 2x2 or 4x4 subpixels of each pixel, of which OIDN makes a better image: 1, 2, 4, auto "
-        "(where they are known to help; default)",
+        help="keep KxK subpixels of each pixel, from which OIDN makes a better image: 1, 2, 4, or auto "
+        "(2 where that is known to help; default)",
     )
     parser.add_argument(
         "--diagnostics",

@@ -75,6 +75,14 @@ class Holes:
         some = [bsdf for bsdf in bsdfs if bsdf is not None and has_holes(bsdf) and knows(bsdf)]
         return cls(some) if some else None
 
+    def behind(
+        self, si: mi.SurfaceInteraction3f, T: mi.Spectrum, left: mi.UInt32, going: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.UInt32, mi.Bool]:
+        """T behind the surface at ``si``, how many holes may be ``left`` there, and which rays are still ``going``."""
+        T = dr.select(going, mi.Spectrum(T * dr.select(left > 0, self.share(si, going), 0)), T)
+        going = going & (dr.max(T) > 0)
+        return T, dr.select(going, left - 1, left), going
+
     @dr.syntax
     def transmittance(self, scene, ray: mi.Ray3f, target: mi.Point3f, most, active: mi.Bool) -> mi.Spectrum:
         """T along ``ray`` to the ``target``; 0 where it is blocked, or leads through more than ``most`` holes."""
@@ -84,9 +92,7 @@ class Holes:
             hit = scene.ray_intersect_preliminary(ray, active=going)
             going &= hit.is_valid()
             si = hit.compute_surface_interaction(ray, mi.RayFlags.All, going)
-            T = dr.select(going, mi.Spectrum(T * dr.select(left > 0, self.share(si, going), 0)), T)
-            going &= dr.max(T) > 0
-            left = dr.select(going, left - 1, left)
+            T, left, going = self.behind(si, T, left, going)
             ray = si.spawn_ray_to(target)
         return T
 

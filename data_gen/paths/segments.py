@@ -175,9 +175,7 @@ def through_holes(
         T = dr.select(going, mi.Spectrum(T * piece), T)
         going &= hit.is_valid()
         si = hit.compute_surface_interaction(last, mi.RayFlags.All, going)
-        T = dr.select(going, mi.Spectrum(T * dr.select(left > 0, holes.share(si, going), 0)), T)
-        going &= dr.max(T) > 0
-        left = dr.select(going, left - 1, left)
+        T, left, going = holes.behind(si, T, left, going)
         ray = si.spawn_ray_to(target)
         medium = dr.select(si.is_medium_transition(), si.target_medium(ray.d), there)
         if dr.hint(key is not None, mode="scalar"):

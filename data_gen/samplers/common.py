@@ -16,6 +16,7 @@ from data_gen.passes import SamplePass, render_passes
 from data_gen.paths import segments
 from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.paths.frozen import Frozen
+from data_gen.paths.holes import has_holes
 from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.media import Media
 from data_gen.paths.walk import Limits
@@ -26,6 +27,7 @@ from data_gen.scenes.facts import Facts, scene_facts, shapes_of
 from data_gen.scenes.integrators import own_estimate
 from data_gen.scenes.lamps import Places, weighed
 from data_gen.scenes.load import check_scene, path_depths, reference_integrator
+from data_gen.scenes.lost import without_size
 from ngpt.layers import LAYERS
 from ngpt.options import written
 
@@ -40,9 +42,9 @@ def loses_light(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> bool:
     if integrator.class_name() != "PathIntegrator":
         return False
     found = scene.environment() or integrator.hide_emitters
-    if found and not any(mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta) for emitter in scene.emitters()):
+    if found and not without_size(scene):
         return False
-    return any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in shapes_of(scene) if shape.bsdf())
+    return any(has_holes(shape.bsdf()) for shape in shapes_of(scene) if shape.bsdf())
 
 
 def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[..., mi.Spectrum]:

@@ -13,7 +13,7 @@ _SHARP = ("SmoothConductor", "SmoothDielectric")
 _TINY = 1 / 500
 # By the part of its class's name that all kinds of it have: the disk of a sun fills 7e-5 of a hemisphere.
 _SUN = "Sunsky"
-# Vertex normals are far from those of faces below this mean cosine, of 14 degrees.
+# Below this mean cosine, that of 14 degrees, vertex normals are far from face normals.
 _BENT = 0.97
 
 
@@ -38,7 +38,7 @@ def has_holes(scene: mi.Scene) -> bool:
 
 
 def bent_lamp(scene: mi.Scene) -> mi.Shape | None:
-    """A lamp whose vertex normals are far from those of its faces.
+    """The first lamp that has vertex normals far from its face normals, or None.
 
     Mitsuba samples it by one normal and weighs it by another: its issue 1952.
     """
