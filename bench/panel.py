@@ -1,0 +1,264 @@
+"""A panel of 16 scenes of all kinds: are the default and the shipped methods still as good as the numbers in git?
+
+    python -m bench.panel                          measures, compares to bench/results/panel.json, exits with 1 if worse
+    python -m bench.panel --scenes diffuse haze    only these
+    python -m bench.panel --baseline               measures three seeds, which become the numbers in git and the page's
+    python -m bench.panel --table                  prints the tables of docs/lab/panel.md and measures nothing
+
+A cell is a scene, a number of samples and a pipeline, named SAMPLER+METHOD:
+
+    auto+auto        what `render_scene` and `reconstruct` take by default
+    mitsuba+oidn     the rival: OIDN on Mitsuba's own points and lamps and whole paths (``bench.tails.RIVAL``)
+    primal+oidn      the rival of whatever has gradients: OIDN on our samples
+    all others       the methods that ship
+
+The error is ``bench.tails.steady_error``, by two halves of a reference; FLIP is over their mean. Seconds are
+of processors, of render and method, with compiled kernels. References are kept in the folder --cache, and made there
+where they are missing. What is worse than before, and why noise is not, is in ``bench.verdict``.
+"""
+
+import argparse
+import gc
+import json
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import ngpt
+from bench import verdict
+from bench.common import metadata, renderer, save, write_page
+from bench.seeds import opened
+from bench.tails import RIVAL, WARM_SPP, clean_image, marked, over, processor_seconds, reference_of, steady_error
+from ngpt.errors import NgptError
+from ngpt.evaluation.curves import error_at
+from ngpt.evaluation.references import Reference
+from ngpt.measure.averages import geometric_mean
+from ngpt.measure.flip import flip
+from ngpt.stack import GradientStack
+from ngpt.system.writing import markdown_table
+
+ROOT = Path(__file__).parents[1]
+RESULT = ROOT / "bench" / "results" / "panel.json"
+PAGE = ROOT / "docs" / "lab" / "panel.md"
+MARKS = ("<!-- python -m bench.panel: tables -->", "<!-- tables end -->")
+SIZE, SPP = (192, 108), (4, 16, 64)
+METHODS = {
+    "auto": ["auto"],
+    "gpt": ["ngpt-combine", "ngpt-fast"],
+    "primal": ["ngpt-primal", "oidn"],
+    "mitsuba": ["oidn"],
+}
+DEFAULT = "auto+auto"
+OURS = [f"{sampler}+{method}" for sampler in ("gpt", "primal") for method in METHODS[sampler]]
+PIPELINES = [DEFAULT, *OURS, "mitsuba+oidn"]
+SEEDS = tuple(range(1, 1 + verdict.LEAST_SEEDS))
+EQUAL = ("samples", "seconds")
+# Where the halves of the reference cannot tell how small an error is
+_LEAST_ERROR = 1e-6
+
+
+class Case(NamedTuple):
+    """What a scene is in the panel for, what to open it by, and the samples of each half of its reference."""
+
+    kind: str
+    scene: str
+    reference_spp: int = 256
+
+
+def _file(name: str) -> str:
+    return str(ROOT / "bench" / "scenes" / name / "scene.xml")
+
+
+CASES = {
+    "diffuse": Case("room", "diffuse"),
+    "glossy": Case("room of metal and mirrors", "glossy"),
+    "checks": Case("textures", _file("checks")),
+    "crowd": Case("instances", _file("crowd")),
+    "lampshade": Case("hidden lamp", _file("lampshade")),
+    "ajar": Case("light through a gap", _file("ajar"), 512),
+    "trellis": Case("masks", _file("trellis")),
+    "environment": Case("sky", "environment"),
+    "lens": Case("focus blur", "lens"),
+    "product": Case("product shot", _file("product"), 512),
+    "mirror-caustic": Case("caustics in a mirror", _file("mirror-caustic"), 1024),
+    "haze": Case("fog", "haze"),
+    "smoke": Case("smoke", "smoke"),
+    "cloud": Case("cloud", "cloud"),
+    "generator-20261128-caustic": Case("glass, of the generator", "generator:20261128:caustic", 512),
+    "generator-20261129-mirrors": Case("mirrors, of the generator", "generator:20261129:mirrors"),
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=list(CASES), choices=list(CASES), metavar="SCENE")
+    parser.add_argument("--baseline", action="store_true", help="the cells of these scenes become the numbers in git")
+    parser.add_argument("--table", action="store_true", help="print the tables of the numbers in git")
+    parser.add_argument("--cache", type=Path, default=ROOT / "out" / "panel", help="folder for references")
+    args = parser.parse_args()
+    before = json.loads(RESULT.read_text())["cells"] if RESULT.exists() else []
+    if args.table:
+        print(text(before))
+        return 0
+    if args.baseline:
+        for found in measured(args.scenes, args.cache, SEEDS):
+            before = [cell for cell in before if cell["scene"] != found[0]["scene"]] + found
+            about = metadata("mitsuba", "drjit", "mitsuba-oidn", "onnxruntime")
+            save(RESULT, {"benchmark": "panel", "size": list(SIZE), "metadata": about, "cells": before})
+        write_page(PAGE, text(before), MARKS)
+        return 0
+    cells = [cell for found in measured(args.scenes, args.cache, SEEDS[:1]) for cell in found]
+    judged = verdict.compare(cells, before)
+    if worse := [each for each in judged if each.worse]:
+        print(f"{len(worse)} ratios are worse with one seed; measuring these scenes with all", flush=True)
+        scenes = args.scenes if any(each.key[0] == verdict.MEAN for each in worse) else {e.key[0] for e in worse}
+        for found in measured([name for name in args.scenes if name in scenes], args.cache, SEEDS[1:]):
+            cells = verdict.joined(cells, found)
+        judged = verdict.compare(cells, before)
+    print(text(cells), "", *ratio_table(judged), "", sep="\n")
+    worse = [each for each in judged if each.worse]
+    for each in worse:
+        limit = f"limit {verdict.LIMITS[each.value]:g}, {verdict.DEVIATIONS:g} deviations {each.reach:.2f}"
+        print(f"worse: {', '.join(each.key)}: {each.value} {each.ratio:.3f} times that of before ({limit})")
+    print(f"{len(worse)} of {len(judged)} ratios are worse beyond noise")
+    return 1 if worse else 0
+
+
+def measured(names: Sequence[str], cache: Path, seeds: Sequence[int]) -> Iterator[list[dict[str, Any]]]:
+    """The cells of each scene; then the time of all, without references, is printed."""
+    seconds = used = 0.0
+    for name in names:
+        loaded, reference = opened_with_reference(name, cache)
+        start, start_used = time.perf_counter(), processor_seconds()
+        yield cells_of(name, loaded, reference, seeds)
+        seconds, used = seconds + time.perf_counter() - start, used + processor_seconds() - start_used
+        print(f"{name}: {seconds:.0f} s in all, {used:.0f} s of processors", flush=True)
+
+
+def opened_with_reference(name: str, cache: Path) -> tuple[Any, Reference]:
+    """The loaded scene and its reference, which is rendered where the folder lacks it."""
+    load_scene, _ = renderer()
+    # A kernel knows the shapes of all scenes in memory.
+    gc.collect()
+    case = CASES[name]
+    width, height = SIZE
+    with opened(case.scene) as (_, file):
+        loaded = load_scene(file, SIZE)
+    wanted = argparse.Namespace(references=cache, size=f"{width}x{height}", reference_spp=case.reference_spp)
+    cache.mkdir(parents=True, exist_ok=True)
+    return loaded, reference_of(loaded, name, wanted)
+
+
+def cells_of(name: str, loaded: Any, reference: Reference, seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """The cells of a scene, with error, FLIP and seconds by seed."""
+    clean = clean_image(reference)
+    for sampler, methods in METHODS.items():
+        stack, _ = render(loaded, sampler, WARM_SPP, 0)
+        for method in methods:
+            ngpt.reconstruct(stack, method)
+    cells = []
+    for spp in SPP:
+        by_pipeline: dict[str, dict[str, Any]] = {pipeline: {} for pipeline in PIPELINES}
+        for seed in seeds:
+            for pipeline, values in of_seed(loaded, spp, seed, reference, clean).items():
+                for value, number in values.items():
+                    by_pipeline[pipeline].setdefault(value, {})[str(seed)] = number
+        cells += [{"scene": name, "spp": spp, "pipeline": each} | values for each, values in by_pipeline.items()]
+    return cells
+
+
+def of_seed(loaded: Any, spp: int, seed: int, reference: Reference, clean: np.ndarray) -> dict[str, dict[str, float]]:
+    """Values by pipeline. What the default takes is neither rendered nor denoised a second time."""
+    found: dict[str, dict[str, float]] = {}
+    stacks: dict[str, tuple[GradientStack, float]] = {}
+    for sampler, methods in METHODS.items():
+        stack, seconds = stacks.get(sampler) or render(loaded, sampler, spp, seed)
+        for method in methods:
+            if (pipeline := f"{sampler}+{method}") in found:
+                continue
+            start = processor_seconds()
+            result = ngpt.reconstruct(stack, method)
+            whole = seconds + processor_seconds() - start
+            error = max(steady_error(result.image, reference, clean), _LEAST_ERROR)
+            values = {"error": error, "FLIP": flip(result.image, reference.mean)[0], "seconds": whole}
+            found[pipeline] = {value: float(f"{number:.4g}") for value, number in values.items()}
+            if pipeline == DEFAULT:
+                taken = str(stack.attributes["ngpt:sampler"])
+                stacks[taken] = stack, seconds
+                found[f"{taken}+{result.method}"] = found[pipeline]
+    return {pipeline: found[pipeline] for pipeline in PIPELINES}
+
+
+def render(loaded: Any, sampler: str, spp: int, seed: int) -> tuple[GradientStack, float]:
+    """The stack as `ngpt render` makes it, or as Mitsuba would, and processor seconds."""
+    from data_gen import render_scene
+
+    options: dict[str, Any] = RIVAL | {"tails": "paths", "subpixels": 1} if sampler == "mitsuba" else {}
+    start = processor_seconds()
+    stack = render_scene(loaded, spp, seed, "primal" if options else sampler, **options).stack
+    return stack, processor_seconds() - start
+
+
+def text(cells: list[dict[str, Any]]) -> str:
+    """Tables of errors and FLIP, and of the default over the best of our pipelines."""
+    of = {verdict.key_of(cell): cell for cell in cells}
+    scenes = list(dict.fromkeys(cell["scene"] for cell in cells))
+    rows = []
+    for scene in scenes:
+        for spp in SPP:
+            of_all = (of[scene, str(spp), pipeline] for pipeline in PIPELINES)
+            values = (f"{mean_of(cell, 'error'):.2g}, {mean_of(cell, 'FLIP'):.3f}" for cell in of_all)
+            rows.append([f"{scene} ({CASES[scene].kind})", str(spp), *values])
+    lines = ["Error, FLIP:", "", *markdown_table(["scene", "spp", *PIPELINES], rows), ""]
+    best = {scene: [over_best(of, scene, spp, equal) for equal in EQUAL for spp in SPP] for scene in scenes}
+    rows = [[scene, *(", ".join(map(marked, each)) for each in columns)] for scene, columns in best.items()]
+    means = [
+        ", ".join(over([each[i] for each in column]) for i in (0, 1)) for column in zip(*best.values(), strict=True)
+    ]
+    heads = [f"{spp} spp, equal {equal}" for equal in EQUAL for spp in SPP]
+    lines += ["The default over the best of our other pipelines, error and FLIP:", ""]
+    lines += markdown_table(["scene", *heads], [*rows, ["mean", *means]])
+    return "\n".join(lines)
+
+
+def mean_of(cell: dict[str, Any], value: str) -> float:
+    return geometric_mean(cell[value].values())
+
+
+def over_best(of: dict[verdict.Key, dict[str, Any]], scene: str, spp: int, equal: str) -> list[tuple[float, str]]:
+    """Error and FLIP of the default over the least of ``OURS``, at as many samples or after as many seconds; with the
+    marks of ``ngpt.evaluation.curves``."""
+    default = of[scene, str(spp), DEFAULT]
+    found = []
+    for value in verdict.LIMITS:
+        if equal == "samples":
+            least = min((mean_of(of[scene, str(spp), each], value), "") for each in OURS)
+        else:
+            curves = ([of[scene, str(n), each] for n in SPP] for each in OURS)
+            points = ([(mean_of(cell, "seconds"), mean_of(cell, value)) for cell in curve] for curve in curves)
+            read = (error_at(mean_of(default, "seconds"), each) for each in points)
+            least = min(each for each in read if each)
+        found.append((mean_of(default, value) / least[0], least[1]))
+    return found
+
+
+def ratio_table(judged: list[verdict.Judged]) -> list[str]:
+    """Lines: error and FLIP over those of before; what is worse beyond noise is bold."""
+    shown: dict[tuple[str, str], dict[str, list[str]]] = {}
+    for each in judged:
+        scene, spp, pipeline = each.key
+        ratio = f"**{each.ratio:.2f}**" if each.worse else f"{each.ratio:.2f}"
+        shown.setdefault((scene, spp), {}).setdefault(pipeline, []).append(ratio)
+    rows = [[*place, *(", ".join(by[each]) for each in PIPELINES)] for place, by in shown.items()]
+    return ["Over the numbers in git, error and FLIP:", "", *markdown_table(["scene", "spp", *PIPELINES], rows)]
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except NgptError as error:
+        sys.exit(f"error: {error}")
