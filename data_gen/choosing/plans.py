@@ -279,8 +279,7 @@ def _why(ranked: Sequence[Pipeline], seconds: float) -> str:
     errors: dict[str, tuple[float, Pipeline]] = {}
     for p in ranked:
         errors.setdefault(p.sampler, (p.expected(p.samples(seconds)), p))
-    (least, first), *others = errors.values()
-    low, high = (brief(math.sqrt(error)) for error in first.likely(first.samples(seconds)))
-    what = f"expected to leave an error of {brief(math.sqrt(least))} (in eight of ten cases {low} to {high})"
+    (least, _), *others = errors.values()
+    what = f"expected to leave an error of {brief(math.sqrt(least))}"
     rivals = [f"{brief(math.sqrt(e))} by sampler '{p.sampler}' and method '{p.method}'" for e, p in others]
     return f"{what}, and {', '.join(rivals)}" if rivals else what
