@@ -7,8 +7,6 @@ file under ``repository/``, Markdown as a page, so that one link works in both p
 import ast
 import posixpath
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 from mkdocs.structure.files import File
@@ -76,8 +74,6 @@ def on_files(files, config):
     for name, text in reference().items():
         files.append(File.generated(config, f"api/{name}.md", content=text))
     files.append(File.generated(config, "use/commands.md", content=markdown(parsers())))
-    manual = subprocess.check_output([sys.executable, "-m", "ngpt", "--manual"], text=True)
-    files.append(File.generated(config, "ngpt.1", content=manual))
     files.append(File.generated(config, "site.css", content=CSS))
     config.nav = menu([file.src_uri for file in files.documentation_pages()])
     return files
