@@ -148,6 +148,37 @@ def test_light_that_is_cut_is_counted(renderer):
     assert filled.cut / filled.light == pytest.approx(1 - kept / values.sum(), rel=1e-3)
 
 
+def test_old_records_fade(renderer):
+    """Records that are made later count twice as much, but cells with few records keep them."""
+    filled, half = cache.Cache(FINENESS), dr.arange(mi.UInt32, N) & 1
+    busy, quiet = flat(dr.full(mi.Float, 0.05, N), 0.05), flat(dr.full(mi.Float, 0.95, 2 * LEAST), 0.95)
+    filled.unit = 2.0**-20
+    filled.add(busy, half, [mi.Float(1)] * 3)
+    filled.add(quiet, dr.arange(mi.UInt32, 2 * LEAST) & 1, [mi.Float(1)] * 3)
+    filled.fade()
+    filled.add(busy, half, [mi.Float(4)] * 3)
+    for _ in range(20):
+        filled.settle(FINENESS)
+        for place, light in ((busy, 3), (quiet, 1)):
+            (found, *_), _, known = filled.known.look(place, LEAST, mi.Bool(True))
+            assert np.array(known).all() and np.allclose(np.array(found), light, rtol=1e-3)
+        filled.fade()
+
+
+def test_frames_share_the_noise_of_the_cache(renderer):
+    """So it stands still: what two frames of a still camera have in common is most of the layer's variance."""
+    options = {"spp": 16, "sampler": "primal", "tails": "shared"}
+    still = [stack["shared"] for _, stack in data_gen.render_frames("diffuse", [0, 1], size=(64, 36), **options)]
+    scene = load(renderer, "diffuse", (64, 36))
+    apart = [render_stack(scene, seed=seed, **options)["shared"] for seed in (1, 2)]
+
+    def in_common(pair):
+        a, b = (np.asarray(each, float).reshape(9, 4, 16, 4, 3).mean((1, 3)) for each in pair)
+        return np.mean(a * b) / np.sqrt(np.mean(a * a) * np.mean(b * b))
+
+    assert in_common(still) > 0.7 > 0.4 > in_common(apart)
+
+
 def cell_with_a_wall(at, bright, dark, share=1.0, n=4000):
     """A cache whose one cell has other light on either side of a wall, found by a ``share`` of its records."""
     rng = np.random.default_rng(4)
