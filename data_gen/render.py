@@ -74,8 +74,8 @@ def render_stack(
 
     Unless it is ``unbiased``, samplers with the option ``tails`` let paths share what they find, where that works and
     pays (``data_gen.tails``): the default of all doors, which are this function, ``render_scene``, `ngpt render` and
-    our plugins. The attribute ``ngpt:samplerOptions`` then contains ``tails=shared``. With a ``tails_seed``, the noise of
-    what they share comes from that seed, and so it stands still in the frames of a shot.
+    our plugins. The attribute ``ngpt:samplerOptions`` then contains ``tails=shared``. The noise of what they share
+    comes from ``tails_seed``, by default ``seed``: it stands still in frames that have the same.
 
     With ``subpixels`` K, 2 or 4, or where "auto" finds them of use, the stack has K x K subpixels (``ngpt.subpixels``).
 

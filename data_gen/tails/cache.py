@@ -208,11 +208,11 @@ class Cache:
     def fade(self) -> None:
         """Halves the weight of what is known, before paths add records that end in it.
 
-        Such records repeat the noise of what they have read. Let g be the share of their light that comes from there, and
-        let the number of records double in each round. With equal weights, the noise of the first records falls by
-        (1 + g) / 2 from round to round. Where light is rare, g is large, and that is slower than sqrt(1/2), at which the
-        noise of independent records falls. With half the weight it falls by (1 + 2 g) / 3. Records' own noise grows by
-        13 %. A cell keeps the weight of ``LEAST`` records, so that it is not forgotten.
+        Such records repeat the noise of what they have read. Let g be the share of their light that comes from there,
+        and let the number of records double in each round. With equal weights, the noise of the first records would be
+        (1 + g) / 2 of itself a round later. Where light is rare, g is large, and that is more than sqrt(1/2), the rate
+        of independent records. With half the weight it is (1 + 2 g) / 3. The noise of records' own grows by 13 %. A
+        cell keeps the weight of ``LEAST`` records, so that it is not forgotten.
         """
         much = self.weight >= 2 * LEAST * _WHOLE
         self.sums = [dr.select(much, each >> 1, each) for each in self.sums]

@@ -165,18 +165,38 @@ def test_old_records_fade(renderer):
         filled.fade()
 
 
-def test_frames_share_the_noise_of_the_cache(renderer):
-    """So it stands still: what two frames of a still camera have in common is most of the layer's variance."""
-    options = {"spp": 16, "sampler": "primal", "tails": "shared"}
-    still = [stack["shared"] for _, stack in data_gen.render_frames("diffuse", [0, 1], size=(64, 36), **options)]
-    scene = load(renderer, "diffuse", (64, 36))
-    apart = [render_stack(scene, seed=seed, **options)["shared"] for seed in (1, 2)]
+def test_records_of_earlier_rounds_fade(renderer, monkeypatch):
+    scene = load(renderer, "diffuse", (32, 24))
+    images = [render_stack(scene, 32, 1, "primal", tails="shared")["primal"]]
+    monkeypatch.setattr(cache.Cache, "fade", lambda self: None)
+    images.append(render_stack(scene, 32, 1, "primal", tails="shared")["primal"])
+    assert not np.array_equal(*images) and np.mean(images[0]) == pytest.approx(np.mean(images[1]), rel=0.02)
 
-    def in_common(pair):
-        a, b = (np.asarray(each, float).reshape(9, 4, 16, 4, 3).mean((1, 3)) for each in pair)
-        return np.mean(a * b) / np.sqrt(np.mean(a * a) * np.mean(b * b))
 
-    assert in_common(still) > 0.7 > 0.4 > in_common(apart)
+def test_the_noise_of_the_cache_is_of_its_own_seed(renderer):
+    """The layer ``shared`` says what it is: less changes where only the paths of the image are others."""
+    scene = load(renderer, slit, (32, 24))
+
+    def changes(tails_seed):
+        stacks = [render_stack(scene, 16, i, "primal", tails="shared", tails_seed=tails_seed) for i in range(8)]
+        return np.std([np.mean(stack["shared"], dtype=float) for stack in stacks])
+
+    assert changes(1) < 0.6 * changes(None)
+
+
+def test_frames_have_one_cache(renderer, monkeypatch):
+    from data_gen.frames import shot
+
+    seeds, render = [], shot.render_stack
+
+    def noted(*args, tails_seed, **options):
+        seeds.append((args[2], tails_seed))
+        return render(*args, tails_seed=tails_seed, **options)
+
+    monkeypatch.setattr(shot, "render_stack", noted)
+    list(data_gen.render_frames("diffuse", [0, 1], 1, seed=5, sampler="primal", size=(8, 6)))
+    (first, of_tails), (second, again) = seeds
+    assert first != second and of_tails == again == 5
 
 
 def cell_with_a_wall(at, bright, dark, share=1.0, n=4000):
