@@ -31,10 +31,10 @@ import numpy as np
 import ngpt
 from bench import verdict
 from bench.common import metadata, renderer, save, write_page
+from bench.curves import error_at
 from bench.seeds import opened
 from bench.tails import RIVAL, WARM_SPP, clean_image, marked, over, processor_seconds, reference_of, steady_error
 from ngpt.errors import NgptError
-from ngpt.evaluation.curves import error_at
 from ngpt.evaluation.references import Reference
 from ngpt.measure.averages import geometric_mean
 from ngpt.measure.flip import flip
@@ -231,7 +231,7 @@ def mean_of(cell: dict[str, Any], value: str) -> float:
 
 def over_best(of: dict[verdict.Key, dict[str, Any]], scene: str, spp: int, equal: str) -> list[tuple[float, str]]:
     """Error and FLIP of the default over the least of ``OURS``, at as many samples or after as many seconds; with the
-    marks of ``ngpt.evaluation.curves``."""
+    marks of ``bench.curves``."""
     default = of[scene, str(spp), DEFAULT]
     found = []
     for value in verdict.LIMITS:
