@@ -14,6 +14,8 @@ from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 
+pytest_plugins = ["durations"]
+
 
 def strictly(report):
     """With ``NGPT_STRICT=1`` what is skipped for a reason that is not listed fails."""
@@ -39,9 +41,10 @@ MARKERS = {"renderer": "renders", "chromium": "browser", "toolchain": "hosts", "
 MARKERS |= {"wheel": "processes"}
 # A folder -> the marker of all tests in it.
 FOLDERS = {"campaigns": "processes", "export": "exports", "evaluation": "evaluates"}
-# Names that a test calls where it starts programs.
+# Names that a test calls where it starts programs, or Node.
 PROGRAMS = {"subprocess", "complete", "start", "shell", "in_a_child", "in_a_process", "imported_by", "run_python"}
 PROGRAMS |= {"on_terminal", "read_exr_isolated"}
+NAMES = {**dict.fromkeys(PROGRAMS, "processes"), "read_in_node": "hosts"}
 
 
 def pytest_collection_modifyitems(items):
@@ -50,8 +53,7 @@ def pytest_collection_modifyitems(items):
         found = {MARKERS[fixture] for fixture in MARKERS.keys() & set(item.fixturenames)}
         code = getattr(getattr(item, "function", None), "__code__", None)
         found |= {FOLDERS[folder] for folder in FOLDERS.keys() & set(item.path.parts)}
-        if code and PROGRAMS & set(code.co_names):
-            found.add("processes")
+        found |= {NAMES[name] for name in NAMES.keys() & set(code.co_names if code else ())}
         if not found and not item.get_closest_marker("slow"):
             found.add("quick")
         for marker in sorted(found):
