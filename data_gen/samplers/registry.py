@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from data_gen.budget import LANE_BYTES
-from ngpt.errors import NgptError, WrongUse, did_you_mean
+from ngpt.errors import NgptError, WrongUse
 from ngpt.methods import METHODS
 from ngpt.options import STANDINGS, Option, as_text, settings, unusual
 from ngpt.system.parts import Registry
@@ -198,9 +198,8 @@ def find(name: str, facts: Facts | None = None) -> Sampler:
     if name in FRAME_SAMPLERS:
         raise WrongUse(f"sampler '{name}' is for shots (--frames): {FRAME_SAMPLERS[name].alone}; use --sampler gpt")
     if name not in SAMPLERS:
-        meant = did_you_mean(name, ("auto", *SAMPLERS, *FRAME_SAMPLERS))
-        shots = f"; for shots (--frames): {', '.join(FRAME_SAMPLERS)}"
-        raise WrongUse(f"unknown sampler '{name}'; {meant}choose one of: auto, {', '.join(SAMPLERS)}{shots}")
+        known = f"auto, {', '.join(SAMPLERS)}; for shots (--frames): {', '.join(FRAME_SAMPLERS)}"
+        raise SAMPLERS.unknown(name, ("auto", *SAMPLERS, *FRAME_SAMPLERS), known)
     sampler = SAMPLERS[name]
     if facts is not None and (reason := sampler.refuses(facts)):
         able = [other for other in SAMPLERS.values() if not other.refuses(facts)]
