@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from data_gen.samplers import SAMPLERS
-from ngpt.evaluation.keys import code_text
+from ngpt.system.source import code_text
 
 ROOT = Path(__file__).parent
 # The registry knows all samplers; of what it imports, a render needs its own family's entries.

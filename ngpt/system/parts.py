@@ -62,7 +62,16 @@ def brought(group: str) -> Iterator[Any]:
 
 def find_renderer() -> Any:
     """The renderer, see ``ngpt.renderer.Renderer``. Raises NgptError where none is installed, or it is broken."""
-    for point in points("ngpt.renderers"):
+    return _only("ngpt.renderers")
+
+
+def find_crops() -> Any:
+    """What renders crops to train on, see ``ngpt.renderer.Crops``. Raises NgptError as ``find_renderer`` does."""
+    return _only("ngpt.crops")
+
+
+def _only(group: str) -> Any:
+    for point in points(group):
         return loaded(point)
     raise NgptError(no_renderer())
 
