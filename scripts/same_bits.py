@@ -1,6 +1,6 @@
 """Whether two checkouts render the same bits.
 
-    python -m scripts.same_bits OTHER [-o FILE]
+    python -m scripts.same_bits OTHER [-o FILE] [--samplers NAME ...]
 
 OTHER is the folder of another checkout. Both render small images by every installed sampler, with its defaults and with
 each other value of its options that are choices, of four built-in scenes, and two frames of a shot. Prints each render
@@ -23,14 +23,14 @@ SCENES = ("diffuse", "glossy", "lens", "haze")
 SIZE, SEED = (16, 12), 3
 
 
-def renders() -> Iterator[tuple[str, str, dict[str, Any]]]:
+def renders(samplers: list[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """(scene, sampler, options) of all renders of single images."""
     from data_gen.samplers import SAMPLERS
     from data_gen.samplers.registry import own
 
     SAMPLERS.load()
-    for name, entry in SAMPLERS.items():
-        changed = [{}]
+    for name in samplers or SAMPLERS:
+        entry, changed = SAMPLERS[name], [{}]
         for option, about in own(entry.options).items():
             values = (True, False) if isinstance(about.default, bool) else about.choices
             changed += [{option: value} for value in values if value != about.default]
@@ -38,7 +38,7 @@ def renders() -> Iterator[tuple[str, str, dict[str, Any]]]:
             yield from ((scene, name, options) for options in changed)
 
 
-def hashes() -> dict[str, str]:
+def hashes(samplers: list[str]) -> dict[str, str]:
     """SHA-256 of the layers of each render by the packages that this process imports."""
     import data_gen
     from data_gen.render import render_stack
@@ -48,7 +48,7 @@ def hashes() -> dict[str, str]:
     data_gen.use_variant()
     found = {}
     scenes = {name: data_gen.load_scene(name, SIZE) for name in SCENES}
-    for scene, sampler, options in renders():
+    for scene, sampler, options in renders(samplers):
         words = [scene, sampler, *(f"{name}={value}" for name, value in options.items())]
         spp = max(8, 2 * SAMPLERS[sampler].batch)
         try:
@@ -56,7 +56,8 @@ def hashes() -> dict[str, str]:
             found[" ".join(words)] = digest(stack)
         except NgptError:
             found[" ".join(words)] = "refused"
-    for sampler in ("gpt", *FRAME_SAMPLERS):
+        print(*words, file=sys.stderr)
+    for sampler in () if samplers else ("gpt", *FRAME_SAMPLERS):
         frames = data_gen.render_frames("diffuse", range(2), 2, SEED, sampler, size=SIZE, unbiased=True)
         found |= {f"frame {number} {sampler}": digest(stack) for number, stack in frames}
     return found
@@ -69,10 +70,10 @@ def digest(stack: Any) -> str:
     return found.hexdigest()
 
 
-def hashes_of(checkout: Path) -> dict[str, str]:
+def hashes_of(checkout: Path, samplers: list[str]) -> dict[str, str]:
     """``hashes`` by the packages of a checkout, in a process of its own."""
-    environment = os.environ | {"PYTHONPATH": str(checkout)}
-    command = [sys.executable, __file__, "--here"]
+    environment = os.environ | {"PYTHONPATH": f"{checkout}:{checkout / 'studies'}"}
+    command = [sys.executable, __file__, "--here", *samplers]
     return json.loads(subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True, cwd=checkout).stdout)
 
 
@@ -87,14 +88,15 @@ def differences(ours: dict[str, str], theirs: dict[str, str]) -> list[str]:
 
 
 def main() -> int:
-    if sys.argv[1:] == ["--here"]:
-        print(json.dumps(hashes()))
+    if sys.argv[1:2] == ["--here"]:
+        print(json.dumps(hashes(sys.argv[2:])))
         return 0
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("other", type=Path, metavar="OTHER")
     parser.add_argument("-o", type=Path, dest="file", metavar="FILE")
+    parser.add_argument("--samplers", nargs="+", default=[], metavar="NAME", help="these only, and no shot")
     args = parser.parse_args()
-    ours, theirs = hashes_of(ROOT), hashes_of(args.other.resolve())
+    ours, theirs = (hashes_of(folder, args.samplers) for folder in (ROOT, args.other.resolve()))
     if args.file:
         args.file.write_text(json.dumps({"here": ours, "there": theirs}, indent=1))
     lines = differences(ours, theirs)

@@ -138,7 +138,7 @@ class Sampler(Entry):
 
     @property
     def plugin(self) -> str:
-        return self.name.replace("-", "_")
+        return plugin_of(self.name)
 
     def integrator(self, scene: Any, **options: Any) -> Any:
         """Its integrator with the parameters of the scene's own ``path``, and ``options`` that are checked."""
@@ -179,8 +179,13 @@ FRAME_SAMPLERS: dict[str, FrameSampler] = {}
 SAMPLERS: Registry[Sampler] = Registry("ngpt.samplers", "sampler", Sampler, {}, FRAME_SAMPLERS)
 
 
+def plugin_of(name: str) -> str:
+    """What Mitsuba calls the integrator of a sampler."""
+    return name.replace("-", "_")
+
+
 def by_plugin(plugin: str) -> Sampler:
-    return next(entry for entry in SAMPLERS.values() if entry.plugin == plugin)
+    return next(SAMPLERS[name] for name in SAMPLERS.names() if plugin_of(name) == plugin)
 
 
 def register(entry: Sampler | FrameSampler) -> None:

@@ -5,7 +5,6 @@
     Mixture    a weight for each of several images, and a correction of the logarithm of their mean
     Kernels    weights for the k x k pixels around, in all of the images: their mean, nothing added [Bako et al. 2017,
                "Kernel-predicting convolutional networks", section 4.2; for several images Vogels et al. 2018]
-    SplitKernels  kernels for diffuse and for specular light, see ``ngpt.network.kpcn``
     Pyramid     kernels at several resolutions, of one image, blended from coarse to fine [Vogels et al. 2018,
                "Denoising with kernel prediction and asymmetric loss functions", section 4.3]
 

@@ -12,7 +12,7 @@ PUBLISHED = False
 
 NAME, STUDIES = "ngpt-recon", "ngpt-studies"
 # What ngpt-studies brings, by what a registry calls its entries
-BROUGHT = {"method": ("nlm",)}
+BROUGHT = {"method": ("nlm",), "network": ("kpcn",), "sampler": ("gmlt", "gpt-tiles", "split")}
 CHECKOUT = Path(__file__).parents[2]
 
 

@@ -115,6 +115,10 @@ class Registry(dict[str, T]):
         except KeyError:
             return default
 
+    def names(self) -> list[str]:
+        """The names of all entries; nothing is imported."""
+        return list(dict.fromkeys([*self, *(point.name for point in self._others())]))
+
     def load(self) -> list[str]:
         """Imports the entries of all other packages; returns their names. A broken one costs a line and is left out."""
         for point in points(self.group):

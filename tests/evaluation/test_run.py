@@ -82,8 +82,8 @@ def test_the_folder_of_results(done):
 def test_a_missing_method_is_a_row_that_says_why(done):
     folder, _, results = done
     rows = [cell for cell in results["cells"] if cell["method"] == "oracle"]
-    assert len(rows) == 4 and all("no method 'oracle'" in row["absent"] for row in rows)
-    assert "- `oracle`: there is no method 'oracle'" in (folder / "out" / "results.md").read_text()
+    assert len(rows) == 4 and all("unknown method 'oracle'" in row["absent"] for row in rows)
+    assert "- `oracle`: unknown method 'oracle'" in (folder / "out" / "results.md").read_text()
 
 
 def test_what_is_done_is_not_done_again_unless_a_stack_changed(done, tmp_path, monkeypatch):

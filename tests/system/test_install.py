@@ -28,24 +28,33 @@ STUDIES = tomllib.loads((ROOT / "studies" / "pyproject.toml").read_text())["proj
 
 
 def test_studies_are_those_of_their_package():
-    groups = {"method": "ngpt.methods"}
+    groups = {"method": "ngpt.methods", "network": "ngpt.networks", "sampler": "ngpt.samplers"}
     points = STUDIES["entry-points"]
     assert {what: set(points[group]) for what, group in groups.items()} == {k: {*v} for k, v in install.BROUGHT.items()}
     assert set(points) == set(groups.values()) and STUDIES["name"] == install.STUDIES
 
 
-ASKED = {"method": (METHODS, runnable), "sampler": (SAMPLERS, find)}
+def ask_for(what, name):
+    """The registry, and a call that asks for an entry of that name."""
+    if what == "method":
+        return METHODS, lambda: runnable(name)
+    if what == "sampler":
+        return SAMPLERS, lambda: find(name)
+    pytest.importorskip("torch")
+    from ngpt.network.config import KINDS, ModelConfig
+
+    return KINDS, lambda: ModelConfig(name, (4,), (1,), ("primal",))
 
 
 @pytest.mark.parametrize(("what", "name"), [(what, name) for what, names in install.BROUGHT.items() for name in names])
 def test_a_study_that_is_not_installed_is_one_line_with_the_command(monkeypatch, tmp_path, what, name):
-    registry, ask = ASKED[what]
+    registry, ask = ask_for(what, name)
     monkeypatch.setattr(parts, "points", lambda group: iter(()))
     monkeypatch.delitem(registry, name, raising=False)
 
     def told():
         with pytest.raises(WrongUse) as raised:
-            ask(name)
+            ask()
         line = str(raised.value)
         assert line.startswith(f"{what} '{name}' is of the package ngpt-studies, which is not installed; ")
         return line
