@@ -146,10 +146,10 @@ def test_the_network_of_the_page(site, tmp_path, command, one_thread):
     write_views(tmp_path)
     text = (ROOT / PAGES["network"]).read_text()
     (line,) = re.findall(r"^    ngpt (train .*)$", text, re.M)
-    command(f"{line} data.folders='[\"views\"]' data.crop=32 run.steps=2 run.batch=1")
+    command(f"{line} --set data.folders='[\"views\"]' --set data.crop=32 --set run.steps=2 --set run.batch=1")
     assert "layers" in command("info run/weights.safetensors").out
     command("denoise stack.exr -m ngpt --weights run/weights.safetensors -o image.exr")
-    told = command(f"{line.replace('layers', 'layer')} data.folders='[\"views\"]'", 1, 2).err
+    told = command(f"{line.replace('layers', 'layer')} --set data.folders='[\"views\"]'", 1, 2).err
     assert "unknown network 'layer'" in told
 
 

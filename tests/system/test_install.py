@@ -47,7 +47,7 @@ def ask_for(what, name):
 
 
 @pytest.mark.parametrize(("what", "name"), [(what, name) for what, names in install.BROUGHT.items() for name in names])
-def test_a_study_that_is_not_installed_is_one_line_with_the_command(monkeypatch, tmp_path, what, name):
+def test_a_study_that_is_not_installed_is_one_line_with_the_command(monkeypatch, tmp_path, command, what, name):
     registry, ask = ask_for(what, name)
     monkeypatch.setattr(parts, "points", lambda group: iter(()))
     monkeypatch.delitem(registry, name, raising=False)
@@ -60,6 +60,9 @@ def test_a_study_that_is_not_installed_is_one_line_with_the_command(monkeypatch,
         return line
 
     assert told().endswith(f"pip install -e {ROOT / 'studies'}`")
+    if what == "method":
+        (line,) = command(f"denoise stack.exr -m {name} -o image.exr", 2).err.splitlines()
+        assert line == f"ngpt: error: {told()}"
     monkeypatch.setattr(install, "CHECKOUT", tmp_path)
     assert told().endswith("in a checkout of ngpt, `pip install -e studies`".replace("pip", install._pip()))
     monkeypatch.setattr(install, "PUBLISHED", True)
