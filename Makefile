@@ -9,7 +9,7 @@ demo: setup-demo
 
 WORKERS = -n auto --maxprocesses 4 --dist worksteal
 
-# One minute on two cores: all that neither renders, trains, exports, evaluates, compiles nor starts programs. See tests/conftest.py.
+# One minute on two cores: all that neither renders, trains, exports, evaluates, compiles nor starts programs. See conftest.py.
 quick: setup-quick
 	$(PY) -m pytest -q $(WORKERS) -m quick
 

@@ -21,7 +21,7 @@ from ngpt.evaluation.keys import code_text
 
 ROOT = Path(__file__).parents[3]
 # Where modules of the repository are, as tests import them
-PLACES = (ROOT, ROOT / "tests", ROOT / "tests" / "data_gen", Path(__file__).parent)
+PLACES = (ROOT, ROOT / "studies", ROOT / "tests", ROOT / "tests" / "data_gen", Path(__file__).parent)
 PASSED = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ngpt-laws"
 PACKAGES = ("drjit", "mitsuba", "numpy", "scipy")
 # Laws reconstruct nothing.

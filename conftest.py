@@ -9,12 +9,18 @@ import pytest
 from browser import Browser, Session
 from skips import allowed
 
+from data_gen.samplers import SAMPLERS
 from ngpt.classical.gradients import forward_differences
 from ngpt.cli import main
 from ngpt.errors import NgptError
+from ngpt.methods import METHODS
 from ngpt.stack import GradientStack
 
 pytest_plugins = ["durations"]
+
+# What holds for every method and sampler holds for those of other packages that are installed, such as ngpt-studies.
+for registry in (METHODS, SAMPLERS):
+    registry.load()
 
 
 def strictly(report):
