@@ -111,7 +111,7 @@ class GVCM(VCM):
     connectable as well.
     """
 
-    splatter, plan_class = Marker, Plan
+    splatter, plan_class, straight_on = Marker, Plan, False
     sample_bytes = VCM.sample_bytes + OFFSETS_BYTES
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:

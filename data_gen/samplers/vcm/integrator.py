@@ -28,6 +28,7 @@ from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.eye import Sight
 from data_gen.paths.features import features
+from data_gen.paths.holes import Holes
 from data_gen.paths.light_ends import LightEnds, World
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials
@@ -53,6 +54,7 @@ class VCM(BDPT):
     # What becomes of light paths that end at the camera
     splatter = Splatter
     sample_bytes = SAMPLE_BYTES
+    straight_on = True  # through holes
 
     @property
     def vertices(self) -> int:
@@ -72,7 +74,8 @@ class VCM(BDPT):
         return f", or no more than -O joined_depth={fits}" if fits else ""
 
     def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
-        world = World(scene, LightEnds(scene, self.name), Materials(scene, self.options["roughness_threshold"]))
+        materials = Materials(scene, self.options["roughness_threshold"])
+        world = World(scene, LightEnds(scene, self.name), materials, holes=Holes.of(scene) if self.straight_on else None)
         return Passes(self, world, pixel_width(scene, sensor))
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
