@@ -1,6 +1,7 @@
 """Scenes of light through masks and panes, from lamps with a size and without."""
 
 import mitsuba as mi
+import numpy as np
 from data_gen_scenes import _diffuse, _light, _rgb, _room, _scene, _sphere, _two, _wall
 
 _BESIDE = ([0.3, 1.25, 3.9], [0, 0.9, 0], 50)
@@ -42,3 +43,22 @@ def curtains_in_fog():
     place = mi.ScalarTransform4f().translate([0, 1.2, 0]).scale([1.4, 1.15, 1.45])
     scene = curtains() | {"box": {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": air}}
     return scene | {"integrator": {"type": "volpath", "max_depth": -1}}
+
+
+def leaves(number=24):
+    """The sun, and a lamp with a size, through many leaves one behind the other, also seen through them."""
+    tiles = {"type": "checkerboard", "color0": 1.0, "color1": 0.0}
+    tiles["to_uv"] = mi.ScalarTransform4f().scale([3, 3, 1])
+    rng = np.random.default_rng(5)
+    scene = _scene(
+        -1,
+        ([0, 1.3, 4.2], [0, 0.8, 0], 50),
+        **_room(1.5, _diffuse(0.5, 0.5, 0.5)),
+        sun={"type": "directional", "direction": [0.2, -1, -0.3], "irradiance": _rgb(3, 2.5, 2)},
+        lamp=_light([0.3, 2.3, 0.2], [0, -1, 0], (0.5, 0.5), (9, 8, 7)),
+    )
+    for i in range(number):
+        x, z = rng.uniform(-0.8, 0.8, 2)
+        leaf = {"type": "mask", "opacity": tiles, "nested": _two(0.3, 0.6, 0.2)}
+        scene[f"leaf_{i}"] = _wall([x, 0.3 + 1.6 * i / number, z], [0.1, 1, 0.1 * (-1) ** i], (0.9, 0.9), leaf)
+    return scene

@@ -64,9 +64,7 @@ def connection(
     return C, Edge(Side(cosine(z.si, d), p_z, q_z), Side(cosine(y.si, d), p_y, q_y), distance2)
 
 
-def to_camera(
-    eye: Eye, lens: mi.Point2f, y: Vertex, bsdf, active, seen
-) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:
+def to_camera(eye: Eye, lens: mi.Point2f, y: Vertex, bsdf, active, seen) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:
     """t = 1; and the place on the film, in pixels. ``seen`` (y, toward the camera, active) says what comes to it."""
     camera, importance = eye.toward(y.si, lens, active)
     active = active & (camera.pdf > 0)

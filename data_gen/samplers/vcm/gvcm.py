@@ -108,7 +108,7 @@ class GVCM(VCM):
     """Gradient-domain vertex connection and merging, for surfaces.
 
     Plugin ``gvcm``. Parameters, and what is not handled: as for ``vcm``; where photons are gathered, paths are
-    connectable as well.
+    connectable as well. Holes are vertices, as in ``gbdpt``, and photons are gathered behind them.
     """
 
     splatter, plan_class, straight_on = Marker, Plan, False

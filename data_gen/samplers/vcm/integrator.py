@@ -7,7 +7,7 @@ r"""Vertex connection and merging: ``bdpt`` and ``ppm`` in one, and every path o
 A pass has one camera sample and one light path for each pixel. Light paths are traced once: their vertices are
 connected to the camera (splats), kept in a map, connected to the camera path of the same sample (one of them,
 ``bdpt.camera_path``), and gathered at all camera paths, within the radius, where materials scatter widely. Only those
-that light reaches from mirrors, clear glass or holes are gathered (docs/samplers/photons.md). Their light is the layer
+that light reaches from mirrors or clear glass are gathered (docs/samplers/photons.md). Their light is the layer
 ``caustic`` (``ngpt.layers.GATHERED``).
 
 [Georgiev et al. 2012, "Light Transport Simulation with Vertex Connection and Merging"; Hachisuka et al. 2012, "A Path
@@ -75,7 +75,8 @@ class VCM(BDPT):
 
     def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
         materials = Materials(scene, self.options["roughness_threshold"])
-        world = World(scene, LightEnds(scene, self.name), materials, holes=Holes.of(scene) if self.straight_on else None)
+        holes = Holes.of(scene) if self.straight_on else None
+        world = World(scene, LightEnds(scene, self.name), materials, holes=holes)
         return Passes(self, world, pixel_width(scene, sensor))
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
