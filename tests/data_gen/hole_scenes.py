@@ -46,19 +46,18 @@ def curtains_in_fog():
 
 
 def leaves(number=24):
-    """The sun, and a lamp with a size, through many leaves one behind the other, also seen through them."""
+    """The sun through many leaves one behind the other, over a floor, which is seen through them too."""
     tiles = {"type": "checkerboard", "color0": 1.0, "color1": 0.0}
     tiles["to_uv"] = mi.ScalarTransform4f().scale([3, 3, 1])
     rng = np.random.default_rng(5)
     scene = _scene(
         -1,
-        ([0, 1.3, 4.2], [0, 0.8, 0], 50),
-        **_room(1.5, _diffuse(0.5, 0.5, 0.5)),
+        ([0, 1.6, 3.5], [0, 0.4, 0], 50),
         sun={"type": "directional", "direction": [0.2, -1, -0.3], "irradiance": _rgb(3, 2.5, 2)},
-        lamp=_light([0.3, 2.3, 0.2], [0, -1, 0], (0.5, 0.5), (9, 8, 7)),
+        floor=_wall([0, 0, 0], [0, 1, 0], (6, 6), _diffuse(0.5, 0.5, 0.5)),
     )
+    leaf = {"type": "mask", "opacity": tiles, "nested": _two(0.3, 0.6, 0.2)}
     for i in range(number):
-        x, z = rng.uniform(-0.8, 0.8, 2)
-        leaf = {"type": "mask", "opacity": tiles, "nested": _two(0.3, 0.6, 0.2)}
-        scene[f"leaf_{i}"] = _wall([x, 0.3 + 1.6 * i / number, z], [0.1, 1, 0.1 * (-1) ** i], (0.9, 0.9), leaf)
+        x, z = rng.uniform(-1, 1, 2)
+        scene[f"leaf_{i}"] = _wall([x, 0.3 + 1.2 * i / number, z], [0.1, 1, 0.3 * (-1) ** i], (0.9, 0.9), leaf)
     return scene

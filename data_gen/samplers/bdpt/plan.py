@@ -44,7 +44,7 @@ class Plan(World):
 
     def begins(self, o: mi.Point3f) -> Edge | None:
         """The edge that begins at an end of a path, or at ``o`` on the way to it."""
-        return self.holes and Edge(mi.Point3f(o), dr.full(mi.Bool, True, dr.width(o)))
+        return Edge(mi.Point3f(o), dr.full(mi.Bool, True, dr.width(o))) if self.holes else None
 
     def onward(self, x: Vertex, bsdf, sample: mi.BSDFSample3f, end: Partial) -> tuple[Partial, Edge | None]:
         """``end`` behind the sampled event at ``x``, and the edge there: the one that led there if it passed a hole."""
