@@ -20,6 +20,7 @@ def plain(inputs, *rest, channels=(4, 4, 4, 4), **more):
 
 
 PYRAMID = {"start": ("primal",), "kernel": 3, "scales": 3, "demodulate": True}
+OF_TWO = {"start": ("primal", "base"), "kernel": 5, "scales": 2}
 # Those that ONNX graphs are made of; the name says what others have not.
 GRAPHED = {
     "with a base": dense((*ALL, "base", "primal_se", "dx_se", "dy_se"), "wcv"),
@@ -31,7 +32,7 @@ GRAPHED = {
     ),
     "converging": dense(("primal", "base", "primal_noise", "dx_se"), "wcv", start=("primal", "base"), quiet=1.0),
     "of a primal alone": dense(("primal", "primal_change", "primal_noise"), start=("primal", "denoised")),
-    "by kernels": dense(("primal", "base", "dx_se", "primal_se"), "wcv", start=("primal", "base"), quiet=1.0, kernel=5),
+    "by kernels of two": dense(("primal", "base", "dx_se", "primal_se"), "wcv", quiet=1.0, **OF_TWO),
     "as published": ModelConfig("dense", (4, 4), (2, 1), ALL),
     "without features": plain(("primal", "dx", "dy"), channels=(6, 8)),
     "by a pyramid of kernels": dense(("primal", "albedo", "normal"), channels=(4, 6, 6), **PYRAMID),
@@ -44,7 +45,7 @@ GRAPHED = {
     "a pyramid drawn to gradients": plain(SLOPES, "wcv", sweeps=2, **PYRAMID | {"scales": 2}),
 }
 NETWORKS = GRAPHED | {
-    "by wide kernels": plain(("primal", "albedo"), channels=(4,), start=("primal",), kernel=17),
+    "by wide kernels": plain(("primal", "albedo"), channels=(4, 4), start=("primal",), kernel=17, scales=2),
     "kernels of two parts": ModelConfig("kpcn", (6,), (2,), SPLIT, kernel=21),
     "of OIDN's shape": ModelConfig("oidn", next(iter(SHAPES)), (), ("base", "albedo", "normal"), "wcv"),
 }

@@ -108,17 +108,13 @@ class _Top(_Parser):
         return formatter.format_help()
 
 
-class _Print(argparse.Action):
-    """Prints what a function makes of all parsers, "module.function", and ends. Its value, if any, goes there too."""
-
-    def __init__(self, *args: Any, prints: str, **options: Any):
-        super().__init__(*args, **options)
-        self.prints = prints
+class _Completion(argparse.Action):
+    """Prints the completion script of a shell, and ends."""
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, option: str | None = None) -> None:
-        module, _, function = self.prints.rpartition(".")
-        given = [values] if isinstance(values, str) else []
-        print(getattr(import_module(module), function)(*given, parser, parsers()), end="")
+        from ngpt.cli.completion import script
+
+        print(script(values, parser, parsers()), end="")
         parser.exit()
 
 
@@ -164,18 +160,10 @@ def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"ngpt {__version__}")
     parser.add_argument(
         "--completion",
-        action=_Print,
-        prints="ngpt.cli.completion.script",
+        action=_Completion,
         choices=("bash", "zsh", "fish"),
         metavar="SHELL",
         help="print the completion script of a shell: bash, zsh or fish",
-    )
-    parser.add_argument(
-        "--manual",
-        action=_Print,
-        prints="ngpt.cli.manual.page",
-        nargs=0,
-        help="print the manual page: pipe into man -l -",
     )
     subparsers = parser.add_subparsers(required=True, metavar="VERB", parser_class=_Parser)
     for name, verb in verbs.items():

@@ -42,11 +42,10 @@ class ModelConfig:
     ``quiet``     the relative standard error of the primal, over 15x15 pixels, below which the result goes over to the
                   base, in proportion and in the logarithm: as noise vanishes it converges with the base, whatever the
                   network says. Where the variance is 0, or not known, it does not. 0: nowhere
-    ``kernel``    the side, in pixels, of the kernels by which it averages those images instead, see
-                  ``ngpt.network.heads``; odd. 0: it weighs and corrects them pixel by pixel. For kpcn, the side of the
-                  kernels of both parts of the light
-    ``scales``    the number of resolutions that have kernels, each half as fine as the last; from 2 on the kernels
-                  average the weighted mean of these images
+    ``kernel``    the side, in pixels, of the kernels by which it averages the weighted mean of those images instead,
+                  see ``ngpt.network.heads.Pyramid``; odd. 0: it weighs and corrects them pixel by pixel. For kpcn, the
+                  side of the kernels of both parts of the light
+    ``scales``    the number of resolutions that have kernels, each half as fine as the last; 1 without kernels
     ``demodulate``  whether the kernels average the image divided by the albedo, and multiply by it again; needs the
                   input albedo, and ``scales``
     ``sweeps``    at each of several resolutions, steps that draw the image toward the gradients, by weights that the
@@ -144,14 +143,14 @@ class Plain(Kind):
     def check(self, config: ModelConfig) -> None:
         check_layers(config, self.has_units)
         levels = len(config.channels)
-        if type(config.kernel) is not int or config.kernel not in (0, *range(1, MAX_KERNEL + 1, 2)):
-            raise NgptError(f"kernel = {config.kernel!r}: must be an odd number of pixels up to {MAX_KERNEL}, or 0")
+        if type(config.kernel) is not int or config.kernel not in (0, *range(3, MAX_KERNEL + 1, 2)):
+            raise NgptError(f"kernel = {config.kernel!r}: must be an odd number of pixels from 3 to {MAX_KERNEL}, or 0")
         if config.kernel and not config.start:
             raise NgptError(f"kernel = {config.kernel}: there is no image to average; give a base, or start")
         if type(config.scales) is not int or not 1 <= config.scales <= levels:
             raise NgptError(f"scales = {config.scales!r}: must be from 1 to the {levels} levels of the network")
-        if config.scales > 1 and config.kernel < 3:
-            raise NgptError(f"scales = {config.scales}: needs kernels of 3 pixels or more")
+        if bool(config.kernel) != (config.scales > 1):
+            raise NgptError(f"kernel = {config.kernel}, scales = {config.scales}: kernels need 2 scales or more")
         pyramid = config.scales > 1 and "albedo" in config.inputs
         if type(config.demodulate) is not bool or (config.demodulate and not pyramid):
             raise NgptError(f"demodulate = {config.demodulate!r}: true or false; needs scales and the input albedo")

@@ -47,8 +47,8 @@ class Trainer:
     """One run in the folder ``out``, new or continued.
 
     ``task`` is what it trains. Files in ``out``: ``checkpoint.safetensors``, ``weights.safetensors`` (for inference),
-    ``best.safetensors`` (the weights with the least validation error), ``log.jsonl``, ``log.csv``, ``run.html``,
-    ``tensorboard/``, ``validation-STEP.png``.
+    ``best.safetensors`` (the weights with the least validation error), ``log.jsonl``, ``run.html``, ``tensorboard/``,
+    ``validation-STEP.png``.
     """
 
     def __init__(
@@ -96,6 +96,7 @@ class Trainer:
         if header.get("kind") != "checkpoint":
             raise NgptError(f"{self.checkpoint}: holds {header.get('kind')}, not a checkpoint")
         check(header, {"settings": dict, "step": int, "seconds": (int, float)}, f"{self.checkpoint}: its header")
+        header["settings"].get("run", {}).pop("wandb", None)  # a setting of earlier versions
         before = from_dict(header["settings"], str(self.checkpoint))
         if before.model != self.settings.model:
             raise NgptError(f"{self.checkpoint}: was trained with another [model]; give the run another folder")
@@ -131,7 +132,7 @@ class Trainer:
         batches = self.task.batches(self.model, self.step, self.processes)
         meter = Meter(self.step, self.device)
         if self.processes.rank == 0:
-            self._loggers = loggers(self.out, self.step + 1, self.settings)
+            self._loggers = loggers(self.out, self.step + 1)
         previous = {s: signal.signal(s, self._interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
         progress(self.step, run.steps)
         try:

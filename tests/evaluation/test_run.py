@@ -77,15 +77,11 @@ def test_the_folder_of_results(done):
     with open(out / "results.csv", newline="") as file:
         lines = list(csv.DictReader(file))
     assert len(lines) == 20 and float(lines[0]["relMSE"]) == found[4, "primal", 0]["metrics"]["relMSE"]
-    assert (out / results["plots"]["frontier"]["room"]).read_text().startswith("<svg")
-    assert "the command" in (out / "results.md").read_text()
 
 
 def test_a_missing_method_is_a_row_that_says_why(done):
-    folder, _, results = done
-    rows = [cell for cell in results["cells"] if cell["method"] == "oracle"]
+    rows = [cell for cell in done[2]["cells"] if cell["method"] == "oracle"]
     assert len(rows) == 4 and all("no method 'oracle'" in row["absent"] for row in rows)
-    assert "- `oracle`: there is no method 'oracle'" in (folder / "out" / "results.md").read_text()
 
 
 def test_what_is_done_is_not_done_again_unless_a_stack_changed(done, tmp_path, monkeypatch):
@@ -146,16 +142,14 @@ def spoilt(tmp_path_factory):
         spoil(folder / name)
     scenes = ", ".join(f'"{folder}/{name}"' for name in ("hall", *SPOILT))
     config = replace(read(CONFIG.replace('"{folder}"', scenes), folder), spp=(16,), methods=("primal", "l2"))
-    return evaluated(config, folder / "out"), (folder / "out" / "results.md").read_text()
+    return evaluated(config, folder / "out")
 
 
 @pytest.mark.parametrize(("name", "message"), [(name, message) for name, (_, message) in SPOILT.items()])
 def test_bad_scenes_are_named_and_the_others_go_on(spoilt, name, message):
-    results, page = spoilt
-    cells = [cell for cell in results["cells"] if cell["scene"] == name]
+    cells = [cell for cell in spoilt["cells"] if cell["scene"] == name]
     assert any(cell["absent"] and message in cell["absent"] for cell in cells if cell["method"] == "l2")
-    assert message in page
-    assert results["scenes"]["hall"]["absent"] is None
+    assert spoilt["scenes"]["hall"]["absent"] is None
 
 
 def never(*arguments, **options):

@@ -27,16 +27,16 @@ ROWS = [
     (PLAIN, {"inputs": ("primal", "albedo"), "start": ("albedo",)}, "start 'albedo': must be one of"),
     (PLAIN, {"start": ("denoised",)}, "start 'denoised'"),
     (PLAIN, {"kernel": 3}, "kernel = 3: there is no image to average"),
-    *((PLAIN, {"start": ("primal",), "kernel": size}, "must be an odd number of pixels up to 17, or 0")
-      for size in (2, -1, 19, True, "3", 3.0)),
+    *((PLAIN, {"start": ("primal",), "kernel": size}, "must be an odd number of pixels from 3 to 17, or 0")
+      for size in (1, 2, -1, 19, True, "3", 3.0)),
+    (PLAIN, {"start": ("primal",), "kernel": 3}, "kernels need 2 scales or more"),
     (QUIET, {"inputs": ("primal", "base"), "quiet": 3}, "quiet = 3: goes over to the base"),
     *((QUIET, {"quiet": quiet}, "must be a finite relative standard error")
       for quiet in (-1, float("nan"), float("inf"), "very", True)),
     (OF_KERNELS, {"scales": 0}, "must be from 1 to the 3 levels of the network"),
     (OF_KERNELS, {"scales": 4}, "must be from 1 to the 3 levels of the network"),
-    (OF_KERNELS, {"kernel": 1}, "needs kernels of 3 pixels or more"),
+    (OF_KERNELS, {"kernel": 0}, "kernels need 2 scales or more"),
     (OF_KERNELS, {"start": ()}, "there is no image to average"),
-    (OF_KERNELS, {"scales": 1}, "demodulate = True: true or false; needs scales and the input albedo"),
     (OF_KERNELS, {"inputs": ("primal",)}, "demodulate = True: true or false; needs scales and the input albedo"),
     (BY_PARTS, {"inputs": ("primal", "diffuse", "albedo")}, "network 'kpcn' needs the inputs .*; lacks specular"),
     (BY_PARTS, {"kernel": 0}, "must be an odd number from 3 to 21"),

@@ -9,7 +9,7 @@ from torch.nn.functional import avg_pool2d
 
 import ngpt
 from ngpt.errors import NgptError
-from ngpt.network.heads import Kernels, Mixture, Pyramid, Residual
+from ngpt.network.heads import Mixture, Pyramid, Residual
 from ngpt.network.kpcn import EPSILON, SplitKernels
 from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.safetensors import save_weights
@@ -36,31 +36,11 @@ def close(one, other):
     return torch.allclose(one, other, rtol=1e-4)
 
 
-@pytest.mark.parametrize(
-    "head", [Residual(("base",)), Mixture(BOTH), Kernels(BOTH, 3)], ids=lambda head: type(head).__name__
-)
+@pytest.mark.parametrize("head", [Residual(("base",)), Mixture(BOTH)], ids=lambda head: type(head).__name__)
 def test_a_prediction_of_nothing_is_the_mean_of_what_the_head_reads(head):
     given = images(head)
     mean = sum(avg_pool2d(image, 2 * head.radius + 1, 1) for image in given) / len(given)
     assert close(image_of(torch.zeros(1, head.outputs, 9, 11), given, head), mean)
-
-
-@pytest.mark.parametrize("size", [1, 3, 5])
-def test_a_kernel_picks_the_pixel_it_points_to(size):
-    head = Kernels(BOTH, size)
-    given = images(head)
-    for tap in range(head.outputs):
-        i, (y, x) = tap // size**2, divmod(tap % size**2, size)
-        prediction = torch.zeros(1, head.outputs, 9, 11)
-        prediction[:, tap] = 200
-        assert close(image_of(prediction, given, head), given[i][..., y : y + 9, x : x + 11])
-
-
-def test_kernels_stay_between_the_least_and_the_largest_pixel():
-    head = Kernels(BOTH, 3)
-    given = torch.stack(images(head)).clamp(max=3)
-    result = image_of(20 * torch.randn(1, head.outputs, 9, 11), list(given), head)
-    assert given.min() - 1e-6 <= result.min() and result.max() <= given.max() + 1e-5
 
 
 def pyramid(image, trust=0.0, share=0.0, reflectance=None, **changes):
