@@ -217,8 +217,7 @@ def render_shot(
             else:
                 try:
                     own = frame_seed(seed, frame)
-                    of_frame = {"progress": progress(frame), "tails_seed": seed}
-                    stack = render_stack(scene, spp, own, sampler, **of_frame, **options)
+                    stack = render_stack(scene, spp, own, sampler, progress(frame), tails_seed=seed, **options)
                 except Unfinished as error:
                     stack, failed = error.stack, error
                 try:

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from data_gen.paths.holes import Holes
 from data_gen.paths.vertex import Materials
 from ngpt.errors import NgptError
 
@@ -254,3 +255,4 @@ class World:
     lights: LightEnds
     materials: Materials | None = None  # for samplers that ask nothing of them
     fog: Any = None  # ``photons.map.fog.Fog``: the media, for samplers that gather photons there
+    holes: Holes | None = None  # which are no vertices; None where there are none, or where they are

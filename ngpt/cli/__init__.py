@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, NoReturn
 
 from ngpt.errors import NgptError, WrongUse, did_you_mean
 from ngpt.system.console import Console, logged, run_command
-from ngpt.system.install import install_command
+from ngpt.system.install import install_command, study
 from ngpt.system.parts import brought, no_renderer
 from ngpt.version import __version__
 
@@ -76,6 +76,9 @@ class _Parser(argparse.ArgumentParser):
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
+            registry = getattr(action.choices, "registry", None)
+            if registry is not None and (line := study(registry.what, str(value))):
+                raise WrongUse(line)
             known = list(map(str, action.choices))
             text = f"invalid choice: '{value}'; {did_you_mean(str(value), known)}choose one of: {', '.join(known)}"
             raise argparse.ArgumentError(action, text)

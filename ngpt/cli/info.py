@@ -11,7 +11,7 @@ import numpy as np
 
 from ngpt.cli.arguments import add_json, add_layers, add_untrusted, add_view, assignment, print_json
 from ngpt.cli.streams import standard_input
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.io.aliases import format_aliases
 from ngpt.io.exr import pass_through, read, views_in
 from ngpt.io.resolution import layers_held, propose
@@ -23,6 +23,7 @@ from ngpt.network.describe import describe
 from ngpt.shared import CUT, TAILS, noise_of_light
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console, tell
+from ngpt.system.install import BROUGHT, study
 from ngpt.system.parts import find_renderer
 from ngpt.training.dataset import summary
 from ngpt.training.run_summary import is_run
@@ -135,6 +136,8 @@ def other(name: str, parameters: dict[str, str]) -> dict:
         found |= renderer.describe_sampler(name)
     if found:
         return found
+    if line := next(filter(None, (study(what, name) for what in BROUGHT)), ""):
+        raise WrongUse(line)
     return {"scene": name} | renderer.inspect(name, parameters)
 
 

@@ -3,7 +3,6 @@
     Direct     the prediction is the logarithm [Kettunen et al. 2019]
     Residual   it corrects the logarithm of the image the network starts from
     Mixture    a weight for each of several images, and a correction of the logarithm of their mean
-    SplitKernels  kernels for diffuse and for specular light, see ``ngpt.network.kpcn``
     Pyramid     kernels at several resolutions, of one image, blended from coarse to fine [Vogels et al. 2018,
                "Denoising with kernel prediction and asymmetric loss functions", section 4.3]
 

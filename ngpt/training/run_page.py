@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ngpt.errors import NgptError
+from ngpt.network.training_log import LOG, entries_of
 from ngpt.report.curves import curves
 from ngpt.report.document import document
 from ngpt.report.markup import plain_table, plots_html
@@ -19,7 +20,7 @@ from ngpt.system.console import span
 from ngpt.system.records import read_json
 from ngpt.system.text import markup
 from ngpt.system.writing import write_text
-from ngpt.training.run_summary import LOG, PAGE, SETTINGS, entries_of
+from ngpt.training.run_summary import PAGE, SETTINGS
 from ngpt.training.settings_text import difference, flat
 
 RECORD = "run.json"

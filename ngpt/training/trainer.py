@@ -24,6 +24,7 @@ from ngpt.errors import NgptError
 from ngpt.network import safetensors
 from ngpt.network.device import in_bfloat16
 from ngpt.network.model import parameters
+from ngpt.network.training_log import LOG
 from ngpt.system import files
 from ngpt.system.console import print_line
 from ngpt.system.records import check
@@ -31,7 +32,7 @@ from ngpt.system.writing import write_text
 from ngpt.training.distributed import Processes
 from ngpt.training.loggers import Logger, Meter, loggers
 from ngpt.training.run_page import write_run
-from ngpt.training.run_summary import CHECKPOINT, LOG, WEIGHTS
+from ngpt.training.run_summary import CHECKPOINT, WEIGHTS
 from ngpt.training.schedule import learning_rate, update_average, warmup_of
 from ngpt.training.settings import Settings, changed, from_dict, published
 from ngpt.training.task import Task
