@@ -34,8 +34,10 @@ class BentLamps:
     @staticmethod
     def of(scene: mi.Scene) -> BentLamps | None:
         """None where no lamp is bent."""
-        lamps = [emitter.get_shape() for emitter in scene.emitters()]
-        bent = {number: shape for number, shape in enumerate(lamps) if shape is not None and is_bent(shape)}
+        # Shapes that their emitters tell of are not always known to be meshes.
+        found = [shape for shape in scene.shapes() if shape.is_emitter() and is_bent(shape)]
+        numbers = {emitter.ptr: number for number, emitter in enumerate(scene.emitters())} if found else {}
+        bent = {numbers[shape.emitter().ptr]: shape for shape in found}
         return BentLamps(scene, bent) if bent else None
 
     def __init__(self, scene: mi.Scene, bent: dict[int, mi.Mesh]):

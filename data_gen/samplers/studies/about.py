@@ -12,6 +12,7 @@ register(
         standing="study",
         refusals=(*SURFACES, spectra, hidden_emitters),
         loses=THROUGH_HOLES,
+        leaves_lamps=True,
         notes={
             "transport": "paths are shared in tiles where materials are rough",
             "noise": "correlated within tiles, which denoisers of independent noise do not expect",
@@ -48,6 +49,7 @@ register(
         standing="study",
         refusals=(*SURFACES, hidden_emitters),
         loses=THROUGH_HOLES,
+        leaves_lamps=True,
         notes={"transport": "split by the lobe of the first scattering event"},
         gradients=False,
     )
