@@ -16,6 +16,8 @@ from data_gen.scenes.load import path_depths
 
 # Shapes that Mitsuba samples uniformly by area, besides meshes; for spheres it samples the visible part.
 _UNIFORM_SHAPES = ("Rectangle", "Disk", "Cylinder")
+# What emission depends on, where it is met: of thousands of shapes, all else takes twice the time to record.
+_EMISSION = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
 
 
 class Lights:
@@ -188,7 +190,7 @@ def emission_seen(scene, integrator, medium, ray: mi.RayDifferential3f, active) 
     # Most rays meet no lamp: nothing else is computed for them.
     lamp = hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 - a comparison of arrays of pointers
     shines = active & (lamp | ~hit.is_valid())
-    si = hit.compute_surface_interaction(ray, mi.RayFlags.All, lamp)
+    si = hit.compute_surface_interaction(ray, _EMISSION, lamp)
     return si.emitter(scene, shines).eval(si, shines)
 
 
