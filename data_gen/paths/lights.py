@@ -160,7 +160,7 @@ def emission(
 
 
 def shared_emission(scene, lights: Lights, x1, Le, p, *, x, y, y1, J) -> tuple[mi.Spectrum, mi.Float]:
-    """``emission(scene, y1, y, True, True, lights)`` by way of ``Le`` and ``p`` of the same vertex ``x1``, as seen from ``x``.
+    """``emission(scene, y1, y, True, True, lights)`` by ``Le`` and ``p`` of the same vertex ``x1``, as seen from ``x``.
 
     ``y1`` is ``x1`` with another incident direction; ``J`` is the ratio d'²/d² of the squared distances.
     """

@@ -84,9 +84,7 @@ def _replay(scene, plan: Plan, random, record: Record, y, good):
     return y, β, good, L
 
 
-def _lit(
-    scene: mi.Scene, plan: Plan, y: mi.SurfaceInteraction3f, numbers: Numbers, active: mi.Bool
-) -> mi.Spectrum:
+def _lit(scene: mi.Scene, plan: Plan, y: mi.SurfaceInteraction3f, numbers: Numbers, active: mi.Bool) -> mi.Spectrum:
     """f m Le V / p of the emitter that the numbers choose."""
     bsdf = y.bsdf()
     active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
