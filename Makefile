@@ -2,25 +2,35 @@
 
 PY = .venv/bin/python
 
-.PHONY: demo quick test test-slow campaigns check docs wheel try-wheel bench setup-demo setup-dev setup-test setup-quick setup-docs
+.PHONY: demo quick test test-hosts durations test-slow campaigns check docs wheel try-wheel bench setup-demo setup-dev setup-test setup-hosts setup-quick setup-docs
 
 demo: setup-demo
 	$(PY) -m ngpt demo -o demo --force
 
 WORKERS = -n auto --maxprocesses 4 --dist worksteal
 
-# One minute on two cores: all that neither renders, trains, exports, evaluates, compiles nor starts programs. See tests/conftest.py.
+# One minute on two cores: all that neither renders, trains, exports, evaluates, compiles nor starts programs. See conftest.py.
 quick: setup-quick
 	$(PY) -m pytest -q $(WORKERS) -m quick
 
+# A law of a sampler that has passed with the same code on this machine is skipped, unless NGPT_STRICT=1:
+# tests/data_gen/laws/conftest.py.
 test: setup-test
-	$(PY) -m pytest -q $(WORKERS) -m "not slow"
+	$(PY) -m pytest -q $(WORKERS) -m "not slow and not hosts and not browser"
 
-test-slow: setup-test
+# What needs a compiler, Node or a browser.
+test-hosts: setup-hosts
+	$(PY) -m pytest -q $(WORKERS) -m "not slow and (hosts or browser)"
+
+# The processor seconds of all of them, in tests/durations.json.
+durations: setup-test setup-hosts
+	NGPT_STRICT=1 $(PY) -m pytest -q $(WORKERS) -m "not slow" --durations-to tests/durations.json
+
+test-slow: setup-test setup-hosts
 	$(PY) -m pytest -q -m slow --ignore tests/campaigns
 
 # Bad inputs, kills, full disks and long runs in their long form, and the page of what came out (an hour or several).
-campaigns: setup-test
+campaigns: setup-test setup-hosts
 	$(PY) scripts/reliability.py
 
 check: setup-dev docs
@@ -54,7 +64,10 @@ setup-dev:
 	@scripts/setup dev llvm
 
 setup-test:
-	@scripts/setup dev llvm chromium hosts programs
+	@scripts/setup dev llvm programs
+
+setup-hosts:
+	@scripts/setup dev llvm chromium hosts
 
 setup-quick:
 	@scripts/setup dev

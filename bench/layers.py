@@ -4,33 +4,37 @@ layers of a stack") and docs/use/from-your-renderer.md ("What auto takes").
     python -m bench.layers --cache /tmp/stacks --scenes diffuse glossy environment lens SCENE.xml ...
 
 Renders stacks with gradients and references (kept in the cache folder), measures what `auto` takes of every choice of
-their layers, with OIDN and without, and of files with the layer names of each renderer. Writes ngpt/measure/layers.json
-and prints both tables as Markdown. Errors are geometric means of the trimmed relMSE over the scenes.
+their layers, with OIDN and without, and of files with the layer names of each renderer. Writes
+bench/results/layers.json and prints both tables as Markdown. Errors are geometric means of the trimmed relMSE over the
+scenes.
 """
 
 import argparse
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
-import ngpt
 from bench.common import metadata, rendered
 from ngpt.evaluation.config import scene_name
 from ngpt.io.exr import read
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
+from ngpt.layers import LAYERS
 from ngpt.measure.averages import geometric_mean
-from ngpt.measure.gains import NEED_OIDN, cases
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS, choose, reconstruct
 from ngpt.repair import variance_of_primal
 from ngpt.stack import GradientStack
 from ngpt.system.writing import markdown_table, write_json
 
-TABLE = Path(__file__).parents[1] / "ngpt" / "measure" / "layers.json"
+TABLE = Path(__file__).parent / "results" / "layers.json"
 SPP, SIZE, REFERENCE_SPP = (4, 16, 64), (192, 108), 2048
+# Layers that a renderer gives together
+GROUPS = (("albedo",), ("normal",), ("depth",), ("primal_var",), ("dx", "dy"), ("dx_var", "dy_var"))
+NEED_OIDN = ("ngpt-combine", "ngpt-primal", "oidn")
 # Samples per pixel for the table of renderers
 RENDERER_SPP = 16
 
@@ -61,7 +65,7 @@ RENDERERS: dict[str, dict[str, tuple[str, str]]] = {
     "Karma": {"primal": ("C", "RGB"), "albedo": ("albedo", "RGB"), "normal": ("N", "XYZ")},
 }
 # Our own names, which any renderer may write.
-OWN = {name: (name, "".join(layer.channels)) for name, layer in ngpt.layers.LAYERS.items()}
+OWN = {name: (name, "".join(layer.channels)) for name, layer in LAYERS.items()}
 FEATURES, GRADIENTS, VARIANCES = ("albedo", "normal", "depth"), ("dx", "dy"), ("primal_var", "dx_var", "dy_var")
 CHOICES: tuple[tuple[str, ...], ...] = (
     (),
@@ -110,6 +114,35 @@ def main() -> None:
     print(by_layers(rows) + "\n")
     with tempfile.TemporaryDirectory() as folder:
         print(by_renderer(renderers(stacks[RENDERER_SPP], Path(folder))))
+
+
+def cases() -> dict[tuple[str, tuple[str, ...]], None]:
+    """Each method that ``auto`` chooses for some layers, and the layers that it uses; with OIDN and without."""
+    found: dict[tuple[str, tuple[str, ...]], None] = {}
+    for added in choices():
+        layers = {"primal", *added}
+        for oidn in (True, False):
+            method = choose(layers, usable(oidn))
+            found[method, used(method, layers)] = None
+    return found
+
+
+def choices() -> Iterator[list[str]]:
+    """The layers of every choice of ``GROUPS``."""
+    for size in range(len(GROUPS) + 1):
+        for groups in combinations(GROUPS, size):
+            yield [name for group in groups for name in group]
+
+
+def usable(oidn: bool) -> Callable[[str], bool]:
+    """Which methods ``choose`` may take where all packages are installed, with OIDN or without."""
+    return lambda name: oidn or name not in NEED_OIDN
+
+
+def used(method: str, layers: Container[str]) -> tuple[str, ...]:
+    """The given layers that a method uses, in the order of ``LAYERS``."""
+    entry = METHODS[method]
+    return tuple(name for name in LAYERS if name in layers and name in (*entry.needs, *entry.uses, *entry.estimates))
 
 
 def error_of(scenes: Sequence[tuple[GradientStack, np.ndarray]], method: str, layers: Sequence[str]) -> float:

@@ -12,16 +12,16 @@ folder takes the place of what is kept of its size. Without folders the tables a
 import argparse
 import json
 import math
-import shutil
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 from bench.common import save, write_page
+from bench.curves import error_at
+from bench.frontier import draw, points_against
 from bench.tables import RIVALS, heading
-from ngpt.evaluation.curves import error_at
-from ngpt.evaluation.wholetime import ratio
-from ngpt.evaluation.worth import marked, worth_of_gradients
+from bench.wholetime import against_rivals, groups_of, ratio
+from bench.worth import marked, worth_of_gradients
 from ngpt.measure.averages import geometric_mean
 
 ROOT = Path(__file__).parents[1]
@@ -47,11 +47,15 @@ def main() -> None:
         before = json.loads(RESULT.read_text()).get("sizes", []) if RESULT.is_file() else []
         sizes = {tuple(size["size"]): size for size in before}
         for folder in args.folders:
-            size = kept(json.loads((folder / "results.json").read_text()))
+            results = json.loads((folder / "results.json").read_text())
+            size = kept(results)
             sizes[tuple(size["size"])] = size
+            measured = [name for name, entry in results["scenes"].items() if not entry["absent"]]
+            groups = groups_of(results, measured)
             for group in Size(size).drawn():
-                if (plot := folder / "plots" / f"frontier-rivals-{group}.svg").is_file():
-                    shutil.copyfile(plot, IMAGES / picture(size, group))
+                title = f"{group}: geometric mean over {len(groups[group])} scenes"
+                plot = draw(points_against(results, groups[group]), title, results["primary"])
+                (IMAGES / picture(size, group)).write_text(plot)
         save(RESULT, {"benchmark": "main", "sizes": [sizes[size] for size in sorted(sizes)]})
     for (page, name), text in blocks(json.loads(RESULT.read_text())).items():
         write_page(ROOT / page, text, marks(name))
@@ -77,8 +81,7 @@ def kept(results: dict[str, Any]) -> dict[str, Any]:
     ]
     # Gradients are compared to unbiased rivals only.
     unbiased = [row for row in results["summary"] if row["method"] not in SHARED]
-    found = {"against": results["against"], "worth": worth_of_gradients(results | {"summary": unbiased})}
-    tables = {name: {key: table[key] for key in ("rows", "means")} for name, table in found.items()}
+    tables = {"against": against_rivals(results), "worth": worth_of_gradients(results | {"summary": unbiased})}
     settings["rivals"] = settings.pop("against")
     return facts | settings | {"cells": cells} | tables
 

@@ -27,11 +27,11 @@ import time
 from pathlib import Path
 
 import numpy as np
+from ngpt.evaluation.gradientmap import variances_of_differences, write_map
 
 import ngpt
 from bench.common import kept, metadata, renderer, save
 from ngpt.evaluation.config import scene_name
-from ngpt.evaluation.gradientmap import variances_of_differences, write_map
 from ngpt.evaluation.references import reference_noise
 from ngpt.measure.averages import summary
 from ngpt.measure.metrics import compare

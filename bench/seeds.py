@@ -14,7 +14,7 @@ The sampler is `primal`. Scenes are files, built-in names, or generator:SEED:SIG
     seconds    of processors, of the render and of OIDN
 
 In the table the error at equal whole time is over the curve of whole paths, geometric means over seeds; marks are those
-of ``ngpt.evaluation.curves``. References are made as ``bench.tails`` makes them. ``--against`` names the folder of
+of ``bench.curves``. References are made as ``bench.tails`` makes them. ``--against`` names the folder of
 another version of the code, which renders shared tails too. Cells that are measured again replace the old ones.
 """
 
@@ -33,6 +33,7 @@ import numpy as np
 
 import ngpt
 from bench.common import blocks, metadata, renderer, save
+from bench.curves import error_at
 from bench.tails import (
     TAILS,
     WARM_SPP,
@@ -47,7 +48,6 @@ from bench.tails import (
     table,
 )
 from ngpt.evaluation.config import scene_name
-from ngpt.evaluation.curves import error_at
 from ngpt.measure.averages import geometric_mean
 
 SIDES = (8, 32)

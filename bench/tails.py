@@ -15,7 +15,7 @@ Samplers are `primal`, `gpt`, and `mitsuba`: `primal` with Mitsuba's own points 
 
 References are NAME-WxH-a.exr and -b.exr of the folder; what is missing is rendered there, without shared tails. At
 equal whole time a cell with shared tails is over the errors of its own sampler and method with tails=paths; for the
-marks see ``ngpt.evaluation.curves``. W, C and W/C of gradients are against `primal` with the same tails. Cells that the
+marks see ``bench.curves``. W, C and W/C of gradients are against `primal` with the same tails. Cells that the
 file has are not measured again. Values are medians over seeds, means over scenes geometric.
 """
 
@@ -31,10 +31,10 @@ import numpy as np
 
 import ngpt
 from bench.common import blocks, metadata, renderer, save
+from bench.curves import error_at, joined
+from bench.worth import worth_tables
 from ngpt.evaluation.config import scene_name
-from ngpt.evaluation.curves import error_at, joined
 from ngpt.evaluation.references import HALVES, Reference, read_reference
-from ngpt.evaluation.worth import worth_of_gradients, worth_tables
 from ngpt.measure.averages import geometric_mean, median
 from ngpt.measure.metrics import EPSILON, relmse_trimmed, scores, squared_error, trimmed_mean
 from ngpt.methods import choose
@@ -251,7 +251,7 @@ def show(cells: list[dict], groups: dict[str, list[str]]) -> None:
     table(["scenes", "sampler", "method", "spp", *RATIOS], lines)
     for tails in TAILS:
         print(f"\ngradients, tails={tails}")
-        told = worth_tables({"worth": worth_of_gradients(evaluated(cells, tails, groups)), "methods": pipelines()})
+        told = worth_tables(evaluated(cells, tails, groups))
         for title, (head, *lines) in told.items():
             print(f"\n{title}")
             table(head, lines)

@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from data_gen.samplers import SAMPLERS
-from ngpt.evaluation.keys import code_text
+from ngpt.system.source import code_text
 
 ROOT = Path(__file__).parent
 # The registry knows all samplers; of what it imports, a render needs its own family's entries.
@@ -37,15 +37,16 @@ def scene_code(name: str) -> str:
 
 
 def reached(sampler: str) -> list[str]:
-    """The modules of data_gen that a render by the sampler runs, sorted."""
+    """The modules of data_gen, and of the sampler's own package, that a render by the sampler runs, sorted."""
     entries = [SAMPLERS[sampler]] if sampler in SAMPLERS else [s for s in SAMPLERS.values() if s.rank]
     modules = [entry.module for entry in entries if sampler in (entry.name, "auto") and isinstance(entry.module, str)]
     queue, found = ["data_gen.render", _MACHINERY, *modules, *filter(None, map(_entries_of, modules))], set()
+    homes = frozenset({_FACE, *(module.partition(".")[0] for module in modules)})
     while queue:
         module = queue.pop()
         if module not in found and module not in (_REGISTRY, _FACE, *_BUILT_IN):
             found.add(module)
-            queue += _imports(_file(module))
+            queue += _imports(_file(module), homes)
     return sorted(found)
 
 
@@ -57,22 +58,22 @@ def _entries_of(module: str) -> str | None:
     return None
 
 
-def _imports(file: Path) -> set[str]:
-    """The modules of data_gen that a file imports, and the packages they are in."""
-    return {name for name in _named(file, file.stat().st_mtime_ns) if _file(name).is_file()}
+def _imports(file: Path, homes: frozenset[str]) -> set[str]:
+    """The modules of the packages ``homes`` that a file imports, and the packages they are in."""
+    return {name for name in _named(file, file.stat().st_mtime_ns, homes) if _file(name).is_file()}
 
 
 # Cached by the time of the last change of the file
 @lru_cache(maxsize=1024)
-def _named(file: Path, changed: int) -> frozenset[str]:
-    """Names in data_gen that a file imports, and what they are in."""
+def _named(file: Path, changed: int, homes: frozenset[str]) -> frozenset[str]:
+    """Names in the packages ``homes`` that a file imports, and what they are in."""
     found = set()
     for node in ast.walk(ast.parse(file.read_bytes())):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and not node.level:
             found |= {node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)}
-    parts = [name.split(".") for name in found if name.partition(".")[0] == "data_gen"]
+    parts = [name.split(".") for name in found if name.partition(".")[0] in homes]
     return frozenset(".".join(words[: i + 1]) for words in parts for i in range(len(words)))
 
 
@@ -82,11 +83,14 @@ def _text(file: Path, changed: int) -> str:
 
 
 def _file(module: str) -> Path:
-    """The file of a module of data_gen, or of a package's ``__init__``; or of another package's module."""
-    if module.partition(".")[0] != "data_gen":
-        spec = find_spec(module)
-        return Path(spec.origin if spec and spec.origin else module)
-    path = ROOT.joinpath(*module.split(".")[1:])
+    """The file of a module of data_gen or of another package, of a package its ``__init__``."""
+    package, *names = module.split(".")
+    home = ROOT
+    if package != _FACE:
+        spec = find_spec(package)
+        inside = spec.submodule_search_locations if spec else None
+        home = Path(next(iter(inside)) if inside else spec.origin if spec and spec.origin else package)
+    path = home.joinpath(*names)
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 

@@ -48,10 +48,12 @@ class Rounds(Protocol):
 
     ``shares``  whether they depend on it in the current render
     ``said``    header attributes that say so
+    ``seed``    of what rounds find; None: that of the render
     """
 
     shares: bool
     said: dict[str, Any]
+    seed: int | None
 
     def begin(self, sensor: mi.Sensor, seed: int, sample: int, film: GradientFilm) -> None:
         """Called before each pass, with what the ``film`` has; ``sample`` is the first sample of the pass, and 0
@@ -66,6 +68,7 @@ class _OneRound:
 
     shares = False
     said: dict[str, Any] = {}  # noqa: RUF012 - it stays empty
+    seed: int | None = None
 
     def begin(self, sensor: mi.Sensor, seed: int, sample: int, film: GradientFilm) -> None:
         pass

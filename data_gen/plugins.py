@@ -1,4 +1,6 @@
-"""Our integrators as Mitsuba's: ``mi.load_dict({"type": "gpt"})`` after ``import data_gen``, whatever the variant.
+"""Samplers as Mitsuba's integrators: ``mi.load_dict({"type": "gpt"})`` after ``import data_gen``, whatever the variant.
+
+Those of other packages are there too, by their entry points.
 
 Mitsuba knows plugins by variant, and only once one is set. So with each variant that is set, constructors are
 registered that know no more than a name. A class is made when it is first used: all of them take half a second.
@@ -57,24 +59,23 @@ def _register() -> None:
     """Has the current variant know the names of our integrators."""
     import mitsuba as mi
 
-    from data_gen.samplers import SAMPLERS
+    from data_gen.samplers.registry import SAMPLERS, plugin_of
 
-    for entry in SAMPLERS.values():
-        if isinstance(entry.module, str):
-            mi.register_integrator(entry.plugin, lambda props, entry=entry: _construct(entry, props))
+    for name in SAMPLERS.names():
+        mi.register_integrator(plugin_of(name), lambda props, name=name: _construct(name, props))
 
 
-def _construct(entry: Any, props: Any) -> Any:
+def _construct(name: str, props: Any) -> Any:
     """The integrator of a sampler, of the current variant. Raises NgptError where the sampler is none of Mitsuba's."""
-    from data_gen.samplers.registry import integrator_of
+    from data_gen.samplers.registry import SAMPLERS, integrator_of
     from ngpt.errors import NgptError
 
     make_classes()
-    kind = integrator_of(entry.module)
+    module = SAMPLERS[name].module
+    kind = integrator_of(module) if isinstance(module, str) else None
     if kind is None:
         raise NgptError(
-            f"sampler '{entry.name}' is no integrator of Mitsuba; "
-            f"use data_gen.render_scene(scene, sampler='{entry.name}')"
+            f"sampler '{name}' is no integrator of Mitsuba; use data_gen.render_scene(scene, sampler='{name}')"
         )
     return kind(props)
 
@@ -105,9 +106,12 @@ def _modules_with_classes() -> list[ModuleType]:
     common = sys.modules.get("data_gen.samplers.common")
     if not common:
         return []
+    from data_gen.samplers.registry import SAMPLERS
+
+    homes = {str(entry.module).partition(".")[0] for entry in SAMPLERS.values()}
     depth = {}
     for name, module in list(sys.modules.items()):
-        for value in vars(module).values() if name.startswith("data_gen.") else ():
+        for value in list(vars(module).values()) if name.partition(".")[0] in homes else ():
             if isinstance(value, type) and value.__module__ == name and issubclass(value, common.GradientIntegrator):
                 depth[name] = len(value.__mro__)
     return [sys.modules[name] for name in sorted(depth, key=lambda name: depth[name])]

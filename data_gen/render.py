@@ -58,6 +58,7 @@ def render_stack(
     adaptive: Adaptive | None = None,
     made: Made | None = None,
     unbiased: bool = False,
+    tails_seed: int | None = None,
     subpixels: int | str = 1,
     **options: Any,
 ) -> GradientStack:
@@ -73,7 +74,8 @@ def render_stack(
 
     Unless it is ``unbiased``, samplers with the option ``tails`` let paths share what they find, where that works and
     pays (``data_gen.tails``): the default of all doors, which are this function, ``render_scene``, `ngpt render` and
-    our plugins. The attribute ``ngpt:samplerOptions`` then contains ``tails=shared``.
+    our plugins. The attribute ``ngpt:samplerOptions`` then contains ``tails=shared``. The noise of what they share
+    comes from ``tails_seed``, by default ``seed``: it stands still in frames that have the same.
 
     With ``subpixels`` K, 2 or 4, or where "auto" finds them of use, the stack has K x K subpixels (``ngpt.subpixels``).
 
@@ -133,6 +135,7 @@ def render_stack(
         more |= own(settings) | ({"places": places} if places else {})
         made = made or Made()
         sample = made.sampler(entry, scene, more)
+        rounds_of(sample).seed = tails_seed
         # However long it took to weigh the lamps, the render is begun.
         if seconds is not None:
             budget = replace(budget, seconds=max(seconds - (clock() - begun), 1e-3))

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from data_gen import code as source
@@ -107,18 +105,3 @@ def inspect(name: str, parameters: dict[str, str]) -> dict[str, Any]:
     from data_gen.inspect import inspect_scene
 
     return inspect_scene(name, parameters)
-
-
-@contextmanager
-def stream(config: Path, kept: str = "") -> Iterator[Any]:
-    from data_gen.dataset.config import read_config
-    from data_gen.dataset.jobs import Pool
-    from data_gen.dataset.stream import Stream
-
-    # Training that is interrupted finishes its step, and may still ask for crops.
-    with Pool(1, interruptible=False) as worker, Stream(read_config(config), worker, kept=kept) as data:
-        try:
-            yield data
-        finally:
-            # What it is at would take minutes, and nobody is going to see it.
-            worker.end()

@@ -12,6 +12,7 @@ from typing import Any
 
 from data_gen.backend import DEFAULT_VARIANT
 from data_gen.begun import Asked, Rest, Unfinished, begun_stack, scene_name
+from data_gen.cluster import cluster
 from data_gen.frames.pattern import filled
 from data_gen.outputs import Denoising, Output
 from data_gen.samplers import FRAME_SAMPLERS
@@ -168,8 +169,6 @@ def write_frames_on_cluster(
         raise WrongUse("--cluster distributes the frames itself; leave --shard out")
     for file in files.values():
         _check(file, overwrite or skip_existing)
-    from data_gen.dataset.jobs import cluster
-
     parts = -(-len(files) // FRAMES_OF_A_PART)
     # A part that is tried again, since its worker died, goes on.
     options |= {"overwrite": overwrite, "skip_existing": skip_existing or not overwrite}

@@ -14,7 +14,7 @@ import numpy as np
 
 from ngpt.classical.bases import CLASSICAL
 from ngpt.coverage import empty_pixels, kept_within
-from ngpt.denoisers import caustic, nfor, nlm, oidn
+from ngpt.denoisers import caustic, nfor, oidn
 from ngpt.errors import NgptError, WrongUse, did_you_mean
 from ngpt.io.primaries import converted, inside_rec709
 from ngpt.layers import GATHERED
@@ -160,14 +160,6 @@ _OURS = {
     ),
     "ngpt": _network("ngpt", "neural network of the paper's size", (*_GRADIENTS, *_FEATURES), "niche"),
     # The methods below do not use gradients.
-    "nlm": Method(
-        "joint non-local means of scikit-image",
-        ("primal", "albedo", "normal", "primal_var"),
-        nlm.nlm,
-        {},
-        "study",
-        nlm.missing,
-    ),
     "nfor": Method(
         "first-order regression on albedo, normal and depth, for machines without OIDN",
         ("primal",),
@@ -206,8 +198,7 @@ def by_standing(*standings: str) -> dict[str, Method]:
 
 def unknown_method(name: str) -> WrongUse:
     """The error for a name that is no method's."""
-    meant = did_you_mean(name, ("auto", *METHODS))
-    return WrongUse(f"unknown method '{name}'; {meant}choose one of: auto, {', '.join(by_standing('use', 'niche'))}")
+    return METHODS.unknown(name, ("auto", *METHODS), f"auto, {', '.join(by_standing('use', 'niche'))}")
 
 
 def runnable(name: str) -> Method:

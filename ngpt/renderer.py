@@ -1,10 +1,11 @@
-"""The renderer as ngpt sees it: what the evaluation, ``ngpt info`` and ``ngpt train`` ask of it.
+"""The renderer as ngpt sees it: what the evaluation and ``ngpt info`` ask of it, and ``ngpt train``.
 
 ``ngpt.system.parts.find_renderer`` finds the one that is installed, ``data_gen.service``: an entry point of the group
 "ngpt.renderers" names it. Nothing in ngpt imports it.
 """
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -60,8 +61,13 @@ class Renderer(Protocol):
     def inspect(self, name: str, parameters: dict[str, str]) -> dict[str, Any]:
         """What a scene is made of and how it would be rendered."""
 
-    def stream(self, config: Path, kept: str = "") -> Any:
-        """To be entered: crops of a dataset's configuration, rendered in another process while they are trained on.
+
+class Crops(Protocol):
+    """What ``ngpt train`` renders with. ``ngpt.system.parts.find_crops`` finds it by an entry point of the group
+    "ngpt.crops"; ours is ``data_gen.dataset.stream.stream``."""
+
+    def __call__(self, config: Path, kept: str = "") -> AbstractContextManager[Any]:
+        """Crops of a dataset's configuration, rendered in another process while they are trained on.
 
         ``kept``  folder for its references, which are made once; "" makes new ones for ever
         """

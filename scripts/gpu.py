@@ -24,11 +24,12 @@ import numpy as np
 
 from bench.common import metadata
 from ngpt.errors import NgptError
+from ngpt.network.training_log import entries_of
 from ngpt.system import configs
 from ngpt.system.limits import processors
 from ngpt.system.writing import write_json, write_text
 from ngpt.training.dataset import read_manifest
-from ngpt.training.run_summary import entries_of, summary
+from ngpt.training.run_summary import summary
 
 ROOT = Path(__file__).parents[1]
 # Of each training: its share, and changes of its configuration. How long it will be need not be known: the learning

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 TRIALS: dict[str, tuple[str, str]] = {
     "": ("ngpt, data_gen, onnxruntime", "denoise noisy.exr -o clean.exr"),
     "render": ("mitsuba", "render diffuse --size 32x24 --spp 2 --sampler gpt -o stack.exr"),
-    "peers": ("skimage", "denoise noisy.exr -o nlm.exr -m nlm"),
+    "peers": ("skimage", "diff noisy.exr noisy.exr"),
     "export": ("torch, onnx", "export --method l2 -o l2.onnx"),
     "cluster": ("distributed", "info noisy.exr"),
     "train": ("torch, mitsuba, tensorboard", "train --config tiny --dry-run"),

@@ -12,7 +12,8 @@ import tomllib
 from pathlib import Path
 
 TREE = Path(__file__).parents[1]
-COPIED = ("ngpt", "data_gen", "tests", "configs", "export", "train.py", "eval.py", "pyproject.toml")
+COPIED = ("ngpt", "data_gen", "studies", "tests", "configs", "export")
+COPIED += ("conftest.py", "train.py", "eval.py", "pyproject.toml")
 
 
 def killed(mutant: dict, copy: Path) -> bool:
@@ -22,7 +23,9 @@ def killed(mutant: dict, copy: Path) -> bool:
         raise SystemExit(f"{mutant['file']}: has '{mutant['old']}' {clean.count(mutant['old'])} times, not once")
     file.write_text(clean.replace(mutant["old"], mutant["new"]), "utf-8")
     call = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "not slow", "-p", "no:cacheprovider", *mutant["tests"]]
-    done = subprocess.run(call, cwd=copy, env=os.environ | {"PYTHONPATH": str(copy)}, stdout=subprocess.PIPE, text=True)
+    done = subprocess.run(
+        call, cwd=copy, env=os.environ | {"PYTHONPATH": f"{copy}:{copy / 'studies'}"}, stdout=subprocess.PIPE, text=True
+    )
     file.write_text(clean, "utf-8")
     # 1: tests failed; 0: none did
     if done.returncode not in (0, 1):

@@ -1,10 +1,15 @@
 """One small network of every kind, and layers for it to read: what all networks must do is tested on each."""
 
+import pytest
 import torch
 
+from ngpt.errors import NgptError
 from ngpt.network import features
+from ngpt.network.config import KINDS
 from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.oidnet import SHAPES
+from ngpt.network.safetensors import save_weights
+from ngpt.network.transfer import signed_exp, signed_log
 
 ALL = ("primal", "dx", "dy", "albedo", "normal", "depth")
 SPLIT = ("primal", "diffuse", "specular", "diffuse_se", "specular_se", "albedo", "normal")
@@ -20,6 +25,7 @@ def plain(inputs, *rest, channels=(4, 4, 4, 4), **more):
 
 
 PYRAMID = {"start": ("primal",), "kernel": 3, "scales": 3, "demodulate": True}
+OF_TWO = {"start": ("primal", "base"), "kernel": 5, "scales": 2}
 # Those that ONNX graphs are made of; the name says what others have not.
 GRAPHED = {
     "with a base": dense((*ALL, "base", "primal_se", "dx_se", "dy_se"), "wcv"),
@@ -31,7 +37,7 @@ GRAPHED = {
     ),
     "converging": dense(("primal", "base", "primal_noise", "dx_se"), "wcv", start=("primal", "base"), quiet=1.0),
     "of a primal alone": dense(("primal", "primal_change", "primal_noise"), start=("primal", "denoised")),
-    "by kernels": dense(("primal", "base", "dx_se", "primal_se"), "wcv", start=("primal", "base"), quiet=1.0, kernel=5),
+    "by kernels of two": dense(("primal", "base", "dx_se", "primal_se"), "wcv", quiet=1.0, **OF_TWO),
     "as published": ModelConfig("dense", (4, 4), (2, 1), ALL),
     "without features": plain(("primal", "dx", "dy"), channels=(6, 8)),
     "by a pyramid of kernels": dense(("primal", "albedo", "normal"), channels=(4, 6, 6), **PYRAMID),
@@ -44,10 +50,12 @@ GRAPHED = {
     "a pyramid drawn to gradients": plain(SLOPES, "wcv", sweeps=2, **PYRAMID | {"scales": 2}),
 }
 NETWORKS = GRAPHED | {
-    "by wide kernels": plain(("primal", "albedo"), channels=(4,), start=("primal",), kernel=17),
-    "kernels of two parts": ModelConfig("kpcn", (6,), (2,), SPLIT, kernel=21),
+    "by wide kernels": plain(("primal", "albedo"), channels=(4, 4), start=("primal",), kernel=17, scales=2),
     "of OIDN's shape": ModelConfig("oidn", next(iter(SHAPES)), (), ("base", "albedo", "normal"), "wcv"),
 }
+# What holds for every network holds for that of ngpt-studies, where it is installed.
+if "kpcn" in KINDS:
+    NETWORKS["kernels of two parts"] = ModelConfig("kpcn", (6,), (2,), SPLIT, kernel=21)
 
 
 def untrained(config, deviation=0.1):
@@ -69,3 +77,53 @@ def layers_for(config, height, width, seed=0):
 
 def brighter(layers, factor):
     return {name: layer * factor if name in features.RADIANCE else layer for name, layer in layers.items()}
+
+
+def image_of(prediction, given, head):
+    return signed_exp(head.forward(prediction, given))
+
+
+def close(one, other):
+    return torch.allclose(one, other, rtol=1e-4)
+
+
+def wall(light, gloss, noise):
+    """Layers of a wall with paint in light and a highlight, with noise, and what they are without."""
+    torch.manual_seed(0)
+    albedo = 0.05 + 0.9 * torch.rand(1, 3, 32, 32)
+    layers = {name: torch.rand(1, 3, 32, 32) for name in SPLIT} | {"albedo": albedo}
+    for name, part in (("diffuse", albedo * light), ("specular", gloss)):
+        layers[name] = part * (1 + noise * torch.randn(part.shape)).clamp(min=0.1)
+    return layers | {"primal": layers["diffuse"] + layers["specular"]}, albedo * light + gloss
+
+
+STEP, SPOT = torch.ones(1, 3, 32, 32), torch.zeros(1, 3, 32, 32)
+STEP[..., 13:], SPOT[..., 20:, :] = 6, 9
+
+
+def learns(config, scene, bound):
+    """Whether it falls far below the noise of the input, by the factor ``bound``, and below equal kernels."""
+    torch.manual_seed(0)
+    model, (layers, clean) = Reconstructor(config), scene
+    optimizer = torch.optim.Adam(model.parameters(), 1.5e-2)
+
+    def loss(image):
+        return (signed_log(image) - signed_log(clean)).square().mean()
+
+    first = loss(model(layers)).item()
+    for _ in range(60):
+        optimizer.zero_grad()
+        loss(model(layers)).backward()
+        optimizer.step()
+    return loss(model(layers)).item() < min(0.35 * first, bound * loss(layers["primal"]).item())
+
+
+def no_graph(folder, config):
+    """Whether the export of such a network is refused, with what runs it."""
+    pytest.importorskip("onnxscript")
+    from ngpt.export.network import network_model
+
+    save_weights(folder / "w.safetensors", Reconstructor(config), {})
+    with pytest.raises(NgptError, match="for which there is no ONNX graph; run its weights in PyTorch"):
+        network_model(folder / "w.safetensors", "mine")
+    return True

@@ -15,6 +15,7 @@ from ngpt.cli import all_verbs
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("export/**/*.md")])
+PAGES += sorted(ROOT.glob("studies/*.md"))
 PAGES = [page for page in PAGES if "node_modules" not in page.parts]
 NOTEBOOKS = sorted(ROOT.glob("docs/**/*.ipynb"))
 

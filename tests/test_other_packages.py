@@ -1,5 +1,6 @@
 """Methods, samplers, losses and metrics of other packages, by entry points: the pages show these packages."""
 
+import os
 import re
 import subprocess
 import sys
@@ -20,6 +21,7 @@ PAGES = {
     "method": "docs/methods/add-a-method.md",
     "sampler": "docs/samplers/add-a-sampler.md",
     "loss": "docs/train/add-a-loss.md",
+    "network": "docs/train/add-a-network.md",
 }
 
 
@@ -53,14 +55,16 @@ def site(tmp_path, monkeypatch):
     modules = set(sys.modules)
     registries = [METHODS, METRICS, SAMPLERS]
     if "torch" in sys.modules:
+        from ngpt.network.config import KINDS
         from ngpt.training.loss import TERMS
 
-        registries.append(TERMS)
+        registries += [TERMS, KINDS]
+    before = [set(registry._imported) for registry in registries]
     yield folder
-    for registry in registries:
-        for name in registry._imported:
+    for registry, names in zip(registries, before, strict=True):
+        for name in registry._imported - names:
             del registry[name]
-        registry._imported.clear()
+        registry._imported &= names
     for name in set(sys.modules) - modules:
         if str(folder) in str(getattr(sys.modules[name], "__file__", "")):
             del sys.modules[name]
@@ -109,19 +113,50 @@ def test_the_sampler_of_the_page(renderer, site, command):
     assert "gradients by random replay" in command("info replay").out
     from data_gen.code import code
 
-    before = code("replay")
+    # Both are keyed by a file of their package, which only one of them names.
+    before = code("replay"), code("replay-path")
     (site / "ngpt_replay" / "replay.py").write_text("changed = 1\n")
-    assert code("replay") != before
+    assert code("replay") != before[0] and code("replay-path") != before[1]
+
+
+def test_the_integrator_of_the_page_is_a_plugin_of_every_variant(renderer, site):
+    install_page(site, PAGES["sampler"])
+    code = (
+        "import data_gen, mitsuba as mi\n"
+        "for variant in ('llvm_ad_rgb', 'llvm_ad_spectral', 'llvm_ad_rgb'):\n"
+        "    mi.set_variant(variant)\n"
+        "    assert isinstance(mi.load_dict({'type': 'replay_path'}), mi.Integrator), variant\n"
+    )
+    environment = os.environ | {"PYTHONPATH": f"{site}:{ROOT}"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def write_views(folder):
+    """A training set of two views in the folder "views"."""
+    for i in range(2):
+        view = folder / "views" / f"view{i}"
+        view.mkdir(parents=True)
+        ngpt.write(view / "few.exr", full_stack(32, 32, seed=i))
+        ngpt.write(view / "reference.exr", full_stack(32, 32, seed=2 + i)["primal"])
+
+
+def test_the_network_of_the_page(site, tmp_path, command, one_thread):
+    install_page(site, PAGES["network"])
+    write_views(tmp_path)
+    text = (ROOT / PAGES["network"]).read_text()
+    (line,) = re.findall(r"^    ngpt (train .*)$", text, re.M)
+    command(f"{line} --set data.folders='[\"views\"]' --set data.crop=32 --set run.steps=2 --set run.batch=1")
+    assert "layers" in command("info run/weights.safetensors").out
+    command("denoise stack.exr -m ngpt --weights run/weights.safetensors -o image.exr")
+    told = command(f"{line.replace('layers', 'layer')} --set data.folders='[\"views\"]'", 1, 2).err
+    assert "unknown network 'layer'" in told
 
 
 @pytest.mark.parametrize("changes", ["loss.squared=0.5", "loss.kind=squared loss.relative=0 loss.gradient=0"])
 def test_the_loss_of_the_page(site, tmp_path, command, changes, one_thread):
     install_page(site, PAGES["loss"])
-    for i in range(2):
-        view = tmp_path / "views" / f"view{i}"
-        view.mkdir(parents=True)
-        ngpt.write(view / "few.exr", full_stack(32, 32, seed=i))
-        ngpt.write(view / "reference.exr", full_stack(32, 32, seed=2 + i)["primal"])
+    write_views(tmp_path)
     changes = f"data.folders=['views'] data.crop=32 run.steps=2 run.batch=1 {changes}".split()
     given = " ".join(f'--set "{change}"' for change in changes)
     output = command(f"train --config tiny --out run {given}").out
@@ -190,7 +225,7 @@ def test_names_of_ours_are_refused(site, capsys):
     install(site, "own", groups)
     before = dict(METHODS), dict(METRICS), dict(SAMPLERS)
     for registry in (METHODS, METRICS, SAMPLERS):
-        assert registry.load() == []
+        registry.load()
     assert (dict(METHODS), dict(METRICS), dict(SAMPLERS)) == before
     told = capsys.readouterr().err
     for name in ("wcv", "auto", "relMSE", "gpt", "restir"):

@@ -4,6 +4,7 @@ Imports inside functions count like those at the top: what is late is quick to s
 """
 
 import ast
+from collections.abc import Iterable
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -27,7 +28,7 @@ ngpt.report
 ngpt.training ngpt.evaluation
 ngpt.export
 ngpt.cli
-data_gen.scenes data_gen.budget data_gen.llvm
+data_gen.scenes data_gen.budget data_gen.llvm data_gen.cluster
 data_gen.paths data_gen.film
 data_gen.passes data_gen.tails
 data_gen.samplers
@@ -39,18 +40,24 @@ data_gen.outputs data_gen.service
 data_gen.shot_files
 data_gen.cli
 ngpt data_gen
-ngpt.__main__ data_gen.__main__ train eval export bench
+ngpt.__main__ data_gen.__main__ train eval export ngpt_studies
+bench
 scripts
 """
+
+# What makes data sets, trains and compares, and the verbs that are doors to it: what renders, denoises and exports does
+# without. `ngpt info` and `ngpt report` describe its folders too.
+LAB = ("ngpt.training", "ngpt.evaluation", "data_gen.dataset")
+DOORS = {f"ngpt.cli.{verb}" for verb in ("train", "evaluate", "info", "report")} | {"data_gen.cli.dataset"}
 
 
 def modules(root: Path) -> dict[str, Path]:
     """Name -> file of all code but the tests'."""
-    folders = [root / name for name in ("ngpt", "data_gen", "export", "bench", "scripts")]
+    folders = [root / name for name in ("ngpt", "data_gen", "export", "bench", "scripts", "studies/ngpt_studies")]
     files = [file for folder in folders for file in folder.rglob("*.py") if "node_modules" not in file.parts]
     files += [root / "train.py", root / "eval.py"]
     names = {".".join(file.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): file for file in files}
-    return {name: file for name, file in names.items() if file.exists()}
+    return {name.removeprefix("studies."): file for name, file in names.items() if file.exists()}
 
 
 def imports(name: str, file: Path, known: dict[str, Path]) -> set[str]:
@@ -92,6 +99,30 @@ def faults(graph: dict[str, set[str]]) -> list[str]:
     return wrong
 
 
+def is_in(name: str, rooms: Iterable[str]) -> bool:
+    return any(name == room or name.startswith(f"{room}.") for room in rooms)
+
+
+def of_the_lab(graph: dict[str, set[str]]) -> list[str]:
+    """The imports by which what renders, denoises or exports would need the lab."""
+    core = [name for name in graph if is_in(name, ("ngpt", "data_gen")) and not is_in(name, LAB) and name not in DOORS]
+    return [f"{name} imports {target}" for name in core for target in sorted(graph[name]) if is_in(target, LAB)]
+
+
+GRAPH = {name: imports(name, file, modules(ROOT)) for name, file in modules(ROOT).items()}
+
+
 def test_every_import_leads_down():
-    known = modules(ROOT)
-    assert not faults({name: imports(name, file, known) for name, file in known.items()})
+    assert not faults(GRAPH)
+
+
+def test_what_renders_denoises_and_exports_never_imports_the_lab():
+    assert not of_the_lab(GRAPH)
+    assert not [name for name in DOORS if not any(is_in(target, LAB) for target in GRAPH[name])]
+    assert of_the_lab(GRAPH | {"ngpt.stack": {"ngpt.training.loss"}}) == ["ngpt.stack imports ngpt.training.loss"]
+
+
+def test_nothing_but_benchmarks_imports_the_studies():
+    """They stand on what any other package can use."""
+    wrong = {name for name, targets in GRAPH.items() if any(is_in(target, ["ngpt_studies"]) for target in targets)}
+    assert {name for name in wrong if not is_in(name, ("ngpt_studies", "bench"))} == set()

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 from full_stack import hidden_oidn
 
-from bench.layers import CHOICES, RENDERERS, renderers
+from bench.layers import CHOICES, NEED_OIDN, RENDERERS, renderers
 from ngpt.denoisers import oidn
-from ngpt.measure.gains import NEED_OIDN
 from ngpt.methods import METHODS, choose
 
 PAGE = Path(__file__).parents[1] / "docs" / "use" / "from-your-renderer.md"

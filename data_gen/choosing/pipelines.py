@@ -15,8 +15,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from data_gen.adaptive import LEAST, Adaptive, assess, gain
 from data_gen.choosing.trials import Trial, Witnesses
 from data_gen.samplers import SAMPLERS
@@ -33,10 +31,6 @@ WITHOUT = ("oidn", "ngpt-primal", "primal")
 # weight of the pilot in an exponent, and the steepest and flattest exponents allowed
 BY_GRADIENTS, BY_DENOISERS = -0.95, -0.55
 SEEN, STEEPEST, FLATTEST = 0.3, -1.2, -0.2
-# By how many times errors turned out as expected, at least and at most in eight of ten cases, at 1, 4 and 16 times the
-# samples of the pilot: of networks that use gradients and of others, on all scenes of that file.
-SPREADS = {True: ((0.4, 2.3), (0.5, 3.2), (0.6, 5.1)), False: ((0.5, 1.8), (0.5, 2.4), (0.5, 2.6))}
-_SPREAD_AT = (1, 4, 16)
 # The exponent for images by photons, from theory; and how many standard errors are added to their error
 _BY_PHOTONS, _DOUBT = -2 / 3, 2.0
 # The power of the pilot's gain that adaptive samples with gradients achieve: the pilot's need is smoother than the true
@@ -105,13 +99,6 @@ class Pipeline:
         if spp < self.least:
             return math.inf
         return self._begins * (spp / self.spp) ** self.fall
-
-    def likely(self, spp: float) -> tuple[float, float]:
-        """Between which errors eight of ten such expectations turned out to lie."""
-        spreads = SPREADS[{"dx", "albedo"} <= set(METHODS[self.method].needs)]
-        at = np.interp(math.log(spp / self.spp), [math.log(n) for n in _SPREAD_AT], range(len(_SPREAD_AT)))
-        low, high = (float(np.interp(at, range(len(spreads)), ends)) for ends in zip(*spreads, strict=True))
-        return low * self.expected(spp), high * self.expected(spp)
 
     def needed(self, error: float) -> float:
         """The samples that are expected to leave the error, or the least there are."""

@@ -1,10 +1,9 @@
 """Which sampler, how many samples and which method: chosen by a pilot, small renders by each sampler that could do it.
 
 ``plan`` is for a given time and a method that makes the image: the least error wins. ``plan_sampler`` is for
-``--sampler auto`` where the method is not known. It compares, with even samples and one simple method for each sampler,
-the times to reach the error that the scene's own sampler is expected to have at the end. It chooses photons where they
-are clearly better, but not in scenes whose light only photons can find. No pilot can see light that none of the
-samplers has found.
+``--sampler auto`` where the method is not known: the least error wins again, with even samples and one simple method
+for each sampler. It chooses photons where they are clearly better, but not in scenes whose light only photons can find.
+No pilot can see light that none of the samplers has found.
 """
 
 from __future__ import annotations
@@ -45,9 +44,9 @@ _GROWS = 0.9
 _METHOD_SECONDS, _OTHERS = {"auto": 18.0, "ngpt-combine": 18.0, "ngpt-primal": 7.0, "oidn": 8.0}, 3.0
 # Seconds from which on the pilot's images are as large as they ever are, and the least share of that
 LONG, LEAST_PIXELS = 400.0, 1 / 16
-# A rival must need this much less time, or leave this much less error: a choice is not worth changing for what chance
-# could have made. The error of an image is expected less well, and its choice was seen to be wrong by 1.6 times.
-_MARGIN, _MARGIN_OF_ERROR = 1.1, 1.6
+# A rival must leave so many times less error: a choice is not worth changing for what chance could have made. The
+# errors of networks and denoisers are expected less well, and their choice was seen to be wrong by 1.6 times.
+_MARGIN, _MARGIN_OF_IMAGES = 1.1, 1.6
 
 
 @dataclass(frozen=True)
@@ -235,43 +234,28 @@ def simple(sampler: str) -> str:
     return "oidn" if able else "primal"
 
 
-def best_image(ranked: Sequence[Pipeline], default: str, seconds: float) -> Pipeline:
-    """The first of pipelines in the order of their errors, but the first of sampler ``default`` unless that is clearly
-    worse."""
+def best_image(ranked: Sequence[Pipeline], default: str, seconds: float, margin: float = _MARGIN_OF_IMAGES) -> Pipeline:
+    """The first of pipelines in the order of their errors, but the first of sampler ``default`` unless its error is
+    more than ``margin`` times as large."""
     own = next((p for p in ranked if p.sampler == default), ranked[0])
     errors = [p.expected(p.samples(seconds)) for p in (ranked[0], own)]
-    return own if errors[1] < _MARGIN_OF_ERROR * errors[0] else ranked[0]
+    return own if errors[1] < margin * errors[0] else ranked[0]
 
 
 def best_of(pipelines: Sequence[Pipeline], seconds: float) -> tuple[str, str]:
-    """The sampler to take for a render of so many ``seconds``, of the pilot's size, and why; the first is the scene's
-    own."""
-    times, unsure = times_to_the_end(pipelines, seconds), [p.sampler for p in pipelines if p.doubtful]
-    best, why = judge(pipelines[0].sampler, times)
-    if best not in unsure:
-        best, why = judge(pipelines[0].sampler, {name: t for name, t in times.items() if name not in unsure})
-        if unsure:
-            names = " and ".join(f"'{name}'" for name in unsure)
-            why += f"; the others find too little of the light to judge {names}"
-    return best, why
+    """The sampler to take for a render of so many ``seconds``, at the pilot's size, and why.
 
-
-def times_to_the_end(pipelines: Sequence[Pipeline], seconds: float) -> dict[str, float]:
-    """Seconds that each sampler takes to the error that the first has after so many of them."""
-    first = pipelines[0]
-    # These methods are so quick that their time is not counted.
-    error = first.expected(max(first.least, seconds / first.seconds))
-    return {p.sampler: p.needed(error) * p.seconds for p in pipelines}
-
-
-def judge(default: str, times: dict[str, float]) -> tuple[str, str]:
-    """The sampler of the least of the ``times``, but the ``default`` unless that is clearly worse; and why."""
-    best = min(times, key=lambda name: times[name])
-    if times[best] * _MARGIN > times[default]:
-        best = default
-    others = [f"'{name}' takes {brief(times[name] / times[best])} times as long" for name in times if name != best]
-    found = f"to the same error, {', '.join(others)}" if others else "there was no time to try others"
-    return best, f"chosen by a pilot: {found}"
+    The first of ``pipelines`` is the scene's own, which stays unless another is expected to leave clearly less error.
+    """
+    own = pipelines[0].sampler
+    ranked = choose(pipelines, seconds)
+    if not ranked:
+        return own, "chosen by the scene: a pilot found no sampler that would be done in time"
+    best = best_image(ranked, own, seconds, _MARGIN)
+    why = f"chosen by a pilot: {_why([best, *ranked], seconds)}"
+    if unsure := [f"'{p.sampler}'" for p in pipelines if p.doubtful and p is not best]:
+        why += f"; the others find too little of the light to judge {' and '.join(unsure)}"
+    return best.sampler, why
 
 
 def _why(ranked: Sequence[Pipeline], seconds: float) -> str:
@@ -279,8 +263,7 @@ def _why(ranked: Sequence[Pipeline], seconds: float) -> str:
     errors: dict[str, tuple[float, Pipeline]] = {}
     for p in ranked:
         errors.setdefault(p.sampler, (p.expected(p.samples(seconds)), p))
-    (least, first), *others = errors.values()
-    low, high = (brief(math.sqrt(error)) for error in first.likely(first.samples(seconds)))
-    what = f"expected to leave an error of {brief(math.sqrt(least))} (in eight of ten cases {low} to {high})"
+    (least, _), *others = errors.values()
+    what = f"expected to leave an error of {brief(math.sqrt(least))}"
     rivals = [f"{brief(math.sqrt(e))} by sampler '{p.sampler}' and method '{p.method}'" for e, p in others]
     return f"{what}, and {', '.join(rivals)}" if rivals else what

@@ -7,7 +7,7 @@ that a sampler finds in one pixel of a thousand is an outlier, which a method ta
 
 What a sample takes is measured in processor seconds, which other work on the machine hardly changes, so a busy moment
 moves no sampler against another. A user gives seconds of the wall. One factor for all trials turns the one into the
-other: their wall seconds over their processor seconds, both of further samples.
+other: the wall seconds of all trials divided by their processor seconds, both for further samples.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from ngpt.measure.metrics import EPSILON, trimmed_mean
 from ngpt.stack import GradientStack
 from ngpt.system.late import ndimage
 
-# Samples per pixel of each of a trial's stacks; of a sampler with batches at least two of those
+# Samples per pixel of each stack of a trial; a sampler with batches takes at least two batches
 SPP = 8
-# Pixels of a pilot; larger images are rendered smaller. In images with fewer than the other, chance would choose.
+# The most pixels of a pilot's image; and the least, below which the choice would be chance
 PIXELS, _LEAST_PIXELS = 1 << 16, 1 << 10
 # The worst pixels are left out, as ngpt.measure.metrics.relmse_trimmed does.
 _TRIM = 0.001
@@ -63,8 +63,8 @@ class Pilot:
 def candidates(scene: mi.Scene, biased: bool = False, gradients: bool = False) -> list[str]:
     """Samplers that could render the scene: the one that its description stands for, then the ones to compare it with.
 
-    Where that is the simple way, the others are only those that find light that it hardly finds. With ``biased``,
-    biased samplers are included and come last; ``gradients``: only samplers that render them.
+    If the first is the simple way, the others are those that find light which it hardly finds. ``biased`` adds biased
+    samplers at the end. ``gradients`` leaves out samplers that render none.
     """
     facts = scene_facts(scene)
     first, method, _ = described(facts, gradients)
@@ -84,9 +84,9 @@ def try_all(
 ) -> dict[str, Trial]:
     """Trials of the samplers that can render the scene, by name.
 
-    Together they may take as many seconds of the clock as the ``budget`` returns when called with the trials so far. A
-    trial that would not fit into the remaining time, by its time to compile and to render, is left out. The ``first``
-    has a budget of its own, and is always compiled.
+    ``budget`` returns the seconds of the clock that all trials may take together; it is called with the trials so far.
+    A trial whose compilation and render would not fit into the rest is left out. The first sampler has a budget of its
+    own, ``first``, and is always compiled.
     """
     clock, stop = pilot.clock, pilot.stop
     start, slow = clock(), 1.0
@@ -115,7 +115,7 @@ def seed_of(sampler: str) -> int:
 
 
 def by_processor(trials: dict[str, Trial]) -> dict[str, Trial]:
-    """Trials whose wall seconds are to each other as their processor seconds are, and the same in sum."""
+    """Rescales wall seconds to the ratios of processor seconds; their sum stays."""
     if not trials or not all(trial.processor for trial in trials.values()):
         return trials
     wall = sum(trial.seconds for trial in trials.values()) / sum(trial.processor for trial in trials.values())
@@ -132,8 +132,8 @@ def try_out(
 ) -> tuple[Trial | None, float]:
     """Four small stacks by a sampler, and when its kernels were compiled.
 
-    None for the stacks where it finds, of this scene, that it cannot render it, where they are expected to end later
-    than the ``limit`` from now, and where ``stop`` says so.
+    Returns None for the stacks if the sampler cannot render the scene, if they would take longer than ``limit``, or if
+    ``stop`` returns true.
     """
     begins = clock()
     batch = SAMPLERS[sampler].batch
@@ -247,9 +247,9 @@ def _denominator(scale: np.ndarray) -> np.ndarray:
 
 @contextmanager
 def at_most(scene: mi.Scene, pixels: int):
-    """While in it, images of the scene have no more ``pixels``; yields how many times more they have without it.
+    """Shrinks the scene's film to at most ``pixels`` within the block; yields the factor by which it shrinks.
 
-    A cropped film stays as it is: its window could not be set again.
+    A cropped film keeps its size, since its window could not be set again.
     """
     film = scene.sensors()[0].film()
     (width, height), window = (tuple(int(n) for n in numbers) for numbers in (film.size(), film.crop_size()))

@@ -48,8 +48,6 @@ class Row:
     spp: int
     seconds: float  # of sampler and method
     error: float
-    low: float  # from here to ``high`` eight of ten such errors turned out to lie
-    high: float
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
@@ -79,13 +77,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
         report = {"scene": args.scene, "size": [int(n) for n in film], "sampler": found[0].sampler}
         print_json(report | {"advice": rows})
         return 0
-    tell(
-        f"{'sampler':12}{'method':16}{'samples':12}{'spp':>7}{'seconds':>9}{'relMSE trimmed':>16}{'8 in 10 within':>22}"
-    )
+    tell(f"{'sampler':12}{'method':16}{'samples':12}{'spp':>7}{'seconds':>9}{'relMSE trimmed':>16}")
     for row in found:
         shared = "adaptive" if row.adaptive else "even"
-        within = f"{row.low:.2g} to {row.high:.2g}"
-        tell(f"{row.sampler:12}{row.method:16}{shared:12}{row.spp:7}{row.seconds:9.3g}{row.error:16.3g}{within:>22}")
+        tell(f"{row.sampler:12}{row.method:16}{shared:12}{row.spp:7}{row.seconds:9.3g}{row.error:16.3g}")
     for line in ("", *commands_of(found[0], args)):
         tell(line)
     return 0
@@ -98,7 +93,7 @@ def rows_of(pipelines: list[Pipeline], seconds: float | None, error: float | Non
     for p in pipelines:
         spp = math.floor(p.samples(seconds)) if seconds is not None else math.ceil(p.needed(error or math.inf))
         if max(p.least, 2) <= spp < LARGEST_SPP:
-            found.append(Row(p.sampler, p.method, p.shared, spp, p.takes(spp), p.expected(spp), *p.likely(spp)))
+            found.append(Row(p.sampler, p.method, p.shared, spp, p.takes(spp), p.expected(spp)))
     if not found and seconds is not None:
         least = min(p.takes(max(p.least, 2)) for p in pipelines)
         raise NgptError(f"nothing fits into {seconds:g} s: the cheapest takes {brief(least)} s")

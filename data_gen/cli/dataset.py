@@ -41,9 +41,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
         raise WrongUse("--out is missing: the folder of the training set")
     # Only the verbs that render import the renderer.
     from data_gen.backend import use_variant
+    from data_gen.cluster import cluster
     from data_gen.dataset.card import write_card
     from data_gen.dataset.config import read_config
-    from data_gen.dataset.jobs import cluster, generate, processes
+    from data_gen.dataset.jobs import generate, processes
 
     config = read_config(path)
     if not args.cluster:

@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from functools import partial
 from multiprocessing import active_children, get_context
 from pathlib import Path
@@ -16,7 +15,6 @@ from data_gen.dataset.config import Config, Job, as_json
 from data_gen.dataset.crops import make_shard
 from ngpt.errors import NgptError
 from ngpt.system.files import exclusive
-from ngpt.system.install import install_command
 from ngpt.system.workers import end_with_parent
 from ngpt.system.writing import write_json
 from ngpt.training.dataset import FORMAT, MANIFEST, VERSION, checksum, read_manifest
@@ -59,24 +57,6 @@ class Pool(ProcessPoolExecutor):
 
 def processes(count: int) -> Executor:
     return Serial() if count == 1 else Pool(count)
-
-
-@contextmanager
-def cluster(address: str) -> Iterator[Executor]:
-    """The workers of a Dask cluster; ``address`` is the address of its scheduler, such as tcp://host:8786."""
-    try:
-        from distributed import Client
-    except ModuleNotFoundError as error:
-        raise NgptError(f"a Dask cluster needs distributed; `{install_command('cluster')}`") from error
-    try:
-        client = Client(address, timeout="20s")
-    except (OSError, ValueError) as error:
-        raise NgptError(
-            f"--cluster {address}: no Dask scheduler answers there: {error}; start `dask scheduler`, or correct the "
-            "address"
-        ) from error
-    with client:
-        yield client.get_executor(retries=3)
 
 
 def generate(

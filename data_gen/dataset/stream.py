@@ -14,13 +14,15 @@ import threading
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 
 import numpy as np
 
-from data_gen.dataset.config import Config, Job
+from data_gen.dataset.config import Config, Job, read_config
 from data_gen.dataset.crops import make_shard
+from data_gen.dataset.jobs import Pool
 from data_gen.dataset.kept import Again, home, keep
 from ngpt.errors import NgptError
 from ngpt.training.dataset import Crop
@@ -137,3 +139,15 @@ class Stream:
             self._changed.notify_all()
         # Kept open, it lives on for as long as one of its crops does.
         path.unlink()
+
+
+@contextmanager
+def stream(config: Path, kept: str = "") -> Iterator[Stream]:
+    """Crops of a configuration, rendered in another process while they are trained on: see ``ngpt.renderer.Crops``."""
+    # Training that is interrupted finishes its step, and may still ask for crops.
+    with Pool(1, interruptible=False) as worker, Stream(read_config(config), worker, kept=kept) as data:
+        try:
+            yield data
+        finally:
+            # What it is at would take minutes, and nobody is going to see it.
+            worker.end()

@@ -168,8 +168,9 @@ def render_shot(
     Stacks have the layer ``motion`` to the previous frame in ``frames``. For the first frame, it is the motion to the
     frame that a shot of the same step would have before it, or all NaN if there is none. Motion refers to the whole
     picture; crop windows may show another part of it in each frame. Each frame has its own seed, so its bits do not
-    depend on which other frames are rendered. ``options`` and errors are as in ``render_stack``; cameras without a
-    projection raise NgptError.
+    depend on which other frames are rendered. Only the cache of tails is filled by ``seed`` in all frames: its noise is
+    smooth, and would flicker. ``options`` and errors are as in ``render_stack``; cameras without a projection raise
+    NgptError.
 
     A ``sampler`` of ``data_gen.samplers.FRAME_SAMPLERS`` reuses the previous frames, up to ``warm_up`` of them where
     frames are skipped, and uses ``seed`` for all frames. If more than the camera changes, it needs the scene of the
@@ -216,7 +217,7 @@ def render_shot(
             else:
                 try:
                     own = frame_seed(seed, frame)
-                    stack = render_stack(scene, spp, own, sampler, progress=progress(frame), **options)
+                    stack = render_stack(scene, spp, own, sampler, progress(frame), tails_seed=seed, **options)
                 except Unfinished as error:
                     stack, failed = error.stack, error
                 try:

@@ -23,13 +23,25 @@ _KNOWN = ("MaskBSDF", "Null", "ThinDielectric", "BlendBSDF")
 
 
 @dataclass
-class Aim:
+class _Straight:
+    """Where a path was before the holes that it has passed."""
+
+    o: mi.Point3f
+
+    def seen_by(self, x: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
+        """``x`` moved to where the path was, for densities of sampling emitters."""
+        there = mi.SurfaceInteraction3f(x)
+        there.p = mi.Point3f(self.o)
+        return there
+
+
+@dataclass
+class Aim(_Straight):
     """From where a path has come straight on, and the density ``p`` of its direction there.
 
     ``p`` is infinite where no sampled emitter is in competition: from the camera, and behind mirrors.
     """
 
-    o: mi.Point3f
     p: mi.Float
 
     @classmethod
@@ -42,11 +54,19 @@ class Aim:
             dr.select(passed, self.o, x.p), dr.select(passed, self.p, dr.select(kind == SMOOTH, p, mi.Float(dr.inf)))
         )
 
-    def seen_by(self, x: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
-        """``x`` moved to where the path has come from, for densities of sampling emitters."""
-        there = mi.SurfaceInteraction3f(x)
-        there.p = mi.Point3f(self.o)
-        return there
+
+@dataclass
+class Edge(_Straight):
+    """An edge of a path from either end, however many holes it leads through."""
+
+    first: mi.Bool  # it begins at the camera or at a lamp
+
+    def behind(self, passed: mi.Bool, x: mi.SurfaceInteraction3f) -> Edge:
+        """Behind vertex ``x``, where the path may have ``passed`` a hole."""
+        return Edge(dr.select(passed, self.o, x.p), self.first & passed)
+
+    def length2(self, x: mi.SurfaceInteraction3f) -> mi.Float:
+        return dr.squared_norm(x.p - self.o)
 
 
 class Holes:
@@ -69,7 +89,7 @@ class Holes:
         return mi.Spectrum(dr.select(known, bsdf.eval_null_transmission(si, known), 0))
 
     @classmethod
-    def of(cls, scene: mi.Scene, passed: Callable[[mi.Shape], bool]) -> Holes | None:
+    def of(cls, scene: mi.Scene, passed: Callable[[mi.Shape], bool] = lambda shape: False) -> Holes | None:
         """The holes of a scene, but in shapes that are ``passed``; None where there are none."""
         bsdfs = (shape.bsdf() for shape in shapes_of(scene) if not passed(shape))
         some = [bsdf for bsdf in bsdfs if bsdf is not None and has_holes(bsdf) and knows(bsdf)]
@@ -84,8 +104,10 @@ class Holes:
         return T, dr.select(going, left - 1, left), going
 
     @dr.syntax
-    def transmittance(self, scene, ray: mi.Ray3f, target: mi.Point3f, most, active: mi.Bool) -> mi.Spectrum:
-        """T along ``ray`` to the ``target``; 0 where it is blocked, or leads through more than ``most`` holes."""
+    def transmittance(
+        self, scene, ray: mi.Ray3f, target: mi.Point3f, most, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.UInt32]:
+        """T along ``ray`` to the ``target``, and the number of holes; T is 0 behind more than ``most`` of them."""
         ray, left, going = mi.Ray3f(ray), mi.UInt32(most), mi.Bool(active)
         T = dr.select(active, mi.Spectrum(1), 0)
         while dr.hint(going, label="holes"):
@@ -94,7 +116,29 @@ class Holes:
             si = hit.compute_surface_interaction(ray, mi.RayFlags.All, going)
             T, left, going = self.behind(si, T, left, going)
             ray = si.spawn_ray_to(target)
-        return T
+        return T, most - left
+
+    @dr.syntax
+    def toward_camera(
+        self, scene, si: mi.SurfaceInteraction3f, target: mi.Point3f, most, active: mi.Bool
+    ) -> mi.Spectrum:
+        """As ``transmittance()`` from ``si``, where lamps hide from the camera, but not from what is behind holes."""
+        ray, left, going = si.spawn_ray_to(target), mi.UInt32(most), mi.Bool(active)
+        # As a surface sees it, and as the camera does
+        T, seen = dr.select(active, mi.Spectrum(1), 0), dr.select(active & ~_on_lamp(si, scene), mi.Spectrum(1), 0)
+        while dr.hint(going, label="holes"):
+            hit = scene.ray_intersect_preliminary(ray, active=going)
+            going &= hit.is_valid()
+            si = hit.compute_surface_interaction(ray, mi.RayFlags.All, going)
+            T, left, _ = self.behind(si, T, left, going)
+            seen = dr.select(going & ~_on_lamp(si, scene), T, seen)
+            going &= (dr.max(T) > 0) | (dr.max(seen) > 0)
+            ray = si.spawn_ray_to(target)
+        return seen
+
+
+def _on_lamp(si: mi.SurfaceInteraction3f, scene: mi.Scene) -> mi.Bool:
+    return si.emitter(scene) != None  # noqa: E711 - a comparison of arrays of pointers
 
 
 def has_holes(bsdf: mi.BSDF) -> bool:

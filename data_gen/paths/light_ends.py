@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.paths.bent import BentLamps
+from data_gen.paths.holes import Holes
 from data_gen.paths.vertex import Materials
 from data_gen.scenes.lamps import Chosen, emitter_numbers
 from ngpt.errors import NgptError
@@ -290,3 +291,4 @@ class World:
     lights: LightEnds
     materials: Materials | None = None  # for samplers that ask nothing of them
     fog: Any = None  # ``photons.map.fog.Fog``: the media, for samplers that gather photons there
+    holes: Holes | None = None  # which are no vertices; None where there are none, or where they are

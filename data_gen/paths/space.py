@@ -67,7 +67,7 @@ class Space:
         """
         if self.holes is None:
             return 1, ~self.scene.ray_test(x.spawn_ray_to(target), active)
-        T = self.holes.transmittance(self.scene, x.spawn_ray_to(target), target, most, active)
+        T, _ = self.holes.transmittance(self.scene, x.spawn_ray_to(target), target, most, active)
         return T, dr.max(T) > 0
 
     def reconnect(

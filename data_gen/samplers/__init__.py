@@ -15,7 +15,6 @@ import data_gen.samplers.gbdpt.about
 import data_gen.samplers.photons.about
 import data_gen.samplers.vcm.about
 import data_gen.samplers.primal.about
-import data_gen.samplers.studies.about
 import data_gen.samplers.restir.about
 # isort: on
 

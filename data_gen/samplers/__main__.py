@@ -1,6 +1,6 @@
-"""``python -m data_gen.samplers``: the table of samplers in docs/use/rendering.md."""
+"""``python -m data_gen.samplers``: the table of ngpt's own samplers in docs/use/rendering.md."""
 
-from data_gen.samplers import by_standing
+from data_gen.samplers import SAMPLERS, by_standing
 from data_gen.samplers.registry import own
 from ngpt.options import written
 
@@ -10,10 +10,12 @@ GROUPS = {"use": "", "niche": "for some scenes", "study": "for comparison: anoth
 
 def table() -> str:
     """All samplers in Markdown, by standing, with their options and defaults."""
-    lines = ["| sampler | what it is | options |", "|---|---|---|"]
+    lines, others = ["| sampler | what it is | options |", "|---|---|---|"], SAMPLERS.load()
     for standing, title in GROUPS.items():
         lines += [f"| | *{title}* | |"] if title else []
         for name, entry in by_standing(standing).items():
+            if name in others:
+                continue
             options = ", ".join(f"`{option}={written(value.default)}`" for option, value in own(entry.options).items())
             lines.append(f"| `{name}` | {entry.summary} | {options} |")
     return "\n".join(lines)

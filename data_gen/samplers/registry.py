@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from data_gen.budget import LANE_BYTES
-from ngpt.errors import NgptError, WrongUse, did_you_mean
+from ngpt.errors import NgptError, WrongUse
 from ngpt.methods import METHODS
 from ngpt.options import STANDINGS, Option, as_text, settings, unusual
 from ngpt.system.parts import Registry
@@ -140,7 +140,7 @@ class Sampler(Entry):
 
     @property
     def plugin(self) -> str:
-        return self.name.replace("-", "_")
+        return plugin_of(self.name)
 
     def integrator(self, scene: Any, **options: Any) -> Any:
         """Its integrator with the parameters of the scene's own ``path``, and ``options`` that are checked."""
@@ -181,8 +181,13 @@ FRAME_SAMPLERS: dict[str, FrameSampler] = {}
 SAMPLERS: Registry[Sampler] = Registry("ngpt.samplers", "sampler", Sampler, {}, FRAME_SAMPLERS)
 
 
+def plugin_of(name: str) -> str:
+    """What Mitsuba calls the integrator of a sampler."""
+    return name.replace("-", "_")
+
+
 def by_plugin(plugin: str) -> Sampler:
-    return next(entry for entry in SAMPLERS.values() if entry.plugin == plugin)
+    return next(SAMPLERS[name] for name in SAMPLERS.names() if plugin_of(name) == plugin)
 
 
 def register(entry: Sampler | FrameSampler) -> None:
@@ -200,9 +205,8 @@ def find(name: str, facts: Facts | None = None) -> Sampler:
     if name in FRAME_SAMPLERS:
         raise WrongUse(f"sampler '{name}' is for shots (--frames): {FRAME_SAMPLERS[name].alone}; use --sampler gpt")
     if name not in SAMPLERS:
-        meant = did_you_mean(name, ("auto", *SAMPLERS, *FRAME_SAMPLERS))
-        shots = f"; for shots (--frames): {', '.join(FRAME_SAMPLERS)}"
-        raise WrongUse(f"unknown sampler '{name}'; {meant}choose one of: auto, {', '.join(SAMPLERS)}{shots}")
+        known = f"auto, {', '.join(SAMPLERS)}; for shots (--frames): {', '.join(FRAME_SAMPLERS)}"
+        raise SAMPLERS.unknown(name, ("auto", *SAMPLERS, *FRAME_SAMPLERS), known)
     sampler = SAMPLERS[name]
     if facts is not None and (reason := sampler.refuses(facts)):
         able = [other for other in SAMPLERS.values() if not other.refuses(facts)]

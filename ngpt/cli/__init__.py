@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, NoReturn
 
 from ngpt.errors import NgptError, WrongUse, did_you_mean
 from ngpt.system.console import Console, logged, run_command
-from ngpt.system.install import install_command
+from ngpt.system.install import install_command, study
 from ngpt.system.parts import brought, no_renderer
 from ngpt.version import __version__
 
@@ -76,6 +76,9 @@ class _Parser(argparse.ArgumentParser):
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
+            registry = getattr(action.choices, "registry", None)
+            if registry is not None and (line := study(registry.what, str(value))):
+                raise WrongUse(line)
             known = list(map(str, action.choices))
             text = f"invalid choice: '{value}'; {did_you_mean(str(value), known)}choose one of: {', '.join(known)}"
             raise argparse.ArgumentError(action, text)
@@ -108,17 +111,13 @@ class _Top(_Parser):
         return formatter.format_help()
 
 
-class _Print(argparse.Action):
-    """Prints what a function makes of all parsers, "module.function", and ends. Its value, if any, goes there too."""
-
-    def __init__(self, *args: Any, prints: str, **options: Any):
-        super().__init__(*args, **options)
-        self.prints = prints
+class _Completion(argparse.Action):
+    """Prints the completion script of a shell, and ends."""
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, option: str | None = None) -> None:
-        module, _, function = self.prints.rpartition(".")
-        given = [values] if isinstance(values, str) else []
-        print(getattr(import_module(module), function)(*given, parser, parsers()), end="")
+        from ngpt.cli.completion import script
+
+        print(script(values, parser, parsers()), end="")
         parser.exit()
 
 
@@ -164,18 +163,10 @@ def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"ngpt {__version__}")
     parser.add_argument(
         "--completion",
-        action=_Print,
-        prints="ngpt.cli.completion.script",
+        action=_Completion,
         choices=("bash", "zsh", "fish"),
         metavar="SHELL",
         help="print the completion script of a shell: bash, zsh or fish",
-    )
-    parser.add_argument(
-        "--manual",
-        action=_Print,
-        prints="ngpt.cli.manual.page",
-        nargs=0,
-        help="print the manual page: pipe into man -l -",
     )
     subparsers = parser.add_subparsers(required=True, metavar="VERB", parser_class=_Parser)
     for name, verb in verbs.items():

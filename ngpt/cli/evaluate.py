@@ -12,7 +12,7 @@ from ngpt.system.console import Console
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
-        "Writes results.json, results.csv, results.md, plots, pictures and report.html into DIR. The same command "
+        "Writes results.json, results.csv, pictures and report.html into DIR. The same command "
         "continues an interrupted run. After a change, only the results that depend on it are computed anew."
     )
     add_config(parser, configs.EVALUATION, "scenes, methods and metrics")
@@ -54,5 +54,5 @@ def run(args: argparse.Namespace, console: Console) -> int:
     absent = [name for name, entry in results["scenes"].items() if entry.get("absent")]
     if absent:
         console.error(f"{len(absent)} of {len(results['scenes'])} scenes are absent: {', '.join(absent)}")
-    console.say(f"{args.out}/results.md, {args.out}/report.html")
+    console.say(f"{args.out}/results.csv, {args.out}/report.html")
     return 1 if absent else 0

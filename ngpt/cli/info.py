@@ -11,12 +11,11 @@ import numpy as np
 
 from ngpt.cli.arguments import add_json, add_layers, add_untrusted, add_view, assignment, print_json
 from ngpt.cli.streams import standard_input
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.io.aliases import format_aliases
 from ngpt.io.exr import pass_through, read, views_in
 from ngpt.io.resolution import layers_held, propose
 from ngpt.layers import LAYERS
-from ngpt.measure.gains import Gain, gains
 from ngpt.merging import DIAGNOSTICS
 from ngpt.methods import METHODS, by_standing, choose
 from ngpt.network.describe import SUFFIXES as NETWORKS
@@ -24,6 +23,7 @@ from ngpt.network.describe import describe
 from ngpt.shared import CUT, TAILS, noise_of_light
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console, tell
+from ngpt.system.install import BROUGHT, study
 from ngpt.system.parts import find_renderer
 from ngpt.training.dataset import summary
 from ngpt.training.run_summary import is_run
@@ -136,6 +136,8 @@ def other(name: str, parameters: dict[str, str]) -> dict:
         found |= renderer.describe_sampler(name)
     if found:
         return found
+    if line := next(filter(None, (study(what, name) for what in BROUGHT)), ""):
+        raise WrongUse(line)
     return {"scene": name} | renderer.inspect(name, parameters)
 
 
@@ -192,16 +194,9 @@ def stack(stack: GradientStack) -> dict:
             if not method.missing() and all(layer in stack for layer in method.needs)
         ],
         "auto": choose(stack),
-        "auto with more": {", ".join(gain.add): _bought(gain) for gain in gains(stack)},
         "attributes": {name: _plain(value) for name, value in sorted(stack.attributes.items())},
     }
-    for name in (
-        "diagnostics",
-        "noise of the mean light, relative to it",
-        "shared tails",
-        "proposed",
-        "auto with more",
-    ):
+    for name in ("diagnostics", "noise of the mean light, relative to it", "shared tails", "proposed"):
         if not report[name]:
             del report[name]
     return report
@@ -228,11 +223,6 @@ def _missing(stack: GradientStack) -> list[str]:
     if "dx" not in stack and "ngpt:sampler" not in stack.attributes:
         wanted = ["albedo", "normal", "depth"]
     return [name for name in wanted if name not in stack]
-
-
-def _bought(gain: Gain) -> dict:
-    """What `auto` would take with more layers, and how much of its error it would leave, as measured by samples."""
-    return {"auto": gain.method, "times the error at": {f"{n} spp": round(x, 2) for n, x in gain.error.items()}}
 
 
 def show(report: dict, as_json: bool) -> None:

@@ -88,7 +88,7 @@ def _on_disk(settings: Any) -> list[str]:
 
 def _task(settings: Any, out: Path, stack: ExitStack, processes: Any, say: Callable[[str], None]) -> Any:
     """What the settings say to train, on the data in their folders; ``stack`` closes those that are being rendered."""
-    from ngpt.system.parts import find_renderer
+    from ngpt.system.parts import find_crops
     from ngpt.training.clips import clips
     from ngpt.training.crops import Mixture, open_crops
     from ngpt.training.images import Images
@@ -111,5 +111,5 @@ def _task(settings: Any, out: Path, stack: ExitStack, processes: Any, say: Calla
     if settings.temporal:
         return Blending(settings, training, held_out)
     made = [configs.find_config(f, configs.DATASET) for f in settings.data.folders if f.endswith(".toml")]
-    streams = [stack.enter_context(find_renderer().stream(config, settings.data.kept)) for config in made]
+    streams = [stack.enter_context(find_crops()(config, settings.data.kept)) for config in made]
     return Images(settings, Mixture(training, *streams), held_out, loss)

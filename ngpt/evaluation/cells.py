@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from ngpt.errors import NgptError, did_you_mean
+from ngpt.errors import NgptError
 from ngpt.evaluation.config import Column, Config
 from ngpt.evaluation.keys import code_of, file_hash, library_hash
 from ngpt.evaluation.references import Reference
 from ngpt.io.exr import write
 from ngpt.measure.metrics import METRICS, scores
-from ngpt.methods import METHODS, check_request, reconstruct
+from ngpt.methods import METHODS, check_request, reconstruct, unknown_method
 from ngpt.stack import GradientStack
 from ngpt.system.files import make_folder
 from ngpt.system.machine import versions
@@ -102,8 +102,7 @@ class Scorer:
 def absence(column: Column) -> str:
     """Why a column cannot be computed at all here, "" if it can."""
     if column.method not in METHODS:
-        meant = did_you_mean(column.method, METHODS)
-        return f"there is no method '{column.method}'; {meant}choose one of: {', '.join(METHODS)}"
+        return str(unknown_method(column.method))
     weights = column.options.get("weights", "")
     if weights and not Path(weights).is_file():
         return f"weights {weights}: no such file; train them first"

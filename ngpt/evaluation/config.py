@@ -1,6 +1,5 @@
 """The configuration of an evaluation: a TOML file, checked before any work starts."""
 
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from glob import glob, has_magic
 from pathlib import Path
@@ -256,10 +255,3 @@ def _merged(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
         if isinstance(value, dict) and isinstance(base.get(name), dict)
     }
     return base | values | tables
-
-
-def groups_of(results: dict[str, Any], scenes: Iterable[str]) -> dict[str, list[str]]:
-    """The ``scenes`` of each group of the configuration, and all of them as "all" if they are several."""
-    found = list(dict.fromkeys(scenes))
-    groups = {name: [s for s in found if s in listed] for name, listed in results["settings"]["groups"].items()}
-    return groups | ({"all": found} if len(found) > 1 else {})

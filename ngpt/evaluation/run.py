@@ -11,11 +11,10 @@ from typing import Any
 from ngpt.errors import NgptError
 from ngpt.evaluation.cells import PACKAGES, Scorer, absence
 from ngpt.evaluation.config import Column, Config, file_part
-from ngpt.evaluation.gradientmap import write_map
 from ngpt.evaluation.references import HALVES, Reference
 from ngpt.evaluation.renders import KINDS, Render
 from ngpt.evaluation.results import write_results
-from ngpt.evaluation.stacks import USUAL, Costs, SceneStacks
+from ngpt.evaluation.stacks import USUAL, SceneStacks
 from ngpt.image.display import auto_exposure
 from ngpt.io.exr import write
 from ngpt.measure.metrics import METRICS
@@ -178,9 +177,6 @@ def _scene(
                     "absent": None,
                 }
             )
-    maps = gradient_map(stacks, pilot, costs, out)
-    if maps:
-        entry["gradients"] = maps
     # All at once: a scene that fails half-way is absent as a whole.
     results["scenes"][name] = entry
     results["cells"] += cells
@@ -230,16 +226,6 @@ def _reference_entry(reference: Reference, scorer: Scorer, name: str, out: Path)
         "doubt": reference.doubt,
         "floors": scorer.floors(reference),
     }
-
-
-def gradient_map(stacks: SceneStacks, render: Render, costs: Costs, out: Path) -> str | None:
-    """Draws where gradients pay and where they hurt, from the stack of most samples; its path relative to ``out``."""
-    stack = stacks.stack(render, stacks.samples(render, max(stacks.config.spp), costs), 0)
-    if not all(layer in stack for layer in ("direct", "primal_var", "dx_var", "dy_var")):
-        return None
-    path = f"plots/gradients-{stacks.name}.png"
-    write_map(out / path, stack)
-    return path
 
 
 def wanted(images: str, seed: int) -> bool:

@@ -7,7 +7,7 @@ import onnx
 
 from ngpt.export.network import convolutions
 from ngpt.sequence.network import INPUTS
-from ngpt.training.temporal import load
+from ngpt.sequence.weights import load
 from ngpt.version import __version__
 
 

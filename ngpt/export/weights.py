@@ -11,7 +11,7 @@ from torch import Tensor
 from ngpt.errors import NgptError
 from ngpt.network import tza
 from ngpt.network.safetensors import in_halves, load_weights, read_tensors, write_tensors
-from ngpt.training.run_summary import LOG, entries_of
+from ngpt.network.training_log import LOG, entries_of
 
 POINTS = 100
 

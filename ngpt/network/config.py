@@ -13,9 +13,10 @@ from torch import nn
 
 from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
-from ngpt.network import features, inputs, kpcn, oidnet, padding, poisson
+from ngpt.network import features, inputs, oidnet, padding, poisson
 from ngpt.network.heads import Head, head_of
 from ngpt.network.unet import POOLING, DenseUNet, PlainUNet
+from ngpt.system.parts import Registry
 
 # What a file may ask for: far more than networks have, far less than takes down a machine.
 MAX_LEVELS, MAX_CHANNELS, MAX_UNITS = 8, 1024, 32
@@ -28,12 +29,11 @@ MAX_SWEEPS = 64
 class ModelConfig:
     """What a reconstruction is made of.
 
-    ``network``   "dense" or "plain", see ``ngpt.network.unet``, "kpcn", see ``ngpt.network.kpcn``, or "oidn", see
-                  ``ngpt.network.oidnet``
-    ``channels``  for each level, finest first: what each unit adds (dense), the width (plain, and kpcn, which has one
-                  level), or the channels of OIDN's small or default network (oidn)
-    ``units``     for each level, units on the way down and again on the way up (dense), or 5x5 convolutions (kpcn);
-                  none for plain and oidn
+    ``network``   "dense" or "plain", see ``ngpt.network.unet``, "oidn", see ``ngpt.network.oidnet``, or the name of
+                  another package's kind, whose documentation says what it makes of the fields below
+    ``channels``  for each level, finest first: what each unit adds (dense), the width (plain), or the channels of
+                  OIDN's small or default network (oidn)
+    ``units``     for each level, units on the way down and again on the way up (dense); none for plain and oidn
     ``inputs``    the layers it reads, in order; names of ``ngpt.network.features.CHANNELS``
     ``base``      the classical method whose result is its layer "base"; "" for none
     ``start``     the images among its inputs that it starts from: it predicts a weight for each of them in each pixel,
@@ -42,11 +42,9 @@ class ModelConfig:
     ``quiet``     the relative standard error of the primal, over 15x15 pixels, below which the result goes over to the
                   base, in proportion and in the logarithm: as noise vanishes it converges with the base, whatever the
                   network says. Where the variance is 0, or not known, it does not. 0: nowhere
-    ``kernel``    the side, in pixels, of the kernels by which it averages those images instead, see
-                  ``ngpt.network.heads``; odd. 0: it weighs and corrects them pixel by pixel. For kpcn, the side of the
-                  kernels of both parts of the light
-    ``scales``    the number of resolutions that have kernels, each half as fine as the last; from 2 on the kernels
-                  average the weighted mean of these images
+    ``kernel``    the side, in pixels, of the kernels by which it averages the weighted mean of those images instead,
+                  see ``ngpt.network.heads.Pyramid``; odd. 0: it weighs and corrects them pixel by pixel
+    ``scales``    the number of resolutions that have kernels, each half as fine as the last; 1 without kernels
     ``demodulate``  whether the kernels average the image divided by the albedo, and multiply by it again; needs the
                   input albedo, and ``scales``
     ``sweeps``    at each of several resolutions, steps that draw the image toward the gradients, by weights that the
@@ -70,7 +68,7 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         if not isinstance(self.network, str) or self.network not in KINDS:
-            raise NgptError(f"network '{self.network}': choose one of: {', '.join(KINDS)}")
+            raise KINDS.unknown(str(self.network), KINDS, ", ".join(KINDS))
         if self.pooling not in POOLING:
             raise NgptError(f"pooling '{self.pooling}': choose one of: {', '.join(POOLING)}")
         if self.base and not self.start:
@@ -144,14 +142,14 @@ class Plain(Kind):
     def check(self, config: ModelConfig) -> None:
         check_layers(config, self.has_units)
         levels = len(config.channels)
-        if type(config.kernel) is not int or config.kernel not in (0, *range(1, MAX_KERNEL + 1, 2)):
-            raise NgptError(f"kernel = {config.kernel!r}: must be an odd number of pixels up to {MAX_KERNEL}, or 0")
+        if type(config.kernel) is not int or config.kernel not in (0, *range(3, MAX_KERNEL + 1, 2)):
+            raise NgptError(f"kernel = {config.kernel!r}: must be an odd number of pixels from 3 to {MAX_KERNEL}, or 0")
         if config.kernel and not config.start:
             raise NgptError(f"kernel = {config.kernel}: there is no image to average; give a base, or start")
         if type(config.scales) is not int or not 1 <= config.scales <= levels:
             raise NgptError(f"scales = {config.scales!r}: must be from 1 to the {levels} levels of the network")
-        if config.scales > 1 and config.kernel < 3:
-            raise NgptError(f"scales = {config.scales}: needs kernels of 3 pixels or more")
+        if bool(config.kernel) != (config.scales > 1):
+            raise NgptError(f"kernel = {config.kernel}, scales = {config.scales}: kernels need 2 scales or more")
         pyramid = config.scales > 1 and "albedo" in config.inputs
         if type(config.demodulate) is not bool or (config.demodulate and not pyramid):
             raise NgptError(f"demodulate = {config.demodulate!r}: true or false; needs scales and the input albedo")
@@ -187,7 +185,7 @@ class Plain(Kind):
 
     def network(self, config: ModelConfig) -> nn.Module:
         channels = features.channels(config.inputs)
-        return PlainUNet(channels, config.channels, **_last(config), pooling=config.pooling)
+        return PlainUNet(channels, config.channels, **last_of(config), pooling=config.pooling)
 
 
 class Dense(Plain):
@@ -197,29 +195,7 @@ class Dense(Plain):
 
     def network(self, config: ModelConfig) -> nn.Module:
         channels = features.channels(config.inputs)
-        return DenseUNet(channels, config.channels, config.units, **_last(config), pooling=config.pooling)
-
-
-class Kpcn(Kind):
-    """``ngpt.network.kpcn.KPCN``."""
-
-    goes_without = ("base", "start", "quiet", "scales", "demodulate", "sweeps", "pooling")
-
-    def check(self, config: ModelConfig) -> None:
-        check_layers(config, units=True)
-        if missing := [name for name in kpcn.NEEDED if name not in config.inputs]:
-            raise NgptError(f"network 'kpcn' needs the inputs {', '.join(kpcn.NEEDED)}; lacks {', '.join(missing)}")
-        if type(config.kernel) is not int or config.kernel not in range(3, kpcn.MAX_KERNEL + 1, 2):
-            most = kpcn.MAX_KERNEL
-            raise NgptError(f"kernel = {config.kernel!r}: of 'kpcn' it must be an odd number from 3 to {most}")
-        if len(config.channels) > 1:
-            raise NgptError(f"channels {list(config.channels)}: 'kpcn' has one level; give one number")
-
-    def head(self, config: ModelConfig) -> Head:
-        return kpcn.SplitKernels(size=config.kernel)
-
-    def network(self, config: ModelConfig) -> nn.Module:
-        return kpcn.KPCN(config.inputs, config.channels[0], config.units[0], **_last(config))
+        return DenseUNet(channels, config.channels, config.units, **last_of(config), pooling=config.pooling)
 
 
 class Oidn(Kind):
@@ -244,7 +220,9 @@ class Oidn(Kind):
         return oidnet.OidnUNet(config.channels)
 
 
-KINDS: dict[str, Kind] = {"dense": Dense(), "plain": Plain(), "kpcn": Kpcn(), "oidn": Oidn()}
+_OURS: dict[str, Kind] = {"dense": Dense(), "plain": Plain(), "oidn": Oidn()}
+# Other packages bring theirs by entry points (docs/train/add-a-network.md).
+KINDS: Registry[Kind] = Registry("ngpt.networks", "network", Kind, _OURS)
 
 
 def check_layers(config: ModelConfig, units: bool) -> None:
@@ -272,8 +250,8 @@ def check_layers(config: ModelConfig, units: bool) -> None:
             )
 
 
-def _last(config: ModelConfig) -> dict[str, Any]:
-    """The last convolution of a network, by its head."""
+def last_of(config: ModelConfig) -> dict[str, Any]:
+    """The last convolution of a network, by its head: the arguments of ``ngpt.network.unet.LastConvolution``."""
     return {"outputs": config.head.outputs, "zero": config.head.neutral, "normalise": config.head.normalise}
 
 

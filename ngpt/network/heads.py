@@ -3,9 +3,6 @@
     Direct     the prediction is the logarithm [Kettunen et al. 2019]
     Residual   it corrects the logarithm of the image the network starts from
     Mixture    a weight for each of several images, and a correction of the logarithm of their mean
-    Kernels    weights for the k x k pixels around, in all of the images: their mean, nothing added [Bako et al. 2017,
-               "Kernel-predicting convolutional networks", section 4.2; for several images Vogels et al. 2018]
-    SplitKernels  kernels for diffuse and for specular light, see ``ngpt.network.kpcn``
     Pyramid     kernels at several resolutions, of one image, blended from coarse to fine [Vogels et al. 2018,
                "Denoising with kernel prediction and asymmetric loss functions", section 4.3]
 
@@ -117,34 +114,6 @@ class Mixture(Head):
     def graph(self, op: Any, prediction: Any, images: list[Any]) -> Any:
         weights, total = _softmax(op, op.Slice(prediction, [3], [self.outputs], [1]))
         return op.Slice(prediction, [0], [3], [1]) + op.signed_log(_mixed(op, weights, images) / total)
-
-
-@dataclass(frozen=True)
-class Kernels(Head):
-    """In each pixel a weight (softmax) for each of ``size`` x ``size`` pixels around it, in each image.
-
-    The result lies between the least and the largest of these pixels: it can neither invent a colour nor add light.
-    """
-
-    size: int = 3
-
-    @property
-    def radius(self) -> int:
-        return self.size // 2
-
-    @property
-    def outputs(self) -> int:
-        return len(self.start) * self.size**2
-
-    def forward(self, prediction: Tensor, images: list[Tensor]) -> Tensor:
-        parts = torch.softmax(prediction, 1).split(self.size**2, 1)
-        mean = torch.stack([averaged(part, image, self.size) for part, image in zip(parts, images, strict=True)]).sum(0)
-        return signed_log(mean)
-
-    def graph(self, op: Any, prediction: Any, images: list[Any]) -> Any:
-        weights, total = _softmax(op, prediction)
-        pixels = [shifted for image in images for shifted in _shifted(op, image, self.size)]
-        return op.signed_log(_mixed(op, weights, pixels) / total)
 
 
 @dataclass(frozen=True)
@@ -308,14 +277,9 @@ def _shifted(op: Any, image: Any, size: int) -> list[Any]:
 
 
 def head_of(start: tuple[str, ...], kernel: int, scales: int = 1, demodulate: bool = False) -> Head:
-    """The head of a network that starts from these images, by kernels of that size or (0) pixel by pixel.
-
-    ``scales`` and ``demodulate`` are as in ``Pyramid``.
-    """
-    if scales > 1:
-        return Pyramid(start, kernel, scales, demodulate)
+    """The head of a network that starts from these images: a ``Pyramid`` for ``kernel`` > 0, else pixel by pixel."""
     if kernel:
-        return Kernels(start, kernel)
+        return Pyramid(start, kernel, scales, demodulate)
     if not start:
         return Direct()
     return Residual(start) if len(start) == 1 else Mixture(start)

@@ -56,14 +56,6 @@ class Axes:
         )
         return parts
 
-    def level(self, value: float, color: str, label: str) -> str:
-        """A dashed horizontal line."""
-        y = self.y(value)
-        return (
-            f'<path d="M{self.left} {y:.1f}H{self.right}" stroke="{color}" stroke-dasharray="4 4"/>'
-            f'<text x="{self.left + 6}" y="{y - 4:.1f}" fill="{color}" font-size="11">{markup(label)}</text>'
-        )
-
     def legend(self, names: list[tuple[str, str, str]]) -> list[str]:
         """Names with their colours and dashes, at the right."""
         parts = []

@@ -62,7 +62,6 @@ class Overview:
     """What comes after the scenes, all optional."""
 
     tables: dict[str, list[list[str]]] = field(default_factory=dict)  # title -> rows of text, the first is the head
-    plots: dict[str, str] = field(default_factory=dict)  # title -> SVG document
     formulas: dict[str, str] = field(default_factory=dict)  # metric -> its formula in plain text
 
 

@@ -20,7 +20,7 @@ ROOM = 54 * 1280 * 720
 def write_evaluation_report(folder: str | os.PathLike, output: str | os.PathLike, *, overwrite: bool = False) -> Path:
     """Writes the report of ``folder``/results.json to ``output`` and returns its path.
 
-    Tables and plots hold every cell; pictures of the first seed are shown for as many sample counts, from the lowest
+    Tables hold every cell; pictures of the first seed are shown for as many sample counts, from the lowest
     on, as fit into ROOM, and the page says which those are. A method without a picture is named with its reason.
 
     Raises NgptError if the folder has no results that can be read, or none with a picture.
@@ -44,7 +44,7 @@ def write_evaluation_report(folder: str | os.PathLike, output: str | os.PathLike
         key: str(results["metadata"][key]) for key in ("cpu", "threads", "commit") if results["metadata"].get(key)
     }
     footer["pictures"] = f"first seed; {', '.join(map(str, shown))} spp of {', '.join(map(str, counts))}"
-    overview = Overview(_tables(results), _plots(folder, results), _formulas(results))
+    overview = Overview(_tables(results), _formulas(results))
     title, command = results["title"], results["command"]
     return write_report(output, title, scenes, command=command, footer=footer, overview=overview, overwrite=overwrite)
 
@@ -122,20 +122,18 @@ def _tables(results: dict) -> dict[str, list[list[str]]]:
     counts = sorted({row["spp"] for row in results["summary"]})
     tables = {}
     for scene in [None, *results["scenes"]]:
+        doubt = (results["scenes"][scene].get("reference") or {}).get("doubt") if scene else None
         rows = [["method", *(f"{spp} spp" for spp in counts)]]
         for method in results["methods"]:
             found = [_row(results, scene, spp, method) for spp in counts]
             if any(row["metrics"] for row in found):
-                rows.append([method, *(_cell(row, results["primary"]) for row in found)])
-        note = "median (lowest to highest) over seeds, seconds in all; ● on the Pareto front"
+                rows.append([method, *(_cell(row, results["primary"], doubt) for row in found)])
+        note = "median (lowest to highest) over seeds, seconds in all; ● on the Pareto front; ~ noise of the reference"
         if len(rows) > 1:
             tables[f"{results['primary']}, {scene or 'geometric mean over scenes'}: {note}"] = rows
     absent = {(cell["scene"], cell["method"], cell["absent"]) for cell in results["cells"] if cell["absent"]} | {
         (name, "all", scene["absent"]) for name, scene in results["scenes"].items() if scene["absent"]
     }
-    worth = results.get("worth", {}).get("tables", {})
-    tables |= {f"{title} (worth.md explains)": rows for title, rows in worth.items()}
-    tables |= results.get("against", {}).get("tables", {})
     if several_samplers(results):
         tables |= _costs(results)
     if absent:
@@ -159,27 +157,17 @@ def _costs(results: dict) -> dict[str, list[list[str]]]:
     return {"Milliseconds a sample, by kind of stack and sampler": rows} if costs else {}
 
 
-def _cell(row: dict, metric: str) -> str:
+def _cell(row: dict, metric: str, doubt: float | None) -> str:
+    """The numbers of a row; ~ where the error is below ``doubt``, what the reference can tell."""
     value = row["metrics"].get(metric)
     if not value or value["median"] is None:
         return "-"
-    text = f"{value['median']:.4g}"
+    text = f"{value['median']:.4g}{' ~' if value['median'] < (doubt or 0.0) else ''}"
     if None not in (value.get("low"), value.get("high")) and value["low"] != value["high"]:
         text += f" ({value['low']:.3g} to {value['high']:.3g})"
     if row["seconds"] and row["seconds"].get("total") is not None:
         text += f", {row['seconds']['total']:.3g} s"
     return text + (" ●" if row.get("pareto") else "")
-
-
-def _plots(folder: Path, results: dict) -> dict[str, str]:
-    plots = {}
-    for kind, files in results["plots"].items():
-        for name, file in files.items():
-            try:
-                plots[f"{kind}: {name}"] = (folder / file).read_text(encoding="utf-8")
-            except OSError as error:
-                raise NgptError(f"{folder / file}: cannot be read ({error.strerror}); run eval.py again") from error
-    return plots
 
 
 def _formulas(results: dict) -> dict[str, str]:

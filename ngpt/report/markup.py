@@ -110,12 +110,11 @@ def _spread(values: float | Sequence[float]) -> str:
 
 
 def overview_html(overview: Overview) -> str:
-    """Plots, tables and formulas, each under its title."""
-    plots = f"<h3>Plots</h3>{plots_html(overview.plots)}" if overview.plots else ""
+    """Tables and formulas, each under its title."""
     tables = "".join(f"<h3>{markup(title)}</h3>{plain_table(rows)}" for title, rows in overview.tables.items())
     formulas = "".join(f"<dt>{markup(key)}</dt><dd>{markup(text)}</dd>" for key, text in overview.formulas.items())
     formulas = f'<h3>Metrics</h3><dl class="formulas">{formulas}</dl>' if formulas else ""
-    body = tables + plots + formulas
+    body = tables + formulas
     return f'<details id="overview" open><summary>Overview</summary>{body}</details>' if body else ""
 
 

@@ -10,7 +10,9 @@ from pathlib import Path
 # (tests/system/test_install.py sees to it).
 PUBLISHED = False
 
-NAME = "ngpt-recon"
+NAME, STUDIES = "ngpt-recon", "ngpt-studies"
+# What ngpt-studies brings, by what a registry calls its entries
+BROUGHT = {"method": ("nlm",), "network": ("kpcn",), "sampler": ("gmlt", "gpt-tiles", "split")}
 CHECKOUT = Path(__file__).parents[2]
 
 
@@ -27,6 +29,20 @@ def install_command(extra: str) -> str:
 def package_command(package: str) -> str:
     """What to type for a package of the index."""
     return f"{_pip()} install {shlex.quote(package)}"
+
+
+def study(what: str, name: str) -> str:
+    """The line for a method, sampler or network that ngpt-studies brings, and that is not here; "" for other names."""
+    if name not in BROUGHT.get(what, ()):
+        return ""
+    folder = CHECKOUT / "studies"
+    if PUBLISHED:
+        how = f"`{package_command(STUDIES)}`"
+    elif folder.is_dir():
+        how = f"`{_pip()} install -e {shlex.quote(str(folder))}`"
+    else:
+        how = f"in a checkout of ngpt, `{_pip()} install -e studies`"
+    return f"{what} '{name}' is of the package {STUDIES}, which is not installed; {how}"
 
 
 def packages_of(extra: str) -> list[str]:

@@ -5,13 +5,13 @@ Anyone can also add methods, samplers, losses and metrics: each registry is a ``
 
 import sys
 import traceback
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterable, Iterator
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse, did_you_mean
 from ngpt.system.console import print_line
-from ngpt.system.install import install_command
+from ngpt.system.install import install_command, study
 
 T = TypeVar("T")
 
@@ -62,7 +62,16 @@ def brought(group: str) -> Iterator[Any]:
 
 def find_renderer() -> Any:
     """The renderer, see ``ngpt.renderer.Renderer``. Raises NgptError where none is installed, or it is broken."""
-    for point in points("ngpt.renderers"):
+    return _only("ngpt.renderers")
+
+
+def find_crops() -> Any:
+    """What renders crops to train on, see ``ngpt.renderer.Crops``. Raises NgptError as ``find_renderer`` does."""
+    return _only("ngpt.crops")
+
+
+def _only(group: str) -> Any:
+    for point in points(group):
         return loaded(point)
     raise NgptError(no_renderer())
 
@@ -106,6 +115,10 @@ class Registry(dict[str, T]):
         except KeyError:
             return default
 
+    def names(self) -> list[str]:
+        """The names of all entries; nothing is imported."""
+        return list(dict.fromkeys([*self, *(point.name for point in self._others())]))
+
     def load(self) -> list[str]:
         """Imports the entries of all other packages; returns their names. A broken one costs a line and is left out."""
         for point in points(self.group):
@@ -117,6 +130,13 @@ class Registry(dict[str, T]):
             except NgptError as error:
                 warn(str(error))
         return [name for name in self if name in self._imported]
+
+    def unknown(self, name: str, names: Iterable[str], choices: str) -> WrongUse:
+        """The error for a name that is no entry's: how to install the study of that name, else one of ``names`` that
+        may be meant, and the ``choices``."""
+        if line := study(self.what, name):
+            return WrongUse(line)
+        return WrongUse(f"unknown {self.what} '{name}'; {did_you_mean(name, names)}choose one of: {choices}")
 
     def _others(self) -> list[Any]:
         return [point for point in points(self.group) if not self._is_taken(point)]

@@ -12,17 +12,18 @@ from pathlib import Path
 from typing import Any
 
 from ngpt.errors import NgptError
+from ngpt.network.training_log import LOG, entries_of
 from ngpt.report.curves import curves
 from ngpt.report.document import document
 from ngpt.report.markup import plain_table, plots_html
 from ngpt.system.console import span
 from ngpt.system.records import read_json
 from ngpt.system.text import markup
-from ngpt.system.writing import csv_text, write_text
-from ngpt.training.run_summary import LOG, PAGE, SETTINGS, entries_of
+from ngpt.system.writing import write_text
+from ngpt.training.run_summary import PAGE, SETTINGS
 from ngpt.training.settings_text import difference, flat
 
-TABLE, RECORD = "log.csv", "run.json"
+RECORD = "run.json"
 # Seconds after which an open page of a run that goes on is read again.
 REFRESH = 30
 COLUMNS = ("input", "result", "reference")
@@ -89,19 +90,11 @@ def read_run(folder: str | Path, name: str = "") -> Run:
 
 
 def write_run(folder: str | Path) -> None:
-    """Writes ``run.html`` and ``log.csv`` into the folder of a run; nothing where it has no log yet."""
+    """Writes ``run.html`` into the folder of a run; nothing where it has no log yet."""
     folder = Path(folder)
     if not (folder / LOG).is_file():
         return
-    run = read_run(folder)
-    for name, text in ((PAGE, page([run])), (TABLE, table(run.entries))):
-        write_text(folder / name, text)
-
-
-def table(entries: list[dict[str, float]]) -> str:
-    """The log as comma-separated values: a column for each number, empty where a line of the log has none."""
-    names = list(dict.fromkeys(name for entry in entries for name in entry))
-    return csv_text([names, *(map(entry.get, names) for entry in entries)])
+    write_text(folder / PAGE, page([read_run(folder)]))
 
 
 def page(runs: list[Run], command: str = "") -> str:

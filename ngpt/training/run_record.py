@@ -1,6 +1,5 @@
 """``run.json``: what a run's settings change in the configuration that it began with, and what it runs on."""
 
-import secrets
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ from ngpt.network.model import parameters
 from ngpt.system import configs
 from ngpt.system.limits import processors
 from ngpt.system.machine import metadata
-from ngpt.system.records import read_json
 from ngpt.system.writing import write_json
 from ngpt.training.run_page import RECORD
 from ngpt.training.settings import Settings, published, read_settings
@@ -19,17 +17,17 @@ from ngpt.training.settings_text import difference, flat
 
 
 def write_record(out: Path, settings: Settings, config: Path, model: nn.Module, device: torch.device) -> None:
-    """Writes the record into the folder ``out``; a run that goes on keeps its ``id``. Folders are named, not where they
-    lie. ``base`` is the configuration ``config``, or where that is a file of the user's own, the nearest that comes
-    with ngpt."""
-    before = read_json(out / RECORD) if (out / RECORD).is_file() else {}
+    """Writes the record into the folder ``out``; it names folders without their paths.
+
+    ``base`` is the configuration ``config``, or for a file of the user's own the nearest one that comes with ngpt.
+    """
     base, changed = nearest(settings, config)
     system: dict[str, Any] = metadata("torch", "numpy", "safetensors")
     system |= {"device": str(device), "threads": torch.get_num_threads(), "processors": processors()}
     system |= {name: found for name, found in system.pop("versions").items() if found}
     if device.type == "cuda":
         system["gpu"] = torch.cuda.get_device_name(device)
-    record = {"id": before.get("id") or secrets.token_hex(8), "base": base, "changed": changed}
+    record = {"base": base, "changed": changed}
     write_json(out / RECORD, record | {"parameters": parameters(model), "system": system})
 
 

@@ -7,10 +7,11 @@ from typing import Any
 
 from ngpt.errors import NgptError
 from ngpt.network.identity import identify
-from ngpt.system.reading import read_text, regular_file
+from ngpt.network.training_log import LOG, entries_of
+from ngpt.system.reading import regular_file
 from ngpt.system.records import check, parse_json, read_json
 
-CHECKPOINT, LOG, SETTINGS, WEIGHTS = "checkpoint.safetensors", "log.jsonl", "settings.json", "weights.safetensors"
+CHECKPOINT, SETTINGS, WEIGHTS = "checkpoint.safetensors", "settings.json", "weights.safetensors"
 PAGE = "run.html"
 # Entries of the log that the loss is averaged over: one batch says little.
 _RECENT = 10
@@ -54,24 +55,6 @@ def summary(folder: Path) -> dict[str, Any]:
     if bad := sorted(path.name for path in folder.glob("bad-batch-*.safetensors")):
         report["batches whose loss was not finite"] = bad
     return report
-
-
-def entries_of(path: Path) -> list[dict[str, float]]:
-    """The lines of a log; the last one may be cut short, as it is while it is written."""
-    lines = read_text(path).splitlines()
-    entries = []
-    for number, line in enumerate(lines, 1):
-        where = f"{path}: line {number}"
-        try:
-            entry = parse_json(line, where)
-        except NgptError:
-            if number == len(lines):
-                break
-            raise
-        check(entry, {"step": int}, where)
-        check(entry, {str: (int, float)}, where)
-        entries.append(entry)
-    return entries
 
 
 def _header(path: Path) -> dict[str, Any]:

@@ -76,7 +76,6 @@ class RunSettings:
     ``minutes``    wall-clock budget of one call; 0 is none. A run that it stops can be resumed
     ``log``, ``save``, ``validate``  every so many steps
     ``views``      validation inputs looked at each time, spread over all of them
-    ``wandb``      project of Weights & Biases that the log is sent to as well; "" sends nothing
     """
 
     steps: int = 600_000
@@ -88,7 +87,6 @@ class RunSettings:
     save: int = 1000
     validate: int = 1000
     views: int = 64
-    wandb: str = ""
 
 
 @dataclass(frozen=True)

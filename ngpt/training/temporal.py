@@ -26,15 +26,14 @@ from ngpt.errors import NgptError
 from ngpt.measure.images import middle
 from ngpt.network import safetensors
 from ngpt.network.device import body_precision
-from ngpt.network.unet import PlainUNet
 from ngpt.sequence.network import BANDS, INPUTS, LARGEST, MOST, Corrections
+from ngpt.sequence.weights import KIND, WIDTHS, load, network
 from ngpt.training.clips import Clip, blended, errors, play, relit, robust
 from ngpt.training.distributed import Processes
 from ngpt.training.settings import Settings
 from ngpt.training.task import Task
 from ngpt.training.validation import Pictures, spread
 
-WIDTHS = (16, 24, 32)
 FLICKER = 1.0
 ENERGY = 300.0
 LEAST = 3e-4
@@ -43,7 +42,6 @@ LENGTHS = (1, 1, 4, 12)
 # The share of clips whose light is made to change, more often and more than in the shots themselves.
 RELIT = 0.4
 # What the header of a file of weights says that it holds.
-KIND = "temporal"
 
 
 class Blending(Task):
@@ -162,21 +160,6 @@ class Blending(Task):
 
     def load(self, path: str) -> nn.Module:
         return load(path)[0]
-
-
-def load(path: str | Path) -> tuple[PlainUNet, dict[str, Any]]:
-    """The network of a file that a run wrote, and the file's header; raises NgptError for others."""
-    tensors, header = safetensors.read_tensors(path)
-    if header.get("kind") != KIND or header.get("inputs") != list(INPUTS) or header.get("widths") != list(WIDTHS):
-        raise NgptError(f"{path}: holds no network that blends frames, or one of another version; train it anew")
-    model = network()
-    safetensors.fill(model, tensors, str(path))
-    return model.eval(), header
-
-
-def network() -> PlainUNet:
-    """It says nothing to begin with."""
-    return PlainUNet(len(INPUTS), WIDTHS, BANDS, zero=True)
 
 
 def loss(corrections: Tensor, batch: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:

@@ -24,6 +24,7 @@ from ngpt.errors import NgptError
 from ngpt.network import safetensors
 from ngpt.network.device import in_bfloat16
 from ngpt.network.model import parameters
+from ngpt.network.training_log import LOG
 from ngpt.system import files
 from ngpt.system.console import print_line
 from ngpt.system.records import check
@@ -31,7 +32,7 @@ from ngpt.system.writing import write_text
 from ngpt.training.distributed import Processes
 from ngpt.training.loggers import Logger, Meter, loggers
 from ngpt.training.run_page import write_run
-from ngpt.training.run_summary import CHECKPOINT, LOG, WEIGHTS
+from ngpt.training.run_summary import CHECKPOINT, WEIGHTS
 from ngpt.training.schedule import learning_rate, update_average, warmup_of
 from ngpt.training.settings import Settings, changed, from_dict, published
 from ngpt.training.task import Task
@@ -47,8 +48,8 @@ class Trainer:
     """One run in the folder ``out``, new or continued.
 
     ``task`` is what it trains. Files in ``out``: ``checkpoint.safetensors``, ``weights.safetensors`` (for inference),
-    ``best.safetensors`` (the weights with the least validation error), ``log.jsonl``, ``log.csv``, ``run.html``,
-    ``tensorboard/``, ``validation-STEP.png``.
+    ``best.safetensors`` (the weights with the least validation error), ``log.jsonl``, ``run.html``, ``tensorboard/``,
+    ``validation-STEP.png``.
     """
 
     def __init__(
@@ -96,6 +97,7 @@ class Trainer:
         if header.get("kind") != "checkpoint":
             raise NgptError(f"{self.checkpoint}: holds {header.get('kind')}, not a checkpoint")
         check(header, {"settings": dict, "step": int, "seconds": (int, float)}, f"{self.checkpoint}: its header")
+        header["settings"].get("run", {}).pop("wandb", None)  # a setting of earlier versions
         before = from_dict(header["settings"], str(self.checkpoint))
         if before.model != self.settings.model:
             raise NgptError(f"{self.checkpoint}: was trained with another [model]; give the run another folder")
@@ -131,7 +133,7 @@ class Trainer:
         batches = self.task.batches(self.model, self.step, self.processes)
         meter = Meter(self.step, self.device)
         if self.processes.rank == 0:
-            self._loggers = loggers(self.out, self.step + 1, self.settings)
+            self._loggers = loggers(self.out, self.step + 1)
         previous = {s: signal.signal(s, self._interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
         progress(self.step, run.steps)
         try:

@@ -7,14 +7,11 @@ file under ``repository/``, Markdown as a page, so that one link works in both p
 import ast
 import posixpath
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 from mkdocs.structure.files import File
 
 from ngpt.cli import parsers
-from ngpt.cli.manual import markdown
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -70,14 +67,18 @@ def reference() -> dict[str, str]:
     return pages
 
 
+def commands() -> str:
+    """What the ``--help`` of each verb says, as a page."""
+    texts = [f"## {name}\n\n```text\n{parser.format_help().rstrip()}\n```" for name, parser in parsers().items()]
+    return "\n\n".join(["# Commands", "What `ngpt VERB --help` prints.", *texts]) + "\n"
+
+
 def on_files(files, config):
     for file in sorted(outside()):
         files.append(File.generated(config, address(file), abs_src_path=str(file)))
     for name, text in reference().items():
         files.append(File.generated(config, f"api/{name}.md", content=text))
-    files.append(File.generated(config, "use/commands.md", content=markdown(parsers())))
-    manual = subprocess.check_output([sys.executable, "-m", "ngpt", "--manual"], text=True)
-    files.append(File.generated(config, "ngpt.1", content=manual))
+    files.append(File.generated(config, "use/commands.md", content=commands()))
     files.append(File.generated(config, "site.css", content=CSS))
     config.nav = menu([file.src_uri for file in files.documentation_pages()])
     return files

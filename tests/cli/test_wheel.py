@@ -45,7 +45,7 @@ def test_it_holds_the_two_packages_and_the_configurations(held):
     configs = {f"ngpt/configs/{path.name}" for path in (ROOT / "configs").iterdir()}
     weights = {f"ngpt/weights/{path.name}" for path in (ROOT / "export" / "weights").iterdir()}
     assert {name for name in held if "dist-info" not in name} == packages | configs | weights
-    assert {"ngpt/py.typed", "ngpt/report/report.html", "ngpt/measure/layers.json"} <= packages
+    assert {"ngpt/py.typed", "ngpt/report/report.html"} <= packages
     assert "ngpt/configs/tiny.toml" in configs
 
 

@@ -232,8 +232,8 @@ class Copies(Ends):
         for met in self.from_light[:s]:
             good &= met.there
         dr.eval(good)
-        g, _ = connection(self.scene, z.vertex, z.bsdf, y.vertex, good)
-        g1, edge = connection(self.scene, own.vertex, own.bsdf, y.vertex, good, seen=offset.joined)
+        g, _ = connection(self.plan, z.vertex, z.bsdf, y.vertex, good)
+        g1, edge = connection(self.plan, own.vertex, own.bsdf, y.vertex, good, seen=offset.joined)
         found = offset.β * g1, offset.r, mis.others_connected(own.vertex.end, y.vertex.end, edge)
         return z.vertex.β * g, found, self.brute(t, s), self.copy.brute(t, s), s + 1, good
 
@@ -244,8 +244,7 @@ class Copies(Ends):
         y, before, connectable = self.from_light[s - 1], self.from_light[max(s - 2, 0)], self.materials.connectable
         good = y.there & connectable(y.bsdf)
         good &= s == 1 or (~before.sharp & connectable(before.bsdf))
-        nothing_between = lambda si, to, active: self.scene.ray_test(si.spawn_ray_to(to.p), active)  # noqa: E731
-        C, others, uv = to_camera(self.eye, self.lens, y.vertex, y.bsdf, good, nothing_between)
+        C, others, uv = to_camera(self.eye, self.lens, y.vertex, y.bsdf, good, self.plan.seen_by_camera)
         path = {"first": dr.opaque(mi.Bool, s == 1), "start": self.start, "before": before.vertex}
         path |= {"p": before.sample.pdf, "survival": mi.Float(1), "events": mi.UInt32(0), "allowed": mi.Bool(good)}
         path = Splatted(y.vertex, y.d, uv, self.lens, C, others, **path)
@@ -355,12 +354,12 @@ def compare(others, densities, strategy, good, path, worst=0.01, least=100):
 
 def check_weights(ends):
     """The weights of all connections: to vertices, the light's own point and the camera."""
-    scene = ends.scene
+    scene, plan = ends.scene, plan_of(ends.scene)
     for t in range(1, 4):
         for s in range(1, 4):
             z, y = ends.from_camera[t - 1], ends.from_light[s - 1]
             smooth = scatters_smoothly(z.bsdf) & scatters_smoothly(y.bsdf)
-            C, others = connected(scene, z.vertex, z.bsdf, y.vertex, smooth)
+            C, others = connected(plan, z.vertex, z.bsdf, y.vertex, smooth)
             path = ends.from_camera[:t] + ends.from_light[:s]
             compare(others, ends.brute(t, s)[0], s + 1, smooth & (dr.max(C) > 0), path)
     for t in range(1, 4):
@@ -378,6 +377,5 @@ def check_weights(ends):
         compare(others, ends.brute(t, 0)[0], 1, good, ends.from_camera[:t])
     for s in range(1, 4):
         y = ends.from_light[s - 1]
-        seen = lambda si, toward, active: mi.Bool(False)  # noqa: E731
-        C, others, _ = to_camera(ends.eye, ends.lens, y.vertex, y.bsdf, scatters_smoothly(y.bsdf), seen)
+        C, others, _ = to_camera(ends.eye, ends.lens, y.vertex, y.bsdf, scatters_smoothly(y.bsdf), lambda *_: 1)
         compare(others, ends.brute(0, s)[0], s + 1, dr.max(C) > 0, ends.from_light[:s])

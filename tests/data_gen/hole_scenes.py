@@ -1,6 +1,7 @@
 """Scenes of light through masks and panes, from lamps with a size and without."""
 
 import mitsuba as mi
+import numpy as np
 from data_gen_scenes import _diffuse, _light, _rgb, _room, _scene, _sphere, _two, _wall
 
 _BESIDE = ([0.3, 1.25, 3.9], [0, 0.9, 0], 50)
@@ -42,3 +43,21 @@ def curtains_in_fog():
     place = mi.ScalarTransform4f().translate([0, 1.2, 0]).scale([1.4, 1.15, 1.45])
     scene = curtains() | {"box": {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": air}}
     return scene | {"integrator": {"type": "volpath", "max_depth": -1}}
+
+
+def leaves(number=24):
+    """The sun through many leaves one behind the other, over a floor, which is seen through them too."""
+    tiles = {"type": "checkerboard", "color0": 1.0, "color1": 0.0}
+    tiles["to_uv"] = mi.ScalarTransform4f().scale([3, 3, 1])
+    rng = np.random.default_rng(5)
+    scene = _scene(
+        -1,
+        ([0, 1.6, 3.5], [0, 0.4, 0], 50),
+        sun={"type": "directional", "direction": [0.2, -1, -0.3], "irradiance": _rgb(3, 2.5, 2)},
+        floor=_wall([0, 0, 0], [0, 1, 0], (6, 6), _diffuse(0.5, 0.5, 0.5)),
+    )
+    leaf = {"type": "mask", "opacity": tiles, "nested": _two(0.3, 0.6, 0.2)}
+    for i in range(number):
+        x, z = rng.uniform(-1, 1, 2)
+        scene[f"leaf_{i}"] = _wall([x, 0.3 + 1.2 * i / number, z], [0.1, 1, 0.3 * (-1) ** i], (0.9, 0.9), leaf)
+    return scene

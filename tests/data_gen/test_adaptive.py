@@ -18,7 +18,7 @@ from ngpt.subpixels import means
 pytest.importorskip("mitsuba")
 
 from data_gen import adaptive, passes
-from data_gen.adaptive import Adaptive, assess, share_out
+from data_gen.adaptive import Adaptive, Assessment, assess, share_out
 from data_gen.choosing import plans
 from data_gen.render import render_stack
 
@@ -178,6 +178,23 @@ def test_an_error_is_reached(renderer, converged, sampler):
     assert np.sqrt(relmse_trimmed(reconstruct(stack, method).image, *halves)) == pytest.approx(0.09, rel=0.5)
     ended = render(renderer, 32, 1, scene, sampler, 1e-4, method)
     assert ended["samples"].mean() == 32 and ended.attributes["ngpt:error"] > 1e-4
+
+
+def test_an_error_is_reached_in_few_steps(renderer, monkeypatch):
+    """Errors fall with the root of the samples. 200 are needed here: after 128, the next step goes there, and not far
+    beyond."""
+    taken = [16.0]
+
+    def shared_out(need, n, samples):
+        blocks = share_out(need, n, samples)
+        taken.append(taken[-1] + adaptive.BLOCK * blocks.mean())
+        return blocks
+
+    monkeypatch.setattr(adaptive, "share_out", shared_out)
+    monkeypatch.setattr(adaptive, "assess", lambda stack, method: Assessment(np.ones(64), taken[-1] ** -0.5, method))
+    scene = load(renderer, "diffuse", (8, 8))
+    render(renderer, None, 1, scene, "primal", 200**-0.5, "primal", with_features=False)
+    assert taken[:4] == [16, 32, 64, 128] and len(taken) == 5 and 200 <= taken[4] <= 224
 
 
 def test_an_error_and_counts_are_said_and_written(renderer, command):

@@ -52,7 +52,6 @@ def test_the_least_error_in_a_time(seen, advice):
     ]
     assert rows[0]["spp"] in (99, 100) and rows[0]["error"] == pytest.approx(0.02 * 16 / 100, rel=0.02)
     assert all(row["seconds"] <= 0.1 + 1e-9 for row in rows)
-    assert all(row["low"] < row["error"] < row["high"] for row in rows)
     best = advice("--seconds 1")[0]
     assert (best["sampler"], best["method"], best["adaptive"]) == ("gpt", "wcv", True)
 
@@ -80,14 +79,6 @@ def test_on_a_busy_machine_one_sampler_is_tried_and_no_more(renderer, monkeypatc
     found = plans.explore(scene, 30.0, pilot=Pilot(lambda: float(next(seconds))), patient=True)
     assert {p.sampler for p in found} == {"gpt"} and len(found) == 1
     assert plans.explore(scene, 30.0, pilot=Pilot(lambda: float(next(seconds)))) == []
-
-
-def test_the_further_beyond_the_samples_of_a_pilot_the_less_is_known():
-    """And least about networks with gradients."""
-
-    combine, wcv = (Pipeline("gpt", name, 16, 0.01, -0.9, 0.001, 0.0) for name in ("ngpt-combine", "wcv"))
-    spreads = [p.likely(spp)[1] / p.expected(spp) for p in (combine, wcv) for spp in (8, 16, 64, 256, 4096)]
-    assert spreads == pytest.approx([2.3, 2.3, 3.2, 5.1, 5.1, 1.8, 1.8, 2.4, 2.6, 2.6])
 
 
 def test_the_least_time_to_an_error(seen, advice, command):

@@ -21,6 +21,7 @@ from ngpt.training.dataset import Dataset, problems, read_manifest
 pytest.importorskip("safetensors")
 pytest.importorskip("mitsuba")
 
+from data_gen.cluster import cluster as dask_cluster
 from data_gen.dataset import jobs
 from data_gen.dataset.cameras import Surroundings, View, find_view, random_view, what_shows, with_one_kernel
 from data_gen.dataset.config import Config, Files, read_config
@@ -230,7 +231,7 @@ def test_dask_cluster_with_a_worker_killed(tmp_path, monkeypatch):
             if done >= 5 and not killed:
                 killed.append(os.kill(pids[0], signal.SIGKILL))
 
-        with jobs.cluster(cluster.scheduler_address) as executor:
+        with dask_cluster(cluster.scheduler_address) as executor:
             jobs.generate(config, tmp_path, executor, progress=progress)
     assert killed and len(hashes(tmp_path)) == 60 and problems(tmp_path) == []
 

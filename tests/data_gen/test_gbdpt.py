@@ -171,8 +171,7 @@ def test_what_the_camera_has_seen_is_found_again(renderer, name):
     some = Sight.of(camera.at(lanes))
     again = light_again(plan, some, depths)
     end, link, left, there = again.end, again.link, again.left, again.there
-    seen = lambda *_: mi.Bool(False)  # noqa: E731
-    C, others, uv = to_camera(some.eye, again.lens, end.y, end.y.si.bsdf(), there, seen)
+    C, others, uv = to_camera(some.eye, again.lens, end.y, end.y.si.bsdf(), there, lambda *_: 1)
     marker = Marker(second, some.ray, some.importance)
     marker.sees(mi.UInt64(0), Seen(end.y, C, others, some.eye.pixel_at(uv), None))
     smooth = link.depth + 1 == end.y.depth

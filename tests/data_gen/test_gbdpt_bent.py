@@ -207,7 +207,7 @@ class Caustics(Ends):
             link = next_link(link, mi.UInt32(depth), met.sample, mi.Float(1))
             dr.eval(found, before, link)
         y, d, link, before, good = found
-        C, others, uv = to_camera(self.eye, self.lens, y, y.si.bsdf(), good, self.hidden)
+        C, others, uv = to_camera(self.eye, self.lens, y, y.si.bsdf(), good, self.seen)
         before_it = {"first": link.depth == 0, "start": self.start, "before": before, "p": link.p}
         before_it |= {"survival": link.survival, "events": link.events}
         self.path = Splatted(y, d, uv, self.lens, C, others, **before_it, allowed=good)
@@ -216,8 +216,8 @@ class Caustics(Ends):
     def camera_path(self, z, end, d):
         return []
 
-    def hidden(self, si, to, active):
-        return self.scene.ray_test(si.spawn_ray_to(to.p), active)
+    def seen(self, y, to, active):
+        return dr.select(self.scene.ray_test(y.si.spawn_ray_to(to.p), active), mi.Float(0), 1)
 
     def shift(self, path, uv, active):
         """(C', r, others') at that place on the film."""
@@ -280,7 +280,7 @@ class Caustics(Ends):
             si, d, β, end = dr.select(here, (reached, d_next, β * f_p, left), (si, d, β, end))
             dr.eval(si, d, β, end)
         y = Vertex(si, β, end, path.y.depth)
-        C, others, uv = to_camera(self.eye, path.lens, y, si.bsdf(), good, self.hidden)
+        C, others, uv = to_camera(self.eye, path.lens, y, si.bsdf(), good, self.seen)
         p = dr.select(path.first, path.p, p)
         moved = replace(path, y=y, d=d, uv=uv, C=C, others=others, start=start, p=p)
         dr.eval(moved, good)

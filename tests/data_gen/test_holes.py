@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hole_scenes import curtains, curtains_in_fog
+from hole_scenes import curtains, curtains_in_fog, leaves
 from unbiased import load, render_ours
 
 pytest.importorskip("mitsuba")
@@ -44,6 +44,45 @@ def test_what_does_not_know_its_share_is_no_hole(renderer):
 
     # Where there are none, nothing of them is compiled.
     assert holes(mask) and holes({"type": "diffuse"}) is None and holes(unknown[0]) is None
+
+
+@pytest.mark.parametrize("sampler", ["bdpt", "vcm"])
+def test_connections_go_on_through_many_holes(renderer, sampler):
+    """Light through holes of some leaves is seen through holes of others; no path is counted twice."""
+    import straight_on
+
+    scene = load(renderer, leaves, (16, 16))
+    integrator = straight_on.integrator(renderer)
+    theirs = np.stack(
+        [np.array(renderer.render(scene, integrator=integrator, spp=256, seed=1000 + i)) for i in range(8)]
+    )
+    ours = np.stack([stack["primal"] for stack in render_ours(scene, sampler, 8, 64)])
+    assert z_test(ours, theirs).passed
+    assert abs(ours.mean() / theirs.mean() - 1) < 0.005
+
+
+@pytest.mark.parametrize("hides", [False, True])
+def test_lamps_hide_from_the_camera_only_in_front_of_holes(renderer, hides):
+    """From the floor, below a lamp that is below or above a mask: what comes to the camera above both."""
+    from data_gen.paths.holes import Holes
+
+    def at(height, **more):
+        to_world = renderer.ScalarTransform4f().translate([0, 0, height])
+        return {"type": "rectangle", "to_world": to_world, **more}
+
+    lamp = {"emitter": {"type": "area"}}
+    mask = {"type": "mask", "opacity": 0.75, "nested": {"type": "diffuse"}}
+    for lamp_at, mask_at, seen in ((2, 1, 0.25 if hides else 0), (1, 2, 0)):
+        parts = {"floor": at(0), "lamp": at(lamp_at, **lamp), "mask": at(mask_at, bsdf=mask)}
+        scene = load(renderer, {"type": "scene", **parts})
+        holes, ray = Holes.of(scene), renderer.Ray3f([0.1, 0.1, 0.5], [0, 0, -1])
+        floor = scene.ray_intersect(ray)
+        way = scene, floor, renderer.Point3f(0.1, 0.1, 3), renderer.UInt32(3), renderer.Bool(True)
+        if hides:
+            T = holes.toward_camera(*way)
+        else:
+            T, _ = holes.transmittance(scene, floor.spawn_ray_to(way[2]), *way[2:])
+        assert np.allclose(T, seen)
 
 
 @pytest.mark.slow

@@ -30,6 +30,8 @@ IN_GLASS, IN_HOLES = (
         (GLASS, LAMP.format(0.3), "primal", ""),
         (GLASS, POINT, "vcm", ""),
         (MASK, POINT, "gpt", ""),
+        (MASK, POINT, "bdpt", ""),
+        (MASK, POINT, "gbdpt", IN_HOLES),
         (MASK, POINT, "gpt-basic", IN_HOLES),
         (MASK, LAMP.format(0.3), "gpt-basic", ""),
         ('<bsdf type="plastic"/>', POINT, "primal", ""),

@@ -164,7 +164,7 @@ def test_a_render_goes_on_and_its_image_is_made_anew(renderer, command, kept):
         ("-o a.png --denoise wcv --sampler primal", "needs gradients, and sampler 'primal' renders none"),
         ("-o a.png --denoise wcv --sampler restir --frames 0:2", "sampler 'restir' renders none"),
         ("-o a.png --denoise ngpt-primal --spp 1", "needs variances"),
-        ("-o a.png --denoise nlm", "method 'nlm' cannot be used: none here; name another"),
+        ("-o a.png --denoise nfor", "method 'nfor' cannot be used: none here; name another"),
         ("-o a.png --transform aces", "--transform aces needs OpenColorIO"),
         ("-o a.tga", "stacks are OpenEXR; let the name end in .exr, or for an image in .png"),
         ("-o a.tga --denoise", "results are OpenEXR, PFM or pictures"),
@@ -198,7 +198,7 @@ def test_a_render_goes_on_and_its_image_is_made_anew(renderer, command, kept):
     ],
 )
 def test_what_would_fail_afterwards_is_refused_before(command, no_render, monkeypatch, words, message):
-    monkeypatch.setitem(METHODS, "nlm", replace(METHODS["nlm"], missing=lambda: "none here"))
+    monkeypatch.setitem(METHODS, "nfor", replace(METHODS["nfor"], missing=lambda: "none here"))
     monkeypatch.setattr(transforms, "find_spec", lambda name: None)
     transforms._aces.cache_clear()
     for name in ("there.png", "there.exr"):

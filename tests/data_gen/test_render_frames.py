@@ -141,7 +141,7 @@ def test_parts_of_a_shot_are_its_frames(shot):
 
 
 def test_a_cluster_renders_the_parts_that_are_missing(shot, command, monkeypatch):
-    monkeypatch.setattr(jobs, "cluster", lambda address: jobs.Serial())
+    monkeypatch.setattr(shot_files, "cluster", lambda address: jobs.Serial())
     monkeypatch.setattr(shot_files, "FRAMES_OF_A_PART", 1)
     whole, cluster = shot("whole"), "--cluster tcp://nowhere:1 --json"
     assert list(shot("farm", cluster)) == list(whole)

@@ -148,6 +148,57 @@ def test_light_that_is_cut_is_counted(renderer):
     assert filled.cut / filled.light == pytest.approx(1 - kept / values.sum(), rel=1e-3)
 
 
+def test_old_records_fade(renderer):
+    """Records that are made later count twice as much, but cells with few records keep them."""
+    filled, half = cache.Cache(FINENESS), dr.arange(mi.UInt32, N) & 1
+    busy, quiet = flat(dr.full(mi.Float, 0.05, N), 0.05), flat(dr.full(mi.Float, 0.95, 2 * LEAST), 0.95)
+    filled.unit = 2.0**-20
+    filled.add(busy, half, [mi.Float(1)] * 3)
+    filled.add(quiet, dr.arange(mi.UInt32, 2 * LEAST) & 1, [mi.Float(1)] * 3)
+    filled.fade()
+    filled.add(busy, half, [mi.Float(4)] * 3)
+    for _ in range(20):
+        filled.settle(FINENESS)
+        for place, light in ((busy, 3), (quiet, 1)):
+            (found, *_), _, known = filled.known.look(place, LEAST, mi.Bool(True))
+            assert np.array(known).all() and np.allclose(np.array(found), light, rtol=1e-3)
+        filled.fade()
+
+
+def test_records_of_earlier_rounds_fade(renderer, monkeypatch):
+    scene = load(renderer, "diffuse", (32, 24))
+    images = [render_stack(scene, 32, 1, "primal", tails="shared")["primal"]]
+    monkeypatch.setattr(cache.Cache, "fade", lambda self: None)
+    images.append(render_stack(scene, 32, 1, "primal", tails="shared")["primal"])
+    assert not np.array_equal(*images) and np.mean(images[0]) == pytest.approx(np.mean(images[1]), rel=0.02)
+
+
+def test_the_noise_of_the_cache_is_of_its_own_seed(renderer):
+    """The layer ``shared`` says what it is: less changes where only the paths of the image are others."""
+    scene = load(renderer, slit, (32, 24))
+
+    def changes(tails_seed):
+        stacks = [render_stack(scene, 16, i, "primal", tails="shared", tails_seed=tails_seed) for i in range(8)]
+        return np.std([np.mean(stack["shared"], dtype=float) for stack in stacks])
+
+    assert changes(1) < 0.6 * changes(None)
+
+
+def test_frames_have_one_cache(renderer, monkeypatch):
+    from data_gen.frames import shot
+
+    seeds, render = [], shot.render_stack
+
+    def noted(*args, tails_seed, **options):
+        seeds.append((args[2], tails_seed))
+        return render(*args, tails_seed=tails_seed, **options)
+
+    monkeypatch.setattr(shot, "render_stack", noted)
+    list(data_gen.render_frames("diffuse", [0, 1], 1, seed=5, sampler="primal", size=(8, 6)))
+    (first, of_tails), (second, again) = seeds
+    assert first != second and of_tails == again == 5
+
+
 def cell_with_a_wall(at, bright, dark, share=1.0, n=4000):
     """A cache whose one cell has other light on either side of a wall, found by a ``share`` of its records."""
     rng = np.random.default_rng(4)

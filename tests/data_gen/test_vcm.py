@@ -128,7 +128,9 @@ class Beside:
         good = base.there & own.there & connectable(base.bsdf) & connectable(own.bsdf)
         some = np.flatnonzero(np.array(good & (offset.apart if t == 1 else offset.joined)))
         some = mi.UInt32(some[:: max(1, len(some) // number)])
-        z, y, offset = (dr.gather(type(value), value, some) for value in (base.vertex, own.vertex, offset))
+        parts = ((v.si, v.β, v.end, v.depth) for v in (base.vertex, own.vertex))
+        z, y = (Vertex(*(dr.gather(type(part), part, some) for part in each)) for each in parts)
+        offset = dr.gather(type(offset), offset, some)
         # From the other end the base path is the copy: of its own density.
         ray = mi.Ray3f(z.si.p + z.si.to_world(z.si.wi), -z.si.to_world(z.si.wi))
         hit = copies.scene.ray_intersect_preliminary(ray)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ngpt.evaluation.curves import REACH, error_at, first_at
+from bench.curves import REACH, error_at, first_at
 
 LAW = [(t, 0.3 * t**-0.7) for t in (8, 32, 128)]
 

@@ -28,7 +28,7 @@ def key_of(scene: str, folder: Path, sampler: str = "gpt") -> str:
 
 def test_a_sampler_has_the_key_of_the_code_it_runs(tree, tmp_path):
     """What is shared changes all, a sampler's own code that sampler, and those that use it."""
-    names = ("auto", "gpt", "gmlt", "bdpt", "gbdpt", "primal", "ppm", "gpm")
+    names = ("auto", "gpt", "bdpt", "gbdpt", "primal", "ppm", "gpm")
     last: dict[str, str] = {}
 
     def changed(file: str = "", text: str = "\nsomething = 1\n") -> set[str]:
@@ -43,11 +43,10 @@ def test_a_sampler_has_the_key_of_the_code_it_runs(tree, tmp_path):
     assert changed() == {*names} and changed() == set()
     for shared in ("film/gradient_film.py", "render.py", "samplers/registry.py"):
         assert changed(shared) == {*names}, shared
-    assert changed("samplers/common.py") == {*names} - {"gmlt"}
-    assert changed("samplers/studies/gmlt/chains.py") == changed("samplers/studies/gmlt/integrator.py") == {"gmlt"}
+    assert changed("samplers/common.py") == {*names}
     assert changed("samplers/gpt/about.py") == {"auto", "gpt"}
-    # gmlt shifts the paths of its chains by it, and primal walks its base paths where lamps are chosen by place.
-    assert changed("samplers/gpt/offset_path.py") == {"auto", "gpt", "gmlt", "primal"}
+    # primal walks the base paths of gpt where lamps are chosen by place.
+    assert changed("samplers/gpt/offset_path.py") == {"auto", "gpt", "primal"}
     assert {"ppm", "gpm"} <= changed("samplers/photons/map/trace.py") <= {"ppm", "gpm"}
     assert changed("paths/fresh.py") == set()
     late = "\ndef late():\n    from data_gen.paths import fresh\n"
@@ -78,7 +77,7 @@ def test_what_renders_nothing_does_not_change_the_key(tree, tmp_path):
     film = tree / "film" / "gradient_film.py"
     film.write_text("# A remark.\n" + re.sub(r'"""(?=[A-Z])', '"""More words. ', film.read_text()))
     files = ("dataset/crops.py", "scenes/procedural/scenes.py", "inspect.py", "choosing/plans.py", "__main__.py")
-    for name in (*files, "session.py", "cli/render.py", "samplers/studies/about.py", "samplers/__init__.py"):
+    for name in (*files, "session.py", "cli/render.py", "samplers/photons/about.py", "samplers/__init__.py"):
         (tree / name).write_text((tree / name).read_text() + "\nsomething = 1\n")
     assert key_of("diffuse", tmp_path) == before
 

@@ -9,7 +9,6 @@ from folders import evaluated, read, smooth_image, write_halves, write_scene
 import ngpt
 from ngpt.errors import NgptError
 from ngpt.evaluation.references import find_reference, read_reference, reference_noise
-from ngpt.evaluation.stability import flicker_and_bias, study
 from ngpt.measure.metrics import scores
 
 CONFIG = """
@@ -71,17 +70,3 @@ def test_an_evaluation_measures_by_both_halves(tmp_path, rng):
     cell = next(cell for cell in results["cells"] if (cell["method"], cell["seed"]) == ("l2", 0))
     assert len(halves) == 2
     assert cell["metrics"]["relMSE"] == pytest.approx(scores(["relMSE"], image, *halves)["relMSE"], rel=1e-4)
-
-
-def test_stability_takes_the_noise_off_the_bias(tmp_path, rng):
-    """An unbiased method has no bias, even by references with more noise than its mean image."""
-    truth = np.ones((40, 50, 3))
-    images = truth + rng.normal(0, 0.2, (16, *truth.shape))
-    a, b = truth + rng.normal(0, 0.1, (2, *truth.shape))
-    assert abs(flicker_and_bias(images, a, b, share=0)["bias"]) < 0.001
-    assert flicker_and_bias(images, (a + b) / 2, share=0)["bias"] > 0.004
-    write_scene(tmp_path / "room", rng)
-    write_halves(tmp_path / "room", rng, 0.1)
-    evaluated(read(CONFIG.format(folder=tmp_path / "room"), tmp_path), tmp_path / "out")
-    rows = {row["method"]: row for row in study(tmp_path / "out")}
-    assert abs(rows["primal"]["bias"]) < 0.003 and rows["primal"]["flicker"] > 0.01

@@ -1,11 +1,10 @@
-"""Tables and plots of cells whose order is known."""
+"""Means, quartiles and the Pareto set of cells whose order is known."""
 
 import pytest
 
 from bench.common import measure
-from ngpt.evaluation.frontier import Point, pareto
+from bench.frontier import Point, pareto
 from ngpt.evaluation.results import as_csv, summarised
-from ngpt.evaluation.tables import tables
 from ngpt.measure.averages import geometric_mean
 
 CLOCKS = ("render", "reconstruct", "total", "reconstruct wall")
@@ -16,7 +15,7 @@ def method_entry(name: str) -> dict:
     return {"stack": kind, "render": kind, "family": name, "absent": None}
 
 
-def make_results(errors: dict[str, list[float]], noise: float = 1e-6) -> dict:
+def make_results(errors: dict[str, list[float]]) -> dict:
     """Two scenes, one spp, with these errors by method, one for each seed; the second scene's are a hundred times."""
     results = {
         "title": "Title",
@@ -27,9 +26,7 @@ def make_results(errors: dict[str, list[float]], noise: float = 1e-6) -> dict:
         "metrics": {"relMSE": {"formula": "f", "better": "lower"}, "PSNR": {"formula": "p", "better": "higher"}},
         "settings": {"spp": [16], "seeds": 3, "size": [8, 8]},
         "methods": {m: method_entry(m) for m in errors},
-        "scenes": {
-            s: {"reference": {"noise": noise, "doubt": 3 * noise}, "cost": {}, "absent": None} for s in ("a", "b")
-        },
+        "scenes": {s: {"reference": {"noise": 1e-6, "doubt": 3e-6}, "cost": {}, "absent": None} for s in ("a", "b")},
         "cells": [],
     }
     for scene, factor in (("a", 1), ("b", 100)):
@@ -43,11 +40,6 @@ def make_results(errors: dict[str, list[float]], noise: float = 1e-6) -> dict:
     return results
 
 
-def row_of(text: str, scene: str) -> list[str]:
-    line = next(line for line in text.splitlines() if line.startswith(f"| {scene} "))
-    return [cell.strip() for cell in line.strip("|").split("|")]
-
-
 def test_medians_and_means():
     results = make_results({"l1": [0.01, 0.02, 0.09], "oidn": [0.03, 0.03, 0.03]})
     rows = {(row["scene"], row["method"]): row for row in results["summary"]}
@@ -58,32 +50,6 @@ def test_medians_and_means():
     assert rows[None, "l1"]["error"] == pytest.approx(0.2)
     assert rows[None, "l1"]["metrics"]["PSNR"]["median"] == pytest.approx(505)
     assert rows["a", "l1"]["pareto"] and not rows["a", "oidn"]["pareto"]
-
-
-def test_losses_are_marked():
-    text = tables(make_results({"primal": [0.5], "l1": [0.2], "wcv": [0.04], "oidn": [0.1]}))
-    assert row_of(text, "a") == ["a", "16", "0.5000", "*0.2000*", "**0.0400**", "0.1000", "0.00000"]
-    assert "| `primal`† | `l1` | `wcv` | `oidn`† |" in text
-
-
-def test_duels_are_counted_over_cells_that_both_have():
-    results = make_results({"primal": [0.5], "l1": [0.2], "oidn": [0.1]})
-    cell = next(c for c in results["cells"] if (c["scene"], c["method"]) == ("b", "l1"))
-    cell["metrics"] = {"relMSE": 1.0, "PSNR": 99.0}
-    results["cells"] = [c for c in results["cells"] if (c["scene"], c["method"]) != ("b", "primal")]
-    results["summary"] = summarised(results)
-    text = tables(results).split("the better relMSE")[1]
-    assert row_of(text, "`l1`") == ["`l1`", "1/1", "", "1/2"]
-    assert row_of(text, "`primal`") == ["`primal`", "", "0/1", "0/1"]
-    # Metrics of which more is better; equal is not better.
-    results["primary"] = "PSNR"
-    text = tables(results).split("the better PSNR")[1]
-    assert row_of(text, "`l1`") == ["`l1`", "0/1", "", "0/2"]
-
-
-def test_what_the_reference_cannot_tell_is_marked():
-    text = tables(make_results({"l1": [0.2, 0.2, 0.2], "oidn": [0.1, 0.1, 0.4]}, noise=0.05))
-    assert row_of(text, "a")[2:4] == ["*0.2000*", "**0.1000 ±75% ~**"]
 
 
 def test_csv_has_a_line_for_each_cell():

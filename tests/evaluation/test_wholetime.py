@@ -1,14 +1,13 @@
 """Errors over rivals' at equal whole time: curves and envelopes of hand-made numbers, and folders of stacks."""
 
-import csv
 import xml.etree.ElementTree as ElementTree
 
 import pytest
 from folders import evaluated, read, write_scene
 
+from bench import evaluated as tables
+from bench.wholetime import against_rivals, envelope
 from ngpt.evaluation import cells
-from ngpt.evaluation.wholetime import against_rivals, envelope
-from ngpt.report.evaluation import write_evaluation_report
 
 
 def made(rows: dict[str, list[tuple[float, float, float]]], scenes=("a",), **settings) -> dict:
@@ -88,29 +87,26 @@ stack = "features"
 """
 
 
-def test_an_evaluation_holds_its_methods_against_rivals(tmp_path, rng):
-    """Rivals have counts of their own; results, tables, plots and the report say what they are at equal whole time."""
+def test_an_evaluation_holds_its_methods_against_rivals(tmp_path, rng, capsys):
+    """Rivals have counts of their own; tables and plots say what they are at equal whole time."""
     write_scene(tmp_path / "room", rng, spp=(4, 16, 64), seeds=1)
     config = read(CONFIG.format(folder=tmp_path / "room"), tmp_path)
     results = evaluated(config, tmp_path / "out")
     measured = {(cell["method"], cell["spp"]) for cell in results["cells"]}
     assert ("primal", 64) in measured and ("l2", 64) not in measured and ("nfor", 64) not in measured
-    rows = {(row["method"], row["spp"]): row for row in results["against"]["rows"]}
+    rows = {(row["method"], row["spp"]): row for row in against_rivals(results)["rows"]}
     assert set(rows) == {(method, spp) for method in ("l2", "nfor") for spp in (4, 16)}
     cell = next(c for c in results["cells"] if (c["method"], c["spp"]) == ("l2", 16))
     row = rows["l2", 16]
     assert row["seconds"] == pytest.approx(1.6 + cell["seconds"]["reconstruct"]) and not row["mark"]
     assert row["error"] < 0.5
     assert cell["seconds"]["reconstruct wall"] == cell["seconds"]["reconstruct"]  # the clock of this one
-    page = (tmp_path / "out" / "results.md").read_text()
-    assert "| rooms (1) | 16 | l2 | 1.6" in page and "path (`primal`, `raw`)" in page
-    with open(tmp_path / "out" / "against.csv", newline="") as file:
-        assert len(list(csv.DictReader(file))) == 4
-    plot = ElementTree.parse(tmp_path / "out" / results["plots"]["frontier"]["rivals-rooms"])
+    tables.main(tmp_path / "out")
+    page = capsys.readouterr().out
+    assert "| rooms (1) | 16 | l2 | 1.6" in page and "at equal whole time, scene by scene:" in page
+    plot = ElementTree.parse(tmp_path / "out" / "frontier-rooms.svg")
     texts = [element.text for element in plot.iter("{http://www.w3.org/2000/svg}text")]
     assert {"path", "l2", "nfor"} <= set(texts) and "raw" not in texts
-    report = write_evaluation_report(tmp_path / "out", tmp_path / "report.html").read_text()
-    assert "at equal whole time, scene by scene" in report
 
 
 def test_processor_seconds_of_a_reconstruction_are_those_of_all_threads(tmp_path, rng, monkeypatch):

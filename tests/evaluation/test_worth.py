@@ -1,16 +1,11 @@
-"""W, C and the maps: curves and stacks whose worth is known."""
-
-import csv
-import xml.etree.ElementTree as ElementTree
+"""W and C: curves and stacks whose worth is known."""
 
 import numpy as np
 import pytest
 from folders import evaluated, read, smooth_image, write_halves
 
 import ngpt
-from ngpt.evaluation.worth import _means, worth_of_gradients, worth_tables
-from ngpt.evaluation.worthplots import block_errors, block_size
-from ngpt.report.evaluation import write_evaluation_report
+from bench.worth import _means, worth_of_gradients, worth_tables
 from ngpt.stack import GradientStack
 
 WORTH = 3.0
@@ -65,28 +60,20 @@ def write_room(folder, rng):
 
 def test_stacks_of_known_worth(tmp_path, rng):
     write_room(tmp_path / "room", rng)
-    config, out = read(CONFIG.format(folder=tmp_path / "room"), tmp_path), tmp_path / "out"
-    results = evaluated(config, out, "the command")
-    best = [row for row in results["worth"]["rows"] if row["best"]]
+    results = evaluated(read(CONFIG.format(folder=tmp_path / "room"), tmp_path), tmp_path / "out")
+    worth = worth_of_gradients(results)
+    best = [row for row in worth["rows"] if row["best"]]
     assert [(row["spp"], row["method"], row["rival"]) for row in best] == [(n, "ours", "primal") for n in (4, 16, 64)]
     assert [row["W"] for row in best] == pytest.approx([WORTH] * 3, rel=0.15)
     assert [row["mark"] for row in best] == ["", "", "~"]  # three times 64 samples were not measured
-    worse = [row["W"] for row in results["worth"]["rows"] if row["method"] == "ours-worse"]
+    worse = [row["W"] for row in worth["rows"] if row["method"] == "ours-worse"]
     assert worse == pytest.approx([WORTH / 2] * 3, rel=0.15)
     # Samples take the same time with gradients, and copying an image takes none: worth over cost is the worth.
-    assert all(row["C"] == pytest.approx(1) for row in results["worth"]["rows"])
+    assert all(row["C"] == pytest.approx(1) for row in worth["rows"])
     assert all(row["W/C"] == pytest.approx(row["W"], rel=0.05) for row in best)
-    # At equal time, which without costs are equal samples, nearly all blocks are better.
-    assert all(row["blocks"] > 0.5 for row in best)
-    with open(out / "worth.csv", newline="") as file:
-        lines = list(csv.DictReader(file))
-    assert [float(line["W"]) for line in lines if line["best"] == "True"] == [row["W"] for row in best]
-    page = (out / "worth.md").read_text()
-    assert f"| room | 16 | ours | primal | {best[1]['W']:.2f} |" in page and "the command" in page
-    assert f"| rooms (1) | 64 | ~{best[2]['W']:.2f} | 1.00 |" in page
-    ElementTree.parse(out / results["plots"]["worth"]["room"])
-    report = write_evaluation_report(out, tmp_path / "report.html").read_text()
-    assert "Worth of gradients, scene by scene" in report and "worth: room" in report
+    means, scenes = worth_tables(results).values()
+    assert ["room", "16", "ours", "primal", f"{best[1]['W']:.2f}"] == scenes[2][:5]
+    assert ["rooms (1)", "64", f"~{best[2]['W']:.2f}", "1.00"] == means[3][:4]
 
 
 def of_known_costs(costs: dict[str, tuple[float, float]], worth: float = WORTH) -> dict:
@@ -126,28 +113,12 @@ def test_of_two_rivals_the_one_that_is_done_first_counts():
     assert row["rival"] == "slow_samples" and row["rival seconds"] == pytest.approx(12)
 
 
-def test_blocks_sum_the_error_and_halves_take_its_noise_off(rng):
-    image, truth = np.ones((20, 33, 3)), np.ones((20, 33, 3))
-    image[:8, :8] = 1.5
-    errors = block_errors(image, truth, block=8)
-    assert errors.shape == (3, 5)
-    assert errors[0, 0] == pytest.approx(64 * 0.25 / 1.001) and errors.sum() == pytest.approx(errors[0, 0])
-    # The noise of a reference counts, that of two halves does not.
-    halves = truth + rng.normal(0, 0.1, (2, *truth.shape))
-    one, two = (block_errors(image, *reference, block=8)[1:, :4].mean() for reference in (halves[:1], halves))
-    assert one == pytest.approx(48 * 0.1**2, rel=0.2) and abs(two) < 0.2 * one
-    assert block_size(100) == 8 and block_size(1280) == 32
-
-
 def test_means_over_scenes_are_geometric_and_carry_marks():
     results = of_known_costs({"ours": (0, 1.0), "primal": (0, 1.0)})
     results["settings"]["groups"] = {"rooms": ["b", "c"]}
     row = {"spp": 4, "method": "ours", "sampler": "gpt", "best": True, "error": 1.0, "rival": "primal", "C": 2.0}
     rows = [row | {"scene": s, "W": w, "W/C": w / 2, "mark": m} for s, w, m in (("a", 1.0, ""), ("b", 4.0, ">"))]
-    results["worth"] = {"rows": rows, "means": _means(results, rows)}
-    one, best = [mean for mean in results["worth"]["means"] if mean["method"] is None]
+    one, best = [mean for mean in _means(results, rows) if mean["method"] is None]
     assert (one["group"], one["scenes"], one["W"]) == ("rooms", 1, pytest.approx(4.0))
     assert (best["group"], best["scenes"], best["mark"]) == ("all", 2, ">")
     assert (best["W"], best["C"], best["W/C"]) == pytest.approx((2.0, 2.0, 1.0))
-    table = next(iter(worth_tables(results).values()))
-    assert table[2][:5] == ["all (2)", "4", ">2.00", "2.00", ">1.00"]

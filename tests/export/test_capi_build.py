@@ -39,6 +39,7 @@ file(WRITE ${CMAKE_BINARY_DIR}/networks.txt ${ngpt_NETWORKS})
 C, CPP = ("gcc", "clang"), ("g++", "clang++")
 
 
+@pytest.mark.hosts
 @pytest.mark.parametrize(
     ("compilers", "standard"), [(C, "c89"), (C, "c99"), (C, "c17"), (CPP, "c++98")], ids=lambda value: value[:5]
 )

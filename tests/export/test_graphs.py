@@ -17,7 +17,7 @@ from ngpt.export.builder import FLOAT, Graph, choose, op, repeat
 from ngpt.export.graphs import transfer, variances
 from ngpt.export.graphs.model import _OperatorsOfHeads
 from ngpt.network import transfer as torch_transfer
-from ngpt.network.heads import Direct, Kernels, Mixture, Pyramid, Residual
+from ngpt.network.heads import Direct, Mixture, Pyramid, Residual
 from ngpt.network.poisson import GRADIENTS, Poisson
 from ngpt.network.shipped import WEIGHTS
 
@@ -78,10 +78,7 @@ HEADS = [
     Direct(),
     Residual(("base",)),
     Mixture(("primal", "base")),
-    Kernels(("primal",), 1),
-    Kernels(("primal", "base"), 5),
     Poisson(("base",), Residual(("base",)), 1),
-    Poisson(("primal",), Kernels(("primal",), 3), 1),
     Poisson(("primal", "base"), Mixture(("primal", "base")), 3),
     Poisson(("primal",), Pyramid(("primal",), 3, 3, True), 2),
     Poisson(("primal", "base"), Pyramid(("primal", "base"), 3, 2, True), 2),

@@ -1,7 +1,7 @@
 """Configurations of networks that cannot be: each says what is wrong with which value."""
 
 import pytest
-from networks import PYRAMID, SLOPES, SPLIT
+from networks import PYRAMID, SLOPES
 
 from ngpt.errors import NgptError
 from ngpt.network.model import ModelConfig
@@ -11,13 +11,12 @@ from ngpt.training.augment import Augmentation
 DENSE = {"network": "dense", "channels": (4,), "units": (1,), "inputs": ("primal",)}
 PLAIN = {"network": "plain", "channels": (4,), "units": (), "inputs": ("primal",)}
 OF_KERNELS = PLAIN | {"channels": (6, 6, 6), "inputs": ("primal", "albedo")} | PYRAMID
-BY_PARTS = {"network": "kpcn", "channels": (6,), "units": (2,), "inputs": SPLIT, "kernel": 5}
 DRAWN = PLAIN | {"channels": (4, 4, 4, 4), "inputs": SLOPES, "base": "wcv", "sweeps": 2}
 QUIET = PLAIN | {"inputs": ("primal", "base", "primal_se"), "base": "wcv"}
 OIDN = {"network": "oidn", "channels": next(iter(SHAPES)), "units": (), "inputs": ("base", "albedo", "normal")}
 OIDN |= {"base": "wcv"}
 ROWS = [
-    (DENSE, {"network": "round"}, "network 'round'"),
+    (DENSE, {"network": "round"}, "unknown network 'round'; choose one of: dense, plain, oidn"),
     (DENSE, {"inputs": ("primal", "colour")}, "input 'colour' is unknown"),
     (DENSE, {"inputs": ("albedo",)}, "'primal' among them"),
     (DENSE, {"channels": (4, 4)}, "each of 2 levels"),
@@ -27,24 +26,17 @@ ROWS = [
     (PLAIN, {"inputs": ("primal", "albedo"), "start": ("albedo",)}, "start 'albedo': must be one of"),
     (PLAIN, {"start": ("denoised",)}, "start 'denoised'"),
     (PLAIN, {"kernel": 3}, "kernel = 3: there is no image to average"),
-    *((PLAIN, {"start": ("primal",), "kernel": size}, "must be an odd number of pixels up to 17, or 0")
-      for size in (2, -1, 19, True, "3", 3.0)),
+    *((PLAIN, {"start": ("primal",), "kernel": size}, "must be an odd number of pixels from 3 to 17, or 0")
+      for size in (1, 2, -1, 19, True, "3", 3.0)),
+    (PLAIN, {"start": ("primal",), "kernel": 3}, "kernels need 2 scales or more"),
     (QUIET, {"inputs": ("primal", "base"), "quiet": 3}, "quiet = 3: goes over to the base"),
     *((QUIET, {"quiet": quiet}, "must be a finite relative standard error")
       for quiet in (-1, float("nan"), float("inf"), "very", True)),
     (OF_KERNELS, {"scales": 0}, "must be from 1 to the 3 levels of the network"),
     (OF_KERNELS, {"scales": 4}, "must be from 1 to the 3 levels of the network"),
-    (OF_KERNELS, {"kernel": 1}, "needs kernels of 3 pixels or more"),
+    (OF_KERNELS, {"kernel": 0}, "kernels need 2 scales or more"),
     (OF_KERNELS, {"start": ()}, "there is no image to average"),
-    (OF_KERNELS, {"scales": 1}, "demodulate = True: true or false; needs scales and the input albedo"),
     (OF_KERNELS, {"inputs": ("primal",)}, "demodulate = True: true or false; needs scales and the input albedo"),
-    (BY_PARTS, {"inputs": ("primal", "diffuse", "albedo")}, "network 'kpcn' needs the inputs .*; lacks specular"),
-    (BY_PARTS, {"kernel": 0}, "must be an odd number from 3 to 21"),
-    (BY_PARTS, {"kernel": 23}, "must be an odd number from 3 to 21"),
-    (BY_PARTS, {"channels": (4, 4), "units": (1, 1)}, "'kpcn' has one level"),
-    (BY_PARTS, {"units": ()}, "give a positive number, up to 32, for each of 1 levels"),
-    (BY_PARTS, {"start": ("primal",)}, "network 'kpcn' cannot be combined with start"),
-    (BY_PARTS, {"sweeps": 2, "quiet": 1.0}, "network 'kpcn' cannot be combined with quiet, sweeps"),
     (DRAWN, {"sweeps": -1}, "sweeps = -1"),
     (DRAWN, {"sweeps": 65}, "whole number up to 64"),
     (DRAWN, {"sweeps": True}, "sweeps = True"),

@@ -46,6 +46,17 @@ def test_a_shot_at_rest_converges(rng, history, method):
     assert flicker(over_time[4:], truth[4:], motions[4:]) < 0.1 * flicker(alone[4:], truth[4:], motions[4:])
 
 
+def test_a_shot_at_rest_is_the_mean_of_its_frames(rng):
+    """Frame n + 1 has n / (n + 1) of its history: variances of the two parts of a blend add by squared weights."""
+    image, features = view()
+    temporal, weights = Temporal(None), []
+    for _ in range(6):
+        stack = frame_of(image, features, rng)
+        temporal.next(stack, identity(stack))
+        weights.append(np.median(temporal.weight))
+    assert np.allclose(weights, [n / (n + 1) for n in range(6)], atol=0.02)
+
+
 def test_a_camera_that_moves_by_one_pixel_finds_its_neighbour(rng, history):
     """As if at rest: the frame before, moved by a pixel, with the same noise."""
     image, features = view()

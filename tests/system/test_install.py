@@ -1,11 +1,15 @@
 """What is told to be typed installs: messages and pages say the same, and no more than is true today."""
 
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
-from ngpt.system import install
+from data_gen.samplers import SAMPLERS, find
+from ngpt.errors import WrongUse
+from ngpt.methods import METHODS, runnable
+from ngpt.system import install, parts
 
 ROOT = Path(__file__).parents[2]
 
@@ -18,6 +22,51 @@ def test_a_checkout_is_installed_from_where_it_lies_and_a_package_by_its_name(mo
     assert all(install.packages_of(extra) for extra in ("render", "export", "train", "cluster", "peers"))
     monkeypatch.setattr(install, "PUBLISHED", True)
     assert install.install_command("render").endswith("install 'ngpt-recon[render]'")
+
+
+STUDIES = tomllib.loads((ROOT / "studies" / "pyproject.toml").read_text())["project"]
+
+
+def test_studies_are_those_of_their_package():
+    groups = {"method": "ngpt.methods", "network": "ngpt.networks", "sampler": "ngpt.samplers"}
+    points = STUDIES["entry-points"]
+    assert {what: set(points[group]) for what, group in groups.items()} == {k: {*v} for k, v in install.BROUGHT.items()}
+    assert set(points) == set(groups.values()) and STUDIES["name"] == install.STUDIES
+
+
+def ask_for(what, name):
+    """The registry, and a call that asks for an entry of that name."""
+    if what == "method":
+        return METHODS, lambda: runnable(name)
+    if what == "sampler":
+        return SAMPLERS, lambda: find(name)
+    pytest.importorskip("torch")
+    from ngpt.network.config import KINDS, ModelConfig
+
+    return KINDS, lambda: ModelConfig(name, (4,), (1,), ("primal",))
+
+
+@pytest.mark.parametrize(("what", "name"), [(what, name) for what, names in install.BROUGHT.items() for name in names])
+def test_a_study_that_is_not_installed_is_one_line_with_the_command(monkeypatch, tmp_path, command, what, name):
+    registry, ask = ask_for(what, name)
+    monkeypatch.setattr(parts, "points", lambda group: iter(()))
+    monkeypatch.delitem(registry, name, raising=False)
+
+    def told():
+        with pytest.raises(WrongUse) as raised:
+            ask()
+        line = str(raised.value)
+        assert line.startswith(f"{what} '{name}' is of the package ngpt-studies, which is not installed; ")
+        return line
+
+    assert told().endswith(f"pip install -e {ROOT / 'studies'}`")
+    if what == "method":
+        (line,) = command(f"denoise stack.exr -m {name} -o image.exr", 2).err.splitlines()
+        assert line == f"ngpt: error: {told()}"
+    monkeypatch.setattr(install, "CHECKOUT", tmp_path)
+    assert told().endswith("in a checkout of ngpt, `pip install -e studies`".replace("pip", install._pip()))
+    monkeypatch.setattr(install, "PUBLISHED", True)
+    assert told().endswith("pip install ngpt-studies`")
 
 
 @pytest.mark.parametrize(

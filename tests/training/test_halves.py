@@ -12,6 +12,7 @@ from ngpt.stack import GradientStack
 from ngpt.training.augment import Augmentation
 from ngpt.training.examples import Examples, collated, other_half
 from ngpt.training.halves import halves
+from ngpt.training.loss import make_loss
 
 
 def examples_of(*crops, augmentation=None, size=32, cache=0):
@@ -105,6 +106,18 @@ def test_a_share_of_the_examples_is_pairs():
     assert len(batch["primal"]) == 60 and len(batch["target"]) == 60 - len(pairs)
     assert torch.equal(batch["primal"][60 - len(pairs)], pairs[0]["primal"])
     assert torch.equal(batch["other/primal"][-1], pairs[-1]["other/primal"])
+
+
+def test_references_and_pairs_count_by_their_number():
+    """Three crops with references and one pair: three quarters of one loss, a quarter of the other with its weight."""
+    generator = torch.Generator().manual_seed(3)
+    image, target, *layers = torch.rand(8, 4, 3, 8, 8, generator=generator)
+    names = ("primal", "dx", "dy", "primal_se", "dx_se", "dy_se")
+    other = {name: layer[3:] for name, layer in zip(names, layers, strict=True)} | {"counts": torch.ones(1, 1, 8, 8)}
+    loss = make_loss({"kind": "l1", "gradient": 0.0, "halves": 0.5})
+    total, parts = loss(image, target[:3], generator, other)
+    assert parts["l1"] > 0.1 and parts["halves"] > 0.1
+    assert total.item() == pytest.approx(0.75 * parts["l1"].item() + 0.25 * 0.5 * parts["halves"].item())
 
 
 def test_what_cannot_be_learnt_from_is_refused():

@@ -1,22 +1,17 @@
-"""The page of a run and the comparison of several, the best weights, and where else the numbers of a run go."""
+"""The page of a run and the comparison of several, and the best weights."""
 
-import csv
 import json
 import re
-import sys
 from shutil import copytree
-from types import SimpleNamespace
 from urllib.parse import quote
 
 import pytest
 from crops import SyntheticCrop, trainer
 
 from ngpt.cli import main
-from ngpt.errors import NgptError
 from ngpt.network import safetensors
 from ngpt.system import configs
 from ngpt.training import images
-from ngpt.training.loggers import loggers
 from ngpt.training.run_record import write_record
 
 CROPS = [SyntheticCrop(f"<scene> {i}", i) for i in range(4)]
@@ -24,10 +19,10 @@ MODEL = {"network": "dense", "channels": [4], "units": [1], "inputs": ["primal"]
 RUN = {"batch": 1, "log": 1, "save": 2, "validate": 2}
 
 
-def made(out, steps=6, rate=1e-2, wandb=""):
+def made(out, steps=6, rate=1e-2):
     """A run of a few steps, with a validation after each second."""
     optimizer = {"learning_rate": rate, "warmup": 1}
-    changes = {"model": MODEL, "optimizer": optimizer, "run": RUN | {"steps": steps, "wandb": wandb}}
+    changes = {"model": MODEL, "optimizer": optimizer, "run": RUN | {"steps": steps}}
     run = trainer(out, CROPS[:2], CROPS[2:], augmentation={}, **changes)
     (out / "settings.json").write_text(json.dumps(run.settings.to_dict()))
     write_record(out, run.settings, configs.FOLDER / "tiny.toml", run.model, run.device)
@@ -53,11 +48,8 @@ def test_a_run_writes_its_page_while_it_goes_on(finished):
     assert "<script" not in text and not re.findall(r"(?:src|href)=\"(?!data:)|url\((?!data:)", text)
     for told in ("what differs from tiny", "optimizer.learning_rate", "memory, MiB", "steps a second", "AMD|Intel|cpu"):
         assert re.search(told, text), told
-    rows = list(csv.DictReader((folder / "log.csv").open()))
     log = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-    assert len(rows) == len(log) == 9
-    for row, entry in zip(rows, log, strict=True):
-        assert {name: float(value) for name, value in row.items() if value} == entry
+    assert len(log) == 9
     assert all(entry["steps/s"] > 0 and entry["memory MiB"] > 50 for entry in log if "loss" in entry)
 
 
@@ -113,51 +105,3 @@ def test_the_page_fits_a_telephone_and_no_rule_is_broken(browser, finished):
     assert width <= 420
     # 32 pixels a side, at twice their size
     assert strip == [192, 64] and shown == 'url("data:imag'
-
-
-def test_numbers_go_to_weights_and_biases_where_that_is_asked_for(tmp_path, monkeypatch):
-    calls, sent, axes = [], [], []
-
-    class Theirs:
-        """Drops steps before the last, as W&B does, unless they are a number among the others."""
-
-        last = 0
-
-        def log(self, values, step=None):
-            if step is None or step >= Theirs.last:
-                Theirs.last = step or Theirs.last
-                sent.append((values.get("step", step), values))
-
-        def define_metric(self, name, step_metric):
-            axes.append((name, step_metric))
-
-    def init(**given):
-        calls.append(given)
-        return Theirs()
-
-    fake = SimpleNamespace(init=init, Settings=lambda **given: given)
-    monkeypatch.setitem(sys.modules, "wandb", fake)
-    made(tmp_path / "without").run()
-    assert calls == [] and sent == []
-    made(tmp_path / "mine", steps=2, wandb="kitchens").run()
-    assert calls[0]["project"] == "kitchens" and calls[0]["name"] == "mine"
-    assert calls[0]["settings"] == {"disable_git": True, "disable_code": True, "console": "off"}
-    assert [step for step, _ in sent] == [1, 2, 2] and "loss" in sent[0][1] and "relMSE" in sent[2][1]
-    # Going on, it is the same run to them.
-    more = made(tmp_path / "mine", steps=3, wandb="kitchens")
-    more.resume()
-    more.run()
-    assert calls[1]["id"] == calls[0]["id"] and len(calls[0]["id"]) == 16
-    assert axes == 2 * [("*", "step")] and sent[-1][0] == 3
-    # After a kill it goes on from an earlier step than the last that it told.
-    logger = loggers(tmp_path / "mine", 2, more.settings)[-1]
-    logger.log(2, {"loss": 0.5})
-    assert sent[-1] == (2, {"step": 2, "loss": 0.5})
-    # Without a key, and what is not installed, is said before the first step.
-    fake.init = lambda **given: (_ for _ in ()).throw(RuntimeError("api_key not configured\n(no-tty)"))
-    with pytest.raises(NgptError, match=r"run\.wandb = 'kitchens': api_key not configured \(no-tty\); `wandb login`"):
-        made(tmp_path / "keyless", wandb="kitchens").run()
-    monkeypatch.setitem(sys.modules, "wandb", None)
-    with pytest.raises(NgptError, match=r"run\.wandb = 'kitchens': wandb is not installed; .*pip install wandb"):
-        made(tmp_path / "lacking", wandb="kitchens").run()
-    assert not (tmp_path / "lacking" / "log.jsonl").exists()

@@ -221,11 +221,3 @@ def test_models_are_made_anew_with_scene_files_and_without(model, files, tmp_pat
     at = small.index("--weights") + 1
     assert small[at : small.index("-o")] == files
     assert small[-1] in whole and whole[-1].endswith(".onnx")
-
-
-def test_kpcn_has_the_papers_size():
-    from ngpt.network.model import Reconstructor, parameters
-
-    model = Reconstructor(read_settings(configs.find_config("kpcn", configs.TRAINING)).model)
-    # Nine layers of 100 channels: seven hidden ones of 250,000 weights in each network.
-    assert 3.5e6 < parameters(model) < 4e6 and model.config.head.outputs == 2 * 441

@@ -1,7 +1,7 @@
 """The entry of ``bdpt``."""
 
 from data_gen.samplers.registry import Sampler, register
-from data_gen.samplers.shared import BETWEEN_HOLES, BOTH_ENDS, joined_depth
+from data_gen.samplers.shared import BOTH_ENDS, joined_depth
 
 register(
     Sampler(
@@ -17,7 +17,6 @@ register(
         gradients=False,
         tried=True,
         compiles=2.0,
-        loses=BETWEEN_HOLES,
         finds=("hidden lamps",),
         batch=4,
     )

@@ -59,10 +59,11 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
     depth = mi.UInt32(1)  # edges of the path up to si
     sky = Sky.from_camera(limits.hide_emitters)
     active = si.is_valid() & (depth < limits.max_depth)
-    _, density = sight.eye.toward(si, sight.eye.lens, active)
+    toward, density = sight.eye.toward(si, sight.eye.lens, active)
     end = mis.begin_camera(density, cosine(si, ray.d))  # what the path knows of the other strategies, at si
+    edge = plan.begins(si.p + toward.d * toward.dist)  # that has led there
     while dr.hint(active, label="camera path"):
-        z = Vertex(si, β, end, depth)
+        z = Vertex(si, β, end, depth, edge)
         bsdf = si.bsdf()
         smooth = active & scatters_smoothly(bsdf)
         joined = depth + 1 <= plan.longest
@@ -78,10 +79,11 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
         f = dr.select(dr.isfinite(dr.sum(f)) & dr.isfinite(p), f, 0)
         lit &= dr.max(f * weight) > 0
         q = reverse_density(si, bsdf, wo, lit)
-        z.end = mis.Partial(dr.select(joined, end.vcm, 0), dr.select(joined, end.vc, 0), end.waiting)
+        T, holes = plan.sees(si, light.p, limits.max_depth - 1 - depth, lit)
+        z.end = known(end, depth + 1 + holes <= plan.longest)
         C, others = to_light(lights, z, light, weight, f, p=p, q=q)
-        lit &= ~scene.ray_test(si.spawn_ray_to(light.p), lit)
-        L += dr.select(lit, C / (1 + others), 0)
+        L += dr.select(lit, C * T / (1 + others), 0)
+        z.end = known(end, joined)
 
         # ------------------- To the light path -------------------
         if dr.hint(light_path is not None, mode="scalar"):
@@ -97,6 +99,7 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
         sky = sky.behind(event_kind(sample.sampled_type), found)
         η = dr.select(found, η * sample.eta, η)
         d, end = leave(z, bsdf, sample, found, plan.merged(bsdf, joined))
+        end, edge = plan.onward(z, bsdf, sample, end)
         β *= f_p
         survival = roulette(dr.max(β), depth >= limits.rr_depth, η)
         active = found & (dr.max(β) > 0) & (u_survival < survival)
@@ -106,14 +109,22 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
 
         # ----------------- Emission met by chance ----------------
         met = active & sky.meets(reached)
-        Le_met, p, e = emission_at(scene, lights, reached, si, met)
+        Le_met, p, e = emission_at(scene, lights, reached, si if edge is None else edge.seen_by(si), met)
+        if dr.hint(edge is not None, mode="scalar"):
+            # Nothing is connected to the camera itself.
+            p, e = dr.select(edge.first, 0, p), dr.select(edge.first, 0, e)
         # Longer paths are not found by light paths.
         end.vc = dr.select(depth <= plan.longest, end.vc, 0)
         L += dr.select(met, β * Le_met / (1 + mis.others_emitted(end, e, p)), 0)
         si = reached
         active &= si.is_valid() & (depth < limits.max_depth)
-        end = mis.arrive(end, cosine(si, d), dr.square(si.t))
+        end = plan.arrives(end, edge, si, d)
     return L, Le, L_merged
+
+
+def known(end: Partial, joined: mi.Bool) -> Partial:
+    """At a vertex: paths longer than light paths are weighted as if light paths found none."""
+    return Partial(dr.select(joined, end.vcm, 0), dr.select(joined, end.vc, 0), end.waiting)
 
 
 @dr.syntax
@@ -123,7 +134,7 @@ def connection(plan: Plan, z: Vertex, bsdf, active, light_path: LightPath, u: mi
     chosen, times = choose(z, active, light_path, plan.longest, u)
     if active & (times > 0):
         y = recall(light_path.kept.read(chosen), z.si.time, z.si.wavelengths)
-        C, others = connected(plan.scene, z, bsdf, y, mi.Bool(True))
+        C, others = connected(plan, z, bsdf, y, mi.Bool(True))
         L = dr.select(dr.max(C) > 0, C * (times / (1 + others)), 0)
     return L
 

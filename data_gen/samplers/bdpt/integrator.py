@@ -32,6 +32,7 @@ from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.paths.eye import Sight
 from data_gen.paths.features import features
 from data_gen.paths.frozen import Frozen
+from data_gen.paths.holes import Holes
 from data_gen.paths.light_ends import LightEnds, World
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.bdpt.camera_path import camera_path
@@ -73,6 +74,7 @@ class BDPT(GradientIntegrator):
             world.scene,
             world.lights,
             world.materials,
+            holes=world.holes,
             limits=self.limits,
             longest=self.longest,
             first_hit=self.first_hit,
@@ -81,7 +83,7 @@ class BDPT(GradientIntegrator):
         )
 
     def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
-        plan = self.plan(World(scene, LightEnds(scene, self.name)))
+        plan = self.plan(World(scene, LightEnds(scene, self.name), holes=Holes.of(scene)))
         return partial(self.sample_pass, Frozen(scene, plan), plan)
 
     def sample_pass(self, frozen: Frozen, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.eye import Sight
-from data_gen.paths.light_ends import LightRay, World
+from data_gen.paths.light_ends import LightRay
 from data_gen.paths.walk import roulette
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.plan import Plan
@@ -63,24 +62,32 @@ class LightPath:
     count: mi.UInt32  # how many vertices it has
 
 
-def begin(world: World, random, camera_ray: mi.Ray3f) -> tuple[LightRay, End, mi.Bool]:
+def begin(plan: Plan, random, camera_ray: mi.Ray3f) -> tuple[LightRay, End, mi.Bool]:
     """A path from a light up to its first vertex, and whether it exists; ``camera_ray`` gives time and wavelengths."""
-    scene, lights = world.scene, world.lights
+    scene, lights = plan.scene, plan.lights
     start = lights.sample(scene, random, camera_ray.time, camera_ray.wavelengths)
     active = dr.max(start.β) > 0
     hit = scene.ray_intersect_preliminary(start.ray, active=active)
     si = hit.compute_surface_interaction(start.ray)
-    e, p_light = lights.densities(scene, start, si)
-    end = mis.begin_light(e, p_light, start.delta, cosine(si, start.ray.d))
-    return start, End(start.ray, hit, Vertex(si, start.β, end, mi.UInt32(1))), active & si.is_valid()
+    y = Vertex(si, start.β, lit(plan, start, si), mi.UInt32(1), plan.begins(start.ray.o))
+    return start, End(start.ray, hit, y), active & si.is_valid()
+
+
+def lit(plan: Plan, start: LightRay, si: mi.SurfaceInteraction3f) -> mis.Partial:
+    """What a path knows at its first vertex."""
+    e, p_light = plan.lights.densities(plan.scene, start, si)
+    return mis.begin_light(e, p_light, start.delta, cosine(si, start.ray.d))
 
 
 def go_on(plan: Plan, random, start: LightRay, y: Vertex, bsdf, active) -> tuple:
-    """The next vertex behind ``y``, whether there is one, the event that leads there, and 1 / the probability to
-    survive."""
+    """The next vertex behind ``y``, as it was reached, whether there is one, the event that leads there, and 1 / the
+    probability to survive."""
     u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
     sample, f_p = bsdf.sample(context(IMPORTANCE), y.si, u_lobe, u_direction, active)
-    d, f_p, end = light_leaves(y, bsdf, sample, f_p, active & (sample.pdf > 0))
+    known = replace(y, end=plan.known(y.end, bsdf))
+    d, f_p, end = light_leaves(known, bsdf, sample, f_p, active & (sample.pdf > 0))
+    # Behind a hole nothing has been gathered yet.
+    end, edge = plan.onward(y, bsdf, sample, end)
     β = y.β * dr.select(sample.pdf > 0, f_p, 0)
     # Russian roulette by what is left of the light that the path began with
     survives = roulette(dr.max(β) * dr.rcp(dr.max(start.β)), y.depth >= plan.limits.rr_depth)
@@ -88,8 +95,12 @@ def go_on(plan: Plan, random, start: LightRay, y: Vertex, bsdf, active) -> tuple
     ray = y.si.spawn_ray(d)
     hit = plan.scene.ray_intersect_preliminary(ray, active=active)
     si = hit.compute_surface_interaction(ray)
-    end = mis.arrive(end, cosine(si, d), dr.square(si.t))
-    there = End(ray, hit, Vertex(si, β / survives, end, y.depth + 1))
+    end = plan.arrives(end, edge, si, d)
+    if edge is not None:
+        # Not all lights are seen from further away as from near by.
+        first = lit(plan, start, si)
+        end = mis.Partial(dr.select(edge.first, first.vcm, end.vcm), dr.select(edge.first, first.vc, end.vc))
+    there = End(ray, hit, Vertex(si, β / survives, end, y.depth + 1, edge))
     return there, active & si.is_valid(), sample, dr.rcp(survives)
 
 
@@ -119,9 +130,9 @@ def light_path(plan: Plan, sight: Sight, visitor: Visitor) -> tuple[LightPath, A
 
         # --------------------- To the camera ---------------------
         on_lens = eye.place_on_lens(random)
-        C, others, uv = to_camera(eye, on_lens, y, bsdf, smooth, partial(plan.hidden, plan.scene))
+        C, others, uv = to_camera(eye, on_lens, y, bsdf, smooth, plan.seen_by_camera)
         state = visitor.sees(state, Seen(y, C, others, eye.pixel_at(uv), here))
 
         # ---------------------- Next vertex ----------------------
-        end, active, _, _ = go_on(plan, random, start, y, bsdf, active & (y.depth + 1 < plan.longest))
+        end, active, _, _ = go_on(plan, random, start, end.y, bsdf, active & (y.depth + 1 < plan.longest))
     return LightPath(kept, count), random, state

@@ -16,6 +16,9 @@ stands for both: p_emit / (p_connect cos). It is the density of sampling the fir
 of choosing the end to connect to, per unit area facing the end. Delta events cannot be met by a connection: their
 summands are 0, and the densities of both directions cancel in what is behind them.
 
+Holes that connections go through are no vertices: an edge leads through them, and is as long as from vertex to vertex.
+That a path passes one by chance is no density, but a weight, as it is for a connection.
+
 Both ends may also come to one vertex, and merge: η = π r² N times as many such pairs of N light paths lie within the
 radius r as there are pairs that end in a given unit of area. Paths merge at vertices where photons are gathered, and
 there only if light came from a delta event: else a connection finds the path, and blurs nothing. So a light path knows
@@ -63,6 +66,11 @@ def leave(end: Partial, cos: mi.Float, p: mi.Float, q: mi.Float, delta: mi.Bool,
 def arrive(end: Partial, cos: mi.Float, distance2: mi.Float) -> Partial:
     """At the next vertex."""
     return Partial(end.vcm * distance2 / cos, end.vc / cos, end.waiting * dr.rcp(cos))
+
+
+def passed(end: Partial, cos: mi.Float, distance2: mi.Float) -> Partial:
+    """Behind a hole, which is no vertex: undoes ``arrive()`` there."""
+    return Partial(end.vcm * (cos / distance2), end.vc * cos, end.waiting * cos)
 
 
 def gathered(y: Partial, η: mi.Float) -> Partial:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.holes import Edge
 from data_gen.paths.light_ends import World
+from data_gen.paths.vertex import event_kind
 from data_gen.paths.walk import Limits
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Partial
+from data_gen.samplers.bdpt.vertex import Vertex, cosine
 
 
 @dataclass(kw_only=True)
@@ -35,3 +39,38 @@ class Plan(World):
     def known(self, end: Partial, bsdf: mi.BSDFPtr) -> Partial:
         """What a light path knows at a vertex of that material, where photons are gathered if it scatters widely."""
         return end if self.η is None else mis.gathered(end, self.merged(bsdf))
+
+    # ------------------------------- Edges through holes -------------------------------
+
+    def begins(self, o: mi.Point3f) -> Edge | None:
+        """The edge that begins at an end of a path, or at ``o`` on the way to it."""
+        return Edge(mi.Point3f(o), dr.full(mi.Bool, True, dr.width(o))) if self.holes else None
+
+    def onward(self, x: Vertex, bsdf, sample: mi.BSDFSample3f, end: Partial) -> tuple[Partial, Edge | None]:
+        """``end`` behind the sampled event at ``x``, and the edge there: the one that led there if it passed a hole."""
+        if self.holes is None:
+            return end, None
+        passed = self.holes.passed(bsdf, event_kind(sample.sampled_type))
+        same = mis.passed(x.end, cosine(x.si, x.si.to_world(x.si.wi)), x.edge.length2(x.si))
+        parts = ((getattr(same, name), getattr(end, name)) for name in ("vcm", "vc", "waiting"))
+        return Partial(*(dr.select(passed, a, b) for a, b in parts)), x.edge.behind(passed, x.si)
+
+    def arrives(self, end: Partial, edge: Edge | None, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> Partial:
+        """``end`` at the next vertex, ``si``, or at a hole on the way there."""
+        return mis.arrive(end, cosine(si, d), dr.square(si.t) if edge is None else edge.length2(si))
+
+    def sees(self, si: mi.SurfaceInteraction3f, target: mi.Point3f, most: mi.UInt32, active) -> tuple[Any, Any]:
+        """What comes from the ``target`` to ``si``, through at most so many holes, and how many there are."""
+        ray = si.spawn_ray_to(target)
+        if self.holes is None:
+            return dr.select(self.scene.ray_test(ray, active), mi.Float(0), 1), 0
+        return self.holes.transmittance(self.scene, ray, target, most, active)
+
+    def seen_by_camera(self, y: Vertex, camera: mi.DirectionSample3f, active) -> Any:
+        """What comes from ``y`` to the camera."""
+        if self.holes is None:
+            return dr.select(self.hidden(self.scene, y.si, camera, active), mi.Float(0), 1)
+        most = self.longest - 1 - y.depth
+        if self.limits.hide_emitters:
+            return self.holes.toward_camera(self.scene, y.si, camera.p, most, active)
+        return self.sees(y.si, camera.p, most, active)[0]

@@ -17,6 +17,7 @@ from data_gen.paths.eye import Eye
 from data_gen.paths.light_ends import LightEnds
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Edge, Side
+from data_gen.samplers.bdpt.plan import Plan
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, Vertex, cosine, evaluate
 
 
@@ -37,13 +38,15 @@ def to_light(lights: LightEnds, z: Vertex, light, weight, f, *, p, q) -> tuple[m
     return z.β * f * weight, mis.others_to_light(z.end, e, p_light, cosine(z.si, light.d), p, q)
 
 
-def connected(scene, z: Vertex, z_bsdf, y: Vertex, active) -> tuple[mi.Spectrum, mi.Float]:
+def connected(plan: Plan, z: Vertex, z_bsdf, y: Vertex, active) -> tuple[mi.Spectrum, mi.Float]:
     """s, t > 1, occlusion included."""
-    C, edge = connection(scene, z, z_bsdf, y, active)
+    C, edge = connection(plan, z, z_bsdf, y, active)
     return z.β * C, mis.others_connected(z.end, y.end, edge)
 
 
-def connection(scene, z: Vertex, z_bsdf, y: Vertex, active, seen: mi.Bool | bool = False) -> tuple[mi.Spectrum, Edge]:
+def connection(
+    plan: Plan, z: Vertex, z_bsdf, y: Vertex, active, seen: mi.Bool | bool = False
+) -> tuple[mi.Spectrum, Edge]:
     """As ``connected()``, without the camera path's throughput; and the edge, which its MIS weight depends on.
 
     Where it is known that the vertices see each other, ``seen``, no ray is traced.
@@ -56,18 +59,17 @@ def connection(scene, z: Vertex, z_bsdf, y: Vertex, active, seen: mi.Bool | bool
     C = y.β * f * g / distance2
     # Vertices in one place are no path: their density is infinite.
     lit = active & (dr.max(z.β * C) > 0) & (distance2 > 0)
-    C = dr.select(lit & ~scene.ray_test(z.si.spawn_ray_to(y.si.p), lit & ~mi.Bool(seen)), C, 0)
+    T, _ = plan.sees(z.si, y.si.p, plan.longest - 1 - z.depth - y.depth, lit & ~mi.Bool(seen))
+    C = dr.select(lit, C * T, 0)
     return C, Edge(Side(cosine(z.si, d), p_z, q_z), Side(cosine(y.si, d), p_y, q_y), distance2)
 
 
-def to_camera(
-    eye: Eye, lens: mi.Point2f, y: Vertex, bsdf, active, occluded
-) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:
-    """t = 1; and the place on the film, in pixels. ``occluded`` is asked for (si, toward the camera, active)."""
+def to_camera(eye: Eye, lens: mi.Point2f, y: Vertex, bsdf, active, seen) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:
+    """t = 1; and the place on the film, in pixels. ``seen`` (y, toward the camera, active) says what comes to it."""
     camera, importance = eye.toward(y.si, lens, active)
     active = active & (camera.pdf > 0)
     f, _, q = evaluate(IMPORTANCE, y.si, bsdf, y.si.to_local(camera.d), active)
     C = y.β * f * importance
-    seen = active & (dr.max(C) > 0)
-    C = dr.select(seen & ~occluded(y.si, camera, seen), C, 0)
+    lit = active & (dr.max(C) > 0)
+    C = dr.select(lit, C * seen(y, camera, lit), 0)
     return C, mis.others_to_camera(y.end, importance, cosine(y.si, camera.d), q), camera.uv

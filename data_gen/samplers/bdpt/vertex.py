@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.holes import Edge
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Partial
@@ -30,6 +31,7 @@ class Vertex:
     β: mi.Spectrum  # throughput of the path so far
     end: Partial
     depth: mi.UInt32
+    edge: Edge | None = None  # that has led there; None where no edge leads through holes
 
 
 @cache

@@ -58,7 +58,8 @@ from data_gen.samplers.gbdpt.roulette import Rater, Worth, survivors, thresholds
 class GBDPT(BDPT):
     """Gradient-domain bidirectional path tracing, for surfaces.
 
-    Plugin ``gbdpt``, with the parameters of ``bdpt`` and ``roughness_threshold``. Not handled: as there.
+    Plugin ``gbdpt``, with the parameters of ``bdpt`` and ``roughness_threshold``. Not handled: as there. Holes are
+    vertices, which end connections: shifts do not go straight on through them.
     """
 
     plan_class = Plan

@@ -115,13 +115,13 @@ def light_again(plan: Plan, sight: Sight, depth: mi.UInt32) -> Again:
     link, left = first_link(), dr.zeros(record_class(mi.variant()))
     while dr.hint(active & (end.y.depth < depth), label="light path again"):
         bsdf = end.y.si.bsdf()
-        y = replace(end.y, end=plan.known(end.y.end, bsdf))
-        here = record(end.ray, end.hit, y, active)
+        depth_here = end.y.depth
+        here = record(end.ray, end.hit, replace(end.y, end=plan.known(end.y.end, bsdf)), active)
         # Where the path was joined to the camera
         eye.place_on_lens(random)
-        end, active, sample, survival = go_on(plan, random, start, y, bsdf, active)
-        link = next_link(link, y.depth, sample, survival)
-        left = dr.select(link.depth == y.depth, here, left)
+        end, active, sample, survival = go_on(plan, random, start, end.y, bsdf, active)
+        link = next_link(link, depth_here, sample, survival)
+        left = dr.select(link.depth == depth_here, here, left)
     on_lens = eye.place_on_lens(random)
     end.y.end = plan.known(end.y.end, end.y.si.bsdf())
     return Again(start, end, link, left, on_lens, active)

@@ -65,7 +65,7 @@ def splat_differences(
     bsdf = y.si.bsdf()
     joined = again.there & scatters_smoothly(bsdf)
     # It has been seen: nothing is in between.
-    C, others, uv = to_camera(eye, again.lens, y, bsdf, joined, lambda *_: mi.Bool(False))
+    C, others, uv = to_camera(eye, again.lens, y, bsdf, joined, lambda *_: 1)
     lit = dr.max(C) > 0
 
     # --------------------- Its four shifts -----------------------

@@ -82,8 +82,8 @@ def with_differences(offsets: list[Offset], Δ: list[mi.Spectrum]) -> list[Offse
 def connect(plan: Plan, step: Step, y: Vertex, times, offsets: list[Offset], Δ: list) -> tuple:
     """C and ``others`` of the connection of the vertex of ``step`` to ``y``, one of the light path; and the sums Δ with
     it, where it counts so many ``times``."""
-    scene, z = plan.scene, step.z
-    g, edge = connection(scene, z, z.si.bsdf(), y, mi.Bool(True))
+    z = step.z
+    g, edge = connection(plan, z, z.si.bsdf(), y, mi.Bool(True))
     C, others = z.β * g, mis.others_connected(z.end, y.end, edge)
     lit = dr.max(C) > 0
     # ------- Settled copies: the same connection, other weights -------
@@ -104,7 +104,7 @@ def connect(plan: Plan, step: Step, y: Vertex, times, offsets: list[Offset], Δ:
             v = Vertex(own_vertex(offset, z.si), offset.β, offset.end, z.depth)
             bsdf = v.si.bsdf()
             good = lit & (offset.joined | (both & plan.materials.connectable(bsdf)))
-            g1, edge1 = connection(scene, v, bsdf, y, good, seen=offset.joined)
+            g1, edge1 = connection(plan, v, bsdf, y, good, seen=offset.joined)
             others1 = mis.others_connected(v.end, y.end, edge1)
             return times * plan.pair(C, others, v.β * g1, offset.r, others1)
 

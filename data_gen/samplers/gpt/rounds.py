@@ -55,6 +55,7 @@ class SharedTails:
         self.frozen, self.take = frozen, take
         # No method of this object, which has ``frozen``: there must be no circle.
         self.plan, self.paths = plan, partial(paths, view, plan)
+        self.seed: int | None = None
         self.cache: Cache | None = None
         self.off, self.fed, self.pixels, self.until, self.share = "", 0, 1, 0, feeding.BEGIN
 
@@ -76,6 +77,7 @@ class SharedTails:
 
     def begin(self, sensor: mi.Sensor, seed: int, sample: int, film: GradientFilm) -> None:
         """Feeds the cache for all rounds that have begun by this ``sample``, one after the other."""
+        seed = seed if self.seed is None else self.seed
         if sample == 0:
             self.pixels = int(dr.prod(mi.ScalarVector2u(sensor.film().crop_size())))
             self.off = "" if self.plan.matt.any else "no material has a diffuse part"
@@ -94,6 +96,7 @@ class SharedTails:
             # The light of the layer ``caustic`` is kept apart, where there is such a layer.
             self.cache = Cache(size, 2 if self.plan.caustic else 1, grid(sensor, seed))
         for part in parts:
+            self.cache.fade()
             while self.fed < part:
                 first = self.fed == 0
                 with recording():

@@ -7,7 +7,7 @@ r"""Vertex connection and merging: ``bdpt`` and ``ppm`` in one, and every path o
 A pass has one camera sample and one light path for each pixel. Light paths are traced once: their vertices are
 connected to the camera (splats), kept in a map, connected to the camera path of the same sample (one of them,
 ``bdpt.camera_path``), and gathered at all camera paths, within the radius, where materials scatter widely. Only those
-that light reaches from mirrors, clear glass or holes are gathered (docs/samplers/photons.md). Their light is the layer
+that light reaches from mirrors or clear glass are gathered (docs/samplers/photons.md). Their light is the layer
 ``caustic`` (``ngpt.layers.GATHERED``).
 
 [Georgiev et al. 2012, "Light Transport Simulation with Vertex Connection and Merging"; Hachisuka et al. 2012, "A Path
@@ -28,6 +28,7 @@ from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.eye import Sight
 from data_gen.paths.features import features
+from data_gen.paths.holes import Holes
 from data_gen.paths.light_ends import LightEnds, World
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials
@@ -53,6 +54,7 @@ class VCM(BDPT):
     # What becomes of light paths that end at the camera
     splatter = Splatter
     sample_bytes = SAMPLE_BYTES
+    straight_on = True  # through holes
 
     @property
     def vertices(self) -> int:
@@ -72,7 +74,9 @@ class VCM(BDPT):
         return f", or no more than -O joined_depth={fits}" if fits else ""
 
     def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
-        world = World(scene, LightEnds(scene, self.name), Materials(scene, self.options["roughness_threshold"]))
+        materials = Materials(scene, self.options["roughness_threshold"])
+        holes = Holes.of(scene) if self.straight_on else None
+        world = World(scene, LightEnds(scene, self.name), materials, holes=holes)
         return Passes(self, world, pixel_width(scene, sensor))
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from data_gen_scenes import glass
 from media_scenes import haze
+from ngpt.evaluation.gradientmap import variances_of_differences
 from registered import cases, quick, scene_for
 from unbiased import failed_shifts, load, render_ours
 
 from data_gen.budget import Budget
 from data_gen.passes import render_passes
 from data_gen.samplers import SAMPLERS
-from ngpt.evaluation.gradientmap import variances_of_differences
 from ngpt.stack import GradientStack
 from ngpt.testing import z_test
 

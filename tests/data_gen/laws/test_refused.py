@@ -6,7 +6,6 @@ from bdpt_scenes import SCENES
 from data_gen_scenes import fog, hidden_lamp, polished
 from unbiased import load
 
-from data_gen.adaptive import Adaptive
 from data_gen.render import render_stack
 from data_gen.samplers import find
 from data_gen.scenes.facts import Facts
@@ -47,11 +46,6 @@ TABLE = [
     ),
     ("gpt-simple", fog, {}, "knows only 'path'; use --sampler gpt, or gpt-basic"),
     ("gpt-simple", hidden_lamp, {}, "hides emitters; use --sampler gpt"),
-    ("gpt-tiles", fog, {}, "'gpt-tiles' knows only 'path'"),
-    ("gpt-tiles", hidden_lamp, {}, "hides emitters; use --sampler gpt"),
-    ("gpt-tiles", "diffuse", {"adaptive": Adaptive()}, "'gpt-tiles' depend on each other and cannot be adaptive"),
-    ("split", fog, {}, "'split' knows only 'path'"),
-    ("split", hidden_lamp, {}, "hides emitters; use --sampler gpt"),
     ("gbeams", media_scenes.smoke, {}, r"density varies.* use --sampler gpt, .*vpm \(no gradients\), or gvpm"),
     ("vpm", endless, {}, "infinitely far away comes through a medium without end"),
     ("gpt", media_scenes.haze, {"shift": "half-vector"}, "gpt: shift 'half-vector' does not go through media"),
@@ -63,6 +57,10 @@ TABLE = [
 
 @pytest.mark.parametrize(("sampler", "scene", "options", "message"), TABLE)
 def test_refused(renderer, sampler, scene, options, message):
+    is_refused(renderer, sampler, scene, options, message)
+
+
+def is_refused(renderer, sampler, scene, options, message):
     with pytest.raises(NgptError, match=message) as refusal:
         render_stack(load(renderer, scene, (8, 8)), 64 if options else 1, sampler=sampler, unbiased=True, **options)
     assert sampler in str(refusal.value)

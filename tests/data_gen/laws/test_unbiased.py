@@ -116,10 +116,6 @@ SLOW = [
     *(Case("gpt-basic", scene, **LONG) for scene in (*BUILTIN, "glass", "fog", "within_fog", "hidden_lamp")),
     *(Case("gpt-simple", scene, **LONG) for scene in ("diffuse", "lens", "courtyard")),
     Case("gpt-simple", "panels", (FAR,), size=(24, 24)),
-    *(Case("gpt-tiles", scene, spp=64) for scene in ("diffuse", "glossy", "lens", "courtyard")),
-    Case("gpt-tiles", "courtyard", (1,), {"tile": 2}, **LONG),
-    Case("gpt-tiles", "courtyard", (1,), {"tile": 4}, **LONG),
-    *(Case("split", scene, **LONG) for scene in ("glossy", "environment", "lens", "everything")),
     *(Case("bdpt", f"lit: {scene}", spp=16) for scene in OF_ALL_LAMPS),
     Case("bdpt", "lit: areas", options={"joined_depth": 3}),
     *(Case("gbdpt", f"lit: {scene}", (FAR,), spp=64) for scene in OF_ALL_LAMPS),
@@ -130,6 +126,11 @@ SLOW = [
 
 @pytest.mark.parametrize("case", [*QUICK, *(slow(case, id=f"{case}-long") for case in SLOW)], ids=str)
 def test_unbiased(renderer, case):
+    holds(renderer, case)
+
+
+def holds(renderer, case):
+    """The law of one case."""
     description = case.description(renderer)
     expected, scene = references(renderer, description, case.size, case.by), load(renderer, description, case.size)
     for pixels in case.pixels[: 1 + SAMPLERS[case.sampler].gradients]:

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from ngpt.errors import NgptError
+from ngpt.network.config import Kind, ModelConfig, check_layers, last_of
 from ngpt.network.features import CHANNELS, PARTS
 from ngpt.network.heads import Head, averaged
 from ngpt.network.transfer import signed_exp, signed_log
@@ -112,3 +113,29 @@ class SplitKernels(Head):
 
     def graph(self, op: Any, prediction: Any, images: list[Any]) -> Any:
         raise NgptError("kernels of split light have no ONNX graph")
+
+
+class Kpcn(Kind):
+    """Of the fields of a configuration, ``channels`` has the width of its convolutions and ``units`` their number, one
+    each; ``kernel`` is the side of the kernels of both parts of the light."""
+
+    goes_without = ("base", "start", "quiet", "scales", "demodulate", "sweeps", "pooling")
+
+    def check(self, config: ModelConfig) -> None:
+        check_layers(config, units=True)
+        if missing := [name for name in NEEDED if name not in config.inputs]:
+            raise NgptError(f"network 'kpcn' needs the inputs {', '.join(NEEDED)}; lacks {', '.join(missing)}")
+        if type(config.kernel) is not int or config.kernel not in range(3, MAX_KERNEL + 1, 2):
+            most = MAX_KERNEL
+            raise NgptError(f"kernel = {config.kernel!r}: of 'kpcn' it must be an odd number from 3 to {most}")
+        if len(config.channels) > 1:
+            raise NgptError(f"channels {list(config.channels)}: 'kpcn' has one level; give one number")
+
+    def head(self, config: ModelConfig) -> Head:
+        return SplitKernels(size=config.kernel)
+
+    def network(self, config: ModelConfig) -> nn.Module:
+        return KPCN(config.inputs, config.channels[0], config.units[0], **last_of(config))
+
+
+KIND = Kpcn()

@@ -30,8 +30,8 @@ from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
-from data_gen.samplers.registry import SAMPLERS
-from data_gen.samplers.studies.gmlt.chains import Paths, run, value_of
+from data_gen.samplers import SAMPLERS
+from ngpt_studies.gmlt.chains import Paths, run, value_of
 
 # Mutations for each candidate, and candidates for each chain
 MUTATIONS, CANDIDATES = 3, 256

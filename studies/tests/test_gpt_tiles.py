@@ -19,7 +19,7 @@ class Tile:
     """All connections of one sample per pixel, as NumPy arrays by lane, and the geometry they come from."""
 
     def __init__(self, mi, side):
-        from data_gen.samplers.studies import gpt_tiles
+        from ngpt_studies import gpt_tiles
 
         scene = load(mi, "diffuse", SIZE)
         tiles = find("gpt-tiles").made(scene, tile=side)

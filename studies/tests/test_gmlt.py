@@ -20,7 +20,7 @@ SIZE = (16, 12)
 @pytest.fixture
 def chains(renderer):
     """The module, in the renderer's variant."""
-    from data_gen.samplers.studies.gmlt import chains
+    from ngpt_studies.gmlt import chains
 
     return chains
 
@@ -107,7 +107,7 @@ def test_numbers_that_do_not_change_make_the_same_path(monkeypatch, chains):
 
 def test_chains_accept_enough(renderer, monkeypatch):
     """A floor: chains that never move would pass every test of the mean."""
-    from data_gen.samplers.studies.gmlt import integrator
+    from ngpt_studies.gmlt import integrator
 
     rates, run = [], integrator.run
 

@@ -42,7 +42,7 @@ def _glass_class(variant: str) -> type:
         """A smooth dielectric in vacuum. ``material``: a name of ``SELLMEIER`` ("n-bk7").
 
         A ray goes the way of its first wavelength. So images are right where all wavelengths of a ray are one, as
-        ``data_gen.samplers.studies.spectral.render`` has them; elsewhere the others lose their way, but no light. In
+        ``ngpt_studies.spectral.render`` has them; elsewhere the others lose their way, but no light. In
         variants without wavelengths the index is for sodium light.
         """
 

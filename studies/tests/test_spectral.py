@@ -9,9 +9,9 @@ import pytest
 from unbiased import load
 
 from data_gen.backend import use_variant
-from data_gen.samplers.studies.spectral.glass import index, register
 from ngpt.errors import NgptError
 from ngpt.testing import z_test
+from ngpt_studies.spectral.glass import index, register
 
 SIZE = (24, 16)
 
@@ -20,7 +20,7 @@ SIZE = (24, 16)
 def spectral(renderer):
     """The names of the study, in a spectral variant of Mitsuba with its glass; the usual variant afterwards."""
     use_variant("llvm_ad_spectral")
-    from data_gen.samplers.studies.spectral import glass, render
+    from ngpt_studies.spectral import glass, render
 
     register()
     yield SimpleNamespace(**vars(render), prism=glass.prism)

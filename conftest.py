@@ -9,10 +9,18 @@ import pytest
 from browser import Browser, Session
 from skips import allowed
 
+from data_gen.samplers import SAMPLERS
 from ngpt.classical.gradients import forward_differences
 from ngpt.cli import main
 from ngpt.errors import NgptError
+from ngpt.methods import METHODS
 from ngpt.stack import GradientStack
+
+pytest_plugins = ["durations"]
+
+# What holds for every method and sampler holds for those of other packages that are installed, such as ngpt-studies.
+for registry in (METHODS, SAMPLERS):
+    registry.load()
 
 
 def strictly(report):
@@ -39,9 +47,10 @@ MARKERS = {"renderer": "renders", "chromium": "browser", "toolchain": "hosts", "
 MARKERS |= {"wheel": "processes"}
 # A folder -> the marker of all tests in it.
 FOLDERS = {"campaigns": "processes", "export": "exports", "evaluation": "evaluates"}
-# Names that a test calls where it starts programs.
+# Names that a test calls where it starts programs, or Node.
 PROGRAMS = {"subprocess", "complete", "start", "shell", "in_a_child", "in_a_process", "imported_by", "run_python"}
 PROGRAMS |= {"on_terminal", "read_exr_isolated"}
+NAMES = {**dict.fromkeys(PROGRAMS, "processes"), "read_in_node": "hosts"}
 
 
 def pytest_collection_modifyitems(items):
@@ -50,8 +59,7 @@ def pytest_collection_modifyitems(items):
         found = {MARKERS[fixture] for fixture in MARKERS.keys() & set(item.fixturenames)}
         code = getattr(getattr(item, "function", None), "__code__", None)
         found |= {FOLDERS[folder] for folder in FOLDERS.keys() & set(item.path.parts)}
-        if code and PROGRAMS & set(code.co_names):
-            found.add("processes")
+        found |= {NAMES[name] for name in NAMES.keys() & set(code.co_names if code else ())}
         if not found and not item.get_closest_marker("slow"):
             found.add("quick")
         for marker in sorted(found):

@@ -1,6 +1,6 @@
 """Temporal stability: how much a method's image changes when only the noise changes.
 
-    python -m ngpt.evaluation.stability DIR
+    python -m ngpt_studies.stability DIR
 
 DIR is a folder of results with pictures of all seeds (images = "all", configs/eval-stability.toml). A still scene
 rendered with a new seed for each frame should not move; what does move flickers. Writes DIR/stability.json, a table

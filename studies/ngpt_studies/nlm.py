@@ -5,6 +5,7 @@ from importlib.util import find_spec
 import numpy as np
 
 from ngpt.errors import NgptError
+from ngpt.methods import Method
 from ngpt.repair import Repaired
 from ngpt.system.install import install_command
 
@@ -47,3 +48,8 @@ def nlm(data: Repaired) -> np.ndarray:
     stacked = np.pad(stacked, ((0, int(height == 1)), (0, int(width == 1)), (0, 0)), mode="edge")
     filtered = denoise_nl_means(stacked, patch_size=5, patch_distance=9, h=bandwidth, channel_axis=-1)
     return (filtered[:height, :width, -3:] / tiny).astype(np.float32)
+
+
+METHOD = Method(
+    "joint non-local means of scikit-image", ("primal", "albedo", "normal", "primal_var"), nlm, {}, "study", missing
+)

@@ -61,7 +61,7 @@ def test_diffuse_light_is_that_of_the_same_materials_without_gloss(renderer):
 
 def shares(mi, description, n=2000):
     """The share of diffuse lobes at random pairs of directions, f of them alone, of the others alone, of all."""
-    from data_gen.samplers.studies.split import Lobes
+    from ngpt_studies.split import Lobes
 
     scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle", "bsdf": description}})
     rng = np.random.default_rng(0)

@@ -1,7 +1,10 @@
 """Speed against accuracy as a picture: error over total seconds, both axes logarithmic, by hand as SVG."""
 
 from dataclasses import dataclass
+from typing import Any
 
+from bench.wholetime import envelope
+from ngpt.measure.averages import geometric_mean
 from ngpt.report.axes import Axes
 from ngpt.system.text import markup
 
@@ -35,11 +38,29 @@ def pareto(points: list[Point]) -> list[bool]:
     ]
 
 
-def draw(points: list[Point], title: str, metric: str, doubt: float | None = None) -> str:
+def points_against(results: dict[str, Any], scenes: list[str]) -> list[Point]:
+    """Geometric means over the scenes of the columns that are no rival's setting, and each rival at its best."""
+    rivals = results["settings"]["against"]
+    points = [
+        Point(rival, 0, seconds, error, rival)
+        for rival in rivals
+        for seconds, error in envelope(results, rival, scenes)
+    ]
+    settings = {column for columns in rivals.values() for column in columns}
+    for method in (name for name in results["methods"] if name not in settings):
+        for spp in results["settings"]["spp"]:
+            rows = [r for r in results["summary"] if (r["spp"], r["method"]) == (spp, method) and r["scene"] in scenes]
+            rows = [row for row in rows if (row["error"] or 0) > 0 and row["seconds"]["total"]]
+            if scenes and len(rows) == len(scenes):
+                seconds = geometric_mean(row["seconds"]["total"] for row in rows)
+                points.append(Point(method, spp, seconds, geometric_mean(row["error"] for row in rows), method))
+    return points
+
+
+def draw(points: list[Point], title: str, metric: str) -> str:
     """An SVG: a line for each method over its sample counts, filled rings for the Pareto set, the line through it.
 
-    Samplers of one method share its colour, and differ in dashes. ``doubt`` is the error below which the reference
-    cannot tell methods apart: a dashed line, where it is in the picture.
+    Samplers of one method share its colour, and differ in dashes.
     """
     x = [p.seconds for p in points]
     y = [p.error for p in points]
@@ -49,8 +70,6 @@ def draw(points: list[Point], title: str, metric: str, doubt: float | None = Non
     best = sorted((p for p, is_best in zip(points, pareto(points), strict=True) if is_best), key=lambda p: p.seconds)
     path = "L".join(f"{axes.x(p.seconds):.1f} {axes.y(p.error):.1f}" for p in best)
     parts.append(f'<path d="M{path}" fill="none" stroke="#000000" stroke-width="7" stroke-opacity="0.12"/>')
-    if doubt and axes.y_range[0] < doubt < axes.y_range[1]:
-        parts.append(axes.level(doubt, "#999999", "what the reference can tell"))
     looks = _looks(points)
     for method, (color, dash) in looks.items():
         own = sorted((p for p in points if p.method == method), key=lambda p: (p.spp, p.seconds))

@@ -1,26 +1,25 @@
 """Errors over those that rivals have after the same whole time: rendering and reconstruction.
 
 A rival is a family of columns, the settings of one denoiser on the samples of one renderer (``against`` in the
-configuration). Each setting has a curve of errors over whole seconds (``ngpt.evaluation.curves``). At a time the rival
+configuration). Each setting has a curve of errors over whole seconds (``bench.curves``). At a time the rival
 has the least error of all its settings, and the least FLIP, whichever setting that is of: its user knew the best one.
 A setting counts from its quickest cell on, unless no setting was measured in so little time.
 """
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
-from ngpt.evaluation.config import groups_of
-from ngpt.evaluation.curves import Points, error_at, joined
+from bench.curves import Points, error_at, joined
 from ngpt.measure.averages import geometric_mean
 
-FIELDS = ("scene", "spp", "method", "seconds", "rival", "setting", "error", "mark", "FLIP", "FLIP mark")
 FLIP = "FLIP"
 # Points of an envelope that is drawn
 _STEPS = 17
 
 
 def against_rivals(results: dict[str, Any]) -> dict[str, Any]:
-    """``rows`` for each scene, count of samples, column and rival that it is no setting of (``FIELDS``), and ``means``.
+    """``rows`` for each scene, count of samples, column and rival that it is no setting of, and ``means``.
 
     ``error`` is the primary metric over the rival's at the column's ``seconds``, ``setting`` the column of the rival
     that it is over; FLIP likewise. Means are geometric over the scenes of each group and over all; ``less`` and ``less
@@ -138,9 +137,8 @@ def against_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
     tables: dict[str, list[list[str]]] = {}
     rivals = list(results["settings"]["against"])
     settings = {column for columns in results["settings"]["against"].values() for column in columns}
-    means, by_scene = (
-        [row for row in results["against"][key] if row["method"] not in settings] for key in ("means", "rows")
-    )
+    ratios = against_rivals(results)
+    means, by_scene = ([row for row in ratios[key] if row["method"] not in settings] for key in ("means", "rows"))
     heads = [text for rival in rivals for text in (f"error over {rival}", f"FLIP over {rival}")]
     heads += [text for rival in rivals for text in (f"less error than {rival}", f"less FLIP than {rival}")]
     if means:
@@ -182,3 +180,10 @@ def _ratios(rows: list[dict[str, Any] | None]) -> list[str]:
 
 def _count(row: dict[str, Any] | None, key: str) -> str:
     return f"{row[f'less{key}']} of {row[f'scenes{key}']}" if row else ""
+
+
+def groups_of(results: dict[str, Any], scenes: Iterable[str]) -> dict[str, list[str]]:
+    """The ``scenes`` of each group of the configuration, and all of them as "all" if they are several."""
+    found = list(dict.fromkeys(scenes))
+    groups = {name: [s for s in found if s in listed] for name, listed in results["settings"]["groups"].items()}
+    return groups | ({"all": found} if len(found) > 1 else {})

@@ -7,29 +7,23 @@
     W       m / n: how many times more samples that pipeline needs
     C       the seconds of a further sample with gradients over the seconds of a further sample of that pipeline
 
-T' and m are read off curves of errors (``ngpt.evaluation.curves``, which explains the marks; W has the mark of W / C).
+T' and m are read off curves of errors (``bench.curves``, which explains the marks; W has the mark of W / C).
 C compares the renders with the least and the most samples, so that what a render takes to begin is no part of it.
 """
 
 from collections.abc import Sequence
 from typing import Any
 
-from ngpt.evaluation.config import groups_of
-from ngpt.evaluation.curves import first_at, joined
+from bench.curves import first_at, joined
+from bench.wholetime import groups_of
 from ngpt.measure.averages import geometric_mean, median
-
-FIELDS = (
-    *("scene", "spp", "method", "sampler", "best", "error", "seconds", "rival", "rival seconds", "rival samples"),
-    *("W", "C", "W/C", "mark", "blocks"),
-)
 
 
 def worth_of_gradients(results: dict[str, Any]) -> dict[str, Any]:
-    """``rows`` for each scene, number of samples and column with gradients (``FIELDS``); ``means`` of them over scenes.
+    """``rows`` for each scene, number of samples and column with gradients; ``means`` of them over scenes.
 
-    ``best`` marks the column of least error among those with gradients. ``blocks``, the share of blocks where gradients
-    pay, comes with the maps (``ngpt.evaluation.worthplots``). Both lists are empty where a column of either kind is
-    missing; what has no time, as stacks from elsewhere may have none, has no row.
+    ``best`` marks the column of least error among those with gradients. Both lists are empty where a column of either
+    kind is missing. A method without a time, as stacks from elsewhere may have none, has no row.
     """
     rows = [row for scene in results["scenes"] for row in _scene_rows(results, scene)]
     return {"rows": rows, "means": _means(results, rows)}
@@ -115,7 +109,7 @@ def _means(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str
 
 def worth_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
     """Title -> rows of text, the first is the head: W/C of the means, and all that is known of each scene."""
-    worth = results["worth"]
+    worth = worth_of_gradients(results)
     columns = [name for name in results["methods"] if any(row["method"] == name for row in worth["rows"])]
     heads = [f"W/C {name}" for name in columns]
     tables = {}
@@ -130,13 +124,12 @@ def worth_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
                 table.append([name, str(spp), *(marked(best, key) for key in ("W", "C", "W/C")), *others])
         tables["Worth of gradients, geometric means; best pipelines, then each column with gradients"] = table
     rows = {(row["scene"], row["spp"], row["method"]): row for row in worth["rows"]}
-    table = [["scene", "spp", "with gradients", "without", "W", "C", "W/C", "blocks", *heads]]
+    table = [["scene", "spp", "with gradients", "without", "W", "C", "W/C", *heads]]
     for best in worth["rows"]:
         if best["best"]:
             others = [marked(rows.get((best["scene"], best["spp"], name)), "W/C") for name in columns]
             values = [marked(best, key) for key in ("W", "C", "W/C")]
-            blocks = "" if best.get("blocks") is None else f"{best['blocks']:.0%}"
-            table.append([best["scene"], str(best["spp"]), best["method"], best["rival"], *values, blocks, *others])
+            table.append([best["scene"], str(best["spp"]), best["method"], best["rival"], *values, *others])
     if len(table) > 1:
         tables["Worth of gradients, scene by scene"] = table
     return tables

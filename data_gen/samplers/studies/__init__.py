@@ -1,1 +1,0 @@
-"""Samplers that were measured and lost: kept to be compared with, not to be used."""
