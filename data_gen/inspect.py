@@ -215,10 +215,11 @@ def warn_of_lost_light(scene: mi.Scene, sampler: str) -> None:
     if facts.integrator == "path" and entry.loses and without_size(scene) and has_holes(scene):
         remedy = "--sampler gpt, or primal, finds it"
         _LOG.warning("of lamps without size, '%s' loses light %s; %s", sampler, entry.loses, remedy)
-    if lamp := bent_lamp(scene):
+    if entry.leaves_lamps and (lamp := bent_lamp(scene)):
         _LOG.warning(
-            "lamp%s has few faces and smooth normals; Mitsuba %s samples it by one normal and weighs it by another, so "
-            "light beside it is wrong by up to 4 %%: give it face_normals=true",
+            "'%s' leaves lamp%s, which has few faces and smooth normals, to Mitsuba %s, which weighs it by the wrong "
+            "normal: light beside it is wrong by up to 4 %%; --sampler gpt, or primal, is right",
+            sampler,
             f" '{lamp.id()}'" if lamp.id() else "",
             mi.__version__,
         )

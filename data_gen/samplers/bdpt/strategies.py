@@ -23,8 +23,8 @@ from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, Vertex, cosine, 
 
 def emission_at(scene, lights: LightEnds, si, ref, active) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
     """Le at ``si`` toward ``ref`` where ``active``; ``p`` of connecting to it from there, and ``e`` of ``mis``."""
-    light = mi.DirectionSample3f(scene, si, ref)
-    Le, p = light.emitter.eval(si, active), scene.pdf_emitter_direction(ref, light, active)
+    light, p = lights.met(scene, si, ref, active)
+    Le = light.emitter.eval(si, active)
     cos = dr.abs(dr.dot(light.n, light.d))
     e = lights.emission(lights.index_of(light.emitter, active), p, cos, dr.square(light.dist))
     return Le, p, dr.select(p > 0, e, 0)

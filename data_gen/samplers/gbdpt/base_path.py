@@ -43,6 +43,7 @@ class Step:
     # A sampled point of an emitter
     light: mi.DirectionSample3f
     weight: mi.Spectrum  # Le / p
+    front: mi.Normal3f | None  # of ``LightEnds.connect()``
     shared: mi.Bool  # Δ has a share in what is completed at z
     C_light: mi.Spectrum
     others_light: mi.Float
@@ -94,7 +95,7 @@ def base_step(
     # ------------------------ To a light -------------------------
     u_light, u_lobe, u_direction = random.next_2d(), random.next_1d(), random.next_2d()
     u_survival = random.next_1d()
-    light, weight = scene.sample_emitter_direction(si, u_light, False, smooth)
+    light, weight, front = lights.connect(scene, si, u_light, smooth)
     lit = smooth & (light.pdf > 0)
     wo = si.to_local(light.d)
     f, p, sample, f_p = bsdf.eval_pdf_sample(context(RADIANCE), si, wo, u_lobe, u_direction)
@@ -131,6 +132,7 @@ def base_step(
         connectable=active & materials.connectable(bsdf),
         light=light,
         weight=weight,
+        front=front,
         shared=mi.Bool(True),
         C_light=C,
         others_light=others,

@@ -269,7 +269,7 @@ def bend(plan: Plan, step: Step, chain: Chain, y: Offset, none: Offset, si) -> t
 def to_same_light(plan: Plan, step: Step, y: Offset, si, bsdf, active):
     """f J / p, the factor of r, and ``others``, of the path that ends at the same point of an emitter."""
     base = step.light
-    light, weight, r = plan.lights.seen_from_elsewhere(plan.scene, base, step.weight, si, active)
+    light, weight, r = plan.lights.seen_from_elsewhere(plan.scene, base, step.weight, si, active, front=step.front)
     f, p, q = evaluate(RADIANCE, si, bsdf, si.to_local(light.d), active)
     C = y.β * f * weight
     lit = active & (dr.max(C) > 0)

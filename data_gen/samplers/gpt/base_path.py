@@ -213,7 +213,7 @@ def base_step(
         passed = space.holes.passed(bsdf, kind)
         aim = path.aim.behind(passed, x, kind, sample.pdf)
         seen_by, sampled, p_x1 = aim.seen_by(x), dr.isfinite(aim.p), aim.p
-    Le, p_light = emission(scene, x1, seen_by, goes_on & sky.meets(x1), goes_on & sampled, plan.lights.places)
+    Le, p_light = emission(scene, x1, seen_by, goes_on & sky.meets(x1), goes_on & sampled, plan.lights)
     L_bsdf = Le * mis_weight(p_x1, p_light)
 
     # ------------------- The layer ``caustic`` -------------------
