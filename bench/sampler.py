@@ -15,7 +15,7 @@ It renders the built-in scenes and each FOLDER/*/scene.xml that `gpt` can render
 
 References are rendered for a fixed time and kept in CACHE for the next run. An interrupted run continues where it ended
 if it is started with the same arguments. The script writes the results and, for each scene named by --maps,
-docs/images/NAME-gradients.png, see ngpt/evaluation/gradientmap.py.
+docs/images/NAME-gradients.png, see bench/gradientmap.py.
 """
 
 import argparse
@@ -27,10 +27,10 @@ import time
 from pathlib import Path
 
 import numpy as np
-from ngpt.evaluation.gradientmap import variances_of_differences, write_map
 
 import ngpt
 from bench.common import kept, metadata, renderer, save
+from bench.gradientmap import variances_of_differences, write_map
 from ngpt.evaluation.config import scene_name
 from ngpt.evaluation.references import reference_noise
 from ngpt.measure.averages import summary

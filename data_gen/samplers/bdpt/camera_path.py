@@ -79,7 +79,7 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
         f = dr.select(dr.isfinite(dr.sum(f)) & dr.isfinite(p), f, 0)
         lit &= dr.max(f * weight) > 0
         q = reverse_density(si, bsdf, wo, lit)
-        T, holes = plan.sees(si, light.p, limits.max_depth - 1 - depth, lit)
+        T, holes = plan.sees(si, light.p, limits.max_depth - (depth + 1), lit)
         z.end = known(end, depth + 1 + holes <= plan.longest)
         C, others = to_light(lights, z, light, weight, f, p=p, q=q)
         L += dr.select(lit, C * T / (1 + others), 0)
