@@ -148,6 +148,34 @@ def test_light_that_is_cut_is_counted(renderer):
     assert filled.cut / filled.light == pytest.approx(1 - kept / values.sum(), rel=1e-3)
 
 
+PLASTIC = {"type": "roughplastic", "alpha": 0.1, "diffuse_reflectance": {"type": "rgb", "value": [0.7, 0.4, 0.1]}}
+METAL = {"type": "roughconductor", "alpha": 0.3, "specular_reflectance": {"type": "rgb", "value": 0.8}}
+DARK = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.002}}
+
+
+@pytest.mark.parametrize(
+    ("walls", "floor", "most"),
+    [(PLASTIC, PLASTIC, 6), ({"type": "twosided", "bsdf": METAL}, DARK, 10)],
+    ids=["what-is-left", "dark"],
+)
+def test_records_have_no_fireflies(renderer, monkeypatch, walls, floor, most):
+    """Paths survive as what they look for deserves: what a material leaves for them weighs as much as the material, and
+    behind a dark surface with a record is light of that record."""
+    scene, found, add = builtin.diffuse(), [], cache.Cache.add
+    for name, part in scene.items():
+        if isinstance(part, dict) and "bsdf" in part and name != "lamp":
+            part["bsdf"] = floor if name == "floor" else walls
+    scene["integrator"] = {"type": "path", "rr_depth": 1}
+
+    def noted(self, place, half, values):
+        found.append(max(np.abs(np.array(value)).max() for value in values))
+        add(self, place, half, values)
+
+    monkeypatch.setattr(cache.Cache, "add", noted)
+    render_stack(load(renderer, scene, (64, 36)), 16, 1, "primal", tails="shared")
+    assert 1 < max(found) < most
+
+
 def test_old_records_fade(renderer):
     """Records that are made later count twice as much, but cells with few records keep them."""
     filled, half = cache.Cache(FINENESS), dr.arange(mi.UInt32, N) & 1

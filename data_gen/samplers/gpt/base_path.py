@@ -190,7 +190,9 @@ def base_step(
     η = dr.select(found, path.η * sample.eta, path.η)
 
     # ---------------------- Russian roulette ---------------------
-    largest = brightest(path.β * f_p, f_p, offsets)
+    # What is left of f is as bright as f where it is followed: else it would have to survive twice.
+    whole = f_p * dr.rcp(dr.maximum(survival_of_rest, 1e-20))
+    largest = brightest(path.β * whole, whole, offsets)
     if recording:
         largest = dr.maximum(largest, dr.select(recording.here, E_p, 0))
     q = roulette(largest, path.depth >= plan.limits.rr_depth, η) * survival_of_rest
@@ -207,6 +209,9 @@ def base_step(
     β1 = path.β * f_p
     if path.ρ is not None:
         E_p = dr.select(goes_on, E_p * survival, 0)
+    if recording:
+        # What follows is light of the record, however dark the surface is.
+        β1 = dr.select(recording.here, E_p * segment.weight, β1)
     # After a mirror emitter sampling could not have found x1: p_light = 0, and m = 1.
     aim, passed, seen_by, sampled, p_x1 = None, None, x, kind == SMOOTH, sample.pdf
     if path.aim is not None:
