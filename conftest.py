@@ -18,7 +18,7 @@ from ngpt.stack import GradientStack
 
 pytest_plugins = ["durations"]
 
-# What holds for every method and sampler holds for those of other packages that are installed, such as ngpt-studies.
+# Tests of all methods and samplers include those of other installed packages, such as ngpt-studies.
 for registry in (METHODS, SAMPLERS):
     registry.load()
 

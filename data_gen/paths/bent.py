@@ -1,4 +1,4 @@
-"""Mesh lamps whose vertex normals are not those of their faces, sampled with the right density.
+"""Sampling of mesh lamps whose vertex normals differ from the normals of their faces, with the right density.
 
 Mitsuba turns the density of a point on a mesh into one of directions by the vertex normals, where it samples the point
 and where it is asked for the density (its issue 1952). The solid angle of a face depends on the normal of the face.
@@ -114,7 +114,7 @@ class BentLamps:
         return light, weight / chosen.p, here.front
 
     def density(self, lamp: mi.UInt32, n: mi.Normal3f, d: mi.Vector3f, dist: mi.Float) -> mi.Float:
-        """Of sampling a bent lamp in direction ``d``, where it has the normal ``n``: per solid angle."""
+        """The density per solid angle of sampling a bent lamp in direction ``d``, at a point of normal ``n``."""
         cos = -dr.dot(n, d)
         return dr.select(cos > 0, dr.gather(mi.Float, self.per_area, lamp) * dr.square(dist) / cos, 0)
 
@@ -134,6 +134,14 @@ class BentLamps:
         si.p, si.n, si.uv, si.sh_frame = here.p, here.n, here.uv, mi.Frame3f(here.front)
         si.wi, si.time, si.wavelengths = si.to_local(w), at.time, at.wavelengths
         return emitter.eval(si, active)
+
+
+def sample_emitter(scene: mi.Scene, bent: BentLamps | None, x: mi.Interaction3f, u: mi.Point2f, active) -> tuple:
+    """``scene.sample_emitter_direction(x, u, False, active)``, right for ``bent`` lamps too; and the ``front`` there,
+    None in scenes without them."""
+    if not bent:
+        return *scene.sample_emitter_direction(x, u, False, active), None
+    return bent.sample(x, Chosen.of_scene(scene, u, active), active)
 
 
 class _Faces:

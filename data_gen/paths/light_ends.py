@@ -9,10 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.bent import BentLamps
+from data_gen.paths.bent import BentLamps, sample_emitter
 from data_gen.paths.holes import Holes
 from data_gen.paths.vertex import Materials
-from data_gen.scenes.lamps import Chosen, emitter_numbers
+from data_gen.scenes.lamps import emitter_numbers
 from ngpt.errors import NgptError
 
 # An emitter is an area, a point (spots are points that fill a cone), or infinitely far away.
@@ -37,7 +37,7 @@ class LightEnds:
 
     Points on areas are sampled as Mitsuba's emitters do, with a cosine distribution of directions; the directions of
     what is infinitely far away as well, on a disk that covers the scene; points light all around, spots their cone.
-    Those of ``BentLamps`` are sampled as these say.
+    ``BentLamps`` samples points on bent lamps.
 
     Raises NgptError, in the name of the ``sampler``, for a scene with emitters that Mitsuba does not tell enough of.
     """
@@ -96,9 +96,7 @@ class LightEnds:
 
     def connect(self, scene, si: mi.SurfaceInteraction3f, u: mi.Point2f, active) -> tuple:
         """As ``scene.sample_emitter_direction(si, u, False, active)``, and the ``front`` of a light ray there."""
-        if not self.bent:
-            return *scene.sample_emitter_direction(si, u, False, active), None
-        return self.bent.sample(si, Chosen.of_scene(scene, u, active), active)
+        return sample_emitter(scene, self.bent, si, u, active)
 
     def met(self, scene, si: mi.SurfaceInteraction3f, ref, active) -> tuple[mi.DirectionSample3f, mi.Float]:
         """The emitter at ``si``, and the density with which ``connect()`` finds it from ``ref``."""

@@ -9,7 +9,7 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths.bent import BentLamps
+from data_gen.paths.bent import BentLamps, sample_emitter
 from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.scenes.lamps import Chosen, Places
 from data_gen.scenes.load import path_depths
@@ -53,10 +53,8 @@ class Lights:
         return *self.at(x, chosen, active), chosen
 
     def anywhere(self, scene, x: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool) -> tuple:
-        """The same of a lamp that is chosen as often as the scene says."""
-        if not self.bent:
-            return scene.sample_emitter_direction(x, u, False, active)
-        return self.bent.sample(x, Chosen.of_scene(scene, u, active), active)[:2]
+        """The direction sample and Le / p, where lamps are chosen with the scene's own probabilities."""
+        return sample_emitter(scene, self.bent, x, u, active)[:2]
 
     def seen(self, scene, x: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool) -> tuple:
         """As ``anywhere()``, with Le V / p."""
@@ -66,7 +64,7 @@ class Lights:
         return light, dr.select(scene.ray_test(x.spawn_ray_to(light.p), active & (light.pdf > 0)), 0, weight)
 
     def at(self, x: mi.SurfaceInteraction3f, chosen: Chosen, active: mi.Bool) -> tuple:
-        """The same of the lamp that is ``chosen`` by place."""
+        """The direction sample and Le / p of the lamp that is ``chosen`` by place."""
         return self.bent.sample(x, chosen, active)[:2] if self.bent else self.places.sample(x, chosen, active)
 
 
