@@ -200,7 +200,7 @@ class Copies(Ends):
         from data_gen.samplers.gbdpt.offset_path import own_vertex, start, take_step
 
         shifted = self.camera.rays(self.shift)
-        offsets = [start(self.eye, x, shifted, self.scene.ray_intersect_preliminary(shifted[0]))]
+        offsets = [start(self.plan, self.eye, x, shifted)]
         z, active = Vertex(x, mi.Spectrum(1), end, mi.UInt32(1)), x.is_valid()
         found, self.copied, self.steps, self.offsets = [], [], [], []
         for _ in range(self.length):
@@ -232,8 +232,12 @@ class Copies(Ends):
         for met in self.from_light[:s]:
             good &= met.there
         dr.eval(good)
-        g, _ = connection(self.plan, z.vertex, z.bsdf, y.vertex, good)
-        g1, edge = connection(self.plan, own.vertex, own.bsdf, y.vertex, good, seen=offset.joined)
+        g, _, through = connection(self.plan, z.vertex, z.bsdf, y.vertex, good)
+
+        def sees(v, y, lit):
+            return self.plan.sees_alike(v.si, y.si.p, through, lit & ~offset.joined), 0
+
+        g1, edge, _ = connection(self.plan, own.vertex, own.bsdf, y.vertex, good, sees)
         found = offset.β * g1, offset.r, mis.others_connected(own.vertex.end, y.vertex.end, edge)
         return z.vertex.β * g, found, self.brute(t, s), self.copy.brute(t, s), s + 1, good
 

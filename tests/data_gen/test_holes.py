@@ -79,7 +79,7 @@ def test_lamps_hide_from_the_camera_only_in_front_of_holes(renderer, hides):
         floor = scene.ray_intersect(ray)
         way = scene, floor, renderer.Point3f(0.1, 0.1, 3), renderer.UInt32(3), renderer.Bool(True)
         if hides:
-            T = holes.toward_camera(*way)
+            T, _ = holes.toward_camera(*way)
         else:
             T, _ = holes.transmittance(scene, floor.spawn_ray_to(way[2]), *way[2:])
         assert np.allclose(T, seen)
