@@ -151,6 +151,7 @@ class Holes:
             going &= left > 0
         return x, T
 
+
 def _on_lamp(si: mi.SurfaceInteraction3f, scene: mi.Scene) -> mi.Bool:
     return si.emitter(scene) != None  # noqa: E711 - a comparison of arrays of pointers
 

@@ -121,7 +121,6 @@ def connect(plan: Plan, step: Step, y: Vertex, times, offsets: list[Offset], Δ:
             bsdf = v.si.bsdf()
             good = lit & (offset.joined | (both & plan.materials.connectable(bsdf)))
 
-
             def sees(v, y, lit):
                 return plan.sees_alike(v.si, y.si.p, through, lit & offset.apart), through[1]
 
@@ -299,9 +298,7 @@ def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si) -> tuple[Offs
     return moved, β * Le, others
 
 
-def go_through(
-    plan: Plan, step: Step, y: Offset, none: Offset, si, eye: Eye
-) -> tuple[Offset, mi.Spectrum, mi.Float]:
+def go_through(plan: Plan, step: Step, y: Offset, none: Offset, si, eye: Eye) -> tuple[Offset, mi.Spectrum, mi.Float]:
     """Through the hole at ``si`` as the base path went through one, both in front of their first smooth event."""
     T, d = plan.holes.share(si, mi.Bool(True)), mi.Vector3f(y.ray.d)
     β = y.β * T * (step.survival / step.p)
@@ -313,7 +310,10 @@ def go_through(
     # Behind mirrors vcm is 0, so that lengths do not count.
     end = mis.passed(y.end, cosine(si, d), mi.Float(1))
     others = dr.select(step.edge.first, 0, mis.others_emitted(known_met(end, step.counted), e, p_met))
-    end, seen = mis.arrive(end, cosine(y1, d), mi.Float(1)), mis.begin_camera(eye.toward(y1, eye.lens)[1], cosine(y1, d))
+    end, seen = (
+        mis.arrive(end, cosine(y1, d), mi.Float(1)),
+        mis.begin_camera(eye.toward(y1, eye.lens)[1], cosine(y1, d)),
+    )
     end = Partial(dr.select(step.edge.first, seen.vcm, end.vcm), dr.select(step.edge.first, seen.vc, end.vc))
     β, lives = dr.select(good, β, 0), good & y1.is_valid() & step.x1.is_valid()
     return Offset(ray, hit, dr.select(lives, β, 0), y.r, end, lives, mi.Bool(False), none.Δ, none.own), β * Le, others
