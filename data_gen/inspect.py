@@ -190,11 +190,9 @@ def _of_tiny_lamps(plugins: dict[str, Counter], facts: Facts) -> list[str]:
         return []
     able = _finding(facts, "caustics", and_hidden_lamps=True)
     what = "lamps without size, or a sun, meet smooth glass or mirrors: what these make of it"
-    return [
-        f"{what} needs {able}; `ngpt render` says how much that is"
-        if able
-        else f"{what} is found by no sampler that renders this scene"
-    ]
+    if not able:
+        return [f"{what} is found by no sampler that renders this scene"]
+    return [f"{what} needs {able}; `ngpt render` says how much that is"]
 
 
 def _finding(facts: Facts, light: str, and_hidden_lamps: bool = False) -> str:
@@ -212,7 +210,7 @@ def _how_much(scene: mi.Scene) -> str:
     if share is None:
         return ""
     amount = f"about {share:.0%}" if share >= 0.01 else "less than 1%"
-    return f", {amount} of the light on what the camera sees directly,"
+    return f", {amount} of the light on what the camera sees directly"
 
 
 def warn_of_lost_light(scene: mi.Scene, sampler: str) -> None:

@@ -142,7 +142,7 @@ class Holes:
     def through(
         self, scene, x: mi.SurfaceInteraction3f, d: mi.Vector3f, number, active: mi.Bool
     ) -> tuple[mi.SurfaceInteraction3f, mi.Spectrum]:
-        """What is behind so many holes along ``d``, of which ``x`` is the first, and T; T is 0 where there are fewer."""
+        """What is behind so many holes along ``d``, of which ``x`` is the first, and T; 0 where there are fewer."""
         x, T, left, active = mi.SurfaceInteraction3f(x), mi.Spectrum(1), mi.UInt32(number), mi.Bool(active)
         going = active & (left > 0)
         while dr.hint(going, label="holes"):

@@ -13,9 +13,12 @@ its copy share one weight over all strategies of both: see ``pairs``.
 The map: mirrors and clear glass in front of the camera are replayed; the first vertex behind them is the copy's own,
 and from there it goes straight to the next vertex of the path, which both share with all further ones. It is rejected,
 alike by all strategies, where one of these three vertices is not connectable, or where the copy is occluded or black.
-On each edge the copy goes straight on through as many holes as the path, weakened by T' where the path has passed by
-chance, or is weakened by T; a copy with another number of holes is rejected. What is completed by connecting the camera path's first vertices is
-shifted in ``offset_path``; what ends by connecting a light path to the camera, in ``light_shift``.
+What is completed by connecting the camera path's first vertices is shifted in ``offset_path``; what ends by connecting
+a light path to the camera, in ``light_shift``.
+
+Holes are no vertices (``paths.holes``). On each edge the copy goes straight on through as many of them as the path, and
+is rejected where there are more or fewer. It is weakened by what they let through, whether the path was, or has passed
+them by chance.
 
 Between that first vertex and the next one mirrors and glass may lie: then the copy walks through the same events to the
 same next vertex. Camera paths do so in a second kernel (``chain_shift``), light paths that end at the first vertex in a
