@@ -1,4 +1,4 @@
-"""How much light mirrors and glass make of lamps without size: a look says so, and `--for auto` takes photons for it."""
+"""How much light mirrors and glass make of lamps without size: a look says so, and `--for auto` takes photons then."""
 
 import logging
 
@@ -30,7 +30,12 @@ def burning_glass(mi, ball="dielectric", lamp=None, film=(48, 36)):
         "floor": {"type": "rectangle", "to_world": to.rotate([1, 0, 0], -90).scale(2), "bsdf": matte},
         "ball": {"type": "sphere", "center": [0, 1.3, 0], "radius": 0.5, "bsdf": {"type": ball}},
         # Of a size that paths meet
-        "beside": {"type": "sphere", "center": [1.5, 1, 1], "radius": 0.2, "emitter": {"type": "area", "radiance": 2.0}},
+        "beside": {
+            "type": "sphere",
+            "center": [1.5, 1, 1],
+            "radius": 0.2,
+            "emitter": {"type": "area", "radiance": 2.0},
+        },
         "lamp": lamp or {"type": "point", "position": [0, 3, 0], "intensity": 5.0},
     }
     return load(mi, scene, film)

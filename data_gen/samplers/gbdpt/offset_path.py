@@ -17,8 +17,8 @@ from data_gen.paths.shift import reconnection_jacobian
 from data_gen.paths.vertex import SMOOTH, event_kind, seen_from
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Partial
-from data_gen.samplers.bdpt.strategies import connection, emission_at
-from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, context, cosine, evaluate
+from data_gen.samplers.bdpt.strategies import emission_at
+from data_gen.samplers.bdpt.vertex import RADIANCE, context, cosine, evaluate
 from data_gen.samplers.gbdpt.base_path import Plan, Step, known_end, known_met
 from data_gen.samplers.gbdpt.chain_shift import Chain, Course, follow_chain
 
@@ -93,47 +93,6 @@ def brightest(offsets: list[Offset]) -> mi.Float:
 def with_differences(offsets: list[Offset], Δ: list[mi.Spectrum]) -> list[Offset]:
     """The offset paths with ``Δ`` as their sums."""
     return [replace(offset, Δ=total) for offset, total in zip(offsets, Δ, strict=True)]
-
-
-def connect(plan: Plan, step: Step, y: Vertex, times, offsets: list[Offset], Δ: list) -> tuple:
-    """C and ``others`` of the connection of the vertex of ``step`` to ``y``, one of the light path; and the sums Δ with
-    it, where it counts so many ``times``."""
-    z = step.z
-    g, edge, through = connection(plan, z, z.si.bsdf(), y, mi.Bool(True))
-    C, others = z.β * g, mis.others_connected(z.end, y.end, edge)
-    lit = dr.max(C) > 0
-    # ------- Settled copies: the same connection, other weights -------
-    busy, sums = mi.Bool(False), []
-    for offset, Δ_before in zip(offsets, Δ, strict=True):
-        own = offset.apart | offset.joined
-        busy |= own
-        others1 = mis.others_connected(offset.end, y.end, edge)
-        sums.append(Δ_before + dr.select(~own, times * plan.pair(C, others, offset.β * g, offset.r, others1), 0))
-    # --------- Others: from the copy's own vertex, one by one ---------
-    # What a shift to y needs of the materials, except for the offset path's own
-    both = step.connectable & plan.materials.connectable(y.si.bsdf())
-
-    def one(i, *Δ):
-        offset = pick(offsets, i)
-
-        def own(Δ1):
-            v = Vertex(own_vertex(offset, z.si), offset.β, offset.end, z.depth)
-            bsdf = v.si.bsdf()
-            good = lit & (offset.joined | (both & plan.materials.connectable(bsdf)))
-
-            def sees(v, y, lit):
-                return plan.sees_alike(v.si, y.si.p, through, lit & offset.apart), through[1]
-
-            g1, edge1, _ = connection(plan, v, bsdf, y, good, sees)
-            others1 = mis.others_connected(v.end, y.end, edge1)
-            return times * plan.pair(C, others, v.β * g1, offset.r, others1)
-
-        Δ1 = dr.if_stmt((mi.Spectrum(0),), lit & (offset.apart | offset.joined), own, lambda Δ1: Δ1)
-        return i + 1, *(dr.select(i == k, old + Δ1, old) for k, old in enumerate(Δ))
-
-    state = (mi.UInt32(0), *sums)
-    Δ = dr.while_loop(state, lambda i, *_: busy & lit & (i < len(offsets)), one, label="connected offsets")[1:]
-    return C, others, list(Δ)
 
 
 def take_step(
@@ -310,10 +269,8 @@ def go_through(plan: Plan, step: Step, y: Offset, none: Offset, si, eye: Eye) ->
     # Behind mirrors vcm is 0, so that lengths do not count.
     end = mis.passed(y.end, cosine(si, d), mi.Float(1))
     others = dr.select(step.edge.first, 0, mis.others_emitted(known_met(end, step.counted), e, p_met))
-    end, seen = (
-        mis.arrive(end, cosine(y1, d), mi.Float(1)),
-        mis.begin_camera(eye.toward(y1, eye.lens)[1], cosine(y1, d)),
-    )
+    end = mis.arrive(end, cosine(y1, d), mi.Float(1))
+    seen = mis.begin_camera(eye.toward(y1, eye.lens)[1], cosine(y1, d))
     end = Partial(dr.select(step.edge.first, seen.vcm, end.vcm), dr.select(step.edge.first, seen.vc, end.vc))
     β, lives = dr.select(good, β, 0), good & y1.is_valid() & step.x1.is_valid()
     return Offset(ray, hit, dr.select(lives, β, 0), y.r, end, lives, mi.Bool(False), none.Δ, none.own), β * Le, others
@@ -360,11 +317,3 @@ def to_same_light(plan: Plan, step: Step, y: Offset, si, bsdf, active):
     e = plan.lights.emission(plan.lights.index_of(light.emitter), light.pdf, cos, dr.square(light.dist))
     p_light = dr.select(light.delta, 0, light.pdf)
     return C, r, mis.others_to_light(known_end(y.end, step.joins_light), e, p_light, cosine(si, light.d), p, q)
-
-
-def pick(offsets: list[Offset], i: mi.UInt32) -> Offset:
-    """The offset path of that number."""
-    found = offsets[0]
-    for k, offset in enumerate(offsets[1:], 1):
-        found = dr.select(i == k, offset, found)
-    return found
