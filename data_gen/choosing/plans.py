@@ -18,13 +18,14 @@ import mitsuba as mi
 from data_gen import samplers
 from data_gen.adaptive import Adaptive
 from data_gen.budget import DEFAULT_MEMORY
-from data_gen.choosing.caustics import share_of_caustics
+from data_gen.caustics import share_of_caustics
 from data_gen.choosing.look import features_pay
 from data_gen.choosing.pipelines import Pipeline, choose, measure, methods_for
-from data_gen.choosing.trials import PIXELS, Pilot, Trial, at_most, candidates, try_all
+from data_gen.choosing.trials import PIXELS, Pilot, Trial, candidates, try_all
 from data_gen.passes import film_within
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.facts import scene_facts
+from data_gen.scenes.load import at_most
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS, runnable
 from ngpt.system.console import brief

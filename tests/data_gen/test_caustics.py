@@ -8,8 +8,8 @@ from unbiased import load
 
 pytest.importorskip("mitsuba")
 
+from data_gen.caustics import share_of_caustics
 from data_gen.choosing import plans
-from data_gen.choosing.caustics import share_of_caustics
 from data_gen.choosing.trials import Pilot
 from data_gen.render import render_stack
 

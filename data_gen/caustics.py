@@ -14,7 +14,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.choosing.trials import at_most
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.eye import Sight
 from data_gen.paths.holes import Holes
@@ -26,6 +25,7 @@ from data_gen.samplers.bdpt.plan import Plan
 from data_gen.samplers.bdpt.strategies import to_camera
 from data_gen.samplers.bdpt.vertex import scatters_smoothly
 from data_gen.scenes.facts import scene_facts
+from data_gen.scenes.load import at_most
 from data_gen.scenes.lost import behind_sharp, hard_to_meet
 
 # 65,536 light paths, of at most so many edges
