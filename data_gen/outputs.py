@@ -6,19 +6,22 @@ render that was begun goes on from a result as from a stack.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from data_gen.begun import Asked, joined_or_kept, kept_apart, write_part
+from data_gen.begun import joined_or_kept, kept_apart, rest_of
+from data_gen.request import RenderRequest
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
 from ngpt.cli.picture import check_image, seen
 from ngpt.errors import NgptError, WrongUse
 from ngpt.image.pictures import check_size
+from ngpt.io.exr import write
 from ngpt.io.openexr import read_header
 from ngpt.io.whole import finished
 from ngpt.methods import reconstruct, runnable
 from ngpt.stack import GradientStack
+from ngpt.system.files import save
 from ngpt.system.text import by_names
 
 
@@ -82,11 +85,21 @@ class Denoising:
 
 @dataclass(frozen=True)
 class Output:
-    """The ``file`` for a stack or, with ``denoising``, for its image; ``kept`` is one for the stack then, if any."""
+    """The ``file`` for the stack of a request or, with ``denoising``, for its image; ``kept``: one for the stack then.
 
+    ``frame``: of a shot
+    """
+
+    request: RenderRequest
     file: Path
     denoising: Denoising | None = None
     kept: Path | None = None
+    frame: int | None = None
+    header: dict[str, str] = field(init=False)  # what the stack's header says of the request
+
+    def __post_init__(self) -> None:
+        # Of the scene's file as it is before the render
+        object.__setattr__(self, "header", self.request.header(self.frame))
 
     @property
     def stack(self) -> Path:
@@ -104,24 +117,32 @@ class Output:
         if self.kept is not None and self.kept.resolve() == self.file.resolve():
             raise WrongUse(f"--keep {self.kept}: is the file of the image; give another name, or leave --keep out")
 
-    def check_begun(self, sampler: str) -> None:
-        """Raises WrongUse for an image that cannot be made of what ``sampler`` has begun."""
-        if self.denoising is not None:
-            self.denoising.check(sampler, None, str(self.stack))
-
     def check_skipping(self) -> None:
         """Raises WrongUse where nothing could tell what is there of a render."""
+        if self.request.cpu_seconds is not None:
+            raise WrongUse("--skip-existing: no file says how much processor time it took; give --time or --spp")
         if self.stack.suffix.lower() != ".exr":
             raise WrongUse(
                 f"{self.file}: --skip-existing checks only OpenEXR files; keep the stack too: --keep FILE.exr"
             )
 
-    def done(self, asked: Asked) -> bool:
+    def rest(self) -> RenderRequest | None:
+        """What is left to render of the file's stack, which is whole, None if nothing is; raises NgptError if the stack
+        is of another request, or of no use for the image."""
+        rest = rest_of(self.request, self.stack, self.frame)
+        for_whom = self.denoising or Denoising(self.request.method or "auto")
+        for_whom.check(str(read_header(self.stack)[0].get("ngpt:sampler", "")), None, str(self.stack))
+        return rest
+
+    def done(self) -> bool:
         """Whether all is there that is asked for.
 
         Raises NgptError where a stack is there in place of its image, or the image of another method.
         """
-        if not asked.done(self.stack):
+        try:
+            if not finished(self.stack) or rest_of(self.request, self.stack, self.frame) is not None:
+                return False
+        except NgptError:
             return False
         by = read_header(self.file)[0].get("ngpt:method") if _readable(self.file) else None
         if self.denoising is not None and by and self.denoising.method not in ("auto", by):
@@ -143,14 +164,16 @@ class Output:
     def write(
         self, stack: GradientStack, overwrite: bool, begun: GradientStack | None = None
     ) -> tuple[GradientStack, dict[str, Any]]:
-        """Writes a stack, in place of the one that was ``begun`` and together with it, or the image of both.
+        """Writes a stack, in place of the one that was ``begun`` and together with it, or the image of both. The header
+        says what was asked for.
 
         Returns the whole stack, and the attributes that say what made the image. Nothing that was rendered is lost.
         """
+        stack.attributes |= self.header
+        if begun is not None:
+            stack, overwrite = joined_or_kept(self.stack, stack, begun), True
         if self.denoising is None or self.kept is not None:
-            stack = write_part(self.stack, stack, overwrite, begun)
-        elif begun is not None:
-            stack, overwrite = joined_or_kept(self.file, stack, begun), True
+            save(self.stack, lambda path, overwrite: write(path, stack, overwrite=overwrite), overwrite)
         return stack, self.image(stack, overwrite) if self.denoising else {}
 
     def image(self, stack: GradientStack, overwrite: bool) -> dict[str, Any]:

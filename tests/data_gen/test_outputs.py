@@ -50,7 +50,7 @@ def planned(monkeypatch, *plan, of="plan_sampler"):
 def no_render(renderer, monkeypatch):
     from data_gen.frames import shot
 
-    monkeypatch.setattr(rendering, "render_stack", lambda *_, **__: pytest.fail("rendered"))
+    monkeypatch.setattr(rendering, "render", lambda *_, **__: pytest.fail("rendered"))
     monkeypatch.setattr(shot, "render_shot", lambda *_, **__: pytest.fail("rendered"))
 
 
