@@ -22,6 +22,7 @@ from ngpt.io.openexr import read_header
 from ngpt.io.results import MADE_BY
 from ngpt.merging import DIAGNOSTICS, OPTIONS, REQUEST, UNFINISHED, merge
 from ngpt.methods import METHODS
+from ngpt.options import written
 from ngpt.stack import GradientStack
 from ngpt.subpixels import SUBPIXELS
 from ngpt.system.files import save
@@ -102,12 +103,11 @@ def _same(request: RenderRequest, path: Path, attributes: Mapping[str, Any], fra
     if said is None:
         raise NgptError(f"{path}: is another render: its header has no request, as an older ngpt wrote it; {remedy}")
     for what, ours in request.identity(frame).items():
-        # "auto" leaves it open what a sampler or a number of subpixels is: what the file has will do.
-        if said[what] != ours and ours != "auto":
+        if (theirs := said.get(what)) != ours:
             # Names alike differ in the checksum, which says nothing to anybody.
-            alike = what == "scene" and str(said[what]).rpartition(" ")[0] == ours.rpartition(" ")[0]
+            alike = what == "scene" and str(theirs).rpartition(" ")[0] == str(ours).rpartition(" ")[0]
             why = " (its file, -D, --sensor, --camera, --fps or --dt was another)" if alike else ""
-            raise NgptError(f"{path}: is another render: {what} {said[what]}, not {ours}{why}; {remedy}")
+            raise NgptError(f"{path}: is another render: {what} {_said(theirs)}, not {_said(ours)}{why}; {remedy}")
     return said
 
 
@@ -150,3 +150,7 @@ def kept_apart(why: str, stack: GradientStack, path: Path, what: str = "was rend
 
 def _number(value: Any) -> float:
     return float(value) if isinstance(value, int | float | np.number) and math.isfinite(value) else 0.0
+
+
+def _said(value: Any) -> str:
+    return "none" if value is None else written(value)

@@ -13,13 +13,13 @@ from typing import Any
 from data_gen.begun import joined_or_kept, kept_apart, rest_of
 from data_gen.request import RenderRequest
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
-from ngpt.cli.picture import check_image, seen
 from ngpt.errors import NgptError, WrongUse
 from ngpt.image.pictures import check_size
 from ngpt.io.exr import write
 from ngpt.io.openexr import read_header
 from ngpt.io.whole import finished
 from ngpt.methods import reconstruct, runnable
+from ngpt.result_file import Look, check_image, seen, write_result
 from ngpt.stack import GradientStack
 from ngpt.system.files import save
 from ngpt.system.text import by_names
@@ -27,14 +27,10 @@ from ngpt.system.text import by_names
 
 @dataclass(frozen=True)
 class Denoising:
-    """``method`` is a name, or "auto": see ``ngpt.methods.choose``.
-
-    ``transform`` and ``exposure`` say how a picture shows light, as in `ngpt denoise`.
-    """
+    """``method`` is a name, or "auto": see ``ngpt.methods.choose``."""
 
     method: str = "auto"
-    transform: str = "standard"
-    exposure: float | str = 0.0
+    look: Look = field(default_factory=Look)  # of a picture
 
     @property
     def needs_gradients(self) -> bool:
@@ -63,8 +59,6 @@ class Denoising:
 
         What was rendered is not lost where that fails: the stack is written beside ``file``, unless one ``keeps`` it.
         """
-        from ngpt.cli.denoise_files import Frame, write_frame  # imports metrics, which a stack does not need
-
         try:
             pixels = seen(stack.place)
             check_size(file, pixels.width, pixels.height)
@@ -78,9 +72,9 @@ class Denoising:
             # What stands for standard output goes when the command ends.
             lasting = file if by_names(str(file)) == str(file) else Path(file.name)
             raise kept_apart(why, stack, lasting.with_name(f"{file.stem}.stack.exr")) from error
-        frame = Frame(Path(stack.path), file, stack, result)
-        write_frame(frame, overwrite, self.transform, self.exposure, keep=True)
-        return result.attributes
+        views, made = [(result.image, stack)], result.attributes
+        save(file, lambda path, overwrite: write_result(path, views, made, self.look, overwrite), overwrite)
+        return made
 
 
 @dataclass(frozen=True)
@@ -108,7 +102,7 @@ class Output:
     def check(self) -> None:
         """Raises WrongUse for files that cannot be such."""
         if self.denoising is not None:
-            check_image(self.file, self.denoising.transform)
+            check_image(self.file, self.denoising.look.transform)
         for path in (self.kept, None if self.denoising else self.file):
             if path is not None and path.suffix.lower() != ".exr":
                 raise WrongUse(

@@ -24,20 +24,6 @@ from ngpt.merging import REQUEST
 from ngpt.options import as_text
 
 DEFAULT_SPP = 32
-# What a canonical request leaves out, field by field, and what messages call it then
-_DEFAULTS = {
-    "scene": "unknown",
-    "frame": "none",
-    "size": "the scene's own",
-    "seed": "0",
-    "sampler": "auto",
-    "options": "none",
-    "adaptive": "no",
-    "unbiased": "no",
-    "subpixels": "auto",
-    "colours": "rgb",
-    "diagnostics": "no",
-}
 # Parts of a variant's name that say where and how precisely it computes, and nothing of the light
 _MACHINES = {"scalar", "llvm", "cuda", "metal", "ad", "double"}
 
@@ -121,7 +107,8 @@ class RenderRequest:
         # What is made over time of a shot may need gradients.
         self._set("gradients", self.gradients or bool(self.frames))
         remembers = FRAME_SAMPLERS.get(self.sampler) if self.frames else None
-        if self.spp is None and (remembers or not self.limited):
+        timed = self.seconds is not None or self.cpu_seconds is not None
+        if self.spp is None and (remembers or not (timed or self.error is not None)):
             self._set("spp", remembers.spp if remembers else DEFAULT_SPP)
         if not isinstance(self.scene, str) and (self.size or self.parameters or self.sensor is not None):
             raise NgptError("size, parameters and sensor of a loaded scene are fixed; give them to data_gen.load_scene")
@@ -135,7 +122,7 @@ class RenderRequest:
         if remembers is None and self.sampler != "auto":
             find(self.sampler)
         check_options(self.sampler, self.options)
-        if self.method is not None and not (self.shares or self.open):
+        if self.method is not None and not (self.shares or (timed and self.sampler == "auto" and self.spp is None)):
             raise WrongUse(
                 "--for needs --adaptive or --error; or give --time without --sampler and --spp, and a pilot chooses "
                 "the sampler for it"
@@ -153,58 +140,41 @@ class RenderRequest:
         object.__setattr__(self, name, value)
 
     @property
-    def limited(self) -> bool:
-        """Whether anything but a number of samples ends the render."""
-        return (self.seconds, self.cpu_seconds, self.error) != (None, None, None)
-
-    @property
     def shares(self) -> bool:
         """Whether pixels get different numbers of samples."""
         return self.adaptive or self.error is not None
 
     @property
-    def open(self) -> bool:
-        """Whether a time is all that is said of samples and sampler, so that a pilot may choose both."""
-        timed = self.seconds is not None or self.cpu_seconds is not None
-        return timed and self.sampler == "auto" and self.spp is None
-
-    @property
     def budget(self) -> Budget:
         memory = DEFAULT_MEMORY if self.memory is None else self.memory
-        if self.cpu_seconds is not None:
-            return Budget(self.spp, self.cpu_seconds, memory, time.process_time)
-        return Budget(self.spp, self.seconds, memory, wall)
+        if self.cpu_seconds is None:
+            return Budget(self.spp, self.seconds, memory, wall)
+        return Budget(self.spp, self.cpu_seconds, memory, time.process_time)
 
     def header(self, frame: int | None = None) -> dict[str, str]:
         """The attribute of the header that says what was asked for, of a ``frame`` or an image, in canonical form."""
-        said = {name: value for name, value in self.identity(frame).items() if value != _DEFAULTS[name]}
-        budget = {"spp": self.spp, "seconds": self.seconds, "cpu_seconds": self.cpu_seconds, "error": self.error}
-        known = {name: value for name, value in budget.items() if value is not None}
-        return {REQUEST: json.dumps({**said, **known}, sort_keys=True)}
+        budget = {"spp": self.spp, "seconds": self.seconds, "error": self.error}
+        return {REQUEST: json.dumps(self.identity(frame) | budget, sort_keys=True)}
 
-    def identity(self, frame: int | None = None) -> dict[str, str]:
+    def identity(self, frame: int | None = None) -> dict[str, Any]:
         """All that decides which image is rendered: requests of equal identities may continue each other."""
         entry = FRAME_SAMPLERS.get(self.sampler) or SAMPLERS.get(self.sampler)
-        settings = entry.unusual(entry.settings(self.options)) if entry else as_text(self.options)
-        yes = {False: "no", True: "yes"}
         return {
-            "scene": self._scene(frame),
-            "frame": _DEFAULTS["frame"] if frame is None else str(frame),
-            "size": "{}x{}".format(*self.size) if self.size else _DEFAULTS["size"],
-            "seed": str(self.seed),
+            "scene": self._scene(frame) if isinstance(self.scene, str) else None,
+            "frame": frame,
+            "size": self.size and "{}x{}".format(*self.size),
+            "seed": self.seed,
             "sampler": self.sampler,
-            "options": settings or _DEFAULTS["options"],
-            "adaptive": f"for '{self.method or 'auto'}'" if self.adaptive else _DEFAULTS["adaptive"],
-            "unbiased": yes[self.unbiased],
-            "subpixels": str(self.subpixels),
+            "options": (entry.unusual(entry.settings(self.options)) if entry else as_text(self.options)) or None,
+            "adaptive": (self.method or "auto") if self.adaptive else None,
+            "unbiased": self.unbiased,
+            "subpixels": self.subpixels,
             "colours": " ".join(part for part in str(self.variant).split("_") if part not in _MACHINES),
-            "diagnostics": yes[self.diagnostics],
+            "diagnostics": self.diagnostics,
         }
 
     def _scene(self, frame: int | None) -> str:
         """The scene's name, and a checksum of its file and of all that changes it; meshes and textures do not count."""
-        if not isinstance(self.scene, str):
-            return _DEFAULTS["scene"]
         given = dict(self.parameters) | ({} if self.sensor is None else {"--sensor": str(self.sensor)})
         scene = self.scene
         if frame is not None:
@@ -222,12 +192,12 @@ class RenderRequest:
 
 
 def said_by(attributes: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The canonical request in the header of a file: its identity and its budget; None if it has none."""
+    """The canonical request in the header of a file, with its budget; None if it has none."""
     try:
         said = json.loads(str(attributes.get(REQUEST, "")))
     except ValueError:
         return None
-    return _DEFAULTS | said if isinstance(said, dict) else None
+    return said if isinstance(said, dict) else None
 
 
 FIELDS = {each.name: each.default for each in fields(RenderRequest)}

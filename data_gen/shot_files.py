@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from concurrent.futures import as_completed
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -72,8 +73,9 @@ def write_frames(
     begun = _begun(outputs) if skip_existing else []
     gone_on = {frame for _, frames in begun for frame in frames}
 
+    @cache
     def begins() -> None:
-        for folder in dict.fromkeys(files[frame].parent for frame in ours):
+        for folder in {files[frame].parent for frame in ours}:
             make_folder(folder)
         made(written, len(ours))
 
@@ -96,7 +98,8 @@ def write_frames(
         written.frames.append(report_of(stack, files[frame], by) | said)
         made(written, len(ours))
 
-    progress = _once(begins)
+    def progress(frame: int) -> Callable[[int, int], None]:
+        return lambda done, total: begins()
 
     def write_all(part: RenderRequest, skip: Callable[[int], bool]) -> None:
         try:
@@ -178,14 +181,3 @@ def _check(file: Path, overwrite: bool) -> None:
     """``check_output``, for a file whose folder need not be there."""
     if file.parent.exists():
         check_output(file, overwrite, may_skip=True)
-
-
-def _once(begins: Callable[[], None]) -> Callable[[int], Callable[[int, int], None]]:
-    """The ``progress`` of frames that calls ``begins`` when the first of them begins."""
-    waiting = [begins]
-
-    def progress(done: int, total: int) -> None:
-        while waiting:
-            waiting.pop()()
-
-    return lambda frame: progress

@@ -22,6 +22,7 @@ ngpt.classical ngpt.merging
 ngpt.denoisers
 ngpt.network
 ngpt.methods
+ngpt.result_file
 ngpt.sequence
 ngpt.api ngpt.measure
 ngpt.report

@@ -19,12 +19,12 @@ from data_gen.request import FIELDS, RenderRequest
 from data_gen.session import render_scene, stop_on_ctrl_c
 from data_gen.shot_files import Written, report_of, write_frames, write_frames_on_cluster
 from ngpt.cli.arguments import output_file, print_json
-from ngpt.cli.picture import IMAGES
 from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.whole import finished
 from ngpt.merging import UNFINISHED
 from ngpt.methods import choose
+from ngpt.result_file import IMAGES, Look
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 from ngpt.system.interrupts import Interrupt
@@ -60,7 +60,7 @@ def denoising_of(args: argparse.Namespace) -> Denoising | None:
     method = args.denoise if args.denoise not in (None, "auto") else args.method or "auto"
     if args.error is not None and args.method is None and method != "auto":
         args.method = method  # the error is measured on the image
-    denoising = Denoising(method, args.transform, args.exposure)
+    denoising = Denoising(method, Look(args.transform, args.exposure))
     denoising.check(args.sampler, args.spp)
     return denoising
 

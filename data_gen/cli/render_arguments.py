@@ -20,9 +20,10 @@ from ngpt.cli.arguments import (
     relative,
     size,
 )
-from ngpt.cli.picture import IMAGES, add_look
+from ngpt.cli.picture import add_look
 from ngpt.errors import WrongUse
 from ngpt.methods import METHODS
+from ngpt.result_file import IMAGES
 from ngpt.subpixels import CHOICES
 
 
