@@ -54,28 +54,6 @@ class Denoising:
                 f"method '{self.method}' needs variances, and one sample per pixel has none: --spp 2 or more"
             )
 
-    def write(self, file: Path, stack: GradientStack, overwrite: bool, keeps: bool) -> dict[str, Any]:
-        """Makes and writes the image, and returns the attributes that say what made it.
-
-        What was rendered is not lost where that fails: the stack is written beside ``file``, unless one ``keeps`` it.
-        """
-        try:
-            pixels = seen(stack.place)
-            check_size(file, pixels.width, pixels.height)
-            result = reconstruct(stack, self.method)
-        except Exception as error:  # methods may come from other packages, and fail in any way
-            if keeps:
-                raise
-            why = str(error)
-            if not isinstance(error, NgptError):
-                why = f"method '{self.method}' failed: {type(error).__name__}: {error}".rstrip(": ")
-            # What stands for standard output goes when the command ends.
-            lasting = file if by_names(str(file)) == str(file) else Path(file.name)
-            raise kept_apart(why, stack, lasting.with_name(f"{file.stem}.stack.exr")) from error
-        views, made = [(result.image, stack)], result.attributes
-        save(file, lambda path, overwrite: write_result(path, views, made, self.look, overwrite), overwrite)
-        return made
-
 
 @dataclass(frozen=True)
 class Output:
@@ -99,8 +77,8 @@ class Output:
     def stack(self) -> Path:
         return self.kept or self.file
 
-    def check(self) -> None:
-        """Raises WrongUse for files that cannot be such."""
+    def check(self, skip_existing: bool) -> None:
+        """Raises WrongUse for files that cannot be such, or that cannot say what is there of a render."""
         if self.denoising is not None:
             check_image(self.file, self.denoising.look.transform)
         for path in (self.kept, None if self.denoising else self.file):
@@ -110,19 +88,20 @@ class Output:
                 )
         if self.kept is not None and self.kept.resolve() == self.file.resolve():
             raise WrongUse(f"--keep {self.kept}: is the file of the image; give another name, or leave --keep out")
-
-    def check_skipping(self) -> None:
-        """Raises WrongUse where nothing could tell what is there of a render."""
-        if self.request.cpu_seconds is not None:
+        if skip_existing and self.request.cpu_seconds is not None:
             raise WrongUse("--skip-existing: no file says how much processor time it took; give --time or --spp")
-        if self.stack.suffix.lower() != ".exr":
+        if skip_existing and self.stack.suffix.lower() != ".exr":
             raise WrongUse(
                 f"{self.file}: --skip-existing checks only OpenEXR files; keep the stack too: --keep FILE.exr"
             )
 
-    def rest(self) -> RenderRequest | None:
-        """What is left to render of the file's stack, which is whole, None if nothing is; raises NgptError if the stack
-        is of another request, or of no use for the image."""
+    def left(self) -> RenderRequest | None:
+        """What is left to render: all, if no whole file is there, or the rest; None: nothing.
+
+        Raises NgptError if the file's stack is of another request, or of no use for the image.
+        """
+        if not finished(self.stack):
+            return self.request
         rest = rest_of(self.request, self.stack, self.frame)
         for_whom = self.denoising or Denoising(self.request.method or "auto")
         for_whom.check(str(read_header(self.stack)[0].get("ngpt:sampler", "")), None, str(self.stack))
@@ -134,7 +113,7 @@ class Output:
         Raises NgptError where a stack is there in place of its image, or the image of another method.
         """
         try:
-            if not finished(self.stack) or rest_of(self.request, self.stack, self.frame) is not None:
+            if self.left() is not None:
                 return False
         except NgptError:
             return False
@@ -171,12 +150,32 @@ class Output:
         return stack, self.image(stack, overwrite) if self.denoising else {}
 
     def image(self, stack: GradientStack, overwrite: bool) -> dict[str, Any]:
+        """Makes and writes the image, and returns the attributes that say what made it.
+
+        What was rendered is not lost where that fails: unless the stack is kept, it is written beside the image.
+        """
         assert self.denoising is not None
         # Dr.Jit keeps the memory of a render for the next one: at 1920x1080 more than a method takes.
         import drjit as dr
 
         dr.flush_malloc_cache()
-        return self.denoising.write(self.file, stack, overwrite, keeps=self.kept is not None)
+        file, method, look = self.file, self.denoising.method, self.denoising.look
+        try:
+            pixels = seen(stack.place)
+            check_size(file, pixels.width, pixels.height)
+            result = reconstruct(stack, method)
+        except Exception as error:  # methods may come from other packages, and fail in any way
+            if self.kept is not None:
+                raise
+            why = str(error)
+            if not isinstance(error, NgptError):
+                why = f"method '{method}' failed: {type(error).__name__}: {error}".rstrip(": ")
+            # What stands for standard output goes when the command ends.
+            lasting = file if by_names(str(file)) == str(file) else Path(file.name)
+            raise kept_apart(why, stack, lasting.with_name(f"{file.stem}.stack.exr")) from error
+        views, made = [(result.image, stack)], result.attributes
+        save(file, lambda path, overwrite: write_result(path, views, made, look, overwrite), overwrite)
+        return made
 
 
 def _readable(file: Path) -> bool:

@@ -64,9 +64,7 @@ def write_frames(
     ours = [frame for frame in files if part_of[frame] == number]
     outputs = {frame: Output(request, files[frame], denoising, frame=frame) for frame in ours}
     for frame, output in outputs.items():
-        output.check()
-        if skip_existing:
-            output.check_skipping()
+        output.check(skip_existing)
         _check(files[frame], overwrite or skip_existing)
     written = Written()
     # Begun frames come first, grouped by what is left of them: the scene stays in memory.
@@ -83,7 +81,7 @@ def write_frames(
         # Only when its turn has come, for several machines may be at work on one shot.
         if part_of[frame] != number or frame in gone_on:
             return True
-        there = skip_existing and finished(files[frame]) and outputs[frame].rest() is None and outputs[frame].done()
+        there = skip_existing and outputs[frame].left() is None and outputs[frame].done()
         written.skipped += there
         return there
 
@@ -169,7 +167,7 @@ def _begun(outputs: Mapping[int, Output]) -> list[tuple[RenderRequest, list[int]
     """What is left of frames that were begun, and the frames of which it is."""
     begun: list[tuple[RenderRequest, list[int]]] = []
     for frame, output in outputs.items():
-        if finished(output.file) and (rest := output.rest()):
+        if (rest := output.left()) is not None and rest is not output.request:
             frames = next((frames for other, frames in begun if other == rest), None)
             if frames is None:
                 begun.append((rest, frames := []))

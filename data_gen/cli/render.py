@@ -21,7 +21,6 @@ from data_gen.shot_files import Written, report_of, write_frames, write_frames_o
 from ngpt.cli.arguments import output_file, print_json
 from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
-from ngpt.io.whole import finished
 from ngpt.merging import UNFINISHED
 from ngpt.methods import choose
 from ngpt.result_file import IMAGES, Look
@@ -87,25 +86,23 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
     target = Path(args.output or f"{Path(args.scene).stem}.exr")
     request = request_of(args, denoising)
     output = Output(request, target, denoising, Path(args.keep) if args.keep else None)
-    output.check()
+    output.check(args.skip_existing)
     for file in {target, output.stack}:
         output_file(file, args)
-    begun, there = None, output.stack.exists()
-    if args.skip_existing:
-        output.check_skipping()
-    if args.skip_existing and finished(output.stack):
-        rest = output.rest()
-        if rest is None and output.done():
-            console.say(f"{target}: skipped: the {'stack' if denoising is None else 'image'} is there")
-            return 0
-        begun = begun_stack(output.stack)
-        if rest is None:
-            made = output.image(begun, overwrite=True)
-            console.say(f"{output.stack} -> {target}: {described(made)}; the stack was there")
-            return 0
-        request = rest
+    there = output.stack.exists()
+    left = output.left() if args.skip_existing else request
+    if left is None and output.done():
+        console.say(f"{target}: skipped: the {'stack' if denoising is None else 'image'} is there")
+        return 0
+    begun = None if left is request else begun_stack(output.stack)
+    if left is None:
+        assert begun is not None
+        made = output.image(begun, overwrite=True)
+        console.say(f"{output.stack} -> {target}: {described(made)}; the stack was there")
+        return 0
+    if begun is not None:
         console.say(f"{output.stack}: has {begun.attributes['ngpt:spp']} samples per pixel; going on with it")
-    with rendering(args, request, denoising, console) as (stack, failed, stop, looking):
+    with rendering(args, left, denoising, console) as (stack, failed, stop, looking):
         # Within it: the samples of an hour are not lost to a signal that comes while they are written.
         if args.skip_existing and not there and output.done():
             console.say(f"{target}: skipped: it is there by now, of another process")

@@ -155,8 +155,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 def denoise(args: argparse.Namespace, console: Console) -> int:
     pairs = output_paths(arguments.stack_files(args.stacks), args.output)
-    files, options = asked(args, pairs)
-    reference = Reference.read(args.ref, args.untrusted) if args.ref else None
+    files, options, reference = asked(args, pairs)
     # One stack has no progress to tell, but somebody who looks on sees that it is at work.
     bar = console.progress("denoise", "frames") if len(pairs) > 1 or console.terminal else nullcontext(_unseen)
     frames = results(args, pairs, files, options, reference, console)
@@ -192,8 +191,10 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
     return 1 if failed else 0
 
 
-def asked(args: argparse.Namespace, pairs: list[tuple[Path, Path]]) -> tuple[dict[str, str], dict[str, Any]]:
-    """Files of further layers, and the method's options; raises an error for what cannot be done."""
+def asked(
+    args: argparse.Namespace, pairs: list[tuple[Path, Path]]
+) -> tuple[dict[str, str], dict[str, Any], Reference | None]:
+    """Files of further layers, the method's options, and the reference; raises an error for what cannot be done."""
     files = arguments.given_files(args)
     if len(pairs) > 1 and (files or args.halves):
         of_one = f"--{next(iter(files))} belongs" if files else "--halves belong"
@@ -206,11 +207,12 @@ def asked(args: argparse.Namespace, pairs: list[tuple[Path, Path]]) -> tuple[dic
     names = ("alpha", "weights", "device", "memory")
     options = {name: getattr(args, name) for name in names if getattr(args, name) is not None} | dict(args.option)
     check_request(args.method, options)
+    reference = Reference.read(args.ref, args.untrusted) if args.ref else None
     for _, target in pairs:
         if target.suffix.lower() != ".exr":
             check_picture(target, args)
         arguments.output_file(target, args)
-    return files, options
+    return files, options, reference
 
 
 def results(
