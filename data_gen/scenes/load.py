@@ -157,7 +157,7 @@ def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int |
     # In parallel objects are numbered as they come, which differs from process to process, and with it the kernel: it
     # would be compiled again.
     config.parallel = False
-    with _found_beside(path):
+    with found_beside(path):
         state = mi.parser.parse_file(config, path, **parameters)
         mi.parser.transform_all(config, state)
         if state.root.props.plugin_name() == "scene":
@@ -184,7 +184,7 @@ def _keep(state: mi.parser.ParserState, sensor: int | str, path: str) -> None:
 
 
 @contextmanager
-def _found_beside(path: str):
+def found_beside(path: str):
     """While in it, files that a scene names are looked for beside it first."""
     resolver = mi.file_resolver()
     before = list(resolver)

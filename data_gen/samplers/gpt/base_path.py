@@ -154,10 +154,10 @@ def base_step(
     to_light = x.to_local(light.d)
     E_light: Any = None
     E_p: Any = None
-    if recording is None:
+    both = matt_too(plan, path, recording)
+    if both is None:
         f, p, sample, f_p = media.evaluate_and_sample(bsdf, x, place, to_light, u_lobe, u_direction)
     else:
-        both = recording.here & ~plan.matt.lambertian(x, recording.here)
         f, p, sample, f_p = matt.evaluate_and_sample(bsdf, x, to_light, u_lobe, u_direction, both)
     survival_of_rest = mi.Float(1)
     if path.ρ is not None:
@@ -304,6 +304,22 @@ def brightest(β1: mi.Spectrum, f_p: mi.Spectrum, offsets: list) -> mi.Float:
         ahead = dr.select(y.apart | y.joined, dr.max(y.β) / (1 + y.r), 0)
         largest = dr.fmax(largest, dr.fmax(ahead, dr.max(dr.abs(y.a * f_p)) / 2))
     return largest
+
+
+def matt_too(plan: Plan, path: Path, recording: Recording | None) -> mi.Bool | None:
+    """Where the next direction must be one that a matt surface scatters into, though the material might not sample it;
+    None for nowhere.
+
+    A record is what arrives at a matt surface. And behind a vertex that has been answered for as one, the rest is
+    negative where the material, tilted by a bump or normal map, scatters nothing: all of these directions count.
+    """
+    x, both = path.x, None
+    if path.ρ is not None and plan.matt.any_tilted:
+        both = plan.matt.tilted(x, dr.max(path.ρ) > 0)
+    if recording:
+        here = recording.here & ~plan.matt.lambertian(x, recording.here)
+        both = here if both is None else here | both
+    return both
 
 
 def rest(f: mi.Spectrum, ended: mi.Spectrum) -> tuple[mi.Spectrum, mi.Float]:
