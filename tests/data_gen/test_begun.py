@@ -144,6 +144,11 @@ def test_shared_tails_are_as_asked_for_unless_unbiased(tmp_path):
             assert left(path, spp=336, **given) is None and left(path, spp=400, **given).spp == 64
             with pytest.raises(NgptError, match="unbiased false, not true"):
                 left(path, spp=336, unbiased=True, **given)
+    # Whole paths and then shared ones are biased too. Nobody asked for what is merged by hand.
+    there(path, box(), samplerOptions="tails=shared")
+    merged = ngpt.merge([ngpt.read(there(tmp_path / "b.exr", box(seed=4), seed="4")), ngpt.read(path)])
+    assert merged.attributes["ngpt:samplerOptions"] == "tails=shared, tails=paths"
+    assert said_by(merged.attributes) is None
 
 
 def test_parts_and_frames_have_seeds_of_their_own():
