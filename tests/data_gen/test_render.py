@@ -108,7 +108,7 @@ def test_attributes_tell_how_it_was_made(renderer):
 
 
 def means(spp=256):
-    stack = render_stack(load_scene("lens", (12, 8)), spp, sampler="gpt", unbiased=True)
+    stack = render_stack(load_scene("lens", (12, 8)), spp, gradients=True, unbiased=True)
     return {name: stack[name].mean(axis=(0, 1)) for name in stack.names}
 
 
