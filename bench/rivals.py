@@ -110,7 +110,7 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterato
         reference = reference_of(load_scene(file, size), name, args)
         for render in RENDERS:
             gc.collect()  # a kernel knows the shapes of all scenes in memory
-            ways = ours(file, size, render) if render not in POINTS else mitsubas(file, size, POINTS[render])
+            make = by_default(file, size) if render == "default" else by_ways(images_of(file, size, render))
             warm = False
             for spp in args.spp:
                 for seed in args.seeds:
@@ -119,43 +119,68 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterato
                         continue
                     if not warm:
                         # The default has subpixels, and so other kernels, from FEWEST samples on.
-                        for few in (WARM_SPP, FEWEST) if render == "default" else (WARM_SPP,):
-                            warm = bool([make(few, 0) for make in ways.values()])
-                    yield cell | {"ways": {way: judged(make, spp, seed, reference) for way, make in ways.items()}}
+                        warm = bool([make(few, 0) for few in (WARM_SPP, FEWEST)])
+                    yield cell | {"ways": {way: judged(*made, reference) for way, made in make(spp, seed).items()}}
 
 
-def judged(make: Callable, spp: int, seed: int, reference: Reference) -> dict[str, float]:
-    image, seconds = make(spp, seed)
+Made = dict[str, tuple[np.ndarray, float]]  # by way: the image and its whole seconds
+
+
+def judged(image: np.ndarray, seconds: float, reference: Reference) -> dict[str, float]:
     found = scores(["relMSE trimmed", "FLIP"], image, *reference.images)
     return {"seconds": seconds, "error": found["relMSE trimmed"], "FLIP": found["FLIP"]}
 
 
-def ours(file: str, size: tuple[int, int], render: str) -> dict[str, Callable]:
-    """By way: what makes an image of so many samples and a seed; returns it, and its whole seconds."""
+def by_default(file: str, size: tuple[int, int]) -> Callable[[int, int], Made]:
     load_scene, render_stack = renderer()
     from data_gen.choosing.plans import plan_sampler
 
     scene = load_scene(file, size)
-    if render == "default":
 
-        def by_default(spp: int, seed: int) -> tuple[np.ndarray, float]:
+    def make(spp: int, seed: int) -> Made:
+        start = processor_seconds()
+        plan = plan_sampler(scene, spp, None)
+        how = {"unbiased": False, "subpixels": "auto", **plan.options}
+        image = ngpt.reconstruct(render_stack(scene, spp, seed, plan.sampler, **how), plan.method or "auto").image
+        return {"default": (image, processor_seconds() - start)}
+
+    return make
+
+
+def by_ways(images: Callable[[int, int, int], Images]) -> Callable[[int, int], Made]:
+    def make(spp: int, seed: int) -> Made:
+        rendered, made = {}, {}
+        for k in sorted({k for k, _ in WAYS.values()}):
             start = processor_seconds()
-            plan = plan_sampler(scene, spp, None)
-            how = {"unbiased": False, "subpixels": "auto", **plan.options}
-            image = ngpt.reconstruct(render_stack(scene, spp, seed, plan.sampler, **how), plan.method or "auto").image
-            return image, processor_seconds() - start
+            rendered[k] = images(spp, seed, k), processor_seconds() - start
+        for way, (k, auxiliary) in WAYS.items():
+            given, seconds = rendered[k]
+            start = processor_seconds()
+            features = {"albedo": given.albedo, "normal": given.normal}
+            image = ngpt.denoise(given.primal, "oidn", auxiliary=auxiliary, **features)
+            image = means(image, k) if k > 1 else image
+            made[way] = image, seconds + processor_seconds() - start
+        return made
 
-        return {"default": by_default}
+    return make
+
+
+def images_of(file: str, size: tuple[int, int], render: str) -> Callable[[int, int, int], Images]:
+    """What renders so many samples per pixel by a seed, at K times the size."""
+    if render in POINTS:
+        return mitsubas(file, size, POINTS[render])
+    load_scene, render_stack = renderer()
+    scene = load_scene(file, size)
 
     def images(spp: int, seed: int, k: int) -> Images:
         stack = render_stack(scene, spp, seed, "primal", unbiased=True, subpixels=k)
         return Images(*((stack.fine if k > 1 else stack)[layer] for layer in Images._fields))
 
-    return {way: denoised(images, *how) for way, how in WAYS.items()}
+    return images
 
 
-def mitsubas(file: str, size: tuple[int, int], points: str) -> dict[str, Callable]:
-    """As ``ours``, rendered by Mitsuba."""
+def mitsubas(file: str, size: tuple[int, int], points: str) -> Callable[[int, int, int], Images]:
+    """As ``images_of``, by Mitsuba itself."""
     import mitsuba as mi
 
     scenes = {k: mitsuba_scene(file, (k * size[0], k * size[1]), points) for k in (1, 2)}
@@ -167,18 +192,7 @@ def mitsubas(file: str, size: tuple[int, int], points: str) -> dict[str, Callabl
         # Behind the channels of the film, of which a fourth is alpha
         return Images(*(np.ascontiguousarray(each) for each in (layers[..., :3], layers[..., -6:-3], layers[..., -3:])))
 
-    return {way: denoised(images, *how) for way, how in WAYS.items()}
-
-
-def denoised(images: Callable[[int, int, int], Images], k: int, auxiliary: str) -> Callable:
-    def make(spp: int, seed: int) -> tuple[np.ndarray, float]:
-        start = processor_seconds()
-        given = images(spp, seed, k)
-        features = {"albedo": given.albedo, "normal": given.normal}
-        image = ngpt.denoise(given.primal, "oidn", auxiliary=auxiliary, **features)
-        return means(image, k) if k > 1 else image, processor_seconds() - start
-
-    return make
+    return images
 
 
 def mitsuba_scene(file: str, size: tuple[int, int], points: str) -> Any:
@@ -207,7 +221,7 @@ def mitsuba_scene(file: str, size: tuple[int, int], points: str) -> Any:
                 for node in nodes:
                     node.props.set_plugin_name(name)
                     for key in list(node.props.keys()) if name == "box" else ():
-                        node.props.remove_property(key)
+                        del node.props[key]
             mi.parser.transform_all(config, state)
             # Else Mitsuba would be slow where a scene has many meshes.
             merge(config, state)

@@ -15,8 +15,10 @@ from unbiased import light_of_gradients, load
 
 import data_gen
 import ngpt
+from data_gen import passes
 from data_gen.adaptive import Adaptive
 from data_gen.render import render_stack
+from data_gen.samplers.gpt import rounds
 from data_gen.scenes import builtin
 from data_gen.tails import cache, schedule
 from data_gen.tails.cache import LEAST
@@ -213,6 +215,20 @@ def test_records_of_earlier_rounds_fade(renderer, monkeypatch):
     monkeypatch.setattr(cache.Cache, "fade", lambda self: None)
     images.append(render_stack(scene, 32, 1, "primal", tails="shared")["primal"])
     assert not np.array_equal(*images) and np.mean(images[0]) == pytest.approx(np.mean(images[1]), rel=0.02)
+
+
+def test_paths_that_feed_have_random_numbers_of_their_own(renderer, monkeypatch):
+    """Else a path of the image would end in the light that the same path has found."""
+    seeds = {}
+    for module in (passes, rounds):
+
+        def camera(sensor, seed, *args, name=module.__name__, real=module.CameraSamples, **named):
+            seeds.setdefault(name, set()).add(seed)
+            return real(sensor, seed, *args, **named)
+
+        monkeypatch.setattr(module, "CameraSamples", camera)
+    render_stack(load(renderer, "diffuse", (32, 24)), 16, 5, "primal", tails="shared")
+    assert len(seeds) == 2 and not set.intersection(*seeds.values())
 
 
 def test_the_noise_of_the_cache_is_of_its_own_seed(renderer):

@@ -44,6 +44,7 @@ MATERIALS = {
     "leaf": lambda: {"type": "principledthin", "roughness": 0.5, "diff_trans": 0.8},
     "metal and grey": lambda: {"type": "blendbsdf", "weight": 0.9, "grey": GREY, "metal": METAL},
     "plastic and grey": lambda: {"type": "blendbsdf", "weight": 0.5, "grey": GREY, "plastic": {"type": "plastic"}},
+    "mirror and grey": lambda: {"type": "blendbsdf", "weight": 0.2, "grey": GREY, "mirror": {"type": "conductor"}},
     "mask": lambda: {"type": "mask", "opacity": 0.6, "grey": GREY},
     "two-sided": lambda: {"type": "twosided", "front": GREY, "back": {"type": "plastic"}},
     "bumps": lambda: {"type": "bumpmap", "bumps": _picture(0, 0.02, 0.02, 0), "grey": GREY},

@@ -210,8 +210,8 @@ def base_step(
     if path.ρ is not None:
         E_p = dr.select(goes_on, E_p * survival, 0)
     if recording:
-        # What follows is light of the record, however dark the surface is.
-        β1 = dr.select(recording.here, E_p * segment.weight, β1)
+        # What follows is light of the record, however dark the surface is; and behind a mirror, of earlier ones only.
+        β1 = dr.select(recording.here, dr.maximum(β1, E_p * segment.weight), β1)
     # After a mirror emitter sampling could not have found x1: p_light = 0, and m = 1.
     aim, passed, seen_by, sampled, p_x1 = None, None, x, kind == SMOOTH, sample.pdf
     if path.aim is not None:
