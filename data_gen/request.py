@@ -195,7 +195,7 @@ def said_by(attributes: Mapping[str, Any]) -> dict[str, Any] | None:
     """The canonical request in the header of a file, with its budget; None if it has none."""
     try:
         said = json.loads(str(attributes.get(REQUEST, "")))
-    except ValueError:
+    except (ValueError, RecursionError):  # whoever wrote the file
         return None
     return said if isinstance(said, dict) else None
 

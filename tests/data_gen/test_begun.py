@@ -100,13 +100,17 @@ def test_a_file_of_another_render_is_neither_taken_nor_replaced(tmp_path):
     with pytest.raises(NgptError, match=r"another render: scene box \w+, not box \w+"):
         file.write_text("<scene> </scene>")
         rest_of(asked, path)
-    shot = RenderRequest("box", 9, 3, "gpt", options=uniform, frames=(7,))
-    there(path, box(options=uniform))
-    with pytest.raises(NgptError, match=r"scene box \w+, not box \w+|frame none, not 7"):
-        rest_of(shot, path, 7)
+    shot = RenderRequest("box", 9, 3, "gpt", frames=(7, 8))
+    there(path, request=shot.header(7)["ngpt:request"])
+    assert rest_of(shot, path, 7) is None
+    with pytest.raises(NgptError, match="frame 7, not 8"):
+        rest_of(shot, path, 8)
 
 
-@pytest.mark.parametrize("request_", [{}, {"request": "no json"}, {"request": "[1]"}, {"scene": "box 1", "time": 9.0}])
+@pytest.mark.parametrize(
+    "request_",
+    [{}, {"request": "no json"}, {"request": "[1]"}, {"request": 9**5 * "["}, {"scene": "box 1", "time": 9.0}],
+)
 def test_a_file_without_a_request_is_neither_taken_nor_replaced(tmp_path, request_):
     path = there(tmp_path / "a.exr", **request_)
     with pytest.raises(NgptError, match=r"a.exr: is another render: its header has no request.* or --force in place"):
