@@ -110,19 +110,19 @@ def bench_scene(scene_file: str, name: str, args: argparse.Namespace) -> dict | 
         dr.sync_thread()
 
     compiled = {"path": compile_seconds(lambda: path(0))}
-    compiled["gpt"] = compile_seconds(lambda: render_stack(scene, args.spp, 0, unbiased=True))
+    compiled["gpt"] = compile_seconds(lambda: render_stack(scene, args.spp, 0, "gpt", unbiased=True))
     seconds: dict[str, list[float]] = {"path": [], "gpt": []}
     for seed in range(args.repeats):
         start = time.perf_counter()
         path(seed)
         between = time.perf_counter()
-        render_stack(scene, args.timing_spp, seed, unbiased=True)
+        render_stack(scene, args.timing_spp, seed, "gpt", unbiased=True)
         seconds["path"].append(between - start)
         seconds["gpt"].append(time.perf_counter() - between)
     ratios = [ours / theirs for ours, theirs in zip(seconds["gpt"], seconds["path"], strict=True)]
     cost = summary(ratios)
     spp = max(1, round(args.spp * cost["median"]))
-    stacks = [render_stack(scene, args.spp, seed, unbiased=True) for seed in range(args.repeats)]
+    stacks = [render_stack(scene, args.spp, seed, "gpt", unbiased=True) for seed in range(args.repeats)]
     file = args.cache / f"{name}-reference-{size[0]}x{size[1]}-{args.reference_seconds:g}s.exr"
     reference = kept(
         file, lambda: render_stack(scene, None, REFERENCE_SEED, "primal", seconds=args.reference_seconds, unbiased=True)

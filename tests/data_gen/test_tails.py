@@ -245,13 +245,13 @@ def test_the_noise_of_the_cache_is_of_its_own_seed(renderer):
 def test_frames_have_one_cache(renderer, monkeypatch):
     from data_gen.frames import shot
 
-    seeds, render = [], shot.render_stack
+    seeds, render = [], shot.render
 
-    def noted(*args, tails_seed, **options):
-        seeds.append((args[2], tails_seed))
-        return render(*args, tails_seed=tails_seed, **options)
+    def noted(scene, request, watch, tails_seed):
+        seeds.append((request.seed, tails_seed))
+        return render(scene, request, watch, tails_seed=tails_seed)
 
-    monkeypatch.setattr(shot, "render_stack", noted)
+    monkeypatch.setattr(shot, "render", noted)
     list(data_gen.render_frames("diffuse", [0, 1], 1, seed=5, sampler="primal", size=(8, 6)))
     (first, of_tails), (second, again) = seeds
     assert first != second and of_tails == again == 5
