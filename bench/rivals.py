@@ -14,7 +14,7 @@ What rivals render, OIDN denoises in each of the WAYS: at K times the size, and 
 denoises them first), clean or noisy. An image at twice the size is then scaled down. Each cell has, by way:
 
     seconds  of processors, of the render and of OIDN, both warmed up
-    error    relMSE by two halves of a reference, without the worst 0.1 % of the pixels; FLIP is over their mean
+    error    after ``steady`` of ``bench.tails``, since references of some rooms are noisy; FLIP is over their mean
 
 The table has the error and FLIP of the default over the curve of each of RIVALS at the default's whole time, geometric
 means over seeds; marks are those of ``bench.curves``. A rival's curve takes at each time the best of its ways. Scenes
@@ -38,9 +38,11 @@ from bench.tails import (
     WARM_SPP,
     add_references,
     check_references,
+    clean_image,
     marked,
     processor_seconds,
     reference_of,
+    steady_error,
     table,
 )
 from ngpt.errors import NgptError
@@ -108,6 +110,7 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterato
     size = tuple(map(int, args.size.split("x")))
     with opened(scene) as (name, file):
         reference = reference_of(load_scene(file, size), name, args)
+        clean = clean_image(reference)
         for render in RENDERS:
             gc.collect()  # a kernel knows the shapes of all scenes in memory
             make = by_default(file, size) if render == "default" else by_ways(images_of(file, size, render))
@@ -120,15 +123,17 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterato
                     if not warm:
                         # The default has subpixels, and so other kernels, from FEWEST samples on.
                         warm = bool([make(few, 0) for few in (WARM_SPP, FEWEST)])
-                    yield cell | {"ways": {way: judged(*made, reference) for way, made in make(spp, seed).items()}}
+                    yield cell | {
+                        "ways": {way: judged(*made, reference, clean) for way, made in make(spp, seed).items()}
+                    }
 
 
 Made = dict[str, tuple[np.ndarray, float]]  # by way: the image and its whole seconds
 
 
-def judged(image: np.ndarray, seconds: float, reference: Reference) -> dict[str, float]:
-    found = scores(["relMSE trimmed", "FLIP"], image, *reference.images)
-    return {"seconds": seconds, "error": found["relMSE trimmed"], "FLIP": found["FLIP"]}
+def judged(image: np.ndarray, seconds: float, reference: Reference, clean: np.ndarray) -> dict[str, float]:
+    flip = scores(["FLIP"], image, *reference.images)["FLIP"]
+    return {"seconds": seconds, "error": steady_error(image, reference, clean), "FLIP": flip}
 
 
 def by_default(file: str, size: tuple[int, int]) -> Callable[[int, int], Made]:
