@@ -33,7 +33,7 @@ data_gen.scenes data_gen.budget data_gen.llvm data_gen.cluster data_gen.pattern
 data_gen.paths data_gen.film
 data_gen.passes data_gen.tails
 data_gen.samplers
-data_gen.adaptive data_gen.plugins
+data_gen.adaptive data_gen.plugins data_gen.caustics
 data_gen.inspect data_gen.backend
 data_gen.request
 data_gen.begun

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -120,6 +121,26 @@ def set_film_size(scene: mi.Scene, size: tuple[int, int]) -> None:
     if crop != [(0, length) for length in size]:
         params["film.crop_offset"], params["film.crop_size"] = ([*each] for each in zip(*crop, strict=True))
         params.update()
+
+
+@contextmanager
+def at_most(scene: mi.Scene, pixels: int):
+    """Shrinks the scene's film to at most ``pixels`` within the block; yields the factor by which it shrinks.
+
+    A cropped film keeps its size, since its window could not be set again.
+    """
+    film = scene.sensors()[0].film()
+    (width, height), window = (tuple(int(n) for n in numbers) for numbers in (film.size(), film.crop_size()))
+    shrink = math.sqrt(pixels / (width * height))
+    if shrink >= 1 or (width, height) != window:
+        yield 1.0
+        return
+    small = max(1, round(width * shrink)), max(1, round(height * shrink))
+    set_film_size(scene, small)
+    try:
+        yield width * height / (small[0] * small[1])
+    finally:
+        set_film_size(scene, (width, height))
 
 
 def _scaled(begin: int, length: int, whole: int, new: int) -> tuple[int, int]:

@@ -23,12 +23,20 @@ def behind_sharp(scene: mi.Scene) -> str:
         return ""
     if without_size(scene):
         return "lamps without size"
-    whole = float(np.linalg.norm(np.array(scene.bbox().extents())))
-    return "tiny lamps" if any(_is_tiny(emitter, whole) for emitter in scene.emitters()) else ""
+    return "tiny lamps" if any(hard_to_meet(scene, emitter) for emitter in scene.emitters()) else ""
 
 
 def without_size(scene: mi.Scene) -> bool:
-    return any(mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta) for emitter in scene.emitters())
+    return any(map(_has_no_size, scene.emitters()))
+
+
+def hard_to_meet(scene: mi.Scene, emitter: mi.Emitter) -> bool:
+    """Whether hardly a path meets that emitter of the scene: it has no size, or is tiny."""
+    return _has_no_size(emitter) or _is_tiny(emitter, float(np.linalg.norm(np.array(scene.bbox().extents()))))
+
+
+def _has_no_size(emitter: mi.Emitter) -> bool:
+    return mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
 
 
 def has_holes(scene: mi.Scene) -> bool:

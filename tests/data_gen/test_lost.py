@@ -17,7 +17,7 @@ LAMP = """<shape type="sphere"><point name="center" x="0" y="1" z="4"/><float na
 <emitter type="area"><rgb name="radiance" value="9"/></emitter></shape>"""
 GLASS, MASK = '<bsdf type="dielectric"/>', '<bsdf type="mask"><bsdf type="diffuse"/></bsdf>'
 IN_GLASS, IN_HOLES = (
-    "meet smooth glass or mirrors: what these make of their light, '{}' hardly finds",
+    "of the light on what the camera sees directly, '{}' hardly finds",
     "'{}' loses light that",
 )
 
@@ -31,7 +31,7 @@ IN_GLASS, IN_HOLES = (
         (GLASS, POINT, "vcm", ""),
         (MASK, POINT, "gpt", ""),
         (MASK, POINT, "bdpt", ""),
-        (MASK, POINT, "gbdpt", IN_HOLES),
+        (MASK, POINT, "gbdpt", ""),
         (MASK, POINT, "gpt-basic", IN_HOLES),
         (MASK, LAMP.format(0.3), "gpt-basic", ""),
         ('<bsdf type="plastic"/>', POINT, "primal", ""),
