@@ -7,7 +7,6 @@ independent of those in the file, and parts are merged exactly as stacks with di
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -160,8 +159,11 @@ def kept_apart(why: str, stack: GradientStack, path: Path, what: str = "was rend
 
 
 def _number(value: Any) -> float:
-    # In the JSON of a request, whole numbers may be larger than any float.
-    return float(value) if isinstance(value, int | float | np.number) and abs(value) <= sys.float_info.max else 0.0
+    try:
+        number = float(value) if isinstance(value, int | float | np.number) else 0.0
+    except OverflowError:  # a whole number in JSON may be larger than any float
+        return 0.0
+    return number if math.isfinite(number) else 0.0
 
 
 def _said(value: Any) -> str:
