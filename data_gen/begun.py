@@ -100,14 +100,24 @@ def _same(request: RenderRequest, path: Path, attributes: Mapping[str, Any], fra
     """What the header of a file says of its request; raises NgptError where that is another, but for its budget."""
     said = said_by(attributes)
     remedy = "give another name, or --force in place of --skip-existing to replace it"
+    for what, given in {"scene": request.scene, "camera": request.camera}.items():
+        if not isinstance(given, str | Path | None):
+            raise NgptError(
+                f"{path}: whether it is of this {what} cannot be known, for a {type(given).__name__} has no file; name "
+                f"the {what}'s file, give another name, or --force (overwrite=True) to replace it"
+            )
     if said is None:
-        raise NgptError(f"{path}: is another render: its header has no request, as an older ngpt wrote it; {remedy}")
+        raise NgptError(
+            f"{path}: is another render: its header has no request (it was merged, or is of an older ngpt); {remedy}"
+        )
     for what, ours in request.identity(frame).items():
         if (theirs := said.get(what)) != ours:
             # Names alike differ in the checksum, which says nothing to anybody.
             alike = what == "scene" and str(theirs).rpartition(" ")[0] == str(ours).rpartition(" ")[0]
             why = " (its file, -D, --sensor, --camera, --fps or --dt was another)" if alike else ""
-            raise NgptError(f"{path}: is another render: {what} {_said(theirs)}, not {_said(ours)}{why}; {remedy}")
+            raise NgptError(
+                f"{path}: is another render: {what} {_said(theirs)}, not {_said(ours)}{why}; ask for the same, {remedy}"
+            )
     return said
 
 
@@ -149,7 +159,11 @@ def kept_apart(why: str, stack: GradientStack, path: Path, what: str = "was rend
 
 
 def _number(value: Any) -> float:
-    return float(value) if isinstance(value, int | float | np.number) and math.isfinite(value) else 0.0
+    try:
+        number = float(value) if isinstance(value, int | float | np.number) else 0.0
+    except OverflowError:  # a whole number in JSON may be larger than any float
+        return 0.0
+    return number if math.isfinite(number) else 0.0
 
 
 def _said(value: Any) -> str:

@@ -68,7 +68,8 @@ def render_stack(
     if isinstance(adaptive, Adaptive):
         given |= {"error": adaptive.error, "method": adaptive.method}
     if not isinstance(scene, RenderRequest):
-        given = {"subpixels": 1, "adaptive": bool(adaptive), **given} | ({} if with_features else {"features": False})
+        given = {"subpixels": 1, **given}
+    given = {"adaptive": bool(adaptive), **given} | ({} if with_features else {"features": False})
     named = {"spp": spp, "seed": seed, "sampler": sampler, "progress": progress}
     request, watch = asked(scene, named | given)
     return render(check_scene(request.scene), request, watch, made=made, tails_seed=tails_seed)

@@ -100,10 +100,13 @@ class RenderRequest:
     dt: int = 0
 
     def __post_init__(self) -> None:
+        for each in FIELDS.keys() - {"scene", "camera", "options", "parameters"}:
+            self._set(each, _plain(getattr(self, each)))
         mitsuba = sys.modules.get("mitsuba")
         self._set("variant", self.variant or (mitsuba.variant() if mitsuba else None) or DEFAULT_VARIANT)
         self._set("scene", str(self.scene) if isinstance(self.scene, Path) else self.scene)
         self._set("parameters", dict(self.parameters or {}))
+        self._set("options", dict(self.options or {}))
         # What is made over time of a shot may need gradients.
         self._set("gradients", self.gradients or bool(self.frames))
         remembers = FRAME_SAMPLERS.get(self.sampler) if self.frames else None
@@ -117,6 +120,9 @@ class RenderRequest:
         if self.cpu_seconds is not None and not str(self.variant).startswith("llvm"):
             raise WrongUse(f"--cpu-time: variant '{self.variant}' does not render on processors; give --time")
         self.budget.check()
+        for option, given in {"--camera": self.camera, "--dt": self.dt}.items():
+            if given and not self.frames:
+                raise WrongUse(f"{option} belongs to a shot; name its frames: --frames 0:120")
         if not 0 <= self.seed < 2**64:
             raise WrongUse(f"seed {self.seed} is out of range; use 0 .. 2^64 - 1")
         if remembers is None and self.sampler != "auto":
@@ -200,6 +206,12 @@ def said_by(attributes: Mapping[str, Any]) -> dict[str, Any] | None:
     return said if isinstance(said, dict) else None
 
 
+def _plain(value: Any) -> Any:
+    """A value of NumPy as one of Python, and its sequences as tuples: only those can be compared and put in headers."""
+    value = value.tolist() if hasattr(value, "tolist") else value
+    return tuple(map(_plain, value)) if isinstance(value, list | tuple | range) else value
+
+
 FIELDS = {each.name: each.default for each in fields(RenderRequest)}
 _WATCHED = {each.name for each in fields(Watch)}
 
@@ -207,14 +219,16 @@ _WATCHED = {each.name for each in fields(Watch)}
 def asked(scene: Any, given: Mapping[str, Any], frames: Iterable[int] = ()) -> tuple[RenderRequest, Watch]:
     """The request of a call by keywords, and who watches it. What neither of the two knows is an option of the sampler.
 
-    A ``scene`` that is a request already is returned as it is; raises WrongUse if more is ``given``.
+    A ``scene`` that is a request already is returned as it is; raises WrongUse if anything else is ``given``.
     """
     watch = Watch(**{name: value for name, value in given.items() if name in _WATCHED})
     known = {name: value for name, value in given.items() if name in FIELDS}
     options = {name: value for name, value in given.items() if name not in _WATCHED | FIELDS.keys()}
+    if frames := tuple(frames):
+        known["frames"] = frames
     if not isinstance(scene, RenderRequest):
         options = {**known.pop("options", {}), **options}
-        return RenderRequest(scene, options=options, frames=tuple(frames), **known), watch
-    if options or any(value != FIELDS[name] for name, value in known.items()):
+        return RenderRequest(scene, options=options, **known), watch
+    if options or any(value not in (FIELDS[name], getattr(scene, name)) for name, value in known.items()):
         raise WrongUse("a RenderRequest says all that is asked for: use dataclasses.replace to change it")
     return scene, watch

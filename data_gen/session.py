@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from data_gen.backend import use_variant
 from data_gen.pattern import filled
 from data_gen.request import RenderRequest, asked
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.stack import GradientStack
 from ngpt.system.interrupts import noted
 
@@ -54,6 +54,8 @@ def render_scene(
     sense, and for scenes that cannot be loaded or that the sampler cannot render.
     """
     request, watch = asked(scene, {"spp": spp, "seed": seed, "sampler": sampler, **given})
+    if request.frames:
+        raise WrongUse(f"{len(request.frames)} frames were asked for, and one image is rendered; use render_frames")
     use_variant(str(request.variant))
     from data_gen.inspect import warn_of_lost_light
     from data_gen.render import render
@@ -97,6 +99,8 @@ def render_frames(
     ``render_scene``, and for cameras without a projection.
     """
     request, watch = asked(scene, {"spp": spp, "seed": seed, "sampler": sampler, **given}, frames)
+    if not request.frames:
+        raise WrongUse("there are no frames to render; give their numbers")
     use_variant(str(request.variant))
     from data_gen.frames.shot import Shot, render_shot
 

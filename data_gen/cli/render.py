@@ -76,8 +76,7 @@ def request_of(args: argparse.Namespace, denoising: Denoising | None) -> RenderR
 
 
 def image(args: argparse.Namespace, denoising: Denoising | None, console: Console) -> int:
-    apart = {"--camera": args.camera, "--dt": args.dt, "--shard": args.shard, "--cluster": args.cluster}
-    for option, given in apart.items():
+    for option, given in {"--shard": args.shard, "--cluster": args.cluster}.items():
         if given:
             raise WrongUse(f"{option} belongs to a shot; name its frames: --frames 0:120")
     for text in (args.scene, *(value for _, value in args.define)):

@@ -19,8 +19,9 @@ from data_gen.adaptive import LEAST
 from data_gen.begun import frame_seed, part_seed, rest_of
 from data_gen.cli import onlook, render
 from data_gen.film import GradientFilm
+from data_gen.frames.camera_path import CameraPath, Key
 from data_gen.request import RenderRequest, said_by
-from data_gen.session import render_scene
+from data_gen.session import render_frames, render_scene
 from data_gen.shot_files import write_frames
 
 GPT = "render diffuse --size 16x12 --sampler gpt"
@@ -94,7 +95,9 @@ def test_a_file_of_another_render_is_neither_taken_nor_replaced(tmp_path):
         "subpixels auto, not 2": {"subpixels": 2},
         "diagnostics false, not true": {"diagnostics": True},
     }.items():
-        with pytest.raises(NgptError, match=f"a.exr: is another render: {what}; give another name, or --force"):
+        with pytest.raises(
+            NgptError, match=f"a.exr: is another render: {what}; ask for the same, give another name, or --force"
+        ):
             rest_of(replace(asked, **changes), path)
     assert rest_of(replace(asked, variant="llvm_ad_rgb_double", gradients=True, memory=99), path) is None
     with pytest.raises(NgptError, match=r"another render: scene box \w+, not box \w+"):
@@ -115,6 +118,65 @@ def test_a_file_without_a_request_is_neither_taken_nor_replaced(tmp_path, reques
     path = there(tmp_path / "a.exr", **request_)
     with pytest.raises(NgptError, match=r"a.exr: is another render: its header has no request.* or --force in place"):
         left(path, spp=9)
+
+
+def test_a_number_beyond_floats_in_a_header_counts_as_none(tmp_path):
+    said = box(seconds=15.0).header()["ngpt:request"]
+    path = there(tmp_path / "a.exr", request=said.replace("15.0", "1" + 400 * "0"))
+    assert left(path, seconds=20.0).seconds == 6.0
+
+
+def test_a_scene_or_camera_without_a_file_goes_on_with_nothing(tmp_path, renderer):
+    """Its header does not say which one it is, and samples of two must not be mixed."""
+    from data_gen.frames.shot import Shot
+
+    path, shot = tmp_path / "a.exr", Shot(lambda frame: ("diffuse", {}))
+    for what, asked in {
+        "scene": RenderRequest(shot, 9, frames=(7,)),
+        "camera": RenderRequest("diffuse", 9, frames=(7,), camera=CameraPath([Key(0, np.eye(4))])),
+    }.items():
+        there(path, spp=4, request=asked.header(7)["ngpt:request"])
+        with pytest.raises(NgptError, match=f"a.exr: whether it is of this {what} cannot be known"):
+            rest_of(asked, path, 7)
+
+
+def test_a_request_holds_plain_values_of_its_own():
+    options = {"reuse": True}
+    request = box(spp=np.int64(9), seed=np.uint64(2**63), size=np.array([16, 12]), error=np.float32(0.5),
+                  seconds=np.float64(2), subpixels=np.int64(2), unbiased=np.bool_(True), options=options,
+                  frames=np.arange(2))  # fmt: skip
+    plain = box(spp=9, seed=2**63, size=(16, 12), error=0.5, seconds=2.0, subpixels=2, unbiased=True, options=options,
+                frames=(0, 1))  # fmt: skip
+    options["reuse"] = False
+    assert request == plain and request.options == {"reuse": True}
+    assert request.header(0) == plain.header(0) and said_by(request.header(0))["seed"] == 2**63
+    assert box(size=[16, 12]) == box(size=(16, 12))
+
+
+def test_nothing_that_is_asked_for_is_left_out_without_a_word(renderer):
+    from data_gen.render import render_stack
+
+    one, shot = RenderRequest("diffuse", 2, size=(16, 12)), RenderRequest("diffuse", 2, size=(16, 12), frames=(0, 1))
+    for what in ({"camera": "path.json"}, {"dt": 2}):
+        with pytest.raises(WrongUse, match="belongs to a shot"):
+            render_scene("diffuse", 2, **what)
+    for image in (lambda: render_scene(shot), lambda: render_scene("diffuse", 2, frames=(0, 1))):
+        with pytest.raises(WrongUse, match="2 frames were asked for, and one image is rendered"):
+            image()
+    for none in (lambda: render_frames(one), lambda: render_frames("diffuse", [])):
+        with pytest.raises(WrongUse, match="there are no frames to render"):
+            none()
+    loaded = RenderRequest(load(renderer, "diffuse", (16, 12)), 2, sampler="primal")
+    for other in (
+        lambda: render_frames(one, range(2)),
+        lambda: render_frames(shot, (0, 2)),
+        lambda: write_frames(shot, {2: Path("a.exr")}),
+        lambda: render_stack(loaded, adaptive=True),
+        lambda: render_stack(loaded, with_features=False),
+    ):
+        with pytest.raises(WrongUse, match="a RenderRequest says all"):
+            other()
+    assert [frame for frame, _ in render_frames(shot, (0, 1))] == [0, 1]
 
 
 def test_the_header_says_the_same_of_the_same_request(tmp_path):
