@@ -102,6 +102,9 @@ class RenderRequest:
     def __post_init__(self) -> None:
         for each in FIELDS.keys() - {"scene", "camera", "options", "parameters"}:
             self._set(each, _plain(getattr(self, each)))
+        for each in ("spp", "seed", "memory", "dt"):
+            if not isinstance(value := getattr(self, each), int | None):
+                raise WrongUse(f"{each} {value!r} is not a whole number")
         mitsuba = sys.modules.get("mitsuba")
         self._set("variant", self.variant or (mitsuba.variant() if mitsuba else None) or DEFAULT_VARIANT)
         self._set("scene", str(self.scene) if isinstance(self.scene, Path) else self.scene)

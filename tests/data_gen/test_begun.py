@@ -140,6 +140,12 @@ def test_a_scene_or_camera_without_a_file_goes_on_with_nothing(tmp_path, rendere
             rest_of(asked, path, 7)
 
 
+@pytest.mark.parametrize("given", [{"spp": 2.0}, {"spp": "2"}, {"seed": 0.5}, {"memory": "lots"}])
+def test_what_is_counted_is_a_whole_number(given):
+    with pytest.raises(WrongUse, match=f"{next(iter(given))} .* is not a whole number"):
+        RenderRequest("diffuse", **given)
+
+
 def test_a_request_holds_plain_values_of_its_own():
     options = {"reuse": True}
     request = box(spp=np.int64(9), seed=np.uint64(2**63), size=np.array([16, 12]), error=np.float32(0.5),
