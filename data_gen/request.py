@@ -102,9 +102,6 @@ class RenderRequest:
     def __post_init__(self) -> None:
         for each in FIELDS.keys() - {"scene", "camera", "options", "parameters"}:
             self._set(each, _plain(getattr(self, each)))
-        for each in ("spp", "seed", "memory", "dt"):
-            if not isinstance(value := getattr(self, each), int | None):
-                raise WrongUse(f"{each} {value!r} is not a whole number")
         mitsuba = sys.modules.get("mitsuba")
         self._set("variant", self.variant or (mitsuba.variant() if mitsuba else None) or DEFAULT_VARIANT)
         self._set("scene", str(self.scene) if isinstance(self.scene, Path) else self.scene)
@@ -116,6 +113,12 @@ class RenderRequest:
         timed = self.seconds is not None or self.cpu_seconds is not None
         if self.spp is None and (remembers or not (timed or self.error is not None)):
             self._set("spp", remembers.spp if remembers else DEFAULT_SPP)
+        self._check(remembers, timed)
+
+    def _check(self, remembers: Any, timed: bool) -> None:
+        for each in ("spp", "seed", "memory", "dt"):
+            if not isinstance(value := getattr(self, each), int | None):
+                raise WrongUse(f"{each} {value!r} is not a whole number")
         if not isinstance(self.scene, str) and (self.size or self.parameters or self.sensor is not None):
             raise NgptError("size, parameters and sensor of a loaded scene are fixed; give them to data_gen.load_scene")
         if self.seconds is not None and self.cpu_seconds is not None:
