@@ -17,10 +17,10 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+import ngpt
 from data_gen.backend import use_variant
 from data_gen.render import render_stack
 from ngpt.denoisers import caustic
-from ngpt.layers import GATHERED
 from ngpt.measure.flip import flip
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import reconstruct
@@ -51,12 +51,11 @@ def main() -> None:
 
 def kept(cache: Path, floor: str, spp: int, seed: int, radius: float) -> GradientStack:
     """A stack by ``vcm``, rendered once."""
-    file = cache / f"{floor}-{spp}-{seed}.npz"
+    file = cache / f"{floor}-{spp}-{seed}.exr"
     if not file.exists():
         cache.mkdir(parents=True, exist_ok=True)
-        np.savez(file, **render_stack(scene(floor), spp, seed, "vcm", radius=radius).layers)
-    with np.load(file) as layers:
-        return GradientStack(dict(layers), {GATHERED: 1})
+        ngpt.write(file, render_stack(scene(floor), spp, seed, "vcm", radius=radius))
+    return ngpt.read(file)
 
 
 def scene(floor: str) -> mi.Scene:
