@@ -18,7 +18,7 @@ from ngpt.stack import GradientStack
 
 pytest_plugins = ["durations"]
 
-# Tests of all methods and samplers include those of other installed packages, such as ngpt-studies.
+# Other installed packages, such as ngpt-studies, add methods and samplers. Tests of all of them must know these, too.
 for registry in (METHODS, SAMPLERS):
     registry.load()
 

@@ -16,9 +16,9 @@ denoises them first), clean or noisy. An image at twice the size is then scaled 
     seconds  of processors, of the render and of OIDN, both warmed up
     error    after ``steady`` of ``bench.tails``, since references of some rooms are noisy; FLIP is over their mean
 
-The table has the error and FLIP of the default over the curve of each of RIVALS at the default's whole time, geometric
-means over seeds; marks are those of ``bench.curves``. A rival's curve takes at each time the best of its ways. Scenes
-and references are as of `bench.seeds`. Cells that the file has are not measured again.
+The table divides the error and FLIP of the default by those of each of RIVALS at the default's whole time. Values are
+geometric means over seeds. At each time, a rival has its best way. ``bench.curves`` explains the marks. Scenes and
+references are as of `bench.seeds`. Cells that the file has are not measured again.
 """
 
 import argparse
@@ -32,7 +32,7 @@ import numpy as np
 
 import ngpt
 from bench.common import metadata, renderer, save
-from bench.curves import error_at, joined
+from bench.curves import error_at
 from bench.seeds import opened
 from bench.tails import (
     WARM_SPP,
@@ -194,7 +194,7 @@ def mitsubas(file: str, size: tuple[int, int], points: str) -> Callable[[int, in
         scene = scenes[k]
         integrator = mi.load_dict({"type": "aov", "aovs": AOVS, "image": scene.integrator()})
         layers = np.array(mi.render(scene, integrator=integrator, spp=max(spp // k**2, 1), seed=seed), np.float32)
-        # Behind the channels of the film, of which a fourth is alpha
+        # AOVs follow the film's own channels: RGB, and alpha if there is any.
         return Images(*(np.ascontiguousarray(each) for each in (layers[..., :3], layers[..., -6:-3], layers[..., -3:])))
 
     return images
@@ -206,7 +206,7 @@ def mitsuba_scene(file: str, size: tuple[int, int], points: str) -> Any:
 
     from data_gen.scenes.bounds import mend_bounds
     from data_gen.scenes.builtin import SCENES
-    from data_gen.scenes.load import found_beside, set_film_size
+    from data_gen.scenes.load import found_beside, parsed, set_film_size
     from data_gen.scenes.merge import merge
 
     if file in SCENES:
@@ -215,10 +215,8 @@ def mitsuba_scene(file: str, size: tuple[int, int], points: str) -> Any:
         description["sensor"]["film"]["rfilter"] = {"type": "box"}
         scene = mi.load_dict(description, optimize=False)
     else:
-        config = mi.parser.ParserConfig(mi.variant())
-        config.merge_equivalent = config.merge_meshes = False
         with found_beside(file):
-            state = mi.parser.parse_file(config, file)
+            config, state = parsed(file)
             for kind, name in ((mi.ObjectType.Sampler, points), (mi.ObjectType.ReconstructionFilter, "box")):
                 nodes = [node for node in state.nodes if node.type == kind]
                 if not nodes:
@@ -227,7 +225,6 @@ def mitsuba_scene(file: str, size: tuple[int, int], points: str) -> Any:
                     node.props.set_plugin_name(name)
                     for key in list(node.props.keys()) if name == "box" else ():
                         del node.props[key]
-            mi.parser.transform_all(config, state)
             # Else Mitsuba would be slow where a scene has many meshes.
             merge(config, state)
             scene = mi.parser.instantiate(config, state)
@@ -247,14 +244,14 @@ def rows(cells: list[dict[str, Any]]) -> Iterator[list[str]]:
 
 
 def over(mine: list[dict], cells: list[dict], renders: tuple[str, ...], ways: tuple[str, ...]) -> list:
-    """Error and FLIP of the default over those of a rival at the same whole time, and their marks."""
+    """The default's error and FLIP, each divided by the rival's at the same whole time, with its mark."""
     seconds, found = geometric_mean([each["seconds"] for each in mine]), []
     for value in VALUES:
         curves = [points(cells, render, way, value) for render in renders for way in ways]
         answers = [answer for curve in curves if (answer := error_at(seconds, curve))]
         least = min(answers, default=None)
         own = geometric_mean([each[value] for each in mine])
-        found.append((own / least[0], joined([least[1]])) if least else None)
+        found.append((own / least[0], least[1]) if least else None)
     return found
 
 

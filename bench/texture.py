@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-import ngpt
+from bench.common import kept
 from data_gen.backend import use_variant
 from data_gen.render import render_stack
 from ngpt.denoisers import caustic
@@ -39,9 +39,9 @@ def main() -> None:
     args = parser.parse_args()
     use_variant("llvm_ad_rgb")
     for floor in ("checks", "clouds"):
-        halves = [kept(args.cache, floor, *case, REFERENCE_RADIUS)["primal"] for case in REFERENCES]
+        halves = [photons(args.cache, floor, *case, REFERENCE_RADIUS)["primal"] for case in REFERENCES]
         for spp, seed in CASES:
-            stack = kept(args.cache, floor, spp, seed, RADIUS)
+            stack = photons(args.cache, floor, spp, seed, RADIUS)
             after, data = reconstruct(stack, "oidn").image, repair(stack)
             before = after - caustic.of_photons(data) + caustic.denoised(data)
             for name, image in (("before", before), ("after", after)):
@@ -49,13 +49,10 @@ def main() -> None:
                 print(f"{floor:7} {spp:3} spp, seed {seed}, {name:6}: relMSE trimmed %.5f, FLIP %.4f" % errors)
 
 
-def kept(cache: Path, floor: str, spp: int, seed: int, radius: float) -> GradientStack:
-    """A stack by ``vcm``, rendered once."""
+def photons(cache: Path, floor: str, spp: int, seed: int, radius: float) -> GradientStack:
+    """A stack by ``vcm``, from the cache if it is there."""
     file = cache / f"{floor}-{spp}-{seed}.exr"
-    if not file.exists():
-        cache.mkdir(parents=True, exist_ok=True)
-        ngpt.write(file, render_stack(scene(floor), spp, seed, "vcm", radius=radius))
-    return ngpt.read(file)
+    return kept(file, lambda: render_stack(scene(floor), spp, seed, "vcm", radius=radius))
 
 
 def scene(floor: str) -> mi.Scene:

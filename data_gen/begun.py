@@ -54,7 +54,7 @@ class Unfinished(NgptError):
 
 
 def rest_of(request: RenderRequest, path: Path, frame: int | None = None) -> RenderRequest | None:
-    """What is left of a request for an image, or for a ``frame``, of which a file has a part; None: nothing is.
+    """The part of a request that its file still lacks, for an image or for a ``frame``; None if it lacks nothing.
 
     Its sampler is the file's, and its seed is one for the next part. Raises NgptError if the file is of another
     request.

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from data_gen.caustics import share_of_caustics
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, SIMPLE, by_standing, described
 from data_gen.scenes.builtin import SCENES, no_scene
 from data_gen.scenes.facts import Facts, polarised, scene_facts, spectral
@@ -205,6 +204,8 @@ def _finding(facts: Facts, light: str, and_hidden_lamps: bool = False) -> str:
 
 def _how_much(scene: mi.Scene) -> str:
     """What share of the light ``behind_sharp()`` is about, by a look with light paths; "" where these do not work."""
+    from data_gen.caustics import share_of_caustics  # .1 s to import, and few scenes need it
+
     share = share_of_caustics(scene)
     if share is None:
         return ""

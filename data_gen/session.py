@@ -163,17 +163,18 @@ def _planned(scene: mi.Scene, request: RenderRequest, watch: Watch) -> Plan:
     from data_gen.choosing import plans
     from data_gen.choosing.trials import Pilot
 
-    spp, seconds, memory, clock = (getattr(request.budget, name) for name in ("spp", "seconds", "memory", "clock"))
+    budget = request.budget
     if request.sampler != "auto":
-        return plans.Plan(request.sampler, request.method or "", request.shares, seconds, "as it was asked for")
-    pilot = Pilot(clock, watch.said, watch.stop, request.unbiased)
+        return plans.Plan(request.sampler, request.method or "", request.shares, budget.seconds, "as it was asked for")
+    pilot = Pilot(budget.clock, watch.said, watch.stop, request.unbiased)
     if request.shares:
         adaptive = Adaptive(request.error, request.method or "auto")
-        plan = plans.plan_adaptive(scene, adaptive, seconds, gradients=request.gradients)
-    elif request.method is None or seconds is None:
-        plan = plans.plan_sampler(scene, spp, seconds, memory, pilot, gradients=request.gradients)
+        plan = plans.plan_adaptive(scene, adaptive, budget.seconds, gradients=request.gradients)
+    elif request.method is None or budget.seconds is None:
+        how = {"gradients": request.gradients}
+        plan = plans.plan_sampler(scene, budget.spp, budget.seconds, budget.memory, pilot, **how)
     else:
-        plan = plans.plan(scene, seconds, request.method, memory, pilot)
+        plan = plans.plan(scene, budget.seconds, request.method, budget.memory, pilot)
     plan = plan if request.needs_features else plans.without_features(scene, plan)
     _LOG.info("plan: sampler %s, method %s: %s", plan.sampler, plan.method or "any", plan.reason)
     return plan

@@ -164,7 +164,7 @@ def write_frames_on_cluster(
 
 
 def _begun(outputs: Mapping[int, Output]) -> list[tuple[RenderRequest, list[int]]]:
-    """What is left of frames that were begun, and the frames of which it is."""
+    """The requests that finish the frames which were begun, each with the numbers of its frames."""
     begun: list[tuple[RenderRequest, list[int]]] = []
     for frame, output in outputs.items():
         if (rest := output.left()) is not None and rest is not output.request:

@@ -18,7 +18,6 @@ import mitsuba as mi
 from data_gen import samplers
 from data_gen.adaptive import Adaptive
 from data_gen.budget import DEFAULT_MEMORY
-from data_gen.caustics import share_of_caustics
 from data_gen.choosing.look import features_pay
 from data_gen.choosing.pipelines import Pipeline, choose, measure, methods_for
 from data_gen.choosing.trials import PIXELS, Pilot, Trial, candidates, try_all
@@ -169,6 +168,8 @@ def _for_caustics(scene: mi.Scene, seconds: float, method: str, start: float, pi
     left = seconds - after
     if left < _CAUSTIC_BEGINS + _CAUSTIC_SPP * _CAUSTIC_SECONDS * _pixels(scene) / 1e6:
         return None
+    from data_gen.caustics import share_of_caustics  # .1 s to import, and few scenes come this far
+
     share = share_of_caustics(scene)
     if share is None or share < _CAUSTIC_SHARE:
         return None

@@ -142,7 +142,10 @@ class Holes:
     def through(
         self, scene, x: mi.SurfaceInteraction3f, d: mi.Vector3f, number, active: mi.Bool
     ) -> tuple[mi.SurfaceInteraction3f, mi.Spectrum]:
-        """What is behind so many holes along ``d``, of which ``x`` is the first, and T; 0 where there are fewer."""
+        """The vertex behind that ``number`` of holes along ``d``, and the transmittance T of these holes.
+
+        ``x`` is at the first hole. T is 0 where there are fewer holes.
+        """
         x, T, left, active = mi.SurfaceInteraction3f(x), mi.Spectrum(1), mi.UInt32(number), mi.Bool(active)
         going = active & (left > 0)
         while dr.hint(going, label="holes"):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 
 import drjit as dr
 import mitsuba as mi
@@ -173,20 +174,26 @@ def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int |
     Where ``merged``, meshes are as ``data_gen.scenes.merge`` has them. Merged as Mitsuba would (``optimize=True``),
     shapes and emitters come in another order each time, and with them other bits.
     """
-    config = mi.parser.ParserConfig(mi.variant())
-    config.merge_equivalent = config.merge_meshes = False
-    # In parallel objects are numbered as they come, which differs from process to process, and with it the kernel: it
-    # would be compiled again.
-    config.parallel = False
     with found_beside(path):
-        state = mi.parser.parse_file(config, path, **parameters)
-        mi.parser.transform_all(config, state)
+        config, state = parsed(path, parameters)
         if state.root.props.plugin_name() == "scene":
             if sensor is not None:
                 _keep(state, sensor, path)
             if merged:
                 merge(config, state)
         return mi.parser.instantiate(config, state)
+
+
+def parsed(path: str, parameters: Mapping[str, str] = MappingProxyType({})) -> tuple:
+    """Mitsuba's configuration and state of a scene file that is read, but of which nothing is made yet."""
+    config = mi.parser.ParserConfig(mi.variant())
+    config.merge_equivalent = config.merge_meshes = False
+    # In parallel objects are numbered as they come, which differs from process to process, and with it the kernel: it
+    # would be compiled again.
+    config.parallel = False
+    state = mi.parser.parse_file(config, path, **parameters)
+    mi.parser.transform_all(config, state)
+    return config, state
 
 
 def _keep(state: mi.parser.ParserState, sensor: int | str, path: str) -> None:
