@@ -18,7 +18,7 @@ from ngpt.stack import GradientStack
 
 pytest_plugins = ["durations"]
 
-# What holds for every method and sampler holds for those of other packages that are installed, such as ngpt-studies.
+# Other installed packages, such as ngpt-studies, add methods and samplers. Tests of all of them must know these, too.
 for registry in (METHODS, SAMPLERS):
     registry.load()
 

@@ -2,8 +2,9 @@
 
     python -m bench.evaluated DIR
 
-Prints them as Markdown and writes a plot, DIR/frontier-GROUP.svg, for each group of scenes: error over whole seconds,
-rivals at their best setting. Rivals and groups are those of the configuration. ``bench.curves`` explains the marks.
+The tables are printed as Markdown. A plot, DIR/frontier-GROUP.svg, is written for each group of scenes. It shows error
+over whole seconds, and each rival has its best setting. The configuration names rivals and groups. ``bench.curves``
+explains the marks.
 """
 
 import sys

@@ -121,25 +121,27 @@ def costs(args: argparse.Namespace, scene: str, shot: str) -> dict[str, dict[str
 
 def compare(args: argparse.Namespace, scene: str, shot: str, cost: dict) -> dict:
     """Noise of a frame, and errors of reconstructions at equal processor time."""
-    from data_gen.frames.shot import render_shot
+    from data_gen.session import render_frames
 
     camera = shot_of(args.folder, scene, shot, args.size)
-    reference = {"sampler": "primal", "with_features": False, "unbiased": True}
+    reference = {"sampler": "primal", "features": False, "unbiased": True, "subpixels": 1}
     wanted = range(args.skip, args.frames)
     references = [
         stack
-        for _, stack in render_shot(
+        for _, stack in render_frames(
             camera, range(args.frames), args.reference_spp, 2, skip=lambda frame: frame not in wanted, **reference
         )
     ]
     stacks, noise = {}, {}
     for name, options in RIVALS.items():
         spp = max(2, round(args.chains * cost["restir"]["processor"] / cost[name]["processor"]))
-        stacks[name] = [stack for _, stack in render_shot(camera, range(args.frames), spp, 1, unbiased=True, **options)]
+        stacks[name] = [
+            stack for _, stack in render_frames(camera, range(args.frames), spp, 1, unbiased=True, **options)
+        ]
         last = stacks[name][-1]
         if name == "gpt":
             # Elsewhere caustics are in the differences.
-            *_, (_, last) = render_shot(
+            *_, (_, last) = render_frames(
                 camera,
                 range(args.frames),
                 64,

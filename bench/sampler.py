@@ -15,7 +15,7 @@ It renders the built-in scenes and each FOLDER/*/scene.xml that `gpt` can render
 
 References are rendered for a fixed time and kept in CACHE for the next run. An interrupted run continues where it ended
 if it is started with the same arguments. The script writes the results and, for each scene named by --maps,
-docs/images/NAME-gradients.png, see ngpt/evaluation/gradientmap.py.
+docs/images/NAME-gradients.png, see bench/gradientmap.py.
 """
 
 import argparse
@@ -27,10 +27,10 @@ import time
 from pathlib import Path
 
 import numpy as np
-from ngpt.evaluation.gradientmap import variances_of_differences, write_map
 
 import ngpt
 from bench.common import kept, metadata, renderer, save
+from bench.gradientmap import variances_of_differences, write_map
 from ngpt.evaluation.config import scene_name
 from ngpt.evaluation.references import reference_noise
 from ngpt.measure.averages import summary
@@ -110,19 +110,19 @@ def bench_scene(scene_file: str, name: str, args: argparse.Namespace) -> dict | 
         dr.sync_thread()
 
     compiled = {"path": compile_seconds(lambda: path(0))}
-    compiled["gpt"] = compile_seconds(lambda: render_stack(scene, args.spp, 0, unbiased=True))
+    compiled["gpt"] = compile_seconds(lambda: render_stack(scene, args.spp, 0, "gpt", unbiased=True))
     seconds: dict[str, list[float]] = {"path": [], "gpt": []}
     for seed in range(args.repeats):
         start = time.perf_counter()
         path(seed)
         between = time.perf_counter()
-        render_stack(scene, args.timing_spp, seed, unbiased=True)
+        render_stack(scene, args.timing_spp, seed, "gpt", unbiased=True)
         seconds["path"].append(between - start)
         seconds["gpt"].append(time.perf_counter() - between)
     ratios = [ours / theirs for ours, theirs in zip(seconds["gpt"], seconds["path"], strict=True)]
     cost = summary(ratios)
     spp = max(1, round(args.spp * cost["median"]))
-    stacks = [render_stack(scene, args.spp, seed, unbiased=True) for seed in range(args.repeats)]
+    stacks = [render_stack(scene, args.spp, seed, "gpt", unbiased=True) for seed in range(args.repeats)]
     file = args.cache / f"{name}-reference-{size[0]}x{size[1]}-{args.reference_seconds:g}s.exr"
     reference = kept(
         file, lambda: render_stack(scene, None, REFERENCE_SEED, "primal", seconds=args.reference_seconds, unbiased=True)

@@ -127,7 +127,7 @@ def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path)
     without gradients; returns the folder names, "" for none. Existing files are kept.
     """
     renderer()
-    from data_gen.frames.shot import render_shot
+    from data_gen.session import render_frames
 
     rests = SPEEDS.get(shot) == 0
     stacks: dict = {"in": {"spp": args.spp, "seed": 1, "sampler": "gpt", "dt": args.pairs}}
@@ -139,7 +139,7 @@ def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path)
         "spp": args.reference_spp * (4 if rests else 1),
         "seed": 2,
         "sampler": "primal",
-        "with_features": False,
+        "features": False,
     }
     for kind, options in (stacks | {"ref": reference}).items():
         (folder / kind).mkdir(parents=True, exist_ok=True)
@@ -148,7 +148,8 @@ def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path)
         target = {frame: folder / kind / f"{frame:04d}.exr" for frame in frames}
         missing = [frame for frame, file in target.items() if not file.exists()]
         moving = shot_of(args.folder, scene, shot, args.size)
-        for frame, stack in render_shot(moving, frames, skip=lambda f, m=missing: f not in m, unbiased=True, **options):
+        how = {"skip": lambda f, m=missing: f not in m, "unbiased": True, "subpixels": 1} | options
+        for frame, stack in render_frames(moving, frames, **how):
             ngpt.write(target[frame], stack)
     return ("without" if args.pairs else "in"), "in", "ref", "plain" if args.plain else ""
 

@@ -11,7 +11,7 @@ denoise are in WAYS. Each cell has, of each way:
 
 and the noise of features, with whether that is little beside the image's (``ngpt.denoisers.clean``).
 
-The table divides each value by that of ``BASE`` and gives medians over seeds.
+The table shows the ratio of each value to the value of ``BASE``: the median over seeds.
 """
 
 import argparse

@@ -143,6 +143,7 @@ def processor_seconds() -> float:
 def reference_of(loaded: Any, scene: str, args: argparse.Namespace) -> Reference:
     from data_gen.render import render_stack
 
+    args.references.mkdir(parents=True, exist_ok=True)
     files = [args.references / f"{scene_name(scene)}-{args.size}{half}.exr" for half in HALVES]
     for i, file in enumerate(files):
         if not file.exists():

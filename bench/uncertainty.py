@@ -70,9 +70,9 @@ def main() -> None:
 def images(scene: str, spp: int, args: argparse.Namespace) -> list[GradientStack]:
     """The reference, the stack and, where they are wanted, its halves; rendered where they are not in the cache."""
     name = Path(scene).name
-    halves = [(f"{name}-{spp}-half{i}.exr", spp // 2, "auto", 2 * spp + i) for i in (0, 1)]
+    halves = [(f"{name}-{spp}-half{i}.exr", spp // 2, "gpt", 2 * spp + i) for i in (0, 1)]
     files = [(f"{name}-reference.exr", args.reference, "primal", spp)]
-    files += halves if args.halves else [(f"{name}-{spp}.exr", spp, "auto", spp)]
+    files += halves if args.halves else [(f"{name}-{spp}.exr", spp, "gpt", spp)]
 
     def make(count: int, sampler: str, seed: int) -> GradientStack:
         load_scene, render_stack = renderer()

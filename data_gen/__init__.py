@@ -14,12 +14,14 @@ from data_gen.plugins import register_when_ready
 if TYPE_CHECKING:
     from data_gen.backend import use_variant
     from data_gen.choosing.plans import Plan
+    from data_gen.request import RenderRequest
     from data_gen.scenes.load import load_scene
     from data_gen.session import render_frames, render_scene, stop_on_ctrl_c
     from data_gen.shot_files import write_frames, write_frames_on_cluster
 
 __all__ = [
     "Plan",
+    "RenderRequest",
     "load_scene",
     "render_frames",
     "render_scene",
@@ -31,6 +33,7 @@ __all__ = [
 
 # Imported when they are asked for, for Mitsuba and what goes with it take a second.
 _HOMES = {"Plan": "choosing.plans", "load_scene": "scenes.load", "use_variant": "backend"}
+_HOMES |= {"RenderRequest": "request"}
 _HOMES |= dict.fromkeys(("render_frames", "render_scene", "stop_on_ctrl_c"), "session")
 _HOMES |= dict.fromkeys(("write_frames", "write_frames_on_cluster"), "shot_files")
 

@@ -1,4 +1,4 @@
-"""What a render may spend, and who watches it: two small records that go from ``render_stack`` to each pass."""
+"""What a render may spend, and who watches it: two small records that go down to each pass."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ngpt.errors import WrongUse
+from ngpt.stack import GradientStack
 
 # What a render may use, in MiB, beside the scene itself
 DEFAULT_MEMORY = 6144
@@ -32,10 +33,8 @@ class Budget:
     memory: int = DEFAULT_MEMORY  # MiB for paths and film
     clock: Callable[[], float] = wall  # or time.process_time, which other work on the machine hardly moves
 
-    def check(self, ends: bool = False) -> None:
-        """Raises WrongUse for what no scene could be rendered with; ``ends``: something else ends the render."""
-        if self.spp is None and self.seconds is None and not ends:
-            raise WrongUse("neither a number of samples per pixel nor a time to render for is given")
+    def check(self) -> None:
+        """Raises WrongUse for what no scene could be rendered with."""
         if self.spp is not None and not 1 <= self.spp < 2**31:
             raise WrongUse(f"{self.spp} samples per pixel: from 1 to 2^31 - 1 can be rendered")
         if self.seconds is not None and not 0 < self.seconds < float("inf"):
@@ -46,7 +45,13 @@ class Budget:
 
 @dataclass(frozen=True)
 class Watch:
+    """Who hears of a render while it goes on."""
+
     progress: Progress = lambda done, total: None  # called before the first pass and after each
     stop: Callable[[], bool] = lambda: False  # asked after each pass whether to end there
+    # Called after each pass with a function that makes the stack of the samples done by then
+    newest: Callable[[Callable[[], GradientStack]], None] = lambda stack: None
+    chosen: Callable[[Any], None] = lambda plan: None  # called before the render with the plan of "auto"
+    said: Callable[[str], None] = lambda line: None  # called with a line on each sampler that a pilot tries
     # Called with the ``GradientFilm`` after each pass, before ``stop``; it leaves the film as it is
     look: Callable[[Any], None] = lambda film: None

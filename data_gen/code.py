@@ -6,7 +6,6 @@ The files are found by following imports, wherever in a file they stand, from th
 
 from __future__ import annotations
 
-import ast
 import hashlib
 from collections.abc import Iterable
 from functools import lru_cache
@@ -14,7 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from data_gen.samplers import SAMPLERS
-from ngpt.system.source import code_text
+from ngpt.system.source import code_text, imports
 
 ROOT = Path(__file__).parent
 # The registry knows all samplers; of what it imports, a render needs its own family's entries.
@@ -67,13 +66,7 @@ def _imports(file: Path, homes: frozenset[str]) -> set[str]:
 @lru_cache(maxsize=1024)
 def _named(file: Path, changed: int, homes: frozenset[str]) -> frozenset[str]:
     """Names in the packages ``homes`` that a file imports, and what they are in."""
-    found = set()
-    for node in ast.walk(ast.parse(file.read_bytes())):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and not node.level:
-            found |= {node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)}
-    parts = [name.split(".") for name in found if name.partition(".")[0] in homes]
+    parts = [name.split(".") for name in imports(file) if name.partition(".")[0] in homes]
     return frozenset(".".join(words[: i + 1]) for words in parts for i in range(len(words)))
 
 

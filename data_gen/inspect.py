@@ -190,7 +190,9 @@ def _of_tiny_lamps(plugins: dict[str, Counter], facts: Facts) -> list[str]:
         return []
     able = _finding(facts, "caustics", and_hidden_lamps=True)
     what = "lamps without size, or a sun, meet smooth glass or mirrors: what these make of it"
-    return [f"{what} needs {able}" if able else f"{what} is found by no sampler that renders this scene"]
+    if not able:
+        return [f"{what} is found by no sampler that renders this scene"]
+    return [f"{what} needs {able}; `ngpt render` says how much that is"]
 
 
 def _finding(facts: Facts, light: str, and_hidden_lamps: bool = False) -> str:
@@ -198,6 +200,17 @@ def _finding(facts: Facts, light: str, and_hidden_lamps: bool = False) -> str:
     able = {name: s for name, s in SAMPLERS.items() if s.standing != "study" and not s.refuses(facts)}
     found = [n for n, s in able.items() if light in s.finds and ("hidden lamps" in s.finds) == and_hidden_lamps]
     return ", ".join(f"`--sampler {name}`" for name in found)
+
+
+def _how_much(scene: mi.Scene) -> str:
+    """What share of the light ``behind_sharp()`` is about, by a look with light paths; "" where these do not work."""
+    from data_gen.caustics import share_of_caustics  # .1 s to import, and few scenes need it
+
+    share = share_of_caustics(scene)
+    if share is None:
+        return ""
+    amount = f"about {share:.0%}" if share >= 0.01 else "less than 1%"
+    return f", {amount} of the light on what the camera sees directly"
 
 
 def warn_of_lost_light(scene: mi.Scene, sampler: str) -> None:
@@ -210,15 +223,16 @@ def warn_of_lost_light(scene: mi.Scene, sampler: str) -> None:
     if not getattr(entry, "finds", ()) and (lamps := behind_sharp(scene)):
         able = _finding(facts, "caustics", and_hidden_lamps=True).replace("`", "").split(", ")[0]
         remedy = f"{able} finds it" if able else "no sampler that renders this scene finds it"
-        what = "smooth glass or mirrors: what these make of their light"
+        what = f"smooth glass or mirrors: what these make of their light{_how_much(scene)}"
         _LOG.warning("%s meet %s, '%s' hardly finds; %s", lamps, what, sampler, remedy)
     if facts.integrator == "path" and entry.loses and without_size(scene) and has_holes(scene):
         remedy = "--sampler gpt, or primal, finds it"
         _LOG.warning("of lamps without size, '%s' loses light %s; %s", sampler, entry.loses, remedy)
-    if lamp := bent_lamp(scene):
+    if entry.leaves_lamps and (lamp := bent_lamp(scene)):
         _LOG.warning(
-            "lamp%s has few faces and smooth normals; Mitsuba %s samples it by one normal and weighs it by another, so "
-            "light beside it is wrong by up to 4 %%: give it face_normals=true",
+            "'%s' leaves lamp%s, which has few faces and smooth normals, to Mitsuba %s, which weighs it by the wrong "
+            "normal: light beside it is wrong by up to 4 %%; --sampler gpt, or primal, is right",
+            sampler,
             f" '{lamp.id()}'" if lamp.id() else "",
             mi.__version__,
         )

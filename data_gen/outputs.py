@@ -6,32 +6,31 @@ render that was begun goes on from a result as from a stack.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from data_gen.begun import Asked, joined_or_kept, kept_apart, write_part
+from data_gen.begun import joined_or_kept, kept_apart, rest_of
+from data_gen.request import RenderRequest
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
-from ngpt.cli.picture import check_image, seen
 from ngpt.errors import NgptError, WrongUse
 from ngpt.image.pictures import check_size
+from ngpt.io.exr import write
 from ngpt.io.openexr import read_header
 from ngpt.io.whole import finished
 from ngpt.methods import reconstruct, runnable
+from ngpt.result_file import Look, check_image, seen, write_result
 from ngpt.stack import GradientStack
+from ngpt.system.files import save
 from ngpt.system.text import by_names
 
 
 @dataclass(frozen=True)
 class Denoising:
-    """``method`` is a name, or "auto": see ``ngpt.methods.choose``.
-
-    ``transform`` and ``exposure`` say how a picture shows light, as in `ngpt denoise`.
-    """
+    """``method`` is a name, or "auto": see ``ngpt.methods.choose``."""
 
     method: str = "auto"
-    transform: str = "standard"
-    exposure: float | str = 0.0
+    look: Look = field(default_factory=Look)  # of a picture
 
     @property
     def needs_gradients(self) -> bool:
@@ -55,47 +54,33 @@ class Denoising:
                 f"method '{self.method}' needs variances, and one sample per pixel has none: --spp 2 or more"
             )
 
-    def write(self, file: Path, stack: GradientStack, overwrite: bool, keeps: bool) -> dict[str, Any]:
-        """Makes and writes the image, and returns the attributes that say what made it.
-
-        What was rendered is not lost where that fails: the stack is written beside ``file``, unless one ``keeps`` it.
-        """
-        from ngpt.cli.denoise_files import Frame, write_frame  # imports metrics, which a stack does not need
-
-        try:
-            pixels = seen(stack.place)
-            check_size(file, pixels.width, pixels.height)
-            result = reconstruct(stack, self.method)
-        except Exception as error:  # methods may come from other packages, and fail in any way
-            if keeps:
-                raise
-            why = str(error)
-            if not isinstance(error, NgptError):
-                why = f"method '{self.method}' failed: {type(error).__name__}: {error}".rstrip(": ")
-            # What stands for standard output goes when the command ends.
-            lasting = file if by_names(str(file)) == str(file) else Path(file.name)
-            raise kept_apart(why, stack, lasting.with_name(f"{file.stem}.stack.exr")) from error
-        frame = Frame(Path(stack.path), file, stack, result)
-        write_frame(frame, overwrite, self.transform, self.exposure, keep=True)
-        return result.attributes
-
 
 @dataclass(frozen=True)
 class Output:
-    """The ``file`` for a stack or, with ``denoising``, for its image; ``kept`` is one for the stack then, if any."""
+    """The ``file`` for the stack of a request or, with ``denoising``, for its image; ``kept``: one for the stack then.
 
+    ``frame``: of a shot
+    """
+
+    request: RenderRequest
     file: Path
     denoising: Denoising | None = None
     kept: Path | None = None
+    frame: int | None = None
+    header: dict[str, str] = field(init=False)  # what the stack's header says of the request
+
+    def __post_init__(self) -> None:
+        # Of the scene's file as it is before the render
+        object.__setattr__(self, "header", self.request.header(self.frame))
 
     @property
     def stack(self) -> Path:
         return self.kept or self.file
 
-    def check(self) -> None:
-        """Raises WrongUse for files that cannot be such."""
+    def check(self, skip_existing: bool) -> None:
+        """Raises WrongUse for files that cannot be such, or that cannot say what is there of a render."""
         if self.denoising is not None:
-            check_image(self.file, self.denoising.transform)
+            check_image(self.file, self.denoising.look.transform)
         for path in (self.kept, None if self.denoising else self.file):
             if path is not None and path.suffix.lower() != ".exr":
                 raise WrongUse(
@@ -103,25 +88,34 @@ class Output:
                 )
         if self.kept is not None and self.kept.resolve() == self.file.resolve():
             raise WrongUse(f"--keep {self.kept}: is the file of the image; give another name, or leave --keep out")
-
-    def check_begun(self, sampler: str) -> None:
-        """Raises WrongUse for an image that cannot be made of what ``sampler`` has begun."""
-        if self.denoising is not None:
-            self.denoising.check(sampler, None, str(self.stack))
-
-    def check_skipping(self) -> None:
-        """Raises WrongUse where nothing could tell what is there of a render."""
-        if self.stack.suffix.lower() != ".exr":
+        if skip_existing and self.request.cpu_seconds is not None:
+            raise WrongUse("--skip-existing: no file says how much processor time it took; give --time or --spp")
+        if skip_existing and self.stack.suffix.lower() != ".exr":
             raise WrongUse(
                 f"{self.file}: --skip-existing checks only OpenEXR files; keep the stack too: --keep FILE.exr"
             )
 
-    def done(self, asked: Asked) -> bool:
+    def left(self) -> RenderRequest | None:
+        """What is left to render: all, if no whole file is there, or the rest; None: nothing.
+
+        Raises NgptError if the file's stack is of another request, or of no use for the image.
+        """
+        if not finished(self.stack):
+            return self.request
+        rest = rest_of(self.request, self.stack, self.frame)
+        for_whom = self.denoising or Denoising(self.request.method or "auto")
+        for_whom.check(str(read_header(self.stack)[0].get("ngpt:sampler", "")), None, str(self.stack))
+        return rest
+
+    def done(self) -> bool:
         """Whether all is there that is asked for.
 
         Raises NgptError where a stack is there in place of its image, or the image of another method.
         """
-        if not asked.done(self.stack):
+        try:
+            if self.left() is not None:
+                return False
+        except NgptError:
             return False
         by = read_header(self.file)[0].get("ngpt:method") if _readable(self.file) else None
         if self.denoising is not None and by and self.denoising.method not in ("auto", by):
@@ -143,23 +137,45 @@ class Output:
     def write(
         self, stack: GradientStack, overwrite: bool, begun: GradientStack | None = None
     ) -> tuple[GradientStack, dict[str, Any]]:
-        """Writes a stack, in place of the one that was ``begun`` and together with it, or the image of both.
+        """Writes a stack, in place of the one that was ``begun`` and together with it, or the image of both. The header
+        says what was asked for.
 
         Returns the whole stack, and the attributes that say what made the image. Nothing that was rendered is lost.
         """
+        stack.attributes |= self.header
+        if begun is not None:
+            stack, overwrite = joined_or_kept(self.stack, stack, begun), True
         if self.denoising is None or self.kept is not None:
-            stack = write_part(self.stack, stack, overwrite, begun)
-        elif begun is not None:
-            stack, overwrite = joined_or_kept(self.file, stack, begun), True
+            save(self.stack, lambda path, overwrite: write(path, stack, overwrite=overwrite), overwrite)
         return stack, self.image(stack, overwrite) if self.denoising else {}
 
     def image(self, stack: GradientStack, overwrite: bool) -> dict[str, Any]:
+        """Makes and writes the image, and returns the attributes that say what made it.
+
+        What was rendered is not lost where that fails: unless the stack is kept, it is written beside the image.
+        """
         assert self.denoising is not None
         # Dr.Jit keeps the memory of a render for the next one: at 1920x1080 more than a method takes.
         import drjit as dr
 
         dr.flush_malloc_cache()
-        return self.denoising.write(self.file, stack, overwrite, keeps=self.kept is not None)
+        file, method, look = self.file, self.denoising.method, self.denoising.look
+        try:
+            pixels = seen(stack.place)
+            check_size(file, pixels.width, pixels.height)
+            result = reconstruct(stack, method)
+        except Exception as error:  # methods may come from other packages, and fail in any way
+            if self.kept is not None:
+                raise
+            why = str(error)
+            if not isinstance(error, NgptError):
+                why = f"method '{method}' failed: {type(error).__name__}: {error}".rstrip(": ")
+            # What stands for standard output goes when the command ends.
+            lasting = file if by_names(str(file)) == str(file) else Path(file.name)
+            raise kept_apart(why, stack, lasting.with_name(f"{file.stem}.stack.exr")) from error
+        views, made = [(result.image, stack)], result.attributes
+        save(file, lambda path, overwrite: write_result(path, views, made, look, overwrite), overwrite)
+        return made
 
 
 def _readable(file: Path) -> bool:

@@ -48,7 +48,7 @@ class Rounds(Protocol):
 
     ``shares``  whether they depend on it in the current render
     ``said``    header attributes that say so
-    ``seed``    of what rounds find; None: that of the render
+    ``seed``    the seed by which rounds find it; None: the seed of the render
     """
 
     shares: bool

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import mitsuba as mi
 
 from data_gen.adaptive import Adaptive, check_adaptive, render_adaptive
 from data_gen.begun import Unfinished
-from data_gen.budget import DEFAULT_MEMORY, Budget, Progress, Watch, wall
+from data_gen.budget import Progress, Watch
 from data_gen.film import GradientFilm
 from data_gen.passes import render_passes, rounds_of
-from data_gen.samplers import SAMPLERS, choose, find
+from data_gen.request import RenderRequest, asked
+from data_gen.samplers import SAMPLERS, described, find
 from data_gen.samplers.registry import Entry, Sampler, own
 from data_gen.samplers.reused import Made
 from data_gen.samplers.sharing import sharing_of
@@ -23,7 +25,7 @@ from data_gen.scenes.cameras import place_of
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import check_scene
-from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
+from ngpt.errors import WrongUse, stop_if_interrupted
 from ngpt.io.exr import with_channels
 from ngpt.layers import GATHERED
 from ngpt.merging import UNFINISHED
@@ -32,9 +34,6 @@ from ngpt.stack import GradientStack
 from ngpt.subpixels import CHOICES, SUBPIXELS, best
 from ngpt.version import __version__
 
-# Called after each pass of a render with a function that makes the stack of the samples done by then
-Newest = Callable[[Callable[[], GradientStack]], None]
-
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
 # The share of light cut from the cache that is said
@@ -42,80 +41,87 @@ _MUCH_CUT = 0.01
 
 
 def render_stack(
-    scene: mi.Scene,
-    spp: int | None,
+    scene: mi.Scene | RenderRequest,
+    spp: int | None = None,
     seed: int = 0,
     sampler: str = "auto",
     progress: Progress = lambda done, total: None,
     *,
-    seconds: float | None = None,
-    clock: Callable[[], float] = wall,
-    memory: int = DEFAULT_MEMORY,
-    stop: Callable[[], bool] = lambda: False,
-    newest: Newest = lambda stack: None,
-    diagnostics: bool = False,
-    with_features: bool = True,
-    adaptive: Adaptive | None = None,
     made: Made | None = None,
-    unbiased: bool = False,
     tails_seed: int | None = None,
-    subpixels: int | str = 1,
-    **options: Any,
+    with_features: bool = True,
+    adaptive: Adaptive | bool | None = None,
+    **given: Any,
 ) -> GradientStack:
-    """Renders a stack from the scene's first sensor.
+    """Renders a stack from the first sensor of a loaded scene.
 
-    What ``data_gen.render_scene`` has too is as there; ``options`` may be strings; ``seconds`` are of the ``clock``.
-    With ``diagnostics`` the images of ``data_gen.film.GradientFilm.diagnose()`` are further channels. Without
-    ``with_features`` the stack holds only the primal; only sampler "primal" can do without features. The scene's
-    reconstruction filter is not used: the pixels of a stack, and so their differences, are box-filtered.
+    ``given`` is as for ``data_gen.render_scene``; a request may be given in place of the scene. Here "auto" is the
+    sampler that the scene's description stands for, without a pilot, and "auto" subpixels must be asked for.
 
-    With ``adaptive``, pixels get different numbers of samples, which the layer ``samples`` contains: see
-    ``data_gen.adaptive``. ``spp`` and ``ngpt:spp`` are then means over pixels.
+    ``with_features``  False is the option ``features=False`` of sampler "primal": the stack holds only the primal
+    ``adaptive``       may say error and method at once; ``ngpt:spp`` is the mean over pixels then, and the layer
+                       ``samples`` says how many each has
+    ``made``           renders of one scene that are given the same object share their samplers, where possible
+    ``tails_seed``     of the noise of the cache of tails, by default ``seed``: it stands still in frames that have the
+                       same
+    """
+    if isinstance(adaptive, Adaptive):
+        given |= {"error": adaptive.error, "method": adaptive.method}
+    if not isinstance(scene, RenderRequest):
+        given = {"subpixels": 1, **given}
+    given = {"adaptive": bool(adaptive), **given} | ({} if with_features else {"features": False})
+    named = {"spp": spp, "seed": seed, "sampler": sampler, "progress": progress}
+    request, watch = asked(scene, named | given)
+    return render(check_scene(request.scene), request, watch, made=made, tails_seed=tails_seed)
 
-    Unless it is ``unbiased``, samplers with the option ``tails`` let paths share what they find, where that works and
-    pays (``data_gen.tails``): the default of all doors, which are this function, ``render_scene``, `ngpt render` and
-    our plugins. The attribute ``ngpt:samplerOptions`` then contains ``tails=shared``. The noise of what they share
-    comes from ``tails_seed``, by default ``seed``: it stands still in frames that have the same.
 
-    With ``subpixels`` K, 2 or 4, or where "auto" finds them of use, the stack has K x K subpixels (``ngpt.subpixels``).
+def render(
+    scene: mi.Scene,
+    request: RenderRequest,
+    watch: Watch = Watch(),  # noqa: B008 - it is frozen
+    *,
+    made: Made | None = None,
+    tails_seed: int | None = None,
+    more: Mapping[str, Any] = MappingProxyType({}),
+) -> GradientStack:
+    """The stack of a request by its sampler, from the first sensor of its loaded ``scene``; ``more`` goes into the
+    header. For ``made`` and ``tails_seed`` see ``render_stack``.
 
-    Renders of one scene that are given the same object ``made`` share their samplers, where that is possible.
+    The scene's reconstruction filter is not used: the pixels of a stack, and so their differences, are box-filtered.
+    With ``diagnostics`` the images of ``data_gen.film.GradientFilm.diagnose()`` are further channels. Samplers with the
+    option ``tails`` let paths share what they find, where that works and pays (``data_gen.tails``), unless the request
+    is ``unbiased``; ``ngpt:samplerOptions`` then contains ``tails=shared``.
 
     The same seed, options and number of samples give the same bits, however the render was ended. If the number of
     samples is not known beforehand, the option points=rounds is used and recorded in ``ngpt:samplerOptions``. A render
     that ``stop`` ended before it had all samples is marked by ``ngpt:unfinished``.
 
-    Raises Unfinished, which has the stack of the samples done by then, where a later pass fails; and NgptError for
-    options that do not exist or make no sense, and for a scene that the sampler cannot render.
+    Raises Unfinished, which has the stack of the samples done by then, where a later pass fails; and NgptError for a
+    scene that the sampler cannot render.
     """
-    budget = Budget(spp, seconds, memory, clock)
-    check_limits(budget, seed, sampler, adaptive is not None and adaptive.error is not None)
-    facts = scene_facts(check_scene(scene))
-    if sampler == "auto":
-        sampler, _ = choose(facts)
+    spp, seed, budget = request.spp, request.seed, request.budget
+    seconds, clock = budget.seconds, budget.clock
+    facts = scene_facts(scene)
+    sampler = described(facts, request.gradients)[0] if request.sampler == "auto" else request.sampler
     entry = find(sampler, facts)
-    if not with_features:
-        if "features" not in entry.options:
-            without = ", ".join(name for name, other in SAMPLERS.items() if "features" in other.options)
-            raise NgptError(f"sampler '{sampler}' always renders features; only '{without}' can leave them out")
-        options["features"] = False
-    settings = entry.settings(options)
+    settings = entry.settings(request.options)
     said: dict[str, Any] = {}
     if "tails" in settings:
         sharing = sharing_of(scene.sensors()[0], entry, facts, settings, budget)
-        if "tails" not in options and not unbiased:
+        if "tails" not in request.options and not request.unbiased:
             said = {TAILS: f"off: {sharing.not_now}"} if sharing.not_now else {}
             settings["tails"] = "paths" if sharing.not_now else "shared"
         if settings["tails"] == "shared":
             if sharing.never:
                 raise WrongUse(f"sampler '{sampler}': tails=shared is not possible: {sharing.never}; leave it out")
             budget = sharing.rest
+    adaptive = Adaptive(request.error, request.method or "auto") if request.shares else None
     if adaptive is not None:
         check_adaptive(adaptive, entry, settings, spp)
-    kept = subpixels_of(entry, subpixels, spp)
+    kept = subpixels_of(entry, request.subpixels, spp)
     _LOG.info("sampler %s, options %s", sampler, options_as_attribute(entry, settings) or "as by default")
     start, begun = time.perf_counter(), clock()
-    more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
+    how_made = {"diagnostics": True} if request.diagnostics and entry.diagnoses else {}
     sensor = scene.sensors()[0]
     chosen: dict[str, Any] = {}
     known = {GATHERED: 1} if entry.gathers else {}
@@ -123,18 +129,18 @@ def render_stack(
 
     def look(film: GradientFilm) -> None:
         whole[:] = [film]
-        newest(lambda: stack_of(film, sensor, seed, sampler, start, known))
+        watch.newest(lambda: stack_of(film, sensor, seed, sampler, start, known))
 
+    looking = replace(watch, look=look)
     # If time may end the render, the number of samples is not known, except that it is at most ``spp``.
     if settings.get("points") == "sobol" and (spp is None or seconds is not None or adaptive is not None):
         settings["points"] = "rounds"
-    watch = Watch(progress, stop, look)
     how: dict[str, Any] = {"lane_bytes": entry.lane_bytes, "points": settings.get("points", "independent")}
     how |= {"gradients": entry.film_of_gradients, "subpixels": kept}
     with weighed(scene, settings["lamps"], entry.by_place) as places:
-        more |= own(settings) | ({"places": places} if places else {})
+        how_made |= own(settings) | ({"places": places} if places else {})
         made = made or Made()
-        sample = made.sampler(entry, scene, more)
+        sample = made.sampler(entry, scene, how_made)
         rounds_of(sample).seed = tails_seed
         # However long it took to weigh the lamps, the render is begun.
         if seconds is not None:
@@ -142,9 +148,9 @@ def render_stack(
         failed = None
         try:
             if adaptive is None:
-                film = render_passes(sample, sensor, seed, budget, watch, batch=entry.batch, **how)
+                film = render_passes(sample, sensor, seed, budget, looking, batch=entry.batch, **how)
             else:
-                film, chosen = render_adaptive(sample, sensor, seed, adaptive, budget, watch, **how)
+                film, chosen = render_adaptive(sample, sensor, seed, adaptive, budget, looking, **how)
         except Exception as error:
             stop_if_interrupted(error)
             if not whole:
@@ -152,7 +158,7 @@ def render_stack(
             film, failed = whole[0], error
             film.forget_pass()
         else:
-            made.keep(entry, scene, more, sample)
+            made.keep(entry, scene, how_made, sample)
     if settings.get("tails") == "shared":
         rounds = rounds_of(sample)
         settings["tails"], said = "shared" if rounds.shares else "paths", rounds.said
@@ -160,11 +166,11 @@ def render_stack(
             what = "some paths were so bright that it would have been seen as spots; --unbiased keeps all light"
             _LOG.warning("the cache of tails has lost %.1f %% of its light: %s", 100 * cut, what)
     done = round(float(film.samples_each.mean()))
-    chosen = chosen | known | said | {"ngpt:spp": done} | options_as_attribute(entry, settings)
-    if failed or (stop() and (spp is None or done < spp)):
+    chosen = chosen | dict(more) | known | said | {"ngpt:spp": done} | options_as_attribute(entry, settings)
+    if failed or (watch.stop() and (spp is None or done < spp)):
         chosen[UNFINISHED] = "failed" if failed else "interrupted"
-    stack = stack_of(film, sensor, seed, sampler, start, chosen, diagnostics=diagnostics)
-    if subpixels == "auto" and best(done) == 1 and stack.fine:  # it was ended early
+    stack = stack_of(film, sensor, seed, sampler, start, chosen, diagnostics=request.diagnostics)
+    if request.subpixels == "auto" and best(done) == 1 and stack.fine:  # it was ended early
         stack = replace(stack, fine={})
         del stack.attributes[SUBPIXELS]
     if failed:
@@ -217,12 +223,3 @@ def subpixels_of(entry: Sampler, asked: int | str, spp: int | None) -> int:
         f"sampler '{entry.name}' puts light on any pixel and has no subpixels: leave --subpixels out, or name one of: "
         f"{able}"
     )
-
-
-def check_limits(budget: Budget, seed: int, sampler: str, ends: bool = False) -> None:
-    """Raises WrongUse for what no scene could be rendered with; ``ends``: something else ends the render."""
-    budget.check(ends)
-    if not 0 <= seed < 2**64:
-        raise WrongUse(f"seed {seed} is out of range; use 0 .. 2^64 - 1")
-    if sampler != "auto":
-        find(sampler)

@@ -31,7 +31,7 @@ def render(scene: mi.Scene, options: Options, spp: int | None, seed: int, *, sec
     from data_gen.render import render_stack
 
     # References and what is compared are unbiased, unless a row's options name tails=shared.
-    return render_stack(scene, spp, seed, seconds=seconds, unbiased=True, **options)
+    return render_stack(scene, spp, seed, **{"seconds": seconds, "unbiased": True, "gradients": True, **options})
 
 
 def warm_up(scene: mi.Scene, options: Options) -> GradientStack:

@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from concurrent.futures import as_completed
 from dataclasses import dataclass, field
-from inspect import signature
+from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-from data_gen.backend import DEFAULT_VARIANT
-from data_gen.begun import Asked, Rest, Unfinished, begun_stack, scene_name
+from data_gen.begun import Unfinished, begun_stack
 from data_gen.cluster import cluster
-from data_gen.frames.pattern import filled
 from data_gen.outputs import Denoising, Output
-from data_gen.samplers import FRAME_SAMPLERS
-from data_gen.session import DEFAULT_SPP, render_frames
-from ngpt.errors import NgptError, WrongUse
+from data_gen.request import RenderRequest, asked
+from data_gen.session import render_frames
+from ngpt.errors import NgptError
 from ngpt.io.whole import finished
 from ngpt.stack import GradientStack
 from ngpt.system.files import check_output, make_folder
@@ -41,7 +38,7 @@ class Written:
 
 
 def write_frames(
-    scene: str,
+    scene: str | RenderRequest,
     files: Mapping[int, Path],
     *,
     shard: tuple[int, int] = (0, 1),
@@ -50,34 +47,33 @@ def write_frames(
     denoising: Denoising | None = None,
     made: Callable[[Written, int], None] = lambda written, total: None,
     stop: Callable[[], bool] = lambda: False,
-    **options: Any,
+    **given: Any,
 ) -> Written:
     """Writes the stack of each frame to its file; ``files`` maps all frames of the shot, in order, to their files.
 
     With ``denoising`` it writes images instead of stacks, see ``data_gen.outputs``. With ``shard`` (i, n) it writes
     only part i of n. ``made`` is called with what is written so far and the number of frames, before the first sample
-    and after each frame. Missing folders are made before the first sample, too. ``options`` are as in
-    ``render_frames``. Raises NgptError as ``render_frames`` does, and for files that exist unless ``overwrite`` or
-    ``skip_existing`` says what to do with them.
+    and after each frame. Missing folders are made before the first sample, too. All else is as in ``render_frames``.
+    Raises NgptError as ``render_frames`` does, and for files that exist unless ``overwrite`` or ``skip_existing`` says
+    what to do with them.
     """
+    request, _ = asked(scene, given, files)
     number, parts = shard
     # Each part is a run of consecutive frames, since a frame needs the scene of the previous one.
     part_of = {frame: i * parts // len(files) for i, frame in enumerate(files)}
     ours = [frame for frame in files if part_of[frame] == number]
-    outputs = {frame: Output(files[frame], denoising) for frame in ours}
+    outputs = {frame: Output(request, files[frame], denoising, frame=frame) for frame in ours}
     for frame, output in outputs.items():
-        output.check()
-        if skip_existing:
-            output.check_skipping()
+        output.check(skip_existing)
         _check(files[frame], overwrite or skip_existing)
     written = Written()
-    asked = {frame: asked_of(scene, frame, **options) for frame in ours}
     # Begun frames come first, grouped by what is left of them: the scene stays in memory.
-    begun = _begun(asked, outputs) if skip_existing else {}
-    gone_on = {frame for frames in begun.values() for frame in frames}
+    begun = _begun(outputs) if skip_existing else []
+    gone_on = {frame for _, frames in begun for frame in frames}
 
+    @cache
     def begins() -> None:
-        for folder in dict.fromkeys(files[frame].parent for frame in ours):
+        for folder in {files[frame].parent for frame in ours}:
             make_folder(folder)
         made(written, len(ours))
 
@@ -85,63 +81,44 @@ def write_frames(
         # Only when its turn has come, for several machines may be at work on one shot.
         if part_of[frame] != number or frame in gone_on:
             return True
-        there = skip_existing and finished(files[frame]) and asked[frame].left(files[frame]) is None
-        there = there and outputs[frame].done(asked[frame])
+        there = skip_existing and outputs[frame].left() is None and outputs[frame].done()
         written.skipped += there
         return there
 
     def add(frame: int, stack: GradientStack) -> None:
-        asked[frame].name(stack)
         cut = skip_existing and files[frame].exists() and not finished(files[frame])
         # Another machine may have been faster.
         by: dict[str, Any] = {}
-        if not (skip_existing and outputs[frame].done(asked[frame])):
+        if not (skip_existing and outputs[frame].done()):
             before = begun_stack(files[frame]) if frame in gone_on else None
             stack, by = outputs[frame].write(stack, overwrite or cut, before)
         said = {"in place of": "a file that was not whole"} if cut else {}
         written.frames.append(report_of(stack, files[frame], by) | said)
         made(written, len(ours))
 
-    progress = _once(begins)
+    def progress(frame: int) -> Callable[[int, int], None]:
+        return lambda done, total: begins()
 
-    def write_all(skip: Callable[[int], bool], more: Mapping[str, Any]) -> None:
-        how = {**options, **more, "skip": skip, "stop": stop, "progress": progress}
+    def write_all(part: RenderRequest, skip: Callable[[int], bool]) -> None:
         try:
-            for frame, stack in render_frames(scene, list(files), **how):
+            for frame, stack in render_frames(part, skip=skip, stop=stop, progress=progress):
                 add(frame, stack)
         except Unfinished as error:
             frame = error.stack.attributes["ngpt:frame"]
-            if not options.get("dt"):
+            if not request.dt:
                 add(frame, error.stack)
                 raise NgptError(f"{error}; {files[frame]} has the samples done before") from error
             raise
 
-    for rest, frames in begun.items():
+    for rest, frames in begun:
         others = frozenset(files) - frozenset(frames)
-        write_all(others.__contains__, rest.options(options.get("seed", 0)))
-    write_all(skip, {})
+        write_all(rest, others.__contains__)
+    write_all(request, skip)
     if stop():
         done = {report["frame"] for report in written.frames if "unfinished" not in report}
-        left = (frame for frame in ours if frame not in done and not asked[frame].done(files[frame]))
+        left = (frame for frame in ours if frame not in done and not outputs[frame].done())
         written.interrupted = next(left, None)
     return written
-
-
-def asked_of(scene: str, frame: int, **arguments: Any) -> Asked:
-    """What ``render_frames`` is asked for a frame by these ``arguments``; the defaults are in its signature."""
-    bound = signature(render_frames).bind(scene, [frame], **arguments)
-    bound.apply_defaults()
-    its = SimpleNamespace(**bound.arguments)
-    remembers, spp = FRAME_SAMPLERS.get(its.sampler), its.spp
-    if spp is None and (its.seconds is None or remembers):
-        spp = remembers.spp if remembers else DEFAULT_SPP
-    given = {name: filled(text, frame) for name, text in (its.parameters or {}).items()}
-    given |= {"--fps": str(its.fps), "--dt": str(its.dt)}
-    given |= {} if its.sensor is None else {"--sensor": str(its.sensor)}
-    name = scene_name(filled(scene, frame), given, None if its.camera is None else str(its.camera))
-    same = ("seed", "sampler", "options", "size", "seconds", "unbiased", "diagnostics", "subpixels")
-    known = {field: getattr(its, field) for field in same}
-    return Asked(name, spp=spp, frame=frame, variant=its.variant or DEFAULT_VARIANT, **known)
 
 
 def report_of(stack: GradientStack, file: Path, made: Mapping[str, Any]) -> dict[str, Any]:
@@ -156,27 +133,27 @@ def report_of(stack: GradientStack, file: Path, made: Mapping[str, Any]) -> dict
 
 def write_frames_on_cluster(
     address: str,
-    scene: str,
+    scene: str | RenderRequest,
     files: Mapping[int, Path],
     *,
     overwrite: bool = False,
     skip_existing: bool = False,
+    denoising: Denoising | None = None,
     made: Callable[[Written, int], None] = lambda written, total: None,
-    **options: Any,
+    **given: Any,
 ) -> Written:
     """``write_frames`` in parts, each on a worker of the Dask cluster whose scheduler is at ``address``."""
-    if options.pop("shard", None):
-        raise WrongUse("--cluster distributes the frames itself; leave --shard out")
+    request, _ = asked(scene, given, files)
     for file in files.values():
         _check(file, overwrite or skip_existing)
     parts = -(-len(files) // FRAMES_OF_A_PART)
     # A part that is tried again, since its worker died, goes on.
-    options |= {"overwrite": overwrite, "skip_existing": skip_existing or not overwrite}
+    how: Any = {"overwrite": overwrite, "skip_existing": skip_existing or not overwrite, "denoising": denoising}
     order = list(files)
     whole = Written()
     with cluster(address) as workers:
         made(whole, len(files))
-        futures = [workers.submit(write_frames, scene, dict(files), shard=(i, parts), **options) for i in range(parts)]
+        futures = [workers.submit(write_frames, request, dict(files), shard=(i, parts), **how) for i in range(parts)]
         for future in as_completed(futures):
             part = future.result()
             whole.frames += part.frames
@@ -186,13 +163,15 @@ def write_frames_on_cluster(
     return whole
 
 
-def _begun(asked: Mapping[int, Asked], outputs: Mapping[int, Output]) -> dict[Rest, list[int]]:
-    """The frames that were begun, by what is left of them."""
-    begun: dict[Rest, list[int]] = {}
+def _begun(outputs: Mapping[int, Output]) -> list[tuple[RenderRequest, list[int]]]:
+    """The requests that finish the frames which were begun, each with the numbers of its frames."""
+    begun: list[tuple[RenderRequest, list[int]]] = []
     for frame, output in outputs.items():
-        if finished(output.file) and (rest := asked[frame].left(output.file)):
-            output.check_begun(rest.sampler)
-            begun.setdefault(rest, []).append(frame)
+        if (rest := output.left()) is not None and rest is not output.request:
+            frames = next((frames for other, frames in begun if other == rest), None)
+            if frames is None:
+                begun.append((rest, frames := []))
+            frames.append(frame)
     return begun
 
 
@@ -200,14 +179,3 @@ def _check(file: Path, overwrite: bool) -> None:
     """``check_output``, for a file whose folder need not be there."""
     if file.parent.exists():
         check_output(file, overwrite, may_skip=True)
-
-
-def _once(begins: Callable[[], None]) -> Callable[[int], Callable[[int, int], None]]:
-    """The ``progress`` of frames that calls ``begins`` when the first of them begins."""
-    waiting = [begins]
-
-    def progress(done: int, total: int) -> None:
-        while waiting:
-            waiting.pop()()
-
-    return lambda frame: progress

@@ -37,6 +37,8 @@ VARIANCES = {name: f"{name}_var" for name in ("primal", "dx", "dy", "caustic", "
 DIAGNOSTICS = "diagnostics."
 # Attribute: what broke a render off before all that was asked for was done, "interrupted" or "failed"
 UNFINISHED = "ngpt:unfinished"
+# Attribute: what was asked for, all in one (``data_gen.request``); of stacks that are merged nobody asked so
+REQUEST = "ngpt:request"
 # Attribute: the sampler's options that are not defaults, with commas between
 OPTIONS = "ngpt:samplerOptions"
 # Of these, how a path finds light behind its first steps: in a cache of what other paths found, or by itself, which is
@@ -69,8 +71,10 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     ``ngpt:seconds`` and ``ngpt:discarded`` are sums, ``ngpt:samplerOptions`` has the options of all stacks, and also
     tails=paths where only some of them have tails=shared, ``ngpt:tails`` says what it says in each stack,
     ``ngpt:tailsCut`` is the mean over all samples, ``ngpt:gathered`` is 1 where any stack has it, ``ngpt:featureNoise``
-    is the noise of the merged features where all stacks have it, ``ngpt:unfinished`` is left out, and all other
-    attributes come from the first stack. Raises NgptError for fewer than two stacks, stacks that differ in layers or
+    is the noise of the merged features where all stacks have it, ``ngpt:unfinished`` and ``ngpt:request`` are left out,
+    and all other attributes come from the first stack.
+
+    Raises NgptError for fewer than two stacks, stacks that differ in layers or
     sampler, or are of pictures of different size, tiles that leave pixels out, a seed that occurs twice in one place,
     missing ``ngpt:spp`` or ``ngpt:seed``, ``samples`` that are negative or not finite, ``ngpt:seconds``,
     ``ngpt:discarded``, ``ngpt:featureNoise`` or ``ngpt:tailsCut`` that are no numbers, results of a reconstruction, and
@@ -104,12 +108,11 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     if np.ptp(total):
         layers["samples"] = total
     seeds = dict.fromkeys(seed for stack in stacks for seed in _seeds(stack))
-    attributes = dict(stacks[0].attributes) | {
+    of_parts = (UNFINISHED, REQUEST, SUBPIXELS)
+    attributes = {name: value for name, value in stacks[0].attributes.items() if name not in of_parts} | {
         "ngpt:spp": max(1, round(float(total.mean()))),
         "ngpt:seed": " ".join(seeds),
     }
-    attributes.pop(UNFINISHED, None)
-    attributes.pop(SUBPIXELS, None)
     attributes |= {SUBPIXELS: k} if fine else {}
     attributes |= _options(stacks) | _tails(stacks, spp)
     for name in ("ngpt:seconds", "ngpt:discarded"):

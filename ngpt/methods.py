@@ -326,7 +326,8 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     with np.errstate(over="ignore", invalid="ignore"):
         image = _run(name, entry, data, values, stack.path) + data.direct
         if data.caustic is not None:
-            image += data.by_oidn.of_caustic if data.by_oidn else caustic.denoised(data)
+            spread = caustic.of_photons if apart else caustic.denoised
+            image += data.by_oidn.of_caustic if data.by_oidn else spread(data)
     image = enlarged(image, power)
     if matrix is not None:
         image = converted(image, np.linalg.inv(matrix))

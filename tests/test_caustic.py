@@ -57,7 +57,7 @@ def test_oidn_leaves_the_light_of_photons_to_the_diffusion(auxiliary):
     photons = GradientStack(alone, {GATHERED: 1})
     plain = GradientStack({name: PLAIN[name] for name in alone if not name.startswith("caustic")})
     data = repair(photons)
-    expected = ngpt.denoise(plain, "oidn", auxiliary=auxiliary) + caustic.denoised(data)
+    expected = ngpt.denoise(plain, "oidn", auxiliary=auxiliary) + caustic.of_photons(data)
     assert np.allclose(ngpt.denoise(photons, "oidn", auxiliary=auxiliary), expected, atol=1e-4)
     for method in ("primal", "nfor"):
         assert np.array_equal(ngpt.denoise(photons, method), ngpt.denoise(GradientStack(alone), method))
@@ -217,6 +217,21 @@ def test_light_does_not_cross_from_surface_to_surface():
     layers["normal"][:, :20, 2] = layers["normal"][:, 20:, 0] = 3
     image = caustic.denoised(repair(stack.replace(caustic=lit, caustic_var=lit**2, **layers)))
     assert image[:, 20:].sum() < 0.01 * image.sum()
+
+
+def test_the_texture_under_photons_stays(rng):
+    """Light that is the same everywhere, but for noise, on a floor of many colours."""
+    size = (40, 50)
+    albedo = rng.uniform(0.1, 0.8, (*size, 3)).astype(np.float32)
+    light = (albedo * rng.uniform(0, 4, (*size, 1))).astype(np.float32)
+    layers = {"albedo": albedo, "normal": np.zeros_like(albedo), "depth": np.full((*size, 1), 3.0)}
+    data = repair(full_stack(*size).replace(primal=light, caustic=light, caustic_var=(2 * albedo) ** 2, **layers))
+
+    def error(image):
+        return np.square(image / (2 * albedo) - 1).mean()
+
+    assert error(caustic.of_photons(data)) < 0.2 * error(caustic.denoised(data))
+    assert caustic.of_photons(data).sum(dtype=np.float64) == pytest.approx(light.sum(dtype=np.float64), rel=1e-4)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 1), (2, 2), (3, 70)])

@@ -22,18 +22,22 @@ ngpt.classical ngpt.merging
 ngpt.denoisers
 ngpt.network
 ngpt.methods
+ngpt.result_file
 ngpt.sequence
 ngpt.api ngpt.measure
 ngpt.report
 ngpt.training ngpt.evaluation
 ngpt.export
 ngpt.cli
-data_gen.scenes data_gen.budget data_gen.llvm data_gen.cluster
+data_gen.scenes data_gen.budget data_gen.llvm data_gen.cluster data_gen.pattern
 data_gen.paths data_gen.film
 data_gen.passes data_gen.tails
 data_gen.samplers
-data_gen.adaptive data_gen.begun data_gen.plugins
-data_gen.render data_gen.inspect data_gen.backend
+data_gen.adaptive data_gen.plugins data_gen.caustics
+data_gen.inspect data_gen.backend
+data_gen.request
+data_gen.begun
+data_gen.render
 data_gen.frames data_gen.choosing
 data_gen.dataset data_gen.session data_gen.code
 data_gen.outputs data_gen.service

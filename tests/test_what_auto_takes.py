@@ -24,7 +24,7 @@ def rows(renderer, tmp_path_factory):
 
     scenes = [load_scene(name, (96, 64)) for name in ("diffuse", "glossy")]
     truths = [render_stack(scene, 512, seed=1, sampler="primal", unbiased=True)["primal"] for scene in scenes]
-    stacks = [render_stack(scene, 16, seed=0, unbiased=True) for scene in scenes]
+    stacks = [render_stack(scene, 16, seed=0, sampler="gpt", unbiased=True) for scene in scenes]
     return renderers(list(zip(stacks, truths, strict=True)), tmp_path_factory.mktemp("files"))
 
 

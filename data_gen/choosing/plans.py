@@ -20,10 +20,11 @@ from data_gen.adaptive import Adaptive
 from data_gen.budget import DEFAULT_MEMORY
 from data_gen.choosing.look import features_pay
 from data_gen.choosing.pipelines import Pipeline, choose, measure, methods_for
-from data_gen.choosing.trials import PIXELS, Pilot, Trial, at_most, candidates, try_all
+from data_gen.choosing.trials import PIXELS, Pilot, Trial, candidates, try_all
 from data_gen.passes import film_within
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.facts import scene_facts
+from data_gen.scenes.load import at_most
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS, runnable
 from ngpt.system.console import brief
@@ -47,6 +48,10 @@ LONG, LEAST_PIXELS = 400.0, 1 / 16
 # A rival must leave so many times less error: a choice is not worth changing for what chance could have made. The
 # errors of networks and denoisers are expected less well, and their choice was seen to be wrong by 1.6 times.
 _MARGIN, _MARGIN_OF_IMAGES = 1.1, 1.6
+# The share of light that only photons find from which on they are taken, if so many samples fit into the time; seconds
+# of a million of their samples on two cores, and until the first one is done
+_CAUSTIC_SHARE, _CAUSTIC_SPP = 0.02, 16
+_CAUSTIC_SECONDS, _CAUSTIC_BEGINS = 10.0, 8.0
 
 
 @dataclass(frozen=True)
@@ -128,11 +133,14 @@ def plan(
     description stands for, then the other unbiased samplers that ``--sampler auto`` compares, as far as they fit into a
     tenth of the time, compilation and methods included. The less time, the smaller are its images. Another sampler is
     chosen only if it is expected to leave clearly less error. If there is no time for a pilot, or if the pilot finds
-    that nothing fits, the description decides, and the render takes the remaining time. The measurements change from
+    that nothing fits, the description decides, and the render takes the remaining time. Photons are taken without a
+    pilot where a look finds light that only they find, and there is time for them. The measurements change from
     run to run. Raises NgptError for a method that does not run here or cannot use any of the stacks.
     """
     start = pilot.clock()
     able = _able(scene, method)
+    if for_caustics := _for_caustics(scene, seconds, method, start, pilot):
+        return for_caustics
     whole: list[Pipeline] = []
     if seconds >= LEAST_SECONDS and not pilot.stop():
         whole = explore(scene, seconds, method, memory, pilot)
@@ -148,6 +156,25 @@ def plan(
     after = _beside(scene) + _METHOD_SECONDS.get(method, _OTHERS) * _pixels(scene) / 1e6
     # However slow the method may be here, half of the time is rendered.
     return Plan(sampler, method, False, max(left - after, left / 2, 1e-3), f"{why}; there is no time for a pilot")
+
+
+def _for_caustics(scene: mi.Scene, seconds: float, method: str, start: float, pilot: Pilot) -> Plan | None:
+    """The plan for a scene whose light paths from the camera hardly find, or None: it has little of it, or no time."""
+    facts = scene_facts(scene)
+    able = [name for name, entry in SAMPLERS.items() if entry.gathers and not entry.refuses(facts)]
+    if not able or not (methods := methods_for(able[0], method)) or pilot.stop():
+        return None
+    after = _beside(scene) + _METHOD_SECONDS.get(methods[0], _OTHERS) * _pixels(scene) / 1e6
+    left = seconds - after
+    if left < _CAUSTIC_BEGINS + _CAUSTIC_SPP * _CAUSTIC_SECONDS * _pixels(scene) / 1e6:
+        return None
+    from data_gen.caustics import share_of_caustics  # .1 s to import, and few scenes come this far
+
+    share = share_of_caustics(scene)
+    if share is None or share < _CAUSTIC_SHARE:
+        return None
+    why = f"about {share:.0%} of the light is what smooth glass or mirrors make of lamps without size, or tiny ones"
+    return Plan(able[0], methods[0], False, left - (pilot.clock() - start), why)
 
 
 def plan_sampler(

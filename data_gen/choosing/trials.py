@@ -17,7 +17,6 @@ import statistics
 import time
 import zlib
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import mitsuba as mi
@@ -26,7 +25,6 @@ import numpy as np
 from data_gen.render import render_stack
 from data_gen.samplers import SAMPLERS, SIMPLE, described
 from data_gen.scenes.facts import scene_facts
-from data_gen.scenes.load import set_film_size
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import EPSILON, trimmed_mean
 from ngpt.stack import GradientStack
@@ -243,23 +241,3 @@ def error_of(x: np.ndarray, a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> 
 def _denominator(scale: np.ndarray) -> np.ndarray:
     """m² + 1e-3 of an image that has noise itself, which the mean over 7x7 pixels lessens."""
     return ndimage.uniform_filter(scale.astype(np.float64), (7, 7, 1)) ** 2 + EPSILON
-
-
-@contextmanager
-def at_most(scene: mi.Scene, pixels: int):
-    """Shrinks the scene's film to at most ``pixels`` within the block; yields the factor by which it shrinks.
-
-    A cropped film keeps its size, since its window could not be set again.
-    """
-    film = scene.sensors()[0].film()
-    (width, height), window = (tuple(int(n) for n in numbers) for numbers in (film.size(), film.crop_size()))
-    shrink = math.sqrt(pixels / (width * height))
-    if shrink >= 1 or (width, height) != window:
-        yield 1.0
-        return
-    small = max(1, round(width * shrink)), max(1, round(height * shrink))
-    set_film_size(scene, small)
-    try:
-        yield width * height / (small[0] * small[1])
-    finally:
-        set_film_size(scene, (width, height))

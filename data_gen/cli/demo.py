@@ -86,7 +86,7 @@ def demo_scene(name: str, args: argparse.Namespace, folder: Path, console: Conso
     targets = {label: check_output(folder / f"{name}_{label}.exr", args.force) for label in ("stack", "ref", *methods)}
     scene = load_scene(name, args.size)
     with console.progress(f"{name}: stack", "spp", begins=KERNELS) as progress:
-        stack = render_stack(scene, args.spp, progress=progress, unbiased=True)
+        stack = render_stack(scene, args.spp, progress=progress, unbiased=True, gradients=True)
     # Another seed than the stack's: a reference must not share its noise.
     with console.progress(f"{name}: reference", "spp", begins=KERNELS) as progress:
         reference = render_stack(scene, args.reference_spp, seed=1, sampler="primal", progress=progress, unbiased=True)[

@@ -1,34 +1,38 @@
 """``ngpt render``: from a scene to a gradient stack, or at once to the image of a method."""
 
+from __future__ import annotations
+
 import argparse
 import shlex
-from collections.abc import Callable
-from contextlib import ExitStack, closing, nullcontext
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from data_gen.backend import DEFAULT_VARIANT
-from data_gen.begun import Asked, Unfinished, begun_stack, scene_name
+from data_gen.begun import Unfinished, begun_stack
 from data_gen.cli import KERNELS
 from data_gen.cli.render_arguments import add_arguments as add_arguments
 from data_gen.cli.render_arguments import targets
-from data_gen.frames.pattern import filled, varies
 from data_gen.outputs import Denoising, Output
-from data_gen.samplers import check_options
-from data_gen.session import DEFAULT_SPP, render_scene, stop_on_ctrl_c
+from data_gen.pattern import filled, varies
+from data_gen.request import FIELDS, RenderRequest
+from data_gen.session import render_scene, stop_on_ctrl_c
 from data_gen.shot_files import Written, report_of, write_frames, write_frames_on_cluster
 from ngpt.cli.arguments import output_file, print_json
-from ngpt.cli.picture import IMAGES
 from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
-from ngpt.io.whole import finished
 from ngpt.merging import UNFINISHED
 from ngpt.methods import choose
+from ngpt.result_file import IMAGES, Look
+from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 from ngpt.system.interrupts import Interrupt
 from ngpt.system.limits import limit_threads
 from ngpt.system.text import by_names
+
+if TYPE_CHECKING:
+    from data_gen.choosing.plans import Plan
+    from data_gen.cli.onlook import Onlookers
 
 # A render explains why it was late if it took this many times its time for at most this many samples per pixel.
 _LATE, _FEW = 1.2, 16
@@ -55,138 +59,62 @@ def denoising_of(args: argparse.Namespace) -> Denoising | None:
     method = args.denoise if args.denoise not in (None, "auto") else args.method or "auto"
     if args.error is not None and args.method is None and method != "auto":
         args.method = method  # the error is measured on the image
-    denoising = Denoising(method, args.transform, args.exposure)
+    denoising = Denoising(method, Look(args.transform, args.exposure))
     denoising.check(args.sampler, args.spp)
     return denoising
 
 
-def asked(args: argparse.Namespace) -> dict[str, Any]:
-    """What ``render_scene`` and ``render_frames`` both take, by their names."""
-    names = ("spp", "seed", "sampler", "sensor", "size", "memory", "diagnostics", "unbiased", "variant", "subpixels")
-    options = dict(args.option)
-    check_options(args.sampler, options)  # so that none of them goes by another's name
-    given = {name: getattr(args, name) for name in names}
-    return given | {"seconds": args.time, "parameters": dict(args.define)} | options
+def request_of(args: argparse.Namespace, denoising: Denoising | None) -> RenderRequest:
+    """What the command line asks for."""
+    given = {name: value for name, value in vars(args).items() if name in FIELDS}
+    given |= {"options": dict(args.option), "parameters": dict(args.define), "frames": tuple(args.frames or ())}
+    return RenderRequest(
+        **given,
+        gradients=denoising is not None and denoising.needs_gradients,
+        needs_features=denoising is None or denoising.method not in ("auto", "oidn"),
+    )
 
 
 def image(args: argparse.Namespace, denoising: Denoising | None, console: Console) -> int:
-    from data_gen.cli.onlook import onlookers  # takes as long as all else that help needs
-
-    apart = {"--camera": args.camera, "--dt": args.dt, "--shard": args.shard, "--cluster": args.cluster}
-    for option, given in apart.items():
+    for option, given in {"--shard": args.shard, "--cluster": args.cluster}.items():
         if given:
             raise WrongUse(f"{option} belongs to a shot; name its frames: --frames 0:120")
     for text in (args.scene, *(value for _, value in args.define)):
         if varies(text):
             raise WrongUse(f"'{text}' changes from frame to frame; name the frames: --frames 0:120")
     target = Path(args.output or f"{Path(args.scene).stem}.exr")
-    output = Output(target, denoising, Path(args.keep) if args.keep else None)
-    output.check()
+    request = request_of(args, denoising)
+    output = Output(request, target, denoising, Path(args.keep) if args.keep else None)
+    output.check(args.skip_existing)
     for file in {target, output.stack}:
         output_file(file, args)
-    given, begun, there = asked(args), None, output.stack.exists()
-    how = {"adaptive": args.adaptive, "error": args.error, "method": args.method, "cpu_seconds": args.cpu_time}
-    limits = (args.time, args.cpu_time, args.error)
-    wanted = args.spp or (DEFAULT_SPP if limits == (None, None, None) else None)
-    whole = Asked(
-        scene_name(args.scene, dict(args.define) | ({"--sensor": args.sensor} if args.sensor else {})),
-        args.seed,
-        args.sampler,
-        dict(args.option),
-        args.size,
-        wanted,
-        args.time,
-        args.error,
-        (args.method or "auto") if args.adaptive else "",
-        unbiased=args.unbiased,
-        variant=args.variant or DEFAULT_VARIANT,
-        diagnostics=args.diagnostics,
-        subpixels=args.subpixels,
-    )
-    if args.skip_existing:
-        if args.cpu_time:
-            raise WrongUse("--skip-existing: no file says how much processor time it took; give --time or --spp")
-        output.check_skipping()
-    if args.skip_existing and finished(output.stack):
-        rest = whole.left(output.stack)
-        if rest is None and output.done(whole):
-            console.say(f"{target}: skipped: the {'stack' if denoising is None else 'image'} is there")
-            return 0
-        begun = begun_stack(output.stack)
-        for_whom = denoising or Denoising(args.method or "auto")
-        replace(output, denoising=for_whom).check_begun(str(begun.attributes.get("ngpt:sampler", "")))
-        if rest is None:
-            made = output.image(begun, overwrite=True)
-            console.say(f"{output.stack} -> {target}: {described(made)}; the stack was there")
-            return 0
-        given |= rest.options(args.seed)
-        goal = args.method or (choose(begun) if "ngpt:for" in begun.attributes else None)
-        how = {"adaptive": bool(rest.adaptive), "error": rest.error, "method": rest.method(goal)}
+    there = output.stack.exists()
+    left = output.left() if args.skip_existing else request
+    if left is None and output.done():
+        console.say(f"{target}: skipped: the {'stack' if denoising is None else 'image'} is there")
+        return 0
+    begun = None if left is request else begun_stack(output.stack)
+    if left is None:
+        assert begun is not None
+        made = output.image(begun, overwrite=True)
+        console.say(f"{output.stack} -> {target}: {described(made)}; the stack was there")
+        return 0
+    if begun is not None:
         console.say(f"{output.stack}: has {begun.attributes['ngpt:spp']} samples per pixel; going on with it")
-
-    def chosen(plan) -> None:
-        if denoising is not None:
-            denoising.check(plan.sampler, wanted)
-        how = f"{', adaptive samples' if plan.shared else ''}, method '{plan.method}'" if plan.method else ""
-        console.say(f"{args.scene}: sampler '{plan.sampler}'{how}: {plan.reason}")
-
-    unit = "s" if args.time or args.cpu_time else "spp"
-    looking = onlookers(args.live, args.scene, args.command, console, unit)
-    with (
-        closing(looking),
-        console.progress(f"render {args.scene}", unit, begins=KERNELS) as progress,
-        stop_on_ctrl_c(ending) as stop,
-    ):
-
-        def ended() -> bool:
-            return stop() or looking.enough
-
-        def told(done: int, total: int) -> None:
-            progress(done, total)
-            looking.progress(done, total)
-
-        failed = None
-        try:
-            stack, _ = render_scene(
-                args.scene,
-                progress=told,
-                stop=ended,
-                newest=looking.newest,
-                chosen=chosen,
-                said=console.say,
-                gradients=denoising is not None and denoising.needs_gradients,
-                needs_features=denoising is None or denoising.method not in ("auto", "oidn"),
-                **how,
-                **given,
-            )
-        except Unfinished as error:
-            stack, failed = error.stack, error
+    with rendering(args, left, denoising, console) as (stack, failed, stop, looking):
         # Within it: the samples of an hour are not lost to a signal that comes while they are written.
-        whole.name(stack)
-        if args.skip_existing and not there and output.done(whole):
+        if args.skip_existing and not there and output.done():
             console.say(f"{target}: skipped: it is there by now, of another process")
             return 0
         stack, made = output.write(stack, args.force or there, begun)
         looking.last(stack, f"ended: {target} is written")
-    if stack.attributes["ngpt:discarded"]:
-        console.say(f"{args.scene}: {stack.attributes['ngpt:discarded']} non-finite values were left out")
-    done, took = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
-    if args.error is not None and "ngpt:error" in stack.attributes:
-        expected, method = stack.attributes["ngpt:error"], stack.attributes["ngpt:adaptive"]
-        short = "" if expected <= args.error else f", not {args.error:g}: it was ended before"
-        console.say(f"{args.scene}: '{method}' is expected to have an error of {expected:.3g}{short}")
+    done = stack.attributes["ngpt:spp"]
+    say(stack, made, args, target, console)
     if failed is not None:
         raise NgptError(f"{failed}; {target} has the {done} samples per pixel done before")
     if interrupted := UNFINISHED in stack.attributes:
         tell, why = (console.error, "interrupted") if stop() else (console.say, "enough")
         tell(f"{why}: {target} holds the {done} samples per pixel done by then")
-    by = f", {described(made)}" if made else ""
-    console.say(f"{args.scene} -> {target}: {stack.place}, {done} spp, {took:.2f} s{by}")
-    if args.time is not None and took > _LATE * args.time and done <= _FEW:
-        console.say(
-            f"{args.scene}: it took longer than {args.time:g} s: kernels and a least pass ({done} spp) are not quicker "
-            "on this machine now; a smaller --size is"
-        )
     if denoising is None and by_names(str(target)) == str(target):
         # Another than it is for where that needs variances, which one sample per pixel has not.
         then = f"then: ngpt denoise {shlex.quote(str(target))}, which takes method '{choose(stack)}'"
@@ -197,19 +125,77 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
     return stop.status if interrupted else 0
 
 
+@contextmanager
+def rendering(
+    args: argparse.Namespace, request: RenderRequest, denoising: Denoising | None, console: Console
+) -> Iterator[tuple[GradientStack, NgptError | None, Interrupt, Onlookers]]:
+    """Renders, shows how far it is, and yields the stack, what failed amid it, what interrupts, and who looks on."""
+    from data_gen.cli.onlook import onlookers  # takes as long as all else that help needs
+
+    def chosen(plan: Plan) -> None:
+        if denoising is not None:
+            denoising.check(plan.sampler, request.spp)
+        how = f"{', adaptive samples' if plan.shared else ''}, method '{plan.method}'" if plan.method else ""
+        console.say(f"{args.scene}: sampler '{plan.sampler}'{how}: {plan.reason}")
+
+    unit = "spp" if request.budget.seconds is None else "s"
+    with (
+        closing(onlookers(args.live, args.scene, args.command, console, unit)) as looking,
+        console.progress(f"render {args.scene}", unit, begins=KERNELS) as progress,
+        stop_on_ctrl_c(ending) as stop,
+    ):
+
+        def told(done: int, total: int) -> None:
+            progress(done, total)
+            looking.progress(done, total)
+
+        def ended() -> bool:
+            return stop() or looking.enough
+
+        try:
+            stack, _ = render_scene(
+                request, progress=told, stop=ended, newest=looking.newest, chosen=chosen, said=console.say
+            )
+            failed = None
+        except Unfinished as error:
+            stack, failed = error.stack, error
+        yield stack, failed, stop, looking
+
+
+def say(stack: GradientStack, made: dict[str, Any], args: argparse.Namespace, target: Path, console: Console) -> None:
+    """What a user should know of the samples, and in which time they were made."""
+    attributes = stack.attributes
+    done, took = attributes["ngpt:spp"], attributes["ngpt:seconds"]
+    if attributes["ngpt:discarded"]:
+        console.say(f"{args.scene}: {attributes['ngpt:discarded']} non-finite values were left out")
+    if args.error is not None and "ngpt:error" in attributes:
+        expected, method = attributes["ngpt:error"], attributes["ngpt:adaptive"]
+        short = "" if expected <= args.error else f", not {args.error:g}: it was ended before"
+        console.say(f"{args.scene}: '{method}' is expected to have an error of {expected:.3g}{short}")
+    by = f", {described(made)}" if made else ""
+    console.say(f"{args.scene} -> {target}: {stack.place}, {done} spp, {took:.2f} s{by}")
+    if args.seconds is not None and took > _LATE * args.seconds and done <= _FEW:
+        console.say(
+            f"{args.scene}: it took longer than {args.seconds:g} s: kernels and a least pass ({done} spp) are not "
+            "quicker on this machine now; a smaller --size is"
+        )
+
+
 def shot(args: argparse.Namespace, denoising: Denoising | None, console: Console) -> int:
-    for option, asked_for in {"--live": args.live, "--cpu-time": args.cpu_time}.items():
+    for option, asked_for in {"--live": args.live, "--cpu-time": args.cpu_seconds}.items():
         if asked_for:
             raise WrongUse(f"{option} is for single images; leave it out with --frames")
     if args.adaptive or args.error is not None or args.method is not None:
         raise WrongUse("--adaptive, --error and --for are for single images; leave them out with --frames")
     if args.threads and args.cluster:
         raise WrongUse("--threads is for this process, and --cluster renders in others; start its workers with fewer")
+    if args.shard and args.cluster:
+        raise WrongUse("--cluster distributes the frames itself; leave --shard out")
     if args.keep:
         raise WrongUse("--keep is for single images; name frames .exr, which have their stacks in them")
     files = targets(args.output, args.scene, args.frames)
-    more = {"camera": args.camera, "fps": args.fps, "dt": args.dt}
-    more |= {"overwrite": args.force, "skip_existing": args.skip_existing, "denoising": denoising, **asked(args)}
+    request = request_of(args, denoising)
+    more: Any = {"overwrite": args.force, "skip_existing": args.skip_existing, "denoising": denoising}
     with ExitStack() as shown:
         said = 0
         progress: Callable[[int, int], None] | None = None
@@ -237,10 +223,10 @@ def shot(args: argparse.Namespace, denoising: Denoising | None, console: Console
         # What the workers of a cluster are at, no signal that comes here ends with this pass.
         with nullcontext(Interrupt()) if args.cluster else stop_on_ctrl_c(ending) as stop:
             if args.cluster:
-                written = write_frames_on_cluster(args.cluster, args.scene, files, shard=args.shard, made=made, **more)
+                written = write_frames_on_cluster(args.cluster, request, files, made=made, **more)
             else:
                 shard = args.shard or (0, 1)
-                written = write_frames(args.scene, files, shard=shard, made=made, stop=stop, **more)
+                written = write_frames(request, files, shard=shard, made=made, stop=stop, **more)
     if written.interrupted is not None:
         part = next((each["spp"] for each in written.frames if each["frame"] == written.interrupted), None)
         has = "is left out" if part is None else f"has {part} samples per pixel"

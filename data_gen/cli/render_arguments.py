@@ -4,9 +4,9 @@ import argparse
 import re
 from pathlib import Path
 
-from data_gen.frames.pattern import filled, varies
+from data_gen.pattern import filled, varies
+from data_gen.request import DEFAULT_SPP
 from data_gen.samplers import by_standing
-from data_gen.session import DEFAULT_SPP
 from ngpt.cli.arguments import (
     Names,
     add_force,
@@ -20,9 +20,10 @@ from ngpt.cli.arguments import (
     relative,
     size,
 )
-from ngpt.cli.picture import IMAGES, add_look
+from ngpt.cli.picture import add_look
 from ngpt.errors import WrongUse
 from ngpt.methods import METHODS
+from ngpt.result_file import IMAGES
 from ngpt.subpixels import CHOICES
 
 
@@ -51,12 +52,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument(
         "--time",
+        dest="seconds",
         type=duration,
         metavar="SECONDS",
         help="render for this long, with kernel compilation; with --spp, whichever is reached first",
     )
     limit.add_argument(
         "--cpu-time",
+        dest="cpu_seconds",
         type=duration,
         metavar="SECONDS",
         help="as --time, but in processor time, all cores together, which other work on the machine hardly changes",

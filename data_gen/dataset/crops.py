@@ -117,13 +117,10 @@ def uneven_inputs(config: Config, name: str, crop: int, counts: list[int]) -> li
 
 def render_input(config: Config, scene, spp: int, seed: int, uneven: bool, made: Any = None) -> GradientStack:
     """One input. All inputs of a set that has uneven ones have the layer ``samples``."""
-    from data_gen.adaptive import Adaptive
     from data_gen.render import render_stack
 
-    adaptive = Adaptive() if uneven else None
-    stack = render_stack(
-        scene, spp, seed, config.sampler, adaptive=adaptive, made=made, unbiased=True, **config.options
-    )
+    options = {"made": made, "unbiased": True, "gradients": True, **config.options}
+    stack = render_stack(scene, spp, seed, config.sampler, adaptive=uneven, **options)
     if config.adaptive and "samples" not in stack:
         stack = stack.replace(samples=np.full((stack.height, stack.width, 1), spp, np.float32))
     return stack
@@ -225,7 +222,7 @@ def _crop(
         return CropData([stack for stack, _ in cleaned], counts), told
     clock = time.perf_counter()
     spp, method = -(-config.reference_spp // HALVES), config.reference_method
-    options = {"made": made, "unbiased": True, **config.unbiased_options}
+    options = {"made": made, "unbiased": True, "gradients": True, **config.unbiased_options}
     halves = [render_stack(scene, spp, seed, config.sampler, **options) for seed in seeds[-HALVES:]]
     converged = merge(halves)
     reference, caustic = references(converged, method)

@@ -5,17 +5,19 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from data_gen.begun import Unfinished, frame_seed
-from data_gen.budget import DEFAULT_MEMORY
+from data_gen.budget import Watch
 from data_gen.frames.camera_path import CameraPath, horizontal
 from data_gen.frames.motion import Snapshot, depth, motion_vectors, seen, snapshot, window_moved
 from data_gen.frames.time_differences import difference, light
-from data_gen.render import options_as_attribute, render_stack, stack_of
+from data_gen.render import options_as_attribute, render, stack_of
+from data_gen.request import RenderRequest
 from data_gen.samplers import FRAME_SAMPLERS, FrameSampler
 from data_gen.scenes.dark import warn_without_lamps
 from data_gen.scenes.facts import scene_facts
@@ -27,28 +29,14 @@ from ngpt.stack import GradientStack
 
 
 class Remembering:
-    """The frames of one shot; ``options`` are as in ``render_stack``.
+    """The frames of one shot, by a sampler that remembers those before.
 
-    ``changes``: whether more than the camera may change from frame to frame. Raises NgptError for options that the
-    sampler does not have.
+    ``changes``: whether more than the camera may change from frame to frame.
     """
 
-    def __init__(
-        self,
-        entry: FrameSampler,
-        changes: bool,
-        spp: int | None,
-        seed: int,
-        options: dict[str, Any],
-    ):
-        self.entry, self.changes, self.seed, self.options = entry, changes, seed, dict(options)
-        if self.options.pop("seconds", None) is not None:
-            raise NgptError(f"sampler '{entry.name}' renders a number of samples, not for a time: use --spp")
-        self.spp = spp or entry.spp
-        self.memory = self.options.pop("memory", None) or DEFAULT_MEMORY
-        self.diagnostics = self.options.pop("diagnostics", False)
-        self.options.pop("stop", None)
-        self.options = entry.settings(self.options)
+    def __init__(self, entry: FrameSampler, changes: bool, request: RenderRequest):
+        self.entry, self.changes, self.request = entry, changes, request
+        self.options = entry.settings(request.options)
         self._sampler: Any = None
         self._making = 0.0  # seconds that belong to the first frame
 
@@ -58,7 +46,8 @@ class Remembering:
             if reason := self.entry.refuses(scene_facts(scene)):
                 raise NgptError(f"sampler '{self.entry.name}' cannot render this scene: {reason}; use --sampler gpt")
             start = time.perf_counter()
-            self._sampler = self.entry.made(scene, self.seed, self.spp, self.memory, **self.options)
+            spp, memory = self.request.spp, self.request.budget.memory
+            self._sampler = self.entry.made(scene, self.request.seed, spp, memory, **self.options)
             self._making = time.perf_counter() - start
 
     def render(
@@ -75,12 +64,13 @@ class Remembering:
         Where the shot ``changes``, it is not the scene of the frame before, which must be as it was then.
         """
         start, self._making = time.perf_counter() - self._making, 0.0
-        progress(0, self.spp)
+        spp = int(self.request.spp or 0)
+        progress(0, spp)
         film = self._sampler.film(index, motion, depth, (scene, shapes) if self.changes else None)
-        progress(self.spp, self.spp)
+        progress(spp, spp)
         more = {"ngpt:confidence": self._sampler.confidence} | options_as_attribute(self.entry, self.options)
         sensor, name = scene.sensors()[0], self.entry.name
-        return stack_of(film, sensor, self.seed, name, start, more, diagnostics=self.diagnostics)
+        return stack_of(film, sensor, self.request.seed, name, start, more, diagnostics=self.request.diagnostics)
 
 
 class Shot:
@@ -153,24 +143,19 @@ class Shot:
 
 def render_shot(
     shot: Shot,
-    frames: Sequence[int],
-    spp: int | None,
-    seed: int = 0,
-    dt: int = 0,
+    request: RenderRequest,
+    watch: Watch = Watch(),  # noqa: B008 - it is frozen
     *,
     skip: Callable[[int], bool] = lambda frame: False,
     progress: Callable[[int], Callable[[int, int], None]] = lambda frame: lambda done, total: None,
-    sampler: str = "auto",
-    **options: Any,
 ) -> Iterator[tuple[int, GradientStack]]:
-    """Yields (frame, stack) for each of ``frames``, except where ``skip`` returns true when the frame's turn comes.
+    """Yields (frame, stack) for each frame of a request, but where ``skip`` returns true when the frame's turn comes.
 
-    Stacks have the layer ``motion`` to the previous frame in ``frames``. For the first frame, it is the motion to the
+    Stacks have the layer ``motion`` to the previous frame of the request. For the first frame, it is the motion to the
     frame that a shot of the same step would have before it, or all NaN if there is none. Motion refers to the whole
     picture; crop windows may show another part of it in each frame. Each frame has its own seed, so its bits do not
     depend on which other frames are rendered. Only the cache of tails is filled by ``seed`` in all frames: its noise is
-    smooth, and would flicker. ``options`` and errors are as in ``render_stack``; cameras without a projection raise
-    NgptError.
+    smooth, and would flicker. Errors are as in ``render_stack``; cameras without a projection raise NgptError.
 
     A ``sampler`` of ``data_gen.samplers.FRAME_SAMPLERS`` reuses the previous frames, up to ``warm_up`` of them where
     frames are skipped, and uses ``seed`` for all frames. If more than the camera changes, it needs the scene of the
@@ -182,12 +167,13 @@ def render_shot(
     """
     before: Snapshot | None = None
     last = None
+    frames, dt, seed = request.frames, request.dt, request.seed
     step = frames[1] - frames[0] if len(frames) > 1 else 1
-    remembers = FRAME_SAMPLERS.get(sampler)
+    remembers = FRAME_SAMPLERS.get(request.sampler)
     remembering, turns = None, [shot]
     if remembers is not None:
         changes = shot.changes(frames)
-        remembering = Remembering(remembers, changes, spp, seed, options)
+        remembering = Remembering(remembers, changes, request)
         turns += [shot.twin()] if changes else []
     done = 0
     for i, wanted in enumerate(frames):
@@ -216,8 +202,8 @@ def render_shot(
                 stack = remembering.render(scene, now.shapes, j, motion, far, progress(frame))
             else:
                 try:
-                    own = frame_seed(seed, frame)
-                    stack = render_stack(scene, spp, own, sampler, progress(frame), tails_seed=seed, **options)
+                    own = replace(request, seed=frame_seed(seed, frame))
+                    stack = render(scene, own, replace(watch, progress=progress(frame)), tails_seed=seed)
                 except Unfinished as error:
                     stack, failed = error.stack, error
                 try:
@@ -229,6 +215,7 @@ def render_shot(
             before, last = now, frame
         done = i + 1
         stack = _placed(stack, frame, previous, motion + np.asarray(shift, np.float32))
+        stack.attributes |= request.header(frame)
         if failed is not None:
             raise Unfinished(f"frame {frame}: {failed}", stack) from failed
         del scene  # two scenes in memory would make kernels larger

@@ -121,20 +121,38 @@ class Holes:
     @dr.syntax
     def toward_camera(
         self, scene, si: mi.SurfaceInteraction3f, target: mi.Point3f, most, active: mi.Bool
-    ) -> mi.Spectrum:
+    ) -> tuple[mi.Spectrum, mi.UInt32]:
         """As ``transmittance()`` from ``si``, where lamps hide from the camera, but not from what is behind holes."""
         ray, left, going = si.spawn_ray_to(target), mi.UInt32(most), mi.Bool(active)
         # As a surface sees it, and as the camera does
         T, seen = dr.select(active, mi.Spectrum(1), 0), dr.select(active & ~_on_lamp(si, scene), mi.Spectrum(1), 0)
+        left_there = mi.UInt32(left)
         while dr.hint(going, label="holes"):
             hit = scene.ray_intersect_preliminary(ray, active=going)
             going &= hit.is_valid()
             si = hit.compute_surface_interaction(ray, mi.RayFlags.All, going)
             T, left, _ = self.behind(si, T, left, going)
-            seen = dr.select(going & ~_on_lamp(si, scene), T, seen)
+            shows = going & ~_on_lamp(si, scene)
+            seen, left_there = dr.select(shows, T, seen), dr.select(shows, left, left_there)
             going &= (dr.max(T) > 0) | (dr.max(seen) > 0)
             ray = si.spawn_ray_to(target)
-        return seen
+        return seen, most - left_there
+
+    @dr.syntax
+    def through(
+        self, scene, x: mi.SurfaceInteraction3f, d: mi.Vector3f, number, active: mi.Bool
+    ) -> tuple[mi.SurfaceInteraction3f, mi.Spectrum]:
+        """The vertex behind that ``number`` of holes along ``d``, and the transmittance T of these holes.
+
+        ``x`` is at the first hole. T is 0 where there are fewer holes.
+        """
+        x, T, left, active = mi.SurfaceInteraction3f(x), mi.Spectrum(1), mi.UInt32(number), mi.Bool(active)
+        going = active & (left > 0)
+        while dr.hint(going, label="holes"):
+            T, left, going = self.behind(x, T, left, going)
+            x = dr.select(going, scene.ray_intersect(x.spawn_ray(d), going), x)
+            going &= left > 0
+        return x, T
 
 
 def _on_lamp(si: mi.SurfaceInteraction3f, scene: mi.Scene) -> mi.Bool:

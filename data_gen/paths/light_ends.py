@@ -9,8 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from data_gen.paths.bent import BentLamps, sample_emitter
 from data_gen.paths.holes import Holes
 from data_gen.paths.vertex import Materials
+from data_gen.scenes.lamps import emitter_numbers
 from ngpt.errors import NgptError
 
 # An emitter is an area, a point (spots are points that fill a cone), or infinitely far away.
@@ -27,6 +29,7 @@ class LightRay:
     index: mi.UInt32
     end: mi.DirectionSample3f  # position, normal and uv of the emitter's point, and its pdf
     delta: mi.Bool
+    front: mi.Normal3f | None = None  # the vertex normal there; None in scenes without bent lamps
 
 
 class LightEnds:
@@ -34,6 +37,7 @@ class LightEnds:
 
     Points on areas are sampled as Mitsuba's emitters do, with a cosine distribution of directions; the directions of
     what is infinitely far away as well, on a disk that covers the scene; points light all around, spots their cone.
+    ``BentLamps`` samples points on bent lamps.
 
     Raises NgptError, in the name of the ``sampler``, for a scene with emitters that Mitsuba does not tell enough of.
     """
@@ -54,16 +58,15 @@ class LightEnds:
         self.kinds = set(kinds)
         self.emitters = scene.emitters_dr() if emitters else None
         self.kind = mi.UInt32(np.array(kinds or [0], np.uint32))
-        tables = [_table(scene, emitter, kind) for emitter, kind in zip(emitters, kinds, strict=True)] or [[0] * 8]
+        self.bent = BentLamps.of(scene)
+        both = zip(emitters, kinds, strict=True)
+        tables = [_table(scene, number, *each) for number, each in enumerate(both)] or [[0] * 8]
         x, y, z, u, v, w, self.cutoff, of_ball = map(mi.Float, np.array(tables, np.float32).T)
         self.position, self.axis = mi.Point3f(x, y, z), mi.Vector3f(u, v, w)
         # Density of emission per area for spheres, where connections find only the visible part; else 0
         self.of_ball = of_ball
         self.balls = bool(np.any(np.array(of_ball) > 0))
-        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]) for emitter in emitters]
-        index = np.zeros(max(numbers, default=0) + 1, np.uint32)
-        index[numbers] = np.arange(len(numbers))
-        self.indices = mi.UInt32(index)
+        self.indices = emitter_numbers(scene)
         dr.eval(self.kind, self.position, self.axis, self.cutoff, self.of_ball, self.indices)
 
     def index_of(self, emitter: mi.EmitterPtr, active=True) -> mi.UInt32:
@@ -91,6 +94,18 @@ class LightEnds:
             e = dr.select(kind == _AREA, area, e)
         return e
 
+    def connect(self, scene, si: mi.SurfaceInteraction3f, u: mi.Point2f, active) -> tuple:
+        """As ``scene.sample_emitter_direction(si, u, False, active)``, and the ``front`` of a light ray there."""
+        return sample_emitter(scene, self.bent, si, u, active)
+
+    def met(self, scene, si: mi.SurfaceInteraction3f, ref, active) -> tuple[mi.DirectionSample3f, mi.Float]:
+        """The emitter at ``si``, and the density with which ``connect()`` finds it from ``ref``."""
+        light = mi.DirectionSample3f(scene, si, ref)
+        p = scene.pdf_emitter_direction(ref, light, active)
+        if self.bent:
+            p, light.n = self.bent.corrected(p, light, si, scene.pdf_emitter, active)
+        return light, p
+
     def sample(self, scene, random, time, wavelengths) -> LightRay:
         u, u_position, u_direction = random.next_1d(), random.next_2d(), random.next_2d()
         index, weight, _ = scene.sample_emitter(u)
@@ -99,15 +114,19 @@ class LightEnds:
         n = dr.width(index)
         end = dr.zeros(mi.DirectionSample3f, n)
         origin, d = dr.zeros(mi.Point3f, n), mi.Vector3f(0, 0, 1)
-        β, delta = mi.Spectrum(0), mi.Bool(False)
+        β, delta, front = mi.Spectrum(0), mi.Bool(False), None
         if _AREA in self.kinds:
             here = kind == _AREA
             place, _ = emitter.sample_position(time, u_position, here)
+            if self.bent:
+                front = self._place_bent(place, index, u_position, here)
             si = mi.SurfaceInteraction3f(place, wavelengths)
             si.wi = mi.warp.square_to_cosine_hemisphere(u_direction)
             Le = emitter.eval(si, here)
             β = dr.select(here & (place.pdf > 0), Le * (dr.pi * weight / place.pdf), β)
             d = dr.select(here, si.to_world(si.wi), d)
+            if front is not None:
+                β = dr.select(here & (dr.dot(front, d) <= 0), 0, β)
             origin = dr.select(here, si.spawn_ray(d).o, origin)
             end.p, end.n, end.uv, end.pdf = place.p, place.n, place.uv, place.pdf
         if _POINT in self.kinds:
@@ -134,7 +153,16 @@ class LightEnds:
             delta |= here & sky.delta
             end.pdf = dr.select(here, sky.pdf, end.pdf)
         end.pdf /= weight
-        return LightRay(mi.Ray3f(origin, d, time, wavelengths), β, emitter, index, end, delta)
+        return LightRay(mi.Ray3f(origin, d, time, wavelengths), β, emitter, index, end, delta, front)
+
+    def _place_bent(self, place: mi.PositionSample3f, lamp: mi.UInt32, u: mi.Point2f, active) -> mi.Normal3f:
+        """Moves the ``place`` to where a bent lamp is sampled; returns the ``front`` there, of all lamps."""
+        bent = active & self.bent.has(lamp, active)
+        ours, front = self.bent.point(lamp, u, bent), mi.Normal3f(place.n)
+        pdf = dr.gather(mi.Float, self.bent.per_area, lamp, bent)
+        for name, value in {"p": ours.p, "n": ours.n, "uv": ours.uv, "pdf": pdf}.items():
+            setattr(place, name, dr.select(bent, value, getattr(place, name)))
+        return mi.Normal3f(dr.select(bent, ours.front, front))
 
     def densities(self, scene, start: LightRay, y: mi.SurfaceInteraction3f) -> tuple[mi.Float, mi.Float]:
         """``e`` and ``p`` of ``mis``, seen from the first vertex ``y`` of a light path."""
@@ -164,7 +192,10 @@ class LightEnds:
         if _AREA in self.kinds:
             # The ratio for a cosine distribution; behind the emitter there is no light.
             cosines = dr.dot(start.end.n, d) / dr.dot(start.end.n, start.ray.d)
-            ratio = dr.select(kind == _AREA, dr.select(cosines > 0, cosines, 0), ratio)
+            shines = cosines > 0
+            if start.front is not None:
+                shines &= dr.dot(start.front, d) > 0
+            ratio = dr.select(kind == _AREA, dr.select(shines, cosines, 0), ratio)
             β *= ratio
         if _POINT in self.kinds:
             here = kind == _POINT
@@ -173,12 +204,13 @@ class LightEnds:
             density = scene.pdf_emitter(start.index) * _cone_density(dr.gather(mi.Float, self.cutoff, start.index))
             β = dr.select(here, intensity / density, β)
         ray = mi.Ray3f(start.ray.o, d, y.time, y.wavelengths)
-        return LightRay(ray, β, start.emitter, start.index, start.end, start.delta), ratio, per_distance2
+        return LightRay(ray, β, start.emitter, start.index, start.end, start.delta, start.front), ratio, per_distance2
 
     def seen_from_elsewhere(
-        self, scene, light: mi.DirectionSample3f, weight: mi.Spectrum, si: mi.SurfaceInteraction3f, active
+        self, scene, light: mi.DirectionSample3f, weight: mi.Spectrum, si: mi.SurfaceInteraction3f, active, *, front
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum, mi.Float]:
-        """A sampled ``light`` of ``weight`` Le / p shifted: the same point of the emitter seen from ``si``.
+        """A sampled ``light`` of ``weight`` Le / p shifted: the same point of the emitter, of the ``front`` that
+        ``connect()`` gives, seen from ``si``.
 
         The weight that is returned is Le J / p with the p of ``light``. With it comes p' J / p; J = dω' / dω.
         """
@@ -195,7 +227,10 @@ class LightEnds:
         if _AREA in self.kinds:
             here = kind == _AREA
             facing = dr.dot(light.n, other.d) / dr.dot(light.n, light.d)
-            J = dr.select(facing > 0, facing * dr.square(light.dist / distance), 0)
+            shines = facing > 0
+            if front is not None:
+                shines &= dr.dot(front, other.d) < 0
+            J = dr.select(shines, facing * dr.square(light.dist / distance), 0)
             weight *= dr.select(here, J, 1)
             other.pdf = dr.select(here, dr.select(J > 0, light.pdf / J, 0), light.pdf)
             if self.balls:
@@ -216,13 +251,12 @@ def _kind(emitter: mi.Emitter) -> int | None:
     return {"AreaLight": _AREA, "PointLight": _POINT, "SpotLight": _POINT}.get(emitter.class_name())
 
 
-def _table(scene: mi.Scene, emitter: mi.Emitter, kind: int) -> list[float]:
+def _table(scene: mi.Scene, number: int, emitter: mi.Emitter, kind: int) -> list[float]:
     """Position, axis and cosine of the cutoff of points, and of spheres the density of emission per area."""
     if kind == _AREA:
         shape = emitter.get_shape()
         ball = shape.class_name() == "Sphere"
-        index = [other.ptr for other in scene.emitters()].index(emitter.ptr)
-        density = float(scene.pdf_emitter(mi.UInt32(index))[0] / shape.surface_area()[0]) if ball else 0.0
+        density = float(scene.pdf_emitter(mi.UInt32(number))[0] / shape.surface_area()[0]) if ball else 0.0
         return [0, 0, 0, 0, 0, 1, -1, density]
     if kind == _POINT:
         position = emitter.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5))[0].p

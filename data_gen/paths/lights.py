@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.bent import BentLamps, sample_emitter
 from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.scenes.lamps import Chosen, Places
 from data_gen.scenes.load import path_depths
 
 # Shapes that Mitsuba samples uniformly by area, besides meshes; for spheres it samples the visible part.
 _UNIFORM_SHAPES = ("Rectangle", "Disk", "Cylinder")
+# What emission depends on, where it is met: of thousands of shapes, all else takes twice the time to record.
+_EMISSION = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
 
 
 class Lights:
@@ -23,6 +27,8 @@ class Lights:
     Replaying their sampling at another vertex changes only the solid angle, so they need not be sampled again: they are
     ``shared``, if there are no others in the scene. ``near``, ``far``: whether there are emitters of finite and of
     infinite distance; ``places``: how often each is chosen, by place; None: as often as the scene says, everywhere.
+    ``bent``: lamps that Mitsuba samples with a wrong density; None if there are none. Where these shine depends on the
+    vertex that sees them, so that they are not shared.
     """
 
     def __init__(self, scene: mi.Scene, places: Places | None = None):
@@ -32,7 +38,8 @@ class Lights:
         uniform = [shape.is_mesh() or shape.class_name() in _UNIFORM_SHAPES for shape in lamps]
         self.near, self.far = not all(far), any(far)
         # Emitters that are neither infinitely far away nor on a shape (point lights) are not counted as uniform.
-        self.shared = sum(uniform) + sum(far) == len(scene.emitters())
+        self.bent = BentLamps.of(scene)
+        self.shared = not self.bent and sum(uniform) + sum(far) == len(scene.emitters())
         self.places = places
 
     def sample(self, scene, x: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool) -> tuple:
@@ -41,9 +48,24 @@ class Lights:
         That is None where it is not chosen by place.
         """
         if not self.places:
-            return *scene.sample_emitter_direction(x, u, False, active), None
+            return *self.anywhere(scene, x, u, active), None
         chosen = self.places.choose(x, u)
-        return *self.places.sample(x, chosen, active), chosen
+        return *self.at(x, chosen, active), chosen
+
+    def anywhere(self, scene, x: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool) -> tuple:
+        """The direction sample and Le / p, where lamps are chosen with the scene's own probabilities."""
+        return sample_emitter(scene, self.bent, x, u, active)[:2]
+
+    def seen(self, scene, x: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool) -> tuple:
+        """As ``anywhere()``, with Le V / p."""
+        if not self.bent:
+            return scene.sample_emitter_direction(x, u, True, active)
+        light, weight = self.anywhere(scene, x, u, active)
+        return light, dr.select(scene.ray_test(x.spawn_ray_to(light.p), active & (light.pdf > 0)), 0, weight)
+
+    def at(self, x: mi.SurfaceInteraction3f, chosen: Chosen, active: mi.Bool) -> tuple:
+        """The direction sample and Le / p of the lamp that is ``chosen`` by place."""
+        return self.bent.sample(x, chosen, active)[:2] if self.bent else self.places.sample(x, chosen, active)
 
 
 @dataclass
@@ -58,10 +80,13 @@ class LightSample:
 
 
 def sample_light(
-    scene: mi.Scene, si: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool, shadows: bool = True
+    scene: mi.Scene, si: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool, lights: Lights | None = None
 ) -> LightSample:
-    """Emitter sampling at a vertex; without ``shadows`` with no regard for occlusion."""
-    light, weight = scene.sample_emitter_direction(si, u, shadows, active)
+    """Emitter sampling at a vertex, in view of what is in the way; with ``lights`` with no regard for occlusion."""
+    if lights:
+        light, weight = lights.anywhere(scene, si, u, active)
+    else:
+        light, weight = scene.sample_emitter_direction(si, u, True, active)
     return LightSample(light.d, light.pdf, light.delta, dr.select(active & (light.pdf != 0), weight, 0), light.p)
 
 
@@ -74,8 +99,8 @@ def shadowed(scene: mi.Scene, si: mi.SurfaceInteraction3f, light: LightSample, f
 def replay_light(
     scene, lights: Lights, base, base_weight, u, y: mi.SurfaceInteraction3f, *, lit: mi.Bool
 ) -> LightSample:
-    """``sample_light(scene, y, u, lit, False)``, by the direction sample ``base``, of Le / p, at another vertex."""
-    return _replayed(lights, base, base_weight, y, lit, lambda anew: sample_light(scene, y, u, anew, False))
+    """``sample_light(scene, y, u, lit, lights)``, by the direction sample ``base``, of Le / p, at another vertex."""
+    return _replayed(lights, base, base_weight, y, lit, lambda anew: sample_light(scene, y, u, anew, lights))
 
 
 def replay_lamp(
@@ -89,7 +114,7 @@ def replay_lamp(
     places = lights.places
 
     def anew(active: mi.Bool) -> LightSample:
-        light, weight = places.sample(y, chosen, active)
+        light, weight = lights.at(y, chosen, active)
         return LightSample(light.d, light.pdf, light.delta, dr.select(active & (light.pdf != 0), weight, 0), light.p)
 
     sample = _replayed(lights, base, base_weight, y, lit, anew)
@@ -120,23 +145,26 @@ def _replayed(lights: Lights, base, base_weight, y: mi.SurfaceInteraction3f, lit
 
 
 def emission(
-    scene, si: mi.SurfaceInteraction3f, ref: mi.SurfaceInteraction3f, active, sampled, places: Places | None = None
+    scene, si: mi.SurfaceInteraction3f, ref: mi.SurfaceInteraction3f, active, sampled, lights: Lights | None = None
 ) -> tuple:
     """Le at ``si`` toward ``ref`` where ``active``, and the density with which emitter sampling finds it where
-    ``sampled``; lamps may be chosen by ``places``."""
-    light = mi.DirectionSample3f(scene, si, ref)
+    ``sampled``: that of Mitsuba, or that of ``lights``."""
+    light, places = mi.DirectionSample3f(scene, si, ref), lights and lights.places
     p = places.density(ref, light, sampled) if places else scene.pdf_emitter_direction(ref, light, sampled)
+    if lights and lights.bent:
+        choice = partial(places.probability, ref) if places else scene.pdf_emitter
+        p, _ = lights.bent.corrected(p, light, si, choice, sampled)
     return light.emitter.eval(si, active), p
 
 
 def shared_emission(scene, lights: Lights, x1, Le, p, *, x, y, y1, J) -> tuple[mi.Spectrum, mi.Float]:
-    """``emission(scene, y1, y, True, True)`` by way of ``Le`` and ``p`` of the same vertex ``x1``, as seen from ``x``.
+    """``emission(scene, y1, y, True, True, lights)`` by ``Le`` and ``p`` of the same vertex ``x1``, as seen from ``x``.
 
     ``y1`` is ``x1`` with another incident direction; ``J`` is the ratio d'²/d² of the squared distances.
     """
     places = lights.places
     if not lights.shared:
-        return emission(scene, y1, y, True, True, places)
+        return emission(scene, y1, y, True, True, lights)
     escapes = ~x1.is_valid()
     ratio = dr.select(escapes, 1, y1.wi.z / x1.wi.z)
     shared = escapes | ((ratio > 0) & dr.isfinite(ratio))
@@ -145,7 +173,7 @@ def shared_emission(scene, lights: Lights, x1, Le, p, *, x, y, y1, J) -> tuple[m
         lamp = places.index_of(x1.emitter(scene), p1 > 0)
         p1 *= places.probability(y, lamp) / places.probability(x, lamp)
     anew = (x1.emitter(scene) != None) & ~shared  # noqa: E711 - a comparison of arrays of pointers
-    return dr.if_stmt((Le, p1), anew, lambda *_: emission(scene, y1, y, anew, anew, places), lambda *known: known)
+    return dr.if_stmt((Le, p1), anew, lambda *_: emission(scene, y1, y, anew, anew, lights), lambda *known: known)
 
 
 def emission_seen(scene, integrator, medium, ray: mi.RayDifferential3f, active) -> mi.Spectrum:
@@ -160,7 +188,7 @@ def emission_seen(scene, integrator, medium, ray: mi.RayDifferential3f, active) 
     # Most rays meet no lamp: nothing else is computed for them.
     lamp = hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 - a comparison of arrays of pointers
     shines = active & (lamp | ~hit.is_valid())
-    si = hit.compute_surface_interaction(ray, mi.RayFlags.All, lamp)
+    si = hit.compute_surface_interaction(ray, _EMISSION, lamp)
     return si.emitter(scene, shines).eval(si, shines)
 
 

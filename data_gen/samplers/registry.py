@@ -61,6 +61,8 @@ class Entry:
     # scene has them
     notes: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     loses: str = field(default="", kw_only=True)  # which light of lamps without size it loses at holes; "": none
+    # Whether it leaves the densities of lamps to Mitsuba, which errs where these have vertex normals (``BentLamps``)
+    leaves_lamps: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.standing not in STANDINGS:

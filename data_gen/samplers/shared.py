@@ -117,6 +117,5 @@ def first_radius(default: float) -> Option:
 
 # Which light of lamps without size a sampler loses
 THROUGH_HOLES = "that comes through masks and thin panes"
-BETWEEN_HOLES = "that comes through one hole and is seen through another"
 
 IN_MIRRORS = "followed from the camera and from the lights, caustics seen in them too"

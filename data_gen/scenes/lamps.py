@@ -150,7 +150,8 @@ def _walk(scene: mi.Scene, ray: mi.Ray3f, random: mi.PCG32, lamps: mi.UInt32, pa
     of_place = dr.zeros(mi.Float, 3 * n)
 
     def step(ray: mi.Ray3f, random: mi.PCG32, vertex: mi.UInt32, active: mi.Bool) -> tuple:
-        si = scene.ray_intersect(ray, active)
+        # Place and normal are all that is used: of thousands of shapes, all else takes twice the time to record.
+        si = scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
         active = active & si.is_valid()
         # As if all were grey and matt: so no material is compiled for the pilot, which would take longer than the rest.
         side = mi.Frame3f(dr.mulsign(si.n, dr.dot(si.n, -ray.d)))
@@ -182,6 +183,14 @@ def _pair(random: mi.PCG32) -> mi.Point2f:
     return mi.Point2f(random.next_float32(), random.next_float32())
 
 
+def emitter_numbers(scene: mi.Scene, none: int = 0) -> mi.UInt32:
+    """By what Dr.Jit calls an emitter: its number in ``scene.emitters()``. What is no emitter of it has ``none``."""
+    pointers = np.array(dr.reinterpret_array(mi.UInt32, scene.emitters_dr())) if scene.emitters() else np.zeros(0, int)
+    index = np.full(pointers.max(initial=0) + 1, none, np.uint32)
+    index[pointers] = np.arange(len(pointers))
+    return mi.UInt32(index)
+
+
 # Cells along each axis of the finest grid, and of the coarser ones that it goes by, down to the whole scene
 _SIDE = 16
 # Samples that the mean of the larger cell stands for
@@ -197,6 +206,12 @@ class Chosen:
     lamp: mi.UInt32
     p: mi.Float
     u: mi.Point2f
+
+    @classmethod
+    def of_scene(cls, scene: mi.Scene, u: mi.Point2f, active: mi.Bool) -> Chosen:
+        """As the scene chooses it, everywhere alike."""
+        lamp, per_p, left = scene.sample_emitter(u.x, active)
+        return cls(lamp, dr.rcp(per_p), mi.Point2f(left, u.y))
 
 
 @dataclass
@@ -234,10 +249,7 @@ class Places:
         # More than any random number, so that rounding leaves none beyond
         upto[:, -1] = 2
         self.upto = mi.Float(upto.ravel())
-        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]) for emitter in scene.emitters()]
-        index = np.zeros(max(numbers) + 1, np.uint32)
-        index[numbers] = np.arange(len(numbers))
-        self.indices = mi.UInt32(index)
+        self.indices = emitter_numbers(scene)
         # Similar scenes can then share the kernel.
         dr.make_opaque(self.low, self.per_size, self.p, self.upto, self.indices)
 
@@ -257,9 +269,9 @@ class Places:
         left = dr.clip((u.x - before) / p, 0, dr.one_minus_epsilon(mi.Float))
         return Chosen(lamp, p, mi.Point2f(left, u.y))
 
-    def probability(self, x: mi.SurfaceInteraction3f, lamp: mi.UInt32) -> mi.Float:
+    def probability(self, x: mi.SurfaceInteraction3f, lamp: mi.UInt32, active: mi.Bool = True) -> mi.Float:
         """With which this lamp is chosen at vertex ``x``."""
-        return dr.gather(mi.Float, self.p, self.row(x) + lamp)
+        return dr.gather(mi.Float, self.p, self.row(x) + lamp, active)
 
     def sample(self, x: mi.SurfaceInteraction3f, chosen: Chosen, active: mi.Bool) -> tuple:
         """As ``scene.sample_emitter_direction(x, u, False, active)``: a point of the lamp that is ``chosen``.

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 
 import drjit as dr
 import mitsuba as mi
@@ -122,6 +124,26 @@ def set_film_size(scene: mi.Scene, size: tuple[int, int]) -> None:
         params.update()
 
 
+@contextmanager
+def at_most(scene: mi.Scene, pixels: int):
+    """Shrinks the scene's film to at most ``pixels`` within the block; yields the factor by which it shrinks.
+
+    A cropped film keeps its size, since its window could not be set again.
+    """
+    film = scene.sensors()[0].film()
+    (width, height), window = (tuple(int(n) for n in numbers) for numbers in (film.size(), film.crop_size()))
+    shrink = math.sqrt(pixels / (width * height))
+    if shrink >= 1 or (width, height) != window:
+        yield 1.0
+        return
+    small = max(1, round(width * shrink)), max(1, round(height * shrink))
+    set_film_size(scene, small)
+    try:
+        yield width * height / (small[0] * small[1])
+    finally:
+        set_film_size(scene, (width, height))
+
+
 def _scaled(begin: int, length: int, whole: int, new: int) -> tuple[int, int]:
     """Begin and length of a part of ``new`` pixels that was one of a ``whole``: a pixel at least."""
     first, end = ((2 * int(edge) * new + int(whole)) // (2 * int(whole)) for edge in (begin, begin + length))
@@ -152,20 +174,26 @@ def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int |
     Where ``merged``, meshes are as ``data_gen.scenes.merge`` has them. Merged as Mitsuba would (``optimize=True``),
     shapes and emitters come in another order each time, and with them other bits.
     """
-    config = mi.parser.ParserConfig(mi.variant())
-    config.merge_equivalent = config.merge_meshes = False
-    # In parallel objects are numbered as they come, which differs from process to process, and with it the kernel: it
-    # would be compiled again.
-    config.parallel = False
-    with _found_beside(path):
-        state = mi.parser.parse_file(config, path, **parameters)
-        mi.parser.transform_all(config, state)
+    with found_beside(path):
+        config, state = parsed(path, parameters)
         if state.root.props.plugin_name() == "scene":
             if sensor is not None:
                 _keep(state, sensor, path)
             if merged:
                 merge(config, state)
         return mi.parser.instantiate(config, state)
+
+
+def parsed(path: str, parameters: Mapping[str, str] = MappingProxyType({})) -> tuple:
+    """Mitsuba's configuration and state of a scene file that is read, but of which nothing is made yet."""
+    config = mi.parser.ParserConfig(mi.variant())
+    config.merge_equivalent = config.merge_meshes = False
+    # In parallel objects are numbered as they come, which differs from process to process, and with it the kernel: it
+    # would be compiled again.
+    config.parallel = False
+    state = mi.parser.parse_file(config, path, **parameters)
+    mi.parser.transform_all(config, state)
+    return config, state
 
 
 def _keep(state: mi.parser.ParserState, sensor: int | str, path: str) -> None:
@@ -184,7 +212,7 @@ def _keep(state: mi.parser.ParserState, sensor: int | str, path: str) -> None:
 
 
 @contextmanager
-def _found_beside(path: str):
+def found_beside(path: str):
     """While in it, files that a scene names are looked for beside it first."""
     resolver = mi.file_resolver()
     before = list(resolver)

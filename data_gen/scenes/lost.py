@@ -13,8 +13,8 @@ _SHARP = ("SmoothConductor", "SmoothDielectric")
 _TINY = 1 / 500
 # By the part of its class's name that all kinds of it have: the disk of a sun fills 7e-5 of a hemisphere.
 _SUN = "Sunsky"
-# Below this mean cosine, that of 14 degrees, vertex normals are far from face normals.
-_BENT = 0.97
+# Below this mean cosine, that of 2.6 degrees, vertex normals are not those of the faces.
+_BENT = 0.999
 
 
 def behind_sharp(scene: mi.Scene) -> str:
@@ -23,12 +23,20 @@ def behind_sharp(scene: mi.Scene) -> str:
         return ""
     if without_size(scene):
         return "lamps without size"
-    whole = float(np.linalg.norm(np.array(scene.bbox().extents())))
-    return "tiny lamps" if any(_is_tiny(emitter, whole) for emitter in scene.emitters()) else ""
+    return "tiny lamps" if any(hard_to_meet(scene, emitter) for emitter in scene.emitters()) else ""
 
 
 def without_size(scene: mi.Scene) -> bool:
-    return any(mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta) for emitter in scene.emitters())
+    return any(map(_has_no_size, scene.emitters()))
+
+
+def hard_to_meet(scene: mi.Scene, emitter: mi.Emitter) -> bool:
+    """Whether hardly a path meets that emitter of the scene: it has no size, or is tiny."""
+    return _has_no_size(emitter) or _is_tiny(emitter, float(np.linalg.norm(np.array(scene.bbox().extents()))))
+
+
+def _has_no_size(emitter: mi.Emitter) -> bool:
+    return mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
 
 
 def has_holes(scene: mi.Scene) -> bool:
@@ -38,11 +46,11 @@ def has_holes(scene: mi.Scene) -> bool:
 
 
 def bent_lamp(scene: mi.Scene) -> mi.Shape | None:
-    """The first lamp that has vertex normals far from its face normals, or None.
+    """The first lamp that has other vertex normals than its faces, or None.
 
     Mitsuba samples it by one normal and weighs it by another: its issue 1952.
     """
-    return next(filter(_is_bent, (shape for shape in scene.shapes() if shape.is_emitter())), None)
+    return next(filter(is_bent, (shape for shape in scene.shapes() if shape.is_emitter())), None)
 
 
 def _is_tiny(emitter: mi.Emitter, whole: float) -> bool:
@@ -52,7 +60,8 @@ def _is_tiny(emitter: mi.Emitter, whole: float) -> bool:
     return shape is not None and float(np.linalg.norm(np.array(shape.bbox().extents()))) < _TINY * whole
 
 
-def _is_bent(shape: mi.Shape) -> bool:
+def is_bent(shape: mi.Shape) -> bool:
+    """Whether it is a mesh whose vertex normals are not those of its faces."""
     # A rectangle is a mesh too, but has no table of faces.
     if not shape.is_mesh() or not shape.has_vertex_normals() or shape.class_name() == "Rectangle":
         return False

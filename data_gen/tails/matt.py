@@ -40,6 +40,11 @@ class Matt:
         groups = any(shape.class_name() == "Instance" for shape in scene.shapes())
         self.any = groups or any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) for bsdf in bsdfs.values())
         self.nothing_else = ByMaterial(mi.Bool(table))
+        tilted = np.zeros(len(table), bool)
+        tilted[[number for number, bsdf in bsdfs.items() if _BUMPS.search(str(bsdf))]] = True
+        # Materials inside shape groups may tilt their normals too.
+        self.any_tilted = groups or bool(tilted.any())
+        self.tilts = ByMaterial(mi.Bool(tilted))
         self.plain = Plain(bsdfs)
 
     def at(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
@@ -50,6 +55,11 @@ class Matt:
         """Whether it has nothing else: a path that ends there does not go on for a rest."""
         listed, lambertian = self.nothing_else.of(x.bsdf(), active)
         return listed & lambertian
+
+    def tilted(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
+        """Whether its diffuse part may be tilted by a bump or normal map, and so miss directions of a matt surface."""
+        listed, tilted = self.tilts.of(x.bsdf(), active)
+        return active & (~listed | tilted)
 
     def reflectance(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
         """ρ in [0, 1]: π times the diffuse lobe's f in a direction on the side of ``wi``."""

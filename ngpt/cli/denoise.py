@@ -154,70 +154,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def denoise(args: argparse.Namespace, console: Console) -> int:
-    files = arguments.given_files(args)
     pairs = output_paths(arguments.stack_files(args.stacks), args.output)
-    if files and len(pairs) > 1:
-        raise WrongUse(
-            f"--{next(iter(files))} belongs to one stack, and {len(pairs)} are given; denoise them one by one"
-        )
-    if args.halves:
-        args.error = True
-        if len(pairs) > 1:
-            raise WrongUse(f"--halves belong to one stack, and {len(pairs)} are given; denoise them one by one")
-    if args.temporal:
-        for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
-            if given:
-                raise WrongUse(f"--temporal and {option} cannot be combined; leave one out")
-    options = {
-        name: value for name in ("alpha", "weights", "device", "memory") if (value := getattr(args, name)) is not None
-    }
-    options |= dict(args.option)
-    check_request(args.method, options)
-    reference = Reference.read(args.ref, args.untrusted) if args.ref else None
-    for _, target in pairs:
-        if target.suffix.lower() != ".exr":
-            check_picture(target, args)
-        arguments.output_file(target, args)
-    # Their results are there, but later frames are made of them.
-    missing = [i for i, (_, target) in enumerate(pairs) if not finished(target)] if args.temporal else []
-    again = {target for _, target in pairs[: missing[-1]]} if missing else set()
+    files, options, reference = asked(args, pairs)
     # One stack has no progress to tell, but somebody who looks on sees that it is at work.
     bar = console.progress("denoise", "frames") if len(pairs) > 1 or console.terminal else nullcontext(_unseen)
-    overwrite = partial(
-        write_frame,
-        overwrite=args.force,
-        transform=args.transform,
-        exposure=args.exposure,
-        # One of several frames is not kept elsewhere if the disk is full: the next call makes it again.
-        keep=len(pairs) == 1,
-        into=args.into,
-        reduce=args.reduce,
-    )
-    frames: Any
-    windows = False
-    if args.temporal and not all(args.skip_existing and finished(target) for _, target in pairs):
-        by_wcv = args.method == "wcv" and not options
-        windows, told = way([source for source, _ in pairs], dict(args.layer), by_wcv)
-        console.say(f"--temporal: {told}")
-        for name in filter(is_shot, args.stacks):
-            for remark in remarks(name, arguments.stack_files([name]), results=False):
-                console.say(remark)
-    if windows:
-        everything = {target for _, target in pairs}
-        frames = windowed(pairs, partial(read_frame, args=args, files=files, again=everything), overwrite, reference)
-    else:
-        frames = overlapped(
-            pairs,
-            partial(read_frame, args=args, files=files, again=again),
-            partial(
-                compute_frame,
-                args=args,
-                options=options,
-                reference=reference,
-                temporal=defaultdict(Temporal) if args.temporal else None,
-            ),
-            overwrite,
-        )
+    frames = results(args, pairs, files, options, reference, console)
     reports = []
     with bar as progress, closing(frames):
         progress(0, len(pairs))
@@ -250,6 +191,59 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
     return 1 if failed else 0
 
 
+def asked(
+    args: argparse.Namespace, pairs: list[tuple[Path, Path]]
+) -> tuple[dict[str, str], dict[str, Any], Reference | None]:
+    """Files of further layers, the method's options, and the reference; raises an error for what cannot be done."""
+    files = arguments.given_files(args)
+    if len(pairs) > 1 and (files or args.halves):
+        of_one = f"--{next(iter(files))} belongs" if files else "--halves belong"
+        raise WrongUse(f"{of_one} to one stack, and {len(pairs)} are given; denoise them one by one")
+    args.error = args.error or bool(args.halves)
+    if args.temporal:
+        for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
+            if given:
+                raise WrongUse(f"--temporal and {option} cannot be combined; leave one out")
+    names = ("alpha", "weights", "device", "memory")
+    options = {name: getattr(args, name) for name in names if getattr(args, name) is not None} | dict(args.option)
+    check_request(args.method, options)
+    reference = Reference.read(args.ref, args.untrusted) if args.ref else None
+    for _, target in pairs:
+        if target.suffix.lower() != ".exr":
+            check_picture(target, args)
+        arguments.output_file(target, args)
+    return files, options, reference
+
+
+def results(
+    args: argparse.Namespace,
+    pairs: list[tuple[Path, Path]],
+    files: dict[str, str],
+    options: dict[str, Any],
+    reference: Reference | None,
+    console: Console,
+) -> Any:
+    """Makes and writes the result of each pair: an iterator over the report, or the error, of each."""
+    missing = [i for i, (_, target) in enumerate(pairs) if not (args.skip_existing and finished(target))]
+    windows = False
+    if args.temporal and missing:
+        windows, told = way([source for source, _ in pairs], dict(args.layer), args.method == "wcv" and not options)
+        console.say(f"--temporal: {told}")
+        for name in filter(is_shot, args.stacks):
+            for remark in remarks(name, arguments.stack_files([name]), results=False):
+                console.say(remark)
+    # Their results may be there, but later frames are made of them.
+    again = {target for _, target in (pairs if windows else pairs[: missing[-1]])} if args.temporal and missing else ()
+    read = partial(read_frame, args=args, files=files, again=again)
+    # One of several frames is not kept elsewhere if the disk is full: the next call makes it again.
+    write = partial(write_frame, args=args, keep=len(pairs) == 1)
+    if windows:
+        return windowed(pairs, read, write, reference)
+    temporal: Any = defaultdict(Temporal) if args.temporal else None
+    compute = partial(compute_frame, args=args, options=options, reference=reference, temporal=temporal)
+    return overlapped(pairs, read, compute, write)
+
+
 def _unseen(done: int, total: int) -> None:
     """Progress that nobody is shown."""
 
@@ -273,7 +267,7 @@ def read_frame(
     first, *others = (Frame(source, target, stack, there=there, cut=cut) for stack in stacks)
     if others and (what := one_view_only(target, args, files)):
         raise NgptError(f"{source}: has several views, and {what}; choose one, as in --view {first.view}")
-    return first._replace(others=tuple(others))
+    return replace(first, others=tuple(others))
 
 
 def _check_result(source: Path, target: Path, args: argparse.Namespace) -> None:
@@ -320,24 +314,25 @@ def compute_frame(
         result = reconstruct_with_error(stack, args.method, halves=_halves(frame, args), **options)
     else:
         result = reconstruct(stack, args.method, **options)
-    over_time, reason = {}, ""
+    over_time: dict[str, Any] = {}
+    told: dict[str, Any] = {}
     if temporal is not None:
         begun, history = time.perf_counter(), temporal[frame.view]
         image = history.next(stack, result.image)
         result = replace(result, image=image, seconds=result.seconds + time.perf_counter() - begun)
-        over_time, reason = {"ngpt:temporal": "history", "ngpt:history": history.share}, history.reason
+        over_time = {"ngpt:temporal": "history", "ngpt:history": history.share}
+        told = {"why no history": history.reason} if history.reason else {}
         if isinstance(history.corrections, Network):
             over_time["ngpt:historyWeights"] = str(identify(history.corrections.path))
-    errors = None
     if reference is not None:
         image, place = smaller(result.image, stack.place, args.reduce)
-        errors = reference.errors(
+        told |= reference.errors(
             image, GradientStack({"primal": image}, stack.attributes, path=stack.path, place=place)
         )
     if groups:
         parts = lightgroups.denoised(stack, groups, result.image, args.method, **options)
         stack = lightgroups.with_groups(stack, parts)
+        told |= {"groups": list(groups)}
     if result.error is not None:
         stack = stack.replace(error=result.error)
-    frame = frame._replace(stack=stack, result=result, errors=errors, groups=tuple(groups), others=others)
-    return frame._replace(over_time=over_time, reason=reason)
+    return replace(frame, stack=stack, result=result, others=others, over_time=over_time, told=told)

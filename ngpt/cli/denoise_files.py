@@ -1,49 +1,42 @@
 """The files of ``ngpt denoise``: where results go, how they are written, and what there is to say of them."""
 
+from __future__ import annotations
+
+import argparse
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ngpt.cli.picture import exposed, in_picture
-from ngpt.cli.reference import Errors
 from ngpt.errors import WrongUse
-from ngpt.image.pictures import write_picture
-from ngpt.image.transforms import shown
-from ngpt.io.exr import layers_of_result, write
-from ngpt.io.foreign.pfm import write_pfm
+from ngpt.io.exr import layers_of_result
 from ngpt.io.framenames import named, number_of, varies
 from ngpt.io.frames import RESULT_SUFFIX
-from ngpt.io.primaries import converted, to_rec709
 from ngpt.io.reduced import cut_pixels, smaller
 from ngpt.io.resolution import propose
 from ngpt.methods import METHODS, Result
+from ngpt.result_file import Look, write_result
 from ngpt.stack import GradientStack
 from ngpt.system.files import save
 from ngpt.version import __version__
 
 
-class Frame(NamedTuple):
-    """A stack, its file and the file for its result; ``there`` says that the result was there already.
-
-    ``cut`` says that a file is in its place that is not whole.
-    ``over_time`` is what other frames were to the result, as header attributes; ``reason`` why they were nothing.
-    ``others`` are the other views of the file.
-    """
+@dataclass(frozen=True)
+class Frame:
+    """A stack, its file and the file for its result; ``there`` says that the result was there already."""
 
     source: Path
     target: Path
     stack: GradientStack | None
     result: Result | None = None
-    errors: Errors | None = None
-    groups: tuple[str, ...] = ()
     there: bool = False
-    cut: bool = False
-    over_time: Mapping[str, Any] = {}
-    reason: str = ""
-    others: tuple["Frame", ...] = ()
+    cut: bool = False  # whether a file is in its place that is not whole
+    over_time: Mapping[str, Any] = field(default_factory=dict)  # what other frames were to it, as header attributes
+    told: Mapping[str, Any] = field(default_factory=dict)  # what else is reported
+    others: tuple[Frame, ...] = ()  # the other views of the file
 
     @property
     def view(self) -> str:
@@ -51,41 +44,23 @@ class Frame(NamedTuple):
         return self.stack.source.view.name if self.stack is not None and self.stack.source is not None else ""
 
 
-def write_frame(
-    frame: Frame,
-    overwrite: bool,
-    transform: str = "standard",
-    exposure: float | str = 0.0,
-    keep: bool = False,
-    into: str | None = None,
-    *,
-    reduce: int = 1,
-) -> dict:
-    """Writes the result, with ``keep`` elsewhere where it must, and returns what there is to report.
-
-    ``into``, ``reduce``  as of ``ngpt.write``
-    """
-    source, target, stack, result, errors, groups, there, cut, over_time, reason, others = frame
-    report: dict[str, Any] = {"input": str(source), "output": str(target)}
-    if there or stack is None or result is None:
+def write_frame(frame: Frame, args: argparse.Namespace, keep: bool) -> dict:
+    """Writes the result, with ``keep`` elsewhere where it must, and returns what there is to report."""
+    target, stack, result = frame.target, frame.stack, frame.result
+    report: dict[str, Any] = {"input": str(frame.source), "output": str(target)}
+    if frame.there or stack is None or result is None:
         return report | {"skipped": True}
-    made = {**result.attributes, **over_time}
-    image, place = smaller(result.image, stack.place, reduce)
+    views = [(one.result.image, one.stack) for one in (frame, *frame.others) if one.result and one.stack]
+    made, look = {**result.attributes, **frame.over_time}, Look(args.transform, args.exposure)
 
     def save_to(path: Path, overwrite: bool) -> None:
-        if path.suffix.lower() == ".exr":
-            views = [(one.result.image, one.stack) for one in (frame, *others) if one.result and one.stack]
-            write(path, [image for image, _ in views], [of for _, of in views], overwrite, made, into, reduce=reduce)
-        elif path.suffix.lower() == ".pfm":
-            write_pfm(path, converted(image, to_rec709(stack.attributes)), overwrite)
-        else:
-            light = in_picture(converted(image, to_rec709(stack.attributes)), place)
-            write_picture(path, shown(light, transform, exposed(exposure, light)), overwrite)
+        write_result(path, views, made, look, overwrite, into=args.into, reduce=args.reduce)
 
     if keep:
-        save(target, save_to, overwrite or cut)
+        save(target, save_to, args.force or frame.cut)
     else:
-        save_to(target, overwrite or cut)
+        save_to(target, args.force or frame.cut)
+    image, _ = smaller(result.image, stack.place, args.reduce)
     report |= {
         "method": result.method,
         "weights": {"file": result.weights.file, "sha256": result.weights.sha256} if result.weights else None,
@@ -98,26 +73,25 @@ def write_frame(
         "repaired": result.repaired,
         "untrusted": result.untrusted,
         "standard error": result.error is not None,
-        "groups": list(groups),
+        "groups": [],
     }
     if result.error is not None:
         report["pixels without standard error"] = int(np.isnan(result.error).any(axis=-1).sum())
     if target.suffix.lower() == ".exr":
-        report["layers"], report["noisy layers"] = layers_of_result(stack, into)
+        report["layers"], report["noisy layers"] = layers_of_result(stack, args.into)
     if stack.source is not None:
         found = propose(stack.source.view.parts, stack.source.resolution)
         report |= {
             "proposed": {name: found[name] for name in ("albedo", "normal") if name in found and name not in stack}
         }
-    report |= {"views": [one.view for one in (frame, *others)]} if frame.view else {}
-    report |= {"why no history": reason} if reason else {}
-    if reduce > 1:
-        report |= {"reduced by": reduce} | ({"cut": told} if (told := cut_pixels(stack.place, reduce)) else {})
-    report |= {"in place of": "a file that was not whole"} if cut else {}
-    report |= {name: over_time[f"ngpt:{name}"] for name in ("temporal", "history") if f"ngpt:{name}" in over_time}
-    if errors is not None:
-        report |= {"metrics": errors.metrics} | ({"compared": errors.part} if errors.part else {})
-    return report
+    report |= {"views": [one.view for one in (frame, *frame.others)]} if frame.view else {}
+    if args.reduce > 1:
+        cut = cut_pixels(stack.place, args.reduce)
+        report |= {"reduced by": args.reduce} | ({"cut": cut} if cut else {})
+    report |= {"in place of": "a file that was not whole"} if frame.cut else {}
+    over_time = {name.removeprefix("ngpt:"): value for name, value in frame.over_time.items()}
+    report |= {name: over_time[name] for name in ("temporal", "history") if name in over_time}
+    return {**report, **frame.told}
 
 
 def describe(report: dict) -> str:

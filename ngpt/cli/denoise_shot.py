@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -91,9 +92,9 @@ def windowed(
         while done < number:
             yield told[done] if done in told else write(frames.pop(done))
             done += 1
-        errors = reference.errors(result.image, frames[number].stack) if reference is not None else None
+        more = reference.errors(result.image, frames[number].stack) if reference is not None else {}
         over_time = {"ngpt:temporal": "windows"}
-        yield write(frames.pop(number)._replace(result=result, errors=errors, over_time=over_time))
+        yield write(replace(frames.pop(number), result=result, over_time=over_time, told=more))
         done = number + 1
     while done < len(pairs):
         yield told[done] if done in told else write(frames.pop(done))

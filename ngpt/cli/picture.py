@@ -8,18 +8,16 @@ import numpy as np
 from ngpt.cli.arguments import add_force, add_view, number, output_file
 from ngpt.cli.streams import standard_input
 from ngpt.errors import WrongUse
-from ngpt.image.display import auto_exposure, squared
+from ngpt.image.display import squared
 from ngpt.image.pictures import PICTURES, SHOTS, check_kind, write_picture, write_shot
-from ngpt.image.transforms import TRANSFORMS, check_transform, shown
+from ngpt.image.transforms import TRANSFORMS, shown
 from ngpt.io.exr import read_picture
 from ngpt.io.framenames import named, number_of, varies
 from ngpt.io.frames import is_shot, remarks, shot_files
+from ngpt.result_file import Look, check_image, in_picture
 from ngpt.system.console import Console
 from ngpt.system.files import make_folder
-from ngpt.windows import Place, Window, put
-
-# Kinds of files that hold results
-IMAGES = (".exr", ".pfm", *PICTURES)
+from ngpt.windows import put
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +52,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     output_file(target, args)
     with standard_input([args.image]) as (name,):
         image = in_picture(*read_picture(name, view=args.view))
-        write_picture(target, shown(image, args.transform, exposed(args.exposure, image)), args.force)
+        write_picture(target, Look(args.transform, args.exposure).of(image), args.force)
         console.say(f"{name} -> {target}: {image.shape[1]}x{image.shape[0]}")
     return 0
 
@@ -75,7 +73,7 @@ def shot(args: argparse.Namespace, folder: str, target: Path, console: Console) 
         raise WrongUse(f"{target}: is a file; name a folder for the pictures, or a film ({' '.join(SHOTS)})")
     for remark in remarks(folder, files):
         console.say(remark)
-    stops = exposed(args.exposure, in_picture(*read_picture(files[0], view=args.view)))
+    stops = Look(args.transform, args.exposure).stops(in_picture(*read_picture(files[0], view=args.view)))
 
     def pictures():
         for done, file in enumerate(files):
@@ -103,28 +101,6 @@ def write_each(folder: Path, pictures, overwrite: bool) -> None:
     for file, pixels in pictures:
         name = named(str(folder), number_of(file, str(folder))) if each else folder / f"{file.stem}.png"
         write_picture(Path(name), pixels, overwrite)
-
-
-def in_picture(image: np.ndarray, place: Place) -> np.ndarray:
-    """What the display window shows of an image (H, W, 3): all but overscan. An image beside it is shown whole.
-
-    Pixels become as wide as they are high.
-    """
-    return squared(image[seen(place).within(place.data)], place.aspect)
-
-
-def seen(place: Place) -> Window:
-    return place.data.common(place.display) or place.data
-
-
-def check_image(target: Path, transform: str) -> None:
-    """Raises an error for what cannot be the file of a result, or of one that this machine cannot make."""
-    kind = target.suffix.lower()
-    if kind not in IMAGES:
-        raise WrongUse(f"{target}: results are OpenEXR, PFM or pictures; let the name end in {' '.join(IMAGES)}")
-    if kind in PICTURES:
-        check_kind(target, PICTURES)
-        check_transform(transform)
 
 
 def check_picture(target: Path, args: argparse.Namespace) -> None:
@@ -159,11 +135,6 @@ def stops(text: str) -> float | str:
     if text == "auto":
         return text
     return number(text, lambda stops: abs(stops) <= 100, "is neither a number of stops, from -100 to 100, nor auto")
-
-
-def exposed(asked: float | str, image: np.ndarray) -> float:
-    """The exposure of a picture of (H, W, 3), in stops."""
-    return auto_exposure(image) if isinstance(asked, str) else asked
 
 
 def frames_a_second(text: str) -> float:

@@ -1,6 +1,6 @@
 """``ngpt denoise --ref``: the error of a result, in the pixels that both it and the reference have."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -9,13 +9,6 @@ from ngpt.io.primaries import converted, to_rec709
 from ngpt.measure.metrics import compare
 from ngpt.stack import GradientStack
 from ngpt.windows import Place, overlap
-
-
-class Errors(NamedTuple):
-    """What ``compare`` returns, and the pixels it compared as text, "" where these are all of both images."""
-
-    metrics: dict[str, float]
-    part: str
 
 
 class Reference(NamedTuple):
@@ -29,8 +22,12 @@ class Reference(NamedTuple):
     def read(cls, path: str, isolated: bool) -> "Reference":
         return cls(path, *read_picture(path, isolated))
 
-    def errors(self, image: np.ndarray, stack: GradientStack) -> Errors:
-        """The errors of an image (H, W, 3) made from ``stack``. Raises NgptError without pixels in common."""
+    def errors(self, image: np.ndarray, stack: GradientStack) -> dict[str, Any]:
+        """The metrics of an image (H, W, 3) made from ``stack``, and which pixels were compared, if not all of both.
+
+        Raises NgptError without pixels in common.
+        """
         both = overlap([stack.path, self.path], [stack.place, self.place])
         light = converted(image, to_rec709(stack.attributes))
-        return Errors(compare(*both.of([light, self.pixels])), str(both.common) if both.line else "")
+        metrics = {"metrics": compare(*both.of([light, self.pixels]))}
+        return metrics | ({"compared": str(both.common)} if both.line else {})

@@ -8,11 +8,14 @@ Pixels exchange less light the more their surfaces differ, and the more they dif
 [variances travel along as in Schied et al. 2017, "Spatiotemporal variance-guided filtering"].
 
 Photons are the same case: neighbouring pixels gather the same ones, and OIDN takes their blotches for detail, but the
-variance tells them. So method `oidn` leaves them to the diffusion (``ngpt.layers.GATHERED``).
+variance tells them. So method `oidn` leaves them to the diffusion (``ngpt.layers.GATHERED``). They are divided by the
+albedo of the surface that they were gathered at, and multiplied again, so that its texture stays sharp.
 
 Methods from gradients that call OIDN anyway take its image of this light (``ngpt.network.inputs.Oidn``): what OIDN
 takes for noise is given back by one factor for the whole image (docs/lab/log).
 """
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,6 +27,7 @@ from ngpt.repair import Repaired
 MOST = 4.0
 LOUDEST = 1e30  # variances of light of at most 1 are less, or as good as that
 FARTHEST = 1e-6  # depths below this share of the largest one are alike
+DARKEST = 0.05  # is added to the albedo that photons are divided by: gloss reflects light where nothing else does
 
 
 def denoised(data: Repaired) -> np.ndarray:
@@ -41,8 +45,19 @@ def denoised(data: Repaired) -> np.ndarray:
     return np.ascontiguousarray(np.moveaxis(light, 0, -1)) * np.float32(scale)
 
 
+def of_photons(data: Repaired) -> np.ndarray:
+    """As ``denoised()``, of light that photons have brought; the texture of the surfaces stays."""
+    assert data.caustic is not None
+    if "albedo" not in data.features:
+        return denoised(data)
+    texture = np.clip(data.features["albedo"], 0, 1) + np.float32(DARKEST)
+    variance = None if data.caustic_var is None else data.caustic_var / texture**2
+    light = denoised(replace(data, caustic=data.caustic / texture, caustic_var=variance)) * texture
+    return given_back(light, data.caustic)
+
+
 def given_back(found: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """What OIDN has made of ``light``, with as much light as there was, see ``MOST``; both (H, W, 3)."""
+    """What a denoiser has made of ``light``, with as much light as there was, see ``MOST``; both (H, W, 3)."""
     # OIDN may go below zero where no light does.
     found = np.maximum(found, min(float(light.min()), 0))
     before, after = light.sum(dtype=np.float64), found.sum(dtype=np.float64)

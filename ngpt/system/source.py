@@ -1,4 +1,4 @@
-"""What Python files do, without what is written about it: what caches are keyed by."""
+"""What Python files do and import, without what is written about it: what caches are keyed by."""
 
 import ast
 import hashlib
@@ -27,3 +27,24 @@ def code_text(path: Path) -> str:
         if isinstance(node, _DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
             del node.body[0]
     return ast.dump(tree)
+
+
+def imports(path: Path) -> set[str]:
+    """Full names of modules that a file imports anywhere in it, and of what it takes from them.
+
+    What it imports for types only is not run and not listed, nor are relative imports.
+    """
+    found: set[str] = set()
+    queue: list[ast.AST] = [ast.parse(path.read_bytes())]
+    while queue:
+        node = queue.pop()
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            if not node.level and node.module:
+                found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            queue += node.orelse
+        else:
+            queue += ast.iter_child_nodes(node)
+    return found

@@ -11,6 +11,7 @@ GPT_TILES = Sampler(
     standing="study",
     refusals=(*SURFACES, spectra, hidden_emitters),
     loses=THROUGH_HOLES,
+    leaves_lamps=True,
     notes={
         "transport": "paths are shared in tiles where materials are rough",
         "noise": "correlated within tiles, which denoisers of independent noise do not expect",
@@ -43,6 +44,7 @@ SPLIT = Sampler(
     standing="study",
     refusals=(*SURFACES, hidden_emitters),
     loses=THROUGH_HOLES,
+    leaves_lamps=True,
     notes={"transport": "split by the lobe of the first scattering event"},
     gradients=False,
 )

@@ -134,7 +134,9 @@ def test_normals_of_mitsuba_become_those_of_a_stack(renderer, monkeypatch):
     to_sensor = sensor.world_transform().inverse()
     denoiser = ngpt.Denoiser(sensor.film().crop_size(), albedo=True, normals=True, method="normal")
     seen = denoiser(sensor.film().bitmap(), albedo_ch="albedo", normals_ch="normals", to_sensor=to_sensor)
-    error = np.abs(np.array(seen)[..., :3] - render_stack(scene, 16, 0, unbiased=True)["normal"]).mean(axis=(0, 1))
+    error = np.abs(np.array(seen)[..., :3] - render_stack(scene, 16, 0, "gpt", unbiased=True)["normal"]).mean(
+        axis=(0, 1)
+    )
     assert (error < 0.05).all()
 
 

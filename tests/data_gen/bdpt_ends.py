@@ -200,7 +200,7 @@ class Copies(Ends):
         from data_gen.samplers.gbdpt.offset_path import own_vertex, start, take_step
 
         shifted = self.camera.rays(self.shift)
-        offsets = [start(self.eye, x, shifted, self.scene.ray_intersect_preliminary(shifted[0]))]
+        offsets = [start(self.plan, self.eye, x, shifted)]
         z, active = Vertex(x, mi.Spectrum(1), end, mi.UInt32(1)), x.is_valid()
         found, self.copied, self.steps, self.offsets = [], [], [], []
         for _ in range(self.length):
@@ -232,8 +232,12 @@ class Copies(Ends):
         for met in self.from_light[:s]:
             good &= met.there
         dr.eval(good)
-        g, _ = connection(self.plan, z.vertex, z.bsdf, y.vertex, good)
-        g1, edge = connection(self.plan, own.vertex, own.bsdf, y.vertex, good, seen=offset.joined)
+        g, _, through = connection(self.plan, z.vertex, z.bsdf, y.vertex, good)
+
+        def sees(v, y, lit):
+            return self.plan.sees_alike(v.si, y.si.p, through, lit & ~offset.joined), 0
+
+        g1, edge, _ = connection(self.plan, own.vertex, own.bsdf, y.vertex, good, sees)
         found = offset.β * g1, offset.r, mis.others_connected(own.vertex.end, y.vertex.end, edge)
         return z.vertex.β * g, found, self.brute(t, s), self.copy.brute(t, s), s + 1, good
 
@@ -288,7 +292,8 @@ def check_going_straight_and_back(copies):
     hit = copies.scene.ray_intersect_preliminary(mi.Ray3f(ray))
     p = y.bsdf.pdf(context(RADIANCE), y.si, wo)
     connectable = copies.materials.connectable(y.bsdf)
-    reverse = replace(step, z=y.vertex, wo=wo, d=d, p=p, connectable=connectable)
+    way = replace(step.way, o=y.si.p, p=p)
+    reverse = replace(step, z=y.vertex, wo=wo, d=d, p=p, way=way, connectable=connectable)
     base = replace(offset, ray=mi.Ray3f(ray), hit=hit, β=x.β, r=mi.Float(1), end=x.end)
     found = step_own(copies.plan, reverse, base)
     good = check_back(there.joined & (dr.max(there.β) > 0), step.β1, there.r, found.β, found.r)

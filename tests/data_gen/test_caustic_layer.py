@@ -64,4 +64,4 @@ def test_gradients_have_less_noise_for_it(renderer):
     for name in ("dx_var", "dy_var"):
         assert with_layer[name].mean() < 0.7 * without[name].mean()
     # Nor is there one where no path can be of it.
-    assert "caustic" not in render_stack(load(renderer, "diffuse", (8, 8)), 2, unbiased=True)
+    assert "caustic" not in render_stack(load(renderer, "diffuse", (8, 8)), 2, sampler="gpt", unbiased=True)

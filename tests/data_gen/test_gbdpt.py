@@ -35,7 +35,7 @@ def test_lights_seen_from_elsewhere_are_the_same_lights(renderer):
     both, u = x.is_valid() & y.is_valid(), camera.random.clone().next_2d()
     light, weight = scene.sample_emitter_direction(x, u, False, both)
     expected, expected_weight = scene.sample_emitter_direction(y, u, False, both)
-    ours, ours_weight, r = lights.seen_from_elsewhere(scene, light, weight, y, both)
+    ours, ours_weight, r = lights.seen_from_elsewhere(scene, light, weight, y, both, front=None)
     both = np.array(both & (light.pdf > 0))
     index = np.array(lights.index_of(light.emitter))
     assert set(index[both]) == {0, 1, 2}

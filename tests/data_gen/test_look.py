@@ -1,5 +1,7 @@
 """A look at a scene says whether features pay: not where a lens blurs what they would show."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from unbiased import load
@@ -8,8 +10,9 @@ pytest.importorskip("mitsuba")
 
 import data_gen
 import data_gen.choosing.plans
-from data_gen.begun import Asked
+from data_gen.begun import rest_of
 from data_gen.choosing.look import features_pay, noise_of_features
+from data_gen.request import RenderRequest
 from data_gen.scenes.builtin import SCENES
 from ngpt.io.exr import write
 
@@ -37,10 +40,10 @@ def test_images_of_a_wide_lens_are_made_without_features(renderer, tmp_path):
     assert "albedo" in stack and not plan.options and plan.method == "oidn"
     assert "albedo" in data_gen.render_scene(through(renderer, 1e-4), 2, needs_features=False).stack
     assert "albedo" in data_gen.render_scene(scene, 2, needs_features=False, gradients=True).stack
-    asked = Asked("lens", 0, spp=2)
-    asked.name(image)
+    # Only a scene with a name is known again.
+    image.attributes |= RenderRequest("lens", 2).header()
     write(tmp_path / "begun.exr", image)
-    left = Asked("lens", 0, spp=4).left(tmp_path / "begun.exr")
-    assert left.sampler == "primal" and left.options(0)["features"] is False
-    rest = data_gen.render_scene(scene, **left.options(0)).stack
+    left = rest_of(RenderRequest("lens", 4), tmp_path / "begun.exr")
+    assert left.sampler == "primal" and left.options["features"] is False
+    rest = data_gen.render_scene(replace(left, scene=scene)).stack
     assert rest.names == image.names and not np.array_equal(rest["primal"], image["primal"])

@@ -17,7 +17,7 @@ LAMP = """<shape type="sphere"><point name="center" x="0" y="1" z="4"/><float na
 <emitter type="area"><rgb name="radiance" value="9"/></emitter></shape>"""
 GLASS, MASK = '<bsdf type="dielectric"/>', '<bsdf type="mask"><bsdf type="diffuse"/></bsdf>'
 IN_GLASS, IN_HOLES = (
-    "meet smooth glass or mirrors: what these make of their light, '{}' hardly finds",
+    "of the light on what the camera sees directly, '{}' hardly finds",
     "'{}' loses light that",
 )
 
@@ -31,7 +31,7 @@ IN_GLASS, IN_HOLES = (
         (GLASS, POINT, "vcm", ""),
         (MASK, POINT, "gpt", ""),
         (MASK, POINT, "bdpt", ""),
-        (MASK, POINT, "gbdpt", IN_HOLES),
+        (MASK, POINT, "gbdpt", ""),
         (MASK, POINT, "gpt-basic", IN_HOLES),
         (MASK, LAMP.format(0.3), "gpt-basic", ""),
         ('<bsdf type="plastic"/>', POINT, "primal", ""),
@@ -44,7 +44,7 @@ def test_it_is_said_before_the_render(renderer, command, tmp_path, ball, lamp, s
     assert said != IN_GLASS or "--sampler vcm finds it" in told
 
 
-@pytest.mark.parametrize(("rows", "bent"), [(6, True), (30, False)])
+@pytest.mark.parametrize(("rows", "bent"), [(6, True), (100, False)])
 def test_lamps_of_few_faces_with_smooth_normals_are_named(renderer, rows, bent):
     """Mitsuba's issue 1952: densities of such lamps are those of another normal than samples."""
     from lamps_scenes import bowl

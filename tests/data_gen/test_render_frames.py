@@ -14,7 +14,7 @@ import pytest
 
 import ngpt
 from data_gen.cli.render_arguments import frames, targets
-from data_gen.frames.pattern import filled
+from data_gen.pattern import filled
 from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.system.console import Console

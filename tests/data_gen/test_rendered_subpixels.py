@@ -167,15 +167,18 @@ def test_what_cannot_be_kept_is_refused(renderer):
 def test_a_render_goes_on_with_its_subpixels(command, tmp_path, renderer):
     line = "render diffuse --size 16x12 --sampler primal --seed 3 -O tails=paths -o a.exr"
     command(f"{line} --spp 16 --subpixels 2")
-    command(f"{line} --spp 32 --skip-existing")
+    command(f"{line} --spp 32 --skip-existing --subpixels 2")
     joined = ngpt.read(tmp_path / "a.exr")
     assert joined.attributes["ngpt:spp"] == 32 and joined.attributes["ngpt:subpixels"] == 2
     assert np.array_equal(means(joined.fine["primal"], 2), joined["primal"])
     assert "subpixels 2, not 4" in command(f"{line} --spp 48 --skip-existing --subpixels 4", 1)
-    # One that was begun without them goes on without.
+    # One that was begun with few samples, and so without them, goes on without.
     command(f"{line.replace('a.exr', 'b.exr')} --spp 16 --subpixels 1")
-    command(f"{line.replace('a.exr', 'b.exr')} --spp 32 --skip-existing")
-    assert not ngpt.read(tmp_path / "b.exr").fine
+    command(f"{line.replace('a.exr', 'b.exr')} --spp 32 --skip-existing --subpixels 1")
+    command(f"{line.replace('a.exr', 'c.exr')} --spp 2")
+    assert not ngpt.read(tmp_path / "c.exr").fine
+    command(f"{line.replace('a.exr', 'c.exr')} --spp 64 --skip-existing")
+    assert not ngpt.read(tmp_path / "b.exr").fine and not ngpt.read(tmp_path / "c.exr").fine
 
 
 def test_the_command_takes_only_numbers_that_there_are(command):

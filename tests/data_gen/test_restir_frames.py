@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import data_gen
 import ngpt
 from data_gen.frames.camera_path import CameraPath, Key, look_at
 from data_gen.samplers import FRAME_SAMPLERS, find
@@ -21,12 +22,12 @@ KEYS = [
 
 def rendered(frames=range(3), spp=2, seed=7, size=(16, 12), describe=None, update=None, **options):
     """Stacks by their frames of a shot of the built-in scene, or of what ``describe`` (frame) says."""
-    from data_gen.frames.shot import Shot, render_shot
+    from data_gen.frames.shot import Shot
 
     views = [(np.array([key["origin"], key["target"], (0, 1, 0)], float), key["frame"]) for key in KEYS]
     path = CameraPath([Key(frame, look_at(*look), look) for look, frame in views])
     shot = Shot(describe or (lambda frame: ("diffuse", {})), size, path, update=update)
-    return dict(render_shot(shot, frames, spp, seed, sampler="restir", **options))
+    return dict(data_gen.render_frames(shot, frames, spp, seed, sampler="restir", **options))
 
 
 @pytest.fixture(scope="module")

@@ -91,7 +91,7 @@ def test_a_toy_is_found_by_all_that_ask(renderer, capsys, tmp_path):
     scene = load(renderer, "diffuse", (6, 4))
     with pytest.raises(NgptError, match="sampler 'toy' has no option 'loud'; it has: share"):
         render_stack(scene, 1, sampler="toy", loud=True, unbiased=True)
-    with pytest.raises(NgptError, match="sampler 'toy' always renders features; only 'primal'"):
+    with pytest.raises(NgptError, match="sampler 'toy' has no option 'features'; it has: share"):
         render_stack(scene, 1, sampler="toy", with_features=False, unbiased=True)
     target = tmp_path / "toy.exr"
     line = ["render", "diffuse", "--size", "6x4", "--spp", "4", "--sampler", "toy", "-o", str(target)]

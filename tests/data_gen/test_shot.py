@@ -10,7 +10,8 @@ from ngpt.windows import Place, Window
 
 pytest.importorskip("mitsuba")
 
-from data_gen.frames.pattern import filled
+import data_gen
+from data_gen.pattern import filled
 from data_gen.scenes.geometry import VERTICES
 
 XML = """<scene version="3.0.0"><default name="angle" value="0"/><integrator type="path"/>
@@ -33,9 +34,7 @@ def shot(tmp_path, camera=None, update=None, moving=True):
 
 
 def rendered(shot, frames, **options):
-    from data_gen.frames.shot import render_shot
-
-    return dict(render_shot(shot, frames, 2, 7, **{"sampler": "primal"} | options))
+    return dict(data_gen.render_frames(shot, frames, 2, 7, **{"sampler": "primal", "subpixels": 1} | options))
 
 
 def test_a_frame_is_the_same_whatever_others_are_rendered(renderer, tmp_path):

@@ -15,8 +15,10 @@ from unbiased import light_of_gradients, load
 
 import data_gen
 import ngpt
+from data_gen import passes
 from data_gen.adaptive import Adaptive
 from data_gen.render import render_stack
+from data_gen.samplers.gpt import rounds
 from data_gen.scenes import builtin
 from data_gen.tails import cache, schedule
 from data_gen.tails.cache import LEAST
@@ -148,6 +150,48 @@ def test_light_that_is_cut_is_counted(renderer):
     assert filled.cut / filled.light == pytest.approx(1 - kept / values.sum(), rel=1e-3)
 
 
+METAL = {"type": "roughconductor", "alpha": 0.3, "specular_reflectance": {"type": "rgb", "value": 0.8}}
+PLASTIC = {"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": 0.9}}
+DARK = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.002}}
+
+
+def room_of(walls, floor):
+    """The built-in room, whose lamp has 14, of other materials. All paths play Russian roulette."""
+    scene = builtin.diffuse()
+    for name, part in scene.items():
+        if isinstance(part, dict) and "bsdf" in part and name != "lamp":
+            part["bsdf"] = floor if name == "floor" else walls
+    return scene | {"integrator": {"type": "path", "rr_depth": 1}}
+
+
+def test_records_on_dark_surfaces_are_no_fireflies(renderer, monkeypatch):
+    """Behind a record a path survives by the light of the record, not by the colour of the surface."""
+    found, add = [], cache.Cache.add
+
+    def noted(self, place, half, values):
+        found.append(max(np.abs(np.array(value)).max() for value in values))
+        add(self, place, half, values)
+
+    monkeypatch.setattr(cache.Cache, "add", noted)
+    scene = load(renderer, room_of({"type": "twosided", "bsdf": METAL}, DARK), (64, 36))
+    render_stack(scene, 16, 1, "primal", tails="shared")
+    assert 1 < max(found) < 10
+
+
+def test_what_is_left_of_a_material_survives_once(renderer, monkeypatch):
+    """Here a tenth is left of all. Where it is followed it weighs as much as the material, and no more."""
+    from data_gen.samplers.gpt import base_path
+
+    def little(f, ended):
+        answered = dr.max(ended) > 0
+        return dr.select(answered, 0.1, 1) * f, dr.select(answered, mi.Float(0.1), 1)
+
+    monkeypatch.setattr(base_path, "rest", little)
+    stack = render_stack(load(renderer, room_of(PLASTIC, PLASTIC), (64, 36)), 64, 1, "primal", tails="shared")
+    # 7 as it should be, and 320 where it survives twice
+    assert 64 * stack["primal_var"].max() < 40
+
+
 def test_old_records_fade(renderer):
     """Records that are made later count twice as much, but cells with few records keep them."""
     filled, half = cache.Cache(FINENESS), dr.arange(mi.UInt32, N) & 1
@@ -173,6 +217,20 @@ def test_records_of_earlier_rounds_fade(renderer, monkeypatch):
     assert not np.array_equal(*images) and np.mean(images[0]) == pytest.approx(np.mean(images[1]), rel=0.02)
 
 
+def test_paths_that_feed_have_random_numbers_of_their_own(renderer, monkeypatch):
+    """Else a path of the image would end in the light that the same path has found."""
+    seeds = {}
+    for module in (passes, rounds):
+
+        def camera(sensor, seed, *args, name=module.__name__, real=module.CameraSamples, **named):
+            seeds.setdefault(name, set()).add(seed)
+            return real(sensor, seed, *args, **named)
+
+        monkeypatch.setattr(module, "CameraSamples", camera)
+    render_stack(load(renderer, "diffuse", (32, 24)), 16, 5, "primal", tails="shared")
+    assert len(seeds) == 2 and not set.intersection(*seeds.values())
+
+
 def test_the_noise_of_the_cache_is_of_its_own_seed(renderer):
     """The layer ``shared`` says what it is: less changes where only the paths of the image are others."""
     scene = load(renderer, slit, (32, 24))
@@ -187,13 +245,13 @@ def test_the_noise_of_the_cache_is_of_its_own_seed(renderer):
 def test_frames_have_one_cache(renderer, monkeypatch):
     from data_gen.frames import shot
 
-    seeds, render = [], shot.render_stack
+    seeds, render = [], shot.render
 
-    def noted(*args, tails_seed, **options):
-        seeds.append((args[2], tails_seed))
-        return render(*args, tails_seed=tails_seed, **options)
+    def noted(scene, request, watch, tails_seed):
+        seeds.append((request.seed, tails_seed))
+        return render(scene, request, watch, tails_seed=tails_seed)
 
-    monkeypatch.setattr(shot, "render_stack", noted)
+    monkeypatch.setattr(shot, "render", noted)
     list(data_gen.render_frames("diffuse", [0, 1], 1, seed=5, sampler="primal", size=(8, 6)))
     (first, of_tails), (second, again) = seeds
     assert first != second and of_tails == again == 5

@@ -130,7 +130,9 @@ class Beside:
         some = mi.UInt32(some[:: max(1, len(some) // number)])
         parts = ((v.si, v.β, v.end, v.depth) for v in (base.vertex, own.vertex))
         z, y = (Vertex(*(dr.gather(type(part), part, some) for part in each)) for each in parts)
-        offset = dr.gather(type(offset), offset, some)
+        # What a scene without holes does not have is None.
+        parts = {name: v for name, v in vars(offset).items() if v is not None}
+        offset = replace(offset, **{name: dr.gather(type(v), v, some) for name, v in parts.items()})
         # From the other end the base path is the copy: of its own density.
         ray = mi.Ray3f(z.si.p + z.si.to_world(z.si.wi), -z.si.to_world(z.si.wi))
         hit = copies.scene.ray_intersect_preliminary(ray)

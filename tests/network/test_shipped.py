@@ -29,7 +29,7 @@ def views(renderer):
     for name in ("diffuse", "lens"):
         scene = load_scene(name, (96, 64))
         result[name] = (
-            render_stack(scene, 8, seed=3, unbiased=True),
+            render_stack(scene, 8, seed=3, sampler="gpt", unbiased=True),
             render_stack(scene, 256, seed=4, sampler="primal", unbiased=True)["primal"],
         )
     return result

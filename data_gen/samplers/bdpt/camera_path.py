@@ -71,7 +71,7 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
         # ---------------------- To a light -----------------------
         u_light, u_lobe, u_direction = random.next_2d(), random.next_1d(), random.next_2d()
         u_survival = random.next_1d()
-        light, weight = scene.sample_emitter_direction(si, u_light, False, smooth)
+        light, weight = lights.connect(scene, si, u_light, smooth)[:2]
         lit = smooth & (light.pdf > 0)
         wo = si.to_local(light.d)
         # One call for both: the material toward the light, and where the path goes on to.
@@ -79,7 +79,7 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
         f = dr.select(dr.isfinite(dr.sum(f)) & dr.isfinite(p), f, 0)
         lit &= dr.max(f * weight) > 0
         q = reverse_density(si, bsdf, wo, lit)
-        T, holes = plan.sees(si, light.p, limits.max_depth - 1 - depth, lit)
+        T, holes = plan.sees(si, light.p, limits.max_depth - (depth + 1), lit)
         z.end = known(end, depth + 1 + holes <= plan.longest)
         C, others = to_light(lights, z, light, weight, f, p=p, q=q)
         L += dr.select(lit, C * T / (1 + others), 0)

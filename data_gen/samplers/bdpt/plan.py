@@ -51,9 +51,13 @@ class Plan(World):
         if self.holes is None:
             return end, None
         passed = self.holes.passed(bsdf, event_kind(sample.sampled_type))
+        return self.carried(passed, x, end), x.edge.behind(passed, x.si)
+
+    def carried(self, passed: mi.Bool, x: Vertex, end: Partial) -> Partial:
+        """``end`` behind ``x``; where the path has ``passed`` a hole there, what it knew before the hole."""
         same = mis.passed(x.end, cosine(x.si, x.si.to_world(x.si.wi)), x.edge.length2(x.si))
         parts = ((getattr(same, name), getattr(end, name)) for name in ("vcm", "vc", "waiting"))
-        return Partial(*(dr.select(passed, a, b) for a, b in parts)), x.edge.behind(passed, x.si)
+        return Partial(*(dr.select(passed, a, b) for a, b in parts))
 
     def arrives(self, end: Partial, edge: Edge | None, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> Partial:
         """``end`` at the next vertex, ``si``, or at a hole on the way there."""
@@ -70,7 +74,11 @@ class Plan(World):
         """What comes from ``y`` to the camera."""
         if self.holes is None:
             return dr.select(self.hidden(self.scene, y.si, camera, active), mi.Float(0), 1)
+        return self.through_holes_to_camera(y, camera, active)[0]
+
+    def through_holes_to_camera(self, y: Vertex, camera: mi.DirectionSample3f, active) -> tuple[mi.Spectrum, mi.UInt32]:
+        """As ``seen_by_camera()``, in a scene with holes; and how many there are."""
         most = self.longest - 1 - y.depth
         if self.limits.hide_emitters:
             return self.holes.toward_camera(self.scene, y.si, camera.p, most, active)
-        return self.sees(y.si, camera.p, most, active)[0]
+        return self.sees(y.si, camera.p, most, active)

@@ -10,6 +10,9 @@ Each returns f / p of the path that it completes, and ``others`` of ``mis``: its
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -23,8 +26,8 @@ from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, Vertex, cosine, 
 
 def emission_at(scene, lights: LightEnds, si, ref, active) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
     """Le at ``si`` toward ``ref`` where ``active``; ``p`` of connecting to it from there, and ``e`` of ``mis``."""
-    light = mi.DirectionSample3f(scene, si, ref)
-    Le, p = light.emitter.eval(si, active), scene.pdf_emitter_direction(ref, light, active)
+    light, p = lights.met(scene, si, ref, active)
+    Le = light.emitter.eval(si, active)
     cos = dr.abs(dr.dot(light.n, light.d))
     e = lights.emission(lights.index_of(light.emitter, active), p, cos, dr.square(light.dist))
     return Le, p, dr.select(p > 0, e, 0)
@@ -40,16 +43,17 @@ def to_light(lights: LightEnds, z: Vertex, light, weight, f, *, p, q) -> tuple[m
 
 def connected(plan: Plan, z: Vertex, z_bsdf, y: Vertex, active) -> tuple[mi.Spectrum, mi.Float]:
     """s, t > 1, occlusion included."""
-    C, edge = connection(plan, z, z_bsdf, y, active)
+    C, edge, _ = connection(plan, z, z_bsdf, y, active)
     return z.β * C, mis.others_connected(z.end, y.end, edge)
 
 
 def connection(
-    plan: Plan, z: Vertex, z_bsdf, y: Vertex, active, seen: mi.Bool | bool = False
-) -> tuple[mi.Spectrum, Edge]:
-    """As ``connected()``, without the camera path's throughput; and the edge, which its MIS weight depends on.
+    plan: Plan, z: Vertex, z_bsdf, y: Vertex, active, sees: Callable | None = None
+) -> tuple[mi.Spectrum, Edge, tuple[Any, Any]]:
+    """As ``connected()``, without the camera path's throughput; the edge, which its MIS weight depends on; and T of the
+    holes on it, with their number.
 
-    Where it is known that the vertices see each other, ``seen``, no ray is traced.
+    ``sees(z, y, active)`` gives these two where any number that fits would be wrong.
     """
     to = mi.Vector3f(y.si.p - z.si.p)
     distance2 = dr.squared_norm(to)
@@ -59,9 +63,9 @@ def connection(
     C = y.β * f * g / distance2
     # Vertices in one place are no path: their density is infinite.
     lit = active & (dr.max(z.β * C) > 0) & (distance2 > 0)
-    T, _ = plan.sees(z.si, y.si.p, plan.longest - 1 - z.depth - y.depth, lit & ~mi.Bool(seen))
+    T, holes = sees(z, y, lit) if sees else plan.sees(z.si, y.si.p, plan.longest - 1 - z.depth - y.depth, lit)
     C = dr.select(lit, C * T, 0)
-    return C, Edge(Side(cosine(z.si, d), p_z, q_z), Side(cosine(y.si, d), p_y, q_y), distance2)
+    return C, Edge(Side(cosine(z.si, d), p_z, q_z), Side(cosine(y.si, d), p_y, q_y), distance2), (T, holes)
 
 
 def to_camera(eye: Eye, lens: mi.Point2f, y: Vertex, bsdf, active, seen) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:

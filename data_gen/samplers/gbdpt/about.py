@@ -2,7 +2,7 @@
 
 from data_gen.budget import LANE_BYTES
 from data_gen.samplers.registry import Sampler, register
-from data_gen.samplers.shared import BETWEEN_HOLES, BOTH_ENDS, CONNECTABLE, joined_depth
+from data_gen.samplers.shared import BOTH_ENDS, CONNECTABLE, joined_depth
 
 # Bytes of a lane that splats all four differences as well, which are kept per pixel: an eighth of it for a lane, of 8 a
 # pass and the list of vertices that the camera sees, some of them for each lane
@@ -24,7 +24,6 @@ register(
         options={"joined_depth": joined_depth(10), "roughness_threshold": CONNECTABLE},
         tried=True,
         compiles=6.0,
-        loses=BETWEEN_HOLES,
         finds=("hidden lamps",),
         batch=8,
         lane_bytes=SPLATTING_BYTES + _ROULETTE_BYTES,

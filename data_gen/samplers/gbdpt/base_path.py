@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.holes import Edge
 from data_gen.paths.manifold import event
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.paths.walk import Sky, roulette
@@ -25,6 +27,35 @@ class Plan(both_ends.Plan):
 
     pair: Callable = difference  # Δ of a path and its copy, by one of the weights of ``pairs``
 
+    def sees_alike(self, si: mi.SurfaceInteraction3f, target: mi.Point3f, like: tuple[Any, Any], apart: mi.Bool) -> Any:
+        """T from the ``target`` to a copy's vertex ``si``, where its path has ``like``: T, and the number of holes.
+
+        Copies that are not ``apart`` see the same. The others must see the target through as many holes: so all
+        strategies reject the same copies, and a copy is as long as its path.
+        """
+        T, holes = self.sees(si, target, like[1], apart)
+        return T if self.holes is None else dr.select(apart, dr.select(holes == like[1], T, 0), like[0])
+
+    def outside(self, p: mi.Point3f, d: mi.Vector3f) -> mi.Point3f:
+        """A point behind all of the scene that is seen from ``p`` along ``d``."""
+        return p + d * (4 * self.lights.radius)
+
+
+@dataclass
+class Way:
+    """How a base path has come from its last vertex that was no hole."""
+
+    o: mi.Point3f  # that vertex
+    p: mi.Float  # density of the direction there
+    weight: mi.Float  # 1 / probability to survive Russian roulette, and to pass the holes, from there on
+    η: mi.Float  # photons that are gathered there
+    holes: mi.UInt32  # how many it has passed
+
+    def behind(self, passed: mi.Bool, new: Way) -> Way:
+        """Behind an event that has begun a ``new`` way, or ``passed`` a hole with the probability p of that one."""
+        weight, holes = self.weight * new.weight / new.p, self.holes + 1
+        return dr.select(passed, Way(self.o, self.p, weight, self.η, holes), new)
+
 
 @dataclass
 class Past:
@@ -32,6 +63,13 @@ class Past:
 
     η: mi.Float  # product of the relative indices of refraction
     sky: Sky
+    way: Way | None = None  # None in scenes without holes
+
+    @classmethod
+    def of_camera(cls, plan: Plan) -> Past:
+        """At the first vertex that the camera sees."""
+        way = Way(mi.Point3f(0), mi.Float(1), mi.Float(1), mi.Float(0), mi.UInt32(0)) if plan.holes else None
+        return cls(mi.Float(1), Sky.from_camera(plan.limits.hide_emitters), way)
 
 
 @dataclass
@@ -43,6 +81,7 @@ class Step:
     # A sampled point of an emitter
     light: mi.DirectionSample3f
     weight: mi.Spectrum  # Le / p
+    front: mi.Normal3f | None  # of ``LightEnds.connect()``
     shared: mi.Bool  # Δ has a share in what is completed at z
     C_light: mi.Spectrum
     others_light: mi.Float
@@ -50,6 +89,8 @@ class Step:
     f_light: mi.Spectrum
     p_light: mi.Float  # of sampling that direction
     q_light: mi.Float
+    through: tuple[Any, Any]  # T on the way to the light, and the number of holes
+    joins_light: mi.Bool  # light paths may find the path to that light
     joins: mi.Bool  # light paths may find paths that end here
     η: mi.Float  # photons that are gathered here; 0 if none are
     # The sampled direction
@@ -58,6 +99,7 @@ class Step:
     wo: mi.Vector3f
     d: mi.Vector3f
     kind: mi.UInt32
+    passed: mi.Bool | bool  # it goes straight on through a hole, which is no vertex
     event: mi.UInt32  # mirror, glass or hole, of ``manifold``
     p: mi.Float
     q: mi.Float
@@ -76,6 +118,8 @@ class Step:
     p_met: mi.Float  # of connecting to it
     e_met: mi.Float
     counted: mi.Bool  # light paths may find paths that end there
+    way: Way  # that has led there
+    edge: Edge | None  # the same, for weights; None in scenes without holes
 
 
 def base_step(
@@ -94,43 +138,54 @@ def base_step(
     # ------------------------ To a light -------------------------
     u_light, u_lobe, u_direction = random.next_2d(), random.next_1d(), random.next_2d()
     u_survival = random.next_1d()
-    light, weight = scene.sample_emitter_direction(si, u_light, False, smooth)
+    light, weight, front = lights.connect(scene, si, u_light, smooth)
     lit = smooth & (light.pdf > 0)
     wo = si.to_local(light.d)
     f, p, sample, f_p = bsdf.eval_pdf_sample(context(RADIANCE), si, wo, u_lobe, u_direction)
     f = dr.select(dr.isfinite(dr.sum(f)) & dr.isfinite(p), f, 0)
     lit &= dr.max(f * weight) > 0
     q = reverse_density(si, bsdf, wo, lit)
-    known = Vertex(si, z.β, known_end(end, joins), z.depth)
+    through = plan.sees(si, light.p, plan.limits.max_depth - (z.depth + 1), lit)
+    joins_light = z.depth + 1 + through[1] <= plan.longest
+    known = Vertex(si, z.β, known_end(end, joins_light), z.depth)
     C, others = to_light(lights, known, light, weight, f, p=p, q=q)
-    C = dr.select(lit & ~scene.ray_test(si.spawn_ray_to(light.p), lit), C, 0)
+    C = dr.select(lit, C * through[0], 0)
     cos = dr.abs(dr.dot(light.n, light.d))
     e = lights.emission(lights.index_of(light.emitter), light.pdf, cos, dr.square(light.dist))
 
     # ------------------------ Next vertex ------------------------
     found = active & (sample.pdf > 0)
     kind = event_kind(sample.sampled_type)
-    past = Past(dr.select(found, past.η * sample.eta, past.η), past.sky.behind(kind, found))
+    sky = past.sky.behind(kind, found)
+    η = dr.select(found, past.η * sample.eta, past.η)
     d = si.to_world(sample.wo)
     q_next = reverse_density(si, bsdf, sample.wo, found & (kind == SMOOTH))
     β = z.β * f_p
-    survives = roulette(dr.fmax(dr.max(β), brightest_offset), z.depth >= plan.limits.rr_depth, past.η)
+    survives = roulette(dr.fmax(dr.max(β), brightest_offset), z.depth >= plan.limits.rr_depth, η)
     goes_on = found & (dr.max(β) > 0) & (u_survival < survives)
     survival = dr.rcp(survives)
     x1 = scene.ray_intersect(si.spawn_ray(d), goes_on)
 
     # ------------------ Emission met by chance -------------------
-    met = goes_on & past.sky.meets(x1)
-    Le, p_met, e_met = emission_at(scene, lights, x1, si, met)
+    met = goes_on & sky.meets(x1)
     # Longer paths are not found by light paths.
     counted = z.depth + 1 <= plan.longest
     η_merged = plan.merged(bsdf, joins)
     end1 = mis.leave(end, cosine(si, d), sample.pdf, q_next, kind != SMOOTH, η_merged)
+    end1, edge = plan.onward(z, bsdf, sample, end1)
+    Le, p_met, e_met = emission_at(scene, lights, x1, si if edge is None else edge.seen_by(si), met)
+    way, passed = Way(si.p, sample.pdf, survival, η_merged, mi.UInt32(0)), False
+    if edge is not None:
+        # Nothing is connected to the camera itself.
+        p_met, e_met = dr.select(edge.first, 0, p_met), dr.select(edge.first, 0, e_met)
+        passed = plan.holes.passed(bsdf, kind)
+        way = past.way.behind(passed, way)
     step = Step(
         z=z,
         connectable=active & materials.connectable(bsdf),
         light=light,
         weight=weight,
+        front=front,
         shared=mi.Bool(True),
         C_light=C,
         others_light=others,
@@ -138,6 +193,8 @@ def base_step(
         f_light=f,
         p_light=p,
         q_light=q,
+        through=through,
+        joins_light=joins_light,
         joins=joins,
         η=η_merged,
         u_lobe=u_lobe,
@@ -145,6 +202,7 @@ def base_step(
         wo=sample.wo,
         d=d,
         kind=kind,
+        passed=passed,
         event=event(sample.sampled_type),
         p=sample.pdf,
         q=q_next,
@@ -153,7 +211,7 @@ def base_step(
         goes_on=goes_on,
         β1=β * survival,
         x1=x1,
-        end1=mis.arrive(end1, cosine(x1, d), dr.square(x1.t)),
+        end1=plan.arrives(end1, edge, x1, d),
         x1_connectable=materials.connectable(x1.bsdf()),
         met=met,
         C_met=dr.select(met, β * survival * Le, 0),
@@ -162,8 +220,10 @@ def base_step(
         p_met=p_met,
         e_met=e_met,
         counted=counted,
+        way=way,
+        edge=edge,
     )
-    return step, past
+    return step, Past(η, sky, way if plan.holes else None)
 
 
 def known_end(end: Partial, joins: mi.Bool) -> Partial:

@@ -8,14 +8,14 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.eye import Sight
-from data_gen.paths.walk import Sky
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.camera_path import choose
 from data_gen.samplers.bdpt.light_path import LightPath
 from data_gen.samplers.bdpt.vertex import Vertex, cosine, recall, scatters_smoothly
 from data_gen.samplers.gbdpt.base_path import Past, Plan, Step, base_step
 from data_gen.samplers.gbdpt.chain_shift import Chain, Course, along, completes, matters
-from data_gen.samplers.gbdpt.offset_path import Offset, brightest, connect, start, take_step, with_differences
+from data_gen.samplers.gbdpt.connected_offsets import connect
+from data_gen.samplers.gbdpt.offset_path import Offset, brightest, start, take_step, with_differences
 from data_gen.samplers.gbdpt.pairs import weighted
 
 
@@ -45,19 +45,20 @@ def shifted_camera_path(
     scene, limits, random = plan.scene, plan.limits, sight.random
     ray = mi.Ray3f(sight.ray)
     si = plan.first_hit(scene, ray).compute_surface_interaction(ray)
-    offsets = [start(sight.eye, si, one, plan.first_hit(scene, one[0])) for one in shifted]
+    offsets = [start(plan, sight.eye, si, one) for one in shifted]
     Le = sight.importance * si.emitter(scene).eval(si, mi.Bool(limits.shows))
 
     L = dr.zeros(mi.Spectrum, dr.width(ray))
     β = mi.Spectrum(sight.importance)  # throughput f / p up to the vertex si
     depth = mi.UInt32(1)  # edges of the path up to si
-    past = Past(mi.Float(1), Sky.from_camera(limits.hide_emitters))
+    past = Past.of_camera(plan)
     active = si.is_valid() & (depth < limits.max_depth) & matters(course, chain)
-    _, density = sight.eye.toward(si, sight.eye.lens, active)
+    toward, density = sight.eye.toward(si, sight.eye.lens, active)
     end = mis.begin_camera(density, cosine(si, ray.d))  # what the path knows of the other strategies, at si
+    edge = plan.begins(si.p + toward.d * toward.dist)  # that has led there
     while dr.hint(active, label="camera path"):
         # ------- The base path: to a light, and to the next vertex -------
-        z = Vertex(si, β, end, depth)
+        z = Vertex(si, β, end, depth, edge)
         wanted = completes(course, chain)
         step, past = base_step(plan, random, z, past, active, brightest_offset=brightest(offsets), completed=wanted)
         L += weighted(step.C_light, step.others_light) + weighted(step.C_met, step.others_met)
@@ -78,8 +79,8 @@ def shifted_camera_path(
             L, offsets = L + light, with_differences(offsets, Δ)
 
         # ------ The copies: to the same light, and the next vertex -------
-        offsets = take_step(plan, step, offsets, came, chain)
-        si, β, end = step.x1, step.β1, step.end1
+        offsets = take_step(plan, step, offsets, came, chain, sight.eye)
+        si, β, end, edge = step.x1, step.β1, step.end1, step.edge
         depth += 1
         active = step.goes_on & si.is_valid() & (depth < limits.max_depth) & matters(course, chain)
     return L, Le, [offset.Δ for offset in offsets], course

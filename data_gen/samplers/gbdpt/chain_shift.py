@@ -16,6 +16,8 @@ Behind x1 no strategy but one has made any of the path from the light's end: tha
 is ``vc`` of ``mis`` there, and which shifts such paths by a walk of its own (``light_shift``). Each strategy has
 weights of its own, so that they need not agree which walks succeed.
 
+Paths with mirrors or glass and holes between x1 and y are rejected.
+
 A path is *bent* from the first of those events on. The kernel of all paths leaves out the differences of what bent
 paths bring, and marks lanes that have one; in a second kernel these lanes trace the same paths again, and there all
 else is left out. What is bent and cannot be followed is rejected there.
@@ -59,8 +61,9 @@ def next_course(course: Course, step: Step) -> Course:
     """The course at the next vertex; what is met by chance there already belongs to it."""
     smooth = step.kind == SMOOTH
     # This depends on the sampled event, not on whether the path survives it, so that both kernels agree.
-    bends = course.second & ~smooth & (step.p > 0)
-    return Course(course.ahead & ~smooth, course.ahead & smooth & step.connectable, course.bent | bends)
+    bends = course.second & ~smooth & (step.p > 0) & ~mi.Bool(step.passed)
+    second = (course.ahead & smooth & step.connectable) | (course.second & step.passed)
+    return Course(course.ahead & ~smooth, second, course.bent | bends)
 
 
 def along(
@@ -129,7 +132,7 @@ def next_chain(plan: Plan, chain: Chain, course: Course, step: Step) -> Chain:
     """The chain behind ``step``; ``course`` is the one before it."""
     begins = course.ahead & (step.kind == SMOOTH) & step.connectable & step.goes_on
     events, fits = add_event(chain.events, step.event)
-    longer = chain.open & step.goes_on & (step.kind != SMOOTH) & (step.event != 0) & fits
+    longer = chain.open & step.goes_on & (step.kind != SMOOTH) & (step.event != 0) & fits & ~mi.Bool(step.passed)
     lit = (step.x1.is_valid() & step.x1_connectable) | (dr.max(step.C_met) > 0)
     return Chain(
         x1=dr.select(begins, step.z.si, chain.x1),

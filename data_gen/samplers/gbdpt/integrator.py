@@ -10,11 +10,15 @@ its copy share one weight over all strategies of both: see ``pairs``.
                       along y itself, as if y were a base path
     Δ                 gradient sample, the sum over all strategies and lengths
 
-The map: mirrors, clear glass and holes in front of the camera are replayed; the first vertex behind them is the copy's
-own, and from there it goes straight to the next vertex of the path, which both share with all further ones. It is
-rejected, alike by all strategies, where one of these three vertices is not connectable, or where the copy is occluded
-or black. What is completed by connecting the camera path's first vertices is
-shifted in ``offset_path``; what ends by connecting a light path to the camera, in ``light_shift``.
+The map: mirrors and clear glass in front of the camera are replayed; the first vertex behind them is the copy's own,
+and from there it goes straight to the next vertex of the path, which both share with all further ones. It is rejected,
+alike by all strategies, where one of these three vertices is not connectable, or where the copy is occluded or black.
+What is completed by connecting the camera path's first vertices is shifted in ``offset_path``; what ends by connecting
+a light path to the camera, in ``light_shift``.
+
+Holes are no vertices (``paths.holes``). On each edge the copy goes straight on through as many of them as the path, and
+is rejected where there are more or fewer. It is weakened by what they let through, whether the path was, or has passed
+them by chance.
 
 Between that first vertex and the next one mirrors and glass may lie: then the copy walks through the same events to the
 same next vertex. Camera paths do so in a second kernel (``chain_shift``), light paths that end at the first vertex in a
@@ -41,6 +45,7 @@ from data_gen.paths.camera import QUARTERS, CameraSamples, in_packets
 from data_gen.paths.eye import Eye, Sight
 from data_gen.paths.features import features
 from data_gen.paths.frozen import Frozen
+from data_gen.paths.holes import Holes
 from data_gen.paths.light_ends import LightEnds, World
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials
@@ -58,15 +63,15 @@ from data_gen.samplers.gbdpt.roulette import Rater, Worth, survivors, thresholds
 class GBDPT(BDPT):
     """Gradient-domain bidirectional path tracing, for surfaces.
 
-    Plugin ``gbdpt``, with the parameters of ``bdpt`` and ``roughness_threshold``. Not handled: as there. Holes are
-    vertices, which end connections: shifts do not go straight on through them.
+    Plugin ``gbdpt``, with the parameters of ``bdpt`` and ``roughness_threshold``. Not handled: as there.
     """
 
     plan_class = Plan
 
     def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
         materials = Materials(scene, self.options["roughness_threshold"])
-        plan = self.plan(World(scene, LightEnds(scene, self.name), materials), pair=difference)
+        world = World(scene, LightEnds(scene, self.name), materials, holes=Holes.of(scene))
+        plan = self.plan(world, pair=difference)
         return partial(self.gradient_pass, Frozen(scene, plan), plan)
 
     def gradient_pass(self, frozen: Frozen, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:

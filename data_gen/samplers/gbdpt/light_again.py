@@ -71,18 +71,26 @@ class Link:
 
     depth: mi.UInt32  # of that one; 0 is the light's end
     p: mi.Float  # density with which it was left
-    survival: mi.Float  # 1 / probability to survive Russian roulette from there on
+    survival: mi.Float  # 1 / probability to survive Russian roulette, and to pass the holes, from there on
     events: mi.UInt32  # mirrors and glass between the two, of ``manifold``, the last one first
-    whole: mi.Bool  # there is room for all of them
+    whole: mi.Bool  # there is room for all of them, and no hole beside them
+    holes: mi.UInt32  # how many are between the two
 
 
 def first_link() -> Link:
     """The link of the vertex that a light's end lights."""
-    return Link(mi.UInt32(0), mi.Float(1), mi.Float(1), mi.UInt32(0), mi.Bool(True))
+    return Link(mi.UInt32(0), mi.Float(1), mi.Float(1), mi.UInt32(0), mi.Bool(True), mi.UInt32(0))
 
 
-def next_link(link: Link, depth: mi.UInt32, sample: mi.BSDFSample3f, survival: mi.Float) -> Link:
-    """The link of the next vertex, where a sampled event leaves the vertex at ``depth``."""
+def next_link(
+    link: Link, depth: mi.UInt32, sample: mi.BSDFSample3f, survival: mi.Float, passed: mi.Bool | bool = False
+) -> Link:
+    """The link of the next vertex, where a sampled event leaves the vertex at ``depth``, or has ``passed`` a hole."""
+    if passed is not False:
+        whole = link.whole & (link.events == 0)
+        survived = link.survival * survival / sample.pdf
+        through = Link(link.depth, link.p, survived, link.events, whole, link.holes + 1)
+        return dr.select(passed, through, next_link(link, depth, sample, survival))
     smooth = event_kind(sample.sampled_type) == SMOOTH
     code = event(sample.sampled_type)
     events, fits = prepend_event(link.events, code)
@@ -91,7 +99,8 @@ def next_link(link: Link, depth: mi.UInt32, sample: mi.BSDFSample3f, survival: m
         dr.select(smooth, sample.pdf, link.p),
         dr.select(smooth, 1, link.survival) * survival,
         dr.select(smooth, 0, dr.select(fits, events, link.events)),
-        smooth | (link.whole & fits & (code != 0)),
+        smooth | (link.whole & fits & (code != 0) & (link.holes == 0)),
+        dr.select(smooth, 0, link.holes),
     )
 
 
@@ -120,7 +129,8 @@ def light_again(plan: Plan, sight: Sight, depth: mi.UInt32) -> Again:
         # Where the path was joined to the camera
         eye.place_on_lens(random)
         end, active, sample, survival = go_on(plan, random, start, end.y, bsdf, active)
-        link = next_link(link, depth_here, sample, survival)
+        passed = plan.holes.passed(bsdf, event_kind(sample.sampled_type)) if plan.holes else False
+        link = next_link(link, depth_here, sample, survival, passed)
         left = dr.select(link.depth == depth_here, here, left)
     on_lens = eye.place_on_lens(random)
     end.y.end = plan.known(end.y.end, end.y.si.bsdf())

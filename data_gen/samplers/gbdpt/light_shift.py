@@ -43,6 +43,9 @@ class Splatted:
     survival: mi.Float  # 1 / probability to survive Russian roulette from there on
     events: mi.UInt32  # mirrors and glass between the two, of ``manifold``, the last one first
     allowed: mi.Bool  # both vertices are connectable, and ``before`` was left by a smooth event
+    # How many holes are between the two, and between the last vertex and the camera
+    holes: mi.UInt32 | int = 0
+    holes_seen: mi.UInt32 | int = 0
 
 
 def splat_differences(
@@ -64,8 +67,11 @@ def splat_differences(
     y, link = again.end.y, again.link
     bsdf = y.si.bsdf()
     joined = again.there & scatters_smoothly(bsdf)
-    # It has been seen: nothing is in between.
-    C, others, uv = to_camera(eye, again.lens, y, bsdf, joined, lambda *_: 1)
+    # It has been seen: nothing is in between, or holes.
+    T, holes_seen = 1, 0
+    if plan.holes:
+        T, holes_seen = plan.through_holes_to_camera(y, eye.toward(y.si, again.lens, joined)[0], joined)
+    C, others, uv = to_camera(eye, again.lens, y, bsdf, joined, lambda *_: T)
     lit = dr.max(C) > 0
 
     # --------------------- Its four shifts -----------------------
@@ -84,6 +90,8 @@ def splat_differences(
         survival=link.survival,
         events=link.events,
         allowed=link.whole & connectable(bsdf) & (first | connectable(before.si.bsdf())),
+        holes=link.holes,
+        holes_seen=holes_seen,
     )
     is_bent = lit & path.allowed & (link.events != 0)
     Δ = differences(plan, eye, path, is_bent if bent else lit & ~is_bent, bent)
@@ -127,6 +135,9 @@ def shifted(plan: Plan, eye: Eye, path: Splatted, uv: mi.Point2f, active, bent: 
     scene, y = plan.scene, path.y
     ray = eye.ray(uv, path.lens)
     x = plan.first_hit(scene, ray, active).compute_surface_interaction(ray, active=active)
+    T = mi.Spectrum(1)
+    if plan.holes:
+        x, T = plan.holes.through(scene, x, ray.d, path.holes_seen, active & x.is_valid())
     bsdf = x.bsdf()
     active = active & x.is_valid() & plan.materials.connectable(bsdf)
     toward, importance = eye.toward(x, path.lens, active)
@@ -135,7 +146,7 @@ def shifted(plan: Plan, eye: Eye, path: Splatted, uv: mi.Point2f, active, bent: 
     J = importance0 * cosine(y.si, toward0.d) / (importance * cosine(x, toward.d))
 
     # ---------------- The edge to the one before -----------------
-    edge = (mi.Vector3f(0), mi.Spectrum(0), mi.Float(0), mi.Float(0), mi.Float(0), mi.Ray3f(ray))
+    edge = (mi.Vector3f(0), mi.Spectrum(0), mi.Float(0), mi.Float(0), mi.Float(0), mi.Ray3f(ray), mi.Point3f(0))
 
     def from_start(*_):
         moved, ratio, per_distance2 = plan.lights.redirected(scene, path.start, x)
@@ -144,8 +155,10 @@ def shifted(plan: Plan, eye: Eye, path: Splatted, uv: mi.Point2f, active, bent: 
         e, p = plan.lights.densities(scene, moved, x)
         end = mis.begin_light(e, p, moved.delta, cosine(x, d))
         G = cosine(x, d) / cosine(y.si, path.d) * (per_distance2 / per_distance2_0)
-        shadow = dr.select(plan.lights.far(path.start.index), x.spawn_ray(-d), x.spawn_ray_to(moved.end.p))
-        return d, moved.β * G, ratio * G, end.vcm, end.vc, shadow
+        far = plan.lights.far(path.start.index)
+        shadow = dr.select(far, x.spawn_ray(-d), x.spawn_ray_to(moved.end.p))
+        target = dr.select(far, plan.outside(x.p, -d), moved.end.p)
+        return d, moved.β * (G * path.survival), ratio * G, end.vcm, end.vc, shadow, target
 
     def from_before(*_):
         before = path.before
@@ -157,21 +170,28 @@ def shifted(plan: Plan, eye: Eye, path: Splatted, uv: mi.Point2f, active, bent: 
         end = mis.arrive(end, cosine(x, d), distance2)
         G = cosine(x, d) / cosine(y.si, path.d) * (dr.squared_norm(y.si.p - before.si.p) / distance2)
         β = before.β * f * (G * path.survival / path.p)
-        return d, β, p / path.p * G, end.vcm, end.vc, x.spawn_ray_to(before.si.p)
+        return d, β, p / path.p * G, end.vcm, end.vc, x.spawn_ray_to(before.si.p), mi.Point3f(before.si.p)
 
     if bent:
         d, β, r, vc = through_glass(plan, path, x, active)
         vcm = mi.Float(0)
     else:
-        d, β, r, vcm, vc, shadow = dr.if_stmt(edge, path.first, from_start, from_before)
+        d, β, r, vcm, vc, shadow, target = dr.if_stmt(edge, path.first, from_start, from_before)
 
     # ----------------------- To the camera -----------------------
     x.wi = x.to_local(-d)
     f, _, q = evaluate(IMPORTANCE, x, bsdf, x.to_local(toward.d), active)
     C = β * f * importance * J
+    if plan.holes:
+        C *= T
     seen = active & (dr.max(C) > 0) & dr.isfinite(dr.sum(C))
     # Nothing is in the way of what has been followed.
-    C = dr.select(seen if bent else seen & ~scene.ray_test(shadow, seen), C, 0)
+    if not bent and plan.holes:
+        T, holes = plan.holes.transmittance(scene, shadow, target, path.holes, seen)
+        C *= dr.select(holes == path.holes, T, 0)
+    elif not bent:
+        seen &= ~scene.ray_test(shadow, seen)
+    C = dr.select(seen, C, 0)
     end = plan.known(Partial(vcm, vc), bsdf)
     return C, r * J, mis.others_to_camera(end, importance, cosine(x, toward.d), q)
 

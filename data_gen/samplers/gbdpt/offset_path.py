@@ -17,8 +17,8 @@ from data_gen.paths.shift import reconnection_jacobian
 from data_gen.paths.vertex import SMOOTH, event_kind, seen_from
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Partial
-from data_gen.samplers.bdpt.strategies import connection, emission_at
-from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, context, cosine, evaluate
+from data_gen.samplers.bdpt.strategies import emission_at
+from data_gen.samplers.bdpt.vertex import RADIANCE, context, cosine, evaluate
 from data_gen.samplers.gbdpt.base_path import Plan, Step, known_end, known_met
 from data_gen.samplers.gbdpt.chain_shift import Chain, Course, follow_chain
 
@@ -35,14 +35,29 @@ class Offset:
     apart: mi.Bool
     joined: mi.Bool
     Δ: mi.Spectrum
+    own: Own | None = None  # None in scenes without holes
 
 
-def start(eye: Eye, x, shifted: tuple, hit) -> Offset:
+@dataclass
+class Own:
+    """An offset path at its last own vertex, which it comes back to if its base path passes the hole where both meet.
+
+    That vertex is where ``ray`` has led to, at the path's ``hit``; β is 0 where there is nothing to come back to.
+    """
+
+    ray: mi.Ray3f
+    β: mi.Spectrum
+    r: mi.Float
+    end: Partial
+
+
+def start(plan: Plan, eye: Eye, x, shifted: tuple) -> Offset:
     """An offset path up to its first vertex; none where there is no base path.
 
     It begins with the ``shifted`` camera ray, its importance, and whether it is on the film.
     """
     ray, importance, inside = shifted
+    hit = plan.first_hit(plan.scene, ray)
     y = hit.compute_surface_interaction(ray)
     lives = inside & hit.is_valid() & x.is_valid()
     _, density = eye.toward(y, eye.lens, lives)
@@ -57,6 +72,7 @@ def start(eye: Eye, x, shifted: tuple, hit) -> Offset:
         apart=lives,
         joined=mi.Bool(False),
         Δ=dr.zeros(mi.Spectrum, n),
+        own=Own(mi.Ray3f(ray), mi.Spectrum(0), mi.Float(1), Partial(mi.Float(0), mi.Float(0))) if plan.holes else None,
     )
 
 
@@ -79,49 +95,18 @@ def with_differences(offsets: list[Offset], Δ: list[mi.Spectrum]) -> list[Offse
     return [replace(offset, Δ=total) for offset, total in zip(offsets, Δ, strict=True)]
 
 
-def connect(plan: Plan, step: Step, y: Vertex, times, offsets: list[Offset], Δ: list) -> tuple:
-    """C and ``others`` of the connection of the vertex of ``step`` to ``y``, one of the light path; and the sums Δ with
-    it, where it counts so many ``times``."""
-    z = step.z
-    g, edge = connection(plan, z, z.si.bsdf(), y, mi.Bool(True))
-    C, others = z.β * g, mis.others_connected(z.end, y.end, edge)
-    lit = dr.max(C) > 0
-    # ------- Settled copies: the same connection, other weights -------
-    busy, sums = mi.Bool(False), []
-    for offset, Δ_before in zip(offsets, Δ, strict=True):
-        own = offset.apart | offset.joined
-        busy |= own
-        others1 = mis.others_connected(offset.end, y.end, edge)
-        sums.append(Δ_before + dr.select(~own, times * plan.pair(C, others, offset.β * g, offset.r, others1), 0))
-    # --------- Others: from the copy's own vertex, one by one ---------
-    # What a shift to y needs of the materials, except for the offset path's own
-    both = step.connectable & plan.materials.connectable(y.si.bsdf())
-
-    def one(i, *Δ):
-        offset = pick(offsets, i)
-
-        def own(Δ1):
-            v = Vertex(own_vertex(offset, z.si), offset.β, offset.end, z.depth)
-            bsdf = v.si.bsdf()
-            good = lit & (offset.joined | (both & plan.materials.connectable(bsdf)))
-            g1, edge1 = connection(plan, v, bsdf, y, good, seen=offset.joined)
-            others1 = mis.others_connected(v.end, y.end, edge1)
-            return times * plan.pair(C, others, v.β * g1, offset.r, others1)
-
-        Δ1 = dr.if_stmt((mi.Spectrum(0),), lit & (offset.apart | offset.joined), own, lambda Δ1: Δ1)
-        return i + 1, *(dr.select(i == k, old + Δ1, old) for k, old in enumerate(Δ))
-
-    state = (mi.UInt32(0), *sums)
-    Δ = dr.while_loop(state, lambda i, *_: busy & lit & (i < len(offsets)), one, label="connected offsets")[1:]
-    return C, others, list(Δ)
-
-
 def take_step(
-    plan: Plan, step: Step, offsets: list[Offset], course: Course | None = None, chain: Chain | None = None
+    plan: Plan,
+    step: Step,
+    offsets: list[Offset],
+    course: Course | None = None,
+    chain: Chain | None = None,
+    eye: Eye | None = None,
 ) -> list[Offset]:
     """Takes all offset paths along a step of their base path; connections to the light path are not in it.
 
-    With a ``chain``, the one behind the step, only bent paths are shifted; ``course`` is the one before the step.
+    With a ``chain``, the one behind the step, only bent paths are shifted; ``course`` is the one before the step. Holes
+    in front of the camera are passed as its ``eye`` sees them.
     """
     busy = mi.Bool(False)
     for offset in offsets:
@@ -132,7 +117,7 @@ def take_step(
     # them, and puts it behind the others: after four they are in their order again.
     def rotate(i, y, *others):
         own = y.apart | y.joined
-        y = dr.if_stmt((y,), own, lambda y: step_own(plan, step, y, course, chain), lambda y: y)
+        y = dr.if_stmt((y,), own, lambda y: step_own(plan, step, y, course, chain, eye), lambda y: y)
         return i + 1, *others, y
 
     state = (mi.UInt32(0), *offsets)
@@ -144,7 +129,7 @@ def settled(plan: Plan, step: Step, y: Offset) -> Offset:
     here = ~(y.apart | y.joined)
     x = step.z.si
     # ------------------------ To a light -------------------------
-    end = known_end(y.end, step.joins)
+    end = known_end(y.end, step.joins_light)
     cos = cosine(x, step.light.d)
     p_light = dr.select(step.light.delta, 0, step.light.pdf)
     others = mis.others_to_light(end, step.e_light, p_light, cos, step.p_light, step.q_light)
@@ -152,10 +137,12 @@ def settled(plan: Plan, step: Step, y: Offset) -> Offset:
     # ----------------------- Next vertex -------------------------
     β = y.β * step.f_p
     end = mis.leave(y.end, cosine(x, step.d), step.p, step.q, step.kind != SMOOTH, step.η)
+    if plan.holes:
+        end = plan.carried(step.passed, replace(step.z, end=y.end), end)
     # ------------------ Emission met by chance -------------------
     others = mis.others_emitted(known_met(end, step.counted), step.e_met, step.p_met)
     Δ += plan.pair(step.C_met, step.others_met, β * step.Le, y.r, others)
-    end = mis.arrive(end, cosine(step.x1, step.d), dr.square(step.x1.t))
+    end = plan.arrives(end, step.edge, step.x1, step.d)
     return Offset(
         ray=y.ray,
         hit=y.hit,
@@ -165,10 +152,18 @@ def settled(plan: Plan, step: Step, y: Offset) -> Offset:
         apart=y.apart,
         joined=y.joined,
         Δ=y.Δ + dr.select(here, Δ, 0),
+        own=y.own,
     )
 
 
-def step_own(plan: Plan, step: Step, y: Offset, course: Course | None = None, chain: Chain | None = None) -> Offset:
+def step_own(
+    plan: Plan,
+    step: Step,
+    y: Offset,
+    course: Course | None = None,
+    chain: Chain | None = None,
+    eye: Eye | None = None,
+) -> Offset:
     """A step from a vertex of the offset path's own, or from the shared one to which it has come from elsewhere."""
     # --------------- The vertex: apart, or just joined ---------------
     si = own_vertex(y, step.z.si)
@@ -185,7 +180,8 @@ def step_own(plan: Plan, step: Step, y: Offset, course: Course | None = None, ch
     joins = step.goes_on & smooth & step.connectable & connectable
     replays = step.goes_on & ~smooth & y.apart
     # Rejected if it does neither: β = 0.
-    none = Offset(y.ray, y.hit, mi.Spectrum(0), y.r, y.end, mi.Bool(False), mi.Bool(False), Δ)
+    nothing = y.own and replace(y.own, β=mi.Spectrum(0))
+    none = Offset(y.ray, y.hit, mi.Spectrum(0), y.r, y.end, mi.Bool(False), mi.Bool(False), Δ, nothing)
     state = (none, mi.Spectrum(0), mi.Float(0))
     if chain is not None:
         # Its own vertex stays where it is until there is something to walk to.
@@ -195,7 +191,15 @@ def step_own(plan: Plan, step: Step, y: Offset, course: Course | None = None, ch
         state = dr.select(waits, (replace(y, Δ=Δ), *state[1:]), state)
         walks = waits & chain.arrives
         state = dr.if_stmt(state, walks, lambda *_: bend(plan, step, chain, y, none, si), lambda *old: old)
-    state = dr.if_stmt(state, joins, lambda *_: reconnect(plan, step, y, none, si, bsdf), lambda *old: old)
+    state = dr.if_stmt(state, joins, lambda *_: reconnect(plan, step, y, none, si), lambda *old: old)
+    if plan.holes:
+        passes = step.goes_on & step.passed
+        back, through = passes & y.joined & (dr.max(y.own.β) > 0), passes & replays
+        replays &= ~passes
+        ahead = replace(y, ray=y.own.ray, β=y.own.β, r=y.own.r, end=y.own.end, apart=back, joined=mi.Bool(False))
+        before = own_vertex(ahead, step.z.si)
+        state = dr.if_stmt(state, back, lambda *_: reconnect(plan, step, ahead, none, before), lambda *old: old)
+        state = dr.if_stmt(state, through, lambda *_: go_through(plan, step, y, none, si, eye), lambda *old: old)
     # Where all is smooth there is nothing to replay.
     if not plan.materials.all_connectable:
         state = dr.if_stmt(state, replays, lambda *_: replay(plan, step, y, none, si, bsdf), lambda *old: old)
@@ -206,24 +210,35 @@ def step_own(plan: Plan, step: Step, y: Offset, course: Course | None = None, ch
     return moved
 
 
-def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
-    """Straight to the base path's next vertex, or, where that escapes, along with it; and emission there."""
+def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si) -> tuple[Offset, mi.Spectrum, mi.Float]:
+    """From ``si`` straight to the base path's next vertex, or, where that escapes, along with it; and emission there.
+
+    Where the base path has passed holes on its way there, the copy does so, too.
+    """
     # ------------------------ The segment ------------------------
-    x, x1 = step.z.si, step.x1
+    way, x1 = step.way, step.x1
     reaches = x1.is_valid()
     to = mi.Vector3f(x1.p - si.p)
     distance2 = dr.squared_norm(to)
     d = dr.select(reaches, to * dr.rsqrt(distance2), step.d)
-    J = dr.select(reaches, reconnection_jacobian(x.p, si.p, x1.p, x1.n), 1)
-    f, p, q = evaluate(RADIANCE, si, bsdf, si.to_local(d))
+    J = dr.select(reaches, reconnection_jacobian(way.o, si.p, x1.p, x1.n), 1)
+    f, p, q = evaluate(RADIANCE, si, si.bsdf(), si.to_local(d))
     ray = dr.select(reaches, si.spawn_ray_to(x1.p), si.spawn_ray(d))
     good = (p > 0) & dr.isfinite(J) & (dr.max(f) > 0)
     # A joined path goes the way of its base path.
-    good &= ~plan.scene.ray_test(ray, good & y.apart)
-    β, r = y.β * f * (J / step.p * step.survival), y.r * (J * p / step.p)
+    T = mi.Spectrum(1)
+    if plan.holes:
+        target = dr.select(reaches, x1.p, plan.outside(si.p, d))
+        T = mi.Spectrum(plan.sees_alike(si, target, (1, way.holes), good & y.apart))
+        good &= dr.max(T) > 0
+    else:
+        good &= ~plan.scene.ray_test(ray, good & y.apart)
+    β, r = y.β * f * (J / way.p * way.weight), y.r * (J * p / way.p)
+    if plan.holes:
+        β *= T
     good &= dr.isfinite(dr.sum(β)) & dr.isfinite(r)
     β, r = dr.select(good, β, 0), dr.select(good, r, 0)
-    end = mis.leave(y.end, cosine(si, d), p, q, mi.Bool(False), step.η)
+    end = mis.leave(y.end, cosine(si, d), p, q, mi.Bool(False), way.η)
 
     # ----------------------- Emission at x1 ----------------------
     y1 = seen_from(x1, d)
@@ -232,13 +247,37 @@ def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tupl
     end = mis.arrive(end, cosine(x1, d), distance2)
     # Behind vertices that are not connectable the shift is rejected, but they may emit.
     lives = good & reaches & (y.joined | step.x1_connectable)
+    joined, own = lives & y.apart, none.own
+    if plan.holes:
+        # It may have to come back.
+        waits = y.apart & reaches & plan.holes.known.of(x1.bsdf(), reaches)[1]
+        joined, own = joined | waits, Own(y.ray, dr.select(waits, y.β, 0), y.r, y.end)
     ray = mi.Ray3f(si.p, d, si.time, si.wavelengths)
-    moved = Offset(ray, none.hit, dr.select(lives, β, 0), r, end, mi.Bool(False), lives & y.apart, none.Δ)
+    moved = Offset(ray, none.hit, dr.select(lives, β, 0), r, end, mi.Bool(False), joined, none.Δ, own)
     return moved, β * Le, others
 
 
+def go_through(plan: Plan, step: Step, y: Offset, none: Offset, si, eye: Eye) -> tuple[Offset, mi.Spectrum, mi.Float]:
+    """Through the hole at ``si`` as the base path went through one, both in front of their first smooth event."""
+    T, d = plan.holes.share(si, mi.Bool(True)), mi.Vector3f(y.ray.d)
+    β = y.β * T * (step.survival / step.p)
+    good = (dr.max(T) > 0) & dr.isfinite(dr.sum(β))
+    ray = si.spawn_ray(d)
+    hit = plan.scene.ray_intersect_preliminary(ray, active=good)
+    y1 = hit.compute_surface_interaction(ray)
+    Le, p_met, e = emission_at(plan.scene, plan.lights, y1, si, good & step.met)
+    # Behind mirrors vcm is 0, so that lengths do not count.
+    end = mis.passed(y.end, cosine(si, d), mi.Float(1))
+    others = dr.select(step.edge.first, 0, mis.others_emitted(known_met(end, step.counted), e, p_met))
+    end = mis.arrive(end, cosine(y1, d), mi.Float(1))
+    seen = mis.begin_camera(eye.toward(y1, eye.lens)[1], cosine(y1, d))
+    end = Partial(dr.select(step.edge.first, seen.vcm, end.vcm), dr.select(step.edge.first, seen.vc, end.vc))
+    β, lives = dr.select(good, β, 0), good & y1.is_valid() & step.x1.is_valid()
+    return Offset(ray, hit, dr.select(lives, β, 0), y.r, end, lives, mi.Bool(False), none.Δ, none.own), β * Le, others
+
+
 def replay(plan: Plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
-    """The step by the mirror, glass or hole that the base path's random numbers find here; emission at the next vertex.
+    """The step by the mirror or glass that the base path's random numbers find here; and emission at the next vertex.
 
     Only camera paths find such events in front of the first one that is smooth, so that their random numbers belong to
     the path for every strategy that finds it: r = 1, and the shift is a function of the path.
@@ -256,33 +295,25 @@ def replay(plan: Plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[O
     others = mis.others_emitted(known_met(end, step.counted), e, p_met)
     end = mis.arrive(end, cosine(y1, d), dr.square(y1.t))
     lives = good & y1.is_valid() & step.x1.is_valid()
-    return Offset(ray, hit, dr.select(lives, β, 0), y.r, end, lives, mi.Bool(False), none.Δ), β * Le, others
+    return Offset(ray, hit, dr.select(lives, β, 0), y.r, end, lives, mi.Bool(False), none.Δ, none.own), β * Le, others
 
 
 def bend(plan: Plan, step: Step, chain: Chain, y: Offset, none: Offset, si) -> tuple:
     """Through the mirrors and glass of the base path to its next vertex; and emission there."""
     ray, β, r, end, C, others = follow_chain(plan, step, chain, y, si, mi.Bool(True))
     lives = step.x1.is_valid() & step.x1_connectable & (dr.max(β) > 0)
-    return Offset(ray, none.hit, dr.select(lives, β, 0), r, end, mi.Bool(False), lives, none.Δ), C, others
+    return Offset(ray, none.hit, dr.select(lives, β, 0), r, end, mi.Bool(False), lives, none.Δ, none.own), C, others
 
 
 def to_same_light(plan: Plan, step: Step, y: Offset, si, bsdf, active):
     """f J / p, the factor of r, and ``others``, of the path that ends at the same point of an emitter."""
     base = step.light
-    light, weight, r = plan.lights.seen_from_elsewhere(plan.scene, base, step.weight, si, active)
+    light, weight, r = plan.lights.seen_from_elsewhere(plan.scene, base, step.weight, si, active, front=step.front)
     f, p, q = evaluate(RADIANCE, si, bsdf, si.to_local(light.d), active)
     C = y.β * f * weight
     lit = active & (dr.max(C) > 0)
-    C = dr.select(lit & ~plan.scene.ray_test(si.spawn_ray_to(light.p), lit & y.apart), C, 0)
+    C = dr.select(lit, C * plan.sees_alike(si, light.p, step.through, lit & y.apart), 0)
     cos = dr.abs(dr.dot(light.n, light.d))
     e = plan.lights.emission(plan.lights.index_of(light.emitter), light.pdf, cos, dr.square(light.dist))
     p_light = dr.select(light.delta, 0, light.pdf)
-    return C, r, mis.others_to_light(known_end(y.end, step.joins), e, p_light, cosine(si, light.d), p, q)
-
-
-def pick(offsets: list[Offset], i: mi.UInt32) -> Offset:
-    """The offset path of that number."""
-    found = offsets[0]
-    for k, offset in enumerate(offsets[1:], 1):
-        found = dr.select(i == k, offset, found)
-    return found
+    return C, r, mis.others_to_light(known_end(y.end, step.joins_light), e, p_light, cosine(si, light.d), p, q)

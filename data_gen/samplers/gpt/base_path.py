@@ -154,10 +154,10 @@ def base_step(
     to_light = x.to_local(light.d)
     E_light: Any = None
     E_p: Any = None
-    if recording is None:
+    both = matt_too(plan, path, recording)
+    if both is None:
         f, p, sample, f_p = media.evaluate_and_sample(bsdf, x, place, to_light, u_lobe, u_direction)
     else:
-        both = recording.here & ~plan.matt.lambertian(x, recording.here)
         f, p, sample, f_p = matt.evaluate_and_sample(bsdf, x, to_light, u_lobe, u_direction, both)
     survival_of_rest = mi.Float(1)
     if path.ρ is not None:
@@ -190,7 +190,9 @@ def base_step(
     η = dr.select(found, path.η * sample.eta, path.η)
 
     # ---------------------- Russian roulette ---------------------
-    largest = brightest(path.β * f_p, f_p, offsets)
+    # What is left of f is as bright as f where it is followed: else it would have to survive twice.
+    whole = f_p * dr.rcp(dr.maximum(survival_of_rest, 1e-20))
+    largest = brightest(path.β * whole, whole, offsets)
     if recording:
         largest = dr.maximum(largest, dr.select(recording.here, E_p, 0))
     q = roulette(largest, path.depth >= plan.limits.rr_depth, η) * survival_of_rest
@@ -207,13 +209,16 @@ def base_step(
     β1 = path.β * f_p
     if path.ρ is not None:
         E_p = dr.select(goes_on, E_p * survival, 0)
+    if recording:
+        # What follows is light of the record, however dark the surface is; and behind a mirror, of earlier ones only.
+        β1 = dr.select(recording.here, dr.maximum(β1, E_p * segment.weight), β1)
     # After a mirror emitter sampling could not have found x1: p_light = 0, and m = 1.
     aim, passed, seen_by, sampled, p_x1 = None, None, x, kind == SMOOTH, sample.pdf
     if path.aim is not None:
         passed = space.holes.passed(bsdf, kind)
         aim = path.aim.behind(passed, x, kind, sample.pdf)
         seen_by, sampled, p_x1 = aim.seen_by(x), dr.isfinite(aim.p), aim.p
-    Le, p_light = emission(scene, x1, seen_by, goes_on & sky.meets(x1), goes_on & sampled, plan.lights.places)
+    Le, p_light = emission(scene, x1, seen_by, goes_on & sky.meets(x1), goes_on & sampled, plan.lights)
     L_bsdf = Le * mis_weight(p_x1, p_light)
 
     # ------------------- The layer ``caustic`` -------------------
@@ -299,6 +304,22 @@ def brightest(β1: mi.Spectrum, f_p: mi.Spectrum, offsets: list) -> mi.Float:
         ahead = dr.select(y.apart | y.joined, dr.max(y.β) / (1 + y.r), 0)
         largest = dr.fmax(largest, dr.fmax(ahead, dr.max(dr.abs(y.a * f_p)) / 2))
     return largest
+
+
+def matt_too(plan: Plan, path: Path, recording: Recording | None) -> mi.Bool | None:
+    """Where the next direction must be one that a matt surface scatters into, though the material might not sample it;
+    None for nowhere.
+
+    A record is what arrives at a matt surface. And behind a vertex that has been answered for as one, the rest is
+    negative where the material, tilted by a bump or normal map, scatters nothing: all of these directions count.
+    """
+    x, both = path.x, None
+    if path.ρ is not None and plan.matt.any_tilted:
+        both = plan.matt.tilted(x, dr.max(path.ρ) > 0)
+    if recording:
+        here = recording.here & ~plan.matt.lambertian(x, recording.here)
+        both = here if both is None else here | both
+    return both
 
 
 def rest(f: mi.Spectrum, ended: mi.Spectrum) -> tuple[mi.Spectrum, mi.Float]:

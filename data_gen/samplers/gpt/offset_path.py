@@ -297,7 +297,7 @@ def part(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
     if move.aim is not None:
         aim = move.aim.behind(plan.space.holes.passed(own.bsdf, kind), y, kind, leaves.p)
         seen_by, sampled, p_y1 = aim.seen_by(y), found & dr.isfinite(aim.p), aim.p
-    Le, p_light = emission(scene, y1, seen_by, seen, sampled, plan.lights.places)
+    Le, p_light = emission(scene, y1, seen_by, seen, sampled, plan.lights)
 
     # ----------------- Would it be shifted back? -----------------
     # Reject what would not be, or the weights of the pair would not sum to 1 (survey, section 3.5).

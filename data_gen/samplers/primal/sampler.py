@@ -22,6 +22,7 @@ from data_gen.samplers.shared import VOLUMETRIC
 from data_gen.scenes.facts import integrator_name
 from data_gen.scenes.lamps import Places
 from data_gen.scenes.load import reference_integrator
+from data_gen.scenes.lost import bent_lamp
 from data_gen.tails.cache import Known
 
 
@@ -32,9 +33,11 @@ def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places |
     """
     integrator = reference_integrator(scene)
     followed = integrator_name(scene) in ("path", *VOLUMETRIC) and not mi.is_polarized
-    if not (tails == "shared" or (followed and (places or loses_light(scene, integrator)))):
+    errs = places or loses_light(scene, integrator) or bent_lamp(scene)
+    if not (tails == "shared" or (followed and errs)):
         return recorded(scene, partial(samples, scene, integrator, radiance(scene, integrator), features))
-    # Others choose a lamp alike everywhere. Behind holes these paths trace a quarter fewer rays than ``prb``.
+    # Others choose a lamp alike everywhere, by vertex normals. Behind holes these paths trace a quarter fewer rays than
+    # ``prb``.
     view = SAMPLERS["gpt"].integrator(scene, places=places, caustic=False, tails=tails)
     plan = view.plan(scene)
     frozen = Frozen(scene, plan)

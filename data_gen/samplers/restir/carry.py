@@ -129,7 +129,7 @@ def _behind(
 ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float, mi.Bool]:
     """What is behind rc, ``x``, by these random numbers: ``w``, ``L`` and ``p_light`` of a record; whether its lamp,
     sampled at rc, is one that no direction meets."""
-    light, Le_p, lit = _sampled(scene, x, draw(random), active & record.sampled & (record.behind == 0))
+    light, Le_p, lit = _sampled(scene, plan, x, draw(random), active & record.sampled & (record.behind == 0))
     w = dr.select(lit, light.d, record.w)
     L = dr.select(lit, Le_p, 0)
     p_light = dr.select(lit & ~light.delta, light.pdf, 0)
@@ -137,16 +137,16 @@ def _behind(
     walks = active & (record.behind > 0)
     x1 = scene.ray_intersect(x.spawn_ray(record.w), walks)
     met = walks & (record.behind == 1) & ~record.sampled
-    Le, p = emission(scene, x1, x, met, met)
+    Le, p = emission(scene, x1, x, met, met, plan.lights)
     L = dr.select(met, Le, L)
     p_light = dr.select(met, p, p_light)
     return w, L + _further(scene, plan, random, x1, record, walks & ~met & x1.is_valid()), p_light, light.delta
 
 
-def _sampled(scene: mi.Scene, x: mi.SurfaceInteraction3f, numbers, active: mi.Bool):
+def _sampled(scene: mi.Scene, plan: Plan, x: mi.SurfaceInteraction3f, numbers, active: mi.Bool):
     """A sampled emitter, its Le V / p, and whether there is one."""
     lit = active & mi.has_flag(x.bsdf().flags(), mi.BSDFFlags.Smooth)
-    light, Le_p = scene.sample_emitter_direction(x, numbers.light, True, lit)
+    light, Le_p = plan.lights.seen(scene, x, numbers.light, lit)
     return light, Le_p, lit & (light.pdf != 0)
 
 
@@ -161,7 +161,7 @@ def _further(scene, plan: Plan, random, x, record: Record, active):
     behind, sampled = record.behind, record.sampled
     while active:
         numbers = draw(random)
-        light, Le_p, lit = _sampled(scene, x, numbers, active & sampled & (i == behind))
+        light, Le_p, lit = _sampled(scene, plan, x, numbers, active & sampled & (i == behind))
         f, p = evaluate(x.bsdf(), x, x.to_local(light.d), lit)
         L = dr.select(lit, B * f * light_mis(light.delta, light.pdf, p) * Le_p, L)
         event = sample_event(scene, plan, x, numbers, active & (i < behind))
@@ -171,7 +171,7 @@ def _further(scene, plan: Plan, random, x, record: Record, active):
         walks = event.found & (dr.max(B) > 0) & (numbers.survival < q)
         B = dr.select(walks, B * dr.rcp(q), 0)
         met = walks & ~sampled & (i + 1 == behind)
-        Le, p_light = emission(scene, event.x1, x, met, met & (event.kind == SMOOTH))
+        Le, p_light = emission(scene, event.x1, x, met, met & (event.kind == SMOOTH), plan.lights)
         L = dr.select(met, B * Le * mis_weight(event.p, p_light), L)
         x = event.x1
         i += 1

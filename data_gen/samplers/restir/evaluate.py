@@ -54,7 +54,7 @@ def evaluate_record(stage: Stage, seed: int, record: Record, place: mi.Point2f, 
         β, L_replayed = mi.Spectrum(1), mi.Spectrum(0)
         # Where all is connectable the first event is joined.
         good &= record.replayed == 0
-    lit = _lit(scene, y, draw(random), good & (kind == LIGHT))
+    lit = _lit(scene, plan, y, draw(random), good & (kind == LIGHT))
     joined, J, geometry = _connected(scene, plan, record, y, good & (kind != LIGHT) & (kind != REPLAY))
     replayed = dr.select(kind == REPLAY, L_replayed, β * dr.select(kind == LIGHT, lit, joined))
     f = importance * dr.select(good, replayed, 0)
@@ -73,7 +73,7 @@ def _replay(scene, plan: Plan, random, record: Record, y, good):
     while active:
         event = sample_event(scene, plan, y, draw(random), active)
         last = ends & (i + 1 == replayed)
-        Le, p_light = emission(scene, event.x1, y, last & event.found, last & (event.kind == SMOOTH))
+        Le, p_light = emission(scene, event.x1, y, last & event.found, last & (event.kind == SMOOTH), plan.lights)
         # What is joined here, the reverse shift would reconnect.
         good &= ~active | (event.found & ~event.joined & (last | event.x1.is_valid()))
         β *= event.f_p
@@ -84,11 +84,11 @@ def _replay(scene, plan: Plan, random, record: Record, y, good):
     return y, β, good, L
 
 
-def _lit(scene: mi.Scene, y: mi.SurfaceInteraction3f, numbers: Numbers, active: mi.Bool) -> mi.Spectrum:
+def _lit(scene: mi.Scene, plan: Plan, y: mi.SurfaceInteraction3f, numbers: Numbers, active: mi.Bool) -> mi.Spectrum:
     """f m Le V / p of the emitter that the numbers choose."""
     bsdf = y.bsdf()
     active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    light = sample_light(scene, y, numbers.light, active, False)
+    light = sample_light(scene, y, numbers.light, active, plan.lights)
     f, p = evaluate(bsdf, y, y.to_local(light.d), active)
     return shadowed(scene, y, light, dr.select(active, f * light_mis(light.delta, light.p, p), 0))
 
@@ -107,7 +107,7 @@ def _connected(
     f1, p1 = evaluate(bsdf, y, y.to_local(d), active & plan.materials.connectable(bsdf))
     active = active & (dr.max(f1) > 0) & dr.isfinite(J) & (J > 0)
     # rc on a lamp: Le and the density of emitter sampling are looked up anew, whatever lamp it is.
-    Le, p_light = emission(scene, x, y, active & hits, active & hits)
+    Le, p_light = emission(scene, x, y, active & hits, active & hits, plan.lights)
     # rc on a surface
     behind = active & ~hits
     x = seen_from(x, d)

@@ -167,19 +167,19 @@ def _walk(scene, plan: Plan, random, choice, at: _State, kept: _Kept) -> tuple[_
     while active:
         numbers = draw(random)
         u_light, u_hit = choice.next_1d(), choice.next_1d()
-        kept = kept.offered(_to_light(scene, at, numbers), at.W, u_light)
+        kept = kept.offered(_to_light(scene, plan, at, numbers), at.W, u_light)
         at, met = _onward(scene, plan, at, numbers, active)
         kept = kept.offered(met, at.W, u_hit, at.walks)
         active = at.walks & at.x.is_valid() & (at.depth < plan.limits.max_depth)
     return at.rc, kept
 
 
-def _to_light(scene, at: _State, numbers: Numbers) -> _Choice:
+def _to_light(scene, plan: Plan, at: _State, numbers: Numbers) -> _Choice:
     """The path that ends at an emitter which is sampled at x."""
     x, bsdf = at.x, at.x.bsdf()
     before, at_rc, behind = at.phase == _BEFORE, at.phase == _AT, at.phase == _BEHIND
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    light, Le_p = scene.sample_emitter_direction(x, numbers.light, True, lit)
+    light, Le_p = plan.lights.seen(scene, x, numbers.light, lit)
     lit &= light.pdf != 0
     f, p = evaluate(bsdf, x, x.to_local(light.d), lit)
     fm = f * light_mis(light.delta, light.pdf, p)
@@ -241,7 +241,7 @@ def _onward(scene, plan: Plan, at: _State, numbers: Numbers, active: mi.Bool) ->
     replayed = dr.select(joins, at.depth - 1, at.replayed)
 
     # ----------------------- Le that was met ---------------------
-    Le, p_light = emission(scene, x1, x, walks, walks & (event.kind == SMOOTH))
+    Le, p_light = emission(scene, x1, x, walks, walks & (event.kind == SMOOTH), plan.lights)
     m = mis_weight(dr.select(density, p, event.p), p_light)
     kind_behind = dr.select(stuck, mi.UInt32(STUCK), mi.UInt32(SUFFIX))
     kind = dr.select(joins, mi.UInt32(HIT), dr.select(before, mi.UInt32(REPLAY), kind_behind))

@@ -8,6 +8,7 @@ register(
         "gpt-basic",
         "gradients by random sequence replay (any transport; five paths per sample)",
         "data_gen.samplers.teaching.gpt_basic",
+        leaves_lamps=True,
         notes={
             "transport": "replayed as a whole",
             "media": "replayed with everything else; albedo counts them, normal and depth do not",
@@ -23,6 +24,7 @@ register(
         "gradients by reconnection only (surfaces that scatter widely; code to read before gpt)",
         "data_gen.samplers.teaching.gpt_simple",
         refusals=(*SURFACES, hidden_emitters, mirrors),
+        leaves_lamps=True,
         notes={"transport": "offset paths join it at the second vertex"},
     )
 )

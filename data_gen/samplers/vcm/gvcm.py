@@ -108,10 +108,10 @@ class GVCM(VCM):
     """Gradient-domain vertex connection and merging, for surfaces.
 
     Plugin ``gvcm``. Parameters, and what is not handled: as for ``vcm``; where photons are gathered, paths are
-    connectable as well. Holes are vertices, as in ``gbdpt``, and photons are gathered behind them.
+    connectable as well.
     """
 
-    splatter, plan_class, straight_on = Marker, Plan, False
+    splatter, plan_class = Marker, Plan
     sample_bytes = VCM.sample_bytes + OFFSETS_BYTES
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:

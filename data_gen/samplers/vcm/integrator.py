@@ -54,7 +54,6 @@ class VCM(BDPT):
     # What becomes of light paths that end at the camera
     splatter = Splatter
     sample_bytes = SAMPLE_BYTES
-    straight_on = True  # through holes
 
     @property
     def vertices(self) -> int:
@@ -75,8 +74,7 @@ class VCM(BDPT):
 
     def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
         materials = Materials(scene, self.options["roughness_threshold"])
-        holes = Holes.of(scene) if self.straight_on else None
-        world = World(scene, LightEnds(scene, self.name), materials, holes=holes)
+        world = World(scene, LightEnds(scene, self.name), materials, holes=Holes.of(scene))
         return Passes(self, world, pixel_width(scene, sensor))
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:

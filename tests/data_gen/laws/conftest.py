@@ -5,7 +5,6 @@ without comments and docstrings; the stored references; and the versions of what
 outside of the checkout, in $XDG_CACHE_HOME/ngpt-laws or ~/.cache/ngpt-laws.
 """
 
-import ast
 import hashlib
 import os
 import sys
@@ -17,7 +16,7 @@ import pytest
 from references import STORE
 
 from data_gen.samplers import SAMPLERS
-from ngpt.evaluation.keys import code_text
+from ngpt.system.source import code_text, imports
 
 ROOT = Path(__file__).parents[3]
 # Where modules of the repository are, as tests import them
@@ -87,17 +86,7 @@ def files_of(path: Path, samplers: frozenset[str]) -> set[Path]:
 @cache
 def imported(file: Path) -> frozenset[Path]:
     """Files of the repository that a file imports anywhere in it."""
-    names, queue = set(), [ast.parse(file.read_bytes())]
-    while queue:
-        node = queue.pop()
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-        # What types alone need does not run.
-        elif not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"):
-            queue += ast.iter_child_nodes(node)
-    return frozenset(file for name in names for file in _files_of(name))
+    return frozenset(file for name in imports(file) for file in _files_of(name))
 
 
 def _files_of(module: str) -> set[Path]:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from data_gen_scenes import glass
 from media_scenes import haze
-from ngpt.evaluation.gradientmap import variances_of_differences
 from registered import cases, quick, scene_for
 from unbiased import failed_shifts, load, render_ours
 
+from bench.gradientmap import variances_of_differences
 from data_gen.budget import Budget
 from data_gen.passes import render_passes
 from data_gen.samplers import SAMPLERS

@@ -97,6 +97,8 @@ QUICK = [
     Case("bdpt", "lit: sky"),
     Case("bdpt", "lit: areas", options={"joined_depth": 1}),
     Case("gbdpt", "lit: sky", (FAR,)),
+    Case("gbdpt", "curtains", (FAR,), spp=64),
+    Case("gbdpt", "few_edges", (FAR,), size=SMALL, spp=64),
 ]
 LONG = {"spp": 256}
 SLOW = [

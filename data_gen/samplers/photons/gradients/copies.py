@@ -237,4 +237,5 @@ def start_of(starts: LightRay, path: mi.UInt32, active) -> LightRay:
     end = dr.zeros(mi.DirectionSample3f, dr.width(path))
     end.p, end.n = taken(starts.end.p), taken(starts.end.n)
     ray = mi.Ray3f(taken(starts.ray.o), taken(starts.ray.d), starts.ray.time, starts.ray.wavelengths)
-    return LightRay(ray, taken(starts.β), taken(starts.emitter), taken(starts.index), end, taken(starts.delta))
+    kept = [taken(value) for value in (starts.β, starts.emitter, starts.index)]
+    return LightRay(ray, *kept, end, taken(starts.delta), None if starts.front is None else taken(starts.front))

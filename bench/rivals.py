@@ -1,0 +1,266 @@
+"""The default and its rivals at equal whole time: Mitsuba itself with OIDN, and OIDN on our own samples.
+
+    python -m bench.rivals kitchen/scene.xml product glass-caustic --references FOLDER
+
+A scene is rendered by each of RENDERS:
+
+    default      what `ngpt render` does: sampler, subpixels and method by default
+    ours         `primal` with whole paths
+    mitsuba      Mitsuba's own renderer: the scene's integrator, box filter, `independent` points, and its `albedo` and
+                 `sh_normal`; also at twice the size with a quarter of the samples per pixel
+    multijitter  the same with Mitsuba's best points
+
+What rivals render, OIDN denoises in each of the WAYS: at K times the size, and told that features are prefiltered (it
+denoises them first), clean or noisy. An image at twice the size is then scaled down. Each cell has, by way:
+
+    seconds  of processors, of the render and of OIDN, both warmed up
+    error    after ``steady`` of ``bench.tails``, since references of some rooms are noisy; FLIP is over their mean
+
+The table divides the error and FLIP of the default by those of each of RIVALS at the default's whole time. Values are
+geometric means over seeds. At each time, a rival has its best way. ``bench.curves`` explains the marks. Scenes and
+references are as of `bench.seeds`. Cells that the file has are not measured again.
+"""
+
+import argparse
+import gc
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import ngpt
+from bench.common import metadata, renderer, save
+from bench.curves import error_at
+from bench.seeds import opened
+from bench.tails import (
+    WARM_SPP,
+    add_references,
+    check_references,
+    clean_image,
+    marked,
+    processor_seconds,
+    reference_of,
+    steady_error,
+    table,
+)
+from ngpt.errors import NgptError
+from ngpt.evaluation.references import Reference
+from ngpt.measure.averages import geometric_mean
+from ngpt.measure.metrics import scores
+from ngpt.subpixels import FEWEST, means
+
+RENDERS = ("default", "ours", "mitsuba", "multijitter")
+# Name -> K, and what OIDN is told of the features
+WAYS = {
+    "1 prefiltered": (1, "prefiltered"),
+    "2 noisy": (2, "noisy"),
+    "2 clean": (2, "clean"),
+    "2 prefiltered": (2, "prefiltered"),
+}
+# Name -> renders and ways that a rival may choose from
+RIVALS = {
+    "Mitsuba + OIDN": (("mitsuba",), ("1 prefiltered",)),
+    "Mitsuba + OIDN, K = 1 or 2": (("mitsuba",), tuple(WAYS)),
+    "its best points, K = 1 or 2": (("mitsuba", "multijitter"), tuple(WAYS)),
+    "OIDN on our samples, K = 1 or 2": (("ours",), tuple(WAYS)),
+}
+POINTS = {"mitsuba": "independent", "multijitter": "multijitter"}
+CELL = ("scene", "size", "render", "spp", "seed")
+VALUES = ("error", "FLIP")
+AOVS = "albedo:albedo,normal:sh_normal"
+
+
+class Images(NamedTuple):
+    """What a denoiser is given, each (H, W, 3) float32."""
+
+    primal: np.ndarray
+    albedo: np.ndarray
+    normal: np.ndarray
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*", metavar="SCENE", help="none: only the table")
+    add_references(parser)
+    parser.add_argument("--size", default="320x180")
+    parser.add_argument("--spp", type=int, nargs="+", default=[4, 16, 64])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/rivals.json"))
+    args = parser.parse_args()
+    check_references(parser, args)
+    cells = json.loads(args.output.read_text())["cells"] if args.output.exists() else []
+    result = {"benchmark": "rivals", "metadata": metadata("mitsuba", "drjit", "mitsuba-oidn"), "cells": cells}
+    for scene in args.scenes:
+        for cell in measured(scene, args, {place(cell) for cell in cells}):
+            cells.append(cell)
+            save(args.output, result)
+            print(*place(cell), f"{min(way['seconds'] for way in cell['ways'].values()):.2f} s", flush=True)
+    table(["scene", "spp", "whole s", *RIVALS], list(rows(cells)))
+
+
+def place(cell: dict[str, Any]) -> tuple:
+    return tuple(cell[name] for name in CELL)
+
+
+def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterator[dict[str, Any]]:
+    """The cells of a scene that are not ``known``, one after the other."""
+    load_scene, _ = renderer()
+    size = tuple(map(int, args.size.split("x")))
+    with opened(scene) as (name, file):
+        reference = reference_of(load_scene(file, size), name, args)
+        clean = clean_image(reference)
+        for render in RENDERS:
+            gc.collect()  # a kernel knows the shapes of all scenes in memory
+            make = by_default(file, size) if render == "default" else by_ways(images_of(file, size, render))
+            warm = False
+            for spp in args.spp:
+                for seed in args.seeds:
+                    cell = dict(zip(CELL, (name, args.size, render, spp, seed), strict=True))
+                    if place(cell) in known:
+                        continue
+                    if not warm:
+                        # The default has subpixels, and so other kernels, from FEWEST samples on.
+                        warm = bool([make(few, 0) for few in (WARM_SPP, FEWEST)])
+                    yield cell | {
+                        "ways": {way: judged(*made, reference, clean) for way, made in make(spp, seed).items()}
+                    }
+
+
+Made = dict[str, tuple[np.ndarray, float]]  # by way: the image and its whole seconds
+
+
+def judged(image: np.ndarray, seconds: float, reference: Reference, clean: np.ndarray) -> dict[str, float]:
+    flip = scores(["FLIP"], image, *reference.images)["FLIP"]
+    return {"seconds": seconds, "error": steady_error(image, reference, clean), "FLIP": flip}
+
+
+def by_default(file: str, size: tuple[int, int]) -> Callable[[int, int], Made]:
+    load_scene, render_stack = renderer()
+    from data_gen.choosing.plans import plan_sampler
+
+    scene = load_scene(file, size)
+
+    def make(spp: int, seed: int) -> Made:
+        start = processor_seconds()
+        plan = plan_sampler(scene, spp, None)
+        how = {"unbiased": False, "subpixels": "auto", **plan.options}
+        image = ngpt.reconstruct(render_stack(scene, spp, seed, plan.sampler, **how), plan.method or "auto").image
+        return {"default": (image, processor_seconds() - start)}
+
+    return make
+
+
+def by_ways(images: Callable[[int, int, int], Images]) -> Callable[[int, int], Made]:
+    def make(spp: int, seed: int) -> Made:
+        rendered, made = {}, {}
+        for k in sorted({k for k, _ in WAYS.values()}):
+            start = processor_seconds()
+            rendered[k] = images(spp, seed, k), processor_seconds() - start
+        for way, (k, auxiliary) in WAYS.items():
+            given, seconds = rendered[k]
+            start = processor_seconds()
+            features = {"albedo": given.albedo, "normal": given.normal}
+            image = ngpt.denoise(given.primal, "oidn", auxiliary=auxiliary, **features)
+            image = means(image, k) if k > 1 else image
+            made[way] = image, seconds + processor_seconds() - start
+        return made
+
+    return make
+
+
+def images_of(file: str, size: tuple[int, int], render: str) -> Callable[[int, int, int], Images]:
+    """What renders so many samples per pixel by a seed, at K times the size."""
+    if render in POINTS:
+        return mitsubas(file, size, POINTS[render])
+    load_scene, render_stack = renderer()
+    scene = load_scene(file, size)
+
+    def images(spp: int, seed: int, k: int) -> Images:
+        stack = render_stack(scene, spp, seed, "primal", unbiased=True, subpixels=k)
+        return Images(*((stack.fine if k > 1 else stack)[layer] for layer in Images._fields))
+
+    return images
+
+
+def mitsubas(file: str, size: tuple[int, int], points: str) -> Callable[[int, int, int], Images]:
+    """As ``images_of``, by Mitsuba itself."""
+    import mitsuba as mi
+
+    scenes = {k: mitsuba_scene(file, (k * size[0], k * size[1]), points) for k in (1, 2)}
+
+    def images(spp: int, seed: int, k: int) -> Images:
+        scene = scenes[k]
+        integrator = mi.load_dict({"type": "aov", "aovs": AOVS, "image": scene.integrator()})
+        layers = np.array(mi.render(scene, integrator=integrator, spp=max(spp // k**2, 1), seed=seed), np.float32)
+        # AOVs follow the film's own channels: RGB, and alpha if there is any.
+        return Images(*(np.ascontiguousarray(each) for each in (layers[..., :3], layers[..., -6:-3], layers[..., -3:])))
+
+    return images
+
+
+def mitsuba_scene(file: str, size: tuple[int, int], points: str) -> Any:
+    """A scene as Mitsuba reads it, with these ``points`` and a box filter."""
+    import mitsuba as mi
+
+    from data_gen.scenes.bounds import mend_bounds
+    from data_gen.scenes.builtin import SCENES
+    from data_gen.scenes.load import found_beside, parsed, set_film_size
+    from data_gen.scenes.merge import merge
+
+    if file in SCENES:
+        description = SCENES[file]()
+        description["sensor"]["sampler"] = {"type": points}
+        description["sensor"]["film"]["rfilter"] = {"type": "box"}
+        scene = mi.load_dict(description, optimize=False)
+    else:
+        with found_beside(file):
+            config, state = parsed(file)
+            for kind, name in ((mi.ObjectType.Sampler, points), (mi.ObjectType.ReconstructionFilter, "box")):
+                nodes = [node for node in state.nodes if node.type == kind]
+                if not nodes:
+                    raise NgptError(f"{file}: has no {kind.name}, which this benchmark sets: add one to its sensor")
+                for node in nodes:
+                    node.props.set_plugin_name(name)
+                    for key in list(node.props.keys()) if name == "box" else ():
+                        del node.props[key]
+            # Else Mitsuba would be slow where a scene has many meshes.
+            merge(config, state)
+            scene = mi.parser.instantiate(config, state)
+    mend_bounds(scene)
+    set_film_size(scene, size)
+    return scene
+
+
+def rows(cells: list[dict[str, Any]]) -> Iterator[list[str]]:
+    """A line for each scene and number of samples of the default."""
+    for scene, size, spp in sorted({(c["scene"], c["size"], c["spp"]) for c in cells if c["render"] == "default"}):
+        here = [c for c in cells if (c["scene"], c["size"]) == (scene, size)]
+        mine = [c["ways"]["default"] for c in here if c["render"] == "default" and c["spp"] == spp]
+        seconds = geometric_mean([each["seconds"] for each in mine])
+        ratios = [over(mine, here, *rival) for rival in RIVALS.values()]
+        yield [f"{scene} {size}", str(spp), f"{seconds:.2f}", *(", ".join(map(marked, each)) for each in ratios)]
+
+
+def over(mine: list[dict], cells: list[dict], renders: tuple[str, ...], ways: tuple[str, ...]) -> list:
+    """The default's error and FLIP, each divided by the rival's at the same whole time, with its mark."""
+    seconds, found = geometric_mean([each["seconds"] for each in mine]), []
+    for value in VALUES:
+        curves = [points(cells, render, way, value) for render in renders for way in ways]
+        answers = [answer for curve in curves if (answer := error_at(seconds, curve))]
+        least = min(answers, default=None)
+        own = geometric_mean([each[value] for each in mine])
+        found.append((own / least[0], least[1]) if least else None)
+    return found
+
+
+def points(cells: list[dict], render: str, way: str, value: str) -> list[tuple[float, float]]:
+    """Whole seconds and errors of a way by number of samples, geometric means over seeds."""
+    of = [c for c in cells if c["render"] == render and way in c["ways"]]
+    by_spp = [[c["ways"][way] for c in of if c["spp"] == spp] for spp in sorted({c["spp"] for c in of})]
+    return [(geometric_mean([e["seconds"] for e in each]), geometric_mean([e[value] for e in each])) for each in by_spp]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,78 @@
+"""A look at a scene: how much of its light paths from the camera hardly find, since a mirror or glass makes it of lamps
+without size, or tiny ones.
+
+Light paths are joined to the camera at each of their vertices. What counts has come from such a lamp, and met a mirror
+or clear glass first: no connection to the lamp finds it, and hardly a path meets the lamp. Light that is seen only in
+mirrors or through glass is in neither sum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.eye import Sight
+from data_gen.paths.holes import Holes
+from data_gen.paths.light_ends import LightEnds, World
+from data_gen.paths.vertex import DELTA, event_kind
+from data_gen.samplers import SAMPLERS
+from data_gen.samplers.bdpt.light_path import begin, go_on
+from data_gen.samplers.bdpt.plan import Plan
+from data_gen.samplers.bdpt.strategies import to_camera
+from data_gen.samplers.bdpt.vertex import scatters_smoothly
+from data_gen.scenes.facts import scene_facts
+from data_gen.scenes.load import at_most
+from data_gen.scenes.lost import behind_sharp, hard_to_meet
+
+# 65,536 light paths, of at most so many edges
+_PIXELS, _SPP, _LONGEST = 1 << 14, 4, 8
+
+
+def share_of_caustics(scene: mi.Scene) -> float | None:
+    """The share of light on what the camera sees that paths from it hardly find; None where light paths do not work.
+
+    0 in scenes without such lamps, or without mirrors and clear glass. The random numbers are always the same.
+    """
+    if not behind_sharp(scene):
+        return 0.0
+    if SAMPLERS["bdpt"].refuses(scene_facts(scene)):
+        return None
+    integrator = SAMPLERS["bdpt"].integrator(scene)
+    plan = integrator.plan(World(scene, LightEnds(scene, "bdpt"), holes=Holes.of(scene)))
+    plan = replace(plan, longest=min(plan.longest, _LONGEST))
+    if not plan.joins:
+        return 0.0
+    table = mi.Bool([hard_to_meet(scene, emitter) for emitter in scene.emitters()])
+    with at_most(scene, _PIXELS):
+        found, whole = _light(plan, Sight.of(CameraSamples(scene.sensors()[0], 0, _SPP)), table)
+        found, whole = (float(np.array(light, np.float64).sum()) for light in (found, whole))
+    return found / whole if whole > 0 else 0.0
+
+
+@dr.syntax
+def _light(plan: Plan, sight: Sight, table: mi.Bool) -> tuple[mi.Float, mi.Float]:
+    """The light that each path brings to the camera from lamps in the ``table`` by a mirror or glass; and all of it."""
+    eye, random = sight.eye, sight.random.clone()
+    start, end, active = begin(plan, random, sight.ray)
+    hard = dr.gather(mi.Bool, table, start.index)
+    found, whole = mi.Float(0), mi.Float(0)
+    first, caustic = mi.Bool(True), mi.Bool(False)  # it has met nothing but holes; it has met a mirror or glass first
+    while dr.hint(active, label="light to the camera"):
+        y, bsdf = end.y, end.y.si.bsdf()
+        C, _, _ = to_camera(
+            eye, eye.place_on_lens(random), y, bsdf, active & scatters_smoothly(bsdf), plan.seen_by_camera
+        )
+        light = dr.mean(C)
+        light = dr.select(dr.isfinite(light), light, 0)
+        whole += light
+        found += dr.select(caustic, light, 0)
+        end, active, sample, _ = go_on(plan, random, start, y, bsdf, active & (y.depth + 1 < plan.longest))
+        kind = event_kind(sample.sampled_type)
+        passed = mi.Bool(False) if plan.holes is None else plan.holes.passed(bsdf, kind)
+        caustic |= first & hard & (kind == DELTA)
+        first &= passed
+    return found, whole

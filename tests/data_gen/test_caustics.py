@@ -1,0 +1,83 @@
+"""How much light mirrors and glass make of lamps without size: a look says so, and `--for auto` takes photons then."""
+
+import logging
+
+import numpy as np
+import pytest
+from unbiased import load
+
+pytest.importorskip("mitsuba")
+
+from data_gen.caustics import share_of_caustics
+from data_gen.choosing import plans
+from data_gen.choosing.trials import Pilot
+from data_gen.render import render_stack
+
+
+def burning_glass(mi, ball="dielectric", lamp=None, film=(48, 36)):
+    """A floor, seen from below a ball that a lamp shines through; the ball is out of sight."""
+    matte = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
+    to = mi.ScalarTransform4f()
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 8},
+        "sensor": {
+            "type": "perspective",
+            "fov": 45,
+            "to_world": to.look_at(origin=[0, 0.35, 1.2], target=[0, 0, 0], up=[0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 48, "height": 36, "rfilter": {"type": "box"}},
+        },
+        "floor": {"type": "rectangle", "to_world": to.rotate([1, 0, 0], -90).scale(2), "bsdf": matte},
+        "ball": {"type": "sphere", "center": [0, 1.3, 0], "radius": 0.5, "bsdf": {"type": ball}},
+        # Of a size that paths meet
+        "beside": {
+            "type": "sphere",
+            "center": [1.5, 1, 1],
+            "radius": 0.2,
+            "emitter": {"type": "area", "radiance": 2.0},
+        },
+        "lamp": lamp or {"type": "point", "position": [0, 3, 0], "intensity": 5.0},
+    }
+    return load(mi, scene, film)
+
+
+def test_the_look_finds_what_paths_do_not(renderer):
+    """The light that paths from both ends find and Mitsuba's ``path`` does not."""
+    scene = burning_glass(renderer)
+    whole = render_stack(scene, 64, 1, "bdpt")["primal"].mean()
+    seen = np.array(renderer.render(scene, spp=64, seed=2)).mean()
+    share = share_of_caustics(scene)
+    assert 0.1 < share < 0.9 and share == pytest.approx(1 - seen / whole, rel=0.05)
+    assert share == share_of_caustics(scene)
+    assert tuple(scene.sensors()[0].film().size()) == (48, 36)
+
+
+def test_lamps_that_paths_meet_do_not_count(renderer):
+    lamp = {"type": "sphere", "center": [0, 3, 0], "radius": 0.3, "emitter": {"type": "area", "radiance": 9.0}}
+    assert share_of_caustics(burning_glass(renderer, lamp=lamp)) == 0
+    assert share_of_caustics(burning_glass(renderer, "diffuse")) == 0
+    tiny = lamp | {"radius": 0.001, "emitter": {"type": "area", "radiance": 8e5}}
+    assert share_of_caustics(burning_glass(renderer, lamp=tiny)) > 0.1
+
+
+def test_a_plan_takes_photons_where_there_is_time(renderer):
+    scene = burning_glass(renderer)
+    planned = plans.plan(scene, 60.0)
+    assert (planned.sampler, planned.method) == ("vcm", "oidn") and 20 < planned.render < 60
+    assert "of the light is what smooth glass or mirrors make" in planned.reason
+    # Too short, too large, a method that cannot use them, and nothing to find
+    assert plans.plan(scene, 5.0).sampler == "primal"
+    assert plans.plan(burning_glass(renderer, film=(1920, 1080)), 60.0).sampler == "primal"
+    assert plans.plan(scene, 60.0, "ngpt-combine").sampler == "gpt"
+    assert plans.plan(burning_glass(renderer, "diffuse"), 60.0).sampler == "primal"
+    assert plans.plan(scene, 60.0, pilot=Pilot(stop=lambda: True)).sampler == "primal"
+
+
+def test_how_much_is_said(renderer, caplog):
+    from data_gen.inspect import warn_of_lost_light
+
+    scene = burning_glass(renderer)
+    with caplog.at_level(logging.WARNING):
+        warn_of_lost_light(scene, "primal")
+    percent = f"{share_of_caustics(scene):.0%}"
+    assert f"about {percent} of the light on what the camera sees directly, 'primal' hardly finds" in caplog.text
