@@ -12,6 +12,7 @@ import numpy as np
 from data_gen.paths.bent import BentLamps, sample_emitter
 from data_gen.paths.holes import Holes
 from data_gen.paths.vertex import Materials
+from data_gen.scenes.lamp_mesh import is_area
 from data_gen.scenes.lamps import emitter_numbers
 from ngpt.errors import NgptError
 
@@ -248,7 +249,9 @@ def _kind(emitter: mi.Emitter) -> int | None:
     """The kind of an emitter; None for one that light paths cannot begin at."""
     if mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
         return _FAR
-    return {"AreaLight": _AREA, "PointLight": _POINT, "SpotLight": _POINT}.get(emitter.class_name())
+    if is_area(emitter):
+        return _AREA
+    return _POINT if emitter.class_name() in ("PointLight", "SpotLight") else None
 
 
 def _table(scene: mi.Scene, number: int, emitter: mi.Emitter, kind: int) -> list[float]:

@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from data_gen.paths.bent import BentLamps, sample_emitter
 from data_gen.paths.camera import QUARTERS, CameraSamples
+from data_gen.scenes.lamp_mesh import is_area
 from data_gen.scenes.lamps import Chosen, Places
 from data_gen.scenes.load import path_depths
 
@@ -34,7 +35,7 @@ class Lights:
     def __init__(self, scene: mi.Scene, places: Places | None = None):
         lamps = [shape for shape in scene.shapes() if shape.is_emitter()]
         far = [mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) for emitter in scene.emitters()]
-        lamps = [shape for shape in lamps if shape.emitter().class_name() == "AreaLight"]
+        lamps = [shape for shape in lamps if is_area(shape.emitter())]
         uniform = [shape.is_mesh() or shape.class_name() in _UNIFORM_SHAPES for shape in lamps]
         self.near, self.far = not all(far), any(far)
         # Emitters that are neither infinitely far away nor on a shape (point lights) are not counted as uniform.

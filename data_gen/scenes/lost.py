@@ -7,6 +7,7 @@ import numpy as np
 
 from data_gen.scenes.facts import shapes_of
 from data_gen.scenes.integrators import objects_in
+from data_gen.scenes.lamp_mesh import table_of
 
 _SHARP = ("SmoothConductor", "SmoothDielectric")
 # Lamps smaller than this share of the scene's diagonal are met by hardly any path.
@@ -56,6 +57,8 @@ def bent_lamp(scene: mi.Scene) -> mi.Shape | None:
 def _is_tiny(emitter: mi.Emitter, whole: float) -> bool:
     if _SUN in emitter.class_name():
         return True
+    if (many := table_of(emitter)) is not None:
+        return many.smallest < _TINY * whole
     shape = emitter.get_shape() if mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) else None
     return shape is not None and float(np.linalg.norm(np.array(shape.bbox().extents()))) < _TINY * whole
 

@@ -2,7 +2,8 @@
 
 Each shape is a case of its own in the kernels, which Dr.Jit records before the first ray. A room of 800 meshes takes
 seconds for that, a tenth of it once meshes of one material are one. Shapes keep the order of the file, a merged one has
-the place of the first, and all of them lose their names. Meshes that shine, or bound a medium, stay as they are.
+the place of the first, and all of them lose their names. Meshes that bound a medium stay as they are, and those that
+shine as well, unless they are many: see ``many_lamps``.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ from typing import Any
 
 import mitsuba as mi
 
-# The plugins of meshes, and their settings that change normals
-_MESHES = ("obj", "ply", "serialized", "cube", "rectangle")
+from data_gen.scenes.many_lamps import merge_lamps
+from data_gen.scenes.nodes import MESHES, added, parts_of
+
+# Settings of meshes that change normals
 _NORMALS = ("face_normals", "flip_normals")
 # Instances of a group become meshes if their files together have no more bytes: copies take memory, and instances none
 _MOST_BYTES = 1 << 24
@@ -24,10 +27,11 @@ def merge(config: mi.parser.ParserConfig, state: mi.parser.ParserState) -> None:
     """Changes the nodes of a scene file that is parsed; files of meshes are looked for as Mitsuba does."""
     # Exporters repeat a material in each shape. Equal ones become the first of them.
     mi.parser.transform_merge_equivalent(config, state)
+    merge_lamps(state)
     _copy_instances(state)
     scene = state.root.props
     groups: dict[Any, list[str]] = {}
-    for name, number in _parts(scene):
+    for name, number in parts_of(scene):
         if key := _like(state, number):
             groups.setdefault(key, []).append(name)
     for names in groups.values():
@@ -42,19 +46,19 @@ def merge(config: mi.parser.ParserConfig, state: mi.parser.ParserState) -> None:
 def _copy_instances(state: mi.parser.ParserState) -> None:
     """Puts meshes in the place of instances of groups that are small and have nothing else."""
     instances: dict[int, list[str]] = {}
-    for name, number in _parts(state.root.props):
+    for name, number in parts_of(state.root.props):
         if state.nodes[number].props.plugin_name() == "instance":
-            for _, group in _parts(state.nodes[number].props):
+            for _, group in parts_of(state.nodes[number].props):
                 instances.setdefault(group, []).append(name)
     for group, names in instances.items():
-        meshes = [number for _, number in _parts(state.nodes[group].props)]
+        meshes = [number for _, number in parts_of(state.nodes[group].props)]
         if not all(_like(state, number) for number in meshes):
             continue
         if len(names) * sum(_bytes_of(state.nodes[number].props) for number in meshes) > _MOST_BYTES:
             continue
         for name in names:
             _copy(state, name, meshes)
-        for name, number in list(_parts(state.root.props)):
+        for name, number in list(parts_of(state.root.props)):
             if number == group:
                 del state.root.props[name]
 
@@ -65,13 +69,11 @@ def _copy(state: mi.parser.ParserState, name: str, meshes: Sequence[int]) -> Non
     # Now, for nodes that are added move the others.
     placed = [instance["to_world"]] if "to_world" in instance else []
     for i, number in enumerate(meshes):
-        node = mi.parser.SceneNode()
-        node.type, node.props = mi.ObjectType.Shape, mi.Properties(state.nodes[number].props)
-        own = [node.props["to_world"]] if "to_world" in node.props else []
+        props = mi.Properties(state.nodes[number].props)
         if placed:
-            node.props["to_world"] = placed[0] @ own[0] if own else placed[0]
-        state.nodes.append(node)
-        state.root.props[f"{name}_{i}" if i else name] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
+            props["to_world"] = placed[0] @ props["to_world"] if "to_world" in props else placed[0]
+        copy = added(state, mi.ObjectType.Shape, props)
+        state.root.props[f"{name}_{i}" if i else name] = copy
 
 
 def _bytes_of(mesh: mi.Properties) -> int:
@@ -84,25 +86,16 @@ def _in_pairs(state: mi.parser.ParserState, meshes: list) -> mi.Properties.Resol
     """One mesh of all: each is copied as often as they can be halved, and not once for each that is added."""
     if len(meshes) == 1:
         return meshes[0]
-    node = mi.parser.SceneNode()
-    node.type, node.props = mi.ObjectType.Shape, mi.Properties("merge")
-    middle = len(meshes) // 2
+    props, middle = mi.Properties("merge"), len(meshes) // 2
     for i, half in enumerate((meshes[:middle], meshes[middle:])):
-        node.props[f"mesh_{i}"] = _in_pairs(state, half)
-    state.nodes.append(node)
-    return mi.Properties.ResolvedReference(len(state.nodes) - 1)
-
-
-def _parts(props: mi.Properties) -> list[tuple[str, int]]:
-    """(name, number of the node) of what a node refers to."""
-    references = ((name, part) for name, part in props.items() if isinstance(part, mi.Properties.ResolvedReference))
-    return [(name, part.index()) for name, part in references]
+        props[f"mesh_{i}"] = _in_pairs(state, half)
+    return added(state, mi.ObjectType.Shape, props)
 
 
 def _like(state: mi.parser.ParserState, number: int) -> tuple | None:
     """What meshes that become one have in common; None for a node that stays as it is."""
     props = state.nodes[number].props
-    parts = [part for _, part in _parts(props)]
-    if props.plugin_name() not in _MESHES or len(parts) != 1 or state.nodes[parts[0]].type != mi.ObjectType.BSDF:
+    parts = [part for _, part in parts_of(props)]
+    if props.plugin_name() not in MESHES or len(parts) != 1 or state.nodes[parts[0]].type != mi.ObjectType.BSDF:
         return None
     return (*parts, *(bool(props.get(name, False)) for name in _NORMALS))

@@ -1,0 +1,154 @@
+"""One emitter for many lamps that share a mesh: what ``many_lamps`` makes of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+@dataclass
+class Table:
+    """Lamps of one mesh: ``corners`` (F, 3, 3) of all faces, the number of the ``lamp`` of each, (F,), and the
+    ``radiance`` (L, 3) of lamps."""
+
+    corners: np.ndarray
+    lamp: np.ndarray
+    radiance: np.ndarray
+
+    @property
+    def smallest(self) -> float:
+        """The least diagonal of the lamps' bounding boxes."""
+        each = (self.corners[self.lamp == i] for i in range(len(self.radiance)))
+        return min(float(np.linalg.norm(np.ptp(corners, axis=(0, 1)))) for corners in each)
+
+
+def lamps(table: Table) -> mi.Emitter:
+    """The emitter of these lamps, in the current variant of Mitsuba."""
+    return _emitter(mi.variant())(table)
+
+
+def table_of(emitter: mi.Emitter) -> Table | None:
+    """The lamps of an emitter that has many; None for all others."""
+    table = getattr(emitter, "table", None)
+    return table if isinstance(table, Table) else None
+
+
+def is_area(emitter: mi.Emitter) -> bool:
+    """Whether it is a surface that shines to its front, one lamp or many."""
+    return table_of(emitter) is not None or emitter.class_name() == "AreaLight"
+
+
+def mesh_of(props: mi.Properties) -> mi.Mesh:
+    """The mesh of a part of the lamps, with faces of its own vertices."""
+    table = props["emitter"].table
+    count = 3 * len(table.lamp)
+    mesh = mi.Mesh(props.id(), count, len(table.lamp), props, has_vertex_texcoords=True)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = table.corners.astype(np.float32).ravel()
+    uv = np.stack([np.repeat(table.lamp + 0.5, 3), np.full(count, 0.5)], axis=-1)
+    params["vertex_texcoords"] = uv.astype(np.float32).ravel()
+    params["faces"] = np.arange(count, dtype=np.uint32)
+    params.update()
+    return mesh
+
+
+@cache
+def _emitter(variant: str) -> type:
+    """The class for that variant, which must be the current one: Mitsuba's own classes are others in each."""
+
+    class Lamps(mi.Emitter):
+        """Many area lamps of one mesh, each with its radiance, on the side that its faces turn to.
+
+        A face is sampled in proportion to area times mean radiance, and points on it uniformly.
+        """
+
+        def __init__(self, table: Table):
+            super().__init__(mi.Properties())
+            self.table = table
+            corners, lamp, radiance = table.corners, table.lamp, table.radiance
+            across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            areas = np.linalg.norm(across, axis=-1) / 2
+            strength = np.abs(radiance).mean(axis=-1)
+            # Lamps that are all dark are met all the same.
+            strength = strength if strength.any() else np.ones(len(strength))
+            share = areas * strength[lamp]
+            upto = np.cumsum(share / share.sum())
+            # More than any random number, from the last face on that may be sampled
+            upto[np.flatnonzero(share)[-1] :] = 2
+            self.faces, self.upto = len(areas), mi.Float(upto.astype(np.float32))
+            self.corners, self.lamp = mi.Float(corners.astype(np.float32).ravel()), mi.UInt32(lamp.astype(np.uint32))
+            self.radiance = mi.Float(radiance.astype(np.float32).ravel())
+            self.per_area = mi.Float((strength / share.sum()).astype(np.float32))
+            self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
+            self.m_needs_sample_2 = self.m_needs_sample_3 = True
+
+        def _emitted(self, uv: mi.Point2f, active) -> mi.Color3f:
+            return dr.gather(mi.Color3f, self.radiance, mi.UInt32(uv.x), active)
+
+        def _place(self, time: mi.Float, sample: mi.Point2f, active) -> mi.PositionSample3f:
+            face = dr.binary_search(0, self.faces - 1, lambda i: dr.gather(mi.Float, self.upto, i, active) <= sample.x)
+            before = dr.gather(mi.Float, self.upto, face - 1, active & (face > 0))
+            upto = dr.minimum(dr.gather(mi.Float, self.upto, face, active), 1)
+            left = dr.clip((sample.x - before) / dr.maximum(upto - before, 1e-20), 0, dr.one_minus_epsilon(mi.Float))
+            b = mi.warp.square_to_uniform_triangle(mi.Point2f(left, sample.y))
+            a, e1, e2 = (dr.gather(mi.Point3f, self.corners, 3 * face + i, active) for i in range(3))
+            e1, e2 = mi.Vector3f(e1 - a), mi.Vector3f(e2 - a)
+            lamp = dr.gather(mi.UInt32, self.lamp, face, active)
+            place = dr.zeros(mi.PositionSample3f, dr.width(sample))
+            place.p, place.n = a + e1 * b.x + e2 * b.y, mi.Normal3f(dr.normalize(dr.cross(e1, e2)))
+            place.uv, place.time = mi.Point2f(mi.Float(lamp) + 0.5, 0.5), time
+            place.pdf = dr.gather(mi.Float, self.per_area, lamp, active)
+            return place
+
+        def sample_position(self, time, sample, active=True):
+            place = self._place(time, sample, active)
+            return place, dr.select(active & (place.pdf > 0), dr.rcp(place.pdf), 0)
+
+        def pdf_position(self, ps, active=True):
+            return dr.gather(mi.Float, self.per_area, mi.UInt32(ps.uv.x), active)
+
+        def sample_direction(self, it, sample, active=True):
+            place = self._place(it.time, sample, active)
+            light = mi.DirectionSample3f(place)
+            to = mi.Vector3f(place.p - it.p)
+            light.dist = dr.norm(to)
+            light.d = to / light.dist
+            light.emitter = mi.EmitterPtr(self)
+            light.pdf = self.pdf_direction(it, light, active)
+            active = active & (light.pdf > 0)
+            return light, dr.select(active, self._emitted(place.uv, active) / light.pdf, 0)
+
+        def pdf_direction(self, it, ds, active=True):
+            cos = -dr.dot(ds.d, ds.n)
+            active = active & (cos > 0)
+            return dr.select(active, self.pdf_position(ds, active) * dr.square(ds.dist) / cos, 0)
+
+        def eval_direction(self, it, ds, active=True):
+            active = active & (dr.dot(ds.d, ds.n) < 0)
+            return dr.select(active, self._emitted(ds.uv, active), 0)
+
+        def eval(self, si, active=True):
+            active = active & (si.wi.z > 0)
+            return dr.select(active, self._emitted(si.uv, active), 0)
+
+        def sample_ray(self, time, sample1, sample2, sample3, active=True):
+            place = self._place(time, sample2, active)
+            si = mi.SurfaceInteraction3f(place, dr.zeros(mi.Wavelength))
+            d = si.to_world(mi.warp.square_to_cosine_hemisphere(sample3))
+            weight = dr.select(place.pdf > 0, self._emitted(place.uv, active) * (dr.pi / place.pdf), 0)
+            return si.spawn_ray(d), weight
+
+        def sample_wavelengths(self, si, sample, active=True):
+            return dr.zeros(mi.Wavelength), self.eval(si, active)
+
+        def bbox(self):
+            return self.get_shape().bbox()
+
+        def to_string(self):
+            return f"Lamps[{len(self.table.radiance)}]"
+
+    return Lamps

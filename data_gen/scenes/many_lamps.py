@@ -1,0 +1,145 @@
+"""Many lamps as few: hundreds of small meshes that shine become 64 meshes, each with one emitter for all of its lamps.
+
+Dr.Jit records every call of a kernel for each shape and each emitter of a scene before the first sample. With 2,000
+lamps that takes seconds in all. Lamps that are close together share a mesh here, so samplers still choose lamps by
+place. Within a mesh, points are sampled in proportion to the radiance.
+
+A lamp keeps its radiance and its material. It loses its name, and its texture coordinates: their first number says
+which lamp of the mesh it is, as a texture would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from data_gen.scenes.lamp_mesh import Table, lamps, mesh_of
+from data_gen.scenes.lost import is_bent
+from data_gen.scenes.nodes import MESHES, added, is_part, parts_of
+
+# From so many lamps of one material on
+MANY = 256
+# How often they are halved: they become 64 meshes
+_HALVINGS = 6
+# The corners of Mitsuba's rectangle, and its faces
+_RECTANGLE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
+_FACES = np.array([[0, 1, 2], [2, 3, 0]])
+_PLUGIN = "ngpt_lamps"
+_registered: set[str] = set()
+
+
+@dataclass
+class Lamp:
+    """A mesh that shines: ``corners`` (F, 3, 3) of its faces, counterclockwise as seen from where they shine, and the
+    ``radiance`` (3,)."""
+
+    corners: np.ndarray
+    radiance: np.ndarray
+
+
+def merge_lamps(state: mi.parser.ParserState) -> None:
+    """Changes the nodes of a scene file that is parsed. Spectral and polarised variants keep their lamps."""
+    if not mi.is_rgb or mi.is_polarized:
+        return
+    groups: dict[int | None, dict[str, tuple[int, np.ndarray]]] = {}
+    for name, material, shape, radiance in _candidates(state):
+        groups.setdefault(material, {})[name] = shape, radiance
+    for material, found in groups.items():
+        if len(found) < MANY:
+            continue
+        each = {name: _lamp(state.nodes[shape].props, radiance) for name, (shape, radiance) in found.items()}
+        known = {name: lamp for name, lamp in each.items() if lamp}
+        if len(known) >= MANY:
+            _merge(state, material, known)
+
+
+def _merge(state: mi.parser.ParserState, material: int | None, known: dict[str, Lamp]) -> None:
+    """Puts meshes in the place of lamps of one material, each in the place of its first lamp."""
+    if mi.variant() not in _registered:
+        mi.register_shape(_PLUGIN, mesh_of)
+        _registered.add(mi.variant())
+    names = list(known)
+    middles = np.array([lamp.corners.reshape(-1, 3).mean(axis=0) for lamp in known.values()])
+    for part in _halved(np.arange(len(names)), middles, _HALVINGS):
+        props = mi.Properties(_PLUGIN)
+        props["emitter"] = lamps(_table([known[names[i]] for i in part]))
+        if material is not None:
+            props["bsdf"] = mi.Properties.ResolvedReference(material)
+        state.root.props[names[part[0]]] = added(state, mi.ObjectType.Shape, props)
+        for i in part[1:]:
+            del state.root.props[names[i]]
+
+
+def _candidates(state: mi.parser.ParserState) -> Iterator[tuple[str, int | None, int, np.ndarray]]:
+    """Meshes that shine in one colour: the name, the node of the material (None: Mitsuba's own), the node of the mesh,
+    and the radiance."""
+    for name, number in parts_of(state.root.props):
+        shape = state.nodes[number].props
+        nodes = [part for _, part in parts_of(shape)]
+        lamp = [part for part in nodes if state.nodes[part].type == mi.ObjectType.Emitter]
+        material = [part for part in nodes if state.nodes[part].type == mi.ObjectType.BSDF]
+        if shape.plugin_name() not in MESHES or len(lamp) != 1 or len(material) > 1 or len(nodes) > 1 + len(material):
+            continue
+        radiance = _radiance(state.nodes[lamp[0]].props)
+        if radiance is not None and not any(_has_texture(state, each) for each in material):
+            yield name, material[0] if material else None, number, radiance
+
+
+def _radiance(lamp: mi.Properties) -> np.ndarray | None:
+    """Of an area emitter that has one colour and nothing else."""
+    if lamp.plugin_name() != "area" or [name for name, _ in lamp.items()] != ["radiance"]:
+        return None
+    value = lamp["radiance"]
+    return np.array(value, float) if isinstance(value, mi.ScalarColor3d) else None
+
+
+def _has_texture(state: mi.parser.ParserState, number: int) -> bool:
+    node = state.nodes[number]
+    return node.type == mi.ObjectType.Texture or any(_has_texture(state, part) for _, part in parts_of(node.props))
+
+
+def _lamp(shape: mi.Properties, radiance: np.ndarray) -> Lamp | None:
+    """What a node of a mesh describes; None where its vertex normals are not those of its faces."""
+    flipped = bool(shape.get("flip_normals", False))
+    normals = None
+    if shape.plugin_name() == "rectangle":
+        # A rectangle has no table of faces.
+        to_world = np.array(shape["to_world"].matrix, float) if "to_world" in shape else np.eye(4)
+        corners = (_RECTANGLE @ to_world[:3, :3].T + to_world[:3, 3])[_FACES]
+        # As Mitsuba has it, the normal goes with the transform also where that is a reflection.
+        flipped ^= bool(np.linalg.det(to_world[:3, :3]) < 0)
+    else:
+        settings = {name: value for name, value in shape.items() if not is_part(value)}
+        mesh = mi.load_dict({"type": shape.plugin_name(), **settings})
+        if is_bent(mesh):
+            return None
+        params = mi.traverse(mesh)
+        faces = np.array(params["faces"]).reshape(-1, 3)
+        corners = np.array(params["vertex_positions"], float).reshape(-1, 3)[faces]
+        if mesh.has_vertex_normals():
+            normals = np.array(params["vertex_normals"], float).reshape(-1, 3)[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if normals is not None:
+        corners = np.where((across[:, None] * normals).sum(axis=(1, 2))[:, None, None] < 0, corners[:, ::-1], corners)
+    faces = (corners[:, ::-1] if flipped else corners)[np.linalg.norm(across, axis=1) > 0]
+    return Lamp(faces, radiance) if len(faces) else None
+
+
+def _halved(part: np.ndarray, middles: np.ndarray, times: int) -> Iterator[np.ndarray]:
+    """Parts of lamps that are close together: numbers in the order of the file."""
+    if times == 0 or len(part) < 2:
+        yield np.sort(part)
+        return
+    axis = int(np.argmax(np.ptp(middles[part], axis=0)))
+    part = part[np.argsort(middles[part, axis], kind="stable")]
+    for half in np.array_split(part, 2):
+        yield from _halved(half, middles, times - 1)
+
+
+def _table(each: list[Lamp]) -> Table:
+    numbers = np.repeat(np.arange(len(each)), [len(lamp.corners) for lamp in each])
+    corners = np.concatenate([lamp.corners for lamp in each])
+    return Table(corners, numbers, np.array([lamp.radiance for lamp in each]))
