@@ -1,1 +1,1 @@
-"""How good an image is: metrics, perceptual distances, and what one more layer would buy."""
+"""Metrics and perceptual distances between an image and its reference."""

@@ -1,4 +1,4 @@
-"""How repeated measurements become one number."""
+"""Averages of repeated measurements."""
 
 import statistics
 from collections.abc import Iterable, Sequence
@@ -18,10 +18,10 @@ def median(values: Iterable[float | None]) -> float | None:
 
 
 def geometric_mean(values: Iterable[float]) -> float:
-    """Values of 0 or less count as 1e-30."""
+    """The geometric mean. Values of 0 or less count as 1e-30."""
     return float(np.exp(np.mean(np.log(np.maximum(list(values), 1e-30)))))
 
 
 def mean(values: Sequence[float], geometric: bool) -> float:
-    """Arithmetic or geometric."""
+    """The arithmetic or the geometric mean."""
     return geometric_mean(values) if geometric else float(np.mean(values))

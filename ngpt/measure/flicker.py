@@ -12,12 +12,12 @@ from ngpt.sequence.warp import warped
 def flicker_maps(
     images: Sequence[np.ndarray], references: Sequence[np.ndarray], motions: Sequence[np.ndarray | None]
 ) -> list[np.ndarray]:
-    """(H, W, 3) for each frame but the first: (d - d_r)² / (m + 1e-3), NaN where that is not known.
+    """Maps (H, W, 3) of (d - d_r)² / (m + 1e-3), one for each frame but the first. Unknown values are NaN.
 
-    d = x_t(p) - x_{t-1}(p + motion) is the difference in time along motion of the images x, d_r the same difference of
-    the references r, m the mean of r² in both frames. ``motions`` (H, W, 2) has one entry for each frame, and the first
-    is not used; None and NaN: unknown. Changes that the reference has too, such as a moving shadow or a reflection, are
-    not flicker. Raises NgptError for lists of different lengths.
+    d = x_t(p) - x_{t-1}(p + motion) is the change of the images x along the motion, d_r the same change of the
+    references r, m the mean of r² in both frames. ``motions`` (H, W, 2) has one entry for each frame; the first entry
+    is not used. None and NaN mean unknown motion. Changes that the reference shows too, such as a moving shadow or a
+    reflection, are not flicker. Raises NgptError for lists of different lengths, or fewer than two frames.
     """
     if not len(images) == len(references) == len(motions) or len(images) < 2:
         raise NgptError(
@@ -29,10 +29,10 @@ def flicker_maps(
 
 
 def change_maps(images: Sequence[np.ndarray], motions: Sequence[np.ndarray | None]) -> list[np.ndarray]:
-    """(H, W, 3) for each frame but the first: d² / (m + 1e-3), NaN where d is not known.
+    """Maps (H, W, 3) of d² / (m + 1e-3), one for each frame but the first. Unknown values are NaN.
 
-    d = x_t(p) - x_{t-1}(p + motion) is the difference in time along motion of the images x, m the mean of x² in both
-    frames: all that changes, flicker and light that moves. A frame without motion (None) is taken for one at rest.
+    d = x_t(p) - x_{t-1}(p + motion) is the change of the images x along the motion, m the mean of x² in both frames.
+    The maps hold every change: flicker and moving light. Where a frame has no motion (None), nothing moves.
     """
     still = np.zeros((*np.shape(images[0])[:2], 2)) if len(images) else None
     images = [np.asarray(image, np.float64) for image in images]
@@ -42,7 +42,7 @@ def change_maps(images: Sequence[np.ndarray], motions: Sequence[np.ndarray | Non
 def _changes(
     values: Sequence[np.ndarray], levels: Sequence[np.ndarray], motions: Sequence[np.ndarray | None]
 ) -> list[np.ndarray]:
-    """Squared differences in time along motion, over the mean of squared ``levels`` in both frames."""
+    """Squared changes of ``values`` along the motion, over the mean of squared ``levels`` in both frames."""
     maps = []
     squares = [np.square(level, dtype=np.float64) for level in levels]
     pairs = zip(values, values[1:], squares, squares[1:], motions[1:], strict=False)
@@ -61,10 +61,10 @@ def _changes(
 def flicker(
     images: Sequence[np.ndarray], references: Sequence[np.ndarray], motions: Sequence[np.ndarray | None]
 ) -> float:
-    """The mean of ``flicker_maps`` over the pixels where it is known, in each frame without the worst 0.1 %.
+    """The mean of ``flicker_maps`` over frames and known pixels, without the worst 0.1 % of each frame.
 
-    0 for a shot whose error moves with what is seen; twice the mean relMSE where errors of frames have nothing to
-    do with each other. NaN where nothing is known.
+    It is 0 for a shot whose error moves with the surfaces, and twice the mean relMSE if the errors of successive frames
+    are independent. NaN if no pixel is known.
     """
     values = []
     for image in flicker_maps(images, references, motions):

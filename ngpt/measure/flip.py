@@ -1,4 +1,4 @@
-"""HDR-FLIP, as its authors' package computes it: what a viewer sees who flips between two images.
+"""HDR-FLIP, computed by its authors' package: the difference that a viewer sees when flipping between two images.
 
 ``ngpt.measure.distances.flip`` is its differentiable twin, for training.
 """
@@ -16,8 +16,8 @@ from ngpt.system.forks import in_children
 def flip(image: np.ndarray, reference: np.ndarray) -> tuple[float, np.ndarray]:
     """Mean HDR-FLIP in [0, 1] and its map (H, W) [Andersson et al. 2021, "Visualizing errors in rendered HDR images"].
 
-    The largest over exposures of LDR-FLIP at 67 pixels per degree; ``flip_exposures`` fixes the exposures from the
-    reference, so all images of a scene are judged by the same ones.
+    In each pixel it is the largest LDR-FLIP over several exposures, at 67 pixels per degree. ``flip_exposures`` derives
+    the exposures from the reference, so all images of a scene are judged at the same ones.
     """
     check_size(image, reference)
     import flip_evaluator
@@ -50,7 +50,7 @@ def flip_exposures(reference: np.ndarray) -> tuple[float, float, int]:
 
 
 def _one_thread() -> None:
-    """The package's own OpenMP on one thread: a child would wait for its parent's for ever."""
+    """Sets the package's own OpenMP to one thread: a forked child would wait forever for its parent's threads."""
     import flip_evaluator
 
     for library in Path(f"{Path(flip_evaluator.__file__).parent}.libs").glob("libgomp*"):

@@ -1,4 +1,4 @@
-"""What metrics do to images before they compare them."""
+"""Preparation of images for metrics."""
 
 import numpy as np
 
@@ -21,5 +21,5 @@ def reinhard(image: np.ndarray) -> np.ndarray:
 
 
 def middle(halves: tuple[np.ndarray, ...]) -> np.ndarray:
-    """m = (a + b) / 2 of a reference's two halves; the reference itself where there is one image."""
+    """m = (a + b) / 2 of a reference's two halves; the reference itself if there is only one image."""
     return halves[0] if len(halves) == 1 else (halves[0] + halves[1]) / 2

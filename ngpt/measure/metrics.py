@@ -53,15 +53,17 @@ def relmse_trimmed(image: np.ndarray, *halves: np.ndarray, share: float = 0.001)
 
 
 def trimmed_mean(values: np.ndarray, sizes: np.ndarray, share: float) -> float:
-    """The mean of (H, W, 3) without that share of the pixels whose ``sizes``, by channel mean, are largest."""
+    """The mean of ``values`` (H, W, 3) without the ``share`` of pixels that have the largest channel mean of
+    ``sizes``."""
     order = np.argsort(sizes.mean(axis=-1), axis=None)
     return float(values.mean(axis=-1).ravel()[order[: order.size - int(share * order.size)]].mean())
 
 
 def relmse_channel_mean(image: np.ndarray, *halves: np.ndarray) -> float:
-    """relMSE as the code of NGPT has it: mean over pixels of mean_c (x - r)² / (mean_c(r)² + 1e-3).
+    """relMSE as NGPT's code computes it: mean over pixels of mean_c (x - r)² / (mean_c(r)² + 1e-3).
 
-    The squared error's mean over the channels c, relative to the grey of the reference: saturated colours count less.
+    The squared error is averaged over the channels c and divided by the squared grey of the reference, so saturated
+    colours count less.
     """
     error = squared_error(image, *halves).mean(axis=-1)
     return float((error / (middle(halves).mean(axis=-1) ** 2 + EPSILON)).mean())
@@ -73,10 +75,10 @@ def mse(image: np.ndarray, *halves: np.ndarray) -> float:
 
 
 def psnr_reinhard(image: np.ndarray, *halves: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB of x / (1 + x): -10 log10 of the MSE of x'; infinite where that is not positive.
+    """Peak signal-to-noise ratio in dB: -10 log10 of the MSE of x' = x / (1 + x); infinite if the MSE is not positive.
 
-    Noise moves the mean of a tone-mapped half by its variance times the curve's second derivative: a small bias that
-    halves cannot take off.
+    Noise shifts the mean of a tone-mapped half in proportion to its variance and to the curve's second derivative. Two
+    halves do not remove this small bias.
     """
     error = mse(reinhard(image), *map(reinhard, halves))
     return float("inf") if error <= 0 else float(-10 * np.log10(error))
@@ -95,14 +97,15 @@ def largest(image: np.ndarray, reference: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Metric:
-    """One way to judge an image, as tables, reports and ``ngpt diff`` have it.
+    """One metric, as tables, reports and ``ngpt diff`` use it.
 
-    ``formula``   what is printed beside the numbers
+    ``formula``   the text that is printed beside the numbers
     ``better``    "lower" or "higher"
-    ``function``  (x, r, **options) -> float; of a ``squared`` metric (x, a, b) as well
-    ``squared``   made of squares (x - r)², so that two halves of a reference take its noise off
-    ``whole``     looks at neighbourhoods: is given whole images with 0 for what is not finite, not the finite pixels
-    ``missing``   (**options) -> why it cannot be computed here, "" if it can; None: nothing but NumPy is needed
+    ``function``  (x, r, **options) -> float; a ``squared`` metric also takes (x, a, b)
+    ``squared``   the metric is a mean of squares (x - r)², so that two halves remove the noise of the reference
+    ``whole``     the metric reads neighbourhoods: it gets whole images, in which 0 replaces values that are not finite;
+                  other metrics get only the finite pixels
+    ``missing``   (**options) -> why it cannot be computed here, "" if it can; None: it needs only NumPy
     """
 
     formula: str
@@ -145,24 +148,24 @@ _OURS = {
         missing=perceptual.elpips_lack,
     ),
 }
-# Other packages bring theirs by entry points.
+# Other packages register theirs by entry points.
 METRICS = Registry("ngpt.metrics", "metric", Metric, _OURS)
 
 
 def scores(
     names: Iterable[str], image: np.ndarray, *halves: np.ndarray, options: dict[str, dict[str, Any]] | None = None
 ) -> dict[str, float]:
-    """Metrics of ``METRICS`` by name, in double precision; ``options`` go to each metric's function.
+    """Metrics of ``METRICS`` by name, in double precision; ``options`` holds arguments of their functions, by metric.
 
-    Squared metrics are given all ``halves`` (one image or two), the others their mean. Raises NgptError if the images
-    differ in size or have no pixel that is finite in all of them.
+    Squared metrics get all ``halves`` (one image or two), the others their mean. Raises NgptError if the images differ
+    in size or have no pixel that is finite in all of them.
     """
     for half in halves:
         check_size(image, half)
     finite = _finite(image, *halves)
     if not finite.any():
         raise NgptError(f"none of {finite.size} pixels is finite in {'both' if len(halves) == 1 else 'all'} images")
-    # Double precision: squares of 1e12 are fine there, and means of millions of pixels exact enough.
+    # Double precision holds squares of 1e12, and means of millions of pixels are accurate enough.
     x, *parts = (i[finite][None].astype(np.float64) for i in (image, *halves))
     values = {}
     for name in names:
@@ -178,7 +181,7 @@ def scores(
 
 
 def compare(image: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """The metrics that need no package, and ``nonfinite``: how many pixels had to be left out.
+    """The metrics that need no package, and ``nonfinite``: the number of pixels left out.
 
     Raises NgptError if the images differ in size or have no pixel that is finite in both.
     """
@@ -192,10 +195,10 @@ def _finite(*images: np.ndarray) -> np.ndarray:
 
 
 def exposure_mismatch(image: np.ndarray, reference: np.ndarray) -> float:
-    """The stops that the image is brighter than its reference: log2 of the ratio of their mean radiance.
+    """How many stops the image is brighter than its reference: log2 of the ratio of their mean radiance.
 
-    The worst 0.1 % of the values of either are left out. Reconstruction moves it by a fraction of a stop; more means a
-    reference of another exposure, camera or scene. 0 where either is black.
+    Values of each image are clamped to its 99.9 % quantile. Reconstruction changes the ratio by a fraction of a stop; a
+    larger value means that the reference has another exposure, camera or scene. 0 if either image is black.
     """
     sums = []
     for values in (image[np.isfinite(image)], reference[np.isfinite(reference)]):

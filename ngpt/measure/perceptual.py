@@ -1,4 +1,4 @@
-"""Metrics of what the eye sees. Each needs an optional package or weights; ``lack`` and ``elpips_lack`` say which.
+"""Perceptual metrics. Each needs an optional package or weights; ``lack`` and ``elpips_lack`` say which.
 
 x is the image and r the reference, scene-linear (H, W, 3), finite; values below 0 count as 0.
 """
@@ -45,8 +45,8 @@ def elpips(image: np.ndarray, reference: np.ndarray, backbone: str = "", weights
     """E-LPIPS by SqueezeNet, 0 for equal images; ``backbone`` and ``weights`` are files that docs/train/losses.md
     explains.
 
-    d(x, r) averaged over random transforms [Kettunen et al. 2019, "E-LPIPS"], of sRGB(x / (1 + mean_c x)); the draws
-    are the same for all images. Raises NgptError for files that are missing or not what they should be.
+    The distance d(x, r) of sRGB(x / (1 + mean_c x)), averaged over random transforms [Kettunen et al. 2019, "E-LPIPS"].
+    All images get the same transforms. Raises NgptError for files that are missing or have the wrong contents.
     """
     return _elpips(backbone, weights)(image, reference)
 
@@ -64,7 +64,7 @@ def elpips_lack(backbone: str = "", weights: str = "") -> str:
 
 @lru_cache(maxsize=1)
 def _elpips(backbone: str, weights: str) -> Callable[[np.ndarray, np.ndarray], float]:
-    # torch takes seconds to come in.
+    # Importing torch takes seconds.
     import torch
 
     from ngpt.measure.distances.perceptual import PerceptualDistance

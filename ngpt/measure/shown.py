@@ -1,4 +1,4 @@
-"""The metrics that a page shows beside its pictures, and the maps of those that have one."""
+"""The metrics that a page shows beside its pictures, and maps of SSIM and FLIP."""
 
 import numpy as np
 
@@ -11,7 +11,10 @@ _WITH_MAP = {"SSIM": perceptual.ssim, "FLIP": flip}
 
 
 def available(height: int, width: int) -> tuple[list[str], dict[str, str]]:
-    """The metrics of SHOWN and of other packages for images of this size, and why others cannot be: name -> a line."""
+    """(available, unavailable) metrics for images of this size, from SHOWN and from other packages.
+
+    ``unavailable`` maps each name to one line that says why.
+    """
     names = (*SHOWN, *METRICS.load())
     lacks = {name: missing() for name in names if (missing := METRICS[name].missing)}
     if min(height, width) < 11:
@@ -22,7 +25,7 @@ def available(height: int, width: int) -> tuple[list[str], dict[str, str]]:
 def judge(names: list[str], image: np.ndarray, reference: np.ndarray) -> tuple[dict[str, float], dict[str, np.ndarray]]:
     """Metrics of (H, W, 3) images by name, and maps (H, W) of FLIP and SSIM: 0 where equal, 1 where most different.
 
-    Pixels that are not finite count as :func:`ngpt.measure.metrics.scores` counts them, which says what is raised, too.
+    Pixels that are not finite and errors are handled as in :func:`ngpt.measure.metrics.scores`.
     """
     values = scores([name for name in names if name not in _WITH_MAP], image, reference)
     maps = {}

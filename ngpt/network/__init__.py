@@ -1,1 +1,1 @@
-"""What runs a network: inputs, shape, weights, in ONNX Runtime and in PyTorch. ``import ngpt`` imports no torch."""
+"""Networks: their inputs, shapes and weights, run by ONNX Runtime and PyTorch. ``import ngpt`` imports no torch."""

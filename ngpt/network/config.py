@@ -1,7 +1,7 @@
 """The configuration of a network: the table [model] of a TOML file, which is also in the header of its weights.
 
-``ModelConfig`` is the record, with what holds for all. Each kind of network has a class below it, which knows what such
-a network takes and how it is made.
+``ModelConfig`` is the record, with the checks for all kinds. Each kind of network has a ``Kind``, which checks the
+fields of such a network and makes it.
 """
 
 import math
@@ -18,7 +18,7 @@ from ngpt.network.heads import Head, head_of
 from ngpt.network.unet import POOLING, DenseUNet, PlainUNet
 from ngpt.system.parts import Registry
 
-# What a file may ask for: far more than networks have, far less than takes down a machine.
+# The largest sizes that a file may ask for: far more than networks have, and far less than would exhaust a machine.
 MAX_LEVELS, MAX_CHANNELS, MAX_UNITS = 8, 1024, 32
 # Kernels reach no further than the padding.
 MAX_KERNEL = 2 * padding.MARGIN + 1
@@ -27,28 +27,29 @@ MAX_SWEEPS = 64
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """What a reconstruction is made of.
+    """The configuration of a reconstruction.
 
-    ``network``   "dense" or "plain", see ``ngpt.network.unet``, "oidn", see ``ngpt.network.oidnet``, or the name of
-                  another package's kind, whose documentation says what it makes of the fields below
-    ``channels``  for each level, finest first: what each unit adds (dense), the width (plain), or the channels of
-                  OIDN's small or default network (oidn)
+    ``network``   "dense" or "plain", see ``ngpt.network.unet``; "oidn", see ``ngpt.network.oidnet``; or the name of
+                  another package's kind, whose documentation says how it uses the fields below
+    ``channels``  for each level, finest first: the channels that each unit adds (dense), the width (plain), or the
+                  channels of OIDN's small or default network (oidn)
     ``units``     for each level, units on the way down and again on the way up (dense); none for plain and oidn
     ``inputs``    the layers it reads, in order; names of ``ngpt.network.features.CHANNELS``
-    ``base``      the classical method whose result is its layer "base"; "" for none
+    ``base``      the classical method whose result is the layer "base"; "" for none
     ``start``     the images among its inputs that it starts from: it predicts a weight for each of them in each pixel,
-                  and corrects their mean in the logarithm. By default the base; without any it predicts the image
-                  itself, as NGPT does
-    ``quiet``     the relative standard error of the primal, over 15x15 pixels, below which the result goes over to the
-                  base, in proportion and in the logarithm: as noise vanishes it converges with the base, whatever the
-                  network says. Where the variance is 0, or not known, it does not. 0: nowhere
-    ``kernel``    the side, in pixels, of the kernels by which it averages the weighted mean of those images instead,
-                  see ``ngpt.network.heads.Pyramid``; odd. 0: it weighs and corrects them pixel by pixel
+                  and corrects the logarithm of their mean. The default is the base. Without any image it predicts the
+                  image itself, as NGPT does
+    ``quiet``     the relative standard error of the primal, over 15x15 pixels, below which the result is blended with
+                  the base. The blend is linear in the error and in the logarithm: as noise vanishes, the result
+                  converges to the base, whatever the network says. Pixels whose variance is 0 or unknown are not
+                  blended. 0: none are
+    ``kernel``    the side, in pixels, of the kernels that average the weighted mean of those images instead, see
+                  ``ngpt.network.heads.Pyramid``; odd. 0: the network weighs and corrects them pixel by pixel
     ``scales``    the number of resolutions that have kernels, each half as fine as the last; 1 without kernels
     ``demodulate``  whether the kernels average the image divided by the albedo, and multiply by it again; needs the
                   input albedo, and ``scales``
-    ``sweeps``    at each of several resolutions, steps that draw the image toward the gradients, by weights that the
-                  network predicts, see ``ngpt.network.poisson``; needs the inputs dx_noise and dy_noise. 0: none
+    ``sweeps``    the number of steps, at each of several resolutions, that draw the image toward the gradients with
+                  predicted weights, see ``ngpt.network.poisson``; needs the inputs dx_noise and dy_noise. 0: none
     ``pooling``   how the network halves and doubles sizes: "convolution", as NGPT does, or by 1x1 convolutions and
                   "average", "maximum" or "bilinear", see ``ngpt.network.unet``
     """
@@ -92,12 +93,13 @@ class ModelConfig:
 
     @property
     def head(self) -> Head:
-        """What makes an image of the network's prediction."""
+        """The head, which makes an image from the network's prediction."""
         return self.kind.head(self)
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """The layers its inputs are, or are computed of: of a stack, or made of one (``ngpt.network.inputs``)."""
+        """The layers that the inputs are or are computed from; a stack holds them, or ``ngpt.network.inputs`` makes
+        them."""
         names = features.sources(self.inputs)
         # The exposure is computed from the primal.
         return names if "primal" in names else ("primal", *names)
@@ -109,7 +111,7 @@ class ModelConfig:
 
     @property
     def reads_gradients(self) -> bool:
-        """Whether it works on the light that gradients are the differences of; see ``ngpt.repair``."""
+        """Whether the network works on the light whose differences the gradients are; see ``ngpt.repair``."""
         return "dx" in self.needs
 
     def to_dict(self) -> dict[str, Any]:
@@ -123,7 +125,7 @@ class Kind(ABC):
 
     @abstractmethod
     def check(self, config: ModelConfig) -> None:
-        """Raises NgptError for what such a network cannot be."""
+        """Raises NgptError for a configuration that such a network cannot have."""
 
     @abstractmethod
     def head(self, config: ModelConfig) -> Head:
@@ -199,7 +201,7 @@ class Dense(Plain):
 
 
 class Oidn(Kind):
-    """``ngpt.network.oidnet.OidnUNet``, which has what OIDN does around it instead of a head."""
+    """``ngpt.network.oidnet.OidnUNet``, which has OIDN's transfer functions instead of a head."""
 
     goes_without = ("quiet", "kernel", "scales", "demodulate", "sweeps", "pooling")
 
@@ -221,7 +223,7 @@ class Oidn(Kind):
 
 
 _OURS: dict[str, Kind] = {"dense": Dense(), "plain": Plain(), "oidn": Oidn()}
-# Other packages bring theirs by entry points (docs/train/add-a-network.md).
+# Other packages register theirs by entry points (docs/train/add-a-network.md).
 KINDS: Registry[Kind] = Registry("ngpt.networks", "network", Kind, _OURS)
 
 
@@ -251,7 +253,7 @@ def check_layers(config: ModelConfig, units: bool) -> None:
 
 
 def last_of(config: ModelConfig) -> dict[str, Any]:
-    """The last convolution of a network, by its head: the arguments of ``ngpt.network.unet.LastConvolution``."""
+    """The arguments of ``ngpt.network.unet.LastConvolution`` that the head of the network requires."""
     return {"outputs": config.head.outputs, "zero": config.head.neutral, "normalise": config.head.normalise}
 
 

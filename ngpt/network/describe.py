@@ -1,4 +1,4 @@
-"""What a file of weights says of itself, for ``ngpt info``."""
+"""Description of a file of weights, for ``ngpt info``."""
 
 from collections.abc import Collection
 from importlib.util import find_spec
@@ -13,10 +13,10 @@ from ngpt.system.records import parse_json
 from ngpt.version import __version__
 
 SUFFIXES = (".onnx", ".safetensors", ".tza")
-# What the metadata of the network that blends frames have (``ngpt.sequence.network``).
+# The key in the metadata of a network that blends frames (``ngpt.sequence.network``).
 FRAMES = "ngpt.temporal inputs"
 
-# What of a training's settings is worth a line, by table.
+# The settings of a training that are shown, by table.
 _SETTINGS = {
     "data": ("folders", "validation"),
     "loss": ("kind",),
@@ -26,9 +26,9 @@ _SETTINGS = {
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """Whose network it is, what it reads and needs, and how it was trained: one table for people and for JSON.
+    """A table of a network's origin, inputs, requirements and training, for people and for JSON.
 
-    Raises NgptError for a file that is no network of ngpt, and for .safetensors where PyTorch is not installed.
+    Raises NgptError for a file that is no network of ngpt, and for .safetensors if PyTorch is not installed.
     """
     path = Path(path)
     readers = {".safetensors": _safetensors, ".tza": _tza}
@@ -65,7 +65,7 @@ def _onnx(path: Path) -> dict[str, Any]:
 def _safetensors(path: Path) -> dict[str, Any]:
     if find_spec("torch") is None or find_spec("safetensors") is None:
         raise NgptError(f"{path}: to read it needs PyTorch: {install_command('train')}")
-    # torch takes seconds to come in.
+    # Importing torch takes seconds.
     from ngpt.network.safetensors import load_weights
 
     model, header = load_weights(path)

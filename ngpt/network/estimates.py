@@ -1,4 +1,4 @@
-"""Variances of stacks with gradients that come without: what separates the layers from an image with little noise."""
+"""Estimates of variances for stacks with gradients that lack them, from an image with little noise."""
 
 from dataclasses import replace
 
@@ -12,13 +12,13 @@ def with_variances(data: Repaired, image: np.ndarray) -> Repaired:
     """The stack with variances of image, dx and dy; missing ones are estimated.
 
     ``image`` (H, W, 3) is a reconstruction with little noise, without direct emission. The estimate is the squared
-    residual of a layer to it, or to its differences, averaged twice over 3 x 3 pixels. Where the reconstruction blurs,
-    the lost detail counts as noise of the gradients, which is on the safe side (docs/lab/log/2026-W47.md, "what auto
-    takes").
+    difference between a layer and this image (or its pixel differences), averaged twice over 3 x 3 pixels. Where the
+    reconstruction blurs, the lost detail counts as noise of the gradients, which is on the safe side
+    (docs/lab/log/2026-W47.md, "what auto takes").
     """
     noise = data.noise
     if noise is None:
-        # As in a stack that has it: unknown where the camera sees an emitter.
+        # As in stacks that hold variances, they are unknown where the camera sees an emitter.
         seen = data.direct.any(axis=-1, keepdims=True)
         noise = np.where(seen, np.float32(np.nan), _around(data.image, image))
     variances = data.variances
@@ -34,7 +34,7 @@ def with_variances(data: Repaired, image: np.ndarray) -> Repaired:
 
 
 def _around(layer: np.ndarray, smooth: np.ndarray) -> np.ndarray:
-    """The mean squared residual of a layer around each pixel, (H, W, 3) float32."""
+    """The mean squared difference between a layer and ``smooth`` around each pixel, (H, W, 3) float32."""
     squares = (layer.astype(np.float64) - smooth) ** 2
     for _ in range(2):
         squares = ndimage.uniform_filter(squares, (3, 3, 1), mode="nearest")

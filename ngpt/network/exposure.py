@@ -1,14 +1,14 @@
-"""The numbers that belong to a whole image, which all of its tiles share when a network reconstructs them."""
+"""Statistics of a whole image, which all of its tiles share when a network reconstructs them."""
 
 from collections.abc import Mapping
 
 import numpy as np
 
-# What the typical radiance of an image is brought to: 4 is ln(5) = 1.6 after compression, so that what is 40 times
-# darker is still where the logarithm is not linear.
+# The typical radiance of an image after exposure. 4 becomes ln(5) = 1.6 after compression, so that the logarithm still
+# compresses radiance that is 40 times darker.
 KEY = 4.0
 BLOCK = 16
-# Rows that are looked at together; a multiple of BLOCK.
+# Rows that are processed together; a multiple of BLOCK.
 _BAND = 256
 
 
@@ -32,7 +32,7 @@ def statistics(layers: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _block_means(values: np.ndarray) -> np.ndarray:
-    """Means over blocks of 16x16, or of what is left of them at the border."""
+    """Means over blocks of 16x16 pixels; blocks at the border may be smaller."""
     starts = [np.arange(0, length, BLOCK) for length in values.shape]
     counts = [np.diff([*start, length]) for start, length in zip(starts, values.shape, strict=True)]
     sums = np.add.reduceat(np.add.reduceat(values, starts[0], axis=0, dtype=np.float64), starts[1], axis=1)

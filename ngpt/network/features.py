@@ -13,8 +13,8 @@
     primal_se, dx_se, dy_se, diffuse_se, specular_se
                  1   ln(1 + standard error of the layer of that name, mean over RGB)
 
-Relative to an image D, with L the signed log, and enlarged: what tells small differences apart in 16 bits. D is the
-base where "base" is among the inputs, the denoised image otherwise:
+The following are relative to an image D, and enlarged so that small differences survive in 16 bits. L is the signed
+log. D is the base if "base" is among the inputs, the denoised image otherwise:
 
     primal_change, base_change, denoised_base_change
                  3   L(20 (L(x) - L(D)))
@@ -24,7 +24,7 @@ base where "base" is among the inputs, the denoised image otherwise:
                  1   ln(1 + 100 standard error / (1 + |D|)), means over RGB
 
 [Kettunen et al. 2019, section 4.2 and their code; base and standard errors are ours.] Radiance is divided by the
-exposure before. What a configuration does not list, the network does not see: absent layers are never filled with
+exposure before. The network sees only the layers that its configuration lists: absent layers are never filled with
 zeros.
 """
 
@@ -50,10 +50,10 @@ CHANNELS = {
     )
 }
 
-# What differences to an image, and relative noise, are enlarged by; what is added to depth before division.
+# Factors on differences to an image and on relative noise; the number added to the divisor of depth.
 ENLARGED, NOISE_ENLARGED, LEAST_DEPTH = 20, 100, 1e-10
 
-# What is added to albedo before radiance is divided by it: what dark surfaces reflect beside their colour.
+# Added to albedo before radiance is divided by it, for the gloss that dark surfaces reflect too.
 GLOSS = 0.1
 
 # The layers that are computed, and the layers that they are computed from, in addition to ``compared``.
@@ -72,7 +72,7 @@ RADIANCE = frozenset(
 # The layers that are images of the scene: a network may start from them.
 IMAGES = ("primal", *MADE)
 
-# Images of parts of its light.
+# Images of parts of the scene's light.
 PARTS = ("diffuse", "specular")
 
 
@@ -82,7 +82,7 @@ def channels(inputs: tuple[str, ...]) -> int:
 
 
 def sources(inputs: tuple[str, ...]) -> tuple[str, ...]:
-    """The layers that these inputs are, or are computed of."""
+    """The layers that these inputs are or are computed from."""
     beside = (compared(inputs),)
     return tuple(
         dict.fromkeys(source for name in inputs for source in (SOURCES[name] + beside if name in SOURCES else (name,)))
@@ -113,9 +113,9 @@ def _computed(name: str, layers: Mapping[str, Tensor], compared_with: str) -> Te
 
 
 def reflectance(albedo: Tensor) -> Tensor:
-    """What radiance (N, 3, H, W) may be divided by: albedo + ``GLOSS``. Where no albedo is known it is one number.
+    """The divisor of radiance (N, 3, H, W) for demodulation: albedo + ``GLOSS``; constant where the albedo is unknown.
 
-    A continuous function of the albedo: pixels that have 0 or 0.1 by chance do not exchange light ten times too bright.
+    It is a continuous function of the albedo, so a noisy albedo between 0 and 0.1 changes the demodulated light little.
     """
     return albedo + GLOSS
 
@@ -157,7 +157,7 @@ def exposure(primal: Tensor) -> Tensor:
 def normalised(layers: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
     """The layers, radiance over exposure, depth over its maximum, albedo in [0, 1]; and the exposure (N, 1, 1, 1).
 
-    Both belong to the whole image: normalise before cutting tiles.
+    Exposure and maximum depth belong to the whole image: normalise before cutting tiles.
     """
     scale = exposure(layers["primal"])
     result = dict(layers)

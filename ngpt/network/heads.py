@@ -1,4 +1,4 @@
-"""Heads: from what a network predicts to the logarithm of the image. They hold no weights; the last convolution does.
+"""Heads: from a network's prediction to the logarithm of the image. They hold no weights.
 
     Direct     the prediction is the logarithm [Kettunen et al. 2019]
     Residual   it corrects the logarithm of the image the network starts from
@@ -6,7 +6,7 @@
     Pyramid     kernels at several resolutions, of one image, blended from coarse to fine [Vogels et al. 2018,
                "Denoising with kernel prediction and asymmetric loss functions", section 4.3]
 
-Each has the number of channels it asks of the network, the computation in PyTorch, and the same as an ONNX graph.
+Each defines the number of channels of the prediction, the computation in PyTorch, and the same as an ONNX graph.
 """
 
 from abc import ABC, abstractmethod
@@ -26,16 +26,16 @@ LEAST_TRUST, NEVER = 1e-4, -1e9
 
 @dataclass(frozen=True)
 class Head(ABC):
-    """What all heads have.
+    """The interface of all heads.
 
     ``start``    the images it reads, in order; names of ``ngpt.network.features.IMAGES``
     ``outputs``  channels of the prediction
-    ``reads``    the layers that ``forward`` is given: the images, and what else the head reads
-    ``radius``   how far around a pixel it reads them beyond the size of the prediction
-    ``reach``    how far around a pixel its result depends on images and prediction
+    ``reads``    the layers that ``forward`` gets: the images, and the other layers that the head reads
+    ``radius``   pixels on every side by which these layers must be larger than the prediction
+    ``reach``    the distance, in pixels, up to which images and prediction influence the result of a pixel
     ``neutral``  whether a prediction of 0 is a sensible image, so that training begins there
-    ``normalise``  whether the features that the prediction is made of are divided by their root mean square, in each
-                 pixel: softmax holds nothing back, so that features and logits would grow until nothing is learnt
+    ``normalise``  whether the input of the last convolution is divided by its root mean square in each pixel. Softmax
+                 does not limit features and logits: they would grow until nothing is learnt
     """
 
     start: tuple[str, ...] = ()
@@ -72,7 +72,7 @@ class Head(ABC):
 
 
 class Direct(Head):
-    """The logarithm itself."""
+    """The prediction is the logarithm."""
 
     neutral = False
 
@@ -120,20 +120,21 @@ class Mixture(Head):
 class Pyramid(Head):
     """Kernels of ``size`` x ``size`` pixels at ``scales`` resolutions of one image, each half as fine as the last.
 
-    If there are several images, this image is their mean, with a weight for each in each pixel (softmax). With w the
-    trust in each pixel of the image D, in (0, 1), and D_s, w_s both averaged over 2^s x 2^s pixels:
+    If there are several images, D is their mean, with a weight for each in each pixel (softmax). w in (0, 1) is the
+    trust in each pixel of D; D_s and w_s are both averaged over 2^s x 2^s pixels:
 
         I_s(p) = sum of k_s(p, q) w_s(q) D_s(q) / sum of k_s(p, q) w_s(q)       q in the kernel around p
         o_s    = I_s + a_s up(o_(s+1) - down(I_s)),  the coarsest o_s = I_s     a_s in (0, 1)
 
-    o_0 is the result. A pixel that a rare bright path has hit is trusted by no neighbour, at any resolution [as in
-    Gharbi et al. 2019, "Sample-based Monte Carlo denoising using a kernel-splatting network"]. Trust is divided by
-    1 + D at the start, so that such pixels do not dominate the training. The prediction of k_s and a_s is averaged over
-    the pixels of the resolution.
+    o_0 is the result. A low trust removes a pixel that a rare bright path has hit from all neighbours, at every
+    resolution [as in Gharbi et al. 2019, "Sample-based Monte Carlo denoising using a kernel-splatting network"]. Trust
+    is divided by 1 + D, so that such pixels do not dominate the start of training. The predictions of k_s and a_s are
+    averaged over the pixels of the resolution.
 
     ``demodulate``  the kernels average the image divided by the reflectance, and the result is multiplied by it again,
-                    so texture is not averaged. A pixel is then weighted by its reflectance, as in a fit of the image
-                    to the reflectance: otherwise a lamp, whose albedo is 0, would spread ten times its light
+                    so texture is not averaged. A pixel is then weighted by its reflectance, as in a least-squares fit
+                    of the image by the reflectance. Otherwise a lamp, whose albedo is 0, would spread ten times its
+                    light
     """
 
     normalise = True
@@ -233,14 +234,14 @@ class Pyramid(Head):
 
 
 def averaged(kernels: Tensor, image: Tensor, size: int) -> Tensor:
-    """The sum, in each pixel, of the ``size`` x ``size`` around it by ``kernels`` (N, size², H, W), row by row.
+    """Sums of ``size`` x ``size`` pixels, weighted by ``kernels`` (N, size², H, W), whose taps are in row-major order.
 
-    The image (N, C, H + size - 1, W + size - 1) has size // 2 pixels more on every side.
+    The image (N, C, H + size - 1, W + size - 1) has size // 2 more pixels on every side.
     """
     height, width = kernels.shape[-2:]
     total = torch.zeros_like(image[..., :height, :width])
-    # One tap after the other: all of them at once would be size² images. Unbound, since the gradient of each slice
-    # would be a tensor of all.
+    # One tap after the other: all at once would take the memory of size² images. ``unbind``, because the gradient of
+    # each slice would be a tensor of the size of all kernels.
     for tap, kernel in enumerate(kernels.unbind(1)):
         y, x = divmod(tap, size)
         total = total + kernel[:, None] * image[..., y : y + height, x : x + width]
@@ -271,7 +272,7 @@ def _softmax(op: Any, logits: Any) -> tuple[Any, Any]:
 
 def _shifted(op: Any, image: Any, size: int) -> list[Any]:
     """Nodes of the image (N, C, H + size - 1, W + size - 1) as each tap of a kernel sees it, (N, C, H, W), by rows."""
-    # Ends count from the end, as the size is not known here; the last pixel's is beyond any.
+    # The size of the image is unknown here, so slices end relative to its end; the last one ends beyond any size.
     ends = [n - size + 1 if n < size - 1 else 2**62 for n in range(size)]
     return [op.Slice(image, [y, x], [ends[y], ends[x]], [2, 3]) for y in range(size) for x in range(size)]
 

@@ -1,4 +1,4 @@
-"""Which network a file holds: known by the file's contents, not by what the file calls itself."""
+"""Identifies the network in a file by the file's contents, not by its name."""
 
 import hashlib
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ class Identity:
 
     ``file``     its name, without the folder
     ``sha256``   of its contents, 64 hexadecimal digits
-    ``shipped``  the method whose network it is, bit for bit as it comes with this package; "" for any other file
+    ``shipped``  the method whose network this package ships with the same bytes; "" for any other file
     """
 
     file: str
@@ -28,12 +28,12 @@ class Identity:
 
     @property
     def method(self) -> str:
-        """The name for what the network makes: a method's for ours, and never one for a network of the user's own."""
+        """The name of the result's method: a method of ngpt for shipped networks, "own network FILE" for all others."""
         return self.shipped or f"own network {self.file}"
 
 
 def identify(path: str | Path) -> Identity:
-    """Raises NgptError where the file cannot be read."""
+    """The identity of a file of weights. Raises NgptError if the file cannot be read."""
     try:
         with regular_file(Path(path)):
             digest = _digest(str(path), Path(path).stat().st_mtime_ns)

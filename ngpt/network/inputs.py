@@ -1,17 +1,16 @@
-"""What a network may read, gathered from a repaired stack: the same arrays for PyTorch and for ONNX Runtime.
+"""The inputs of networks, gathered from a repaired stack: the same arrays for PyTorch and for ONNX Runtime.
 
     primal, dx, dy, albedo, normal, depth      layers of the stack
     diffuse, specular                          the same: light by the lobe of its first scattering event
     primal_var, dx_var, dy_var                 variances of its layers, NaN where not known (ONNX graphs read these)
-    primal_se, dx_se, dy_se                    standard errors, their roots, 0 where not known (PyTorch reads these)
+    primal_se, dx_se, dy_se                    standard errors: roots of the variances, 0 where not known (for PyTorch)
     diffuse_se, specular_se                    the same
     base                                       a classical reconstruction of ``ngpt.classical.bases``
     denoised, denoised_base                    OIDN's images of the primal and of the base
 
-Radiance is without emission seen directly, but for networks that see it, which read images as other renderers write
-them. Features that a network may do without are zeros where the stack lacks them. OIDN's image of the control variates
-has less noise to remove, so that it errs elsewhere than its image of the primal [after Back et al. 2020, "Deep Combiner
-for Independent and Correlated Pixel Estimates", with a denoiser's image of the correlated estimate for a kernel].
+Radiance excludes directly visible emission. OIDN removes less noise from the base than from the primal, so its two
+images have different errors, and a network can combine them [after Back et al. 2020, "Deep Combiner for Independent and
+Correlated Pixel Estimates"; a denoiser's image of the correlated estimate takes the place of their kernel].
 """
 
 from collections.abc import Collection
@@ -36,10 +35,10 @@ LAYERS = (
 # Images made by another denoiser: of the primal, and of the base.
 DENOISED = ("denoised", "denoised_base")
 
-# By which features are clean enough to be taken as they are
+# How features are judged to be clean enough for use without prefiltering
 CLEAN, _DARK = clean.CLEAN, clean.DARK
 
-# The inputs that are no layers of a stack, but made of them.
+# The inputs that are made from the layers of a stack.
 MADE = ("base", *DENOISED)
 
 # Estimated where a stack with gradients lacks them.
@@ -49,7 +48,7 @@ ESTIMATED = ("primal_var", "dx_var", "dy_var")
 def needs(names: Collection[str], base: str) -> tuple[str, ...]:
     """The layers a stack must hold so that ``gather`` can give these inputs, in the order of ``LAYERS``.
 
-    Names that no stack has come last, and so does "base" where an input is made of it and there is none.
+    Unknown names come last. So does "base", if an input is made from the base and ``base`` is "".
     """
     wanted = {"primal"} | {_layer(name) for name in names if name not in MADE}
     if set(DENOISED) & set(names):
@@ -66,15 +65,15 @@ def gather(
 ) -> dict:
     """The inputs ``names`` of a network that starts from ``base`` ("" for none): arrays (H, W, C) by name.
 
-    ``reader``    what the message says needs the layers that lack
+    ``reader``    the subject of the message about missing layers
     ``estimate``  whether variances that a stack with gradients lacks are estimated, see ``ngpt.network.estimates``
 
-    Raises NgptError where the stack lacks layers they are made of, and where OIDN is needed and not installed.
+    Raises NgptError if the stack lacks layers that the inputs need, or if OIDN is needed and not installed.
     """
     wanted = needs(names, base)
     by_oidn = data.by_oidn or Oidn(data)
     if estimate and data.dx is not None and set(ESTIMATED) & set(wanted) - data.known_variances().keys():
-        # OIDN's image is the better guide, but is there only for networks that read it anyway.
+        # OIDN's image is the better guide, but it is computed only for networks that read it anyway.
         guide = by_oidn.of_primal if set(DENOISED) & set(names) else CLASSICAL["l1"](data)
         data = with_variances(data, guide)
     held = {"primal": data.image, **data.features, **data.parts, **data.known_variances()}
@@ -91,16 +90,16 @@ def gather(
 
 def base_image(data: Repaired, base: str) -> np.ndarray:
     """The reconstruction a network starts from, (H, W, 3) float32, without direct emission."""
-    # Extreme values may leave the range of float32 inside.
+    # Intermediate results of extreme values may exceed the range of float32.
     with np.errstate(over="ignore", invalid="ignore"):
         return BASES[base](data).astype(np.float32, copy=False)
 
 
 class Oidn:
-    """OIDN's images of one frame, by features that it takes for clean, which are prefiltered, once, unless they are.
+    """OIDN's images of one frame. Its features are prefiltered once, unless they are clean already.
 
-    OIDN sees all light of the primal, as it was trained. What it makes of ``caustic`` alone is taken out of its image
-    for networks, and added again to what they return: so light that OIDN finds in both is as sharp as in its image.
+    OIDN sees all light of the primal, as in its training. Networks get its image minus its image of ``caustic``, which
+    is added to their result again. So caustics in the result are as sharp as in OIDN's image.
 
     The primal is denoised by OIDN's largest network, with which the combination has 8 % less error than with smaller
     ones, the base by its smallest: larger ones change the combination by less than 1 % in rooms (docs/lab/log).
@@ -117,7 +116,7 @@ class Oidn:
 
     @cached_property
     def of_caustic(self) -> np.ndarray:
-        """What is added to a reconstruction of the data's ``image``, (H, W, 3) float32: its ``caustic``."""
+        """The denoised ``caustic``, (H, W, 3) float32, which is added to a reconstruction of the data's ``image``."""
         light = self._data.caustic
         assert light is not None
         alone = replace(self._with_clean_features, image=light, direct=np.zeros_like(light), fine={})
@@ -125,7 +124,7 @@ class Oidn:
 
     def of_base(self, base: np.ndarray) -> np.ndarray:
         """OIDN's image of a reconstruction, (H, W, 3) float32; both without direct emission."""
-        # A base swings below zero beside edges. OIDN takes that for 0; negative light of the primal it keeps.
+        # A base may overshoot below zero beside edges. There it is clamped to 0, or to the primal's least value.
         least = min(float(self._data.image.min()), 0) - self._data.direct
         return oidn(replace(self._with_clean_features, image=np.maximum(base, least), fine={}), "clean", "fast")
 
@@ -159,10 +158,10 @@ def denoised(by_oidn: Oidn, base: np.ndarray | None, names: Collection[str]) -> 
 
 
 def _layer(name: str) -> str:
-    """The layer of a stack that an input is, or is the root of."""
+    """The layer of a stack that an input is, or whose root it is."""
     return name.replace("_se", "_var")
 
 
 def _standard_error(variance: np.ndarray) -> np.ndarray:
-    # What is not known is where an emitter is seen: the rest of that pixel hardly matters.
+    # Variances are unknown where the camera sees an emitter; the other light of such a pixel hardly matters.
     return np.sqrt(np.nan_to_num(np.maximum(variance, 0), nan=0, posinf=0))

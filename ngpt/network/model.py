@@ -1,4 +1,4 @@
-"""A neural reconstruction as a whole: the network, and what is around it."""
+"""A complete neural reconstruction: the network, and the steps before and after it."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,8 +11,8 @@ from ngpt.network import features, padding
 from ngpt.network.config import ModelConfig
 from ngpt.network.transfer import signed_exp, signed_log
 
-# For ``quiet``: the side of the window, in pixels, over which noise is averaged, since the variance of one pixel is too
-# noisy; what is added to radiance before noise is divided by it; a large number whose square does not overflow.
+# For ``quiet``: the side, in pixels, of the window over which noise is averaged, since the variance of one pixel is too
+# noisy; a number added to radiance before noise is divided by it; a large number whose square does not overflow.
 WINDOW, DARK, HUGE = 15, 0.01, 1e15
 
 
@@ -21,10 +21,10 @@ class Reconstructor(nn.Module):
 
         exposure, depth scale -> padding -> channels -> network -> head -> (quiet) -> crop -> bounds -> exp -> exposure
 
-    Any H and W. Proportional to the exposure: what goes in ``k`` times as bright comes out ``k`` times as bright. The
-    result is bounded by the range of the primal, and 0. Layers hold finite values; see ``ModelConfig.inputs``.
+    H and W are arbitrary. An input that is ``k`` times as bright gives a result that is ``k`` times as bright. The
+    result is clamped to the range of the primal and 0. Layers hold finite values; see ``ModelConfig.inputs``.
 
-    A network of OIDN's shape has what OIDN does around it instead (``ngpt.network.oidnet``).
+    A network of OIDN's shape has OIDN's own steps around it instead (``ngpt.network.oidnet``).
     """
 
     def __init__(self, config: ModelConfig):
@@ -34,14 +34,14 @@ class Reconstructor(nn.Module):
 
     @property
     def alignment(self) -> int:
-        """What both sides of the padded image are divisible by."""
+        """Both sides of the padded image are divisible by this number of pixels."""
         return self.network.alignment
 
     @property
     def radius(self) -> int:
-        """How far, in pixels, an input's influence on the image reaches, beside exposure, depth scale and bounds."""
+        """How far, in pixels, a pixel of an input influences the image, apart from exposure, depth scale and bounds."""
         head = self.config.head
-        # Plain kernels only move pixels; pyramids and sweeps also move the network's predictions.
+        # Kernels at one scale average only input pixels; pyramids and sweeps also average the network's predictions.
         moves = self.config.scales > 1 or self.config.sweeps
         own = self.network.radius + head.reach if moves else max(self.network.radius, head.reach)
         return max(own, WINDOW // 2 if self.config.quiet else 0)
@@ -61,7 +61,7 @@ class Reconstructor(nn.Module):
         """The signed log of the image, unbounded, from layers normalised, completed and padded; float32."""
         if self.config.network == "oidn":
             return signed_log(self.network.image(*(scaled[name] for name in self.config.inputs)))
-        # Channels last is the layout convolutions are fastest in, by half on CPUs.
+        # Convolutions are fastest with channels last, by half on CPUs.
         x = features.encode(scaled, self.config.inputs).contiguous(memory_format=torch.channels_last)
         prediction = self.network(x).float()
         head = self.config.head

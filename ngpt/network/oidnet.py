@@ -1,11 +1,11 @@
-"""A U-Net of the shape that Open Image Denoise runs, and all that OIDN does around one.
+"""A U-Net of the shape that Open Image Denoise runs, and OIDN's steps before and after it.
 
-Trained here, its weights run in OIDN: on each device that OIDN knows, in its tiles, by its own tools
-(``ngpt.network.tza``). In PyTorch it gives OIDN's pixels, so that training sees what will run:
+Weights that are trained here run in OIDN: on each device that OIDN supports, in its tiles, by its own tools
+(``ngpt.network.tza``). In PyTorch it gives the same pixels as OIDN, so training optimises the later result:
 
     exposure of the colour -> perceptual curve -> zeros up to multiples of 16 -> network -> inverse -> exposure
 
-What goes in is a colour, albedo in [0, 1] and normal in [-1, 1], three channels each. Negative colours count as 0.
+The inputs are a colour, albedo in [0, 1] and normal in [-1, 1], three channels each. Negative colours count as 0.
 
 [Intel Open Image Denoise 2.4.1: training/model.py, core/color.h, core/autoexposure.h, core/unet_filter.cpp]
 """
@@ -26,7 +26,7 @@ FEATURES = ("albedo", "normal")
 # the least do not count.
 KEY, BIN, LEAST = 0.18, 16, 1e-8
 LUMINANCE = (0.212671, 0.715160, 0.072169)
-# The curve in three pieces, between radiance y and its code x; the largest y of a half has the code 1.
+# The curve between radiance y and its code x, in three pieces; the largest half-precision y has the code 1.
 A, B, C, D = 1.41283765e03, 1.64593172, 4.31384981e-01, -2.94139609e-03
 E, F, G = 1.92653254e-01, 6.26026094e-03, 9.98620152e-01
 Y0, Y1, X0, X1 = 1.57945760e-06, 3.22087631e-02, 2.23151711e-03, 3.70974749e-01
@@ -41,7 +41,7 @@ def perceptual(y: Tensor) -> Tensor:
 
 
 def radiance(x: Tensor) -> Tensor:
-    """The inverse of ``perceptual``, of codes >= 0."""
+    """The inverse of ``perceptual`` for codes >= 0."""
     x = x * _code_of_largest()
     power = ((x.clamp(min=X0) - D) / B) ** (1 / C)
     return torch.where(x <= X0, x / A, torch.where(x <= X1, power, torch.exp((x - G) / E) - F))
@@ -52,7 +52,7 @@ def _code_of_largest() -> float:
 
 
 def exposure(colour: Tensor) -> Tensor:
-    """What radiance (N, 3, H, W) is multiplied by, (N, 1, 1, 1); 1 for black images."""
+    """The factor (N, 1, 1, 1) on radiance (N, 3, H, W); 1 for black images."""
     weights = torch.tensor(LUMINANCE, dtype=torch.float64, device=colour.device).reshape(3, 1, 1)
     means = (colour.clamp(min=0) * weights).sum(1)
     for axis in (1, 2):
@@ -123,12 +123,12 @@ class OidnUNet(nn.Module):
         x = relu(self.dec_conv3b(relu(self.dec_conv3a(_doubled_beside(x, quarter)))))
         x = relu(self.dec_conv2b(relu(self.dec_conv2a(_doubled_beside(x, half)))))
         x = relu(self.dec_conv1b(relu(self.dec_conv1a(_doubled_beside(x, given)))))
-        # In 16 bits codes would be off by percents of the radiance.
+        # Rounding codes to 16 bits would change radiance by percents.
         with torch.autocast(x.device.type, enabled=False):
             return self.dec_conv0(x.float())
 
     def image(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
-        """The denoised colour, (N, 3, H, W) of any size, as OIDN makes it, but not brighter than the colour is."""
+        """The denoised colour, (N, 3, H, W) of any size, as OIDN makes it, clamped to the brightest input colour."""
         height, width = colour.shape[-2:]
         scale = exposure(colour)
         given = [perceptual(colour.clamp(min=0) * scale), albedo.clamp(0, 1), normal.clamp(-1, 1) / 2 + 0.5]
@@ -136,7 +136,7 @@ class OidnUNet(nn.Module):
         codes = self(x.contiguous(memory_format=torch.channels_last))[..., :height, :width]
         light = radiance(codes.clamp(min=0))
         if self.training:
-            # Black has no slope, and a network that has once made all of it black would never learn again.
+            # Clamped codes have no gradient: a network that once makes all pixels black would never learn again.
             light = light - relu(-codes)
         largest = colour.amax((1, 2, 3), keepdim=True).clamp(min=0)
         return torch.minimum(light / scale, largest)
@@ -151,5 +151,5 @@ def _convolution(inputs: int, outputs: int) -> nn.Conv2d:
 
 
 def _doubled_beside(x: Tensor, other: Tensor) -> Tensor:
-    """Both, ``x`` at twice its size."""
+    """``x`` at twice its size and ``other``, concatenated by channels."""
     return torch.cat([interpolate(x, scale_factor=2.0, mode="nearest"), other], 1)

@@ -1,4 +1,4 @@
-"""Padding by reflection to sizes a U-Net takes, for images and, with the right signs, for their gradients."""
+"""Padding by reflection to sizes that a U-Net accepts, for images and, with the right signs, for their gradients."""
 
 from collections.abc import Mapping
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad as replicated
 
-# Pixels added on every side at least, so that borders look like the inside of an image [NGPT's code].
+# The least number of pixels added on every side, so that borders look like the inside of an image [NGPT's code].
 MARGIN = 8
 
 Pads = tuple[int, int, int, int]
@@ -41,14 +41,14 @@ def pad(layers: Mapping[str, Tensor], pads: Pads) -> dict[str, Tensor]:
 
 
 def crop(image: Tensor, pads: Pads) -> Tensor:
-    """What ``pad`` was given, back from (..., H + top + bottom, W + left + right)."""
+    """The image (..., H, W) without its padding; ``image`` is (..., H + top + bottom, W + left + right)."""
     top, bottom, left, right = pads
     return image[..., top : image.shape[-2] - bottom, left : image.shape[-1] - right]
 
 
 def extended(image: Tensor, radius: int) -> Tensor:
-    """(N, C, H, W) padded already, with ``radius`` more pixels on every side. What they hold is for pixels that
-    ``crop`` takes away."""
+    """A padded image (N, C, H, W) with ``radius`` more pixels on every side. They influence only pixels that ``crop``
+    removes."""
     return replicated(image, 4 * (radius,), "replicate") if radius else image
 
 

@@ -1,5 +1,5 @@
 """A head that draws the image of another head toward the gradients, by a screened Poisson equation with predicted
-weights. In each pixel they say how far to trust the image and the differences.
+weights. In each pixel the weights say how far to trust the image and the differences.
 
 With D the image of the other head, w_d, w_x and w_y the weights, the result approaches the I that minimises
 
@@ -9,12 +9,13 @@ With D the image of the other head, w_d, w_x and w_y the weights, the result app
 Rousselle et al. 2016 and Manzi et al. 2016 compute them from variances].
 
 The unknown is the change u = I - D. The given differences are the residuals of dx and dy to the differences of D:
-r = dx - ΔD. From the coarsest of ``SCALES`` resolutions to the finest, ``sweeps`` steps of a damped Jacobi iteration
-start from the change that the coarser one has made. So a result depends only on nearby pixels, and tiles agree with the
-whole. Coarser changes are means over 2 x 2 pixels. A difference between two of these is the mean, over two rows, of
-r(2x, y) / 2 + r(2x+1, y) + r(2x+2, y) / 2. Each row counts by its inverse variance, for which the weights stand.
+r = dx - ΔD. The ``SCALES`` resolutions are solved from the coarsest to the finest. At each one, ``sweeps`` steps of a
+damped Jacobi iteration start from the change of the coarser one. So a result depends only on nearby pixels, and tiles
+agree with the whole. Coarser changes are means over 2 x 2 pixels. A difference between two of these is the mean, over
+two rows, of r(2x, y) / 2 + r(2x+1, y) + r(2x+2, y) / 2. Each row is weighted by its inverse variance; the weights serve
+as inverse variances.
 
-The computation is written once, for PyTorch and for ONNX graphs: ``math`` has what is not +, -, * or /.
+The computation is written once, for PyTorch and for ONNX graphs: ``math`` has all operations other than +, -, * and /.
 """
 
 from dataclasses import dataclass, field
@@ -28,18 +29,18 @@ from torch.nn.functional import avg_pool2d, interpolate, pad
 from ngpt.network.heads import Direct, Head
 from ngpt.network.transfer import signed_exp, signed_log
 
-# How many resolutions there are: the coarsest pixels are 8 wide.
+# The number of resolutions: the coarsest pixels are 8 wide.
 SCALES = 4
-# Variances over the squared brightness before the network says more: of the image, and what is added to that measured
-# of differences.
+# Variances over the squared brightness, which the network's weights correct: of the image, and a number that is added to
+# the measured variance of differences.
 IMAGE_VARIANCE, LEAST_VARIANCE = 2e-3, 1e-5
-# Weights are at most this many powers of e larger or smaller than these make them. How far a step goes.
+# The network changes the logarithm of a weight by at most RANGE. DAMPING is the length of a step.
 RANGE, DAMPING = 10.0, 0.8
-# Far less than any weight: keeps fractions finite where there is none.
+# Far less than any weight: keeps fractions finite where all weights are 0.
 NONE = 1e-12
 
 GRADIENTS = ("dx", "dy", "dx_noise", "dy_noise")
-# Axes of (N, C, H, W); as the end of a slice, all that there is.
+# Axes of (N, C, H, W); the end of a slice that has no end.
 _X, _Y, _END = 3, 2, 2**63 - 1
 
 
@@ -68,7 +69,7 @@ class Poisson(Head):
 
     @property
     def reach(self) -> int:
-        # A step reads the next pixel; means and bilinear interpolation read the same coarser pixel, and one beside it.
+        # A step reads the next pixel; means and bilinear interpolation read the coarser pixel and its neighbour.
         return self.inner.reach + sum((self.sweeps + 2) << scale for scale in range(SCALES))
 
     @property
@@ -93,8 +94,8 @@ class Poisson(Head):
 def solved(math: Any, image: Any, logits: Any, gradients: list[Any], sweeps: int) -> Any:
     """``image`` (N, 3, H, W) drawn toward the gradients; sides are divisible by 2^(SCALES - 1).
 
-    ``logits``   (N, 3 SCALES, H, W): for each resolution, finest first, what the logarithms of w_d, w_x and w_y are
-                 beside those by variances; averaged over the pixels of the resolution
+    ``logits``   (N, 3 SCALES, H, W): for each resolution, finest first, corrections of the logarithms of w_d, w_x and
+                 w_y, relative to the weights by variances; averaged over the pixels of the resolution
     ``gradients``  the layers ``GRADIENTS``: dx and dy (N, 3, H, W), and their standard errors over the brightness
                  (N, 1, H, W), 0 where not known
     """
@@ -120,7 +121,7 @@ def solved(math: Any, image: Any, logits: Any, gradients: list[Any], sweeps: int
 
 
 def _precision(math: Any, noise: Any) -> Any:
-    """Inverse variances of differences. An error of 0 is one that is not known: they count like the image then."""
+    """Inverse variances of differences. A standard error of 0 means unknown; it gives the weight of the image."""
     return math.where_positive(noise, math.inverse(noise * noise + LEAST_VARIANCE), 1 / IMAGE_VARIANCE)
 
 
@@ -139,14 +140,17 @@ def _coarser(math: Any, difference: Any, weight: Any, axis: int) -> tuple[Any, A
 
 
 def _swept(math: Any, change: Any, level: tuple[list[Any], Any, Any], sweeps: int) -> Any:
-    """``change`` (None is none) after the steps at one resolution: weights, and what gradients ask for beyond it."""
+    """``change`` after the steps at one resolution; None starts from zero.
+
+    ``level``  the three weights, and the residuals of dx and dy
+    """
     (of_image, right, below), x_rest, y_rest = level
     left, above = math.before(right, _X), math.before(below, _Y)
     share = math.inverse(of_image + left + right + above + below) * DAMPING
     left, right, above, below = (share * weight for weight in (left, right, above, below))
     given = left * math.before(x_rest, _X) - right * x_rest + above * math.before(y_rest, _Y) - below * y_rest
     if change is None:
-        # The first step from nothing.
+        # The first step from zero.
         change, sweeps = given, sweeps - 1
     for _ in range(sweeps):
         beside = left * math.before(change, _X) + right * math.after(change, _X)
@@ -156,7 +160,7 @@ def _swept(math: Any, change: Any, level: tuple[list[Any], Any, Any], sweeps: in
 
 
 class _Torch:
-    """``math`` on tensors. ``before`` and ``after``: what the pixel there holds; 0 where there is none."""
+    """``math`` on tensors. ``before`` and ``after`` give the value of the neighbouring pixel; 0 beyond the border."""
 
     exp, tanh, inverse = torch.exp, torch.tanh, torch.reciprocal
 

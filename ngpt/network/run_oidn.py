@@ -12,7 +12,7 @@ from ngpt.repair import Repaired
 
 
 def reads(path: Path) -> tuple[tuple[str, ...], str]:
-    """The names of what the network of a file reads (``inputs.gather``), colour first, and its base, "" for none."""
+    """The names of the inputs of a file's network (``inputs.gather``), colour first; and its base, "" for none."""
     _, colour = tza.read(path)
     return ("primal" if colour == "primal" else "base", "albedo", "normal"), colour.removeprefix("primal")
 
@@ -25,10 +25,10 @@ def check_device(device: str) -> None:
 
 
 def run(data: Repaired, path: Path, device: str = "auto", memory: int = 3072) -> np.ndarray:
-    """The image (H, W, 3) float32, scene-linear, of the light that the data's ``image`` is of, by that file's weights.
+    """Reconstructs the light of the data's ``image`` by the weights of a file: (H, W, 3) float32, scene-linear.
 
-    ``device``  one of ``DEVICES``; ``memory``  MiB that OIDN's tiles may take. OIDN has no bound of its own: no pixel
-    becomes brighter than the brightest of the colour.
+    ``device``  one of ``DEVICES``; ``memory``  MiB that OIDN's tiles may take. The result is clamped to the brightest
+    value of the colour, since OIDN itself has no bound.
     """
     names, base = reads(path)
     layers = inputs.gather(data, names, base, f"weights {path}", estimate=True)

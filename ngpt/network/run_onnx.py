@@ -1,4 +1,4 @@
-"""Runs our networks by ONNX Runtime: without PyTorch, in tiles within a given memory, on the processor asked for.
+"""Runs our networks by ONNX Runtime: without PyTorch, in tiles within a given memory, on a chosen device.
 
 export/CONTRACT.md tells what the files expect; this is the host that comes with ngpt.
 """
@@ -21,7 +21,8 @@ from ngpt.system.limits import free_address_space, processors
 
 _LOG = logging.getLogger(__name__)
 
-# MiB that the network may use beside the image's own layers: 1280x720 in one tile, where two take a quarter longer.
+# MiB that the network may use in addition to the image's layers. 1280x720 pixels fit in one tile; two would take a
+# quarter longer.
 MEMORY = 3072
 DEVICES = {
     "cpu": "CPUExecutionProvider",
@@ -31,10 +32,10 @@ DEVICES = {
     "directml": "DmlExecutionProvider",
     "coreml": "CoreMLExecutionProvider",
 }
-# As ONNX Runtime calls them.
+# ONNX Runtime's names of types.
 _FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(double)": np.float64}
 
-# Layers that are taken out before a network sees the others.
+# Layers that are removed before a network sees the others.
 _APART = ("direct", "caustic", "caustic_var", "denoised_caustic")
 
 Progress = Callable[[int, int], None]
@@ -49,14 +50,14 @@ class _OutOfMemory(NgptError):
 
 
 class Network:
-    """A network's file, loaded; thread-safe, and right in forked children and when it was pickled.
+    """A loaded network file. It is thread-safe, works in forked children, and can be pickled.
 
     ``path``     model.onnx, as ``ngpt export`` writes it
     ``device``   one of ``DEVICES``; "auto" is "cpu"
-    ``threads``  of the CPU, 0 for as many as it has cores, or ``ngpt.limit_threads`` allows
+    ``threads``  threads of the CPU; 0: one per core, or as many as ``ngpt.limit_threads`` allows
 
-    Raises NgptError for a file that is none of ours, and for a device that cannot be used: there is no other that is
-    taken in silence.
+    Raises NgptError for a file that is not one of ours, and for a device that cannot be used: no other device silently
+    takes its place.
     """
 
     def __init__(self, path: str | Path, device: str = "auto", threads: int = 0):
@@ -72,8 +73,8 @@ class Network:
             raise NgptError(
                 f"{path}: lacks the metadata {error} of an ngpt network; write it anew: ngpt export"
             ) from error
-        # Separate light is taken out, and pixels are repaired, before layers come here. The graph does the same for
-        # other hosts, so here it gets zeros for this light. Graphs of earlier versions have fewer such inputs.
+        # Callers have removed separate light and repaired pixels already. The graph does the same for other hosts, so
+        # it gets zeros for this light here. Graphs of earlier versions have fewer such inputs.
         self.apart = tuple(name for name in names if name in _APART)
         self.inputs = tuple(name for name in names if name not in _APART)
         optional = metadata.get("ngpt.optional", "direct").split(", ")
@@ -83,7 +84,8 @@ class Network:
 
     @property
     def session(self) -> Any:
-        """ONNX Runtime's, shared by all networks of the file. No network holds it: it does not outlive a fork."""
+        """The session of ONNX Runtime, shared by all networks of the file. No network stores it: it must not outlive a
+        fork."""
         return session(self.path, self.device, self.threads)
 
     def _check(self) -> None:
@@ -114,17 +116,17 @@ class Network:
         progress: Progress = lambda done, total: None,
         stop: Callable[[], bool] = lambda: False,
     ) -> np.ndarray:
-        """The image (H, W, 3) float32, scene-linear, with direct emission if ``emission``, and without otherwise.
+        """The image (H, W, 3) float32, scene-linear, without direct emission.
 
-        ``layers``    (H, W, C) float32, all of ``inputs``; radiance with or without direct emission as the image
-        ``base``      (H, W, 3) the reconstruction the network starts from, of networks that have one
-        ``memory``    MiB that tiles may take; smaller ones take longer, and give the same image to 1e-5. Where the
-                      machine has less to give, they shrink by themselves
-        ``batch``     tiles in one run, which fills GPUs
+        ``layers``    (H, W, C) float32, all of ``inputs``; radiance without direct emission
+        ``base``      (H, W, 3), the reconstruction that the network starts from, if it has one
+        ``memory``    MiB that tiles may take; smaller tiles take longer, and give the same image to 1e-5. If the machine
+                      has less memory, the tiles shrink
+        ``batch``     tiles in one run; several use a GPU better
         ``progress``  called with (tiles done, tiles)
-        ``stop``      asked before each run whether to end, which raises ``Cancelled``
+        ``stop``      called before each run; True ends the work and raises ``Cancelled``
 
-        Raises NgptError where ``memory``, or what the machine has of it, does not hold the smallest tile.
+        Raises NgptError if the smallest tile does not fit into ``memory``, or into the memory of the machine.
         """
         memory = min(memory, free_address_space() // 2)
         while True:
@@ -134,7 +136,7 @@ class Network:
                 memory = self._less(layers["primal"].shape[:2], memory, batch, error)
 
     def _less(self, size: tuple[int, int], memory: int, batch: int, error: NgptError) -> int:
-        """Half of what the tiles took that were too large; raises ``error`` where they cannot be smaller."""
+        """Half of the memory, in MiB, of the tiles that were too large; raises ``error`` if they cannot be smaller."""
         _, (rows, columns) = self.plan(*size, memory, batch)
         areas = rows * columns, tiles.smallest(size, self.alignment, self.overlap)
         used, least = (area * self.bytes * batch / 2**20 for area in areas)
@@ -191,7 +193,7 @@ class Network:
         )
 
     def _run(self, session, feed: dict[str, np.ndarray], last: bool) -> np.ndarray:
-        """The output of one run. The ``last`` of an image gives its memory back, which ONNX Runtime would keep."""
+        """The output of one run. The ``last`` run of an image frees the memory that ONNX Runtime would keep."""
         options = runtime().RunOptions()
         if last and self.device == "cpu":
             options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
@@ -230,20 +232,20 @@ def floats(session, path: Path) -> tuple[dict[str, type], str]:
 
 
 def session(path: Path, device: str, threads: int):
-    """The session of a file; made again when the file has changed. Raises NgptError where ONNX Runtime cannot."""
-    # Neither a pipe nor a device, which it would read without an end.
+    """The session of a file; made again when the file has changed. Raises NgptError if ONNX Runtime cannot load it."""
+    # ONNX Runtime would read a pipe or a device forever.
     if not path.is_file():
         raise NgptError(f"{path}: no such file; `ngpt export` writes it")
     return _made(str(path), path.stat().st_mtime_ns, device, threads or processors())
 
 
 def runtime() -> Any:
-    """The module of ONNX Runtime, which sends nothing. Raises NgptError where it is not installed."""
+    """The module of ONNX Runtime with its telemetry off. Raises NgptError if it is not installed."""
     try:
         import onnxruntime
     except ModuleNotFoundError as error:
         raise NgptError(f"ONNX Runtime is not installed: {package_command('onnxruntime')}") from error
-    # Off already (ngpt/__init__.py), unless a program had loaded it before us.
+    # ngpt/__init__.py has switched it off already, unless a program had loaded ONNX Runtime before ngpt.
     onnxruntime.disable_telemetry_events()
     return onnxruntime
 
@@ -259,11 +261,11 @@ def _made(path: str, _modified: int, device: str, threads: int):
         raise NgptError(f"device '{device}': this build of ONNX Runtime has only: {', '.join(have)}; install another")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
-    # Planning the reuse of buffers takes most of the start, six times as long as all else. It saves neither time nor
-    # memory: the arena reuses the same buffers anyway.
+    # Planning the reuse of buffers takes six times as long as the rest of the start. It saves neither time nor memory:
+    # the arena reuses the same buffers anyway.
     options.enable_mem_reuse = False
-    # Spinning threads would keep their cores busy while they wait: a fifth of the processor time of ngpt-fast, which
-    # other work on the machine would lack.
+    # Spinning threads keep their cores busy while they wait: a fifth of the processor time of ngpt-fast, at the cost of
+    # other work on the machine.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     # Errors come as exceptions; the log would repeat them.
     options.log_severity_level = 4

@@ -1,4 +1,4 @@
-"""Neural reconstruction of one stack: the backend of the methods ``ngpt`` and ``ngpt-fast``."""
+"""Runs networks of .safetensors files in PyTorch, in tiles."""
 
 import os
 from functools import lru_cache
@@ -19,20 +19,20 @@ from ngpt.network.transfer import signed_exp
 from ngpt.repair import Repaired
 from ngpt.system.forks import in_children
 
-# Padded pixels of a tile's side. Larger images are cut, so that memory does not grow with them; 640 holds 480x270.
+# The side of a tile in padded pixels. Larger images are cut, so that memory does not grow with them; 640 holds 480x270.
 TILE = 640
 
 
 def config_of(path: str | Path, device: str = "auto") -> ModelConfig:
-    """The configuration of the weights of that file, which are loaded as ``run`` needs them."""
+    """The configuration in a file of weights. The weights are loaded and cached for ``run``."""
     return _loaded(path, device).config
 
 
 def run(data: Repaired, path: str | Path, device: str = "auto", tile: int = TILE) -> np.ndarray:
-    """The image (H, W, 3) float32, scene-linear, of the light that the data's ``image`` is of, by that file's weights.
+    """Reconstructs the light of the data's ``image`` by the weights of a file: (H, W, 3) float32, scene-linear.
 
-    ``device`` is one of PyTorch's, or "auto": a GPU where there is one. Tiles overlap by what the network sees, so that
-    their size does not change the result. Raises NgptError for weights that cannot be read, and layers they need.
+    ``device`` is one of PyTorch's, or "auto": a GPU if there is one. Tiles overlap by the network's receptive field, so
+    their size does not change the result. Raises NgptError for unreadable weights, and for missing layers.
     """
     model = _loaded(path, device)
     read = layers_of(data, model.config, f"weights {path}", estimate=True)
@@ -43,7 +43,7 @@ def run(data: Repaired, path: str | Path, device: str = "auto", tile: int = TILE
 def layers_of(
     data: Repaired, config: ModelConfig, reader: str = "the network's settings", estimate: bool = False
 ) -> dict[str, Tensor]:
-    """What a network of that configuration reads of a repaired stack, as tensors (C, H, W); see ``inputs.gather``."""
+    """The inputs of a network from a repaired stack, as tensors (C, H, W); see ``inputs.gather``."""
     arrays = inputs.gather(data, config.layers, config.base, reader, estimate)
     return {name: torch.from_numpy(np.array(array.transpose(2, 0, 1), order="C")) for name, array in arrays.items()}
 
@@ -76,7 +76,8 @@ def reconstruct(model: Reconstructor, layers: dict[str, Tensor], tile: int = TIL
 
 
 def _spans(length: int, tile: int, alignment: int, radius: int) -> list[tuple[slice, slice]]:
-    """What each tile is for, and what it needs to see for that; all divisible by ``alignment``."""
+    """(pixels that the tile is for, pixels that it shows to the network) of each tile; all divisible by
+    ``alignment``."""
     margin = -(-radius // alignment) * alignment
     step = max(tile - 2 * margin, alignment) // alignment * alignment if length > tile else length
     return tiles.spans(length, step, margin)
@@ -100,5 +101,6 @@ def _model(path: str, _modified: int, device: str) -> Reconstructor:
 
 
 def one_thread() -> None:
-    """PyTorch on one thread, as in the workers of its ``DataLoader``: a child would wait for its parent's for ever."""
+    """Sets PyTorch to one thread, as in the workers of its ``DataLoader``: a forked child would wait forever for the
+    threads of its parent."""
     torch.set_num_threads(1)

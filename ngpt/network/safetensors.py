@@ -28,9 +28,9 @@ _TYPES = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 def write_tensors(
     path: str | Path, tensors: dict[str, Tensor], header: dict[str, Any], overwrite: bool = False
 ) -> None:
-    """Tensors and ``header`` (anything JSON can hold) in one file, complete or not there at all."""
+    """Writes tensors and ``header`` (anything JSON can hold) to one file, completely or not at all."""
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    # Not save_file, which makes a temporary file of its own: killed, it would leave that behind.
+    # Not save_file: it makes a temporary file of its own, which a killed process would leave behind.
     write_bytes(path, save(tensors, metadata={"ngpt": json.dumps({"format": FORMAT} | header)}), overwrite)
 
 
@@ -40,8 +40,8 @@ def shipped() -> dict[str, Path]:
 
 
 def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """What ``write_tensors`` wrote into a file, or a network of ``shipped`` by its name. Raises NgptError for anything
-    else."""
+    """The tensors and the header of a file by ``write_tensors``; ``path`` may be a name of ``shipped``. Raises NgptError
+    for any other file."""
     if not os.path.isfile(path):
         names = shipped()
         if str(path) not in names:
@@ -65,7 +65,7 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def save_weights(path: str | Path, model: Reconstructor, provenance: dict[str, Any], overwrite: bool = False) -> None:
-    """A model that ``load_weights`` reads back; ``provenance`` says how it was trained."""
+    """Writes a model that ``load_weights`` reads back; ``provenance`` says how it was trained."""
     header = {"kind": "weights", "model": model.config.to_dict(), "training": provenance}
     write_tensors(path, model.state_dict(), header, overwrite)
 
@@ -73,20 +73,20 @@ def save_weights(path: str | Path, model: Reconstructor, provenance: dict[str, A
 def load_weights(path: str | Path) -> tuple[Reconstructor, dict[str, Any]]:
     """The model, ready for inference, and the header of its file; ``path`` may be a name of ``shipped``.
 
-    Raises NgptError where the file is no weights of ngpt, tensors are missing, superfluous, of another shape, or hold
-    values that are not finite.
+    Raises NgptError if the file holds no weights of ngpt, or if tensors are missing, superfluous, of another shape, or
+    not finite.
     """
     tensors, header = read_tensors(path)
     if header.get("kind") != "weights":
         raise NgptError(f"{path}: holds a {header.get('kind', 'something')}, not weights; pass weights.safetensors")
     try:
         fields = dict(header["model"])
-        # Earlier versions had two fields more; shipped files have them, and say nothing by them.
+        # Earlier versions had two more fields. Shipped files still have them, with empty values.
         fields = {name: value for name, value in fields.items() if value or name not in ("optional", "emission")}
         config = ModelConfig(**fields)
     except (TypeError, KeyError, ValueError) as error:
         raise NgptError(f"{path}: its configuration cannot be read: {error}") from error
-    # Memory is for what the file holds, not for what its header claims.
+    # A header may claim huge tensors: check the shapes before memory is allocated.
     with torch.device("meta"):
         check_fit(Reconstructor(config).state_dict(), tensors, str(path))
     model = Reconstructor(config)
@@ -121,8 +121,8 @@ def check_fit(own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], path: st
 def in_halves(tensors: Mapping[str, Tensor], path: str) -> dict[str, Tensor]:
     """The tensors in 16 bits; ``path`` is for messages.
 
-    Raises NgptError for numbers beyond 65504, and where the weights of one output are so small that 16 bits change
-    them by more than rounding. Their scale may be a parameter of its own, so that small ones count. Biases do not.
+    Raises NgptError for numbers beyond 65504, and if the weights of one output are so small that 16 bits change them by
+    more than rounding: their scale may be a parameter of its own, so small weights matter. Small biases do not matter.
     """
     halves = {name: tensor.half() for name, tensor in tensors.items()}
     for name, tensor in tensors.items():

@@ -29,9 +29,9 @@ OPTIONS = {
 
 @dataclass(frozen=True)
 class Shipped:
-    """The network of that name in the package, or a file in its place.
+    """The shipped network of that name; the option ``weights`` puts a file in its place.
 
-    ``also_missing``  says what else it cannot do without, and this machine lacks; "" for nothing
+    ``also_missing``  returns why it cannot be used here, apart from ONNX Runtime and the file; "" if it can
     """
 
     name: str
@@ -50,7 +50,7 @@ class Shipped:
         return self.also_missing()
 
     def reads(self, weights: str, device: str, memory: int) -> tuple[str, ...]:
-        """What ``run`` with these options reads: layers of a stack, and what is made of them (``inputs.gather``).
+        """The inputs of ``run`` with these options: layers of a stack, and inputs made from them (``inputs.gather``).
 
         Raises NgptError for weights that cannot be loaded, and for a device that cannot be used.
         """
@@ -66,7 +66,7 @@ class Shipped:
         return (*config.layers, *config.needs)
 
     def run(self, data: Repaired, weights: str, device: str, memory: int) -> np.ndarray:
-        """The image (H, W, 3) float32, scene-linear, of the light that the data's ``image`` is of.
+        """Reconstructs the light of the data's ``image``: (H, W, 3) float32, scene-linear.
 
         ``weights``  a file instead of the shipped one: .onnx for ONNX Runtime, .safetensors for PyTorch, .tza for OIDN
         ``device``   one of the runtime's, or "auto"
@@ -85,7 +85,7 @@ class Shipped:
         return self._torch(path).run(data, path, device)
 
     def _torch(self, path: Path) -> Any:
-        """``ngpt.network.run_torch``: torch takes seconds to come in."""
+        """``ngpt.network.run_torch``, imported only when needed: importing torch takes seconds."""
         if find_spec("torch") is None or find_spec("safetensors") is None:
             raise NgptError(f"weights {path}: to run them needs PyTorch: {install_command('train')}")
         from ngpt.network import run_torch

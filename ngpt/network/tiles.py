@@ -1,7 +1,7 @@
 """Where images are cut for networks: tiles for ONNX Runtime, spans for PyTorch and for the network that blends frames.
 
-What a network says of a pixel depends on pixels as far as its reach. So a piece shows the network a margin around what
-it is for, and begins at multiples of the network's alignment: where an image is cut does not change the result.
+The result of a pixel depends on all pixels within the network's reach. So each piece has a margin around the pixels that
+it is for, and begins at a multiple of the network's alignment. Then the cuts do not change the result.
 """
 
 from itertools import product
@@ -11,7 +11,8 @@ Cuts = tuple[list[tuple[slice, int]], int]
 
 
 def spans(length: int, step: int, margin: int) -> list[tuple[slice, slice]]:
-    """Pieces of a side: what each is for, ``step`` long, and what it shows, ``margin`` more on both ends."""
+    """Pieces of a side: (pixels that the piece is for, ``step`` long; pixels that it shows, with ``margin`` more on both
+    ends)."""
     return [
         (slice(first, min(first + step, length)), slice(max(first - margin, 0), min(first + step + margin, length)))
         for first in range(0, length, step)
@@ -26,10 +27,10 @@ def within(inner: slice, outer: slice) -> slice:
 def plan(
     size: tuple[int, int], alignment: int, overlap: int, most: int
 ) -> tuple[list[tuple[slice, slice, int, int]], tuple[int, int]] | None:
-    """Tiles (rows, columns, top, left) and their common (height, width): the least work with ``most`` pixels a tile.
+    """Tiles (rows, columns, top, left) and their common (height, width), with the least total number of pixels.
 
-    ``size`` is (height, width); ``rows`` and ``columns`` are what a tile is for, ``top`` and ``left`` where it begins.
-    None where the smallest tile has more pixels.
+    ``size`` is (height, width). A tile is for the pixels ``rows`` and ``columns``, and begins at ``top`` and ``left``. It
+    has at most ``most`` pixels. Returns None if the smallest tile has more.
     """
     best: tuple | None = None
     down, across = (_cuts(n, alignment, overlap) for n in size)
@@ -58,8 +59,8 @@ def _cuts(length: int, alignment: int, overlap: int) -> list[Cuts]:
     for count in range(1, max(1, length // alignment) + 1):
         step = -(-length // (count * alignment)) * alignment
         starts = range(0, length, step)
-        # All of one size, which is why the last ones begin earlier, and all at multiples of the alignment. Two pieces
-        # have a neighbour on one side only.
+        # All pieces have one size, so the last ones begin earlier; all begin at multiples of the alignment. The first
+        # and the last piece have a neighbour on only one side.
         size = min(step + min(len(starts) - 1, 2) * overlap + length % alignment, length)
         pieces = [(slice(n, min(n + step, length)), min(max(n - overlap, 0), length - size)) for n in starts]
         if not cuts or size < cuts[-1][1]:

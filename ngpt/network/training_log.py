@@ -1,4 +1,4 @@
-"""The log of a training run, beside its weights: a line of JSON for each entry."""
+"""The log of a training run, beside its weights: one line of JSON for each entry."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ LOG = "log.jsonl"
 
 
 def entries_of(path: Path) -> list[dict[str, float]]:
-    """The lines of a log; the last one may be cut short, as it is while it is written."""
+    """The entries of a log. The last line may be incomplete, as while it is being written; it is then left out."""
     lines = read_text(path).splitlines()
     entries = []
     for number, line in enumerate(lines, 1):

@@ -1,4 +1,4 @@
-"""Transfer functions: between radiance, of any magnitude, and the range that networks and losses are good at.
+"""Transfer functions between radiance of any magnitude and the range that suits networks and losses.
 
 All are elementwise, on tensors of any shape, and odd: f(-x) = -f(x).
 """
@@ -8,16 +8,16 @@ from torch import Tensor
 
 
 def signed_log(x: Tensor) -> Tensor:
-    """sgn(x) ln(1 + |x|): all of the reals, close to x near 0 [Kettunen et al. 2019, section 4.2].
+    """sgn(x) ln(1 + |x|) for all real x; close to x near 0 [Kettunen et al. 2019, section 4.2].
 
-    Grows by 0.69 per stop: 1e12 becomes 27.6.
+    It grows by 0.69 per stop: 1e12 becomes 27.6.
     """
     # Two halves rather than sgn(x), which would hide the slope of 1 at 0 from automatic differentiation.
     return torch.log1p(torch.clamp(x, min=0)) - torch.log1p(torch.relu(-x))
 
 
 def signed_exp(y: Tensor) -> Tensor:
-    """sgn(y) (exp|y| - 1), the inverse of ``signed_log``. In float32, whatever comes in; overflows beyond 88.7."""
+    """sgn(y) (exp|y| - 1), the inverse of ``signed_log``. Computed in float32; overflows for |y| > 88.7."""
     y = y.float()
     return torch.expm1(torch.clamp(y, min=0)) - torch.expm1(torch.relu(-y))
 

@@ -1,13 +1,13 @@
 """Files of weights for Open Image Denoise, .tza: written for its runtime, and their tables read back.
 
     u16 0x41D7, u8 2, u8 0      magic and version
-    u64                         where the table lies
+    u64                         the position of the table
     tensors                     each at a multiple of 64 bytes
     u32                         their number, and for each of them
         u16, bytes              the name
         u8, u32 ...             the shape
         bytes                   the layout: "oihw" for kernels, "x" for biases
-        "f" or "h", u64         32 or 16 bits, and where it lies
+        "f" or "h", u64         32 or 16 bits, and the position of its data
 
 All numbers are little-endian [Intel Open Image Denoise 2.4.1, core/tza.cpp]. OIDN takes only 16 bits.
 It ignores tensors that it has no use for; one of these says which of our images is the colour.
@@ -26,7 +26,7 @@ from ngpt.system.reading import read_bytes
 MAGIC, VERSION, ALIGNMENT = 0x41D7, 2, 64
 # The prefix of the mark's name; the name of the image follows: "primal", or the base.
 MARK = "ngpt.colour."
-# More than any network has, for files that lie.
+# Limits for damaged or forged files; no network has more.
 MOST_TENSORS, MOST_BYTES = 4096, 2**28
 
 

@@ -6,12 +6,12 @@
                                 └─ pool      unpool
     level 2                       └─ units ─ units ┘          (... one block more for each level)
 
-At every level of the dense U-Net there is one list of tensors, which only grows: its input, what each unit adds, the
-tensor that comes up from below, what the later units add. Each unit, the pool, the unpool and the head read the whole
-list [Kettunen et al. 2019, section 4.1 and figure 5]. Weights are normalised, activations are leaky ReLU with slope
-0.01, convolutions pad with zeros.
+Every level of the dense U-Net has one growing list of tensors: its input, the outputs of the units on the way down, the
+tensor from the level below, and the outputs of the units on the way up. Each unit, the pool, the unpool and the head
+read the whole list [Kettunen et al. 2019, section 4.1 and figure 5]. Weights are normalised, activations are leaky ReLU
+with slope 0.01, convolutions pad with zeros.
 
-Any size whose sides are divisible by 2^(levels - 1) goes in; ``ngpt.network.padding`` sees to that.
+Both sides of the input must be divisible by 2^(levels - 1); ``ngpt.network.padding`` ensures that.
 """
 
 import math
@@ -28,7 +28,7 @@ POOLING = ("convolution", "average", "maximum", "bilinear")
 class Convolution(nn.Module):
     """A convolution with normalised weights, w = √2 s v / |v| for each output channel, and a bias.
 
-    √2 keeps the variance of what passes leaky ReLUs from the first step on [Salimans and Kingma 2016, eq. 2; He et al.
+    √2 preserves the variance through leaky ReLUs from the first step on [Salimans and Kingma 2016, eq. 2; He et al.
     2015]. ``kind`` "1x1", "3x3" and "5x5" keep the size; "pool" is 2x2 with stride 2 and halves it, "unpool" is its
     transpose and doubles it.
     """
@@ -42,7 +42,7 @@ class Convolution(nn.Module):
         self.v = nn.Parameter(torch.empty(shape))
         self.s = nn.Parameter(torch.ones(outputs))
         self.bias = nn.Parameter(torch.zeros(outputs))
-        # The function depends on v's direction only, but the speed at which Adam turns it on its length.
+        # The output depends only on the direction of v, but its length sets how fast Adam rotates it.
         std = 1.612 / math.sqrt(inputs * size * size)
         nn.init.trunc_normal_(self.v, std=std, a=-2 * std, b=2 * std)
 
@@ -66,7 +66,7 @@ class Convolution(nn.Module):
 
 
 class Resampling(nn.Module):
-    """A 1x1 convolution, and half or twice the size by a rule that learns nothing [Kettunen et al. 2019, figure 12].
+    """A 1x1 convolution, then half or twice the size by a fixed rule [Kettunen et al. 2019, figure 12].
 
     ``pooling``  "average": means of 2x2, and each pixel repeated; "maximum": the largest of 2x2, and each repeated;
                  "bilinear": bilinear at the centres of pixels, which is the mean of 2x2 on the way down
@@ -85,25 +85,25 @@ class Resampling(nn.Module):
 
 
 def halved(inputs: int, outputs: int, pooling: str) -> nn.Module:
-    """From one level to the next coarser one; ``pooling`` is one of ``POOLING``."""
+    """The module from one level to the next coarser one; ``pooling`` is one of ``POOLING``."""
     if pooling == "convolution":
         return Convolution(inputs, outputs, "pool")
     return Resampling(inputs, outputs, pooling, up=False)
 
 
 def doubled(inputs: int, outputs: int, pooling: str) -> nn.Module:
-    """The way back of ``halved``."""
+    """The module from a level to the next finer one, the counterpart of ``halved``."""
     if pooling == "convolution":
         return Convolution(inputs, outputs, "unpool")
     return Resampling(inputs, outputs, pooling, up=True)
 
 
 class LastConvolution(nn.Module):
-    """The 1x1 convolution to ``outputs`` channels: float32, whatever autocast does, and not activated.
+    """The 1x1 convolution to ``outputs`` channels: in float32 even under autocast, and without activation.
 
-    It predicts logarithms, where 16 bits are off by percents. ``zero`` is for predictions where 0 is sensible, such as
-    corrections: it starts at 0, and its weights are not normalised, since a small prediction should not need a
-    direction first. ``normalise``: its input is divided by the root mean square in each pixel, if ``zero``.
+    It predicts logarithms, where rounding to 16 bits would change radiance by percents. ``zero`` is for predictions
+    where 0 is sensible, such as corrections: the weights start at 0 and are not normalised, since zero weights have no
+    direction. ``normalise``, which needs ``zero``: the input is divided by its root mean square in each pixel.
     """
 
     def __init__(self, inputs: int, outputs: int, zero: bool, normalise: bool = False):
@@ -122,8 +122,8 @@ class LastConvolution(nn.Module):
             x = x.float()
             if not self.normalise or isinstance(self.convolution, Convolution):
                 return self.convolution(x)
-            # A convolution of one channel is the fastest mean over channels that ONNX Runtime has. What comes out of
-            # the last convolution has fewer channels to divide than what goes in.
+            # A convolution of one channel is the fastest mean over channels in ONNX Runtime. The output is divided
+            # instead of the input, because it has fewer channels.
             square = conv2d(x * x, x.new_full((1, x.shape[1], 1, 1), 1 / x.shape[1]))
             bias = self.convolution.bias
             assert bias is not None
@@ -131,7 +131,7 @@ class LastConvolution(nn.Module):
 
 
 class Unit(nn.Module):
-    """What a dense block is made of: 1x1 to 2g channels, 3x3 to the g channels that the unit adds to the list."""
+    """A unit of a dense block: 1x1 to 2g channels, 3x3 to the g channels that the unit adds to the list."""
 
     def __init__(self, inputs: int, growth: int):
         super().__init__()
@@ -145,8 +145,8 @@ class Unit(nn.Module):
 def radius(convolutions: list[int], pooling: str) -> int:
     """How far, in pixels, a pixel's influence reaches, with so many 3x3 convolutions at each level.
 
-    One reaches as far as its level's pixels are wide; a coarsest pixel spreads what any pixel in it holds to all of it,
-    and bilinear interpolation, at each level, to the pixel beside it.
+    Each convolution reaches as far as the width of its level's pixels. A coarsest pixel spreads the values of its pixels
+    over its whole area; bilinear interpolation at each level spreads them to the next pixel too.
     """
     spread = (1 << len(convolutions) - 1) - 1
     return sum(n << level for level, n in enumerate(convolutions)) + spread * (2 if pooling == "bilinear" else 1)
@@ -212,7 +212,7 @@ class DenseUNet(nn.Module):
 class PlainUNet(nn.Module):
     """The ablation partner: two 3x3 convolutions per level and direction, one skip connection per level.
 
-    (N, inputs, H, W) to (N, outputs, H, W), as ``DenseUNet``, with the same building stones.
+    (N, inputs, H, W) to (N, outputs, H, W), as ``DenseUNet``, from the same building blocks.
     """
 
     def __init__(

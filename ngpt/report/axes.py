@@ -8,7 +8,7 @@ from ngpt.system.text import markup
 
 @dataclass(frozen=True)
 class Axes:
-    """Two logarithmic axes with the ranges they show, in a picture of ``width`` x ``height``; ``even``: x is linear."""
+    """Two logarithmic axes with their ranges, in a picture of ``width`` x ``height`` units; ``even``: x is linear."""
 
     x_range: tuple[float, float]
     y_range: tuple[float, float]
@@ -68,8 +68,8 @@ class Axes:
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """1, 2 and 5 times powers of ten between the two. If these are too many, only powers of ten; if fewer than two,
-    evenly spaced numbers."""
+    """1, 2 and 5 times powers of ten from ``low`` to ``high``. If these are too many, only powers of ten; if fewer than
+    two, evenly spaced numbers."""
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     steps = (1, 2, 5) if math.log10(high / low) < 3.5 else (1,)
     found = [value for p in powers for m in steps if low <= (value := m * 10.0**p) <= high]

@@ -1,4 +1,4 @@
-"""What a page shows: pictures of scenes, what was measured of them, and what comes after."""
+"""The content of a page: pictures of scenes, their metrics, and the overview after them."""
 
 import math
 import statistics
@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 REFERENCE = "reference"  # the name of Scene.reference among the pictures
-BASELINE = "primal"  # what tables compare the others to; the first picture where none has that name
+BASELINE = "primal"  # the picture that tables compare the others to; without it, the first picture
 
 
 @dataclass
 class Entry:
-    """One picture of a scene: what a method made of it, or what was in a file."""
+    """One picture of a scene: the result of a method, or the contents of a file."""
 
     name: str  #                  'primal', 'l2', ...: unique in its scene
     image: np.ndarray  #          (H, W, 3) scene-linear, any value, non-finite ones included
@@ -36,12 +36,12 @@ class Scene:
     # show as colour.
     layers: dict[str, np.ndarray] = field(default_factory=dict)
     rising: Collection[str] = ()  # the metrics for which higher is better; every other is an error
-    # Maps whose colours do not show a difference: name -> meaning, five marks of the scale from 0 to 1
+    # Maps whose colours do not show a difference: name -> (meaning, five labels of the scale from 0 to 1)
     meanings: dict[str, tuple[str, list[str]]] = field(default_factory=dict)
 
     @property
     def pictures(self) -> list[tuple[str, np.ndarray]]:
-        """Everything with light in it, in the order of the page: the entries, then the reference."""
+        """All images of radiance in the order of the page: the entries, then the reference."""
         pictures = [(entry.name, np.asarray(entry.image)) for entry in self.entries]
         return pictures if self.reference is None else [*pictures, (REFERENCE, np.asarray(self.reference))]
 
@@ -59,9 +59,9 @@ class Scene:
 
 @dataclass
 class Overview:
-    """What comes after the scenes, all optional."""
+    """The part of the page after the scenes; everything is optional."""
 
-    tables: dict[str, list[list[str]]] = field(default_factory=dict)  # title -> rows of text, the first is the head
+    tables: dict[str, list[list[str]]] = field(default_factory=dict)  # title -> rows of text, the header first
     formulas: dict[str, str] = field(default_factory=dict)  # metric -> its formula in plain text
 
 

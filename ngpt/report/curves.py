@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from ngpt.report.axes import Axes
 
 COLORS = ("#2f7fd6", "#d9772b", "#3a9a5b", "#b0489a", "#7a6a3a", "#777777")
-# Points of a curve; of more, neighbours become their mean.
+# The most points of a curve; if there are more, groups of neighbours are replaced by their mean.
 MOST = 300
 
 Curve = Sequence[tuple[float, float]]
@@ -15,7 +15,7 @@ Curve = Sequence[tuple[float, float]]
 def curves(across: str, lines: Mapping[str, Curve]) -> str:
     """An SVG of named curves of (x, y): x linear, y logarithmic. Points whose y is not above 0 are left out.
 
-    "" where there is nothing to draw.
+    Returns "" if there is nothing to draw.
     """
     drawn = {name: points for name, line in lines.items() if (points := _thinned(line))}
     if not drawn:
@@ -29,7 +29,7 @@ def curves(across: str, lines: Mapping[str, Curve]) -> str:
     for color, line in zip(_colors(len(drawn)), drawn.values(), strict=True):
         path = "L".join(f"{axes.x(x):.1f} {axes.y(y):.1f}" for x, y in line)
         parts.append(f'<path d="M{path}" fill="none" stroke="{color}" stroke-width="2" stroke-linejoin="round"/>')
-        # The only point of a line that has just begun would not be seen.
+        # Without a dot, a line of a single point would be invisible.
         x, y = line[-1]
         parts.append(f'<circle cx="{axes.x(x):.1f}" cy="{axes.y(y):.1f}" r="3" fill="{color}"/>')
     if len(drawn) > 1:
@@ -43,7 +43,7 @@ def _colors(count: int) -> list[str]:
 
 
 def _thinned(line: Curve) -> list[tuple[float, float]]:
-    """At most ``MOST`` points, means of as many neighbours each."""
+    """At most ``MOST`` points, each the mean of a group of neighbours."""
     points = [(x, y) for x, y in line if math.isfinite(y) and y > 0]
     group = math.ceil(len(points) / MOST)
     parts = [points[i : i + group] for i in range(0, len(points), group)] if points else []

@@ -1,4 +1,4 @@
-"""A page of text, tables and plots without a script, in the style of the viewer's: one file, nothing from elsewhere."""
+"""A page of text, tables and plots in the viewer's style: one file, without scripts, that loads nothing else."""
 
 import base64
 import hashlib

@@ -13,17 +13,17 @@ from ngpt.report.content import Entry, Overview, Scene
 from ngpt.report.page import write_report
 
 FORMAT = 2
-# Pixels of all pictures that a page takes in acceptable quality: 8 methods and reference, 6 scenes
+# Pixels of all pictures that a page holds in acceptable quality: 8 methods and the reference, 6 scenes
 ROOM = 54 * 1280 * 720
 
 
 def write_evaluation_report(folder: str | os.PathLike, output: str | os.PathLike, *, overwrite: bool = False) -> Path:
     """Writes the report of ``folder``/results.json to ``output`` and returns its path.
 
-    Tables hold every cell; pictures of the first seed are shown for as many sample counts, from the lowest
-    on, as fit into ROOM, and the page says which those are. A method without a picture is named with its reason.
+    Tables hold every cell. Pictures of the first seed are shown for the lowest sample counts, as long as they fit into
+    ROOM; the page says for which ones. A method without a picture is listed with the reason.
 
-    Raises NgptError if the folder has no results that can be read, or none with a picture.
+    Raises NgptError if the folder has no readable results, or no result has a picture.
     """
     folder = Path(folder)
     results = read_results(folder)
@@ -50,7 +50,7 @@ def write_evaluation_report(folder: str | os.PathLike, output: str | os.PathLike
 
 
 def read_results(folder: Path) -> dict[str, Any]:
-    """The results of an evaluation. Raises NgptError where they cannot be read, or are of another format."""
+    """The results of an evaluation. Raises NgptError if they cannot be read or have another format."""
     path = folder / "results.json"
     try:
         results = json.loads(path.read_text(encoding="utf-8"))
@@ -62,11 +62,12 @@ def read_results(folder: Path) -> dict[str, Any]:
 
 
 def _fitting(results: dict, cells: list[dict], counts: list[int]) -> list[int]:
-    """The sample counts whose pictures fit into ROOM, at least one; high counts are left out first: they look alike."""
+    """The sample counts whose pictures fit into ROOM, at least one. High counts are left out first: their pictures look
+    alike."""
     taken, shown = 0, list[int]()
     for spp in counts:
         drawn = {(cell["scene"], cell["method"]) for cell in cells if cell["spp"] == spp}
-        names = [name for name, _ in drawn] + list({name for name, _ in drawn})  # a reference each
+        names = [name for name, _ in drawn] + list({name for name, _ in drawn})  # one reference per scene
         taken += sum(math.prod(results["scenes"][name]["size"]) for name in names)
         if shown and taken > ROOM:
             break
@@ -110,7 +111,7 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
 
 
 def _row(results: dict, scene: str | None, spp: int, method: str) -> dict:
-    """The row of the summary; without numbers where there is none."""
+    """The row of the summary; an empty row if there is none."""
     for row in results["summary"]:
         if (row["scene"], row["spp"], row["method"]) == (scene, spp, method):
             return row
@@ -142,12 +143,12 @@ def _tables(results: dict) -> dict[str, list[list[str]]]:
 
 
 def several_samplers(results: dict) -> bool:
-    """Whether any stacks are not by the usual sampler for their kind."""
+    """Whether any method's stacks come from another sampler than the usual one for their kind."""
     return any(entry["render"] != entry["stack"] for entry in results["methods"].values())
 
 
 def _costs(results: dict) -> dict[str, list[list[str]]]:
-    """What a sample costs by scene and sampler: milliseconds for the whole image."""
+    """The cost of one sample per pixel, by scene and sampler: milliseconds for the whole image."""
     costs = {name: entry["cost"] for name, entry in results["scenes"].items() if entry.get("cost")}
     renders = list(dict.fromkeys(name for cost in costs.values() for name in cost))
     rows = [["scene", *renders, "auto"]]

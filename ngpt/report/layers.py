@@ -1,4 +1,4 @@
-"""All that one file holds, for the page: light as pictures, which have an exposure, all else in its own colours."""
+"""The contents of one file for the page: radiance as pictures with an exposure, other layers in their own colours."""
 
 import numpy as np
 
@@ -7,15 +7,15 @@ from ngpt.io.primaries import converted, to_rec709
 from ngpt.report.content import Entry
 from ngpt.stack import GradientStack
 
-# Layers of the contract that are light; gradients, variances and features are not.
+# Layers of the contract that hold radiance; gradients, variances and features do not.
 _LIGHT = ("primal", "direct", "caustic", "diffuse", "specular")
 
 
 def of_stack(stack: GradientStack, shown: np.ndarray, name: str) -> tuple[list[Entry], dict[str, np.ndarray]]:
     """Pictures and layers of a file, as a ``Scene`` takes them: (H, W, 3) scene-linear, and (H, W, 1) or (H, W, 3).
 
-    ``shown`` is the picture that a viewer shows, (H, W, 3), and comes first, by the name of the file; in a result the
-    input follows as "primal". Channels outside of the contract that are no colour come one by one.
+    ``shown`` (H, W, 3) is the picture that a viewer shows. It comes first, under the name of the file. In a result, the
+    input follows as "primal". Channels outside of the contract that form no colour are separate layers.
     """
     light = {layer: stack[layer] for layer in _LIGHT if layer in stack}
     light |= {layer: image for layer, image in layers_of_light(stack).items() if layer not in light}
@@ -23,17 +23,17 @@ def of_stack(stack: GradientStack, shown: np.ndarray, name: str) -> tuple[list[E
     light = {layer: converted(image, matrix) for layer, image in light.items()}
     entries = [Entry(name, shown)]
     for layer, image in light.items():
-        # The root is in the file once more, as what its renderer calls it.
+        # The file holds the root layer a second time, under its renderer's name.
         if not np.array_equal(image, shown, equal_nan=True):
             entries.append(Entry(layer if layer != name else f"{layer} (layer)", image))
     taken = {entry.name for entry in entries}
     layers = {layer: _three(stack[layer]) for layer in stack.names if layer not in light}
     for channel, values in channels_alone(stack).items():
-        if channel not in "RGB":  # the root, which is shown
+        if channel not in "RGB":  # the root layer, which is shown already
             layers[channel] = np.asarray(values, np.float32)[..., None]
     return entries, {layer: values for layer, values in layers.items() if layer not in taken}
 
 
 def _three(layer: np.ndarray) -> np.ndarray:
-    """(H, W, 1) or (H, W, 3), of two channels with a third of zeros."""
+    """The layer as (H, W, 1) or (H, W, 3): two channels get a third one of zeros."""
     return np.pad(layer, ((0, 0), (0, 0), (0, 1))) if layer.shape[2] == 2 else layer

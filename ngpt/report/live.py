@@ -1,11 +1,11 @@
-"""The page of a render that goes on: a small web server on the loopback address, which nobody beyond this machine sees.
+"""The page of a running render: a small web server on the loopback address, which only this machine can reach.
 
-    GET  /         the page of the newest images; the report's, with a script that asks for more
-    GET  /status   {"number": of the newest images, "text": how far the render is, "ended": whether it is over}
-    POST /enough   ends the render, as Ctrl-C does; only from the page itself
+    GET  /         the page of the newest images: the report, with a script that asks for newer ones
+    GET  /status   {"number": of the newest images, "text": the progress of the render, "ended": whether it is over}
+    POST /enough   ends the render, as Ctrl-C does; accepted only from the page itself
 
-Nothing else is answered, and nothing that a browser sends is kept. Other sites learn nothing through a browser:
-requests under a host name other than ours are refused, and so is an ``enough`` from another origin.
+The server answers nothing else, and stores nothing that a browser sends. Other sites learn nothing through a browser:
+the server refuses requests under another host name, and ``enough`` from another origin.
 """
 
 import json
@@ -26,9 +26,9 @@ from ngpt.version import __version__
 ADDRESS, PORT = "127.0.0.1", 8642
 # Seconds after which somebody who asked no more has gone; and that those who look on are waited for at the end.
 _GONE, _FAREWELL = 5.0, 2.5
-# Connections at a time, each with a thread of its own: some browsers', with six each.
+# The most connections at a time, each with its own thread: enough for some browsers, which open up to six each.
 MOST = 32
-# Seconds that a request and its answer may take together: a large page may go through a slow tunnel.
+# The most seconds for a request and its answer: a large page may go through a slow tunnel.
 _LONGEST = 60.0
 _FIRST = """<!DOCTYPE html><html lang="en"><meta charset="utf-8"><meta http-equiv="refresh" content="1">
 <meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" content="dark">
@@ -39,15 +39,15 @@ seconds.</p><p><code>{command}</code></p></body></html>"""
 _HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",  # lest a page lay itself over the button
+    "X-Frame-Options": "DENY",  # so that no page can lay itself over the button
     "Cross-Origin-Resource-Policy": "same-origin",
 }
 
 
 class LivePage:
-    """Serves until ``close``; ``enough`` says whether its button was pressed.
+    """Serves until ``close`` is called; ``enough`` is True once the page's button was pressed.
 
-    Listens on ``port``, or where that is in use on any that is free. Raises NgptError where there is none.
+    Listens on ``port``, or on any free port if that one is in use. Raises NgptError if no port is free.
     """
 
     def __init__(self, title: str, command: str, port: int = PORT):
@@ -69,11 +69,11 @@ class LivePage:
 
     @property
     def watched(self) -> bool:
-        """Whether somebody looks on: has asked in the last seconds."""
+        """Whether a browser has sent a request in the last seconds."""
         return time.monotonic() - self._asked < _GONE
 
     def show(self, preview: Preview, caption: str) -> None:
-        """Puts images in place of those before, at the exposure of the first."""
+        """Replaces the images of the page. All of them are shown at the exposure of the first preview."""
         scene = preview.scene("newest", caption)
         if self.exposure is None:
             self.exposure = auto_exposure(scene)
@@ -83,11 +83,11 @@ class LivePage:
         self.text, self.number = text, number
 
     def tell(self, line: str) -> None:
-        """How far the render is, in one line."""
+        """Sets the line that says how far the render is."""
         self.line = line
 
     def close(self, line: str) -> None:
-        """Says the last word to those who look on, and stops serving."""
+        """Shows the final ``line`` to open pages, and stops serving."""
         self.line, self.ended = line, True
         if self.watched:
             self._told_end.wait(_FAREWELL)
@@ -99,7 +99,7 @@ class LivePage:
         return _FIRST.format(title=markup(self.title), line=markup(self.line), command=markup(self.command))
 
     def answer(self, path: str) -> tuple[str, str] | None:
-        """Type and text of what there is at ``path``, None if there is nothing."""
+        """(content type, text) of the page at ``path``; None if there is none."""
         if path == "/":
             self._asked = time.monotonic()
             return "text/html", self.text or self._first()
@@ -123,16 +123,16 @@ def _listening(port: int, page: LivePage) -> ThreadingHTTPServer:
 class _Server(ThreadingHTTPServer):
     """Answers each connection in a thread, ``MOST`` at a time, each for ``_LONGEST`` seconds at most.
 
-    Who connects while all are taken takes the place of the oldest: honest requests last some milliseconds. So neither
-    many connections nor slow ones keep the page from its reader, or take the render's memory and file descriptors.
+    If all are taken, a new connection replaces the oldest one: ordinary requests last some milliseconds. So neither
+    many nor slow connections can block the page, or use up the memory and the file descriptors of the render.
     """
 
     daemon_threads = True
-    allow_reuse_address = os.name != "nt"  # There two could listen on one port.
-    request_queue_size = 128  # who finds no place among those that wait tries again after seconds
+    allow_reuse_address = os.name != "nt"  # On Windows two servers could listen on one port.
+    request_queue_size = 128  # a client that finds the queue full tries again only after seconds
 
     def __init__(self, *args):
-        self._open: dict[socket.socket, float] = {}  # when they began, the oldest first
+        self._open: dict[socket.socket, float] = {}  # connection -> time when it began, oldest first
         self._changed = threading.Condition()
         super().__init__(*args)
 
@@ -156,18 +156,18 @@ class _Server(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def service_actions(self) -> None:
-        """Called again and again while it serves: hangs up where it has lasted too long."""
+        """The server calls this regularly: closes connections that have lasted too long."""
         with self._changed:
             for connection, begun in self._open.items():
                 if time.monotonic() - begun > _LONGEST:
                     _hang_up(connection)
 
     def handle_error(self, request, client_address) -> None:
-        """Says nothing of what went wrong with a request: the terminal belongs to the render."""
+        """Prints nothing about failed requests: the terminal belongs to the render."""
 
 
 def _hang_up(connection: socket.socket) -> None:
-    """Ends what its thread waits for."""
+    """Shuts the connection down, which ends the wait of its thread."""
     with suppress(OSError):
         connection.shutdown(socket.SHUT_RDWR)
 
@@ -180,7 +180,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         if not self._meant():
             return self._send(HTTPStatus.FORBIDDEN)
-        if self.path == "/favicon.ico":  # which browsers ask for, and complain about
+        if self.path == "/favicon.ico":  # browsers request it, and complain if it is missing
             return self._send(HTTPStatus.NO_CONTENT)
         found = self.page.answer(self.path)
         return self._send(HTTPStatus.OK, *found) if found else self._send(HTTPStatus.NOT_FOUND)
@@ -194,7 +194,7 @@ class _Handler(BaseHTTPRequestHandler):
         return self._send(HTTPStatus.NO_CONTENT)
 
     def _meant(self) -> bool:
-        """Whether the browser meant us, and not a name of somebody else that leads here."""
+        """Whether the request names our host, and not a foreign name that resolves to this address."""
         return self.headers.get("Host") in {f"{host}:{self.server.server_port}" for host in (ADDRESS, "localhost")}
 
     def _send(self, status: HTTPStatus, kind: str = "text/plain", text: str = "") -> None:
@@ -208,4 +208,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(data)
 
     def log_message(self, format: str, *args) -> None:
-        """Nothing: the terminal belongs to the render."""
+        """Prints nothing: the terminal belongs to the render."""

@@ -1,4 +1,4 @@
-"""The markup of a page: figures with their names, tables of what was measured, and the overview."""
+"""The markup of a page: figures with their names, tables of metrics, and the overview."""
 
 import base64
 import math
@@ -16,7 +16,7 @@ NOTHING = "&ndash;"
 
 
 def section(number: int, scene: Scene, stops: float) -> str:
-    """All of one scene but the pixels; ``stops`` is the exposure of its small pictures."""
+    """The markup of one scene without its pixels; ``stops`` is the exposure of its thumbnails."""
     first = next(iter(scene.entries[0].metrics), "")
     notes = {
         entry.name: _note(first, median(entry.metrics[first])) if first in entry.metrics else ""
@@ -71,7 +71,8 @@ def _note(metric: str, value: float) -> str:
 
 
 def _table(scene: Scene) -> str:
-    """Pictures down, metrics and seconds across; the best value is bold, and one picture is the base of comparison."""
+    """A row for each picture, a column for each metric and for the seconds. The best value of a metric is bold; small
+    numbers compare each picture with the baseline."""
     metrics = list(dict.fromkeys(metric for entry in scene.entries for metric in entry.metrics))
     best = {metric: scene.best(metric) for metric in metrics}
     baseline = scene.baseline
@@ -103,7 +104,7 @@ def _table(scene: Scene) -> str:
 
 
 def _spread(values: float | Sequence[float]) -> str:
-    """The lowest and the highest of several seeds."""
+    """The lowest and the highest value over several seeds; "" for one value."""
     if isinstance(values, int | float | np.number) or len(values) < 2:
         return ""
     return f'<small class="spread">{_number(min(values))} &hellip; {_number(max(values))}</small>'
@@ -119,10 +120,10 @@ def overview_html(overview: Overview) -> str:
 
 
 def plots_html(plots: Mapping[str, str]) -> str:
-    """SVG documents by their titles, side by side as far as there is room."""
+    """SVG documents with their titles, side by side as far as there is room."""
     parts = []
     for title, svg in plots.items():
-        # As a picture of its own, so that no script or link in it does anything.
+        # As an image, so that scripts and links in the SVG do nothing.
         data = base64.b64encode(svg.encode()).decode()
         image = f'<img alt="{markup(title)}" src="data:image/svg+xml;base64,{data}">'
         parts.append(f'<figure class="plot">{image}<figcaption><b>{markup(title)}</b></figcaption></figure>')
@@ -130,7 +131,7 @@ def plots_html(plots: Mapping[str, str]) -> str:
 
 
 def plain_table(rows: list[list[str]]) -> str:
-    """Rows of text, the first is the head."""
+    """A table of rows of text; the first row is the header."""
     head, *body = [[markup(cell) for cell in row] for row in rows]
     lines = [f'<tr><th scope="row">{row[0]}</th>' + "".join(f"<td>{c}</td>" for c in row[1:]) + "</tr>" for row in body]
     heads = "".join(f'<th scope="col">{cell}</th>' for cell in head)

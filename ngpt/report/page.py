@@ -1,9 +1,9 @@
-"""One HTML file that shows every method on every scene: for judging images, sending to others, keeping.
+"""One HTML file that shows every method on every scene.
 
-The page needs no network and no other file. Pictures travel as scene-linear numbers (:mod:`ngpt.report.pixelcodec`), so
-the reader can change the exposure and see the error of what was measured, not of a screenshot; what their storage costs
-is stated beside them. ``report.html`` holds the frame, the style and the script; this file fills it. Without
-JavaScript the tables and the thumbnails remain.
+The page needs no network and no other file. It stores pictures as scene-linear numbers (:mod:`ngpt.report.pixelcodec`),
+so the reader can change the exposure and see errors of the radiance itself. The page states the error that the storage
+adds. ``report.html`` holds the frame, the style and the script; this file fills it. Without JavaScript the tables and
+the thumbnails remain.
 """
 
 import base64
@@ -26,7 +26,7 @@ from ngpt.system.text import markup, printable
 from ngpt.system.writing import write_text
 
 _SOURCES = ("report.html", "live.js")
-PAGE_LIMIT = 40e6  # bytes: what mail and a browser still take without complaint
+PAGE_LIMIT = 40e6  # bytes that mail and browsers still accept
 
 
 def write_report(
@@ -43,9 +43,9 @@ def write_report(
     """Writes the page to ``path`` and returns it. The same arguments give the same bytes.
 
     ``command`` is the command line that made the pictures, ``footer`` further facts (versions, device, seed, date).
-    Pictures are stored to 0.14 % of their value. If the page would exceed PAGE_LIMIT bytes, they are stored more
-    coarsely, starting with the noisiest; the page states the worst error of each. The scenes of a ``shot`` are its
-    frames: they are played, at one exposure.
+    Pictures are stored with a relative error of at most 0.14 %. If the page would exceed PAGE_LIMIT bytes, they are
+    stored more coarsely, starting with the noisiest; the page states the worst error of each. The scenes of a ``shot``
+    are its frames: the page plays them at one exposure. Raises NgptError for scenes that do not fit together.
     """
     path = Path(path)
     if not scenes:
@@ -61,7 +61,7 @@ def write_report(
 
 
 def auto_exposure(scene: Scene) -> float:
-    """The exposure of a scene's pictures, in stops, computed from its reference, or else from the first picture."""
+    """The exposure of a scene's pictures in stops, from its reference, or from the first picture if it has none."""
     return display.auto_exposure(scene.entries[0].image if scene.reference is None else scene.reference)
 
 
@@ -76,9 +76,10 @@ def page_text(
     shot: bool = False,
     live: int = 0,
 ) -> str:
-    """The page; each scene is shown at the exposure of its own, in stops. For the rest see ``write_report``.
+    """The HTML of the page; ``exposures`` holds one number for each scene, in stops. See ``write_report`` for the rest.
 
-    ``live`` is the number of a page of ``ngpt.report.live``, from 1 on: it has a script more, which asks for the next.
+    ``live`` is the number of a page of ``ngpt.report.live``, from 1 on. Such a page has another script, which asks for
+    the next page. 0 for a report.
     """
     sections = [section(number, scene, exposures[number]) for number, scene in enumerate(scenes)]
     after = overview_html(overview or Overview())
@@ -111,7 +112,7 @@ def page_text(
 
 
 def _printable(value: Any) -> Any:
-    """What JSON holds, with all its texts as they are in the markup, for the script finds one by the other."""
+    """The value with all texts made printable, as in the markup: the script looks names up there."""
     if isinstance(value, dict):
         return {printable(key): _printable(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -133,7 +134,7 @@ def oversize(path: str | os.PathLike) -> str:
 def _filled(live: bool, **parts: str) -> str:
     """The template with its marks replaced, in one pass so that no part is searched for the marks of another."""
     text, more = ((package_files("ngpt.report") / name).read_text(encoding="utf-8") for name in _SOURCES)
-    # The policy names the styles and the scripts that may run: nothing a name smuggles in does.
+    # The policy lists hashes of our styles and scripts, so markup that is smuggled in by a name cannot run.
     for tag in ("style", "script"):
         parts[tag.upper() + "_HASH"] = _source_hash(text.split(f"<{tag}>")[1].split(f"</{tag}>")[0])
     parts["MORE_POLICY"] = f" {_source_hash(more)}; connect-src 'self'" if live else ""
@@ -146,7 +147,7 @@ def _source_hash(body: str) -> str:
 
 
 def _check(path: Path, scene: Scene) -> None:
-    """Raises NgptError for what the page could only show wrongly: pictures of unequal size, two of one name."""
+    """Raises NgptError for a scene that the page cannot show: no picture, pictures of unequal size, or equal names."""
     if not scene.entries:
         raise NgptError(f"{path}: scene '{scene.name}' has no entry; give it at least one method")
     pictures = scene.pictures
@@ -192,7 +193,8 @@ def _facts(scene: Scene, stops: float, steps: list[int]) -> dict:
 
 
 def _pixels(scenes: list[Scene], exposures: list[float], room: float) -> tuple[list[str], list[list[int]]]:
-    """The script elements of all pictures, in about ``room`` bytes, and the steps per stop of each scene's."""
+    """The script elements of all pictures, in about ``room`` bytes, and for each scene the steps per stop of its
+    pictures."""
     exposed = [
         [image.astype(np.float64) * 2.0 ** round(stops) for _, image in scene.pictures]
         for scene, stops in zip(scenes, exposures, strict=True)

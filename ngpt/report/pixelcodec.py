@@ -2,9 +2,9 @@
 
 A value v, exposed so that middle grey is near 0.18, becomes the whole number nearest
 sgn(v) · steps · log2(1 + |v| / TOE). At most half a step is lost: |stored - v| / (|v| + TOE) is up to
-2^(0.5 / steps) - 1, which is 0.0014 at 256 steps per stop, 0.029 at 12, and 0.09 at 4. What follows loses nothing: the
-three numbers of a pixel are decorrelated by lifting (YCoCg-R, Malvar and Sullivan 2003), each row is predicted from its
-neighbours (the median of LOCO-I, or the mean of four where noise prevails), and the residuals are deflated. All
+2^(0.5 / steps) - 1, which is 0.0014 at 256 steps per stop, 0.029 at 12, and 0.09 at 4. The other steps are lossless:
+the three numbers of a pixel are decorrelated by lifting (YCoCg-R, Malvar and Sullivan 2003), each row is predicted from
+its neighbours (the median of LOCO-I, or the mean of four where noise prevails), and the residuals are deflated. All
 arithmetic is modulo 2^16. ``report.html`` holds the decoder.
 """
 
@@ -12,9 +12,9 @@ import zlib
 
 import numpy as np
 
-TOE = 2.0**-6  # exposed; the numbers are even below it and logarithmic above
+TOE = 2.0**-6  # exposed radiance; codes are about linear below it and logarithmic above
 LADDER = (256, 128, 64, 48, 32, 24, 16, 12, 8, 6, 4)  # steps per stop, finest first
-MAX_CODE = 32000  # 125 stops above TOE at 256 steps per stop; larger values are stored as this
+MAX_CODE = 32000  # 125 stops above TOE at 256 steps per stop; larger values are clamped to it
 INFINITE, UNDEFINED = 32001, 32002
 
 
@@ -30,16 +30,20 @@ def codes(image: np.ndarray, steps: int) -> np.ndarray:
 def values(code: np.ndarray, steps: int) -> np.ndarray:
     """The inverse of :func:`codes`, float64."""
     size = np.abs(code.astype(np.float64))
-    with np.errstate(over="ignore"):  # codes that are no numbers, replaced below
+    with np.errstate(over="ignore"):  # codes that stand for no finite number are replaced below
         out = np.sign(code) * TOE * (2.0 ** (np.minimum(size, MAX_CODE) / steps) - 1.0)
     out = np.where(size == INFINITE, np.copysign(np.inf, out), out)
     return np.where(code == UNDEFINED, np.nan, out)
 
 
 def encode(image: np.ndarray, steps: int) -> bytes:
-    """(H, W, 3) exposed floats -> deflated bytes: the predictor of each row of Y, Cg, Co (H each; 0 median, 1 mean),
-    then all residuals in zigzag order (0, -1, 1, -2, ...), two in a byte, the first one high, where 15 says that the
-    number follows; then the low bytes of those numbers, then their high bytes."""
+    """(H, W, 3) exposed floats -> deflated bytes, in this order:
+
+    3 H bytes  the predictor of each row of Y, then of Cg and Co: 0 median, 1 mean
+    nibbles    all residuals in zigzag code (0, -1, 1, -2, ...), two in a byte, the first one high; 15 marks a
+               residual of 15 or more
+    bytes      the low bytes of those larger residuals, then their high bytes
+    """
     red, green, blue = np.moveaxis(codes(image, steps), 2, 0)
     orange = red - blue  # int16 wraps
     middle = blue + (orange >> 1)
@@ -61,7 +65,8 @@ def encode(image: np.ndarray, steps: int) -> bytes:
 
 
 def _guesses(plane: np.ndarray) -> list[np.ndarray]:
-    """The two predictions of each number, int16. Above the first row all is 0; beyond the sides is what is above."""
+    """The two predictions of each number, int16. Above the first row all values are 0; beyond the sides the values of
+    the row above continue."""
     padded = np.pad(plane.astype(np.int32), ((1, 0), (1, 1)), mode="edge")
     padded[0] = 0
     above, corner, other = padded[:-1, 1:-1], padded[:-1, :-2], padded[:-1, 2:]
@@ -76,8 +81,8 @@ def _guesses(plane: np.ndarray) -> list[np.ndarray]:
 def fitting_steps(images: list[np.ndarray], room: float) -> list[int]:
     """Steps per stop for each of the exposed ``images`` such that all of them, encoded, take about ``room`` bytes.
 
-    Whatever takes most room is made coarser first: that is noise, which hides the loss best. Sizes are estimated from
-    an eighth of the rows. Beyond the coarsest steps nothing gives way, and the room is exceeded.
+    The image that takes most room is made coarser first: it is the noisiest, and noise hides the loss best. Sizes are
+    estimated from an eighth of the rows. If all images have the coarsest steps, the result may exceed ``room``.
     """
     places = [0] * len(images)
     sizes = [_estimate(image, LADDER[0]) for image in images]

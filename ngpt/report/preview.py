@@ -1,4 +1,4 @@
-"""What who looks on sees of a render that goes on: the noisy image, a quick reconstruction, and their errors."""
+"""Preview of a running render: the noisy image, a quick reconstruction, and their standard errors."""
 
 from dataclasses import dataclass, field
 
@@ -11,7 +11,8 @@ from ngpt.report.content import Entry, Scene
 from ngpt.stack import GradientStack
 
 _NOISY = "noisy"
-# The quickest first that are not far from the best: milliseconds for 240x160 pixels on two cores are 50 and 75.
+# Quick methods with an error near the best; the first that is available is used. The first two take 50 and 75 ms for
+# 240x160 pixels on two cores.
 _QUICK = ("oidn-fast", "wcv", "l2")
 _LOW, _HIGH = np.log10(ERROR_RANGE)
 _MEANING = "standard error relative to the light"
@@ -24,10 +25,10 @@ class Preview:
 
     images: dict[str, np.ndarray]
     maps: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
-    most: float = 0.0  # samples of the pixel that has most, where they differ; else 0
+    most: float = 0.0  # the largest number of samples of a pixel if the numbers differ; else 0
 
     def scene(self, name: str, caption: str) -> Scene:
-        """As a tab of the report."""
+        """The preview as a tab of the report."""
         entries = [Entry(image, pixels, maps=self.maps.get(image, {})) for image, pixels in self.images.items()]
         share = [f"{self.most * part:.0f}" for part in (0, 0.25, 0.5, 0.75, 1)]
         meanings = {"std. error": (_MEANING, _MARKS), "samples": ("samples of the pixel", share)}
@@ -60,6 +61,6 @@ def preview(stack: GradientStack) -> Preview:
 
 
 def _place(variance: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Where variances (H, W, 3), over the square of the light (H, W), are on the scale of errors, from 0 to 1."""
+    """The place (H, W) on the scale of errors, in [0, 1], of variances (H, W, 3) over squared radiance (H, W)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.clip((np.log10(np.nan_to_num(variance).mean(axis=-1) / unit) - _LOW) / (_HIGH - _LOW), 0, 1)
