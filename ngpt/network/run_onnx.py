@@ -120,8 +120,8 @@ class Network:
 
         ``layers``    (H, W, C) float32, all of ``inputs``; radiance without direct emission
         ``base``      (H, W, 3), the reconstruction that the network starts from, if it has one
-        ``memory``    MiB that tiles may take; smaller tiles take longer, and give the same image to 1e-5. If the machine
-                      has less memory, the tiles shrink
+        ``memory``    MiB that tiles may take; smaller tiles take longer, and give the same image to 1e-5. If the
+                      machine has less memory, the tiles shrink
         ``batch``     tiles in one run; several use a GPU better
         ``progress``  called with (tiles done, tiles)
         ``stop``      called before each run; True ends the work and raises ``Cancelled``

@@ -40,8 +40,10 @@ def shipped() -> dict[str, Path]:
 
 
 def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """The tensors and the header of a file by ``write_tensors``; ``path`` may be a name of ``shipped``. Raises NgptError
-    for any other file."""
+    """The tensors and the header of a file by ``write_tensors``; ``path`` may be a name of ``shipped``.
+
+    Raises NgptError for any other file.
+    """
     if not os.path.isfile(path):
         names = shipped()
         if str(path) not in names:

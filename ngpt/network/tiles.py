@@ -1,7 +1,7 @@
 """Where images are cut for networks: tiles for ONNX Runtime, spans for PyTorch and for the network that blends frames.
 
-The result of a pixel depends on all pixels within the network's reach. So each piece has a margin around the pixels that
-it is for, and begins at a multiple of the network's alignment. Then the cuts do not change the result.
+The result of a pixel depends on all pixels within the network's reach. So each piece has a margin around the pixels
+that it is for, and begins at a multiple of the network's alignment. Then the cuts do not change the result.
 """
 
 from itertools import product
@@ -11,8 +11,8 @@ Cuts = tuple[list[tuple[slice, int]], int]
 
 
 def spans(length: int, step: int, margin: int) -> list[tuple[slice, slice]]:
-    """Pieces of a side: (pixels that the piece is for, ``step`` long; pixels that it shows, with ``margin`` more on both
-    ends)."""
+    """Pieces of a side: the pixels that each is for, ``step`` long, and those that it shows, ``margin`` more on both
+    ends."""
     return [
         (slice(first, min(first + step, length)), slice(max(first - margin, 0), min(first + step + margin, length)))
         for first in range(0, length, step)
@@ -29,8 +29,8 @@ def plan(
 ) -> tuple[list[tuple[slice, slice, int, int]], tuple[int, int]] | None:
     """Tiles (rows, columns, top, left) and their common (height, width), with the least total number of pixels.
 
-    ``size`` is (height, width). A tile is for the pixels ``rows`` and ``columns``, and begins at ``top`` and ``left``. It
-    has at most ``most`` pixels. Returns None if the smallest tile has more.
+    ``size`` is (height, width). A tile is for the pixels ``rows`` and ``columns``, and begins at ``top`` and ``left``.
+    It has at most ``most`` pixels. Returns None if the smallest tile has more.
     """
     best: tuple | None = None
     down, across = (_cuts(n, alignment, overlap) for n in size)

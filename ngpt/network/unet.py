@@ -145,8 +145,8 @@ class Unit(nn.Module):
 def radius(convolutions: list[int], pooling: str) -> int:
     """How far, in pixels, a pixel's influence reaches, with so many 3x3 convolutions at each level.
 
-    Each convolution reaches as far as the width of its level's pixels. A coarsest pixel spreads the values of its pixels
-    over its whole area; bilinear interpolation at each level spreads them to the next pixel too.
+    Each convolution reaches as far as the width of its level's pixels. A coarsest pixel spreads the values of its
+    pixels over its whole area; bilinear interpolation at each level spreads them to the next pixel too.
     """
     spread = (1 << len(convolutions) - 1) - 1
     return sum(n << level for level, n in enumerate(convolutions)) + spread * (2 if pooling == "bilinear" else 1)

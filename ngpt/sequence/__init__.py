@@ -1,1 +1,1 @@
-"""Shots: frame after frame, with what the frames before it know."""
+"""Shots: frames that are reconstructed with the help of neighbouring frames."""

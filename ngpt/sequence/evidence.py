@@ -1,4 +1,4 @@
-"""How much of history is evidence for: the rules of ``ngpt.sequence.history``, whose equations they are."""
+"""How much history counts: the rules whose equations are in ``ngpt.sequence.history``."""
 
 from dataclasses import dataclass
 
@@ -6,27 +6,28 @@ import numpy as np
 
 from ngpt.system.late import ndimage
 
-# Pixels, of the window of the evidence (standard deviation).
+# The standard deviation, in pixels, of the Gaussian window of the evidence.
 WINDOW = 4.0
-# How far b may be from the b of the variances, before there is evidence (standard deviation).
+# The standard deviation of b around the b of the variances without any evidence.
 DOUBT = 0.12
-# Differences of features beyond what is allowed, at which history counts exp(-1) = 0.37. A pixel that two surfaces
-# share in parts u and 1 - u has features with a standard deviation of sqrt(u (1 - u) / spp) times what they differ by.
+# ALBEDO, NORMAL and DEPTH are differences of features, beyond the allowed ones, at which history counts
+# exp(-1) = 0.37. MIXED scales the allowed difference: if two surfaces share a pixel in parts u and 1 - u, its features
+# have a standard deviation of sqrt(u (1 - u) / spp) times the difference of both surfaces.
 MIXED = 1.0
-# Times the change around it, from which a pixel's counts the less.
+# A pixel's history counts less if its change is more than this many times the change around it.
 UNUSUAL = 15.0
 ALBEDO, NORMAL, DEPTH = 0.1, 0.2, 0.03
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of a frame's history, and what the rules make of it; arrays (H, W), but the first two (H, W, 3).
+    """The evidence about a frame's history, and the result of the rules; arrays (H, W), the first two (H, W, 3).
 
     ``noise``   the variance of the primal around each pixel, positive
-    ``rest``    primal - x, within 4 standard deviations of that noise
-    ``best``    b*, of least squared error by this frame's primal; 0 where h is x
-    ``weight``  how much of that counts beside the b of the variances, 0 to 1
-    ``share``   b of both together, from 0 to the b of the variances
+    ``rest``    primal - x, clamped to 4 standard deviations of that noise
+    ``best``    b*, the b of least squared error by this frame's primal; 0 where h is x
+    ``weight``  the weight of b* in its mean with the b of the variances, 0 to 1
+    ``share``   the resulting b, from 0 to the b of the variances
     """
 
     noise: np.ndarray
@@ -45,7 +46,7 @@ def agreement(now: dict[str, np.ndarray], then: dict[str, np.ndarray], found: np
         here, there = now[name], then[name]
         if name == "depth":
             here, there = (np.log(np.maximum(layer, 1e-6)) for layer in (here, there))
-            # A camera that comes nearer changes all depths: alike, if not by the same factor.
+            # A camera that comes nearer changes all depths by similar factors; the median removes them.
             there = there + (np.median((here - there)[found]) if found.any() else 0)
         low, high = ndimage.minimum_filter(here, (3, 3, 1)), ndimage.maximum_filter(here, (3, 3, 1))
         allowed = MIXED * np.sqrt((here - low) * (high - here))
@@ -59,8 +60,8 @@ def weighed(
 ) -> Evidence:
     """The evidence of this frame's primal p on x and h (H, W, 3); ``trust`` (H, W) is the agreement of features.
 
-    ``variance`` is the variance of p, (H, W, 3), NaN where not known, None if it is known nowhere; ``first`` is the b
-    (H, W) of the variances.
+    ``variance`` (H, W, 3) is the variance of p: NaN where it is unknown, None if it is unknown everywhere. ``first``
+    (H, W) is the b of the variances.
     """
     rest, change = p - x, h - x
     if variance is None:
@@ -73,7 +74,7 @@ def weighed(
     kept = _kept(rest, noise, trust)
     squares = _mean((weight * np.square(change)).sum(axis=-1))
     above = _mean((weight * (change * rest + kept * noise)).sum(axis=-1))
-    # Noise of the channels goes together, and so does their part in the variance of `above`.
+    # The noise of the three channels is correlated, so their standard deviations are added.
     spread = _mean(np.square((weight * np.abs(change) * np.sqrt(noise)).sum(axis=-1))) / (4 * np.pi * WINDOW**2)
     with np.errstate(divide="ignore", invalid="ignore"):
         evidence, doubt = above / squares, spread / np.square(squares)
@@ -84,9 +85,9 @@ def weighed(
 
 
 def _usual(change: np.ndarray, trust: np.ndarray) -> np.ndarray:
-    """1 where history differs from now as it does around a pixel, less where by more: edges that were seen otherwise.
+    """1 where the change of a pixel is usual for its surroundings, less where it is much larger, as at edges.
 
-    Around a pixel is the geometric mean, which single ones do not move.
+    The change of the surroundings is a geometric mean, which single pixels hardly influence.
     """
     tiny = 1e-6 * change.mean() + 1e-30
     around = _mean(trust * np.log(change + tiny)) / np.maximum(_mean(trust), 1e-6)
@@ -94,7 +95,7 @@ def _usual(change: np.ndarray, trust: np.ndarray) -> np.ndarray:
 
 
 def _noise(variance: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """The variance of the primal around each pixel, (H, W, 3), positive; of what the method took off where unknown."""
+    """The variance of the primal around each pixel, (H, W, 3), positive; where unknown, from the squares of ``rest``."""
     known = np.isfinite(variance)
     filled = np.where(known, variance, np.square(rest))
     smooth = ndimage.gaussian_filter(filled.astype(np.float64), (2, 2, 0), mode="nearest")
@@ -104,8 +105,8 @@ def _noise(variance: np.ndarray, rest: np.ndarray) -> np.ndarray:
 def _kept(rest: np.ndarray, noise: np.ndarray, trust: np.ndarray) -> float:
     """d: the share of its own noise that a method leaves in a pixel, from 0 (smooth) to 1 (the noisy image itself).
 
-    For a projection, E (p - x)² is σ² (1 - d), and more where x is biased: so d is no less than this. It is the median
-    where history counts: elsewhere, as in what just came into sight, a method may leave more noise or less.
+    For a projection, E (p - x)² = σ² (1 - d), and more where x is biased, so this estimate is a lower bound. It is the
+    median over pixels where history counts: elsewhere, as on newly visible surfaces, a method may leave other noise.
     """
     ratio = _mean((np.square(rest) / noise).mean(axis=-1))
     trusted = ratio[trust > 0.5]

@@ -2,26 +2,27 @@
 
     y = x + b (h - x)        x: this frame's result by any method; h: the last y, seen along the layer ``motion``
 
-How much history counts, b, is made of
+The weight b of history depends on
 
-    features      no history where albedo, normal and depth of the frame before differ from this pixel's: a surface
-                  that comes into sight takes nothing from what hid it
-    variances     with r the variance of h over the variance of x: b = 1 / (1 + r), and y has (1 - b)² + b² r. So the
-                  first n frames of a shot at rest are averaged, up to ``LONGEST`` of them, and fewer of a fast shot
-    evidence      h knows nothing of this frame's noisy primal p, of variance σ². In a window with weights w,
+    features      no history where albedo, normal and depth of the last frame differ from this pixel's: a newly visible
+                  surface takes nothing from the surface that hid it
+    variances     with r the variance of h over the variance of x: b = 1 / (1 + r), and y has the relative variance
+                  (1 - b)² + b² r. So the first n frames of a shot at rest are averaged, up to ``LONGEST`` of them, and
+                  fewer of a fast shot
+    evidence      h is independent of this frame's noisy primal p, of variance σ². In a window with weights w,
 
                       b* = [Σ w (h - x)(p - x) + k] / Σ w (h - x)²,    k = d Σ w σ²
 
                   is the b of least squared error of y against the truth, where d is the share of a pixel's noise that
-                  the method leaves in it. What both h and x get wrong, blur above all, cancels. b* has a variance of
-                  its own, and the mean of both b, weighted by their variances, is taken. Where lighting or reflections
-                  change, b* falls, to 0 on fast ones
+                  the method leaves in it. Errors that h and x share, mainly blur, cancel. b* has a variance of its own.
+                  The b of the variances and b* are averaged with their inverse variances as weights. Where lighting or
+                  reflections change, b* falls; it reaches 0 for fast changes
 
-    change        less history where h - x is many times what it is around: edges that were seen otherwise
+    change        less history where h - x is much larger than around the pixel, as at edges
 
 b* is the minimum of Stein's unbiased risk over the line from x to h [Rousselle et al. 2013, "Robust denoising using
-feature and color information"]. These are rules (``ngpt.sequence.evidence``); a network that sees them and more
-corrects b (``ngpt.sequence.network``). Where direct emission is known, only the rest is blended.
+feature and color information"]. These are the rules (``ngpt.sequence.evidence``). A network, which sees more than they
+do, corrects b (``ngpt.sequence.network``). Where direct emission is known, only the other light is blended.
 """
 
 from dataclasses import dataclass, replace
@@ -40,17 +41,18 @@ from ngpt.windows import Place
 
 # Frames that history may count for: what changes slowly, and is not seen by the evidence, lags by no more.
 LONGEST = 16
-# Image widths a frame, at which it counts for half as many: what is seen from elsewhere looks otherwise.
+# Motion in image widths per frame at which history counts for half as many frames: surfaces look different from another
+# viewpoint.
 FAST = 0.005
-# Mean weights of history below this are none: 0 %.
+# A mean weight of history below this counts as none, since it would be shown as 0 %.
 NOTHING = 0.005
 NO_MOTION = "no layer 'motion'"
 
 
 @dataclass(frozen=True)
 class _History:
-    """What a frame passes on to the next: the result without direct emission, the direct emission, the relative
-    variance, the features, its place, and the frame."""
+    """The data that a frame passes on to the next: the result without direct emission, the direct emission, the
+    relative variance, the features, its place, and the frame's number."""
 
     light: np.ndarray
     direct: np.ndarray
@@ -70,9 +72,9 @@ class Temporal:
     def __init__(self, corrections: Corrections | Literal["shipped"] | None = "shipped") -> None:
         self.corrections = shipped() if corrections == "shipped" else corrections
         self._history: _History | None = None
-        self.blend: Blend | None = None  # what the last frame was made of; None for a restart
+        self.blend: Blend | None = None  # the inputs of the last frame's blend; None for a restart
         self.weight = np.zeros((1, 1), np.float32)  # b of the last frame, (H, W)
-        self.reason = ""  # why history did not count in the last frame; "" where it did
+        self.reason = ""  # why history did not count in the last frame; "" if it did
 
     @property
     def share(self) -> float:
@@ -80,13 +82,13 @@ class Temporal:
         return float(self.weight.mean())
 
     def next(self, stack: GradientStack, image: np.ndarray, previous: np.ndarray | None = None) -> np.ndarray:
-        """The next frame's result, (H, W, 3) float32: ``image``, its result by any method, blended with those before.
+        """The next frame's result, (H, W, 3) float32: ``image``, its result by any method, blended with history.
 
-        It is ``image`` itself for a first frame, and after a cut: where the stack has no layer ``motion``, is a picture
-        of another size, or says that the frame before it was another one (``ngpt:previousFrame``). Frames may be parts
+        It is ``image`` itself for a first frame, and after a cut. There is a cut if the stack has no layer ``motion``,
+        is a picture of another size, or names another frame before it (``ngpt:previousFrame``). Frames may be parts
         of a picture that move and change their size: history is looked up where they lie. ``previous`` (H, W, 3)
-        is the last frame's result where it is not the one that was returned; also the one before a first frame, whose
-        features are not known then.
+        is the last frame's result, if it is another one than this method returned. It may also be given for a first
+        frame; the features of the frame before are then unknown.
         """
         power = magnitude(stack)
         data = repair(scaled(stack, power), gradients=False)
@@ -130,16 +132,16 @@ class Temporal:
             relative = (np.square(1 - b) + np.square(b) * spread).astype(np.float32)
             self.weight = b
             self.reason = _doubt(b, found, trust)
-            # Features have noise as well. They are blended as the light is, so that they still belong to its pixels.
+            # Features have noise as well. They are blended with the same weights, so they still match the light.
             features = features | {name: features[name] + b[..., None] * (then[name] - features[name]) for name in then}
-        # In the units of the stack: the next one may be of another magnitude.
+        # Stored in the units of the stack, since the next stack may have another magnitude.
         light, direct = enlarged(now, power), enlarged(data.direct, power)
         self._history = _History(light, direct, relative, features, stack.place, frame)
-        # History keeps what this leaves out: where nothing was found by chance, there may be light in the next frame.
+        # History keeps light outside of the coverage: pixels that are empty by chance may have light in the next frame.
         return kept_within(enlarged((now + data.direct).astype(np.float32), power), stack)
 
     def assume(self, variance: float) -> None:
-        """Takes the last result for one of so much of a frame's own variance, as of 1 / ``variance`` frames."""
+        """Sets the variance of the last result relative to one frame's: that of a mean of 1 / ``variance`` frames."""
         if self._history is not None:
             self._history = replace(self._history, variance=np.full_like(self._history.variance, variance))
 
@@ -162,7 +164,10 @@ def _cut(stack: GradientStack, before: _History) -> str:
 
 
 def _doubt(weight: np.ndarray, found: np.ndarray, trust: np.ndarray) -> str:
-    """Why history counts for nothing, where ``weight`` says so: where it was found, and where features agree."""
+    """Why history does not count, if the mean of ``weight`` is about 0; else "".
+
+    ``found``  where motion leads into the last frame; ``trust``  how well features agree
+    """
     if weight.mean() >= NOTHING:
         return ""
     if not found.any():

@@ -1,11 +1,11 @@
-"""History by a network: at each scale of the change from this frame's result to history, how much of it counts.
+"""A network that weights history at each scale of the difference between history and this frame's result.
 
     y = x + t Σ_s b_s D_s,        b_s = min(MOST sigmoid(logit(b / t MOST) + C tanh(c_s / C)), f)
 
 D_s are the bands of h - x, fine to coarse, which add up to h - x. b and t are share and trust of the rules, f is the b
 of the variances (``ngpt.sequence.evidence``), and c_s is the output of the network for ``Blend.inputs``. If c_s = 0, y
-is the result of the rules. The network corrects the rules by no more than C: where their evidence is clear, as after a
-change of all light, it stands. Changes of light have coarse scales, and moving reflections fine ones; noise that is
+is the result of the rules. The network corrects the rules by at most C: so clear evidence, as after a change of all
+light, still decides. Changes of light have coarse scales, and moving reflections fine ones; noise that is
 left in x has both. Whatever the network says, y lies between x and h at each scale, and a surface that comes into sight
 takes nothing from what hid it. The network was trained on frames of moving shots, with histories that it made itself
 (``ngpt.training.temporal``).
@@ -31,12 +31,13 @@ from ngpt.system.late import ndimage
 # (H, W, len(INPUTS)) float32 -> corrections (H, W, len(SCALES) + 1) float32.
 Corrections = Callable[[np.ndarray], np.ndarray]
 
-# Standard deviations, in pixels, of the windows that part the bands.
+# Standard deviations, in pixels, of the windows that separate the bands.
 SCALES = (1.5, 5.0)
 BANDS = len(SCALES) + 1
-# The most that history may count, and the least by which the rules' share differs from none and from all of that.
+# The largest weight of history; and the least distance of the rules' share of it from 0 and 1, which keeps its logit
+# finite.
 MOST, LEAST = 0.97, 0.003
-# The most that the network may say, in the logarithm of odds.
+# C: the largest correction by the network, in the logarithm of odds.
 LARGEST = 1.5
 INPUTS = (
     *("change r", "change g", "change b", "rest r", "rest g", "rest b", "light", "noise", "change over noise"),
@@ -44,13 +45,15 @@ INPUTS = (
     *("share", "first", "trust", "best", "weight", "speed", "albedo", "facing"),
 )
 WEIGHTS = FOLDER / "temporal.onnx"
-# Pixels of a strip of the image that the network sees at a time, at about 1 KB each.
+# Pixels of a strip of the image that the network processes at a time; each takes about 1 KB.
 STRIP = 1 << 20
 
 
 @dataclass(frozen=True)
 class Blend:
-    """One frame and its history: x ``now``, h ``history`` and the noisy ``primal`` (H, W, 3), and what is known."""
+    """One frame and its history: x ``now``, h ``history`` and the noisy ``primal`` (H, W, 3); the rules' evidence,
+    agreement of features ``trust`` and b of the variances ``first`` (H, W); ``speed`` (H, W) in image widths per frame;
+    and features."""
 
     now: np.ndarray
     history: np.ndarray
@@ -63,7 +66,7 @@ class Blend:
 
     @cached_property
     def bands(self) -> np.ndarray:
-        """D_s, (BANDS, H, W, 3), finest first: coarse ones are of what is trusted around a pixel."""
+        """D_s, (BANDS, H, W, 3), finest first. Coarse bands average only trusted pixels."""
         lows = [self.history - self.now]
         trusted = self.trust[..., None] * lows[0]
         for scale in SCALES:
@@ -80,7 +83,7 @@ class Blend:
         return np.log(share / (1 - share)).astype(np.float32)
 
     def by(self, corrections: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """y (H, W, 3) and b, its mean over the bands by what they hold (H, W), of corrections (H, W, BANDS)."""
+        """y (H, W, 3) and b (H, W) for corrections (H, W, BANDS); b is the mean over bands, weighted by energy."""
         with np.errstate(over="ignore"):
             shares = MOST / (1 + np.exp(-(self.prior[..., None] + LARGEST * np.tanh(corrections / LARGEST))))
         shares = (self.trust[..., None] * np.minimum(shares, self.first[..., None])).astype(np.float32)
@@ -91,7 +94,7 @@ class Blend:
         return image, b.astype(np.float32)
 
     def inputs(self) -> np.ndarray:
-        """What the network sees, (H, W, len(INPUTS)) float32; the same at any exposure."""
+        """The inputs of the network, (H, W, len(INPUTS)) float32; the same at any exposure."""
         scale = statistics({"primal": self.primal})[0]
         deviation = np.sqrt(self.evidence.noise)
         log_now, log_then = (np.log1p(np.maximum(image / scale, 0)) for image in (self.now, self.history))
@@ -124,7 +127,7 @@ class Blend:
 class Network:
     """The network of a file (``ngpt.export.temporal``), as ``Corrections``.
 
-    Raises NgptError for a file that is no such network, or one of other inputs.
+    Raises NgptError for a file that is no such network, or a network with other inputs.
     """
 
     def __init__(self, path: str | Path):
@@ -140,7 +143,7 @@ class Network:
         self.types, self.output = run_onnx.floats(session, self.path)
 
     def __call__(self, inputs: np.ndarray) -> np.ndarray:
-        """In strips of rows; their height does not change the result."""
+        """The corrections, computed in strips of rows; the height of the strips does not change the result."""
         height, width = inputs.shape[:2]
         padded = np.pad(inputs, [(0, -height % self.alignment), (0, -width % self.alignment), (0, 0)], mode="edge")
         rows = max(STRIP // padded.shape[1] // self.alignment, 1) * self.alignment

@@ -1,4 +1,4 @@
-"""Images of one frame, as seen from another: looked up along motion vectors."""
+"""Warps images of one frame into another frame along motion vectors."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ import numpy as np
 def warped(
     image: np.ndarray, motion: np.ndarray, sharp: bool = False, shift: tuple[int, int] = (0, 0)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """``image`` (h, w, C) of one frame at x + motion for the pixels x of another, and where that is in the image.
+    """``image`` (h, w, C) of one frame at x + motion for the pixels x of another, and where that is inside the image.
 
-    ``motion`` is (H, W, 2), pixels to the right and down; where it is not finite nothing is found. ``shift`` is the
-    place (x, y) in the image at which the first pixel of the other frame lies. Between pixels the value is bilinear, or
-    with ``sharp`` a Catmull-Rom spline clamped to the range of the four pixels around, since bilinear interpolation
+    ``motion`` (H, W, 2) is in pixels to the right and down; where it is not finite, nothing is found. ``shift`` is the
+    position (x, y) of the other frame's first pixel in the image. Between pixels the value is interpolated bilinearly,
+    or, with ``sharp``, by a Catmull-Rom spline clamped to the range of the four nearest pixels: bilinear interpolation
     loses detail each time. Returns (H, W, C) of the image's type, 0 where nothing is found, and (H, W) booleans.
     """
     (x, y), (height, width) = _aims(motion, shift), image.shape[:2]
@@ -39,10 +39,10 @@ def warped(
 def bilinear_taps(
     motion: np.ndarray, size: tuple[int, int], shift: tuple[int, int] = (0, 0)
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The four pixels, (4, N) numbers row by row, and weights of each place x + motion, and where it is among pixels.
+    """The taps of a bilinear lookup at x + motion in an image of ``size`` (h, w); ``shift`` is as in ``warped``.
 
-    Weights and ``shift`` are as in ``warped``, for an image of ``size`` (h, w). N is H * W, the last array (H, W).
-    Beside the outermost pixels nothing is found.
+    Returns the indices of four pixels, in row-major order, (4, N) with N = H * W; their weights (4, N); and booleans
+    (H, W): where the lookup is between pixel centres of the image.
     """
     (x, y), (height, width) = _aims(motion, shift), size
     with np.errstate(invalid="ignore"):
@@ -57,13 +57,13 @@ def bilinear_taps(
 
 
 def _aims(motion: np.ndarray, shift: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """x + motion, x and y (H, W)."""
+    """The coordinates x and y (H, W) of x + motion."""
     y, x = np.mgrid[: motion.shape[0], : motion.shape[1]].astype(np.float64)
     return x + shift[0] + motion[..., 0], y + shift[1] + motion[..., 1]
 
 
 def _catmull_rom(f: np.ndarray) -> list[np.ndarray]:
-    """The weights of the four pixels around a place, a fraction ``f`` from the second to the third."""
+    """The weights of four neighbouring pixels for a position at the fraction ``f`` between the second and the third."""
     return [
         f * (-0.5 + f * (1 - 0.5 * f)),
         1 + f * f * (-2.5 + 1.5 * f),

@@ -1,20 +1,20 @@
 """Control variates over frames: ``wcv`` with a third difference, in time along motion.
 
-In a window of frames each pixel becomes the mean of what its neighbours say it is [``controlvariates``, survey eq. 14
-and 20 - 22], where neighbours are those in its image, what it showed in the frame before, and the pixels that show it
-in the frame after:
+In a window of frames, each pixel becomes the weighted mean of estimates from its neighbours [``controlvariates``,
+survey eq. 14 and 20 - 22]. The neighbours are pixels of its own image, its position in the frame before, and the pixels
+of the frame after that lead to it:
 
-    I_t(p)  <-  what W I_{t-1}(p) + dt(p) says, with W the image before at p + motion
+    W I_{t-1}(p) + dt(p)  estimates  I_t(p), with W the image before at p + motion
 
-W is bilinear on what is to be found, and a Catmull-Rom spline on a first guess G of it, which costs nothing in the
-iteration: W I = B I + (S - B) G. How far both are apart on G says how wrong W may be: ``INTERPOLATION`` ((S - B) G)²,
-the largest of 3x3 pixels, is added to the variance of dt. So other frames count little at edges that move by parts of a
-pixel. A pixel that comes into sight needs no test: dt holds the difference to what hid it.
+W is bilinear (B) on the unknown image, and a Catmull-Rom spline (S) on a first guess G of it, which is computed once:
+W I = B I + (S - B) G. The difference of both on G shows how wrong W may be: ``INTERPOLATION`` ((S - B) G)², the largest
+of 3x3 pixels, is added to the variance of dt. So other frames count little at edges that move by parts of a pixel. A
+newly visible surface needs no test: dt holds the difference to the surface that hid it.
 
 As in ``controlvariates``, weights are relative: a = f var I / (f var I + var dt), with f the factor by which n
 iterations have lowered the variance of a pixel, and smoothed variances (``ngpt.classical.variances``).
 
-In bytes per pixel and frame, beyond the input: 190 in single precision. Time: see docs/use/shots.md.
+Memory beyond the input: 190 bytes per pixel and frame in single precision. Time: see docs/use/shots.md.
 """
 
 from collections.abc import Sequence
@@ -28,11 +28,12 @@ from ngpt.classical.variances import SHARED, relative, smoothed
 from ngpt.sequence.warp import bilinear_taps, warped
 from ngpt.system.late import ndimage, sparse
 
-# This times the squared difference of two interpolations is added to the variance of dt. Among 3, 10 and 30 it has the
-# least error on slow shots of the built-in scenes `diffuse` and `glossy`.
+# The factor on the squared difference of two interpolations that is added to the variance of dt. Among 3, 10 and 30 it
+# has the least error on slow shots of the built-in scenes `diffuse` and `glossy`.
 INTERPOLATION = 10
-# A factor on the variance of dt, which comes from few pairs. Most of them missed rare light, mainly gloss and caustics.
-# Among 1, 4 and 16 it has the least error over slow and fast shots of those scenes and `coffee`, at 2 pairs a pixel.
+# A factor on the variance of dt. The variance comes from few pairs, which often miss rare light, mainly gloss and
+# caustics. Among 1, 4 and 16 it has the least error over slow and fast shots of those scenes and `coffee`, at 2 pairs a
+# pixel.
 DOUBT = 4
 
 
@@ -40,7 +41,7 @@ DOUBT = 4
 class Link:
     """The relation of a frame to the one before: ``motion`` (H, W, 2), ``dt``, ``dt_var`` (H, W, 3); NaN: not known.
 
-    ``shift`` is the place (x, y) in the frame before at which the first pixel of this one lies.
+    ``shift`` is the position (x, y) of this frame's first pixel in the frame before.
     """
 
     motion: np.ndarray
@@ -51,15 +52,15 @@ class Link:
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame of a window, arrays (H, W, 3), finite but for variances.
+    """One frame of a window, arrays (H, W, 3), all finite except the variances.
 
-    ``image``      what dx and dy are the differences of
-    ``apart``      light that is no part of it, and of dt: what is to be added to the result
-    ``dx, dy``     its differences
+    ``image``      the light whose differences dx and dy are
+    ``apart``      light that dx and dy exclude and dt includes; it is added to the image
+    ``dx, dy``     the gradients
     ``variances``  of image, dx and dy; NaN where not known
-    ``trusted``    for dx and dy, (H, W) booleans; None if all of them are
-    ``guess``      image and apart, by any method
-    ``link``       to the frame before in the window, None if there is nothing to be known
+    ``trusted``    where dx and dy are trusted, (H, W) booleans; None if everywhere
+    ``guess``      image + apart, reconstructed by any method
+    ``link``       the relation to the frame before in the window; None if there is none
     """
 
     image: np.ndarray
@@ -73,7 +74,7 @@ class Frame:
 
 
 def wcv_frames(frames: Sequence[Frame], sweeps: int | None = None) -> list[np.ndarray]:
-    """Image and light apart of each frame, (H, W, 3) float32: ``wcv`` where frames have no link."""
+    """The reconstruction of image + apart of each frame, (H, W, 3) float32; frames without links give ``wcv``."""
     total = [frame.image + frame.apart for frame in frames]
     dtype = np.float64 if _wide(total) else np.float32
     total = [image.astype(dtype) for image in total]
@@ -101,7 +102,7 @@ def wcv_frames(frames: Sequence[Frame], sweeps: int | None = None) -> list[np.nd
 
 
 def _wide(images: Sequence[np.ndarray]) -> bool:
-    """Whether values are so far apart that single precision would not do."""
+    """Whether the range of values exceeds single precision."""
     sizes = [np.abs(image) for image in images]
     typical = float(np.median(np.concatenate([size[size > 0] for size in sizes] + [np.zeros(1)])))
     return max(float(size.max()) for size in sizes) > FLOAT32_RANGE * typical
@@ -130,7 +131,8 @@ class _Still:
             self.y[~self.trusted[1][:-1]] = np.inf
 
     def swept(self, u: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
-        """The weighted sum of changes to u from its neighbours in the image, and the sum of weights; u's own is 1."""
+        """The weighted sum of changes to u from its neighbours in the image, and the sum of weights, in which u itself
+        has the weight 1."""
         own = factor * self.primal
         change, weight = np.zeros_like(u), np.ones_like(own)
         for here, there, r, v in (
@@ -146,7 +148,7 @@ class _Still:
 
 
 class _Step:
-    """From a frame to the one before."""
+    """The link from a frame to the one before, prepared for the iteration."""
 
     def __init__(self, link: Link, guess: np.ndarray, guess_before: np.ndarray, level: float, dtype: type):
         self.shape, self.shape_before = guess.shape, guess_before.shape
@@ -163,7 +165,8 @@ class _Step:
         self.offset: np.ndarray = np.where(known[..., None], link.dt + apart, 0).astype(dtype)
         self.variance: np.ndarray = variance[..., None].astype(dtype)
         self.known = known[..., None]
-        # B, and what all pixels that look at one say of it: the mean by their variances.
+        # B as a matrix. Its transpose gives each pixel the mean of the estimates by all pixels that look it up,
+        # weighted by their inverse variances.
         rows = np.broadcast_to(np.arange(known.size), places.shape)
         taps = (weights * known.ravel()).astype(dtype)
         self.look = sparse.csr_matrix((taps.ravel(), (rows.ravel(), places.ravel())), (known.size, height * width))
@@ -176,7 +179,7 @@ class _Step:
         self.variance_before = (seen / self.total).reshape(height, width, 1)
 
     def before(self, image: np.ndarray) -> np.ndarray:
-        """B of an image of the frame before, 0 where it is not known."""
+        """B of an image of the frame before; 0 where it is not known."""
         return (self.look @ image.reshape(-1, 3)).reshape(self.shape)
 
     def add(
@@ -187,7 +190,11 @@ class _Step:
         said: tuple[np.ndarray, np.ndarray],
         said_before: tuple[np.ndarray, np.ndarray],
     ) -> None:
-        """Adds what the two frames say of each other, e too much in this one, to the changes and weights of both."""
+        """Adds the estimates of both frames for each other to the changes and weights of both.
+
+        ``e`` is the excess of this frame over its estimate from the frame before; ``own`` and ``own_before`` are the
+        variances of both.
+        """
         e = np.where(self.known, e, 0)
         a = own / (own + self.variance)
         said[0][...] -= a * e

@@ -1,9 +1,9 @@
 """Reconstruction of a shot from gradients in space and in time: ``wcv`` over windows of frames.
 
-Frames that have ``motion``, ``dt`` and ``dt_var`` hang together with the frame before. A window is ``LENGTH`` of them;
-the next begins ``HOP`` later. A frame's result is the mean over its windows, weighted by how far it is from their ends:
-so results of windows pass over into each other. It knows frames before and after; those beyond its windows play no
-part.
+Frames that have ``motion``, ``dt`` and ``dt_var`` are linked to the frame before. A window holds ``LENGTH`` linked
+frames; the next window begins ``HOP`` frames later. A frame's result is the mean over its windows, weighted by the
+frame's distance from their ends, so there is no jump between windows. The result depends on frames before and after,
+but only within these windows.
 """
 
 import time
@@ -24,7 +24,7 @@ from ngpt.stack import GradientStack
 
 LENGTH = 10
 HOP = 5
-# The layers by which a frame hangs together with the one before.
+# The layers that link a frame to the one before.
 LINK = ("motion", "dt", "dt_var")
 
 
@@ -33,9 +33,9 @@ def reconstruct_shot(
 ) -> Iterator[tuple[int, GradientStack, Result]]:
     """(number, stack, result by ``wcv`` over time) of each of ``stacks`` that is ``wanted``, in their order.
 
-    There is a cut before a stack without ``LINK``, one that is a picture of another size, or whose
-    ``ngpt:previousFrame`` is not the stack before, and where a stack is None. At most ``LENGTH`` stacks are in memory.
-    Raises NgptError for stacks that lack a layer of ``wcv``.
+    There is a cut before a stack that lacks a layer of ``LINK``, has another size, or whose ``ngpt:previousFrame`` is
+    not the stack before; and where a stack is None. At most ``LENGTH`` stacks are in memory. Raises NgptError for
+    stacks that lack a layer of ``wcv``.
     """
     run = _Run(wanted)
     before: GradientStack | None = None
@@ -58,7 +58,7 @@ def _shift(stack: GradientStack, before: GradientStack) -> tuple[int, int] | Non
 
 
 class _Member:
-    """A frame of a run, and the sum of its results so far, in 2^power of the light's units."""
+    """A frame of a run, and the weighted sum of its results so far, in units of 2^power."""
 
     def __init__(self, number: int, stack: GradientStack, shift: tuple[int, int]):
         self.number, self.stack, self.shift, self.power = number, stack, shift, 0
@@ -88,13 +88,13 @@ class _Member:
 
 
 class _Run:
-    """Frames that hang together."""
+    """A run of linked frames."""
 
     def __init__(self, wanted: Callable[[int], bool]):
         self.wanted = wanted
         self.members: list[_Member] = []
-        self.solved = 0  # of members, that were in a window
-        self.power: int | None = None  # the frames' common one, see ngpt.magnitude
+        self.solved = 0  # the number of members that have been in a window
+        self.power: int | None = None  # common to all frames, see ngpt.magnitude
 
     def add(self, member: _Member) -> Iterator[tuple[int, GradientStack, Result]]:
         self.members.append(member)

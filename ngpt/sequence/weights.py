@@ -8,13 +8,13 @@ from ngpt.network import safetensors
 from ngpt.network.unet import PlainUNet
 from ngpt.sequence.network import BANDS, INPUTS
 
-# What the header of such a file says it holds
+# The value of "kind" in the header of such a file
 KIND = "temporal"
 WIDTHS = (16, 24, 32)
 
 
 def load(path: str | Path) -> tuple[PlainUNet, dict[str, Any]]:
-    """The network of a file that a run wrote, and the file's header; raises NgptError for others."""
+    """The network of a file that a training run wrote, and the file's header. Raises NgptError for other files."""
     tensors, header = safetensors.read_tensors(path)
     if header.get("kind") != KIND or header.get("inputs") != list(INPUTS) or header.get("widths") != list(WIDTHS):
         raise NgptError(f"{path}: holds no network that blends frames, or one of another version; train it anew")
@@ -24,5 +24,5 @@ def load(path: str | Path) -> tuple[PlainUNet, dict[str, Any]]:
 
 
 def network() -> PlainUNet:
-    """It says nothing to begin with."""
+    """An untrained network, whose corrections are 0."""
     return PlainUNet(len(INPUTS), WIDTHS, BANDS, zero=True)

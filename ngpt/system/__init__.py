@@ -1,1 +1,1 @@
-"""What every room stands on: console, files, limits, records of JSON and TOML, worker processes."""
+"""Basics that every other package uses: console, files, limits, records of JSON and TOML, worker processes."""

@@ -11,7 +11,7 @@ FOLDER = next((f for f in (_PACKAGE / "configs", _PACKAGE.parent / "configs") if
 
 # The prefixes of the names of the three kinds; configurations of training have neither of the other prefixes.
 DATASET, EVALUATION, TRAINING = "data-", "eval-", ""
-# What a configuration of one's own begins with where none is named
+# The configurations that a user's own one starts from by default
 STARTS = {DATASET: "data-cpu", EVALUATION: "eval-tiny", TRAINING: "fast"}
 
 
@@ -24,9 +24,9 @@ def names(kind: str) -> list[str]:
 
 
 def find_config(name: str, kind: str) -> Path:
-    """The file called ``name``; where there is none, the configuration of that name that comes with ngpt.
+    """The file called ``name``; if there is none, the configuration of that name that comes with ngpt.
 
-    Raises NgptError where there is neither, with the names of that kind.
+    Raises NgptError if there is neither; the message lists the configurations of that kind.
     """
     if os.path.exists(name) and not os.path.isdir(name):
         return Path(name)

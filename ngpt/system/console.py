@@ -1,4 +1,4 @@
-"""What the command line says while it works: a progress bar on a terminal, plain lines elsewhere.
+"""Output of the command line while it works: a progress bar on a terminal, plain lines elsewhere.
 
 Everything goes to standard error; standard output is kept for results (JSON, tables).
 """
@@ -18,24 +18,24 @@ from ngpt.system.interrupts import raised
 from ngpt.system.limits import address_space
 from ngpt.system.text import printable
 
-# Elsewhere than on a terminal, a line at most this often, and the next when work has gone on for one part more of so
-# many that it took: a log should show life, not fill up.
+# Without a terminal, lines of progress are at least this many seconds apart, and at least 1 / LINES of the elapsed
+# time: a log should show life, not fill up.
 SECONDS_BETWEEN_LINES = 5.0
 LINES = 50
 
-# Columns that a bar takes beside its label: with all of its parts, for a rate in addition, and with only numbers and
-# time left. The last number is what the first form has to leave for the label.
+# Columns that a bar takes in addition to its label: with all of its parts; for a rate; and with only numbers and time
+# left. The first form is used if at least LABEL columns are left for the label.
 WIDE, RATE, NARROW, LABEL = 58, 14, 22, 12
 
-# MiB of address space.
+# The least address space that ngpt needs, in MiB.
 FEWEST_MIB = 512
 
 
 def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "interrupted") -> int:
-    """The exit status of a command: what ``run`` returns, or the status for what stopped it, with a one-line message.
+    """Runs a command and returns its exit status: that of ``run``, or after an error, with a one-line message:
 
-    1 for an error, and where nobody reads standard output any more; 2 for ``WrongUse``; 130 after Ctrl-C and 143 after
-    SIGTERM. ``interrupted`` says what an interrupt means for the work.
+    1 for an error, and if standard output has no reader any more; 2 for ``WrongUse``; 130 after Ctrl-C; 143 after
+    SIGTERM. ``interrupted`` is the message after an interrupt.
     """
     _open_standard_streams()
     console = Console(name=name)
@@ -45,14 +45,14 @@ def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "
             try:
                 return run()
             finally:
-                # Not when Python ends, which complains in its own way.
+                # Errors of flushing are handled here: at its end, Python would report them in its own way.
                 sys.stdout.flush()
         except SystemExit:
             raise
         except BaseException as error:
             if isinstance(error, OSError):
                 _close(sys.stdout)
-            # Libraries that are interrupted, while they are imported above all, raise what they like.
+            # A library that is interrupted, mainly while it is imported, may raise any exception.
             if interrupt() or isinstance(error, KeyboardInterrupt):
                 console.error(interrupted)
                 return interrupt.status
@@ -84,30 +84,31 @@ def _check_address_space() -> None:
 
 
 def tell(line: str) -> None:
-    """A line of the result, on standard output."""
+    """Prints a line of the result on standard output."""
     print(printable(line))
 
 
 def print_line(text: str, stream: TextIO) -> None:
-    """A message, at once. That nobody takes it, as when the disk with the log is full, stops no work."""
+    """Prints a message without buffering. Failure to write it, as on a full disk, does not stop the work."""
     try:
         print(printable(text), file=stream, flush=True)
     except RuntimeError:
-        # From a signal's handler, amid a line of ours: no buffer can be entered twice.
+        # A signal handler interrupted another line of ours: the buffer is not reentrant.
         os.write(stream.fileno(), f"{printable(text)}\n".encode(errors="backslashreplace"))
     except OSError:
         _close(stream)
 
 
 def _close(stream: TextIO) -> None:
-    """Sends what is still to come to nowhere, with what could not be written so far."""
+    """Discards what the stream holds and all further output."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, stream.fileno())
     os.close(null)
 
 
 def _open_standard_streams() -> None:
-    """A file opened while one of them is closed would take its place, and get what is printed."""
+    """Opens standard streams that are closed: otherwise the next opened file would take the place of one of them, and
+    get the printed text."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -115,14 +116,15 @@ def _open_standard_streams() -> None:
             os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", closefd=False))
-    # Text from files may have letters that standard output cannot encode: on Windows a pipe has only one language's.
+    # Text from files may have letters that standard output cannot encode: on Windows, pipes use a local code page.
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
 @contextmanager
 def _own_stderr() -> Iterator[None]:
-    """Gives messages a descriptor of their own: while any thread reads an OpenEXR file, number 2 leads nowhere."""
+    """Gives messages a descriptor of their own: while any thread reads an OpenEXR file, descriptor 2 is redirected to
+    nowhere."""
     stream = sys.stderr
     if type(stream) is not io.TextIOWrapper or stream.fileno() != 2:  # a test's, or a notebook's
         yield
@@ -135,9 +137,9 @@ def _own_stderr() -> Iterator[None]:
 
 
 class _Handler(logging.Handler):
-    """Log records as messages, each to where standard error leads then: above a bar, where there is one.
+    """Prints log records to the current standard error, above a progress bar if there is one.
 
-    A warning is said once, however often the file that it is about is read.
+    Each warning is printed only once, however often its file is read.
     """
 
     def __init__(self) -> None:
@@ -154,7 +156,7 @@ class _Handler(logging.Handler):
 
 @contextmanager
 def logged(verbose: bool, quiet: bool = False) -> Iterator[None]:
-    """Shows what the logger "ngpt" gets: warnings, also details if ``verbose``, or only errors if ``quiet``."""
+    """Prints the messages of the logger "ngpt": warnings; with ``verbose``, all details; with ``quiet``, errors only."""
     logger, handler = logging.getLogger("ngpt"), _Handler()
     handler.setFormatter(logging.Formatter("%(relativeCreated)7.0f ms  %(name)s: %(message)s" if verbose else None))
     before = logger.level
@@ -168,7 +170,7 @@ def logged(verbose: bool, quiet: bool = False) -> Iterator[None]:
 
 
 class Console:
-    """Messages and progress for one command. ``quiet`` leaves only errors; ``name`` is what those begin with."""
+    """Messages and progress for one command. ``quiet`` leaves only errors; error messages begin with ``name``."""
 
     def __init__(self, quiet: bool = False, name: str = "ngpt"):
         self.quiet, self.name = quiet, name
@@ -182,16 +184,16 @@ class Console:
 
     @property
     def terminal(self) -> bool:
-        """Whether somebody is looking on."""
+        """Whether progress is shown on a terminal."""
         return not self.quiet and sys.stderr.isatty()
 
     @contextmanager
     def progress(
         self, label: str, unit: str, rate: bool = False, begins: str = ""
     ) -> Iterator[Callable[[int, int], None]]:
-        """Yields ``update(done, total)``; the first call says what was done before, and from it on time counts.
+        """Yields ``update(done, total)``. Its first call gives the units done before, and starts the clock.
 
-        ``rate``: units per second are shown, too. ``begins``: what goes on until the second call.
+        ``rate``: units per second are shown, too. ``begins``: a phrase that is shown until the second call.
         """
         if self.quiet:
             yield lambda done, total: None
@@ -203,12 +205,13 @@ class Console:
 
 
 class _Pace:
-    """What is left, at the pace of the later half of the time so far: what lay ready in a cache is soon forgotten."""
+    """Estimates the time left from the pace in the later half of the elapsed time, so that units that came quickly from
+    a cache soon stop counting."""
 
     def __init__(self, unit: str, rate: bool, begins: str):
         self.unit, self.rate, self.begins = unit, rate, begins
         self.start, self.elapsed = 0.0, 0.0
-        # (seconds, done), the first of them at half the time or before.
+        # (seconds, done); the first entry is at half of the elapsed time or earlier.
         self.past: deque[tuple[float, int]] = deque()
 
     def __call__(self, done: int, total: int) -> list[str]:
@@ -231,7 +234,7 @@ class _Pace:
 
 
 def brief(value: float) -> str:
-    """A positive number with two digits, or all that are before the point: 0.35, 4.2, 126."""
+    """A positive number with two digits, or with all digits before the point: 0.35, 4.2, 126."""
     return f"{value:.2g}" if value < 10 else f"{value:.0f}"
 
 
@@ -276,17 +279,17 @@ def _bar(label: str, unit: str, pace: _Pace) -> Iterator[Callable[[int, int], No
 
 
 def _shortened(text: str, most: int) -> str:
-    """Its end, where names differ, in ``most`` letters at most."""
+    """The text, or its end, where names differ, in at most ``most`` letters."""
     return text if len(text) <= most else f"…{text[len(text) - most + 1 :]}" if most > 1 else ""
 
 
 def _last(words: list[str]) -> str:
-    """The time left: the last word on the pace."""
+    """The time left: the last of the phrases about the pace."""
     return words[-1].removeprefix("about ") if words else ""
 
 
 class _Lines:
-    """Progress as lines of text: the first, the last, and now and then one between."""
+    """Progress as lines of text: the first, the last, and some between."""
 
     def __init__(self, console: Console, label: str, unit: str, pace: _Pace):
         self.console, self.label, self.unit, self.pace = console, label, unit, pace

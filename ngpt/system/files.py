@@ -20,17 +20,19 @@ try:
 except ImportError:  # Windows, where a locked file could not be written by the block that it is locked for
     fcntl = None  # type: ignore[assignment]
 
-# Temporary files have names of their own, so that what killed processes leave behind is known for what it is.
+# Temporary files have recognisable names, so that those that killed processes leave behind can be found.
 _PREFIX = ".ngpt-"
 _LEFTOVER = re.compile(r"\.ngpt-[a-z0-9_]{8}(\.[^.]*)?")
-_MOST = 99  # names that are tried for what cannot have its own
+_MOST = 99  # names that are tried for a file that cannot be written under its own
 _one_at_a_time = Lock()
 hold_while_forking(_one_at_a_time)
-_FORGOTTEN = 24 * 3600.0  # seconds without a change, after which they are swept where nothing can be locked
+_FORGOTTEN = (
+    24 * 3600.0
+)  # seconds since the last change after which temporary files are removed on systems without locks
 
 
 def make_folder(folder: str | os.PathLike) -> Path:
-    """Makes a folder, and those it is in, where there is none. Raises NgptError where that cannot be done."""
+    """Makes a folder and its parents if they do not exist. Raises NgptError if that is impossible."""
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -41,8 +43,8 @@ def make_folder(folder: str | os.PathLike) -> Path:
 def check_output(path: str | os.PathLike, overwrite: bool = False, may_skip: bool = False) -> Path:
     """Returns ``path`` as a Path if a file may be written there, else raises NgptError.
 
-    Called before long work starts, so that an hour of rendering is not lost to a typing error. ``may_skip``: whoever
-    asks could leave out what exists, which the error then says.
+    Called before long work starts, so that an hour of rendering is not lost to a typing error. ``may_skip``: the error
+    also names the option that leaves existing files out.
     """
     path = Path(path)
     if path.is_dir():
@@ -60,14 +62,14 @@ def check_output(path: str | os.PathLike, overwrite: bool = False, may_skip: boo
 def save(
     path: str | os.PathLike, write: Callable[[Path, bool], object], overwrite: bool = False, *, alike: bool = False
 ) -> None:
-    """``write(path, overwrite)``; where that fails, what was made is written elsewhere, and NgptError says where.
+    """Calls ``write(path, overwrite)``. If that fails, writes the file elsewhere, and raises NgptError that says where.
 
-    For what took long to make. Places, in order: another name beside ``path``, "a.kept.exr" for "a.exr", the working
-    directory, and the folder for temporary files. Nothing is overwritten there. ``write`` is called again for each, and
-    makes files complete or not at all, as ``atomic_output`` does.
+    This is for results that took long to make. Places, in order: another name beside ``path``, "a.kept.exr" for
+    "a.exr"; the working directory; the folder for temporary files. Nothing is overwritten there. ``write`` is called
+    again for each place; it writes complete files or none, as ``atomic_output`` does.
 
-    ``alike`` is for folders that are made by several processes, all of whose files count: whoever makes this file makes
-    the same, so that one which is there by now will do; and nothing is put beside it.
+    ``alike`` is for folders that several processes write, where every file counts. All of them would write the same
+    file, so an existing one is accepted, and no other file is put beside it.
     """
     path = Path(path)
     try:
@@ -85,7 +87,7 @@ def save(
 
 
 def _other_places(path: Path, beside: bool) -> Iterator[Path]:
-    """A free name in each folder where a file may go that cannot be written to ``path``."""
+    """Free paths, one in each fallback folder, for a file that cannot be written to ``path``."""
     names = [f"{path.stem}.kept{f'-{n}' if n > 1 else ''}{path.suffix}" for n in range(1, _MOST + 1)]
     folders: list[Callable[[], str | Path]] = [Path.cwd, tempfile.gettempdir]
     for find in [lambda: path.parent, *folders] if beside else folders:
@@ -100,12 +102,11 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
     """Yields a temporary path beside ``path`` and renames it to ``path`` when the block succeeds.
 
     The temporary file keeps the suffix of ``path`` (writers choose the format by it), is flushed to disk before the
-    rename, and is removed when the block fails, so nobody ever sees half a file under the final name. The block has to
-    write into that file, not replace it. A link stays a link: the file that it leads to is written. A process that is
-    killed leaves its temporary file behind, hidden; the next one that writes into the folder removes it, on Windows
-    when it is a day old.
+    rename, and is removed when the block fails. So an incomplete file never has the final name. The block must write
+    into that file, not replace it. A link stays a link: its target is written. A killed process leaves a hidden
+    temporary file behind; the next process that writes into the folder removes it (on Windows, when it is a day old).
 
-    Raises NgptError when the file cannot be written; of several writers of one new file all but the first.
+    Raises NgptError if the file cannot be written, and if another writer has made the same new file first.
     """
     path = check_output(path, overwrite)
     path = Path(os.path.realpath(path)) if path.is_symlink() else path
@@ -131,7 +132,7 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
 
 
 def _umask() -> int:
-    """The umask of the process. It is known only by setting it: two threads that did so at once would leave it at 0."""
+    """The umask of the process. Reading it means setting it: two threads that did so at once would leave it at 0."""
     with _one_at_a_time:
         umask = os.umask(0)
         os.umask(umask)
@@ -145,18 +146,18 @@ def _temporary(path: Path) -> tuple[Path, int | None]:
         if fcntl is None:
             os.close(handle)
             return Path(name), None
-        with suppress(OSError):  # a file system without locks, on which nobody sweeps either
+        with suppress(OSError):  # a file system without locks, where no process removes temporary files either
             fcntl.flock(handle, fcntl.LOCK_EX)
         if os.path.exists(name):
             return Path(name), handle
-        # Swept away between its making and its locking.
+        # Another process removed it before it was locked.
         os.close(handle)
 
 
 @lru_cache(maxsize=1024)
 def _sweep(folder: Path) -> None:
-    """Removes temporary files whose writers are dead; once in a process, for a folder may hold very many files."""
-    with suppress(OSError):  # what cannot be listed cannot be swept
+    """Removes temporary files of dead writers; once per process and folder, since a folder may hold very many files."""
+    with suppress(OSError):  # a folder that cannot be listed
         for name in filter(_LEFTOVER.fullmatch, os.listdir(folder)):
             with suppress(OSError):
                 _remove_abandoned(folder / name)
@@ -177,10 +178,10 @@ def _remove_abandoned(path: Path) -> None:
 
 
 def _publish(temporary: Path, path: Path, overwrite: bool) -> None:
-    """Gives a finished file its name; raises NgptError where another writer was faster and is not to be replaced."""
+    """Gives a finished file its name. Raises NgptError if another writer was faster and ``overwrite`` is not set."""
     if not overwrite:
         try:
-            os.link(temporary, path)  # which a rename is not: refused when the name is taken
+            os.link(temporary, path)  # unlike a rename, it fails if the name is taken
             return
         except FileExistsError:
             check_output(path)
@@ -190,8 +191,8 @@ def _publish(temporary: Path, path: Path, overwrite: bool) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Has the new name outlive a power cut."""
-    with suppress(OSError):  # file systems that cannot, and Windows, which opens no folders
+    """Flushes the folder to disk, so that the new name survives a power cut."""
+    with suppress(OSError):  # some file systems cannot do it, and Windows cannot open folders
         handle = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(handle)
@@ -203,18 +204,18 @@ def _sync_folder(folder: Path) -> None:
 def exclusive(folder: str | os.PathLike, wait: bool = False) -> Iterator[None]:
     """Keeps other processes out of ``folder`` for the length of the block.
 
-    Raises NgptError if one is at work there, or with ``wait`` waits until it is done. The lock goes with the process,
-    however it ends, though processes that it forked live on.
+    Raises NgptError if another process is at work there; with ``wait``, waits until it is done. The lock ends with the
+    process, however it ends, even if processes that it forked go on.
     """
     with warnings.catch_warnings():
-        # It warns where the system locks no files, and a file that names its process has to stand for a lock.
+        # filelock warns if the system cannot lock files, and it uses a file with the process number instead.
         warnings.simplefilter("ignore")
         # Imported only here: denoising locks no folder.
         from filelock import FileLock, Timeout
 
     lock = FileLock(Path(folder) / ".lock", blocking=wait)
     try:
-        os.stat(folder)  # which FileLock would make if it is not there
+        os.stat(folder)  # raises if the folder does not exist; FileLock would make it
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             lock.acquire()

@@ -1,8 +1,8 @@
-"""Threads and forks: what a process keeps for all its threads, and what a forked child must not inherit.
+"""Objects that own threads, such as pools, in processes that fork.
 
-A forked child has the memory of its parent and none of its threads. A pool of threads that it inherits never answers,
-and even to destroy it may take for ever. So what owns threads is dropped before a fork, and whoever needs it next, in
-parent or child, makes its own.
+A forked child has the memory of its parent but none of its threads. An inherited pool of threads never answers, and
+even destroying it may hang. So objects that own threads are dropped before a fork; parent and child make new ones when
+they need them.
 """
 
 import os
@@ -52,9 +52,9 @@ def until_fork(most: int) -> Callable[[Callable[Given, Made]], Callable[Given, M
 
 @cache
 def in_children(call: Callable[[], object]) -> None:
-    """``call`` is called in every forked child from now on, in the thread that forked; once, however often it is given.
+    """From now on ``call`` runs in every forked child, in the thread that forked; once, even if registered repeatedly.
 
-    For pools that cannot be dropped, such as OpenMP's: with one thread a child needs none of them.
+    It is for pools that cannot be dropped, such as OpenMP's: a child that is set to one thread does not use the pool.
     """
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=call)

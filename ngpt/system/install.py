@@ -1,4 +1,4 @@
-"""The command that installs what an extra of ngpt-recon brings: all messages that name one take it from here."""
+"""The commands that install extras of ngpt-recon, for all messages that name one."""
 
 import re
 import shlex
@@ -6,18 +6,18 @@ import shutil
 import sys
 from pathlib import Path
 
-# Whether the package index has ngpt-recon. The first release makes this True, and README's table goes by the index then
-# (tests/system/test_install.py sees to it).
+# Whether the package index has ngpt-recon. The first release sets this to True, and the table in README then names the
+# index (tests/system/test_install.py checks that).
 PUBLISHED = False
 
 NAME, STUDIES = "ngpt-recon", "ngpt-studies"
-# What ngpt-studies brings, by what a registry calls its entries
+# The entries that ngpt-studies adds, by the word that their registry uses for an entry
 BROUGHT = {"method": ("nlm",), "network": ("kpcn",), "sampler": ("gmlt", "gpt-tiles", "split")}
 CHECKOUT = Path(__file__).parents[2]
 
 
 def install_command(extra: str) -> str:
-    """What to type, as it stands: for the index, for this checkout, or else for the packages that the extra brings."""
+    """The command for an extra: from the index, from this checkout, or else for the packages of the extra."""
     if PUBLISHED:
         return f"{_pip()} install '{NAME}[{extra}]'"
     if (CHECKOUT / "pyproject.toml").is_file():
@@ -27,12 +27,12 @@ def install_command(extra: str) -> str:
 
 
 def package_command(package: str) -> str:
-    """What to type for a package of the index."""
+    """The command for a package of the index."""
     return f"{_pip()} install {shlex.quote(package)}"
 
 
 def study(what: str, name: str) -> str:
-    """The line for a method, sampler or network that ngpt-studies brings, and that is not here; "" for other names."""
+    """The message for a method, sampler or network of ngpt-studies, which is not installed; "" for other names."""
     if name not in BROUGHT.get(what, ()):
         return ""
     folder = CHECKOUT / "studies"
@@ -46,7 +46,7 @@ def study(what: str, name: str) -> str:
 
 
 def packages_of(extra: str) -> list[str]:
-    """The packages that an extra brings, with the versions they must have, as the installed metadata name them."""
+    """The packages of an extra with their required versions, from the installed metadata."""
     from importlib.metadata import PackageNotFoundError, requires  # takes 50 ms
 
     try:

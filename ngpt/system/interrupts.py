@@ -1,4 +1,4 @@
-"""Ctrl-C (SIGINT) and SIGTERM, which service managers, containers and queues send: both end a command alike."""
+"""Ctrl-C (SIGINT) and SIGTERM, which service managers, containers and queues send: both end a command the same way."""
 
 import signal
 import threading
@@ -7,12 +7,12 @@ from contextlib import contextmanager
 
 from ngpt.errors import Interrupted
 
-# Signals, and the handlers that are there where nobody has set another.
+# Signals and their default handlers.
 _SIGNALS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
 
 
 class Interrupt:
-    """Which signal came first, 0 while none has; called, it says whether one has."""
+    """The first signal that has arrived, 0 before. A call returns whether one has arrived."""
 
     def __init__(self) -> None:
         self.signal = 0
@@ -22,15 +22,15 @@ class Interrupt:
 
     @property
     def status(self) -> int:
-        """What a command that was interrupted ends with, as a shell has it: 130 after Ctrl-C, 143 after SIGTERM."""
+        """The exit status of an interrupted command, by the shell's convention: 130 after Ctrl-C, 143 after SIGTERM."""
         return 128 + (self.signal or signal.SIGINT)
 
 
 @contextmanager
 def raised() -> Iterator[Interrupt]:
-    """Both signals raise ``Interrupted`` in the block, so that everything is cleaned up, and are noted.
+    """In the block, both signals are recorded and raise ``Interrupted``, so that everything is cleaned up.
 
-    A signal that other code handles or has switched off is not touched. Outside of the main thread neither is.
+    A signal that other code handles or has switched off is left as it is. Outside of the main thread, both are.
     """
     found = Interrupt()
 
@@ -38,7 +38,7 @@ def raised() -> Iterator[Interrupt]:
         found.signal = found.signal or number
         raise Interrupted
 
-    # Python's own handlers show that no other code has set one. The background jobs of a script have other handlers.
+    # Python's own handlers show that no other code has set one. In background jobs of a script, SIGINT is ignored.
     ours = [number for number, usual in _SIGNALS.items() if signal.getsignal(number) is usual]
     with _handled(ours, note):
         yield found
@@ -46,7 +46,7 @@ def raised() -> Iterator[Interrupt]:
 
 @contextmanager
 def noted(told: Callable[[], None] = lambda: None) -> Iterator[Interrupt]:
-    """The first signal is noted in the block, and nothing else; any further one does what it did before.
+    """In the block, the first signal is only recorded; any further one has its previous effect.
 
     ``told`` is called at once when it comes. A signal that is switched off stays so, and outside of the main thread
     none arrives.
@@ -59,7 +59,7 @@ def noted(told: Callable[[], None] = lambda: None) -> Iterator[Interrupt]:
             signal.signal(other, handler)
         told()
 
-    # None: a handler of a C program that embeds Python.
+    # None means a handler of a C program that embeds Python.
     before = {number: old for number in _SIGNALS if (old := signal.getsignal(number)) not in (signal.SIG_IGN, None)}
     with _handled(list(before), note):
         yield found

@@ -1,4 +1,4 @@
-"""SciPy, imported when it is first used: a quarter of a second of processor time, which most commands do without."""
+"""SciPy, imported at its first use: the import takes a quarter of a second, and most commands do not need it."""
 
 from importlib import import_module
 from typing import Any

@@ -14,13 +14,13 @@ try:
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
-# MiB of address space that stand for no limit: far more than any machine has.
+# MiB of address space that mean "no limit": far more than any machine has.
 UNLIMITED = 2**40
 
-# The most threads of one pool that are allowed; None where nobody has set a limit.
+# The most threads of one pool, set by ``limit_threads``; None without a limit.
 _most: int | None = None
 
-# Bytes of memory where the system does not say how much it has.
+# Assumed bytes of memory if the system does not say how much it has.
 _ASSUMED = 2**34
 
 
@@ -29,11 +29,12 @@ _GROUPS, _OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
 def processors() -> int:
-    """Processors that this process may run on, at most ``limit_threads``; the machine's where the system does not say.
+    """The number of processors that this process may use, at most ``limit_threads``.
 
-    Containers may have less time of processors than these have: then as many as that time is of.
+    It is the number of processors that the process may run on, or that the machine has if the system does not say. The
+    time quota of a container lowers it.
 
-    So many threads work at once: NumPy's, SciPy's, ONNX Runtime's, OIDN's and OpenEXR's.
+    NumPy, SciPy, ONNX Runtime, OIDN and OpenEXR use this number of threads.
     """
     own = _visible()
     return min(own, _most or own, _quota() or own)
@@ -45,7 +46,7 @@ def _visible() -> int:
 
 @cache
 def _quota() -> int | None:
-    """How many processors' time the control groups allow, rounded up; None where they set no limit."""
+    """The number of processors whose time the control groups allow, rounded up; None without a limit."""
     found = [(quota, period) for quota, period in map(str.split, _of_groups("cpu.max", ""))]  # microseconds, or "max"
     found += zip(_of_groups("cpu.cfs_quota_us", "cpu"), _of_groups("cpu.cfs_period_us", "cpu"), strict=False)
     limits = [int(quota) / int(period) for quota, period in found if quota.isdecimal()]
@@ -53,9 +54,9 @@ def _quota() -> int | None:
 
 
 def _of_groups(name: str, controller: str) -> list[str]:
-    """What the files of that name say, in all control groups that this process is in, from its own up.
+    """The contents of the files ``name`` in all control groups of this process, from its own group up.
 
-    ``controller``  of version 1, where each has a tree of its own; "" for version 2
+    ``controller``  the controller of version 1, where each has its own tree; "" for version 2
     """
     try:
         lines = [line.split(":", 2) for line in _OWN_GROUPS.read_text(encoding="utf-8", errors="replace").splitlines()]
@@ -84,12 +85,12 @@ def limit_threads(most: int) -> None:
 
 
 def limited() -> bool:
-    """Whether ``processors`` are fewer than libraries that count for themselves would take."""
+    """Whether ``processors()`` is less than the number of threads that libraries would choose themselves."""
     return _most is not None or processors() < _visible()
 
 
 def memory() -> int:
-    """Bytes that this process may have: the machine's, or what its limits or its container's leave it."""
+    """Bytes of memory that this process may use: the machine's, or less by its own limits or its container's."""
     texts = _of_groups("memory.max", "") + _of_groups("memory.limit_in_bytes", "memory")
     limits = [int(text) for text in texts if text.isdecimal()]
     own = address_space()
@@ -107,7 +108,7 @@ def _physical() -> int:
 
 
 def address_space() -> int | None:
-    """Bytes that this process may map (``ulimit -v``), None where no limit is set."""
+    """Bytes that this process may map (``ulimit -v``); None without a limit."""
     if resource is None:
         return None
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
@@ -115,7 +116,7 @@ def address_space() -> int | None:
 
 
 def free_address_space() -> int:
-    """MiB that this process may still map, ``UNLIMITED`` where no limit is set."""
+    """MiB that this process may still map; ``UNLIMITED`` without a limit."""
     limit = address_space()
     if limit is None:
         return UNLIMITED
@@ -132,6 +133,6 @@ def limit_address_space(limit: int) -> None:
         return
     own = resource.getrlimit(resource.RLIMIT_AS)[1]
     most = limit if own == resource.RLIM_INFINITY else min(limit, own)
-    with suppress(ValueError, OSError):  # macOS knows this limit and refuses to set it
+    with suppress(ValueError, OSError):  # macOS has this limit but refuses to set it
         resource.setrlimit(resource.RLIMIT_AS, (most, own))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -1,4 +1,4 @@
-"""Where and with what numbers were made, as results record it."""
+"""The machine and the versions of packages that made a result, for its record."""
 
 import platform
 import subprocess
@@ -44,7 +44,7 @@ def _cpu() -> str:
 
 
 def _commit() -> str | None:
-    """None where the source is no checkout, or git is not installed."""
+    """The commit of the source; None if it is no checkout, or git is not installed."""
     command = ["git", "rev-parse", "--short", "HEAD"]
     try:
         found = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parent)

@@ -1,6 +1,7 @@
-"""What other packages add by entry points: the renderer, which nothing in ngpt imports, and verbs that render.
+"""Parts that other packages add by entry points.
 
-Anyone can also add methods, samplers, losses and metrics: each registry is a ``Registry``.
+These are the renderer, which nothing in ngpt imports, and verbs that render; and the entries of each ``Registry``:
+methods, samplers, losses, metrics and networks.
 """
 
 import sys
@@ -17,17 +18,17 @@ T = TypeVar("T")
 
 
 def no_renderer() -> str:
-    """What is missing where nothing renders, and what installs it."""
+    """The message for a missing renderer, with the command that installs it."""
     return f"rendering needs the package data_gen, which is not installed; `{install_command('render')}`"
 
 
 def warn(text: str) -> None:
-    """A line on standard error about a package that cannot be used; the work goes on without it."""
+    """Prints a line on standard error about a package that cannot be used; the work goes on without it."""
     print_line(f"ngpt: {text}", sys.stderr)
 
 
 def points(group: str) -> Iterator[Any]:
-    """The entry points of a ``group`` whose packages are still there; nothing is imported."""
+    """The entry points of a ``group`` whose packages are still installed; nothing is imported."""
     from importlib.metadata import entry_points  # takes 50 ms
 
     for point in entry_points(group=group):
@@ -36,7 +37,7 @@ def points(group: str) -> Iterator[Any]:
 
 
 def loaded(point: Any) -> Any:
-    """What an entry point names. Raises NgptError where it cannot be imported, whatever its package raises."""
+    """The object that an entry point names. Raises NgptError if its import fails in any way."""
     try:
         return point.load()
     except Exception as error:
@@ -44,7 +45,7 @@ def loaded(point: Any) -> Any:
 
 
 def blamed(error: Exception) -> str:
-    """What a function of another package raised, and the last of its own lines that it came from."""
+    """An error by a function of another package as text, with the last line in the function's own file."""
     own = traceback.extract_tb(error.__traceback__)[1:]
     last = next((frame for frame in reversed(own) if frame.filename == own[0].filename), None)
     where = f" ({last.filename}, line {last.lineno})" if last else ""
@@ -52,7 +53,8 @@ def blamed(error: Exception) -> str:
 
 
 def brought(group: str) -> Iterator[Any]:
-    """What the entry points of a ``group`` name; a package that cannot be imported costs a line, and is left out."""
+    """The objects that the entry points of a ``group`` name. Packages that cannot be imported are left out, with a
+    warning."""
     for point in points(group):
         try:
             yield loaded(point)
@@ -61,12 +63,12 @@ def brought(group: str) -> Iterator[Any]:
 
 
 def find_renderer() -> Any:
-    """The renderer, see ``ngpt.renderer.Renderer``. Raises NgptError where none is installed, or it is broken."""
+    """The renderer, see ``ngpt.renderer.Renderer``. Raises NgptError if none is installed, or it is broken."""
     return _only("ngpt.renderers")
 
 
 def find_crops() -> Any:
-    """What renders crops to train on, see ``ngpt.renderer.Crops``. Raises NgptError as ``find_renderer`` does."""
+    """The renderer of crops for training, see ``ngpt.renderer.Crops``. Raises NgptError as ``find_renderer`` does."""
     return _only("ngpt.crops")
 
 
@@ -80,9 +82,9 @@ class Registry(dict[str, T]):
     """Entries by name: ours, and those that other packages bring by entry points of a ``group``.
 
     An entry of another package is imported when it is asked for by its name. Iteration goes over ours, and over others'
-    that have been imported; who lists all of them calls ``load`` before. Nobody looks for others to find one of ours.
+    that have been imported; call ``load`` first to list all. Finding one of ours does not search for others.
 
-    ``what``   what an entry is, for messages: "method"
+    ``what``   the word for an entry in messages: "method"
     ``kind``   the class of an entry, or ``Callable``
     ``taken``  further names that no other package's entry may have
     """
@@ -120,7 +122,8 @@ class Registry(dict[str, T]):
         return list(dict.fromkeys([*self, *(point.name for point in self._others())]))
 
     def load(self) -> list[str]:
-        """Imports the entries of all other packages; returns their names. A broken one costs a line and is left out."""
+        """Imports the entries of all other packages and returns their names. Broken ones are left out, with a
+        warning."""
         for point in points(self.group):
             if self._is_taken(point):
                 warn(f"{_owner(point)} is left out: ngpt has a {self.what} of that name; its package must rename it")
@@ -132,8 +135,8 @@ class Registry(dict[str, T]):
         return [name for name in self if name in self._imported]
 
     def unknown(self, name: str, names: Iterable[str], choices: str) -> WrongUse:
-        """The error for a name that is no entry's: how to install the study of that name, else one of ``names`` that
-        may be meant, and the ``choices``."""
+        """The error for an unknown name: how to install the study of that name; or else a similar one of ``names``, and
+        the ``choices``."""
         if line := study(self.what, name):
             return WrongUse(line)
         return WrongUse(f"unknown {self.what} '{name}'; {did_you_mean(name, names)}choose one of: {choices}")

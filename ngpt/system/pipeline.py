@@ -1,4 +1,4 @@
-"""Reading, computing and writing at the same time: what waits for a disk or decodes a file holds up nothing else."""
+"""Reads, computes and writes at the same time, so that computing never waits for a disk or a decoder."""
 
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,9 +15,9 @@ Told = TypeVar("Told")
 def overlapped(
     items: Sequence[Item], read: Callable[[Item], Read], compute: Callable[[Read], Made], write: Callable[[Made], Told]
 ) -> Generator[Told | NgptError, None, None]:
-    """``write(compute(read(item)))`` of each item, in order; for an item that fails, its NgptError.
+    """Yields ``write(compute(read(item)))`` of each item, in order; for an item that fails, its NgptError.
 
-    ``read`` is one item ahead and ``write`` one behind, each in a thread of its own; ``compute`` runs in the caller's.
+    ``read`` is one item ahead and ``write`` one behind, each in its own thread; ``compute`` runs in the caller's.
     So at most three items are held at once. Any other error is raised when its item's turn comes, and so is WrongUse,
     which concerns all items. If an interrupt or ``close()`` ends the work early, the threads finish what they have
     begun and start nothing else. A single item needs no threads. Raises MemoryError if there is no room for two.
@@ -29,7 +29,7 @@ def overlapped(
         try:
             for thread in (reader, writer):
                 thread.submit(int)
-        except RuntimeError as error:  # what Python makes of it
+        except RuntimeError as error:  # Python's error if it cannot start a thread
             raise MemoryError(str(error)) from error
         coming: Future | None = None
         going: Future | None = None
@@ -46,7 +46,7 @@ def overlapped(
 
 
 def _attempt(stage: Callable[[Any], Any], value: Any) -> Any:
-    """What the stage makes of a value; errors are values, which later stages hand on."""
+    """The result of a stage, or its error; errors of earlier stages are passed through."""
     if isinstance(value, Exception):
         return value
     try:

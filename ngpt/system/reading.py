@@ -14,13 +14,13 @@ MOST_TEXT = 2**28  # bytes of a configuration or a record
 
 @contextmanager
 def regular_file(path: Path) -> Iterator[BinaryIO]:
-    """The file, opened for reading; pipes and devices, which may keep a reader waiting for ever, are refused."""
+    """The file, opened for reading. Raises NgptError for pipes and devices, which may keep a reader waiting forever."""
     try:
         file = open(path, "rb", opener=_open_at_once)  # noqa: SIM115
     except FileNotFoundError:
         raise NgptError(f"{path}: not found; check the name") from None
     except (OSError, ValueError) as error:  # ValueError: a name with a zero in it
-        if os.path.isdir(path):  # which not every system says in its error
+        if os.path.isdir(path):  # not every system says so in its error
             raise NgptError(f"{path}: is a directory; name a file in it") from None
         raise NgptError(f"{path}: cannot be read: {getattr(error, 'strerror', '') or error}") from error
     with file:
@@ -37,7 +37,7 @@ def _open_at_once(name: str, flags: int) -> int:
 
 
 def read_bytes(path: str | Path, most: int) -> bytes:
-    """All of a regular file; raises NgptError where that cannot be read, and where it has more than ``most`` bytes."""
+    """The contents of a regular file. Raises NgptError if it cannot be read, or has more than ``most`` bytes."""
     with regular_file(Path(path)) as file:
         data = file.read(most + 1)
     if len(data) > most:

@@ -1,4 +1,4 @@
-"""Records in JSON and TOML: read, and checked to be of the shape that the code behind relies on."""
+"""Reads records in JSON and TOML, and checks that they have the expected shape."""
 
 import json
 import tomllib
@@ -13,18 +13,18 @@ from ngpt.system.reading import read_text
 
 T = TypeVar("T")
 
-# A type, several of them, [shape]: a list of such, {name: shape}: a table with at least these entries, {str: shape}: a
-# table of any names. Whole numbers have 64 bits.
+# A type; several allowed types; [shape]: a list of such values; {name: shape}: a table with at least these entries;
+# {str: shape}: a table with any names. Whole numbers have 64 bits.
 Shape = type | tuple[type, ...] | list["Shape"] | dict["str | type[str]", "Shape"]
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """Raises NgptError for a file that cannot be read or is no TOML."""
+    """The contents of a TOML file. Raises NgptError if it cannot be read or is no TOML."""
     return _call(tomllib.loads, read_text(path), str(path))
 
 
 def read_json(path: str | Path) -> Any:
-    """Raises NgptError for a file that cannot be read or is no JSON."""
+    """The contents of a JSON file. Raises NgptError if it cannot be read or is no JSON."""
     return _call(json.loads, read_text(path), str(path))
 
 
@@ -68,15 +68,15 @@ def _demand(condition: bool, value: Any, wanted: str, where: str) -> None:
 
 
 def _shown(value: Any) -> str:
-    """The beginning of what Python calls it."""
+    """The first 60 letters of the value's ``repr``."""
     try:
         return repr(value)[:60]
-    except ValueError:  # so does Python, of whole numbers of more than 4300 digits
+    except ValueError:  # Python raises it for whole numbers of more than 4300 digits
         return "a number of thousands of digits"
 
 
 def from_table(kind: type[T], values: Any, where: str) -> T:
-    """The dataclass ``kind`` of a table of settings, each of them of the type of its annotation.
+    """The dataclass ``kind`` from a table of settings, whose values must have the annotated types.
 
     Lists become tuples, tables become dataclasses, where the annotations say so: ``tuple[int, ...]``,
     ``tuple[Files, ...]``. A whole number does where a number is asked for. What ``kind`` refuses itself, it refuses by
@@ -110,7 +110,7 @@ class _OtherType(Exception):
 
 
 def _converted(value: Any, hint: Any, where: str) -> Any:
-    """``value`` as the annotation has it."""
+    """``value`` converted to the annotated type; raises ``_OtherType`` if it has another one."""
     kinds = get_args(hint)
     if get_origin(hint) is UnionType:  # a table that may be left out
         return _converted(value, kinds[0], where)
@@ -139,7 +139,7 @@ _NAMES = {int: "whole number", float: "number", str: "string", dict: "table", li
 
 
 def described(hint: Any, many: bool = False) -> str:
-    """What an annotation asks for, in the words of those who write a TOML file."""
+    """An annotated type in the words of TOML: "a list of strings"."""
     kind, kinds = get_origin(hint) or hint, get_args(hint)
     if kind is bool:
         return "true or false"
@@ -151,7 +151,7 @@ def described(hint: Any, many: bool = False) -> str:
 
 
 def _example(default: Any) -> str:
-    """The default, which shows what is meant unless it is empty."""
+    """The default as an example for messages; "" if it is empty."""
     if default is MISSING or not default:
         return ""
     return f", like {list(default) if isinstance(default, tuple) else repr(default)}"

@@ -1,4 +1,4 @@
-"""What Python files do and import, without what is written about it: what caches are keyed by."""
+"""Hashes and imports of Python files, for the keys of caches: comments and docstrings do not count."""
 
 import ast
 import hashlib
@@ -8,9 +8,9 @@ _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def source_hash(folder: Path, left_out: tuple[str, ...] = ()) -> str:
-    """SHA-256 over the Python files in ``folder``, their names and what they do: comments and docstrings do not count.
+    """SHA-256 over names and code of the Python files in ``folder``, without comments and docstrings.
 
-    ``left_out`` are paths of files and folders in it.
+    ``left_out`` are paths of files and folders in ``folder`` that do not count.
     """
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*.py")):
@@ -30,9 +30,9 @@ def code_text(path: Path) -> str:
 
 
 def imports(path: Path) -> set[str]:
-    """Full names of modules that a file imports anywhere in it, and of what it takes from them.
+    """Full names of the modules that a file imports, at any place, and of the names that it imports from them.
 
-    What it imports for types only is not run and not listed, nor are relative imports.
+    Imports under ``TYPE_CHECKING`` and relative imports are not listed.
     """
     found: set[str] = set()
     queue: list[ast.AST] = [ast.parse(path.read_bytes())]

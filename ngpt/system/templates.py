@@ -1,6 +1,6 @@
-"""Configurations to start from: all that could be set, each with its meaning and its default, as comments.
+"""Configurations to start from: comments list every parameter with its meaning and its default.
 
-What a parameter means stands once, in the docstring of its dataclass: ``name``  meaning.
+The meaning of a parameter is in the docstring of its dataclass, as ``name``  meaning.
 """
 
 import re
@@ -11,12 +11,12 @@ from dataclasses import MISSING, fields
 from inspect import cleandoc
 from typing import Any
 
-# The head of a table, [name], or of one of several, [[name]]
+# The header of a table, [name], or of an array of tables, [[name]]
 _HEAD = r"^\[+([\w-]+)[\w.-]*\]+ *(?:#.*)?$"
 
 
 def entries(kind: type) -> list[tuple[tuple[str, ...], str]]:
-    """The parameters that share an entry of the docstring, and what it says: ``one``, ``two``  meaning."""
+    """The entries of a dataclass's docstring, ``one``, ``two``  meaning: (names, meaning) of each."""
     found: list[tuple[tuple[str, ...], str]] = []
     inside = False
     for line in cleandoc(kind.__doc__ or "").splitlines():
@@ -32,14 +32,13 @@ def entries(kind: type) -> list[tuple[tuple[str, ...], str]]:
 def template(
     text: str, tables: Mapping[str, type | None], others: Mapping[str, Mapping[str, tuple[str, Any]]] = {}
 ) -> str:
-    """A configuration, with a comment for every parameter that it leaves at its default: what it means, and what that
-    is. What is set by it stays as it is.
+    """The configuration ``text``, with a comment for every parameter that it does not set: its meaning and its default.
 
-    ``tables``  dataclasses of the tables, by name; "" is the top, None a table that goes without comments
+    ``tables``  dataclasses of the tables, by name; "" is the top level, None means a table without comments
     ``others``  further parameters of a table by name: meaning and default
     """
     given = tomllib.loads(text)
-    # Comments right above a head belong to it.
+    # Comments right above a header belong to it.
     heads = [match.start() for match in re.finditer(rf"(?:^#.*\n)*{_HEAD}", text, re.M)]
     sections = [text[start:end] for start, end in zip([0, *heads], [*heads, len(text)], strict=True)]
     present = [match[1] if (match := re.search(_HEAD, section, re.M)) else "" for section in sections]
@@ -80,7 +79,7 @@ def _default(field: Any) -> Any:
 
 
 def toml(value: Any) -> str:
-    """A value as TOML has it."""
+    """A value in TOML's notation."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):

@@ -7,7 +7,7 @@ from html import escape
 
 from ngpt.errors import NgptError
 
-# Letters that show nothing, of those that Python counts as printable: fillers, joiners and selectors of variants.
+# Invisible letters that Python counts as printable: fillers, joiners and selectors of variants.
 # [Unicode 15, property Default_Ignorable_Code_Point]
 _INVISIBLE = re.compile(
     "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u3164\ufe00-\ufe0f\uffa0\ufff0-\ufff8\U000e0000-\U000e0fff]"
@@ -20,7 +20,7 @@ _names: dict[str, str] = {}
 
 @contextmanager
 def called(path: str, name: str) -> Iterator[None]:
-    """Within the block messages and results say ``name`` for the file ``path``, and so do errors that leave it."""
+    """In the block, messages and results name the file ``path`` as ``name``; so do errors that leave the block."""
     _names[path] = name
     try:
         yield
@@ -31,17 +31,17 @@ def called(path: str, name: str) -> Iterator[None]:
 
 
 def by_names(text: str) -> str:
-    """The text with the names of files that are ``called`` by others."""
+    """The text with paths replaced by the names that ``called`` gives them."""
     for path, name in _names.items():
         text = text.replace(path, name)
     return text
 
 
 def printable(text: str) -> str:
-    """One line of text in which every letter is seen, and in its place.
+    """One line of text in which every letter is visible and in its place.
 
-    Control characters, line breaks, marks of direction (U+202E turns what follows around) and letters that show nothing
-    become what Python writes for them, ``\\x1b`` and ``\\u202e``. Files go by what they are ``called``.
+    Control characters, line breaks, marks of direction (U+202E reverses the text after it) and invisible letters become
+    Python's escapes, such as ``\\x1b`` and ``\\u202e``. Files have the names that ``called`` gives them.
     """
     text = by_names(text)
     if text.isprintable() and not _INVISIBLE.search(text):

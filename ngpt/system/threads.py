@@ -1,4 +1,4 @@
-"""One pool of threads for NumPy: it releases Python's lock while it works, so that parts of an array go in parallel."""
+"""A pool of threads for NumPy, which releases Python's lock, so that parts of an array are computed in parallel."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -9,9 +9,9 @@ from ngpt.system.limits import processors
 
 
 def map_parts(function: Callable[[Any], Any], parts: Iterable) -> list:
-    """What ``function(part)`` returns for each of ``parts``, in their order, computed by ``processors()`` threads.
+    """``function(part)`` for each of ``parts``, in their order, computed by ``processors()`` threads.
 
-    ``function`` must not call this in its turn: threads that wait for threads of the same pool may wait for ever.
+    ``function`` must not call ``map_parts`` itself: threads that wait for threads of the same pool may wait forever.
     """
     return list(_threads(processors()).map(function, parts))
 

@@ -1,4 +1,4 @@
-"""Worker processes that do not outlive the process they work for."""
+"""Worker processes that do not outlive their parent process."""
 
 import os
 import signal
@@ -7,10 +7,10 @@ from multiprocessing import parent_process
 
 
 def end_with_parent(interruptible: bool = True) -> None:
-    """To be called in a worker of multiprocessing: it ends when its parent does, even if that is killed.
+    """Ends the calling worker of multiprocessing when its parent ends, even if the parent is killed.
 
-    Linux' PR_SET_PDEATHSIG would take the end of the thread that started the worker for the end of the process. Ctrl-C,
-    which all processes of a terminal receive, ends a worker silently, unless it is not ``interruptible``.
+    Linux' PR_SET_PDEATHSIG would end the worker already with the thread that started it. Ctrl-C, which all processes of
+    a terminal receive, ends an ``interruptible`` worker silently; other workers ignore it.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL if interruptible else signal.SIG_IGN)
     threading.Thread(target=_wait, daemon=True).start()

@@ -1,4 +1,4 @@
-"""Files of bytes, text and JSON, complete under their names or not there at all; and tables as text."""
+"""Writes files of bytes, text and JSON, completely or not at all; and formats tables as text."""
 
 import csv
 import io
@@ -11,23 +11,23 @@ from ngpt.system.files import atomic_output
 
 
 def write_bytes(path: str | Path, data: bytes, overwrite: bool = True) -> None:
-    """Writes ``path``; raises NgptError where that cannot be done, or it is there and ``overwrite`` is not given."""
+    """Writes ``path``. Raises NgptError if that is impossible, or if it exists and ``overwrite`` is False."""
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(data)
 
 
 def write_text(path: Path, text: str, overwrite: bool = True) -> None:
-    """As ``write_bytes``, in UTF-8; lines end as they do in ``text``, on all systems."""
+    """As ``write_bytes``, in UTF-8; line ends are those of ``text``, on all systems."""
     write_bytes(path, text.encode(), overwrite)
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes or replaces ``path``; raises ValueError for NaN and infinity, which JSON does not know."""
+    """Writes or replaces ``path``. Raises ValueError for NaN and infinity, which JSON does not have."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
 def csv_text(rows: Iterable[Iterable[object]]) -> str:
-    """Comma-separated values, a line for each row; what is None is empty."""
+    """Comma-separated values, one line for each row; None is an empty cell."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()

@@ -1,1 +1,1 @@
-"""What makes a network: data sets, examples, losses, the trainer."""
+"""Training of networks: data sets, examples, losses, the trainer."""

@@ -1,4 +1,4 @@
-"""Augmentation of training examples, as of NGPT: each transform keeps differences the differences of the image.
+"""Augmentation of training examples, as in NGPT: each transform keeps gradients consistent with the image.
 
 An example is a dict of layers (C, H, W), radiance over exposure, among them "target". The transforms take and return
 such dicts. [Kettunen et al. 2019, section 5.2 and their code]
@@ -17,7 +17,7 @@ from ngpt.stack import GradientStack
 
 Layers = dict[str, Tensor]
 
-# Layers with three colours that change with the colours of the light, and with the colours of the surfaces.
+# Layers with three colours that scale with the light; and those that change with any permutation of colours.
 _LIGHT = RADIANCE | {"target"}
 _COLOR = _LIGHT | {"albedo"}
 _VARIANCES = ("primal_var", "dx_var", "dy_var", "caustic_var")
@@ -25,18 +25,17 @@ _VARIANCES = ("primal_var", "dx_var", "dy_var", "caustic_var")
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What is done to each example when it is read.
+    """The random changes to each example when it is read.
 
     ``geometry``    flips and transposition, each with probability 1/2
     ``colors``      permutation of RGB, and a factor for each of mean 1, 0..3, uniform on the simplex
     ``brightness``  standard deviation, in the logarithm, of a log-normal factor of mean 1 on radiance
-    ``depth``       factor of depth, uniform between these
-    ``quieter``     factors of noise, log-uniform between these, one for each crop: shows its best input once more, with
-                    so much less noise (``quieter``). Networks learn from it what to make of more samples than anyone
-                    renders for training. [] for none
-    ``rarer``       k of ``rarer``, log-uniform between these, one for each crop: shows its best input once more, as if
-                    most of its light were found by one path in k. Networks learn from it what to make of rooms lit
-                    through curtains, bulbs and gaps, which take too long to render for training. [] for none
+    ``depth``       range of the factor of depth, uniform
+    ``quieter``     range of a factor on noise, log-uniform, one for each crop: adds its best input with that much less
+                    noise (``quieter``). So networks learn to use more samples than training sets have. [] for none
+    ``rarer``       range of k, log-uniform, one for each crop: adds its best input as if one path in k found most of
+                    its light (``rarer``). So networks learn from rooms lit through curtains, bulbs and gaps, which take
+                    too long to render for training. [] for none
     """
 
     geometry: bool = True
@@ -75,9 +74,10 @@ class Augmentation:
 def quieter(
     stack: GradientStack, reference: np.ndarray, direct: np.ndarray, caustic: np.ndarray, factor: float
 ) -> GradientStack:
-    """The stack with ``factor`` times its noise, as of 1 / factor² times the samples: a mean with the reference.
+    """The stack with ``factor`` times its noise, as by 1 / factor² times the samples: a weighted mean with the
+    reference.
 
-    ``reference`` (H, W, 3) includes emission seen directly and the light of the layer ``caustic``; ``direct`` and
+    ``reference`` (H, W, 3) includes directly visible emission and the light of the layer ``caustic``; ``direct`` and
     ``caustic`` hold these two parts separately. Features stay as they are.
     """
     light = reference - direct - caustic
@@ -97,10 +97,9 @@ def rarer(stack: GradientStack, k: float, share: float, rng: np.random.Generator
     """The stack as if ``share`` of the light in each pixel were found by one path in ``k``, then k times as bright.
 
     In each pixel B = 1 with probability 1/k, else 0. Its light is multiplied by w = 1 - share + share k B, with mean 1.
-    A difference is made of the paths of both its pixels, so its factor is the mean of their factors. Means over B stay
-    equal to the stack. Variances become what they would be in such a stack: if an estimate X has the variance V, w X
-    has the variance E[w²] V + Var[w] E[X]². Emission seen directly, the layer ``caustic`` and features stay as they
-    are.
+    A gradient comes from the paths of both its pixels, so its factor is the mean of their factors. Expectations stay
+    the same. Variances become those of such a stack: if an estimate X has the variance V, w X has the variance
+    E[w²] V + Var[w] E[X]². Directly visible emission, the layer ``caustic`` and features stay as they are.
     """
     height, width = stack["primal"].shape[:2]
     found = np.float32(rng.random((height, width, 1)) * k < 1)
@@ -114,7 +113,7 @@ def rarer(stack: GradientStack, k: float, share: float, rng: np.random.Generator
         factor, light = 1 - share + share * k * hits, stack[name] - beside
         layers[name] = factor * light + beside
         if f"{name}_var" in stack:
-            # Var[w] is share² (k - 1), half of that for a mean of two; it is seen where light was found.
+            # Var[w] is share² (k - 1), and half of that for a mean of two. Only pixels where light was found show it.
             spread = share**2 * (k - 1) * (1 if name == "primal" else 0.5)
             layers[f"{name}_var"] = factor**2 * stack[f"{name}_var"] + k * hits * spread * light**2
     return stack.replace(**layers)
@@ -158,11 +157,11 @@ def transpose(layers: Mapping[str, Tensor]) -> Layers:
 
 
 def color(layers: Mapping[str, Tensor], order: np.ndarray, factors: np.ndarray) -> Layers:
-    """The channels in another order, and each multiplied by its factor; albedo may exceed 1 after it."""
+    """The layers with permuted channels, each multiplied by its factor; albedo may exceed 1 after it."""
     index, factor = torch.as_tensor(order), torch.as_tensor(factors, dtype=torch.float32).reshape(3, 1, 1)
     return {name: layer[index] * factor if name in _COLOR else layer for name, layer in layers.items()}
 
 
 def scale(layers: Mapping[str, Tensor], factor: float) -> Layers:
-    """All light ``factor`` times as bright."""
+    """The layers with all light ``factor`` times as bright."""
     return {name: layer * factor if name in _LIGHT else layer for name, layer in layers.items()}

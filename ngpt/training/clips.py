@@ -1,4 +1,4 @@
-"""Shots to learn from, and what the network that blends frames (``ngpt.sequence.network``) meets in them.
+"""Shots for training, and the examples that they give the network that blends frames (``ngpt.sequence.network``).
 
 The loss is in ``ngpt.training.temporal``.
 """
@@ -24,17 +24,17 @@ from ngpt.system.files import make_folder
 from ngpt.system.writing import write_bytes
 from ngpt.training.dataset import Dataset
 
-# Squared relative errors beyond which more is not much worse: single pixels do not rule what is learnt.
+# Squared relative errors saturate at this value, so that single pixels do not dominate the training.
 OUTLIER = 1.0
-# Share of the mean of squares that is added to a pixel's before errors are divided by it.
+# Errors are divided by a pixel's squared reference plus this share of the mean of squares.
 DARK = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """A shot by one method, with one of its inputs: stacks and the method's results, references (H, W, 3) each.
+    """A shot with one of its inputs, reconstructed by one method: stacks, results and references (H, W, 3) of frames.
 
-    References are without direct emission, and so are ``halves``: pairs of references of half the samples.
+    References exclude direct emission. So do ``halves``, which are pairs of references from half of the samples each.
     """
 
     paired: ClassVar[bool] = False
@@ -47,9 +47,9 @@ class Clip:
 
 
 def clips(folders: Sequence[str | Path], methods: Sequence[str], kept: Path) -> Iterator[Clip]:
-    """All shots of training sets, with each input, by each method; results are kept in the folder ``kept``.
+    """All shots of training sets, with each input, by each method; results are cached in the folder ``kept``.
 
-    Raises NgptError where a folder is no training set, or has no shots.
+    Raises NgptError if a folder is no training set, or has no shots.
     """
     for folder in folders:
         data = Dataset(folder)
@@ -59,7 +59,7 @@ def clips(folders: Sequence[str | Path], methods: Sequence[str], kept: Path) -> 
         for shot in shots:
             crops = [data[i] for i in shot]
             light = [crop.reference - crop.reference_direct for crop in crops]
-            # One image that judges twice where there are no two: its noise counts as an error then.
+            # Without halves, the reference takes the place of both; its noise then counts as an error.
             halves = [
                 tuple(half + crop.reference_caustic for half in crop.reference_halves) or (whole, whole)
                 for crop, whole in zip(crops, light, strict=True)
@@ -71,8 +71,8 @@ def clips(folders: Sequence[str | Path], methods: Sequence[str], kept: Path) -> 
 
 
 def _results(stacks: Sequence[GradientStack], method: str, folder: Path) -> np.ndarray:
-    """The results of a method frame by frame, as they are kept in ``folder``, or made and kept."""
-    # The name is a digest of the stacks: shots change their numbers as a set grows, and sets share names.
+    """The results of a method frame by frame, from the cache in ``folder``; computed and stored if missing."""
+    # The name is a digest of the stacks: shots are renumbered as a set grows, and several sets may share names.
     digest = hashlib.sha256(b"".join(stack["primal"].tobytes() for stack in stacks)).hexdigest()
     kept = make_folder(folder) / f"{digest[:24]}-{method}.safetensors"
     with suppress(OSError, SafetensorError, KeyError):
@@ -83,7 +83,8 @@ def _results(stacks: Sequence[GradientStack], method: str, folder: Path) -> np.n
 
 
 def errors(clip: Clip, images: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Mean error and flicker of images with direct emission, relative to the reference, free of its noise."""
+    """Mean error and flicker of images with direct emission, relative to the reference; without the reference's
+    noise."""
     found, changes = [], []
     last = None
     for stack, image, pair, reference in zip(clip.stacks, images, clip.halves, clip.references, strict=True):
@@ -105,15 +106,15 @@ def _product(values: np.ndarray) -> float:
 
 
 def weight_of(reference: np.ndarray) -> np.ndarray:
-    """What squared errors (H, W, 3) are multiplied by, (H, W, 1)."""
+    """The weights (H, W, 1) of squared errors (H, W, 3)."""
     squares = np.square(reference).mean(axis=-1, keepdims=True)
     return 1 / (squares + DARK * squares.mean() + 1e-20)
 
 
 def play(clip: Clip, corrections: Corrections, long: float = 1.0) -> Iterator[dict[str, np.ndarray]]:
-    """What the network meets in a clip and may learn from, frame by frame: arrays (C, H, W).
+    """The training examples of a clip, frame by frame: arrays (C, H, W).
 
-    The first result is of ``long`` times its error: as if so long a history, of 1 / long² frames, were behind it.
+    The error of the first result is multiplied by ``long``, as if it had a history of 1 / long² frames.
     """
     temporal = Temporal(corrections)
     last = None
@@ -148,7 +149,7 @@ def play(clip: Clip, corrections: Corrections, long: float = 1.0) -> Iterator[di
 
 
 def relit(clip: Clip, rng: np.random.Generator) -> Clip:
-    """The clip with light that changes, all of it or around a place: at one frame, or evenly over all of them."""
+    """The clip with changing light, everywhere or around a random place; at one frame, or evenly over all frames."""
     y, x = np.mgrid[: clip.references[0].shape[0], : clip.references[0].shape[1]] / len(clip.references[0])
     place, width = rng.random(2), rng.choice([0.2, 0.5, 1e3])
     field = np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / (2 * width**2))[..., None]
@@ -172,6 +173,6 @@ def robust(squares):  # type: ignore[no-untyped-def]
 
 
 def blended(clip: Clip, corrections: Corrections | None) -> list[np.ndarray]:
-    """The frames of a clip over time, with corrections by a network, or by only the rules (None)."""
+    """The blended frames of a clip, with corrections by a network, or by the rules without a network (None)."""
     temporal = Temporal(corrections)
     return [temporal.next(*pair) for pair in zip(clip.stacks, clip.results, strict=True)]

@@ -1,4 +1,4 @@
-"""What a network costs, before one trains it."""
+"""The cost of a network, before it is trained."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ def network_of(settings: Settings) -> tuple[nn.Module, int]:
 
 
 def per_pixel(model: Any, channels: int) -> tuple[float, float]:
-    """For each pixel of the (padded) image: multiplications, and numbers that go in and out of convolutions."""
+    """(multiplications, numbers in inputs and outputs of convolutions) per pixel of the padded image."""
     size, macs, numbers = 8 * model.alignment, 0, 0
 
     def count(module: Any, args: tuple, output: torch.Tensor) -> None:
@@ -34,7 +34,7 @@ def per_pixel(model: Any, channels: int) -> tuple[float, float]:
         macs += taps * output.numel()
         numbers += args[0].numel() + output.numel()
 
-    # The last one takes only the weights of its convolution, and runs them itself.
+    # LastConvolution runs the weights of its convolution itself, so its inner module is not counted.
     last = {m.convolution for m in model.modules() if isinstance(m, LastConvolution)}
     kinds = (Convolution, LastConvolution, torch.nn.Conv2d)
     hooks = [m.register_forward_hook(count) for m in model.modules() if isinstance(m, kinds) and m not in last]
@@ -60,7 +60,7 @@ def cost(settings: Settings) -> str:
         "parameters": f"{parameters(model):,}",
         "cost per pixel": f"{macs / 1e3:,.1f} thousand multiplications, {macs * 1280 * 720 / 1e9:,.1f} G at 1280x720",
     }
-    # The training set decides how large the frames of shots are: their cost is not known here.
+    # The size of the frames of shots depends on the training set, so their cost is unknown here.
     if not settings.temporal:
         lines |= {
             "cost per step": f"{step / 1e9:,.0f} G multiplications, forward and backward, batch {run.batch}",

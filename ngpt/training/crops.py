@@ -1,4 +1,4 @@
-"""The data for training: crops of training sets, of folders of stacks with references, and mixtures of them."""
+"""The data for training: crops of training sets, folders of stacks with references, and mixtures of both."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -40,7 +40,7 @@ class Crop(Protocol):
 
 
 class Mixture(Sequence[Any]):
-    """Several sequences of crops as one; they may grow while they are read, as streams do."""
+    """Several sequences of crops as one. They may grow while they are read, as streams do."""
 
     def __init__(self, *parts: Any):
         self.parts = parts
@@ -57,7 +57,7 @@ class Mixture(Sequence[Any]):
 
 
 def read(path: str) -> GradientStack:
-    """The stack in a file. Training sets need no OpenEXR: it comes in with the first file that does."""
+    """The stack in a file. OpenEXR is imported only here, since training sets do not need it."""
     from ngpt.io import exr
 
     return exr.read(path)
@@ -86,7 +86,7 @@ class StackCrop:
 
     def stack(self, k: int) -> GradientStack:
         stack = read(str(self._stacks[k]))
-        # Shards do not have it either: nothing that learns reads it, and augmentation would have to know it.
+        # Shards leave it out too: no network reads it, and augmentation would have to transform it.
         stack.layers.pop("shared", None)
         return stack
 
@@ -96,7 +96,7 @@ class StackCrop:
 
     @property
     def reference_direct(self) -> np.ndarray:
-        # A reference of the path tracer has no such layer; emission seen directly has next to no noise in any stack.
+        # References by the path tracer lack this layer; directly visible emission has hardly any noise in any stack.
         most = self._stacks[int(np.argmax(self.spp))]
         for path in (self._reference, most):
             stack = read(str(path))
@@ -132,9 +132,9 @@ class StackCrop:
 
 
 def stack_folder(folder: Path) -> list[StackCrop]:
-    """The views of a folder, each a folder with ``reference.exr`` and any number of gradient stacks.
+    """The views in a folder; each view is a folder with ``reference.exr`` and any number of gradient stacks.
 
-    Raises NgptError where a folder has stacks without a reference, or sizes differ.
+    Raises NgptError if a view has stacks without a reference, if sizes differ, or if there is no view.
     """
     crops = []
     views = [path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
@@ -151,7 +151,7 @@ def stack_folder(folder: Path) -> list[StackCrop]:
 
 
 def open_crops(folder: str | Path) -> Iterable[Any]:
-    """The crops of a dataset (it has a manifest) or of a folder of stacks."""
+    """The crops of a data set (a folder with a manifest) or of a folder of stacks."""
     path = Path(folder)
     if not path.is_dir():
         raise NgptError(f"{folder}: no such folder; make a training set: ngpt dataset --config ... --out {folder}")

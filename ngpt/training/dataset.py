@@ -35,7 +35,8 @@ _MANIFEST: Shape = {"config": dict, "planned": int, "shards": [_ENTRY]}
 class Crop:
     """One crop; cheap: pixels are read when they are asked for.
 
-    ``spp`` are the samples per pixel of its inputs, ``frame`` its number in a shot, from 0, None for a single image.
+    ``spp`` holds the samples per pixel of its inputs. ``frame`` is its number in a shot, from 0; None for a single
+    image.
     """
 
     shard: Shard
@@ -50,13 +51,14 @@ class Crop:
 
     @property
     def paired(self) -> bool:
-        """Whether it has no reference, but two inputs of equally many samples that judge each other."""
+        """Whether it has no reference, but two independent inputs with equal numbers of samples as targets of each
+        other."""
         return shards.REFERENCES[0] not in self.shard.names
 
     def stack(self, k: int) -> GradientStack:
-        """Input ``k``, all layers of a rendered stack, with gradients if its sampler has them; all values finite.
+        """Input ``k`` with all layers of its rendered stack; gradients only if its sampler has them. Values are finite.
 
-        Frames of shots have the layer ``motion`` too, NaN where it is not known: everywhere in the first.
+        Frames of shots also have the layer ``motion``. It is NaN where it is unknown: everywhere in the first frame.
         """
         if not 0 <= k < self.inputs:
             raise NgptError(f"{self.shard.path}: there is no input {k}; the crop has inputs 0 .. {self.inputs - 1}")
@@ -75,7 +77,7 @@ class Crop:
 
     @property
     def reference(self) -> np.ndarray:
-        """(H, W, 3) float32, the converged image, emission seen directly included; raises NgptError for a pair."""
+        """(H, W, 3) float32, the converged image with directly visible emission; raises NgptError for a pair."""
         if self.paired:
             raise NgptError(
                 f"{self.shard.path}: crop {self.index} is a pair: it has no reference, its inputs are halves"
@@ -84,12 +86,13 @@ class Crop:
 
     @property
     def reference_direct(self) -> np.ndarray:
-        """(H, W, 3) float32, only the emission seen directly."""
+        """(H, W, 3) float32, only the directly visible emission."""
         return self.shard.crop("reference_direct", self.index)
 
     @property
     def reference_caustic(self) -> np.ndarray:
-        """(H, W, 3) float32, what of it the layer ``caustic`` of the inputs estimates; zeros where they have none."""
+        """(H, W, 3) float32, the part of the reference that the inputs' layer ``caustic`` estimates; zeros without
+        such a layer."""
         if shards.REFERENCE_CAUSTIC in self.shard.names:
             return self.shard.crop(shards.REFERENCE_CAUSTIC, self.index)
         return np.zeros_like(self.reference_direct)
@@ -98,7 +101,7 @@ class Crop:
     def reference_halves(self) -> tuple[np.ndarray, ...]:
         """Two independent images (H, W, 3) without direct emission and ``reference_caustic``; () if there are none.
 
-        Each is of half of the reference's samples. What they say alike of an image is no noise of theirs.
+        Each has half of the reference's samples. Their noise is independent, so it cancels in products of errors.
         """
         if shards.REFERENCE_HALVES not in self.shard.names:
             return ()
@@ -108,8 +111,8 @@ class Crop:
 class Dataset:
     """The crops of a training set, in the order of its manifest.
 
-    Opens the manifest only; a shard is checked when one of its crops is read, and anew in each process that an instance
-    is sent to. Raises NgptError for shards that are missing, are other ones than the manifest's, or hold other tensors.
+    Reads only the manifest; a shard is checked when one of its crops is first read, again in each process that receives
+    an instance. Raises NgptError for shards that are missing, differ from the manifest, or hold other tensors.
     """
 
     def __init__(self, folder: str | Path):
@@ -158,7 +161,7 @@ class Dataset:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of the training set in ``folder``; raises NgptError where there is none of this version."""
+    """The manifest of the training set in ``folder``; raises NgptError if there is none of this version."""
     path = folder / MANIFEST
     if not path.is_file():
         raise NgptError(f"{folder}: no training set there ({MANIFEST} is missing); make one by `ngpt dataset`")
@@ -185,7 +188,7 @@ def checksum(path: Path) -> str:
 
 
 def problems(folder: Path) -> list[str]:
-    """Everything that is wrong with a training set, one line each: files, checksums, shapes, counts, numbers."""
+    """All faults of a training set, one line each: files, checksums, shapes, counts, numbers."""
     found = []
     manifest = read_manifest(folder)
     for entry in manifest["shards"]:
@@ -209,8 +212,8 @@ def problems(folder: Path) -> list[str]:
 
 
 def _checked(path: Path, entry: dict[str, Any]) -> Shard:
-    """The shard of a manifest's entry; raises NgptError unless it is that one, and has the tensors that crops need."""
-    # Not Path.is_file, which raises where a name is longer than names may be.
+    """The shard of a manifest's entry. Raises NgptError if its checksum differs, or a tensor is missing or wrong."""
+    # Not Path.is_file, which raises for names that are too long.
     if not os.path.isfile(path):
         raise NgptError(f"{path}: is missing; remove it from the manifest by running `ngpt dataset` again")
     if (digest := checksum(path)) != entry["sha256"]:
@@ -246,7 +249,7 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
 
 
 def summary(folder: Path) -> dict[str, Any]:
-    """What ``ngpt info`` says of a training set; ``problems`` is empty where all of it is in order."""
+    """The facts of a training set for ``ngpt info``; ``problems`` is empty if there are none."""
     data = Dataset(folder)
     entries = data.manifest["shards"]
     crops = [crop for entry in entries for crop in entry["crops"]]

@@ -10,10 +10,10 @@ from ngpt.network.device import default_device
 
 
 class Processes:
-    """The processes of a run; one of them unless ``torchrun`` started this.
+    """The processes of a run: a single one unless ``torchrun`` started it.
 
-    ``rank``, ``count``  which of how many this is
-    ``device``           the GPU that belongs to it, or the CPU
+    ``rank``, ``count``  the number of this process, from 0, and the number of all
+    ``device``           the GPU of this process, or the CPU
     """
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class Processes:
             gradient.copy_(part.view_as(gradient))
 
     def any(self, flag: bool) -> bool:
-        """Whether ``flag`` is set in any process: all of them stop at the same step, or none."""
+        """Whether ``flag`` is set in any process, so that all of them stop at the same step."""
         if self.count == 1:
             return flag
         value = torch.tensor(float(flag), device=self.device)

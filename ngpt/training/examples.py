@@ -19,23 +19,23 @@ from ngpt.stack import GradientStack
 from ngpt.training.augment import Augmentation, Layers, quieter, rarer
 from ngpt.training.crops import Crop
 
-# What the names of layers begin with that judge one half of a pair.
+# The prefix of the names of layers from the other half of a pair.
 OTHER = "other/"
 # Padding varies by up to this around ``padding.MARGIN``, so that networks do not learn where borders are.
 JITTER = 7
 
 
 class Examples(TorchDataset):
-    """Endless training examples, each a function of its index and the seed: whoever asks, and when.
+    """Endless training examples. Each is a function of its index and the seed, in any process and order.
 
-    Example ``i`` is one crop with one of its inputs (or ``Augmentation.quieter``, ``rarer``), at random, normalised,
-    augmented and padded: a dict of layers (C, size + 16, size + 16) and the "target" (3, size - 14, size - 14) for the
-    middle of that, where no padding is whatever its jitter [NGPT's code]. Crops larger than ``size`` are cut at random.
-    What was read and prepared once is kept in memory, up to ``cache`` bytes.
+    Example ``i`` is a random crop with one of its inputs (or ``Augmentation.quieter``, ``rarer``), normalised,
+    augmented and padded: a dict of layers (C, size + 16, size + 16) and the "target" (3, size - 14, size - 14). The
+    target covers the middle, which no jitter of the padding reaches [NGPT's code]. Crops larger than ``size`` are cut
+    at random. Prepared layers are cached in memory, up to ``cache`` bytes.
 
-    The input from a pair is one half. In place of the target, ``ngpt.training.halves`` judges by the other half, in
-    layers whose names begin with "other/". If there are both pairs and crops with references, the share ``pairs`` of
-    the examples are pairs.
+    The input from a pair is one half. Its target is the other half (``ngpt.training.halves``), in layers whose names
+    begin with "other/". If there are both pairs and crops with references, the share ``pairs`` of the examples are
+    pairs.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Examples(TorchDataset):
         kinds = {crop.paired for crop in crops}
         self.pairs = pairs if len(kinds) > 1 else None
         self.crops, self.config, self.augmentation, self.size, self.seed = crops, config, augmentation, size, seed
-        # What makes an input of a crop that was not rendered.
+        # Functions that make further inputs of a crop from its rendered ones.
         made = {self._quieter: augmentation.quieter, self._rarer: augmentation.rarer}
         self._made = [make for make, asked in made.items() if asked]
         self._cache: OrderedDict[tuple[Crop, int], tuple[Layers, Layers]] = OrderedDict()
@@ -65,7 +65,7 @@ class Examples(TorchDataset):
         which, crop = self._drawn(rng)
         k = int(rng.integers(crop.inputs + (0 if crop.paired else len(self._made))))
         parts = _scaled(*self._cut(*self._layers(which, crop, k), rng))
-        # What judges an input goes through the same as the input.
+        # The target gets the same augmentation as the input.
         same = copy.deepcopy(rng)
         layers, judge = self.augmentation(parts[0], rng), self.augmentation(parts[1], same)
         layers = features.completed(layers, self.config.inputs)
@@ -78,7 +78,7 @@ class Examples(TorchDataset):
         return {name: layer.contiguous() for name, layer in (padding.pad(layers, pads) | inside).items()}
 
     def _drawn(self, rng: np.random.Generator) -> tuple[int, Crop]:
-        """A crop, uniform over all crops of its kind, whatever the number of their inputs."""
+        """A random crop with its index, uniform over all crops of a kind, whatever the number of their inputs."""
         paired = None if self.pairs is None else bool(rng.random() < self.pairs)
         while True:
             which = int(rng.integers(len(self.crops)))
@@ -87,7 +87,7 @@ class Examples(TorchDataset):
                 return which, crop
 
     def _layers(self, which: int, crop: Crop, k: int) -> tuple[Layers, Layers]:
-        """Input ``k`` of a crop, and what it is judged by: the "target", or the other half."""
+        """Input ``k`` of a crop, and its target: the layer "target", or layers of the other half."""
         if (crop, k) in self._cache:
             self._cache.move_to_end((crop, k))
             return self._cache[crop, k]
@@ -102,19 +102,19 @@ class Examples(TorchDataset):
         self._cache[crop, k] = layers, judge
         self._free -= _bytes(layers, judge)
         while self._free < 0:
-            # The one that nobody asked for in the longest time: of a stream, a crop that is gone.
+            # Drop the least recently used entry; in a stream, its crop may be gone.
             self._free += _bytes(*self._cache.popitem(last=False)[1])
         return layers, judge
 
     def _quieter(self, which: int, crop: Crop) -> GradientStack:
-        """The input of that crop with most samples, as of many more."""
+        """The input of the crop with the most samples, as if it had many more."""
         low, high = np.log(self.augmentation.quieter)
         factor = float(np.exp(np.random.default_rng((self.seed, which)).uniform(low, high)))
         best = crop.stack(int(np.argmax(crop.spp)))
         return quieter(best, crop.reference, crop.reference_direct, crop.reference_caustic, factor)
 
     def _rarer(self, which: int, crop: Crop) -> GradientStack:
-        """The input of that crop with most samples, as of light that is harder to find."""
+        """The input of the crop with the most samples, as if its light were harder to find."""
         rng = np.random.default_rng((self.seed, which, 1))
         k = float(np.exp(rng.uniform(*np.log(self.augmentation.rarer))))
         return rarer(crop.stack(int(np.argmax(crop.spp))), k, float(rng.uniform(0.5, 1)), rng)
@@ -132,20 +132,20 @@ class Examples(TorchDataset):
 
 
 def collated(examples: Sequence[Layers]) -> Layers:
-    """A batch: layers stacked, those with a "target" first, so that what judges stands in the order of the inputs."""
+    """A batch of stacked layers. Examples with a "target" come first, so that targets are in the order of inputs."""
     ordered = sorted(examples, key=lambda example: "target" not in example)
     names = dict.fromkeys(name for example in ordered for name in example)
     return {name: torch.stack([example[name] for example in ordered if name in example]) for name in names}
 
 
 def other_half(ours: Repaired, other: GradientStack, whole: bool) -> dict[str, np.ndarray]:
-    """What ``ngpt.training.halves`` judges a half by: arrays (H, W, C) of ``other``, and standard errors of the half.
+    """The target of a half for ``ngpt.training.halves``: arrays (H, W, C) of ``other``, and standard errors of ``ours``.
 
     ``ours``   the half, repaired for a method that reads gradients
-    ``whole``  whether the light of the layer ``caustic`` is included. Gradients hold none of it, so its own
-               differences, whose noise is larger, are added to them
+    ``whole``  whether the light of the layer ``caustic`` is included. Gradients exclude it, so its pixel differences,
+               which have more noise, are added to them
 
-    Raises NgptError where both are the same, and where one lacks gradients or their variances.
+    Raises NgptError if both halves are the same, or one lacks gradients or their variances.
     """
     theirs = repair(other)
     if ours.variances is None or theirs.dx is None:
@@ -165,7 +165,7 @@ def other_half(ours: Repaired, other: GradientStack, whole: bool) -> dict[str, n
         after = [np.concatenate([np.delete(variance, 0, axis), np.take(variance, [-1], axis)], axis) for axis in (1, 0)]
         variances = [variances[0] + variance, *(v + variance + a for v, a in zip(variances[1:], after, strict=True))]
     layers |= dict(zip(("primal_se", "dx_se", "dy_se"), (np.sqrt(v) for v in variances), strict=True))
-    # Where lamps are seen, the variance of the light beside them is not known.
+    # In pixels that show lamps, the variance of the other light is unknown.
     counts = known[0] & ~theirs.direct.any(axis=-1)
     return layers | {"counts": counts[..., None].astype(np.float32)}
 
@@ -179,9 +179,9 @@ def _tensors(arrays: dict[str, np.ndarray]) -> Layers:
 
 
 def judges_of(crop: Crop, config: ModelConfig) -> tuple[np.ndarray, ...]:
-    """What errors of such a network are measured by, (H, W, 3) each: two independent halves, or the one target.
+    """The images (H, W, 3) that errors of such a network are measured against: two independent halves, or one target.
 
-    A product of the errors to two halves is free of their noise, see ``ngpt.measure.metrics``.
+    The noise of two halves cancels in the product of both errors, see ``ngpt.measure.metrics``.
     """
     halves = crop.reference_halves
     if not halves:
@@ -192,13 +192,13 @@ def judges_of(crop: Crop, config: ModelConfig) -> tuple[np.ndarray, ...]:
 
 
 def target_of(crop: Crop, config: ModelConfig) -> np.ndarray:
-    """What a network of that configuration is to make of a crop's stacks, (H, W, 3)."""
+    """The target (H, W, 3) of a network of that configuration for a crop's stacks."""
     target = crop.reference - crop.reference_direct
     return target - crop.reference_caustic if config.reads_gradients else target
 
 
 def _scaled(layers: Layers, judge: Layers) -> tuple[Layers, Layers]:
-    """Both over the exposure of the first."""
+    """Both divided by the exposure of the first."""
     scaled, exposure = features.normalised({name: layer[None] for name, layer in layers.items()})
     light = features.RADIANCE | {"target"}
     return {name: layer[0] for name, layer in scaled.items()}, {

@@ -10,13 +10,13 @@ its differences with the gradients of B:
     D_s      mean over 2^s x 2^s pixels
     m        mean over 3x3 pixels of f(A), a constant for the derivative
     v, v_g   variances of the image and of dx, dy, taken from A, see ``spread``
-    rho      Huber's function of the squared error: itself up to ``KNEE``², straight in the error beyond it
+    rho      Huber's function of the squared error: the square up to ``KNEE``², linear in the error beyond it
 
-The noise of B is independent of A and has mean 0: it adds a constant to a square, so the minimum is at the truth
-[Lehtinen et al. 2018, "Noise2Noise"]. Differences have 5 to 24 times less noise than the image, so their term shows
-what the noise of the image hides [compare Guo et al. 2019, "GradNet", where input and target are one render].
+The noise of B is independent of A and has mean 0: it adds a constant to the expected square, so the minimum is at the
+truth [Lehtinen et al. 2018, "Noise2Noise"]. Gradients have 5 to 24 times less noise than the image, so their term shows
+errors that the noise of the image hides [compare Guo et al. 2019, "GradNet", where input and target are one render].
 
-Weights are computed only from A. From B they would be small where B is bright by chance, and results too dark.
+Weights are computed only from A. Weights from B would be small where B is bright by chance, and results too dark.
 """
 
 import torch
@@ -26,18 +26,18 @@ from torch.nn.functional import avg_pool2d
 SCALES, KNEE = 3, 3.0
 # ε, for radiance over the exposure, where 4 is typical. It equals relMSE's ε for a typical radiance of 1/4.
 DARK = 0.25
-# As a share of the squared light: errors of differences below it count as little as noise does.
+# Added to the variance of gradients, as a share of the squared light; the 0.01 of the formula.
 RELATIVE = 0.01
-# A variance is at least this part of those around it: few samples know little of their own.
+# A variance is at least AROUND times the typical one in its window: few samples estimate their own variance badly.
 AROUND, WINDOW = 3.0, 5
 
 
 def halves(prediction: Tensor, other: dict[str, Tensor]) -> Tensor:
-    """L of f(A) (N, 3, H, W), radiance over the exposure of A. ``other``, in the same units, is what judges it:
+    """L of f(A) (N, 3, H, W), radiance over the exposure of A. ``other`` is the target in the same units:
 
     ``primal``, ``dx``, ``dy``           (N, 3, H, W) of B
     ``primal_se``, ``dx_se``, ``dy_se``  (N, 3, H, W) standard errors from A
-    ``counts``                           (N, 1, H, W) 1, or 0 where the image says nothing, as where lamps are seen
+    ``counts``                           (N, 1, H, W) 1, or 0 for pixels that do not count, such as visible lamps
     """
     return judged(prediction, avg_pool2d(prediction.detach(), 3, 1, 1, count_include_pad=False), other)
 
@@ -61,16 +61,16 @@ def judged(prediction: Tensor, smooth: Tensor, other: dict[str, Tensor]) -> Tens
 
 
 def spread(errors: Tensor) -> Tensor:
-    """Variances of standard errors (N, 3, H, W), at least three times what is typical of the 5x5 pixels around.
+    """Variances from standard errors (N, 3, H, W), at least three times the typical variance of the 5x5 pixels around.
 
-    Typical is the mean of their fourth roots, to the power of 4: single large ones hardly count.
+    The typical variance is the mean of fourth roots, to the power of 4: single large ones hardly count.
     """
     around = avg_pool2d(errors.sqrt(), WINDOW, 1, WINDOW // 2, count_include_pad=False)
     return torch.maximum(errors.square(), AROUND * around.pow(4))
 
 
 def _mean(squares: Tensor, share: Tensor) -> Tensor:
-    """The mean of rho over pixels, each by its ``share`` (N, 1, H, W), and channels."""
+    """The mean of rho over pixels and channels; ``share`` (N, 1, H, W) holds the weights of pixels."""
     straight = 2 * KNEE * squares.clamp(min=KNEE**2).sqrt() - KNEE**2
     rho = torch.where(squares < KNEE**2, squares, straight)
     return (share * rho).sum() / (squares.shape[1] * share.sum()).clamp(min=1)

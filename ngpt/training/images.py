@@ -22,16 +22,16 @@ from ngpt.training.validation import validate, views
 
 Loss = Callable[..., tuple[Tensor, dict[str, Tensor]]]
 
-# Logarithms beyond this are cut before exp: 4.9e8 times the typical radiance, far above anything one wants to learn.
+# Logarithms are clamped to this before exp; it is 4.9e8 times the typical radiance, far above any useful target.
 LIMIT = 20.0
 
 
 class Images(Task):
-    """Learns from ``crops`` and is measured by ``held_out``.
+    """Learns from ``crops`` and is validated on ``held_out``.
 
-    ``loss`` takes scene-linear prediction and target (N, 3, H, W) and a generator of the step's random numbers. If
-    there are pairs, it also takes what judges them, and the target covers only the other examples, None if there are
-    none. If crops are rendered meanwhile, as in a stream, no two runs are alike.
+    ``loss`` takes scene-linear prediction and target (N, 3, H, W) and a generator of the step's random numbers. If a
+    batch has pairs, it also takes the layers of their other halves; the target then covers only the other examples, and
+    is None if there are none. If crops are rendered during training, as in a stream, runs cannot be repeated exactly.
     """
 
     def __init__(self, settings: Settings, crops: Sequence[Any], held_out: Sequence[Any], loss: Loss):
@@ -72,7 +72,7 @@ class Images(Task):
                 pin_memory=processes.device.type == "cuda",
             )
         except NgptError as error:
-            # A worker's error comes with the worker's traceback before it.
+            # The text of a worker's error begins with the worker's traceback.
             raise NgptError(str(error).rpartition("NgptError: ")[2]) from None
 
     def loss(

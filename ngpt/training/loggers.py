@@ -1,4 +1,4 @@
-"""Where the numbers of a run go beside ``log.jsonl``, and how fast and with how much memory it runs.
+"""Loggers for the numbers of a run, in addition to ``log.jsonl``; and a meter of its speed and memory.
 
 A logger has ``log(step, values)``. TensorBoard is used if it is installed.
 """
@@ -17,7 +17,7 @@ class Logger(Protocol):
 
 
 class TensorBoard:
-    """Files in the folder ``tensorboard`` of the run; what was written for ``step`` and later is dropped."""
+    """Writes to the folder ``tensorboard`` of the run. Earlier entries for ``step`` and later are dropped."""
 
     def __init__(self, out: Path, step: int):
         from torch.utils.tensorboard import SummaryWriter
@@ -37,7 +37,7 @@ def loggers(out: Path, step: int) -> list[Logger]:
 
 
 class Meter:
-    """Steps a second since it was read last, and the most memory so far in MiB: the GPU's where there is one."""
+    """Steps per second since the last reading, and the largest memory so far in MiB: the GPU's if there is one."""
 
     def __init__(self, step: int, device: torch.device):
         self._step, self._time, self._device = step, time.monotonic(), device

@@ -1,6 +1,6 @@
-"""What training minimises: a perceptual distance over random transforms, and pixelwise terms beside it.
+"""The loss of training: a perceptual distance over random transforms, plus pixelwise terms.
 
-Other packages bring terms by entry points of the group "ngpt.losses", docs/train/add-a-loss.md.
+Other packages add terms by entry points of the group "ngpt.losses", see docs/train/add-a-loss.md.
 """
 
 import math
@@ -37,13 +37,14 @@ KINDS = (*perceptual.KINDS, "pu")
 class LossSettings:
     """The table [loss] of a configuration.
 
-    ``kind``         the perceptual part: "structural" (no weights needed), "elpips-squeeze" (NGPT's), "elpips-vgg",
-                     "pu" (OIDN's), or for none the name of a term, such as "l1", whose weight is 1 then
+    ``kind``         the perceptual part: "structural" (no weights needed), "elpips-squeeze" (NGPT's), "elpips-vgg" or
+                     "pu" (OIDN's); or, without a perceptual part, the name of a term such as "l1", which then has the
+                     weight 1
     ``evaluations``  draws of the random transforms that are averaged in each step
     ``scales``       largest downscaling among the transforms; NGPT trains with 2
     ``l1``, ``gradient``, ``relative``, ``logarithmic``, ``huber``, ``pyramid``, ``flip``
                      weights of the pixelwise parts; NGPT has 0.01, 0.01, 0, 0, 0, 0, 0
-    ``halves``       weight of the loss of pairs, ``ngpt.training.halves``; 0.25 has as much effect as the weights in
+    ``halves``       weight of the loss of pairs, ``ngpt.training.halves``; 0.25 has about the effect of the weights in
                      combine.toml
     ``backbone``, ``weights``  files of E-LPIPS (docs/train/losses.md); "" looks for the backbone in PyTorch's cache
     """
@@ -69,9 +70,9 @@ TERMS: Registry[Term] = Registry("ngpt.losses", "loss", Callable, _OURS, _TAKEN)
 
 
 class Loss:
-    """Call it with prediction and target, scene-linear (N, 3, H, W) float32, and a generator on their device.
+    """The loss of prediction and target, scene-linear (N, 3, H, W) float32, with a generator on their device.
 
-    ``other``  of the last predictions, which have no target: what judges them, see ``ngpt.training.halves``
+    ``other``  the layers of other halves for the last predictions, which have no target; see ``ngpt.training.halves``
 
     Returns the weighted sum, a mean over the predictions, and its parts, by name, before weighting.
     """

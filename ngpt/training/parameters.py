@@ -1,7 +1,7 @@
 """The tables of docs/train/training.md: ``python -m ngpt.training.parameters`` prints them.
 
-What a parameter means stands once, in the docstring of its dataclass: ``name``  meaning. What a configuration is for,
-in the first sentence of its file.
+The meaning of a parameter is in the docstring of its dataclass, as ``name``  meaning. The purpose of a configuration is
+the first sentence of its file.
 """
 
 import re
@@ -20,7 +20,7 @@ from ngpt.training.augment import Augmentation
 from ngpt.training.cost import network_of, per_pixel
 from ngpt.training.loss import TERMS, LossSettings
 
-# The tables of a configuration and what reads them; "" is its top.
+# The tables of a configuration and their dataclasses; "" is its top level.
 TABLES: dict[str, type] = {
     "": settings.Settings,
     "model": ModelConfig,
@@ -34,7 +34,7 @@ TABLES: dict[str, type] = {
 
 
 def parameter_tables() -> str:
-    """All parameters of a configuration: name, kind of value, default, meaning. In Markdown."""
+    """A table in Markdown of all parameters of a configuration: name, kind of value, default, meaning."""
     lines = ["| parameter | value | default | meaning |", "|---|---|---|---|"]
     for table, kind in TABLES.items():
         known: dict[str, Field] = {field.name: field for field in fields(kind)}
@@ -66,7 +66,7 @@ def _default(field: Field) -> str:
 
 
 def configuration_table() -> str:
-    """The configurations that come with ngpt, what they are for and what their networks cost. In Markdown."""
+    """A table in Markdown of the configurations that come with ngpt: their purposes and the cost of their networks."""
     lines = ["| configuration | what | parameters | thousand multiplications per pixel |", "|---|---|--:|--:|"]
     return "\n".join(lines + [configuration_row(name) for name in configs.names(configs.TRAINING)])
 

@@ -10,10 +10,10 @@ from ngpt.measure.distances.structural import ms_ssim
 from ngpt.network import oidnet
 from ngpt.network.transfer import signed_log, srgb
 
-# Resolutions of ``pyramid``, and the exposures at which a viewer may look at them.
+# The number of resolutions of ``pyramid``, and its exposures.
 _SCALES, _EXPOSURES = 4, (0.25, 1.0, 4.0)
-# For ``flip``: typical radiance over the exposure is 4. The first exposure makes it white; the last makes 32 times as
-# much white.
+# For ``flip``: typical radiance over the exposure is 4. The first exposure makes it white; the last one makes radiance
+# that is 32 times as bright white.
 _WHITES = (0.25, 0.0078)
 # The parts of ``pu``.
 _PU_L1, _PU_STRUCTURE = 0.16, 0.84
@@ -25,9 +25,9 @@ def l1(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def gradient_l1(prediction: Tensor, target: Tensor) -> Tensor:
-    """Mean |R(Δp) - R(Δt)| of the differences along x, plus that along y; 0 for a single row or column.
+    """Mean |R(Δp) - R(Δt)| of the differences along x, plus that along y; an axis of one pixel adds 0.
 
-    Both images' differences are taken within the image, so that none compares with nothing.
+    Differences are only between pixels of the image.
     """
     total = prediction.new_zeros(())
     for axis in (-1, -2):
@@ -37,7 +37,7 @@ def gradient_l1(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def relative(prediction: Tensor, target: Tensor, epsilon: float = 1e-2) -> Tensor:
-    """Mean |p - t| / (|p| + |t| + ε), in [0, 1): as much for dark pixels as for bright ones."""
+    """Mean |p - t| / (|p| + |t| + ε), in [0, 1): dark pixels count as much as bright ones."""
     return ((prediction - target).abs() / (prediction.abs() + target.abs() + epsilon)).mean()
 
 
@@ -75,21 +75,21 @@ def pyramid(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def flip(prediction: Tensor, target: Tensor) -> Tensor:
-    """Mean HDR-FLIP in [0, 1), the larger at two exposures: what a viewer sees who flips between both.
+    """Mean HDR-FLIP in [0, 1), the larger at two exposures: the difference that a viewer sees when flipping images.
 
-    It sees what the eye resolves, and weighs it as Lab does [Andersson et al. 2020 and 2021].
+    It filters by the resolution of the eye and compares in the Lab colour space [Andersson et al. 2020 and 2021].
     """
     return _flip.flip(prediction, target, _WHITES)
 
 
 def pu(prediction: Tensor, target: Tensor) -> Tensor:
-    """0.16 mean |p' - t'| + 0.84 (1 - MS-SSIM(p', t')): what OIDN is trained by, at the exposure it would give t.
+    """0.16 mean |p' - t'| + 0.84 (1 - MS-SSIM(p', t')): the training loss of OIDN, at the exposure it would give t.
 
-    x' are codes of its perceptual curve, in which equal steps look alike over all brightnesses that displays may have.
+    x' are codes of its perceptual curve, in which equal steps look equal at all brightnesses of displays.
     [Open Image Denoise 2.4.1, training/loss.py; its windows are Gaussians of 11 pixels, these are boxes of 7.]
     """
     scale = oidnet.exposure(target)
     a, b = (oidnet.perceptual(scale * image.clamp(min=0)) for image in (prediction, target))
-    # Below 0 the curve has no slope: what is there must find the way back.
+    # Below 0 the curve has no gradient: this term draws negative predictions back to 0.
     black = scale * prediction.clamp(max=0).abs()
     return _PU_L1 * ((a - b).abs() + black).mean() + _PU_STRUCTURE * (1 - ms_ssim(a, b)).mean()

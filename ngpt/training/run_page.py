@@ -1,4 +1,4 @@
-"""The page of a training run, written while it goes on, and the page that compares several. Needs no PyTorch.
+"""The page of a training run, updated during training, and the page that compares several. Needs no PyTorch.
 
 It reads ``log.jsonl`` in the folder of a run, and ``settings.json``, ``run.json`` and the last ``validation-STEP`` if
 they exist: a page can be made of any run, at any time.
@@ -24,7 +24,7 @@ from ngpt.training.run_summary import PAGE, SETTINGS
 from ngpt.training.settings_text import difference, flat
 
 RECORD = "run.json"
-# Seconds after which an open page of a run that goes on is read again.
+# Seconds after which an open page of an unfinished run reloads itself.
 REFRESH = 30
 COLUMNS = ("input", "result", "reference")
 
@@ -51,7 +51,7 @@ class Run:
 
     @property
     def steps(self) -> int:
-        """The number of steps that the run is to make; 0 if it is not known."""
+        """The planned number of steps; 0 if it is not known."""
         return int(self.settings.get("run", {}).get("steps", 0))
 
     @property
@@ -69,16 +69,16 @@ class Run:
         return min(self.scores, key=lambda entry: entry["relMSE"], default={})
 
     def line(self, name: str) -> list[tuple[float, float]]:
-        """The curve of an entry's number over the steps."""
+        """The curve of the number ``name`` over the steps."""
         return [(entry["step"], entry[name]) for entry in self.entries if name in entry]
 
     def last(self, name: str) -> float:
-        """The newest number of that name, NaN where there is none."""
+        """The newest number of that name; NaN if there is none."""
         return next((entry[name] for entry in reversed(self.entries) if name in entry), math.nan)
 
 
 def read_run(folder: str | Path, name: str = "") -> Run:
-    """Raises NgptError where there is no log, and for files that cannot be read."""
+    """The run in a folder. Raises NgptError if it has no log, and for files that cannot be read."""
     folder = Path(folder)
     if not (folder / LOG).is_file():
         raise NgptError(f"{folder}: holds no {LOG}; name the folder that `ngpt train --out` wrote")
@@ -90,7 +90,7 @@ def read_run(folder: str | Path, name: str = "") -> Run:
 
 
 def write_run(folder: str | Path) -> None:
-    """Writes ``run.html`` into the folder of a run; nothing where it has no log yet."""
+    """Writes ``run.html`` into the folder of a run, unless it has no log yet."""
     folder = Path(folder)
     if not (folder / LOG).is_file():
         return
@@ -117,7 +117,7 @@ def page(runs: list[Run], command: str = "") -> str:
 
 
 def _overview(runs: list[Run]) -> list[list[str]]:
-    """A row for each run: how far, how good, how fast."""
+    """A row for each run: progress, error, speed."""
     head = ["run", "steps", "best relMSE", "at step", "over the input's", "over the base's", "last relMSE", "time"]
     rows = [[*head, "steps/s", "memory, MiB", "parameters"]]
     least = min((run.best["relMSE"] for run in runs if run.best), default=math.nan)
@@ -134,7 +134,7 @@ def _overview(runs: list[Run]) -> list[list[str]]:
 
 
 def _state(run: Run) -> str:
-    """How much is left, at the rate of late."""
+    """The steps that are left, and their time at the latest rate."""
     if not run.steps:
         return ""
     if run.done >= run.steps:
@@ -180,7 +180,7 @@ def _time(seconds: float) -> str:
 
 
 def _drawn(run: Run) -> tuple[Path, dict[str, Any]] | None:
-    """The picture of the last validation that has captions, and these."""
+    """The picture of the last validation that has captions, and the captions; None if there is none."""
     for path in sorted(run.folder.glob("validation-*.json"), reverse=True):
         told = read_json(path)
         if path.with_suffix(".png").is_file() and isinstance(told, dict) and told.get("views"):
@@ -189,7 +189,7 @@ def _drawn(run: Run) -> tuple[Path, dict[str, Any]] | None:
 
 
 def _pictures(run: Run) -> str:
-    """Views held out, a strip of three pictures each, with what they are and their errors."""
+    """The validation views: a strip of three pictures for each, with scene, samples and errors."""
     found = _drawn(run)
     if found is None:
         return ""
@@ -222,7 +222,7 @@ def _style(runs: list[Run]) -> str:
             path, told = found
             data = base64.b64encode(path.read_bytes()).decode()
             width, height = told["size"]
-            # At twice the size of a pixel, where there is room.
+            # At most two screen pixels for each pixel.
             rules.append(f".{_key(run)}-box {{ max-width: {6 * width}px; }}")
             rules.append(
                 f".{_key(run)} {{ background-image: url(data:image/png;base64,{data}); "
@@ -237,20 +237,20 @@ def _style(runs: list[Run]) -> str:
 
 
 def _settings(title: str, rows: list[list[str]]) -> str:
-    """A table under its title, "" where it has no row but its head."""
+    """A table under its title; "" if it has no row except its header."""
     head = f"<h3>{markup(title)}</h3>" if title else ""
     return f'{head}<div class="settings">{plain_table(rows)}</div>' if len(rows) > 1 else ""
 
 
 def _own(run: Run) -> list[list[str]]:
-    """What the settings of a run change in the configuration that it began with."""
+    """The settings of a run that differ from the configuration that it began with."""
     changed = run.record.get("changed", {})
     rows = [[name, *map(_text, values)] for name, values in changed.items()]
     return [["setting", str(run.record.get("base", "?")), "this run"], *rows]
 
 
 def _differing(runs: list[Run]) -> list[list[str]]:
-    """Settings in which not all runs are alike."""
+    """The settings that differ between runs."""
     values = [flat(run.settings) for run in runs]
     return _side_by_side("setting", runs, values, difference(*values))
 

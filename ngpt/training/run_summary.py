@@ -1,4 +1,4 @@
-"""What ``ngpt info`` says of the folder of a training run, without PyTorch and while the run goes on."""
+"""The summary of a training run's folder for ``ngpt info``, without PyTorch, also during the run."""
 
 import json
 import struct
@@ -13,9 +13,9 @@ from ngpt.system.records import check, parse_json, read_json
 
 CHECKPOINT, SETTINGS, WEIGHTS = "checkpoint.safetensors", "settings.json", "weights.safetensors"
 PAGE = "run.html"
-# Entries of the log that the loss is averaged over: one batch says little.
+# The number of log entries that the loss is averaged over, since the loss of one batch is noisy.
 _RECENT = 10
-# Bytes; far above what names and shapes of tensors take.
+# The largest header in bytes, far more than names and shapes of tensors take.
 _MAX_HEADER = 2**26
 
 
@@ -58,7 +58,7 @@ def summary(folder: Path) -> dict[str, Any]:
 
 
 def _header(path: Path) -> dict[str, Any]:
-    """The record in a checkpoint, without its tensors: a safetensors file begins with a length and so much JSON."""
+    """The record in a checkpoint, without its tensors: a safetensors file begins with the length of its JSON header."""
     try:
         with regular_file(path) as file:
             (length,) = struct.unpack("<Q", file.read(8))

@@ -11,8 +11,8 @@ from ngpt.training.settings import OptimizerSettings
 def learning_rate(settings: OptimizerSettings, step: int, steps: int) -> float:
     """The learning rate of step 0 .. steps - 1.
 
-    paper    grows by a constant factor from 1e-4 of the rate to all of it at ``warmup``, is constant until ``flat``,
-             then halves in every ``half_life`` steps [Kettunen et al. 2019, section 5.3, and their code]
+    paper    grows exponentially from 1e-4 of the rate to the full rate at ``warmup``, is constant until ``flat``, then
+             halves every ``half_life`` steps [Kettunen et al. 2019, section 5.3, and their code]
     cosine   grows linearly until ``warmup``, then falls as half a cosine to 1 % at the last step
     """
     rate, warmup = settings.learning_rate, warmup_of(settings, steps)
@@ -27,13 +27,14 @@ def learning_rate(settings: OptimizerSettings, step: int, steps: int) -> float:
 
 
 def warmup_of(settings: OptimizerSettings, steps: int) -> int:
-    """The steps of the warm-up: a tenth of a run that would otherwise end within it, and never learn at its rate."""
+    """The steps of the warm-up; a tenth of a run that would otherwise end before it reaches its learning rate."""
     return settings.warmup if settings.warmup < steps else steps // 10
 
 
 @torch.no_grad()
 def update_average(average: nn.Module, model: nn.Module, decay: float, step: int) -> None:
-    """average <- d average + (1 - d) model, with d growing to ``decay`` so that first weights are soon forgotten."""
+    """average <- d average + (1 - d) model, where d grows to ``decay``, so that the first weights soon stop
+    counting."""
     decay = min(decay, (1 + step) / (10 + step))
     for mean, value in zip(average.parameters(), model.parameters(), strict=True):
         mean.lerp_(value, 1 - decay)

@@ -17,18 +17,18 @@ from ngpt.training.settings_text import difference, flat
 
 @dataclass(frozen=True)
 class DataSettings:
-    """Where examples come from.
+    """The source of examples.
 
-    ``folders``     datasets (``python -m data_gen``) or folders of stacks with references; all are mixed
-    ``validation``  beginnings of the names of scenes that are kept out of training
-    ``validation_share``  share of the scenes that are kept out where ``validation`` names none, at least one scene; 0
-                    keeps none out
-    ``crop``        pixels of an example's side
-    ``pairs``       share of the examples that have no reference but another half, where there are both kinds
-    ``kept``        folder for references of sets that are rendered while the network trains: made once, they are met
-                    again with inputs of new noise. "" renders new ones for ever
-    ``workers``     processes that prepare examples, as many as there are processors at most; 0 prepares them in between
-    ``cache``       MiB of memory, for each of these, to keep what was prepared in
+    ``folders``     data sets (``python -m data_gen``) or folders of stacks with references; all are mixed
+    ``validation``  prefixes of the names of scenes that are kept out of training
+    ``validation_share``  share of the scenes that are kept out if ``validation`` is empty, at least one scene; 0 keeps
+                    none out
+    ``crop``        side of an example in pixels
+    ``pairs``       share of examples that are pairs without a reference, if there are also crops with references
+    ``kept``        folder for references of sets that are rendered during training: references are rendered once, and
+                    used again with new noise in the inputs. "" always renders new ones
+    ``workers``     processes that prepare examples, at most one for each processor; 0 prepares them between steps
+    ``cache``       MiB of memory for prepared examples, in each of these processes
     """
 
     folders: tuple[str, ...] = ()
@@ -45,12 +45,12 @@ class DataSettings:
 class OptimizerSettings:
     """Adam and its schedule (``ngpt.training.schedule``); defaults are NGPT's.
 
-    ``learning_rate``  the largest of the schedule
+    ``learning_rate``  the largest learning rate of the schedule
     ``betas``      decays of Adam's two moments
     ``schedule``   "paper" (warm-up, flat, exponential decay) or "cosine" (warm-up, half a cosine to 1 % at the end)
-    ``warmup``     steps until the learning rate is reached; a tenth of a run that would end before
-    ``flat``       steps until which it stays ("paper")
-    ``half_life``  steps in which it then halves ("paper")
+    ``warmup``     steps until the learning rate is reached; a tenth of the run if the run would end before
+    ``flat``       step until which the rate is constant ("paper")
+    ``half_life``  steps in which the rate then halves ("paper")
     ``clip``       largest norm of the gradient; 0 does not clip
     ``ema``        decay per step of the average of the weights that is validated and shipped; 0 keeps none
     """
@@ -67,15 +67,15 @@ class OptimizerSettings:
 
 @dataclass(frozen=True)
 class RunSettings:
-    """How long, how precise, how often.
+    """Length, precision and intervals of a run.
 
     ``steps``, ``batch``  length of the run, and examples per step over all processes
-    ``precision``  of the network's body: "float32" or "bfloat16"; CPUs without instructions for the latter, which
-                   would take several times as long, compute in float32
-    ``seed``       of everything random: weights, order, augmentation, transforms of the loss
+    ``precision``  precision of the network's body: "float32" or "bfloat16". CPUs without instructions for bfloat16,
+                   which would take several times as long, compute in float32
+    ``seed``       seed of all random numbers: weights, order, augmentation, transforms of the loss
     ``minutes``    wall-clock budget of one call; 0 is none. A run that it stops can be resumed
-    ``log``, ``save``, ``validate``  every so many steps
-    ``views``      validation inputs looked at each time, spread over all of them
+    ``log``, ``save``, ``validate``  steps between these
+    ``views``      number of inputs in each validation, spread evenly over all
     """
 
     steps: int = 600_000
@@ -91,11 +91,11 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class TemporalSettings:
-    """The network that blends frames (``ngpt.training.temporal``), in place of one that makes images.
+    """The network that blends frames (``ngpt.training.temporal``), instead of a network that makes images.
 
     ``methods``  the methods whose results it learns to blend
-    ``round``    steps until the shots are played anew, with histories by the network as it is then
-    ``clips``    shots of one method that are played in a round, drawn at random
+    ``round``    steps of a round; at its beginning the current network makes new histories of shots
+    ``clips``    number of clips in a round, drawn at random; a clip is a shot by one method
     """
 
     methods: tuple[str, ...] = ("ngpt-fast", "ngpt-combine", "oidn", "wcv")
@@ -105,10 +105,10 @@ class TemporalSettings:
 
 @dataclass(frozen=True)
 class Settings:
-    """All of a run. ``loss`` is for ``ngpt.training.loss.make_loss``. Of ``model`` and ``temporal`` there is one.
+    """All settings of a run. ``ngpt.training.loss.make_loss`` reads ``loss``. Either ``model`` or ``temporal`` is set.
 
-    ``initial``  weights to start from, with the same [model]: a file, or a network that comes with ngpt, by its name;
-                 "" starts from chance
+    ``initial``  weights to start from, with the same [model]: a file, or the name of a network that comes with ngpt; ""
+                 starts from random weights
     """
 
     model: ModelConfig | None = None
@@ -121,14 +121,14 @@ class Settings:
     initial: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """What JSON holds, and ``from_dict`` reads."""
+        """The settings as nested dicts for JSON, which ``from_dict`` reads."""
         return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
 
 
 def read_settings(path: str | Path, changes: list[str] = ()) -> Settings:  # type: ignore[assignment]
     """The settings of a TOML file, after ``changes`` of the form "run.steps=100".
 
-    Raises NgptError for a file that cannot be read, and unknown or ill-typed keys.
+    Raises NgptError for a file that cannot be read, for unknown keys, and for values of a wrong type.
     """
     values = read_toml(path)
     for change in changes:
@@ -144,13 +144,13 @@ def from_dict(values: dict[str, Any], path: str) -> Settings:
 
 
 def changed(before: Settings, now: Settings) -> list[str]:
-    """What differs, a text "table.key: before -> now" each."""
+    """The settings that differ, each as "table.key: before -> now"."""
     one, other = flat(before.to_dict()), flat(now.to_dict())
     return [f"{name}: {one.get(name)} -> {other.get(name)}" for name in difference(one, other)]
 
 
 def published(settings: Settings) -> dict[str, Any]:
-    """The settings as they go into files that are given away: names of folders and files, not where they lie."""
+    """The settings for published files: folders and files without their paths."""
     values = settings.to_dict()
     values["data"]["folders"] = [Path(folder).name for folder in settings.data.folders]
     values["initial"] = Path(settings.initial).name

@@ -1,13 +1,13 @@
-"""Shards of a training set: one safetensors file for a few crops of one scene, complete or not there at all.
+"""Shards of a training set: one safetensors file for a few crops of one scene, written completely or not at all.
 
 Tensors, N crops of K inputs each, (N, K, H, W, C) unless said otherwise, scene-linear:
 
-    indirect, direct            primal - direct - caustic, and direct: kept apart, or half floats would lose what a lamp
-                                outshines
+    indirect, direct            primal - direct - caustic, and direct: separate, since half floats would lose the light
+                                that a lamp outshines
     albedo, normal, depth
     primal_se                   standard errors: variances of small numbers would underflow in half floats
     dx, dy, dx_se, dy_se        all or none: inputs of a sampler without gradients have none
-    caustic, caustic_se         all three or none: light that dx and dy hold nothing of
+    caustic, caustic_se         all three or none: light that dx and dy exclude
     reference_caustic           (N, H, W, 3)
     reference_indirect, reference_direct    (N, H, W, 3)
     reference_halves            (N, 2, H, W, 3), optional: reference_indirect by each half of its samples
@@ -18,11 +18,11 @@ Tensors, N crops of K inputs each, (N, K, H, W, C) unless said otherwise, scene-
 
 The layer ``shared`` of inputs is left out, because no network reads it.
 
-Pairs, K = 2 inputs that judge each other, have none of the references.
+Pairs have K = 2 independent inputs, and no references.
 
 Shots are crops too, one for each frame, in their order; the records of crops number the frames.
 
-A tensor is of half floats where that loses at most ``MAX_LOSS`` of it, measured crop by crop, and of floats elsewhere.
+A tensor is stored in half floats if that changes at most the share ``MAX_LOSS`` of every crop, in floats otherwise.
 The header's metadata holds the record of the shard as JSON under "ngpt".
 """
 
@@ -55,7 +55,7 @@ REFERENCE_CAUSTIC = "reference_caustic"
 REFERENCE_HALVES = "reference_halves"
 MOTION = "motion"
 
-# Pixels of motion that stand for motion that is not known: both lead out of any image.
+# The motion, in pixels, that stands for unknown motion; it leads out of any image.
 FAR = 1e6
 
 # Types of numbers in safetensors
@@ -105,9 +105,11 @@ class CropData:
 def tensor_names(
     gradients: bool, caustic: bool = False, further: Sequence[str] = (), *, pairs: bool = False
 ) -> tuple[str, ...]:
-    """The tensors of a shard whose inputs have gradients, or have none; the layer ``caustic``, or not; and others.
+    """The names of the tensors of a shard.
 
-    ``pairs``  whether it holds pairs, which have no references
+    ``gradients``, ``caustic``  whether its inputs have these layers
+    ``further``                 names of its optional tensors
+    ``pairs``                   whether it holds pairs, which have no references
     """
     references = () if pairs else (*((REFERENCE_CAUSTIC,) if caustic else ()), *REFERENCES)
     return (*INPUTS, *(GRADIENTS if gradients else ()), *(CAUSTIC if caustic else ()), *further, *references, "spp")
@@ -138,17 +140,18 @@ def smallest_float(tensor: np.ndarray) -> np.ndarray:
 
 
 def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]) -> None:
-    """Writes a shard, and the record of how it came about; it may hold no crop at all, when all have failed.
+    """Writes a shard and the record of its rendering. It may hold no crop, if all have failed.
 
-    A shard that is there already is kept: it is the same one but for the times in its record, made by a worker that was
-    faster, or was lost before it said so; and its checksum may be in the manifest by now.
-    Raises NgptError for numbers that are not finite, naming the tensor, and when the file cannot be written.
+    An existing shard is kept: another worker has made it, it differs only in the times of its record, and its checksum
+    may be in the manifest already.
+
+    Raises NgptError for a tensor with numbers that are not finite, and if the file cannot be written.
     """
     from safetensors.numpy import save
 
     each = [crop.tensors() for crop in crops]
     tensors = {name: np.stack([t[name] for t in each]) for name in each[0]} if each else {}
-    # Halves of motion would be off by hundredths of a pixel, and FAR is none of them.
+    # Half floats would change motion by hundredths of a pixel, and cannot hold FAR.
     tensors = {name: tensor if name == MOTION else smallest_float(tensor) for name, tensor in tensors.items()}
     for name, tensor in tensors.items():
         if not np.isfinite(tensor).all():
@@ -160,10 +163,11 @@ def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]
 
 
 class Shard:
-    """A shard for reading, tensors piece by piece.
+    """A shard for reading parts of its tensors.
 
-    Nothing of it is mapped into memory: a file that is cut while it is mapped ends the process without a word.
-    ``keep_open``  whether it is opened once, so that it may be removed while it is read, and not for each piece
+    The file is not mapped into memory: truncating a mapped file would kill the process without a message.
+
+    ``keep_open``  whether the file is opened only once, so that it may be removed while it is read
     """
 
     def __init__(self, path: Path, keep_open: bool = False):
@@ -175,7 +179,7 @@ class Shard:
         if not path.is_file():
             raise NgptError(f"{path}: no such shard; make it again: ngpt dataset")
         try:
-            # It checks the header; tensors are read without it.
+            # safetensors checks the header; tensors are read without it.
             with safe_open(path, framework="np") as checked:
                 metadata = checked.metadata() or {}
                 self.names = tuple(checked.keys())
@@ -197,7 +201,7 @@ class Shard:
         return tuple(self._tensors[name]["shape"])
 
     def type(self, name: str) -> str:
-        """As safetensors calls it, "F16"."""
+        """The type's name in safetensors, such as "F16"."""
         return self._tensors[name]["dtype"]
 
     def tensor(self, name: str) -> np.ndarray:

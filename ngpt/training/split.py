@@ -1,4 +1,4 @@
-"""Which crops a network is trained on, and which it is measured by: whole scenes on either side."""
+"""Splits crops into training and validation, by whole scenes."""
 
 import hashlib
 from collections.abc import Sequence
@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 from ngpt.errors import NgptError
 
-# Names that a message lists before it says "..."
+# The most names in a message, before "..."
 _LISTED = 8
 
 
 class Split(NamedTuple):
-    """``training`` and ``held_out`` crops, and one line that says which were set aside ("" where nothing is split)."""
+    """``training`` and ``held_out`` crops, and one line that says which were set aside ("" if there are no crops)."""
 
     training: list[Any]
     held_out: list[Any]
@@ -23,11 +23,11 @@ def split(crops: Sequence[Any], validation: tuple[str, ...] = (), share: float =
 
     If ``validation`` is empty, a ``share`` of the scenes is set aside, at least one. A hash of the names chooses them,
     so that the same set is always split the same way. With a single scene, a share of the crops is set aside; a single
-    crop is trained on.
+    crop goes to training.
 
-    Pairs of scenes that are set aside are in neither part: they have no reference to measure by.
+    Pairs of scenes that are set aside are in neither part, because they have no reference.
 
-    Raises NgptError for a name that no scene begins with: such a run would be judged by nothing, or by less than asked.
+    Raises NgptError for a name that no scene begins with, since the validation would lack that scene.
     """
     scenes = sorted({crop.scene for crop in crops})
     if not scenes:
@@ -56,7 +56,8 @@ def split(crops: Sequence[Any], validation: tuple[str, ...] = (), share: float =
 
 
 def _of_one_scene(crops: list[Any], measurable: list[Any], share: float) -> Split:
-    """Crops of one scene show the same things, so their errors are lower than on another scene."""
+    """Splits the crops of a single scene. The validation crops resemble the others, so their errors are lower than on
+    another scene."""
     scene, number = measurable[0].scene, len(measurable)
     count = min(_count(number, share), number - 1)
     if not count:
@@ -67,7 +68,8 @@ def _of_one_scene(crops: list[Any], measurable: list[Any], share: float) -> Spli
 
 
 def _chosen(scenes: list[str], share: float) -> set[str]:
-    """A share of the scenes. Those chosen first stay chosen when a set grows, unless a newcomer precedes them."""
+    """A share of the scenes, in the order of hashes. They stay chosen when a set grows, unless a new scene precedes
+    them."""
     ordered = sorted(scenes, key=lambda name: hashlib.sha256(name.encode()).hexdigest())
     return set(ordered[: min(_count(len(scenes), share), len(scenes) - 1)])
 

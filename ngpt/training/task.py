@@ -1,4 +1,4 @@
-"""What a run trains; the trainer (``ngpt.training.trainer``) does the rest: steps, logs, checkpoints, stops, pages."""
+"""The interface of what a run trains; the trainer (``ngpt.training.trainer``) runs steps, logs, checkpoints, pages."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from ngpt.training.distributed import Processes
 
 
 class Task(ABC):
-    """A network, its examples, its loss, and how good it is on what was set aside."""
+    """A network, its examples, its loss, and its validation."""
 
     @abstractmethod
     def network(self) -> nn.Module:
@@ -21,7 +21,7 @@ class Task(ABC):
 
     @abstractmethod
     def batches(self, model: nn.Module, step: int, processes: Processes) -> Iterator[dict[str, Tensor]]:
-        """The batches of this process from ``step`` on, without end; ``model`` is the network that is trained by them.
+        """The endless batches of this process from ``step`` on; ``model`` is the network in training.
 
         A batch is a function of the settings, the number of its step, and the ``state``.
         """
@@ -34,24 +34,24 @@ class Task(ABC):
 
     @abstractmethod
     def validate(self, model: nn.Module, picture: Path) -> dict[str, float]:
-        """Scores on what was set aside: "relMSE" (the least is the best), of what goes in ("relMSE primal"), ...
+        """Scores on the validation data: "relMSE" of the results (lower is better), "relMSE primal" of the inputs, ...
 
-        Some results are drawn into the file ``picture``. {} where nothing was set aside.
+        Some results are drawn into the file ``picture``. {} if there are no validation data.
         """
 
     @abstractmethod
     def save(self, path: Path, model: nn.Module, provenance: dict[str, Any]) -> None:
-        """Writes weights for inference, in place of a file that is there."""
+        """Writes weights for inference; replaces an existing file."""
 
     @abstractmethod
     def load(self, path: str) -> nn.Module:
-        """The network of such a file, or of one that comes with ngpt by its name; raises NgptError for another one."""
+        """The network of such a file, or of ngpt by its name; raises NgptError for a network of another kind."""
 
     def state(self) -> dict[str, Tensor]:
-        """What the next batches depend on beside the settings and the step: it goes into the checkpoint."""
+        """The tensors for the checkpoint that the next batches depend on, in addition to the settings and the step."""
         return {}
 
     def restore(self, state: dict[str, Tensor], path: str) -> None:
-        """Takes the ``state`` of the checkpoint ``path``; raises NgptError where it does not fit."""
+        """Restores the ``state`` from the checkpoint ``path``; raises NgptError if it does not fit."""
         if state:
             raise NgptError(f"{path}: is of a run of another kind; give the run another folder")

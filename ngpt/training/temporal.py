@@ -1,9 +1,9 @@
-"""The task of the trainer that teaches the network that blends frames (``ngpt.sequence.network``), on shots.
+"""The task that trains the network that blends frames (``ngpt.sequence.network``), on shots.
 
-A frame's history is made by the network itself: in each round the current network plays the shots, and it learns from
-the resulting histories until the next round [Ross et al. 2011, "A reduction of imitation learning and structured
-prediction to no-regret online learning"]. Results frame by frame come from several methods, so it learns to work with
-any. The loss of a frame is
+The network makes the history of a frame itself: at the beginning of each round the current network blends the shots,
+and it learns from the resulting histories until the next round [Ross et al. 2011, "A reduction of imitation learning
+and structured prediction to no-regret online learning"]. The results to blend come from several methods, so it learns
+to work with any method. The loss of a frame is
 
     E |y - r|² / E_x + FLICKER E |(y - r) - W (y' - r')|² / F_x
 
@@ -37,11 +37,10 @@ from ngpt.training.validation import Pictures, spread
 FLICKER = 1.0
 ENERGY = 300.0
 LEAST = 3e-4
-# Frames that may be behind the first of a shot, in training: shots are short, and histories are not.
+# Lengths of simulated histories before the first frame of a shot, since shots for training are short.
 LENGTHS = (1, 1, 4, 12)
 # The share of clips whose light is made to change, more often and more than in the shots themselves.
 RELIT = 0.4
-# What the header of a file of weights says that it holds.
 
 
 class Blending(Task):
@@ -67,7 +66,7 @@ class Blending(Task):
         self.settings, self.clips, self.table = settings, clips, settings.temporal
         self.held_out = spread(held_out, settings.run.views)
         self._player: dict[str, Tensor] = {}
-        # Scores of ``held_out`` frame by frame and by the rules, which stay the same: (2, clips, 2).
+        # Scores of ``held_out`` frame by frame and by the rules, which never change: (2, clips, 2).
         self._fixed: np.ndarray | None = None
 
     def network(self) -> nn.Module:
@@ -100,7 +99,7 @@ class Blending(Task):
             step += 1
 
     def _played(self, model: nn.Module, number: int) -> list[dict[str, np.ndarray]]:
-        """The frames of a round, with the histories that the network made at its beginning."""
+        """The frames of a round, with histories by the network at the beginning of the round."""
         rng = np.random.default_rng((self.settings.run.seed, 0, number))
         player = copy.deepcopy(model)
         player.load_state_dict(self._player)
@@ -122,9 +121,9 @@ class Blending(Task):
         return loss(corrections.float(), batch)
 
     def validate(self, model: nn.Module, picture: Path) -> dict[str, float]:
-        """Errors and flicker relative to the reference, free of its noise: geometric means over the clips.
+        """Errors and flicker relative to the reference, without its noise: geometric means over the clips.
 
-        "primal" is frame by frame, "base" by only the rules.
+        "primal" means results frame by frame, "base" the blend by the rules without a network.
         """
         if not self.held_out:
             return {}
@@ -143,7 +142,7 @@ class Blending(Task):
                 pictures.add(images, clip.scene, int(last.number("ngpt:spp") or 0), *relative)
         pictures.write(picture)
         every = np.stack([found, *self._fixed])
-        # Without the noise of the reference an error may come out below 0, where there is next to none.
+        # The estimate of a very small error may be below 0, because the noise of the reference is subtracted.
         good = (np.isfinite(every) & (every > 0)).all(axis=(0, 2))
         if not good.any():
             return {}
@@ -163,7 +162,7 @@ class Blending(Task):
 
 
 def loss(corrections: Tensor, batch: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-    """The loss of frames (N, C, H, W) from ``play`` and its parts; 1 + FLICKER where nothing is won."""
+    """The loss of frames (N, C, H, W) from ``play``, and its parts; 1 + FLICKER without any improvement."""
     shares = MOST * torch.sigmoid(batch["prior"] + LARGEST * torch.tanh(corrections / LARGEST))
     shares = batch["trust"] * torch.minimum(shares, batch["first"])
     bands = batch["bands"].unflatten(1, (BANDS, 3))
@@ -181,7 +180,7 @@ def loss(corrections: Tensor, batch: Mapping[str, Tensor]) -> tuple[Tensor, dict
 
 
 def as_corrections(model: Any) -> Corrections:
-    """What ``ngpt.sequence.history.Temporal`` takes, of a network in PyTorch."""
+    """A network in PyTorch as the corrections of ``ngpt.sequence.history.Temporal``."""
 
     @torch.inference_mode()
     def corrections(inputs: np.ndarray) -> np.ndarray:

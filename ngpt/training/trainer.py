@@ -1,8 +1,8 @@
-"""The training loop: resumable bit for bit, stoppable at any moment.
+"""The training loop: it can be stopped at any moment and resumed bit for bit.
 
-What a step does is a function of the settings, the seed and the step's number, and everything else that it changes
-(weights, their average, Adam's moments) is in the checkpoint: a run that was killed and resumed ends with the same
-weights as one that was not, on the same device with the same number of threads and processes.
+A step depends only on the settings, the seed, its number, and the state in the checkpoint (weights, their average,
+Adam's moments, the state of the task). So a run that was killed and resumed ends with the same weights as an
+uninterrupted one, on the same device with the same number of threads and processes.
 """
 
 import copy
@@ -40,14 +40,14 @@ from ngpt.version import __version__
 
 
 def show(text: str) -> None:
-    """Prints a line at once: logs are looked at while they grow."""
+    """Prints a line without buffering, so that a growing log can be followed."""
     print_line(text, sys.stdout)
 
 
 class Trainer:
     """One run in the folder ``out``, new or continued.
 
-    ``task`` is what it trains. Files in ``out``: ``checkpoint.safetensors``, ``weights.safetensors`` (for inference),
+    ``task`` is the network to train. Files in ``out``: ``checkpoint.safetensors``, ``weights.safetensors`` (for inference),
     ``best.safetensors`` (the weights with the least validation error), ``log.jsonl``, ``run.html``, ``tensorboard/``,
     ``validation-STEP.png``.
     """
@@ -80,7 +80,7 @@ class Trainer:
         if settings.run.precision == "bfloat16" and not in_bfloat16(self.device.type, settings.run.precision):
             say("run.precision: this processor has no instructions for bfloat16: computing in float32, which is faster")
         self._stop = False
-        # The least error of a validation so far.
+        # The least validation error so far.
         self.best = math.inf
         self._loggers: list[Logger] = []
         # The number of the signal that ended it, if one did.
@@ -119,7 +119,7 @@ class Trainer:
             self.task.restore(parts["task"], str(self.checkpoint))
         for change in changed(before, self.settings):
             self.say(f"changed since the checkpoint: {change}")
-        # What was logged after the checkpoint will be logged again.
+        # Entries after the checkpoint will be logged again.
         log = _keep_lines(self.out / LOG, self.step)
         self.best = min((entry["relMSE"] for entry in log if "relMSE" in entry), default=math.inf)
 
@@ -161,7 +161,7 @@ class Trainer:
 
     @contextmanager
     def _saved(self) -> Iterator[None]:
-        """Should what is in it fail, as records do where a disk is full, the steps since the last checkpoint stay."""
+        """Saves a checkpoint if the block fails, as on a full disk, so that no steps are lost."""
         try:
             yield
         except (NgptError, OSError):
@@ -169,9 +169,9 @@ class Trainer:
             raise
 
     def save(self) -> None:
-        """Writes checkpoint and weights; whatever interrupts this, the previous ones stay whole.
+        """Writes checkpoint and weights. If this is interrupted, the previous files stay complete.
 
-        A checkpoint that cannot be written there goes elsewhere, and NgptError says where.
+        A checkpoint that cannot be written to its place is written elsewhere, and NgptError says where.
         """
         if self.processes.rank:
             return
@@ -191,7 +191,7 @@ class Trainer:
         write_run(self.out)
 
     def _save_weights(self, name: str) -> None:
-        """For inference: the average, and how it came about."""
+        """Writes the averaged weights for inference, with the facts of their training."""
         provenance = {
             "step": self.step,
             "hours": round(self.seconds / 3600, 3),
@@ -204,7 +204,7 @@ class Trainer:
         self.task.save(self.out / name, self.average, provenance)
 
     def validate(self) -> None:
-        """Logs the scores of the averaged weights on what was set aside, draws some, and keeps the best weights."""
+        """Logs the validation scores of the averaged weights, draws some results, and keeps the best weights."""
         if self.processes.rank == 0:
             scores = self.task.validate(self.average, self.out / f"validation-{self.step:07d}.png")
             if scores:
@@ -272,7 +272,7 @@ def _seed(seed: int, step: int) -> int:
 
 
 def _keep_lines(path: Path, step: int) -> list[dict[str, float]]:
-    """Drops what a log says of steps after ``step``, and a last line that was cut short; returns what is left."""
+    """Drops entries of a log after ``step``, and an incomplete last line; returns the other entries."""
     if not path.is_file():
         return []
     entries = []

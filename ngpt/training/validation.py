@@ -1,4 +1,4 @@
-"""How good a network is on views it does not train on, in numbers and pictures."""
+"""Validation of a network on views that it is not trained on, in numbers and pictures."""
 
 import math
 from collections.abc import Sequence
@@ -34,7 +34,8 @@ class Pictures:
         self._told: list[dict[str, Any]] = []
 
     def add(self, images: Sequence[np.ndarray], scene: str, spp: int, primal: float, network: float) -> None:
-        """A row of input, result and reference (H, W, 3); ``primal`` and ``network`` are errors of the first two."""
+        """Adds a row of input, result and reference (H, W, 3); ``primal`` and ``network`` are errors of the first
+        two."""
         stops = auto_exposure(images[-1])
         self._rows.append(np.hstack([to_srgb8(image, stops) for image in images]))
         errors = {"relMSE primal": float(primal), "relMSE": float(network)}
@@ -42,10 +43,10 @@ class Pictures:
         self._told.append({"scene": scene, "spp": spp, **finite})
 
     def write(self, picture: str | Path) -> None:
-        """Writes a PNG, and beside it what its rows are, as JSON: the size of one picture, scenes, samples, errors."""
+        """Writes a PNG, and a JSON file with the size of one picture and each row's scene, samples and errors."""
         if not self._rows:
             return
-        # Folders of stacks may hold views of different sizes; those that do not fit are left out.
+        # Folders of stacks may hold views of different sizes; those that differ from the first are left out.
         fit = [i for i, row in enumerate(self._rows) if row.shape == self._rows[0].shape]
         rows = [self._rows[i] for i in fit]
         write_bytes(picture, encode_png(np.ascontiguousarray(np.vstack(rows))))
@@ -54,12 +55,12 @@ class Pictures:
 
 
 def views(crops: Sequence[Any], count: int) -> list[tuple[Any, int]]:
-    """At most ``count`` of all (crop, input), evenly spread."""
+    """At most ``count`` of all pairs (crop, input), evenly spread."""
     return spread([(crop, k) for crop in crops for k in range(crop.inputs)], count)
 
 
 def spread(every: Sequence[Any], count: int) -> list[Any]:
-    """At most ``count`` of them, evenly spread."""
+    """At most ``count`` of the items, evenly spread."""
     if len(every) <= count:
         return list(every)
     return [every[int(i * len(every) / count)] for i in range(count)]
@@ -69,11 +70,11 @@ def spread(every: Sequence[Any], count: int) -> list[Any]:
 def validate(
     model: Reconstructor, views: Sequence[tuple[Any, int]], picture: str | Path = "", precision: str = "float32"
 ) -> dict[str, float]:
-    """Geometric means, over views (crop, input), of the trimmed relMSE; with direct emission if the network reads it.
+    """Geometric means, over views (crop, input), of the trimmed relMSE without direct emission.
 
-    Where the data have two halves of a reference, the noise of the reference is no part of it. Beside the result's they
-    are of the input ("relMSE primal") and of what the network starts from ("relMSE base", NaN without). With
-    ``picture``, some views are drawn into that file (``Pictures``).
+    Two halves of a reference remove the reference's noise. "relMSE" is the error of the result, "relMSE primal" of the
+    input, and "relMSE base" of the base (NaN if there is none). With ``picture``, some views are drawn into that file
+    (``Pictures``).
     """
     model.eval()
     device = next(model.parameters()).device
@@ -97,5 +98,5 @@ def validate(
 
 
 def _mean(values: list[float]) -> float:
-    """The geometric mean, NaN of nothing."""
+    """The geometric mean; NaN for an empty list."""
     return geometric_mean(values) if values else float("nan")
