@@ -1,11 +1,11 @@
-"""What each part of the paper's network and loss is worth, at the scale of a CPU: the ablations of NGPT's section 4.4.
+"""The effect of each part of the paper's network and loss, at the scale of a CPU: the ablations of NGPT's section 4.4.
 
     python -m bench.ablations --data SET ... --apart SCENE ... --out DIR
 
-Trains configs/ablations.toml and its variants on the same crops, for as many steps, from the same seed, and measures
-them on all inputs of the scenes whose names begin with one of --apart: geometric means of trimmed relMSE (free of the
-noise of references in halves) and FLIP, apart for few samples and many. Runs that are there are continued or read: the
-command may be stopped. --only takes some of the variants.
+Trains configs/ablations.toml and its variants on the same crops, for the same number of steps, from the same seed.
+Measures them on all inputs of the scenes whose names begin with one of --apart: geometric means of trimmed relMSE
+(without the noise of references in halves) and FLIP, separately for few samples and many. The command may be stopped:
+existing runs are continued or read. --only selects variants.
 """
 
 import argparse
@@ -34,7 +34,7 @@ from ngpt.training.settings import Settings, read_settings
 from ngpt.training.split import split
 from ngpt.training.trainer import Trainer
 
-# What is changed of the configuration; the plain network has as many parameters.
+# Changes to the configuration; the plain network has about the same number of parameters.
 VARIANTS: dict[str, list[str]] = {
     "dense": [],
     "no gradients": ['model.inputs=["primal", "albedo", "normal", "depth"]'],
@@ -45,7 +45,7 @@ VARIANTS: dict[str, list[str]] = {
     "bilinear": ['model.pooling="bilinear"'],
 }
 METRICS = ("relMSE trimmed", "FLIP")
-FEW = 16  # samples; fewer are apart from as many or more
+FEW = 16  # below this number of samples, an input counts as "few"
 
 
 def train(settings: Settings, crops: Sequence[Any], held_out: Sequence[Any], out: Path) -> None:
@@ -76,7 +76,7 @@ def judged(model: Reconstructor, crops: Sequence[Any]) -> list[dict[str, float]]
 
 def mean(rows: Sequence[dict[str, float]], name: str, few: bool) -> float:
     """The geometric mean over inputs of few samples, or of many; NaN of none."""
-    # The noise of two halves may outweigh what is left of an error.
+    # The noise of two halves may outweigh a very small error and make it negative.
     values = [max(row[name], 1e-9) for row in rows if (row["spp"] < FEW) == few]
     return math.exp(math.fsum(map(math.log, values)) / len(values)) if values else math.nan
 

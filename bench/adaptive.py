@@ -1,16 +1,17 @@
-"""Even and adaptive samples side by side, by the error of the final image of each method.
+"""Compares even and adaptive samples by the error of the final image of each method.
 
     python -m bench.adaptive --scenes diffuse glossy SCENE.xml ... [--by wcv] [--spp 128] [--cache out/adaptive]
     python -m bench.adaptive --timed diffuse SCENE.xml ... [--timed-size 320 180]
-    python -m bench.adaptive --table                                   # of what is in the file
+    python -m bench.adaptive --table                                   # of the results in the file
 
     even      all pixels have --spp samples
-    adaptive  --spp in the mean, shared out by the error that --by is expected to have (data_gen/adaptive.py)
+    adaptive  --spp on average, distributed by the expected error of the method --by (data_gen/adaptive.py)
 
-Errors are trimmed relMSE against two halves of a reference, geometric means over --seeds, of small images. What
-adaptive samples cost is measured on larger ones, since each pass takes a time to start: CPU seconds of the process, the
-runs of the method that the choice needs included. Beside them stands what `assess`, by which `--error` goes, expects of
-each method, over what is true. Scenes that are in the file already are measured again; stacks are kept in --cache.
+Errors are trimmed relMSE against two halves of a reference, geometric means over --seeds, of small images. The cost of
+adaptive samples is measured on larger images, since each pass takes some time to start. It is CPU seconds of the
+process, and includes the reconstructions that choose the samples. The table also has the error that `assess` expects of
+each method (`--error` uses it) over the true error. Scenes that are in the file are measured again; stacks are kept in
+--cache.
 """
 
 import argparse
@@ -90,7 +91,7 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
     for method in OF:
         row: dict = {}
         for name, each in stacks.items():
-            # Above 0: of the two halves' noise more may be taken off than there is, where hardly any error is left.
+            # Very small errors may come out negative, since the noise of two halves is removed only on average.
             row[name] = [max(relmse_trimmed(reconstruct(stack, method).image, *halves), 1e-9) for stack in each]
         row["expected"] = {
             name: [adaptive.assess(stack, method).error ** 2 for stack in each] for name, each in stacks.items()

@@ -1,4 +1,4 @@
-"""What stacks say of their noise, against the noise over seeds.
+"""Compares the variances that stacks claim with the variances over seeds.
 
     python -m bench.claims coffee.xml staircase.xml --spp 16 64
     python -m bench.claims glossy diffuse coffee.xml --every 5 130 --size 64 40 --points rounds
@@ -6,10 +6,10 @@
 
 prints, scene by scene, the real variance over the one that the stack claims: of pixels, and of means over 8x8 pixels,
 `primal` (without the layer `caustic`), `caustic`, `dx` and `dy`. The noisiest 1 % of pixels and 3 % of blocks are left
-out, since few seeds say nothing of them. Blocks of `dx` and `dy` are below 1 with independent samples, too: pixels
-share paths. `--every FIRST LAST` takes all numbers of samples in that range, whose samples are rendered once, and also
-prints the relative squared error of `wcv`, free of the reference's noise, and by how much it rises at most from one
-number of samples to the next.
+out, since few seeds cannot measure them. Blocks of `dx` and `dy` are below 1 even with independent samples, because
+pixels share paths. `--every FIRST LAST` measures all numbers of samples in that range, from one render. It also prints
+the relative squared error of `wcv`, without the reference's noise, and its largest rise from one number of samples to
+the next.
 """
 
 import argparse
@@ -29,7 +29,7 @@ SEEDS = 10
 
 
 def ratio(real: np.ndarray, claimed: np.ndarray, quiet: float) -> float:
-    """Real over claimed of the ``quiet`` share of (H, W, C)."""
+    """The sum of real over the sum of claimed variances, of the ``quiet`` share of values (H, W, C)."""
     total = claimed.sum(axis=-1)
     among = total <= np.quantile(total, quiet)
     return float(real[among].sum() / claimed[among].sum())

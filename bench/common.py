@@ -1,4 +1,4 @@
-"""What benchmarks share: times and versions, by which a result can be judged later; renders that are kept."""
+"""Functions of all benchmarks: times, versions of packages, and cached renders."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -34,7 +34,7 @@ def measure(
 
 
 def metadata(*packages: str) -> dict:
-    """Where, when and with what a benchmark ran."""
+    """The machine, date and versions of a benchmark."""
     return {"date": datetime.now(UTC).strftime("%Y-%m-%d"), **machine.metadata("numpy", "scipy", *packages)}
 
 
@@ -59,7 +59,7 @@ def blocks(image: np.ndarray, side: int = 8) -> np.ndarray:
 
 
 def kept(path: Path, make: Callable[[], GradientStack], names: dict[str, str] | None = None) -> GradientStack:
-    """The stack of a file, read by these ``names`` of layers; where there is no such file, it is made and written."""
+    """The stack of a file, read with these ``names`` of layers. If there is no such file, makes and writes it."""
     if not path.exists():
         print(f"rendering {path.name}", flush=True)
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
-"""Errors over samples or seconds as curves, read off between the measured points and a little outside of them.
+"""Errors over samples or seconds as curves, interpolated between the measured points and extrapolated a little.
 
-A curve is the running minimum of its points, straight between them on logarithmic axes: who has more samples could
-have taken fewer. Outside of the points the nearest slope that falls goes on, no steeper than ``STEEPEST`` and for a
-factor of ``REACH`` at most. Marks say which it was:
+A curve is the running minimum of its points, with straight lines between them on logarithmic axes. Beyond the points
+the nearest falling slope continues, no steeper than ``STEEPEST`` and for at most a factor of ``REACH``. A mark tells
+how a value was found:
 
     ""      between measured points
     "~"     outside, by the nearest slope
@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
 REACH = 4.0  # how far a slope is trusted past the measured points
-# Errors of squares fall by 1/samples. Two short renders may take nearly the same time, and the slope is chance then.
+# Squared errors fall as 1/samples. Two short renders may take nearly the same time; then the slope is mostly noise.
 STEEPEST = -1.0
 
 # (samples or seconds, error)
@@ -23,10 +23,9 @@ _Segment = tuple[tuple[float, float], tuple[float, float]]
 
 
 def first_at(error: float, points: Points) -> tuple[float, str] | None:
-    """Where a curve first comes down to ``error``, and its mark.
+    """The place where a curve first falls to ``error``, and its mark; None if it cannot be known.
 
-    A curve that never falls is there at its first point at the latest, or nobody knows: None. All numbers must be
-    positive.
+    A curve that never falls has only its first point. All numbers must be positive.
     """
     curve, falls = _curve(points)
     target, reach = math.log(error), math.log(REACH)
@@ -66,7 +65,7 @@ def error_at(x: float, points: Points) -> tuple[float, str] | None:
 
 
 def joined(marks: Iterable[str]) -> str:
-    """The mark of a mean: a bound where all bounds are of one side, else "~" where there is any mark."""
+    """The mark of a mean: "<" or ">" if all bounds have that side; else "~" if there is any mark; else ""."""
     found = set(marks) - {""}
     bounds = found & {"<", ">"}
     return bounds.pop() if len(bounds) == 1 else "~" if found else ""

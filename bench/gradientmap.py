@@ -1,4 +1,4 @@
-"""A map of where gradients pay and where they hurt: variance of independent differences over variance of gradients."""
+"""A map of the gain by gradients: variance of independent differences over variance of gradients."""
 
 from pathlib import Path
 

@@ -1,9 +1,9 @@
-"""What it gives to divide the light of photons by the texture under them: docs/lab/log, 2026-W48.
+"""The gain by dividing the light of photons by the texture under them: docs/lab/log, 2026-W48.
 
     python -m bench.texture --cache out/texture
 
 A point lamp shines through a ball of glass and into a ring of gold, onto a floor with checks, or with a cloudy texture.
-`vcm` renders it, and OIDN denoises all but the light of photons. Printed is the error with that light as it was
+`vcm` renders it, and OIDN denoises all light except that of photons. It prints the error with the light of photons as
 gathered (`ngpt.denoisers.caustic.denoised`), and divided by the albedo (`of_photons`). The reference has two halves of
 other seeds, with a smaller radius. Renders are kept in the cache.
 """

@@ -2,13 +2,13 @@
 
     python -m bench.uncertainty --scenes diffuse lens --checked glossy --cache STACKS -o bench/results/uncertainty.json
 
-A scene is a built-in one, or a folder with scene.xml in it. References have noise; of the intervals for the difference
-it is a part: their half-width is sqrt(error² + variance of the reference). Pixels that show a lamp are left out.
+A scene is a built-in one, or a folder with scene.xml in it. The intervals include the noise of the reference: their
+half-width is sqrt(error² + variance of the reference). Pixels that show a lamp are left out.
 
 Each method's factor is chosen on --scenes, so that both coverages are closest to 68.3 and 95 %, and checked on
---checked. With --halves, each stack is merged of two, which the error goes by, too. Two rows are printed for each
-method: coverages, and the tail: the share of values that are more than five errors off, and the sum of all squared
-errors over the claimed one.
+--checked. With --halves, each stack is merged from two halves, which the estimate of the error also uses. Two rows are
+printed for each method: the coverages, and the tail. The tail is the share of values that are more than five standard
+errors off, and the sum of all squared errors over the claimed sum.
 """
 
 import argparse

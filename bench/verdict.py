@@ -1,4 +1,4 @@
-"""What is worse than before, beyond noise: the rule of ``bench.panel``, which needs no render.
+"""Decides which errors are worse than before, beyond noise: the rule of ``bench.panel``, which needs no render.
 
 A cell is a dict with "scene", "spp", "pipeline" and, of each name of LIMITS, a dict from seeds (as text) to values.
 The ratio of a cell is the geometric mean over the seeds that both runs have, of the new value over the old one.
@@ -6,13 +6,14 @@ The ratio of a cell is the geometric mean over the seeds that both runs have, of
 Noise is the spread of a cell: the standard deviation of the logarithm over three seeds or more of the baseline. Few
 seeds may lie close together by chance. So it is at least the usual spread of the same pipeline and number of samples,
 which is the median over scenes of the variances, corrected for the number of seeds. A change of samplers gives the same
-seed other noise, so the logarithm of a ratio over n seeds has a deviation of spread * sqrt(2 / n). What leaves the
-samples as they are has less.
+seed other noise, so the logarithm of a ratio over n seeds has a deviation of spread * sqrt(2 / n). A change that keeps
+the samples has a smaller deviation.
 
-Judged are all cells, and means: over scenes for each pipeline and number of samples, and over numbers of samples for
-each scene and pipeline. Their deviations are smaller, so they show what is small and everywhere. Worse is what is above
-its limit and beyond DEVIATIONS deviations. Chance passes three deviations once in 740 ratios, and a panel has 804. So
-``bench.panel`` measures what is worse with one seed again, with all seeds of the baseline, before it fails.
+The rule judges all cells, and means: over scenes for each pipeline and number of samples, and over numbers of samples
+for each scene and pipeline. Means have smaller deviations, so they show small changes that occur everywhere. A ratio is
+worse if it is above its limit and beyond DEVIATIONS deviations. Chance passes three deviations once in 740 ratios, and
+a panel has 804. So before it fails, ``bench.panel`` measures ratios that are worse with one seed again, with all seeds
+of the baseline.
 """
 
 import math
@@ -33,7 +34,7 @@ Key = tuple[str, str, str]  # scene, number of samples, pipeline; MEAN for a mea
 
 
 class Judged(NamedTuple):
-    """``deviation`` is of the logarithm of the ratio."""
+    """A ratio of new over old values; ``deviation`` is the standard deviation of its logarithm."""
 
     value: str
     key: Key
@@ -42,7 +43,7 @@ class Judged(NamedTuple):
 
     @property
     def reach(self) -> float:
-        """The ratio that noise reaches."""
+        """The largest ratio that noise explains."""
         return math.exp(DEVIATIONS * self.deviation)
 
     @property
@@ -67,7 +68,7 @@ def key_of(cell: dict[str, Any]) -> Key:
 def compare(cells: Sequence[dict[str, Any]], before: Sequence[dict[str, Any]]) -> list[Judged]:
     """The cells of scenes that were measured, over those ``before``, then the means.
 
-    Raises NgptError where one of them has cells that the other has not, no seed in common, or too few seeds before.
+    Raises NgptError if only one run has a cell, if runs share no seed, or if the earlier run has too few seeds.
     """
     scenes = {cell["scene"] for cell in cells}
     new = {key_of(cell): cell for cell in cells}
@@ -104,7 +105,7 @@ def mean_of(value: str, key: Key, group: Sequence[Judged]) -> Judged:
 
 
 def spreads(cells: Sequence[dict[str, Any]], value: str) -> dict[Key, float]:
-    """Standard deviations of the logarithm over seeds, none below the usual one of its pipeline and samples."""
+    """Standard deviations of the logarithm over seeds, at least the usual one of the same pipeline and samples."""
     own: dict[Key, float] = {}
     others: dict[tuple[str, str], list[float]] = {}
     for cell in cells:

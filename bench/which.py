@@ -1,11 +1,11 @@
-"""The picture of docs/start/which-sampler.md: cases of scenes, by path tracing and by the sampler that is for them.
+"""The picture of docs/start/which-sampler.md: scenes by path tracing and by the sampler that suits them.
 
     python -m bench.which --folder SCENES --seconds 12 --cache out/which
 
 SCENES has veach-bidir, after Bitterli's resources.
 
-Each row is one scene and one rendering time: path tracing, the same denoised by OIDN, and the sampler's stack by the
-best method for it. Renders are kept in the cache.
+Each row shows one scene at equal rendering time: path tracing, the same denoised by OIDN, and the stack of the suitable
+sampler by the best method for it. Renders are kept in the cache.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from bench.common import kept
 from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.stack import GradientStack
 
-# Scene, the sampler that is for it, the method after it
+# Scene, suitable sampler, method for its stack
 CASES = (
     ("diffuse", "gpt", "auto"),
     ("veach-bidir/scene.xml", "gbdpt", "auto"),

@@ -1,9 +1,9 @@
-"""Errors over those that rivals have after the same whole time: rendering and reconstruction.
+"""Errors divided by those of rivals after the same whole time, which is rendering plus reconstruction.
 
 A rival is a family of columns, the settings of one denoiser on the samples of one renderer (``against`` in the
-configuration). Each setting has a curve of errors over whole seconds (``bench.curves``). At a time the rival
-has the least error of all its settings, and the least FLIP, whichever setting that is of: its user knew the best one.
-A setting counts from its quickest cell on, unless no setting was measured in so little time.
+configuration). Each setting has a curve of errors over whole seconds (``bench.curves``). At each time the rival gets
+the least error of all its settings, and separately the least FLIP, as if its user knew the best setting. A setting
+counts from the time of its quickest cell on, unless no setting was measured in so little time.
 """
 
 import math
@@ -14,17 +14,17 @@ from bench.curves import Points, error_at, joined
 from ngpt.measure.averages import geometric_mean
 
 FLIP = "FLIP"
-# Points of an envelope that is drawn
+# The number of steps of an envelope in a plot
 _STEPS = 17
 
 
 def against_rivals(results: dict[str, Any]) -> dict[str, Any]:
-    """``rows`` for each scene, count of samples, column and rival that it is no setting of, and ``means``.
+    """``rows`` for each scene, number of samples, column and rival (except the column's own rival), and ``means``.
 
-    ``error`` is the primary metric over the rival's at the column's ``seconds``, ``setting`` the column of the rival
-    that it is over; FLIP likewise. Means are geometric over the scenes of each group and over all; ``less`` and ``less
-    FLIP`` count the scenes where the column has less, of as many as ``scenes`` and ``scenes FLIP`` say. What was not
-    measured, is not positive or has no time makes no row.
+    ``error`` is the primary metric divided by the rival's at the column's ``seconds``; ``setting`` is the rival's
+    column with that error. FLIP has the same fields. Means are geometric, over the scenes of each group and over all.
+    ``less`` and ``less FLIP`` count the scenes where the column is better, out of ``scenes`` and ``scenes FLIP``.
+    Values that are missing, not positive or without a time make no row.
     """
     rows = []
     for scene in results["scenes"]:
@@ -111,16 +111,16 @@ def _mean(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def envelope(results: dict[str, Any], rival: str, scenes: list[str]) -> list[tuple[float, float]]:
-    """What to draw of a rival: (seconds, error) from its quickest to its slowest cell, geometric means over the scenes.
+    """The curve of a rival: (seconds, error) from its quickest to its slowest cell, geometric means over the scenes.
 
-    Each point is at the same share of the way between these two in each scene, on a logarithmic axis. Nothing is drawn
-    of a rival that was not measured on all of them.
+    Each point is at the same fraction between these two cells in every scene, on a logarithmic axis. A rival that was
+    not measured on all scenes has no points.
     """
     parts = []
     for scene in scenes:
         settings = _curves(results, _timed(results, scene), rival).get(results["primary"], {})
         times = [math.log(seconds) for points in settings.values() for seconds, _ in points]
-        if not times:  # a mean over the others would be one over other scenes than all else that is drawn
+        if not times:  # a mean over the other scenes could not be compared with the other curves
             return []
         at = [math.exp(min(times) + i / (_STEPS - 1) * (max(times) - min(times))) for i in range(_STEPS)]
         parts.append([(seconds, _least(seconds, settings)) for seconds in at])
@@ -133,7 +133,7 @@ def envelope(results: dict[str, Any], rival: str, scenes: list[str]) -> list[tup
 
 
 def against_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
-    """Title -> rows of text, the first is the head: means of groups, then each scene; of what is no rival's setting."""
+    """Title -> rows of text, the header first: means of groups, then each scene; columns of rivals are left out."""
     tables: dict[str, list[list[str]]] = {}
     rivals = list(results["settings"]["against"])
     settings = {column for columns in results["settings"]["against"].values() for column in columns}

@@ -1,11 +1,11 @@
-"""What it is worth to denoise the light of photons apart: the table of docs/samplers/photons.md.
+"""The gain by denoising the light of photons separately: the table of docs/samplers/photons.md.
 
     python -m bench.worms --folder SCENES --cache out/worms
 
 SCENES has the scenes that are files, after Bitterli's resources. Each scene is rendered by `vcm` and denoised by OIDN:
 all light at once, and without the light of photons, which `ngpt.denoisers.caustic` denoises. The reference has two
-halves of other seeds, with a smaller radius. Renders are kept in the cache, so a run that was broken off goes on.
-Written are bench/results/worms.json and the table between the marks of the page.
+halves of other seeds, with a smaller radius. Renders are kept in the cache, so an interrupted run can be continued. It
+writes bench/results/worms.json and the table between the marks of the page.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""What gradients are worth in whole time: the time without them divided by the time with them, for the same error.
+"""The value of gradients in whole time: the time without them divided by the time with them, for the same error.
 
     n, e    samples of a pipeline with gradients (a sampler and a method), and its error
     T       its whole time: seconds to render and to reconstruct
@@ -7,8 +7,8 @@
     W       m / n: how many times more samples that pipeline needs
     C       the seconds of a further sample with gradients over the seconds of a further sample of that pipeline
 
-T' and m are read off curves of errors (``bench.curves``, which explains the marks; W has the mark of W / C).
-C compares the renders with the least and the most samples, so that what a render takes to begin is no part of it.
+T' and m come from curves of errors (``bench.curves``, which explains the marks; W has the mark of W / C).
+C compares the renders with the least and the most samples, so that it excludes the start of a render.
 """
 
 from collections.abc import Sequence
@@ -49,7 +49,7 @@ def _scene_rows(results: dict[str, Any], scene: str) -> list[dict[str, Any]]:
 
 
 def _renders(results: dict[str, Any], scene: str, method: str) -> dict[int, tuple[int, float]]:
-    """Nominal samples -> those that were used and the median of the seconds that they took to render."""
+    """Nominal samples -> (samples that were used, median seconds of their render)."""
     found: dict[int, list[dict[str, Any]]] = {}
     for cell in results["cells"]:
         if (cell["scene"], cell["method"]) == (scene, method) and not cell["absent"]:
@@ -84,7 +84,7 @@ def _against(
 
 
 def _of_a_sample(renders: Sequence[tuple[int, float]]) -> float:
-    """Seconds of a further sample, by (samples, seconds) of renders: from the least to the most of them."""
+    """Seconds of a further sample, from the renders (samples, seconds) with the least and the most samples."""
     (few, short), (many, long) = min(renders), max(renders)
     return (long - short) / (many - few) if many > few and long > short else long / many
 
@@ -108,7 +108,7 @@ def _means(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str
 
 
 def worth_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
-    """Title -> rows of text, the first is the head: W/C of the means, and all that is known of each scene."""
+    """Title -> rows of text, the header first: W/C of the means, and all values of each scene."""
     worth = worth_of_gradients(results)
     columns = [name for name in results["methods"] if any(row["method"] == name for row in worth["rows"])]
     heads = [f"W/C {name}" for name in columns]

@@ -95,7 +95,7 @@ def _usual(change: np.ndarray, trust: np.ndarray) -> np.ndarray:
 
 
 def _noise(variance: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """The variance of the primal around each pixel, (H, W, 3), positive; where unknown, from the squares of ``rest``."""
+    """The variance of the primal around each pixel, (H, W, 3), positive; where unknown, from squares of ``rest``."""
     known = np.isfinite(variance)
     filled = np.where(known, variance, np.square(rest))
     smooth = ndimage.gaussian_filter(filled.astype(np.float64), (2, 2, 0), mode="nearest")

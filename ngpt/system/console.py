@@ -156,7 +156,7 @@ class _Handler(logging.Handler):
 
 @contextmanager
 def logged(verbose: bool, quiet: bool = False) -> Iterator[None]:
-    """Prints the messages of the logger "ngpt": warnings; with ``verbose``, all details; with ``quiet``, errors only."""
+    """Prints messages of the logger "ngpt": warnings; with ``verbose``, all details; with ``quiet``, only errors."""
     logger, handler = logging.getLogger("ngpt"), _Handler()
     handler.setFormatter(logging.Formatter("%(relativeCreated)7.0f ms  %(name)s: %(message)s" if verbose else None))
     before = logger.level

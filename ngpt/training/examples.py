@@ -139,7 +139,7 @@ def collated(examples: Sequence[Layers]) -> Layers:
 
 
 def other_half(ours: Repaired, other: GradientStack, whole: bool) -> dict[str, np.ndarray]:
-    """The target of a half for ``ngpt.training.halves``: arrays (H, W, C) of ``other``, and standard errors of ``ours``.
+    """The target of a half (``ngpt.training.halves``): arrays (H, W, C) of ``other``, and standard errors of ``ours``.
 
     ``ours``   the half, repaired for a method that reads gradients
     ``whole``  whether the light of the layer ``caustic`` is included. Gradients exclude it, so its pixel differences,

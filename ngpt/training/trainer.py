@@ -47,9 +47,9 @@ def show(text: str) -> None:
 class Trainer:
     """One run in the folder ``out``, new or continued.
 
-    ``task`` is the network to train. Files in ``out``: ``checkpoint.safetensors``, ``weights.safetensors`` (for inference),
-    ``best.safetensors`` (the weights with the least validation error), ``log.jsonl``, ``run.html``, ``tensorboard/``,
-    ``validation-STEP.png``.
+    ``task`` defines what it trains. Files in ``out``: ``checkpoint.safetensors``, ``weights.safetensors`` (for
+    inference), ``best.safetensors`` (the weights with the least validation error), ``log.jsonl``, ``run.html``,
+    ``tensorboard/``, ``validation-STEP.png``.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
-"""The convolutional networks whose features perceptual losses compare, drawn here so that torchvision is not needed.
+"""The convolutional networks whose features perceptual losses compare, defined here so that torchvision is not needed.
 
-Names of parameters are torchvision's, so that its weight files load. Each returns the features that E-LPIPS uses: the
-image itself, and every ReLU's output (for SqueezeNet, of every fire module), coarser and coarser.
+Names of parameters are torchvision's, so that its weight files load. Each network returns the features that E-LPIPS
+uses, from fine to coarse: the image itself, and every ReLU's output (for SqueezeNet, of every fire module).
 """
 
 import hashlib
@@ -17,10 +17,10 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 from ngpt.errors import NgptError
 from ngpt.system.reading import read_bytes
 
-# What pretrained networks were fed: (x - shift) / scale of x in [-1, 1].
+# The inputs of the pretrained networks: (x - shift) / scale of x in [-1, 1].
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 
-# Bytes; VGG16 has half as many.
+# The largest file in bytes; that of VGG16 has half as many.
 _LARGEST = 2**30
 
 # A function that drops inputs of a convolution, the same for both images of a comparison; the identity if none.
@@ -100,7 +100,7 @@ def _standardised(image: Tensor) -> Tensor:
 
 
 def _checked(kind: type[SqueezeNet] | type[Vgg16], file: Path) -> dict[str, Tensor]:
-    """What torchvision's file holds; it is read once, so that what is loaded is what was checked."""
+    """The tensors of torchvision's file. It is read only once, so the loaded bytes are the checked ones."""
     content = read_bytes(file, _LARGEST)
     if hashlib.sha256(content).hexdigest() != kind.SHA256:
         raise NgptError(
@@ -113,9 +113,9 @@ def _checked(kind: type[SqueezeNet] | type[Vgg16], file: Path) -> dict[str, Tens
 def load(kind: type[SqueezeNet] | type[Vgg16], path: str = "") -> nn.Module:
     """A backbone with torchvision's weights, from ``path`` or PyTorch's cache, frozen.
 
-    A .safetensors is read as it is. torchvision's own file, a pickle, is read only if its SHA-256 is the known one,
-    whatever its name, and then by the reader of PyTorch that takes tensors and no code. Raises NgptError where there is
-    no such file, it is another, or it has other tensors.
+    A .safetensors file may hold any weights. torchvision's own file, a pickle, is read only if its SHA-256 is the known
+    one, and by PyTorch's reader that loads tensors and runs no code. Raises NgptError if the file does not exist, has
+    another checksum, or holds other tensors.
     """
     file = Path(path or Path(torch.hub.get_dir()) / "checkpoints" / kind.FILE)
     if not file.is_file():
@@ -127,7 +127,7 @@ def load(kind: type[SqueezeNet] | type[Vgg16], path: str = "") -> nn.Module:
         tensors = load_file(file) if file.suffix == ".safetensors" else _checked(kind, file)
     except NgptError:
         raise
-    except Exception as error:  # whatever a damaged archive makes of it
+    except Exception as error:  # a damaged archive may raise anything
         raise NgptError(f"{file}: cannot be read as PyTorch weights: {' '.join(str(error).split())[:200]}") from error
     network = kind()
     own = network.state_dict()

@@ -3,8 +3,8 @@
     d(a, b) = Σ_l  mean over pixels  Σ_c  w_lc (f_lc(a) / |f_l(a)| - f_lc(b) / |f_l(b)|)²
 
 [Zhang et al. 2018, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", eq. 1; Kettunen et al.
-2019, "E-LPIPS"]. The weights w are fitted to people's judgements; they are E-LPIPS's own and have to be given, since
-without them it would be another metric.
+2019, "E-LPIPS"]. The weights w are fitted to people's judgements. They come from E-LPIPS and must be given, since other
+weights would make another metric.
 """
 
 from pathlib import Path
@@ -49,7 +49,7 @@ class FeatureDistance(nn.Module):
         images = 2 * torch.cat([a, b]) - 1
         total = images.new_zeros(())
         for i, feature in enumerate(self.backbone(images, dropout)):
-            # The root's derivative is infinite where all channels are 0, unless something is added inside.
+            # Without the addend, the root's derivative would be infinite where all channels are 0.
             unit = feature / torch.sqrt(torch.sum(feature * feature, 1, keepdim=True) + 1e-12)
             difference = (unit[:count] - unit[count:]) ** 2
             total = total + torch.einsum("nchw,c->nhw", difference, self.get_buffer(f"weight{i}")).mean()

@@ -12,7 +12,7 @@ from torch.nn.functional import avg_pool2d
 
 SCALES = 8
 OFFSET = 7
-# The least side of an image after downscaling. E-LPIPS has twice as much; its images are not cut from crops of 114.
+# The least side of an image after downscaling. E-LPIPS has twice as much, but our crops have only 114 pixels.
 SMALLEST = 32
 _PERMUTATIONS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
 
@@ -21,10 +21,10 @@ _PERMUTATIONS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0
 class Transform:
     """One draw of the ensemble for a batch of N images; apply it to every image of a comparison.
 
-    ``scale``, ``phase``  box average over scale x scale pixels, from this row and column on: the batch's
+    ``scale``, ``phase``  box average over scale x scale pixels, from this row and column on; the same for the batch
     ``offset``            (N, 2) rows and columns cut from the top and left, 0 .. 7, the rest of 7 from the other side
     ``flip``              (N,) 0 none, 1 left to right, 2 top to bottom, 3 both
-    ``transpose``         the batch's
+    ``transpose``         whether rows and columns are exchanged; the same for the batch
     ``order``             (N, 3) permutation of the channels
     ``factor``            (N, 3) factors of the channels, 0.2 .. 1
     """
@@ -86,9 +86,9 @@ def draw(
 
 
 def _stratified(kinds: int, count: int, generator: torch.Generator) -> Tensor:
-    """``count`` of 0 .. kinds - 1, each as often as the others give or take one, in random order."""
+    """``count`` numbers of 0 .. kinds - 1 in random order; their frequencies differ by at most one."""
     device = generator.device
-    # Starting anywhere, so that with fewer than ``kinds`` images all kinds are as likely.
+    # A random start, so that with fewer than ``kinds`` images all kinds are equally likely.
     start = torch.randint(kinds, (), generator=generator, device=device)
     kind = torch.randperm(kinds, generator=generator, device=device)[
         (start + torch.arange(count, device=device)) % kinds

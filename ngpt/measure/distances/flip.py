@@ -1,7 +1,9 @@
-"""FLIP on tensors: what a viewer sees of an error who flips between two images. It has gradients, so networks can learn
-from it; ``ngpt.measure.flip.flip`` is the reference implementation, which judges.
+"""FLIP on tensors: the difference that a viewer sees when flipping between two images.
 
-    opponent space -> what the eye resolves (a Gaussian for each channel) -> Lab -> HyAB distance, compressed: colour
+It is differentiable, so networks can learn from it; ``ngpt.measure.flip.flip`` is the reference implementation, for
+measurements.
+
+    opponent space -> contrast sensitivity (a Gaussian for each channel) -> Lab -> HyAB distance, compressed: colour
     luminance -> edges and points, by derivatives of a Gaussian -> their difference: feature
     result = colour^(1 - feature)
 
@@ -20,7 +22,7 @@ PIXELS_PER_DEGREE = 67.0
 _SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
 # Width of edges in degrees; exponents of colour and feature; the knee of the remapping and where it is mapped to.
 _EDGE, _COLOUR, _FEATURE, _KNEE, _MAPPED = 0.082, 0.7, 0.5, 0.4, 0.95
-# Keeps the slope of roots finite: it changes results by less than 0.001.
+# Keeps the derivative of roots finite; it changes results by less than 0.001.
 _SMALL = 1e-6
 
 # Linear sRGB to XYZ under D65, and back.
@@ -44,7 +46,7 @@ def flip(image: Tensor, reference: Tensor, exposures: tuple[float, ...]) -> Tens
 
 
 def aces(image: Tensor) -> Tensor:
-    """Scene-linear to what a screen shows, linear in [0, 1]."""
+    """Scene-linear radiance to linear display values in [0, 1]."""
     x = image.clamp(min=0, max=1e6)
     a, b, c, d, e = _ACES
     return ((a * x * x + b * x) / (c * x * x + d * x + e)).clamp(0, 1)
@@ -66,7 +68,7 @@ def _opponent(rgb: Tensor) -> Tensor:
 
 
 def _perceived(opponent: Tensor) -> Tensor:
-    """Lab, with chroma scaled by lightness [Hunt], of what the eye resolves of an image."""
+    """Lab, with chroma scaled by lightness [Hunt], of an image filtered by contrast sensitivity."""
     seen = torch.cat(
         [_filtered(channel, terms) for channel, terms in zip(opponent.split(1, 1), _SENSITIVITY, strict=True)], 1
     )
@@ -106,7 +108,7 @@ def _largest() -> float:
 
 
 def _feature_difference(a: Tensor, b: Tensor) -> Tensor:
-    """How much more of an edge, or a point, one of two images of lightness has."""
+    """The larger difference in the strength of edges or of points between two images of lightness."""
     sigma = 0.5 * _EDGE * PIXELS_PER_DEGREE
     x = torch.arange(-math.ceil(3 * sigma), math.ceil(3 * sigma) + 1, dtype=torch.float32)
     gauss = torch.exp(-x.square() / (2 * sigma**2))
@@ -126,7 +128,7 @@ def _norm(x: Tensor, y: Tensor) -> Tensor:
 
 
 def _filtered(channel: Tensor, terms: tuple[tuple[float, float], ...]) -> Tensor:
-    """One channel (N, 1, H, W) by the contrast sensitivity of the eye; each Gaussian is a product of two."""
+    """One channel (N, 1, H, W) filtered by contrast sensitivity; each Gaussian is separable."""
     radius = math.ceil(3 * math.sqrt(0.04 / (2 * math.pi**2)) * PIXELS_PER_DEGREE)
     degrees = torch.arange(-radius, radius + 1, dtype=torch.float32) / PIXELS_PER_DEGREE
     kernels = [torch.exp(-(math.pi**2) * degrees.square() / b) for _, b in terms]
@@ -137,7 +139,7 @@ def _filtered(channel: Tensor, terms: tuple[tuple[float, float], ...]) -> Tensor
 
 
 def _separable(image: Tensor, across: Tensor, down: Tensor) -> Tensor:
-    """(N, 1, H, W) by a kernel along rows and one along columns; borders are repeated."""
+    """(N, 1, H, W) filtered by a kernel along rows and one along columns; border pixels are repeated."""
     radius = len(across) // 2
     image = pad(image, 4 * (radius,), "replicate")
     image = conv2d(image, across.to(image).reshape(1, 1, 1, -1))
@@ -145,5 +147,5 @@ def _separable(image: Tensor, across: Tensor, down: Tensor) -> Tensor:
 
 
 def _mixed(matrix: Tensor, image: Tensor) -> Tensor:
-    """The channels of (N, 3, H, W) by a matrix (3, 3)."""
+    """The channels of (N, 3, H, W) multiplied by a matrix (3, 3)."""
     return torch.einsum("ij,njhw->nihw", matrix.to(image), image)

@@ -1,4 +1,4 @@
-"""A perceptual distance averaged over random transforms: what training minimises, and E-LPIPS as a metric."""
+"""A perceptual distance averaged over random transforms, for the loss of training and for E-LPIPS as a metric."""
 
 from collections.abc import Callable
 
@@ -22,14 +22,14 @@ def tone_mapped(image: Tensor) -> Tensor:
 
 
 class PerceptualDistance:
-    """Call it with two images, scene-linear (N, 3, H, W) float32, and a generator on their device: a scalar.
+    """A function of two images, scene-linear (N, 3, H, W) float32, and a generator on their device; returns a scalar.
 
     ``kind``         "structural" (no weights needed), "elpips-squeeze" (NGPT's) or "elpips-vgg"
     ``evaluations``  draws of the random transforms that are averaged
     ``scales``       largest downscaling among the transforms
     ``backbone``, ``weights``  files of E-LPIPS (docs/train/losses.md); "" looks for the backbone in PyTorch's cache
 
-    Raises NgptError for an unknown kind, and for files that are missing or not what they should be.
+    Raises NgptError for an unknown kind, and for files that are missing or have the wrong contents.
     """
 
     def __init__(self, kind: str, evaluations: int, scales: int, backbone: str = "", weights: str = ""):
@@ -45,7 +45,7 @@ class PerceptualDistance:
     def __call__(self, image: Tensor, reference: Tensor, generator: torch.Generator) -> Tensor:
         if isinstance(self._distance, torch.nn.Module):
             self._distance.to(image.device)
-        # What a viewer sees: tone-mapped, clipped to the screen's range below, display-encoded.
+        # As on a display: negative radiance clamped, tone-mapped, display-encoded.
         a, b = (srgb(tone_mapped(x.clamp(min=0))) for x in (image, reference))
         total = image.new_zeros(())
         for _ in range(self.evaluations):

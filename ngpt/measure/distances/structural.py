@@ -4,9 +4,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-# From Wang et al. 2003, for scales 1 to 5; as many are used as the image has room for, scaled to sum to 1.
+# From Wang et al. 2003, for scales 1 to 5. Scales that are too coarse for the image are left out; the others sum to 1.
 _WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
-# Windows of SSIM: boxes at every third pixel. The random offsets of the ensemble make up for the skipped ones.
+# Windows of SSIM: boxes at every third pixel. The random offsets of the ensemble cover the skipped positions.
 _WINDOW, _STRIDE = 7, 3
 _C1, _C2 = 0.01**2, 0.03**2
 # Keeps the root of a gradient magnitude, and its derivative, finite where an image is flat; 0.17 % of the range [GMSD].
@@ -38,7 +38,7 @@ def ms_ssim(a: Tensor, b: Tensor) -> Tensor:
 
         L_S^w_S  Π_s CS_s^w_s
 
-    L and CS are means over the image. Means below 1e-4 count as 1e-4, so that the product has a slope.
+    L and CS are means over the image. Means below 1e-4 count as 1e-4, so that the product has a gradient.
     """
     a, b = a.float(), b.float()
     weights = _weights(a)
@@ -54,7 +54,7 @@ def ms_ssim(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _weights(image: Tensor) -> Tensor:
-    """The weights of the scales that the image has room for; their sum is 1."""
+    """The weights of the scales that are large enough for a window; their sum is 1."""
     scales = 1
     while scales < len(_WEIGHTS) and min(image.shape[-2:]) >> scales >= _WINDOW:
         scales += 1
@@ -65,8 +65,8 @@ def _weights(image: Tensor) -> Tensor:
 def ssim_parts(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """Luminance and contrast-structure of SSIM in windows of 7x7 pixels, every third, range 1 [Wang et al. 2004].
 
-    Smaller images are one window. The images' common mean is taken off before squaring: in float32, E[x²] - E[x]² of
-    bright flat images would be mostly rounding.
+    Smaller images are one window. The images' common mean is subtracted before squaring: in float32, E[x²] - E[x]² of
+    bright flat images would be mostly rounding error.
     """
     window = min(_WINDOW, a.shape[-2]), min(_WINDOW, a.shape[-1])
     center = (a.mean((-2, -1), keepdim=True) + b.mean((-2, -1), keepdim=True)).detach() / 2
