@@ -26,7 +26,7 @@ _BUILT_IN = ("data_gen.scenes.builtin", "data_gen.scenes.grids")
 
 def code(sampler: str) -> str:
     """SHA-256 of the files that a render by the sampler runs, without comments and docstrings; of "auto", by any of the
-    samplers that a scene's description may stand for. Of an unknown name, of what all share."""
+    samplers that a scene's description may stand for. For an unknown name, of the code that all samplers share."""
     return _hash(reached(sampler))
 
 

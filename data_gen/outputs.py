@@ -70,7 +70,7 @@ class Output:
     header: dict[str, str] = field(init=False)  # what the stack's header says of the request
 
     def __post_init__(self) -> None:
-        # Of the scene's file as it is before the render
+        # The checksum of the scene's file before the render
         object.__setattr__(self, "header", self.request.header(self.frame))
 
     @property
@@ -108,7 +108,7 @@ class Output:
         return rest
 
     def done(self) -> bool:
-        """Whether all is there that is asked for.
+        """Whether all that was requested exists.
 
         Raises NgptError where a stack is there in place of its image, or the image of another method.
         """

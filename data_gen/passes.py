@@ -82,7 +82,7 @@ def rounds_of(sample: SamplePass) -> Rounds:
 
 
 def _nothing(left: int) -> str:
-    """Suggests nothing that would fit into so many bytes per lane."""
+    """Has nothing to suggest that would fit into this number of bytes per lane."""
     return ""
 
 
@@ -106,10 +106,10 @@ def render_passes(
 
     The number of blocks of samples in a pass adapts to the speed of the scene and to the memory. A lane takes
     ``lane_bytes``, or what an attribute of this name of ``sample`` says. This changes no bit of the result, which
-    depends only on the seed, the size, the number of samples and ``spp``: the latter determines the first round of the
+    depends only on the seed, the size, the number of samples and ``spp``: ``spp`` determines the first round of the
     ``points``, see ``data_gen.paths.streams.first_round``. With a ``batch``, the samples of a pass depend on each
-    other: each pass is one block of so many samples per pixel, and the film's variances are computed over passes. Such
-    a ``sample`` may keep a state from pass to pass; ``CameraSamples.first`` gives its position.
+    other: each pass is one block of ``batch`` samples per pixel, and the film's variances are computed over passes.
+    Such a ``sample`` may keep a state from pass to pass; ``CameraSamples.first`` gives its position.
 
     A ``sample`` may come in ``Rounds``; no pass crosses the end of a round. The ``kind`` of film, its ``subpixels``
     and whether it has ``gradients``, is as in ``film_within``.
@@ -202,8 +202,8 @@ def end_of_time(gone: float, seconds: float, early: bool) -> tuple[int, int]:
 
 
 def growing_block(pixels: int, done: int, block: int) -> int:
-    """Samples of a pixel side by side in the next block after so many that are ``done``: few at first, where time may
-    end a render at any moment, and then as many as there are, up to ``block``."""
+    """The number of samples of a pixel that the next block takes side by side, after ``done`` samples. It is small at
+    first if time may end the render at any moment. Then it is as large as possible, up to ``block``."""
     first = 1
     while first < block and pixels * first < _FEWEST_LANES:
         first *= 2
@@ -249,9 +249,9 @@ def film_within(
 ) -> tuple[GradientFilm, int, int]:
     """An empty film for ``spp`` samples per pixel, samples of a block, and how many blocks may make a pass.
 
-    ``instead`` is as in ``blocks_within``, ``net`` as in ``CameraSamples``. Of the ``kind`` of film, which
-    are further parameters of its own, it keeps fewer ``subpixels`` where there is no room, and a warning says so.
-    Raises NgptError where one block of samples does not fit into ``memory``.
+    ``instead`` is as in ``blocks_within``, ``net`` as in ``CameraSamples``. ``kind`` has further parameters of the
+    film. Where memory is short, the film has fewer ``subpixels``, and a warning says so. Raises NgptError where one
+    block of samples does not fit into ``memory``.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     block = batch or block_of_samples(width * height)
@@ -262,7 +262,7 @@ def film_within(
 
 
 def film_of(width: int, height: int, memory: int, pixel_bytes: int, *, subpixels: int = 1, **how: Any) -> GradientFilm:
-    """A film with so many subpixels, or as many as leave room for a pass that takes ``pixel_bytes`` a pixel."""
+    """A film with the requested subpixels, or with fewer where a pass of ``pixel_bytes`` per pixel would not fit."""
     k = subpixels
     while True:
         film = GradientFilm(width, height, subpixels=k, **how)
@@ -316,7 +316,8 @@ def blocks_within(
 ) -> int:
     """How many blocks of ``block`` samples a pass may have, so that it and the film stay within ``memory`` MiB.
 
-    Raises NgptError where not even one fits. ``instead`` is asked what else would, with so many bytes left for a lane.
+    Raises NgptError where not even one fits. ``instead`` is called with the bytes that are left for a lane, and returns
+    what else would fit.
     """
     lanes = film.pixels * block
     blocks = lanes_within(memory, film, lanes, lane_bytes, instead) // lanes
@@ -348,7 +349,7 @@ def lanes_within(
 
 
 def least_memory(film: GradientFilm, lanes: int, lane_bytes: int = LANE_BYTES) -> int:
-    """MiB that the film and a pass of so many lanes need."""
+    """MiB that the film and a pass of this number of lanes need."""
     return -(-(film.bytes + lane_bytes * _allocated(lanes)) // 2**20)
 
 

@@ -31,9 +31,10 @@ from ngpt.system.console import brief
 
 # The share of the time that a pilot may take, and the part of it for trials of samplers where it tries methods too
 SHARE, _TRIALS = 0.1, 2 / 3
-# Below so many seconds, or paths where a number of samples is given, a pilot costs more than it could gain: a tenth of
-# them is enough to compile the kernels of other samplers and to try them. One or two cores trace a million paths per
-# second. Two trials on the smallest images take 3.0 to 13.5 processor seconds, with their methods about 4 more.
+# Below this number of seconds, or of paths where a number of samples is given, a pilot costs more than it could gain: a
+# tenth of them is enough to compile the kernels of other samplers and to try them. One or two cores trace a million
+# paths per second. Two trials on the smallest images take 3.0 to 13.5 processor seconds, with their methods about 4
+# more.
 LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
 # What `ngpt denoise` takes beside the method, and `ngpt render` to write the stack: for the process to begin, and to
 # write a million pixels, read them and write the image
@@ -45,8 +46,8 @@ _GROWS = 0.9
 _METHOD_SECONDS, _OTHERS = {"auto": 18.0, "ngpt-combine": 18.0, "ngpt-primal": 7.0, "oidn": 8.0}, 3.0
 # Seconds from which on the pilot's images are as large as they ever are, and the least share of that
 LONG, LEAST_PIXELS = 400.0, 1 / 16
-# A rival must leave so many times less error: a choice is not worth changing for what chance could have made. The
-# errors of networks and denoisers are expected less well, and their choice was seen to be wrong by 1.6 times.
+# A rival's error must be smaller by this factor: smaller differences could be chance. The errors of networks and
+# denoisers are expected less well, and their choice was seen to be wrong by 1.6 times.
 _MARGIN, _MARGIN_OF_IMAGES = 1.1, 1.6
 # The share of light that only photons find from which on they are taken, if so many samples fit into the time; seconds
 # of a million of their samples on two cores, and until the first one is done
@@ -127,7 +128,7 @@ def plan(
     memory: int = DEFAULT_MEMORY,
     pilot: Pilot = Pilot(),  # noqa: B008 - it is frozen
 ) -> Plan:
-    """How to use so many ``seconds`` of the pilot's clock, which include the pilot and the method.
+    """How to use these ``seconds`` of the pilot's clock, which include the pilot and the method.
 
     Only the given ``method`` is considered, unless it is "auto". The pilot tries the sampler that the scene's
     description stands for, then the other unbiased samplers that ``--sampler auto`` compares, as far as they fit into a
@@ -186,7 +187,7 @@ def plan_sampler(
     *,
     gradients: bool = False,
 ) -> Plan:
-    """The sampler for a render of ``spp`` samples per pixel, or of so many ``seconds``; one of them may be None.
+    """The sampler for a render of ``spp`` samples per pixel, or of this many ``seconds``; one of them may be None.
 
     The description decides, at no cost, where only one sampler can render the scene, and where the render is too short
     for a pilot; ``gradients``: only samplers that render them are considered. What a pilot measures changes from run to
@@ -270,7 +271,7 @@ def best_image(ranked: Sequence[Pipeline], default: str, seconds: float, margin:
 
 
 def best_of(pipelines: Sequence[Pipeline], seconds: float) -> tuple[str, str]:
-    """The sampler to take for a render of so many ``seconds``, at the pilot's size, and why.
+    """The sampler for a render of this many ``seconds``, at the pilot's size, and the reason.
 
     The first of ``pipelines`` is the scene's own, which stays unless another is expected to leave clearly less error.
     """

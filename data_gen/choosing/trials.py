@@ -50,7 +50,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Pilot:
-    """How trials go on, and who hears of it."""
+    """The clock of trials, and the functions that are called while they go on."""
 
     clock: Callable[[], float] = time.perf_counter
     said: Callable[[str], None] = lambda line: None  # called with what is tried
@@ -136,7 +136,8 @@ def try_out(
     begins = clock()
     batch = SAMPLERS[sampler].batch
     spp, seed = max(SPP, 2 * batch), seed_of(sampler)
-    # What a render takes to begin is no part of what a sample takes; a render of another length tells the two apart.
+    # The time that a render takes to begin is not part of the time of a sample. A render of another length separates
+    # the two.
     other = batch or 2 * SPP
     try:
         render_stack(scene, 1, seed, sampler, unbiased=unbiased)

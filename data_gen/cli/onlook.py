@@ -69,7 +69,7 @@ class Onlookers:
         self.spent += time.perf_counter() - begin
 
     def last(self, stack: GradientStack, line: str) -> None:
-        """Shows the stack that is written by now, and tells a last line."""
+        """Shows the stack, which has been written, and prints a last line."""
         self.line = line
         if self._watched():
             with self._harmless():

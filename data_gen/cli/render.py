@@ -163,7 +163,7 @@ def rendering(
 
 
 def say(stack: GradientStack, made: dict[str, Any], args: argparse.Namespace, target: Path, console: Console) -> None:
-    """What a user should know of the samples, and in which time they were made."""
+    """What a user should know about the samples, and how long they took."""
     attributes = stack.attributes
     done, took = attributes["ngpt:spp"], attributes["ngpt:seconds"]
     if attributes["ngpt:discarded"]:
@@ -203,7 +203,7 @@ def shot(args: argparse.Namespace, denoising: Denoising | None, console: Console
         def begin() -> Callable[[int, int], None]:
             return shown.enter_context(console.progress(f"render {args.scene}", "frames", begins=KERNELS))
 
-        # A bar before the cluster has answered would tell of work that nobody does.
+        # Before the cluster has answered nobody works, so there is no bar yet.
         if not args.cluster:
             progress = begin()
 

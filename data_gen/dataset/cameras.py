@@ -102,7 +102,7 @@ class Surroundings:
         passed = mi.Float(0)
         for _ in range(MOST_BOUNDARIES if self.boundaries and not boundaries else 0):
             behind = si.is_valid() & is_boundary(si.bsdf())
-            # Asked each time: all steps are one small kernel.
+            # Computed each time: all steps are one small kernel.
             if not dr.any(behind):
                 break
             passed += dr.select(behind, si.t, 0)

@@ -25,7 +25,7 @@ from ngpt.version import __version__
 
 # Views that turn out to be black are replaced this often.
 ATTEMPTS = 6
-# References are rendered in so many independent parts: what two of them agree on is no noise.
+# The number of independent parts of a reference: what two parts have in common is not noise.
 HALVES = 2
 LIT = 0.1  # the share of pixels of the first input that must have seen any light
 

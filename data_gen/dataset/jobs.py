@@ -49,7 +49,7 @@ class Pool(ProcessPoolExecutor):
 
     def __exit__(self, kind, *rest):
         if kind is not None and issubclass(kind, KeyboardInterrupt):
-            # What they are at is made again; waiting for it takes minutes.
+            # The crops that they are working on are made again; waiting for them would take minutes.
             for process in active_children():
                 process.terminate()
         return super().__exit__(kind, *rest)

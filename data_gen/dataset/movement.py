@@ -72,7 +72,7 @@ class Movement:
 
 
 def random_movement(around: Surroundings, view: View, rng: np.random.Generator, frames: int) -> Movement:
-    """How a shot of so many frames goes on from ``view``, which is applied to the scene."""
+    """How a shot of ``frames`` frames goes on from ``view``, which is applied to the scene."""
     scene = around.scene
     view.apply(scene)
     what = seen(scene)

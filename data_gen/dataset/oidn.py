@@ -20,7 +20,7 @@ from ngpt.errors import NgptError
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
 from ngpt.training.dataset import Crop, Dataset
 
-# One scene in so many is for validation, at least one where there are two.
+# One scene in this many is for validation, and at least one if there are two scenes.
 VALIDATION = 10
 
 

@@ -24,9 +24,9 @@ import numpy as np
 from data_gen.film.nets import USUAL, law
 from ngpt.shared import box_means
 
-# Pixels of about the same noise: so many groups at most, of so many pixels at least
+# Groups of pixels of about the same noise: the most groups, and the least pixels of a group
 _GROUPS, _LEAST = 64, 64
-# Side of the square of pixels that tells how much noise there is around the one in its middle
+# Side of the square of pixels around a pixel that its noise is estimated from
 _AROUND = 5
 
 
@@ -59,8 +59,8 @@ def factor(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net:
 def _found(
     squares: np.ndarray, variances: np.ndarray, samples: np.ndarray, net: int, order: np.ndarray, groups: int
 ) -> np.ndarray:
-    """The factors of pixels by the ``order`` in which they are put into so many ``groups`` at most, all (N); 1 of those
-    that are not there."""
+    """The factors of pixels, which are put into at most ``groups`` groups in this ``order``, all (N). Pixels that are
+    not in ``order`` have the factor 1."""
     found = np.ones(len(squares))
     if not len(order):
         return found

@@ -50,7 +50,7 @@ _HALVES_BYTES = 2 * 21 * 4 + 7 * 3 * 4
 _HALVES_BYTES_WITHOUT = 2 * 9 * 4 + 3 * 3 * 4
 # Per pixel, of a pass that is one batch: the mean over the batch, splats and their sums, of one name.
 _BATCH_BYTES = 3 * 8 + 3 * SPLAT_BYTES + 4 + 3 * 8
-# Pixels that tell the mean noise of features well enough
+# Enough pixels to estimate the mean noise of features
 _ENOUGH = 1 << 13
 # With fewer pixels than this, several strands of samples share a pixel: a few long loops would leave cores idle.
 _STRANDS = 1 << 15
@@ -66,7 +66,7 @@ class GradientFilm:
     two ends of a pair of pixels. Each direction of a difference is a mean over the base paths of its own end.
 
     Variances are computed over samples, as if these were independent. If samples are points of rounds, and the first
-    round is a ``net`` of so many points per pixel, the variances are scaled to the noise that is observed, see
+    round is a ``net`` with this number of points per pixel, the variances are scaled to the noise that is observed, see
     ``data_gen.film.claims``. If samples of a pass share photons, reservoirs or the state of a chain, or lanes splat
     onto other pixels, the film is made with ``batches``: each pass is one batch, a pixel's value is its mean over the
     batch, and variances are computed over batches. Batches are weighted by their samples: the last one may have fewer.
@@ -108,7 +108,7 @@ class GradientFilm:
         self._splats: dict[str, Splats] = {}
 
     def begin_pass(self, camera: Celled) -> None:
-        """Takes note of the subpixels that the samples of the next pass lie in, where the film has any."""
+        """Records the subpixel of each sample of the next pass, if the film has subpixels."""
         if self._fine:
             self._cell = camera.cells(self.subpixels)
 
@@ -419,7 +419,7 @@ class GradientFilm:
 
 
 def bytes_of_shared(pixels: int) -> int:
-    """What the layer ``shared`` of so many pixels takes."""
+    """The bytes that the layer ``shared`` takes for this number of pixels."""
     return _SHARED_BYTES * (1 << (max(pixels, _STRANDS) - 1).bit_length())
 
 

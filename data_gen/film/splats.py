@@ -29,8 +29,8 @@ class Splats:
     def __init__(self, pixels: int, channels: int):
         self.pixels = pixels
         self.channels = channels
-        # Ordered by pixel, then by range from the smallest up, then by channel. So channels lie side by side in memory:
-        # most of the time of a splat is memory access.
+        # Ordered by pixel, then by range from the smallest up, then by channel. So the channels of a pixel are adjacent
+        # in memory: most of the time of a splat is memory access.
         self.sums = dr.zeros(dr.int64_array_t(mi.Float), pixels * BINS * channels)
         self.lost = dr.zeros(mi.UInt32, pixels)
 

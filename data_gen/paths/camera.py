@@ -151,7 +151,7 @@ class CameraSamples:
     def look(self, *shifts: tuple[int, int] | str) -> Self:
         """These samples, for a function that is recorded once and asks for their rays by these ``shifts``.
 
-        The function cannot ask most cameras, since Dr.Jit 1.5 does not find their arrays. So they are asked before.
+        The function cannot ask most cameras, since Dr.Jit 1.5 does not find their arrays. So they are evaluated before.
         """
         if bytes_of_rays(self.sensor):
             rays = [self.rays(shift) for shift in shifts]

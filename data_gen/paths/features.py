@@ -14,7 +14,7 @@ MAX_SPECULAR_VERTICES = 32
 # Steps of a ray through a medium whose density varies
 MEDIUM_STEPS = 8
 
-# Materials that turn the shading frame; Mitsuba tells of the turn only through its `aov` integrator.
+# Materials that turn the shading frame; Only Mitsuba's `aov` integrator gives the turned normal.
 _TURNS_NORMALS = ("BumpMap", "NormalMap")
 
 

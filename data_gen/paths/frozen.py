@@ -201,7 +201,8 @@ def evaluated(f: Callable) -> Callable:
 def arrays(owner: Any) -> list:
     """The arrays in the attributes of an object, and of objects there, which become copies.
 
-    Kernels tell arrays by how their memory is aligned, and NumPy's is so or so: they would have to be compiled again.
+    Kernels depend on how the memory of arrays is aligned, which varies for arrays of NumPy: kernels would be compiled
+    again.
     """
     found: list = []
     for name, value in list(vars(owner).items()) if hasattr(owner, "__dict__") else ():

@@ -143,7 +143,7 @@ class Unit(nn.Module):
 
 
 def radius(convolutions: list[int], pooling: str) -> int:
-    """How far, in pixels, a pixel's influence reaches, with so many 3x3 convolutions at each level.
+    """How far, in pixels, a pixel's influence reaches, with this number of 3x3 convolutions at each level.
 
     One reaches as far as its level's pixels are wide; a coarsest pixel spreads what any pixel in it holds to all of it,
     and bilinear interpolation, at each level, to the pixel beside it.

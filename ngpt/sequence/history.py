@@ -38,7 +38,7 @@ from ngpt.sequence.warp import warped
 from ngpt.stack import GradientStack
 from ngpt.windows import Place
 
-# Frames that history may count for: what changes slowly, and is not seen by the evidence, lags by no more.
+# The most frames that history may count for: slow changes, which the evidence does not see, lag by at most this number.
 LONGEST = 16
 # Image widths a frame, at which it counts for half as many: what is seen from elsewhere looks otherwise.
 FAST = 0.005
@@ -84,7 +84,7 @@ class Temporal:
 
         It is ``image`` itself for a first frame, and after a cut: where the stack has no layer ``motion``, is a picture
         of another size, or says that the frame before it was another one (``ngpt:previousFrame``). Frames may be parts
-        of a picture that move and change their size: history is looked up where they lie. ``previous`` (H, W, 3)
+        of a picture that move and change their size: history is looked up at their place in it. ``previous`` (H, W, 3)
         is the last frame's result where it is not the one that was returned; also the one before a first frame, whose
         features are not known then.
         """
@@ -145,7 +145,7 @@ class Temporal:
 
 
 def _shift(stack: GradientStack, before: _History) -> tuple[int, int] | None:
-    """Where the stack's first pixel lies in the last frame; None unless that is the one its motion leads to."""
+    """The position of the stack's first pixel in the last frame; None unless that is the one its motion leads to."""
     previous = stack.number("ngpt:previousFrame")
     follows = previous is None or before.frame is None or previous == before.frame
     return stack.place.shift_in(before.place) if follows and "motion" in stack else None

@@ -48,8 +48,8 @@ def raised() -> Iterator[Interrupt]:
 def noted(told: Callable[[], None] = lambda: None) -> Iterator[Interrupt]:
     """The first signal is noted in the block, and nothing else; any further one does what it did before.
 
-    ``told`` is called at once when it comes. A signal that is switched off stays so, and outside of the main thread
-    none arrives.
+    ``told`` is called as soon as the signal arrives. A signal that is switched off stays so, and outside of the main
+    thread none arrives.
     """
     found = Interrupt()
 

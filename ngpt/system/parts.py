@@ -79,7 +79,7 @@ def _only(group: str) -> Any:
 class Registry(dict[str, T]):
     """Entries by name: ours, and those that other packages bring by entry points of a ``group``.
 
-    An entry of another package is imported when it is asked for by its name. Iteration goes over ours, and over others'
+    An entry of another package is imported when it is requested by name. Iteration goes over ours, and over others'
     that have been imported; who lists all of them calls ``load`` before. Nobody looks for others to find one of ours.
 
     ``what``   what an entry is, for messages: "method"
