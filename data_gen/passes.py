@@ -23,7 +23,7 @@ from ngpt.system.limits import memory as machine_memory
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
-# What takes the samples of one pass: it puts, or splats, one for each camera sample into the film.
+# A function that takes the samples of one pass: it puts, or splats, one value for each camera sample into the film.
 SamplePass = Callable[[CameraSamples, GradientFilm], None]
 
 # Rays of lanes side by side are traced together, and do best where they start from one pixel.
@@ -38,7 +38,7 @@ _FEWEST_LANES = 1 << 13
 _CAUTION, _GROWTH = 0.9, 8
 # Lanes of the first pass of others: enough to render small images at one go, and to judge how long the next may be.
 FIRST_LANES = 1 << 20
-# A pass this long makes little of the time that it takes to start one, and reacts soon enough.
+# Seconds of a pass: starting it costs little in comparison, and the render still reacts soon.
 PASS_SECONDS = 2.0
 
 
@@ -227,7 +227,7 @@ def foretold(done: list[tuple[int, float]]) -> tuple[float, float]:
 def compilation() -> Iterator[list[float]]:
     """Yields a list that has the seconds for which kernels were compiled in it, once that is over."""
     compiled: list[float] = []
-    if dr.flag(dr.JitFlag.KernelHistory):  # Whoever asked for it reads it, which empties it.
+    if dr.flag(dr.JitFlag.KernelHistory):  # The caller reads it, which empties it.
         yield compiled
         return
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -280,11 +280,12 @@ def film_of(width: int, height: int, memory: int, pixel_bytes: int, *, subpixels
 
 @contextmanager
 def recording() -> Iterator[None]:
-    """While kernels are recorded in it, Python frees no scene that is left over from before.
+    """Within the block, where kernels are recorded, Python does not free scenes of earlier renders.
 
-    A call of Dr.Jit holds one function for each object (material, lamp ...) that lives at that moment. Were a second
-    scene freed amid a kernel, a lamp could be one of two in one call and the only one in the next. Dr.Jit 1.5 takes the
-    two ways to call for two functions, gives both one name ("invalid redefinition of function"), and ends the process.
+    A call of Dr.Jit holds one function for each object (material, lamp ...) that lives at that moment. If a second
+    scene were freed while a kernel is recorded, a lamp could be one of two in one call and the only one in the next.
+    Dr.Jit 1.5 takes the two calls for two functions, gives both the same name ("invalid redefinition of function"), and
+    ends the process.
     """
     enabled = gc.isenabled()
     gc.disable()
@@ -298,8 +299,8 @@ def recording() -> Iterator[None]:
 def block_of_samples(pixels: int) -> int:
     """How many samples of a pixel go side by side: as many as are traced together, or fewer where images are large.
 
-    The results of a ray depend, in the last bits, on the rays traced with it. So which they are must not depend on how
-    a render is split into passes, and passes consist of whole blocks.
+    The results of a ray depend, in the last bits, on the rays traced with it. So the grouping of rays must not depend
+    on how a render is split into passes: passes consist of whole blocks.
     """
     block = PACKET
     while block > 1 and pixels * block > _BLOCK_LANES:
@@ -321,7 +322,7 @@ def blocks_within(
     """
     lanes = film.pixels * block
     blocks = lanes_within(memory, film, lanes, lane_bytes, instead) // lanes
-    # A block that ends amid a packet would push the next one to another place in its own.
+    # A block that ends within a packet would shift the next block within its packet.
     return blocks if lanes % PACKET == 0 else 1
 
 

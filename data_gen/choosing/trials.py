@@ -1,4 +1,4 @@
-"""Trials of samplers on a scene: small stacks, what a sample takes, and the error of an image without a reference.
+"""Trials of samplers on a scene: small stacks, the seconds of a sample, and the error of an image without a reference.
 
 The error of an image x, which a bias may be part of, is the mean of (x - a)(x - b) / (m² + 1e-3), where a and b are two
 independent images that had no part in x: their noise has no mean, as in ``ngpt.measure.metrics``. They are primals of
@@ -6,8 +6,8 @@ the sampler's other stacks and of all other unbiased samplers. The difference of
 that a sampler finds in one pixel of a thousand is an outlier, which a method takes out of both.
 
 What a sample takes is measured in processor seconds, which other work on the machine hardly changes, so a busy moment
-moves no sampler against another. A user gives seconds of the wall. One factor for all trials turns the one into the
-other: the wall seconds of all trials divided by their processor seconds, both for further samples.
+favours no sampler. Users give wall seconds. One factor for all trials converts processor seconds to these: the wall
+seconds of all trials divided by their processor seconds, both for further samples.
 """
 
 from __future__ import annotations
@@ -99,8 +99,8 @@ def try_all(
         trial, compiled = try_out(scene, name, clock, rest, stop, unbiased=pilot.unbiased)
         if stop():
             break
-        # A scene of many materials, or a busy machine, slows down the next one as well. Where kernels are kept from
-        # another render nothing is learnt.
+        # A scene of many materials, or a busy machine, slows down the next one as well. Where kernels are cached from
+        # another render, nothing is learnt.
         slow = max(slow, (compiled - begins) / compiles)
         if trial is not None:
             trials[name] = trial

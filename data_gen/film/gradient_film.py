@@ -160,7 +160,7 @@ class GradientFilm:
         cell, self._cell = self._cell, None
         if self._fine and cell is None:
             raise ValueError("a film with subpixels is told of each pass by begin_pass()")
-        # Reading single lanes evaluates an array: without this, each would trace the paths again.
+        # Reading single lanes evaluates an array: without this, each read would trace the paths again.
         dr.eval(values, cell)
         if some is not None:
             self._add_some(values, block, some, cell)
@@ -193,7 +193,7 @@ class GradientFilm:
         self.blocks += spp // block
 
     def forget_pass(self) -> None:
-        """Leaves out what was put since the last pass ended: it was broken off."""
+        """Drops what was put since the last pass ended, because the pass was aborted."""
         self._pass, self._splats, self._cell = {}, {}, None
 
     def _add_some(self, values: dict, block: int | None, some: np.ndarray, cell: mi.UInt32 | None) -> None:
@@ -244,7 +244,7 @@ class GradientFilm:
             if name in splats:
                 sums, lost_splats = splats[name].totals(), splats[name].lost
                 share = dr.opaque(dr.float64_array_t(mi.Float), 1 / spp)
-                # Where nothing was put, splats are all there is; where all that was put is lost, the pixel is unknown.
+                # Where nothing was put, the value is the splats. Where all that was put is lost, the pixel is unknown.
                 mean = [(m if mean else 0) + s * share for m, s in zip(mean or sums, sums, strict=True)]
                 lost = lost + lost_splats
             number = opaque(self.blocks) + dr.zeros(mi.UInt32, self.pixels)
@@ -284,13 +284,13 @@ class GradientFilm:
         count = self._statistics("primal")[0]
         variances = {"primal_var": self._claimed("primal")}
         if "caustic" in layers:
-            # Samplers put it beside a primal without it, whose variance is the one that goes with dx and dy.
+            # Samplers put it beside a primal without it, whose variance belongs to dx and dy.
             layers["primal"] = layers["primal"] + layers["caustic"]
             variances["caustic_var"] = self._claimed("caustic")
         if "shared" in layers:
             if layers["shared"].any():
                 variances["primal_var"] = variances["primal_var"] + shared_variance(layers["shared"])
-            else:  # paths could share, and did not
+            else:  # paths could share their tails, and did not
                 del layers["shared"]
         for layer in _SPLIT:
             if layer in layers:
@@ -392,8 +392,8 @@ class GradientFilm:
         return self._as_seen(self._image(self._statistics(name)[2]), [(name, np.s_[:, :], 1.0)])
 
     def _as_seen(self, variance: np.ndarray, terms: list[tuple[str, tuple, float]]) -> np.ndarray:
-        """A sample ``variance`` (H, W, 3), brought to the noise that is seen where samples are points of nets; of the
-        sum of ``terms``: name, which pixels, factor."""
+        """A sample ``variance`` (H, W, 3), scaled to the observed noise where samples are points of nets. It is the
+        variance of the sum of ``terms``: name, which pixels, factor."""
         if not self.net:
             return variance
         seen = sum(factor * self._image(self._contrast(name))[pixels] for name, pixels, factor in terms)

@@ -3,7 +3,7 @@
 Mitsuba turns the density of a point on a mesh into one of directions by the vertex normals, where it samples the point
 and where it is asked for the density (its issue 1952). The solid angle of a face depends on the normal of the face.
 Here such lamps are sampled by the normals of their faces. Where they shine stays as Mitsuba has it: in front of their
-vertex normals. What is in front of only one of the two normals is not sampled.
+vertex normals. Places in front of only one of the two normals are not sampled.
 """
 
 from __future__ import annotations
