@@ -45,7 +45,6 @@ from bench.tails import (
     steady_error,
     table,
 )
-from ngpt.errors import NgptError
 from ngpt.evaluation.references import Reference
 from ngpt.measure.averages import geometric_mean
 from ngpt.measure.metrics import scores
@@ -200,6 +199,23 @@ def mitsubas(file: str, size: tuple[int, int], points: str) -> Callable[[int, in
     return images
 
 
+def _set_part(state: Any, owner: Any, kind: Any, plugin: str) -> None:
+    """Every node of the type ``owner`` gets one part of this ``kind``, whether it had one or not."""
+    import mitsuba as mi
+
+    from data_gen.scenes.nodes import added, parts_of
+
+    for number in range(len(state.nodes)):
+        if state.nodes[number].type == owner:
+            props = state.nodes[number].props
+            for name, part in parts_of(props):
+                if state.nodes[part].type == kind:
+                    del props[name]
+            # The list of nodes may move when one is added.
+            reference = added(state, kind, mi.Properties(plugin))
+            state.nodes[number].props["ngpt_part"] = reference
+
+
 def mitsuba_scene(file: str, size: tuple[int, int], points: str) -> Any:
     """A scene as Mitsuba reads it, with these ``points`` and a box filter."""
     import mitsuba as mi
@@ -217,14 +233,8 @@ def mitsuba_scene(file: str, size: tuple[int, int], points: str) -> Any:
     else:
         with found_beside(file):
             config, state = parsed(file)
-            for kind, name in ((mi.ObjectType.Sampler, points), (mi.ObjectType.ReconstructionFilter, "box")):
-                nodes = [node for node in state.nodes if node.type == kind]
-                if not nodes:
-                    raise NgptError(f"{file}: has no {kind.name}, which this benchmark sets: add one to its sensor")
-                for node in nodes:
-                    node.props.set_plugin_name(name)
-                    for key in list(node.props.keys()) if name == "box" else ():
-                        del node.props[key]
+            _set_part(state, mi.ObjectType.Sensor, mi.ObjectType.Sampler, points)
+            _set_part(state, mi.ObjectType.Film, mi.ObjectType.ReconstructionFilter, "box")
             # Else Mitsuba would be slow where a scene has many meshes.
             merge(config, state)
             scene = mi.parser.instantiate(config, state)

@@ -31,7 +31,7 @@ __all__ = [
     "write_frames_on_cluster",
 ]
 
-# Imported when they are asked for, for Mitsuba and what goes with it take a second.
+# Imported on first use, because Mitsuba and its libraries take a second.
 _HOMES = {"Plan": "choosing.plans", "load_scene": "scenes.load", "use_variant": "backend"}
 _HOMES |= {"RenderRequest": "request"}
 _HOMES |= dict.fromkeys(("render_frames", "render_scene", "stop_on_ctrl_c"), "session")

@@ -1,6 +1,6 @@
 """Samples where they pay: after a few samples everywhere, more of them where the result's error is large.
 
-Before each step the method that is to reconstruct the image runs twice, which tells the standard error of its result
+Before each step the chosen method reconstructs the image twice, which gives the standard error of its result
 (``ngpt.api.uncertainty``); docs/use/adaptive.md says how the samples of a step follow from it. The samples that decide
 the counts stay in the means, so a pixel whose first samples were too dark by chance might get too few: errors that are
 means over about 9x9 pixels, relative to the light there, keep this bias small.
@@ -48,7 +48,7 @@ _CUT = 0.03
 # a few values far off raise the mean square. Standard errors of l1 count the light that it leaves out, so its factor is
 # below 1. By python -m bench.adaptive, six scenes.
 _TAILS, _TAIL = {"l1": 0.75}, 1.25
-# Pixels, the side of the part of an image that tells how long the method takes
+# Side, in pixels, of the part of an image that the method is timed on
 _PART = 96
 
 
@@ -161,7 +161,7 @@ def assess(stack: GradientStack, method: str) -> Assessment:
     factor = FACTORS.get(result.method, FACTOR)
     squares = np.square(factor * (twice - once))
     error = _TAILS.get(result.method, _TAIL) * math.sqrt(trimmed_mean(squares, squares, _TRIM))
-    # Nor must the error of a firefly count for all pixels around it.
+    # The error of a firefly must not count for all pixels around it either.
     most = np.quantile(np.abs(twice - once), 1 - _CUT)
     around = factor * change(once, once + np.clip(twice - once, -most, most))
     return Assessment(np.sqrt(np.square(around).mean(axis=-1)).ravel(), error, result.method)
@@ -184,9 +184,8 @@ def seconds_to_assess(stack: GradientStack, method: str, clock: Callable[[], flo
 
 
 def share_out(need: np.ndarray, n: np.ndarray, samples: float) -> np.ndarray:
-    """How many more blocks each pixel gets of about so many ``samples``: counts in proportion to ``need``.
-
-    ``n`` are the samples it has. All (pixels).
+    """The number of further blocks for each pixel: about ``samples`` in all, in proportion to ``need``. ``n`` is the
+    number of samples that each pixel has. All arrays are (pixels).
     """
     shares = np.clip(need / max(need.mean(), 1e-300), _FLOOR, _CAP)
     low, high = 0.0, (n.max() + samples) / _FLOOR
@@ -212,7 +211,7 @@ class UnevenRender:
     anywhere. The same total of samples gives the same bits, whatever the passes and whatever ended the render.
 
     ``sample`` must take samples that do not share anything; see ``data_gen.passes.render_passes()`` for it. ``stop`` is
-    asked before each pass, and ``report`` called after it.
+    called before each pass, and ``report`` after it.
     """
 
     def __init__(
@@ -248,10 +247,8 @@ class UnevenRender:
             self.rounds.begin(sensor, seed, first, self.film)
 
     def add(self, blocks: np.ndarray, whole: bool = False) -> None:
-        """Renders so many more ``blocks`` of each pixel, (pixels) integers.
-
-        Unless the ``whole`` is asked for, these are as many of them as there may be; ``ended`` says whether some were
-        left out.
+        """Renders further ``blocks`` of each pixel, (pixels) integers. Unless ``whole`` is set, it renders only as many
+        as the limits allow; ``ended`` says whether some were left out.
         """
         waiting, level = np.zeros(0, np.uint32), 0
         while True:
@@ -290,7 +287,9 @@ class UnevenRender:
         return min(n, most if most > 0 else int(left > begin + each))
 
     def _render(self, some: np.ndarray) -> None:
-        """One block of each of ``some`` pixels, ascending; of a pixel that is there more than once, so many."""
+        """Renders one block of each of ``some`` pixels, in ascending order. A pixel that is listed several times gets
+        as many blocks.
+        """
         start = self.clock()
         pixels, starts, blocks = np.unique(some, return_index=True, return_counts=True)
         within = np.arange(len(some)) - np.repeat(starts, blocks)

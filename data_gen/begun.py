@@ -1,4 +1,4 @@
-"""Renders that were begun: whether a file has all that is asked for, and what is left to render of it.
+"""Renders that were begun: whether a file has all that was requested, and what is left to render.
 
 The rest gets its own seed, made from the requested seed and the number of existing parts. So its samples are
 independent of those in the file, and parts are merged exactly as stacks with different seeds are (``ngpt.merging``).
@@ -97,7 +97,7 @@ def rest_of(request: RenderRequest, path: Path, frame: int | None = None) -> Ren
 
 
 def _same(request: RenderRequest, path: Path, attributes: Mapping[str, Any], frame: int | None) -> dict[str, Any]:
-    """What the header of a file says of its request; raises NgptError where that is another, but for its budget."""
+    """The request in the header of a file. Raises NgptError if it differs from this one in more than the budget."""
     said = said_by(attributes)
     remedy = "give another name, or --force in place of --skip-existing to replace it"
     for what, given in {"scene": request.scene, "camera": request.camera}.items():

@@ -26,7 +26,7 @@ def wall() -> float:
 
 @dataclass(frozen=True)
 class Budget:
-    """What a render may spend. Of ``spp`` and ``seconds`` whichever is reached first ends it."""
+    """What a render may spend. A render ends when it reaches ``spp`` or ``seconds``, whichever comes first."""
 
     spp: int | None = None  # base paths per pixel; None: as many as time allows
     seconds: float | None = None  # of the clock, compilation of kernels included; None: no limit
@@ -45,7 +45,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Watch:
-    """Who hears of a render while it goes on."""
+    """Functions that are called while a render goes on."""
 
     progress: Progress = lambda done, total: None  # called before the first pass and after each
     stop: Callable[[], bool] = lambda: False  # asked after each pass whether to end there

@@ -28,7 +28,7 @@ from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.load import at_most
 from data_gen.scenes.lost import behind_sharp, hard_to_meet
 
-# 65,536 light paths, of at most so many edges
+# The number of light paths, and the most edges of each
 _PIXELS, _SPP, _LONGEST = 1 << 14, 4, 8
 
 

@@ -1,7 +1,8 @@
 """Which code a render runs: what cached stacks are keyed by, so that no other code can have made them.
 
-The files are found by following imports, wherever in a file they stand, from the sampler's own module and from
-``data_gen.render``, which all share. Nothing is listed by hand. Nothing is imported either: Mitsuba need not be there.
+The files are found by following imports, anywhere in a file, from the sampler's own module and from
+``data_gen.render``, which all samplers share. Nothing is listed by hand. Nothing is imported either: Mitsuba need not
+be there.
 """
 
 from __future__ import annotations
@@ -16,17 +17,17 @@ from data_gen.samplers import SAMPLERS
 from ngpt.system.source import code_text, imports
 
 ROOT = Path(__file__).parent
-# The registry knows all samplers; of what it imports, a render needs its own family's entries.
+# The registry knows all samplers. A render needs only its own family's entries of what the registry imports.
 _REGISTRY, _MACHINERY = "data_gen.samplers", "data_gen.samplers.registry"
-# The face of the package hands on what others have.
+# The package's ``__init__`` only re-exports names of other modules.
 _FACE = "data_gen"
-# What the built-in scenes are made of: a scene has a key of its own.
+# Modules of the built-in scenes: a scene has a key of its own.
 _BUILT_IN = ("data_gen.scenes.builtin", "data_gen.scenes.grids")
 
 
 def code(sampler: str) -> str:
     """SHA-256 of the files that a render by the sampler runs, without comments and docstrings; of "auto", by any of the
-    samplers that a scene's description may stand for. Of an unknown name, of what all share."""
+    samplers that a scene's description may stand for. For an unknown name, of the code that all samplers share."""
     return _hash(reached(sampler))
 
 
@@ -76,7 +77,7 @@ def _text(file: Path, changed: int) -> str:
 
 
 def _file(module: str) -> Path:
-    """The file of a module of data_gen or of another package, of a package its ``__init__``."""
+    """The file of a module of data_gen or of another package; for a package, its ``__init__``."""
     package, *names = module.split(".")
     home = ROOT
     if package != _FACE:

@@ -37,9 +37,8 @@ class Denoising:
         return self.method != "auto" and "dx" in runnable(self.method).needs
 
     def check(self, sampler: str, spp: int | None, begun: str = "") -> None:
-        """Raises an error for a method that does not run here, or that needs what such a render lacks.
-
-        ``begun`` is the file of a render that is gone on with, whose sampler it is.
+        """Raises an error for a method that does not run here, or that needs something such a render lacks. ``begun``
+        is the file of a render that is continued with its sampler.
         """
         if self.method == "auto":
             return
@@ -70,7 +69,7 @@ class Output:
     header: dict[str, str] = field(init=False)  # what the stack's header says of the request
 
     def __post_init__(self) -> None:
-        # Of the scene's file as it is before the render
+        # The checksum of the scene's file before the render
         object.__setattr__(self, "header", self.request.header(self.frame))
 
     @property
@@ -78,7 +77,7 @@ class Output:
         return self.kept or self.file
 
     def check(self, skip_existing: bool) -> None:
-        """Raises WrongUse for files that cannot be such, or that cannot say what is there of a render."""
+        """Raises WrongUse for files that cannot be written, or that cannot say how far a render is."""
         if self.denoising is not None:
             check_image(self.file, self.denoising.look.transform)
         for path in (self.kept, None if self.denoising else self.file):
@@ -108,7 +107,7 @@ class Output:
         return rest
 
     def done(self) -> bool:
-        """Whether all is there that is asked for.
+        """Whether all that was requested exists.
 
         Raises NgptError where a stack is there in place of its image, or the image of another method.
         """

@@ -23,7 +23,7 @@ from ngpt.system.limits import memory as machine_memory
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
-# What takes the samples of one pass: it puts, or splats, one for each camera sample into the film.
+# A function that takes the samples of one pass: it puts, or splats, one value for each camera sample into the film.
 SamplePass = Callable[[CameraSamples, GradientFilm], None]
 
 # Rays of lanes side by side are traced together, and do best where they start from one pixel.
@@ -38,7 +38,7 @@ _FEWEST_LANES = 1 << 13
 _CAUTION, _GROWTH = 0.9, 8
 # Lanes of the first pass of others: enough to render small images at one go, and to judge how long the next may be.
 FIRST_LANES = 1 << 20
-# A pass this long makes little of the time that it takes to start one, and reacts soon enough.
+# Seconds of a pass: starting it costs little in comparison, and the render still reacts soon.
 PASS_SECONDS = 2.0
 
 
@@ -82,7 +82,7 @@ def rounds_of(sample: SamplePass) -> Rounds:
 
 
 def _nothing(left: int) -> str:
-    """Suggests nothing that would fit into so many bytes per lane."""
+    """Has nothing to suggest that would fit into this number of bytes per lane."""
     return ""
 
 
@@ -106,10 +106,10 @@ def render_passes(
 
     The number of blocks of samples in a pass adapts to the speed of the scene and to the memory. A lane takes
     ``lane_bytes``, or what an attribute of this name of ``sample`` says. This changes no bit of the result, which
-    depends only on the seed, the size, the number of samples and ``spp``: the latter determines the first round of the
+    depends only on the seed, the size, the number of samples and ``spp``: ``spp`` determines the first round of the
     ``points``, see ``data_gen.paths.streams.first_round``. With a ``batch``, the samples of a pass depend on each
-    other: each pass is one block of so many samples per pixel, and the film's variances are computed over passes. Such
-    a ``sample`` may keep a state from pass to pass; ``CameraSamples.first`` gives its position.
+    other: each pass is one block of ``batch`` samples per pixel, and the film's variances are computed over passes.
+    Such a ``sample`` may keep a state from pass to pass; ``CameraSamples.first`` gives its position.
 
     A ``sample`` may come in ``Rounds``; no pass crosses the end of a round. The ``kind`` of film, its ``subpixels``
     and whether it has ``gradients``, is as in ``film_within``.
@@ -202,8 +202,8 @@ def end_of_time(gone: float, seconds: float, early: bool) -> tuple[int, int]:
 
 
 def growing_block(pixels: int, done: int, block: int) -> int:
-    """Samples of a pixel side by side in the next block after so many that are ``done``: few at first, where time may
-    end a render at any moment, and then as many as there are, up to ``block``."""
+    """The number of samples of a pixel that the next block takes side by side, after ``done`` samples. It is small at
+    first if time may end the render at any moment. Then it is as large as possible, up to ``block``."""
     first = 1
     while first < block and pixels * first < _FEWEST_LANES:
         first *= 2
@@ -227,7 +227,7 @@ def foretold(done: list[tuple[int, float]]) -> tuple[float, float]:
 def compilation() -> Iterator[list[float]]:
     """Yields a list that has the seconds for which kernels were compiled in it, once that is over."""
     compiled: list[float] = []
-    if dr.flag(dr.JitFlag.KernelHistory):  # Whoever asked for it reads it, which empties it.
+    if dr.flag(dr.JitFlag.KernelHistory):  # The caller reads it, which empties it.
         yield compiled
         return
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -249,9 +249,9 @@ def film_within(
 ) -> tuple[GradientFilm, int, int]:
     """An empty film for ``spp`` samples per pixel, samples of a block, and how many blocks may make a pass.
 
-    ``instead`` is as in ``blocks_within``, ``net`` as in ``CameraSamples``. Of the ``kind`` of film, which
-    are further parameters of its own, it keeps fewer ``subpixels`` where there is no room, and a warning says so.
-    Raises NgptError where one block of samples does not fit into ``memory``.
+    ``instead`` is as in ``blocks_within``, ``net`` as in ``CameraSamples``. ``kind`` has further parameters of the
+    film. Where memory is short, the film has fewer ``subpixels``, and a warning says so. Raises NgptError where one
+    block of samples does not fit into ``memory``.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     block = batch or block_of_samples(width * height)
@@ -262,7 +262,7 @@ def film_within(
 
 
 def film_of(width: int, height: int, memory: int, pixel_bytes: int, *, subpixels: int = 1, **how: Any) -> GradientFilm:
-    """A film with so many subpixels, or as many as leave room for a pass that takes ``pixel_bytes`` a pixel."""
+    """A film with the requested subpixels, or with fewer where a pass of ``pixel_bytes`` per pixel would not fit."""
     k = subpixels
     while True:
         film = GradientFilm(width, height, subpixels=k, **how)
@@ -280,11 +280,12 @@ def film_of(width: int, height: int, memory: int, pixel_bytes: int, *, subpixels
 
 @contextmanager
 def recording() -> Iterator[None]:
-    """While kernels are recorded in it, Python frees no scene that is left over from before.
+    """Within the block, where kernels are recorded, Python does not free scenes of earlier renders.
 
-    A call of Dr.Jit holds one function for each object (material, lamp ...) that lives at that moment. Were a second
-    scene freed amid a kernel, a lamp could be one of two in one call and the only one in the next. Dr.Jit 1.5 takes the
-    two ways to call for two functions, gives both one name ("invalid redefinition of function"), and ends the process.
+    A call of Dr.Jit holds one function for each object (material, lamp ...) that lives at that moment. If a second
+    scene were freed while a kernel is recorded, a lamp could be one of two in one call and the only one in the next.
+    Dr.Jit 1.5 takes the two calls for two functions, gives both the same name ("invalid redefinition of function"), and
+    ends the process.
     """
     enabled = gc.isenabled()
     gc.disable()
@@ -298,8 +299,8 @@ def recording() -> Iterator[None]:
 def block_of_samples(pixels: int) -> int:
     """How many samples of a pixel go side by side: as many as are traced together, or fewer where images are large.
 
-    The results of a ray depend, in the last bits, on the rays traced with it. So which they are must not depend on how
-    a render is split into passes, and passes consist of whole blocks.
+    The results of a ray depend, in the last bits, on the rays traced with it. So the grouping of rays must not depend
+    on how a render is split into passes: passes consist of whole blocks.
     """
     block = PACKET
     while block > 1 and pixels * block > _BLOCK_LANES:
@@ -316,11 +317,12 @@ def blocks_within(
 ) -> int:
     """How many blocks of ``block`` samples a pass may have, so that it and the film stay within ``memory`` MiB.
 
-    Raises NgptError where not even one fits. ``instead`` is asked what else would, with so many bytes left for a lane.
+    Raises NgptError where not even one fits. ``instead`` is called with the bytes that are left for a lane, and returns
+    what else would fit.
     """
     lanes = film.pixels * block
     blocks = lanes_within(memory, film, lanes, lane_bytes, instead) // lanes
-    # A block that ends amid a packet would push the next one to another place in its own.
+    # A block that ends within a packet would shift the next block within its packet.
     return blocks if lanes % PACKET == 0 else 1
 
 
@@ -348,7 +350,7 @@ def lanes_within(
 
 
 def least_memory(film: GradientFilm, lanes: int, lane_bytes: int = LANE_BYTES) -> int:
-    """MiB that the film and a pass of so many lanes need."""
+    """MiB that the film and a pass of this number of lanes need."""
     return -(-(film.bytes + lane_bytes * _allocated(lanes)) // 2**20)
 
 

@@ -1,9 +1,9 @@
 """Samplers as Mitsuba's integrators: ``mi.load_dict({"type": "gpt"})`` after ``import data_gen``, whatever the variant.
 
-Those of other packages are there too, by their entry points.
+Samplers of other packages are registered too, by their entry points.
 
-Mitsuba knows plugins by variant, and only once one is set. So with each variant that is set, constructors are
-registered that know no more than a name. A class is made when it is first used: all of them take half a second.
+Mitsuba knows plugins by variant, and only once one is set. So each time a variant is set, constructors are registered
+that need only a name. A class is made when it is first used: all of them take half a second.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def register_when_ready() -> None:
 
 
 class _UntilMitsubaComes(MetaPathFinder):
-    """Finds nothing, but hears of the first import of Mitsuba, and has us follow its variants after it."""
+    """Finds no module itself. It notices the first import of Mitsuba, and then has its variants followed."""
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:
         if name != "mitsuba":

@@ -196,7 +196,7 @@ def stack_of(
 ) -> GradientStack:
     """The stack of a sensor's film, whose rendering began at ``start`` (time.perf_counter()), with ``more`` attributes.
 
-    It lies where the crop window of the sensor does, in a picture of the whole size.
+    It is the crop window of the sensor, within a picture of the whole size.
     """
     attributes = {
         "ngpt:seed": str(seed),
@@ -210,7 +210,7 @@ def stack_of(
 
 
 def subpixels_of(entry: Sampler, asked: int | str, spp: int | None) -> int:
-    """K of the K x K subpixels that a render keeps; raises WrongUse where it cannot have those that are asked for."""
+    """K of the K x K subpixels that a render keeps. Raises WrongUse if it cannot keep the requested ones."""
     if asked != "auto" and asked not in CHOICES:
         raise WrongUse(f"{asked} subpixels: choose one of {', '.join(map(str, CHOICES))}, auto")
     if not entry.batch:

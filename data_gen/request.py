@@ -1,6 +1,6 @@
-"""What is asked of a render: one frozen record, made once by the command line or by Python, and handed down whole.
+"""The request for a render: one frozen record, made once by the command line or by Python, and passed down whole.
 
-Each stack's header has it in canonical form. A render continues a file if both requests are equal but for their
+Each stack's header has it in canonical form. A render continues a file if the two requests differ at most in their
 budgets, and the file has fewer samples (``data_gen.begun``).
 """
 

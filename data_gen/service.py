@@ -16,7 +16,7 @@ from ngpt.stack import GradientStack
 if TYPE_CHECKING:
     import mitsuba as mi
 
-# Of the wall, or of this process on all processors, which other work on the machine does not change
+# Seconds of the wall clock, or of this process on all processors, which other work on the machine does not change
 CLOCKS: dict[str, Callable[[], float]] = {"wall": time.perf_counter, "processor": time.process_time}
 
 

@@ -158,7 +158,7 @@ def _loaded(request: RenderRequest, watch: Watch) -> mi.Scene:
 
 
 def _planned(scene: mi.Scene, request: RenderRequest, watch: Watch) -> Plan:
-    """How to render: as it is asked for, or as a pilot or the description of the scene finds."""
+    """How to render: as requested, or as a pilot or the description of the scene suggests."""
     from data_gen.adaptive import Adaptive
     from data_gen.choosing import plans
     from data_gen.choosing.trials import Pilot

@@ -55,8 +55,8 @@ __all__ = [
     "write",
 ]
 
-# Imported when they are asked for. So the commands are at work, and handle what interrupts them, before NumPy and SciPy
-# have been loaded, which comes with this package otherwise.
+# Imported on first use. So the commands are at work, and handle what interrupts them, before NumPy and SciPy have been
+# loaded, which comes with this package otherwise.
 _HOMES = {"GradientStack": "stack", "NgptError": "errors", "merge": "merging"}
 _HOMES |= dict.fromkeys(("Denoiser", "denoise"), "api.arrays")
 _HOMES |= dict.fromkeys(("read", "read_image", "read_views", "write"), "io.exr")

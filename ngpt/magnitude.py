@@ -20,7 +20,7 @@ from ngpt.stack import GradientStack
 
 # Binary digits between typical light and 1 that methods are made for: a millionth to a million.
 ORDINARY = 20
-# The largest light has at most so many binary digits before the point: its square is a float.
+# The largest light has at most this number of binary digits before the point: its square is a float.
 _LARGEST = 62
 # For typical light below 2^-_DIM, variances of 0 say nothing: a millionth of its square is below 2^-148.
 _DIM = 64

@@ -10,7 +10,7 @@ With n_i samples per pixel, means m_i and variances of the mean v_i, the stack o
 Its expectation is the variance of m for any weights n_i that no sample has a say in, whatever the v_i: so it holds for
 differences too, whose two directions may have samples in different numbers.
 
-Stacks that lie in different places of one picture are tiles: each counts in its own pixels.
+Stacks in different places of one picture are tiles: each counts in its own pixels.
 """
 
 import logging
@@ -41,8 +41,8 @@ UNFINISHED = "ngpt:unfinished"
 REQUEST = "ngpt:request"
 # Attribute: the sampler's options that are not defaults, with commas between
 OPTIONS = "ngpt:samplerOptions"
-# Of these, how a path finds light behind its first steps: in a cache of what other paths found, or by itself, which is
-# the default and so goes without saying.
+# The attribute among these that says how a path finds light behind its first steps: in a cache of other paths' light,
+# or by itself, which is the default where the attribute is missing.
 SHARED_TAILS, WHOLE_PATHS = "tails=shared", "tails=paths"
 # The most samples of a pixel: headers count them in 32 bits.
 _MOST = 2.0**31
@@ -297,7 +297,7 @@ def _variance(tiles: Sequence[_Tile], name: str, variance: str) -> np.ndarray:
 
 def _hole(tiles: Sequence[_Tile], canvas: Window) -> Window | None:
     """The rectangle around the pixels that no tile has; None where there are none."""
-    # Tiles may lie so far apart that no memory holds what is between them.
+    # Tiles may be so far apart that no memory holds the space between them.
     if canvas.width * canvas.height > 4 * sum(tile.stack.width * tile.stack.height for tile in tiles):
         return canvas
     empty = np.ones((canvas.height, canvas.width), bool)
@@ -319,7 +319,7 @@ def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
                 f"{stack.path} is {stack.place} but {first.path} is {first.place}; only stacks of one image can be "
                 "merged: its tiles, or its seeds"
             )
-        # As texts, for files of elsewhere may hold anything under our names.
+        # As text, because files of other programs may hold anything under our names.
         ours, theirs = (str(s.attributes.get("ngpt:sampler")) for s in (stack, first))
         if ours != theirs:
             raise NgptError(

@@ -24,7 +24,7 @@ class Renderer(Protocol):
     def render(
         self, scene: Any, options: Options, spp: int | None, seed: int, *, seconds: float | None
     ) -> GradientStack:
-        """A stack of ``spp`` samples per pixel, or of so many ``seconds``."""
+        """A stack of ``spp`` samples per pixel, or rendered in this many ``seconds``."""
 
     def warm_up(self, scene: Any, options: Options) -> GradientStack:
         """Has the kernels of a render compiled; its stack of one sample."""

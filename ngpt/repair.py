@@ -1,4 +1,4 @@
-"""Non-finite pixels: repaired from their neighbours, and their gradients trusted no more."""
+"""Non-finite pixels are repaired from their neighbours, and their gradients are no longer trusted."""
 
 from dataclasses import dataclass, field
 from typing import Any

@@ -14,7 +14,7 @@ import numpy as np
 TAILS, CUT = "ngpt:tails", "ngpt:tailsCut"
 # Side of the square of pixels over which the squares of a pixel's variance are averaged
 _AROUND = 5
-# Side of the square blocks whose noise is told
+# Side of the square blocks whose noise is reported
 _BLOCK = 32
 
 
@@ -32,8 +32,9 @@ def shared_variance(shared: np.ndarray) -> np.ndarray:
 def noise_of_light(primal: np.ndarray, primal_var: np.ndarray, shared: np.ndarray) -> dict[str, dict[str, float]]:
     """The standard error of the mean light of the whole image, and of blocks of ``_BLOCK`` pixels where there are any.
 
-    Of layers (H, W, C). "own" is what pixels have by themselves, "shared" what they have in common; both are root mean
-    squares over channels and blocks, relative to the mean light of the image. Values that are not finite count as zero.
+    Noise of layers (H, W, C). "own" is the noise of single pixels, "shared" the noise that they have in common; both
+    are root mean squares over channels and blocks, relative to the mean light of the image. Values that are not finite
+    count as zero.
     """
     light, variance, sample = (
         np.where(np.isfinite(layer), layer, 0).astype(np.float64) for layer in (primal, primal_var, shared)

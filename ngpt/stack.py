@@ -128,7 +128,7 @@ class GradientStack(Mapping[str, np.ndarray]):
         return f"GradientStack {self.path}, {self.width}x{self.height}{samples}"
 
     def number(self, attribute: str) -> float | None:
-        """An attribute that is a finite number; None where there is none, for files of elsewhere may hold anything."""
+        """An attribute that is a finite number; None where there is none: files of other programs may hold anything."""
         value = self.attributes.get(attribute)
         if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
             return None

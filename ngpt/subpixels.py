@@ -17,7 +17,7 @@ _LOG = logging.getLogger(__name__)
 
 # The layers that have subpixels
 FINE = ("primal", "albedo", "normal")
-# Of these, the ones whose values are those of half floats: their rounding is nothing beside their noise.
+# The layers among these that are stored as half floats: rounding is far below their noise.
 HALF = ("albedo", "normal")
 # Header attribute: K, where a file has subpixels
 SUBPIXELS = "ngpt:subpixels"
@@ -78,7 +78,7 @@ Part = tuple[Mapping[str, np.ndarray], np.ndarray, tuple[slice, slice]]
 def merged(parts: Sequence[Part], names: Sequence[str], size: tuple[int, int]) -> dict[str, np.ndarray]:
     """The subpixels of an image of this size (width, height), from those of its parts: means weighted by samples.
 
-    Of each part: its subpixels, the samples of its pixels (h, w, 1), and its rows and columns in the image.
+    Each part has its subpixels, the samples of its pixels (h, w, 1), and its rows and columns in the image.
     """
     k = parts[0][0]["primal"].shape[1] // parts[0][1].shape[1]
     layers = {}
@@ -95,7 +95,7 @@ def merged(parts: Sequence[Part], names: Sequence[str], size: tuple[int, int]) -
 
 
 def check(fine: Mapping[str, np.ndarray], width: int, height: int, path: str) -> None:
-    """Raises NgptError for subpixels that are not those of an image of this size."""
+    """Raises NgptError for subpixels that do not fit an image of this size."""
     if not fine:
         return
     if "primal" not in fine or (other := next((name for name in fine if name not in FINE), None)):

@@ -98,8 +98,8 @@ class Place:
     def seen_from(self, other: "Place") -> "Window | None":
         """The pixels in the coordinates of ``other``; None where the two are pictures of different sizes.
 
-        If only the size of an image is known, it lies where the other one of that size does: many programs lose the
-        place of what they cut. Other pictures lie side by side, except two of different sizes with one corner: their
+        If only the size of an image is known, it takes the place of the other image of that size: many programs lose
+        the place of a crop. Other pictures are side by side, except two of different sizes with one corner: their
         resolutions differ.
         """
         if self.display != other.display:

@@ -21,7 +21,7 @@ def features_pay(scene: mi.Scene) -> bool:
 def noise_of_features(scene: mi.Scene) -> float:
     """The share of the variance of albedo and normal over the image that two points of the lens do not agree on.
 
-    Of single samples, at the first surface; the random numbers are always the same.
+    It is measured with single samples at the first surface. The random numbers are always the same.
     """
     random = mi.PCG32(_PIXELS)
     place, *lens = (mi.Point2f(random.next_float32(), random.next_float32()) for _ in range(3))

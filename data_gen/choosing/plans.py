@@ -31,11 +31,12 @@ from ngpt.system.console import brief
 
 # The share of the time that a pilot may take, and the part of it for trials of samplers where it tries methods too
 SHARE, _TRIALS = 0.1, 2 / 3
-# Below so many seconds, or paths where a number of samples is given, a pilot costs more than it could gain: a tenth of
-# them is enough to compile the kernels of other samplers and to try them. One or two cores trace a million paths per
-# second. Two trials on the smallest images take 3.0 to 13.5 processor seconds, with their methods about 4 more.
+# Below this number of seconds, or of paths where a number of samples is given, a pilot costs more than it could gain: a
+# tenth of them is enough to compile the kernels of other samplers and to try them. One or two cores trace a million
+# paths per second. Two trials on the smallest images take 3.0 to 13.5 processor seconds, with their methods about 4
+# more.
 LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
-# What `ngpt denoise` takes beside the method, and `ngpt render` to write the stack: for the process to begin, and to
+# Seconds of `ngpt denoise` besides the method, and of `ngpt render` to write the stack: to start the process, and to
 # write a million pixels, read them and write the image
 _BEGINS, _FILES = 0.8, 3.7
 # The power of the pixels by which the seconds of methods grow: from 4,080 to 230,400 pixels 0.84 (ngpt-combine), 0.86
@@ -45,8 +46,8 @@ _GROWS = 0.9
 _METHOD_SECONDS, _OTHERS = {"auto": 18.0, "ngpt-combine": 18.0, "ngpt-primal": 7.0, "oidn": 8.0}, 3.0
 # Seconds from which on the pilot's images are as large as they ever are, and the least share of that
 LONG, LEAST_PIXELS = 400.0, 1 / 16
-# A rival must leave so many times less error: a choice is not worth changing for what chance could have made. The
-# errors of networks and denoisers are expected less well, and their choice was seen to be wrong by 1.6 times.
+# A rival's error must be smaller by this factor: smaller differences could be chance. The errors of networks and
+# denoisers are expected less well, and their choice was seen to be wrong by 1.6 times.
 _MARGIN, _MARGIN_OF_IMAGES = 1.1, 1.6
 # The share of light that only photons find from which on they are taken, if so many samples fit into the time; seconds
 # of a million of their samples on two cores, and until the first one is done
@@ -73,11 +74,10 @@ def explore(
     *,
     patient: bool = False,
 ) -> list[Pipeline]:
-    """The pipelines of a scene, for an image of its size; see ``plan``, which chooses of them. None where no trial fits
-    into the time; ``patient``, the first sampler has a trial and a method however long they take, and the one for
-    gradients is tried too.
-
-    ``after`` of them is all that follows the render: its file, a process that reads it, the method, the image's file.
+    """The pipelines of a scene, for an image of its size; see ``plan``, which chooses among them. None where no trial
+    fits into the time. If ``patient``, the first sampler has a trial and a method however long they take, and the
+    sampler for gradients is tried too. ``after`` is the part of the seconds that follows the render: its file, a
+    process that reads it, the method, the image's file.
     """
     start = pilot.clock()
     able = _able(scene, method, gradients_too=patient)
@@ -102,7 +102,7 @@ def explore(
 
 
 def _beside(scene: mi.Scene) -> float:
-    """Seconds that a method takes beside its own: for processes and files."""
+    """Seconds for processes and files that come on top of a method's own."""
     return _BEGINS + _FILES * _pixels(scene) / 1e6
 
 
@@ -127,7 +127,7 @@ def plan(
     memory: int = DEFAULT_MEMORY,
     pilot: Pilot = Pilot(),  # noqa: B008 - it is frozen
 ) -> Plan:
-    """How to use so many ``seconds`` of the pilot's clock, which include the pilot and the method.
+    """How to use these ``seconds`` of the pilot's clock, which include the pilot and the method.
 
     Only the given ``method`` is considered, unless it is "auto". The pilot tries the sampler that the scene's
     description stands for, then the other unbiased samplers that ``--sampler auto`` compares, as far as they fit into a
@@ -159,7 +159,9 @@ def plan(
 
 
 def _for_caustics(scene: mi.Scene, seconds: float, method: str, start: float, pilot: Pilot) -> Plan | None:
-    """The plan for a scene whose light paths from the camera hardly find, or None: it has little of it, or no time."""
+    """The plan for a scene with light that paths from the camera hardly find. None if there is little such light, or no
+    time.
+    """
     facts = scene_facts(scene)
     able = [name for name, entry in SAMPLERS.items() if entry.gathers and not entry.refuses(facts)]
     if not able or not (methods := methods_for(able[0], method)) or pilot.stop():
@@ -186,13 +188,13 @@ def plan_sampler(
     *,
     gradients: bool = False,
 ) -> Plan:
-    """The sampler for a render of ``spp`` samples per pixel, or of so many ``seconds``; one of them may be None.
+    """The sampler for a render of ``spp`` samples per pixel, or of this many ``seconds``; one of them may be None.
 
     The description decides, at no cost, where only one sampler can render the scene, and where the render is too short
-    for a pilot; ``gradients``: only samplers that render them are considered. What a pilot measures changes from run to
-    run, what it chooses hardly; the render itself has the bits of ``--sampler NAME``. Raises NgptError where no sampler
-    with gradients can render the scene, and before anything is tried where the image does not fit into ``memory``
-    (MiB).
+    for a pilot; ``gradients``: only samplers that render them are considered. The measurements of a pilot change from
+    run to run, its choice hardly ever does. The render itself has the bits of ``--sampler NAME``. Raises NgptError
+    where no sampler with gradients can render the scene, and before anything is tried where the image does not fit into
+    ``memory`` (MiB).
     """
     start = pilot.clock()
     facts = scene_facts(scene)
@@ -209,7 +211,7 @@ def plan_sampler(
     with at_most(scene, PIXELS) as scale:
 
         def whole(trials: dict[str, Trial]) -> float:
-            """Seconds of the render, should the scene's own sampler do it; 0 where it cannot."""
+            """Seconds of the render with the scene's own sampler; 0 where it cannot render the scene."""
             if sampler not in trials:
                 return 0.0
             return min(math.inf if spp is None else trials[sampler].seconds * spp * scale, longest)
@@ -234,7 +236,7 @@ def plan_adaptive(scene: mi.Scene, adaptive: Adaptive, seconds: float | None, *,
 
 
 def without_features(scene: mi.Scene, plan: Plan) -> Plan:
-    """The plan for an image that nothing is made of but by its method: features stay only where they pay."""
+    """The plan for an image that only its method will use: it keeps features only where they pay."""
     if (plan.sampler, plan.method) != samplers.SIMPLE or features_pay(scene):
         return plan
     why = "the lens blurs albedo and normal, which are left out"
@@ -246,7 +248,7 @@ def _pixels(scene: mi.Scene) -> int:
 
 
 def _check_memory(scene: mi.Scene, sampler: str, spp: int | None, memory: int) -> None:
-    """Raises NgptError where the image itself, not the pilot's, does not fit into ``memory`` (MiB)."""
+    """Raises NgptError where the image itself, which is larger than the pilot's, does not fit into ``memory`` (MiB)."""
     entry = SAMPLERS[sampler]
     film_within(
         memory, scene.sensors()[0], spp or 1 << 31, entry.lane_bytes, entry.batch, gradients=entry.film_of_gradients
@@ -270,7 +272,7 @@ def best_image(ranked: Sequence[Pipeline], default: str, seconds: float, margin:
 
 
 def best_of(pipelines: Sequence[Pipeline], seconds: float) -> tuple[str, str]:
-    """The sampler to take for a render of so many ``seconds``, at the pilot's size, and why.
+    """The sampler for a render of this many ``seconds``, at the pilot's size, and the reason.
 
     The first of ``pipelines`` is the scene's own, which stays unless another is expected to leave clearly less error.
     """
@@ -286,7 +288,7 @@ def best_of(pipelines: Sequence[Pipeline], seconds: float) -> tuple[str, str]:
 
 
 def _why(ranked: Sequence[Pipeline], seconds: float) -> str:
-    """A line: what is expected of the first, and of the best by each other sampler."""
+    """A line with the expected error of the first pipeline, and of the best one of each other sampler."""
     errors: dict[str, tuple[float, Pipeline]] = {}
     for p in ranked:
         errors.setdefault(p.sampler, (p.expected(p.samples(seconds)), p))

@@ -1,4 +1,4 @@
-"""Trials of samplers on a scene: small stacks, what a sample takes, and the error of an image without a reference.
+"""Trials of samplers on a scene: small stacks, the seconds of a sample, and the error of an image without a reference.
 
 The error of an image x, which a bias may be part of, is the mean of (x - a)(x - b) / (m² + 1e-3), where a and b are two
 independent images that had no part in x: their noise has no mean, as in ``ngpt.measure.metrics``. They are primals of
@@ -6,8 +6,8 @@ the sampler's other stacks and of all other unbiased samplers. The difference of
 that a sampler finds in one pixel of a thousand is an outlier, which a method takes out of both.
 
 What a sample takes is measured in processor seconds, which other work on the machine hardly changes, so a busy moment
-moves no sampler against another. A user gives seconds of the wall. One factor for all trials turns the one into the
-other: the wall seconds of all trials divided by their processor seconds, both for further samples.
+favours no sampler. Users give wall seconds. One factor for all trials converts processor seconds to these: the wall
+seconds of all trials divided by their processor seconds, both for further samples.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Pilot:
-    """How trials go on, and who hears of it."""
+    """The clock of trials, and the functions that are called while they go on."""
 
     clock: Callable[[], float] = time.perf_counter
     said: Callable[[str], None] = lambda line: None  # called with what is tried
@@ -99,8 +99,8 @@ def try_all(
         trial, compiled = try_out(scene, name, clock, rest, stop, unbiased=pilot.unbiased)
         if stop():
             break
-        # A scene of many materials, or a busy machine, slows down the next one as well. Where kernels are kept from
-        # another render nothing is learnt.
+        # A scene of many materials, or a busy machine, slows down the next one as well. Where kernels are cached from
+        # another render, nothing is learnt.
         slow = max(slow, (compiled - begins) / compiles)
         if trial is not None:
             trials[name] = trial
@@ -136,7 +136,8 @@ def try_out(
     begins = clock()
     batch = SAMPLERS[sampler].batch
     spp, seed = max(SPP, 2 * batch), seed_of(sampler)
-    # What a render takes to begin is no part of what a sample takes; a render of another length tells the two apart.
+    # The time that a render takes to begin is not part of the time of a sample. A render of another length separates
+    # the two.
     other = batch or 2 * SPP
     try:
         render_stack(scene, 1, seed, sampler, unbiased=unbiased)

@@ -1,4 +1,6 @@
-"""The verbs of ``ngpt`` that render: they come to it by the entry point of group "ngpt.verbs" in pyproject.toml."""
+"""The verbs of ``ngpt`` that render. ``ngpt`` finds them by the entry points of group "ngpt.verbs" in
+pyproject.toml.
+"""
 
 from ngpt.cli import CONTINUES, Verb
 

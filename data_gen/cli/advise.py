@@ -62,8 +62,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     start = time.perf_counter()
     scene = load_scene(args.scene, args.size, dict(args.define), sensor=args.sensor)
-    # Its own time is not part of the time that it advises on, but no more than that. On a machine that is too busy for
-    # it the first sampler is tried all the same, on a small image, and no other.
+    # The advice takes at most as long as the render that it is about, in addition to it. On a machine that is too busy
+    # for it the first sampler is tried all the same, on a small image, and no other.
     longest = _LONGEST / SHARE
     whole = longest if args.seconds is None else min(max(args.seconds / SHARE, LEAST_SECONDS), longest)
     seen = explore(scene, whole, pilot=Pilot(said=console.say), patient=True)
@@ -87,8 +87,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def rows_of(pipelines: list[Pipeline], seconds: float | None, error: float | None) -> list[Row]:
-    """The best of each sampler and method, adaptive or not, in so many ``seconds`` or to the ``error``; the one to take
-    first. Raises NgptError where none fits."""
+    """The best pipeline of each sampler and method, adaptive or not, within ``seconds`` or for the ``error``; the
+    recommended one comes first. Raises NgptError where none fits."""
     found = []
     for p in pipelines:
         spp = math.floor(p.samples(seconds)) if seconds is not None else math.ceil(p.needed(error or math.inf))

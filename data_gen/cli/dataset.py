@@ -59,7 +59,9 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def write_oidn(out: Path, console: Console) -> None:
-    """The set once more as images, once it is whole: of several parts the last one to end writes it."""
+    """Writes the set as images too, once it is complete. If it is made in several parts, the last part to end does
+    this.
+    """
     from data_gen.dataset.oidn import write_layout
 
     data, target = Dataset(out), out / "oidn"

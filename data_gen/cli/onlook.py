@@ -35,7 +35,7 @@ class Onlookers:
         return self.page is not None and self.page.enough
 
     def progress(self, done: int, total: int) -> None:
-        """How far the render is: (samples done, samples), or whole (seconds gone, seconds)."""
+        """The progress of the render: (samples done, samples), or whole (seconds gone, seconds)."""
         gone = time.perf_counter() - self.start
         self.left = gone * (total - done) / done if done else 0.0
         if self.page is not None and not self.page.ended:
@@ -69,7 +69,7 @@ class Onlookers:
         self.spent += time.perf_counter() - begin
 
     def last(self, stack: GradientStack, line: str) -> None:
-        """Shows the stack that is written by now, and tells a last line."""
+        """Shows the stack, which has been written, and prints a last line."""
         self.line = line
         if self._watched():
             with self._harmless():
@@ -82,7 +82,7 @@ class Onlookers:
 
     @contextmanager
     def _harmless(self) -> Iterator[None]:
-        """Whatever fails in it, a method or the memory for an image, costs a line, once, and no render."""
+        """A failure in it, of a method or for lack of memory, is reported in one line, once. The render goes on."""
         try:
             yield
         except Exception as error:

@@ -50,7 +50,9 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def denoising_of(args: argparse.Namespace) -> Denoising | None:
-    """What is to become of the stack; None: it is written as it is. Raises an error for what would fail afterwards."""
+    """How the stack is to be denoised; None: it is written as it is. Raises an error for requests that would fail after
+    the render.
+    """
     of_its_kind = Path(args.output or "").suffix.lower() in IMAGES[1:]
     if args.denoise is None and not of_its_kind:
         if args.keep:
@@ -116,7 +118,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
         tell, why = (console.error, "interrupted") if stop() else (console.say, "enough")
         tell(f"{why}: {target} holds the {done} samples per pixel done by then")
     if denoising is None and by_names(str(target)) == str(target):
-        # Another than it is for where that needs variances, which one sample per pixel has not.
+        # It differs from the requested one where that needs variances, which one sample per pixel does not have.
         then = f"then: ngpt denoise {shlex.quote(str(target))}, which takes method '{choose(stack)}'"
         console.say(f"{target} is a stack, with its noise; {then}")
     if args.json:
@@ -129,7 +131,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
 def rendering(
     args: argparse.Namespace, request: RenderRequest, denoising: Denoising | None, console: Console
 ) -> Iterator[tuple[GradientStack, NgptError | None, Interrupt, Onlookers]]:
-    """Renders, shows how far it is, and yields the stack, what failed amid it, what interrupts, and who looks on."""
+    """Renders and shows progress. Yields the stack, the failure that ended it, the interrupts, and the onlookers."""
     from data_gen.cli.onlook import onlookers  # takes as long as all else that help needs
 
     def chosen(plan: Plan) -> None:
@@ -163,7 +165,7 @@ def rendering(
 
 
 def say(stack: GradientStack, made: dict[str, Any], args: argparse.Namespace, target: Path, console: Console) -> None:
-    """What a user should know of the samples, and in which time they were made."""
+    """What a user should know about the samples, and how long they took."""
     attributes = stack.attributes
     done, took = attributes["ngpt:spp"], attributes["ngpt:seconds"]
     if attributes["ngpt:discarded"]:
@@ -203,7 +205,7 @@ def shot(args: argparse.Namespace, denoising: Denoising | None, console: Console
         def begin() -> Callable[[int, int], None]:
             return shown.enter_context(console.progress(f"render {args.scene}", "frames", begins=KERNELS))
 
-        # A bar before the cluster has answered would tell of work that nobody does.
+        # Before the cluster has answered nobody works, so there is no bar yet.
         if not args.cluster:
             progress = begin()
 
@@ -220,7 +222,7 @@ def shot(args: argparse.Namespace, denoising: Denoising | None, console: Console
             said = len(written.frames)
             progress(written.done, total)
 
-        # What the workers of a cluster are at, no signal that comes here ends with this pass.
+        # A signal that arrives here cannot stop the workers of a cluster within this pass.
         with nullcontext(Interrupt()) if args.cluster else stop_on_ctrl_c(ending) as stop:
             if args.cluster:
                 written = write_frames_on_cluster(args.cluster, request, files, made=made, **more)

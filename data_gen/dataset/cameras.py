@@ -2,8 +2,8 @@
 
 The scene's own camera stands in free space. From there a walk goes along random rays, each time part of the way to what
 they hit, so it never enters an object and stays where one can get to. Views that see nothing are rejected. Where hardly
-any view sees something, as of an object in the middle of nowhere, cameras stand between the scene's own and what that
-sees, and look at something else it sees.
+any view sees something, as around an object in empty space, cameras stand between the scene's own and what that sees,
+and look at something else it sees.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Surroundings:
         hits = distance[np.isfinite(distance)]
         if not len(hits):
             raise NgptError("the scene's camera sees nothing in any direction; move it among the objects")
-        # Not the bounding box, which a ground plane makes as large as it likes.
+        # Not the bounding box, which a ground plane can make arbitrarily large.
         self.scale = float(np.median(hits))
         self.seen = self.points(scene.sensors()[0])
 
@@ -102,7 +102,7 @@ class Surroundings:
         passed = mi.Float(0)
         for _ in range(MOST_BOUNDARIES if self.boundaries and not boundaries else 0):
             behind = si.is_valid() & is_boundary(si.bsdf())
-            # Asked each time: all steps are one small kernel.
+            # Computed each time: all steps are one small kernel.
             if not dr.any(behind):
                 break
             passed += dr.select(behind, si.t, 0)
@@ -121,7 +121,7 @@ class Surroundings:
         for towards in directions(rng, STEPS):
             towards = towards - 0.5 * (towards @ self.up) * self.up
             towards /= np.linalg.norm(towards)
-            # Neither into a medium nor out of one: the camera says once for all which it is in.
+            # Neither into a medium nor out of one: the camera's medium is stated once, for all views.
             distance = float(self.cast(point[None], towards[None], boundaries=True)[0][0])
             point = point + rng.uniform(0.05, 0.8) * min(distance, 1.5 * self.scale) * towards
         return point

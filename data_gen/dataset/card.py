@@ -1,4 +1,4 @@
-"""What a person looks at first: README.md and a contact sheet, written from the training set itself."""
+"""README.md and a contact sheet, which a person looks at first, written from the training set itself."""
 
 from __future__ import annotations
 

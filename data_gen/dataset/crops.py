@@ -25,7 +25,7 @@ from ngpt.version import __version__
 
 # Views that turn out to be black are replaced this often.
 ATTEMPTS = 6
-# References are rendered in so many independent parts: what two of them agree on is no noise.
+# The number of independent parts of a reference: what two parts have in common is not noise.
 HALVES = 2
 LIT = 0.1  # the share of pixels of the first input that must have seen any light
 
@@ -103,7 +103,8 @@ def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:
 
 
 def uneven_inputs(config: Config, name: str, crop: int, counts: list[int]) -> list[bool]:
-    """Which inputs of the crop get adaptive samples: the share ``config.adaptive`` of inputs with enough samples.
+    """Chooses the inputs of a crop that get adaptive samples: the share ``config.adaptive`` of inputs with enough
+    samples.
 
     It uses separate random numbers, so that views, seeds and references are the same as with even samples.
     """
@@ -171,13 +172,15 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
                 before = now
             made.append((data, told))
     finally:
-        # Other crops of the scene find it as it was.
+        # Other crops need the scene in its original state.
         movement.apply(scene, 0)
     return made
 
 
 def make_inputs(config: Config, scene, made: Any, kept: Kept, place: int, seed: int) -> list[tuple[CropData, dict]]:
-    """The crop at that place of kept references and its record: the view of then, inputs with noise by ``seed``."""
+    """The crop at that place of kept references and its record: the view of then, with new inputs, whose noise is by
+    ``seed``.
+    """
     from data_gen.dataset.cameras import View
 
     told = kept.record["crops"][place]

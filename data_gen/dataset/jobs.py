@@ -36,7 +36,7 @@ class Serial(Executor):
 class Pool(ProcessPoolExecutor):
     """``count`` worker processes that end with this one, however it ends, and at once when it is interrupted.
 
-    ``interruptible``  whether Ctrl-C ends them at once; without, who uses them says when to ``end``
+    ``interruptible`` whether Ctrl-C ends them at once; otherwise the caller decides when to ``end`` them
     """
 
     def __init__(self, count: int, interruptible: bool = True):
@@ -49,7 +49,7 @@ class Pool(ProcessPoolExecutor):
 
     def __exit__(self, kind, *rest):
         if kind is not None and issubclass(kind, KeyboardInterrupt):
-            # What they are at is made again; waiting for it takes minutes.
+            # The crops that they are working on are made again; waiting for them would take minutes.
             for process in active_children():
                 process.terminate()
         return super().__exit__(kind, *rest)
@@ -70,9 +70,9 @@ def generate(
 ) -> None:
     """Makes the shards that are missing in ``folder``, of jobs i, i + n, i + 2n ... where ``shard`` is (i, n).
 
-    ``executor`` is any of concurrent.futures; whichever it is, and in whatever order it works, the same configuration
-    gives the same bits. ``progress`` gets the crops done and all crops of this part. Raises NgptError when a file
-    cannot be written or a worker dies; what is finished by then is kept, and the same call continues.
+    ``executor`` is any of concurrent.futures. The same configuration gives the same bits with any of them, in any
+    order. ``progress`` gets the crops done and all crops of this part. Raises NgptError when a file cannot be written
+    or a worker dies; what is finished by then is kept, and the same call continues.
     """
     plan = config.plan()
     start(config, folder, config.frames * sum(len(job.crops) for job in plan))

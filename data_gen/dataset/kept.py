@@ -22,7 +22,7 @@ from ngpt.system.files import atomic_output
 from ngpt.training.shards import REFERENCE_CAUSTIC, REFERENCES, Shard
 
 STEPS = 64
-# log2 of the least number that is kept; what is smaller is 0.
+# log2 of the least number that is kept; smaller ones become 0.
 LEAST = -126
 IMAGES = (*REFERENCES, REFERENCE_CAUSTIC)
 

@@ -15,10 +15,10 @@ from data_gen.dataset.cameras import Surroundings, View, floats
 from data_gen.frames.motion import seen
 from data_gen.scenes.geometry import VERTICES, put_vertices, vertices
 
-# Shares of the shots in which the camera moves, a thing moves, and the light changes; of the last, the share in which a
-# lamp moves, if there is one, rather than changes its radiance.
+# Shares of the shots in which the camera moves, a thing moves, and the light changes; and the share of these in which a
+# lamp moves, if there is one, instead of changing its radiance.
 CAMERA, THING, LIGHT, LAMP = 0.8, 0.35, 0.35, 0.5
-# Pixels a frame of what is seen at the median distance, of the image's width: 0.1 to 9.6 of 96 pixels.
+# Movement per frame at the median distance, as a share of the image's width: 0.1 to 9.6 of 96 pixels.
 SPEEDS = 0.001, 0.1
 # A thing that is moved fills this share of the pixels: smaller ones are not seen, larger ones are walls.
 SIZES = 0.01, 0.3
@@ -72,7 +72,7 @@ class Movement:
 
 
 def random_movement(around: Surroundings, view: View, rng: np.random.Generator, frames: int) -> Movement:
-    """How a shot of so many frames goes on from ``view``, which is applied to the scene."""
+    """How a shot of ``frames`` frames goes on from ``view``, which is applied to the scene."""
     scene = around.scene
     view.apply(scene)
     what = seen(scene)
@@ -126,7 +126,7 @@ def _movable(scene: mi.Scene) -> dict[int, str]:
     """The shapes that can be placed, by their numbers: the parameter that places each of them."""
     places: dict[int, str] = {}
     numbers = {shape: number for number, shape in enumerate(scene.shapes())}
-    # Not by names of shapes, which they need not have.
+    # Not by the names of shapes, which may be missing.
     for name, (_, _, node, _) in mi.traverse(scene).properties.items():
         kind = name.rpartition(".")[2]
         if node in numbers and (kind == "to_world" or (kind in VERTICES and numbers[node] not in places)):

@@ -20,7 +20,7 @@ from ngpt.errors import NgptError
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
 from ngpt.training.dataset import Crop, Dataset
 
-# One scene in so many is for validation, at least one where there are two.
+# One scene in this many is for validation, and at least one if there are two scenes.
 VALIDATION = 10
 
 
@@ -59,8 +59,8 @@ def _named(data: Dataset) -> Iterator[tuple[str, Crop]]:
 
 
 def _images(crop: Crop, digits: int) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-    """The inputs and the reference by what their names end in. The features of the reference are the means over all
-    inputs, by their samples, which are as many as the set has."""
+    """The inputs and the reference by what their names end in. The features of the reference are means over all inputs,
+    weighted by their samples."""
     if "reference_indirect" not in crop.shard.names:
         raise NgptError(f"{crop.shard.path}: has no references, without which Open Image Denoise does not train")
     stacks = [crop.stack(k) for k in range(crop.inputs)]

@@ -149,5 +149,5 @@ def stream(config: Path, kept: str = "") -> Iterator[Stream]:
         try:
             yield data
         finally:
-            # What it is at would take minutes, and nobody is going to see it.
+            # Its current job would take minutes, and nobody would use the result.
             worker.end()

@@ -1,20 +1,18 @@
-"""What the noise of points is, where samples are not independent of each other.
+"""The variance of pixels whose samples are points of nets, and so not independent.
 
 Samples of a pixel that are points of one net (``data_gen.paths.streams``) keep apart from each other: the sample
-variance, which takes them for independent, overstates the noise of their mean. How much is seen in the render itself.
-The samples of a pixel are split into two parts of similar size (``data_gen.film.nets.split``), n1 and n2 of n samples
-with means a and b, and held against each other by their *contrast*
+variance, which takes them for independent, overstates the noise of their mean. The render itself shows by how much. The
+samples of a pixel are split into two parts of similar size (``data_gen.film.nets.split``), n1 and n2 of n samples with
+means a and b, and compared by their *contrast*
 
     (b - a) sqrt(n1 n2) / n,
 
-whose expected square is the variance of the pixel's mean where samples are independent. What it is where they are
-points of nets, and what the variance of the mean is then, ``data_gen.film.nets.law`` says for each way in which noise
-may fall. One square says little of a pixel, but pixels of about the same noise together show which: where little light
-is found by luck, points help much, and where all is, not at all.
-
-The fewer pixels have most of the noise, the less they show. So the factor is a mean over all laws, weighted by how
-likely they are; a geometric one, since factors are wrong by ratios. All laws expect the same contrast of two samples:
-there, only how usual each law is counts.
+whose expected square is the variance of the pixel's mean where samples are independent. ``data_gen.film.nets.law``
+gives, for each way in which noise may fall, what that square and the variance of the mean are where samples are points
+of nets. One square says little about a pixel, but pixels of about the same noise together show which law holds. Points
+help much where little light is found by chance, and not at all where all of it is. If most of the noise is in few
+pixels, they show less. So the factor is a mean over all laws, weighted by how likely they are; a geometric one, since
+factors are wrong by ratios. All laws expect the same contrast of two samples. There, only the prior of each law counts.
 """
 
 from __future__ import annotations
@@ -24,22 +22,22 @@ import numpy as np
 from data_gen.film.nets import USUAL, law
 from ngpt.shared import box_means
 
-# Pixels of about the same noise: so many groups at most, of so many pixels at least
+# Groups of pixels of about the same noise: the most groups, and the least pixels of a group
 _GROUPS, _LEAST = 64, 64
-# Side of the square of pixels that tells how much noise there is around the one in its middle
+# Side of the square of pixels around a pixel that its noise is estimated from
 _AROUND = 5
 
 
 def factors(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net: int) -> np.ndarray:
     """By how much the sample ``variance`` of the mean is to be multiplied, (H, W, 1).
 
-    ``contrast``, as defined above, and ``variance`` are (H, W, C). Pixels where one of them is NaN say nothing.
+    ``contrast``, as defined above, and ``variance`` are (H, W, C). Pixels where one of them is NaN are not used.
     ``samples`` (H, W) is the number of samples of each pixel, and ``net`` the number of points in the first round.
     """
     squares, variances = np.square(contrast).sum(axis=-1), variance.sum(axis=-1)
     good = np.isfinite(squares) & np.isfinite(variances)
-    # Without the pixel itself: its own variance is large where a rare sample is among its own, and such samples are
-    # the ones that are independent of the others. Groups by a pixel's own variance would have them all in one.
+    # Without the pixel itself: its own variance is large where it has a rare sample, and rare samples are the
+    # independent ones. Groups by a pixel's own variance would put all of these into one group.
     filled = np.where(good, variances, 0)
     sums = _AROUND**2 * box_means(filled, _AROUND)
     around = np.where(good, np.maximum(sums - filled, 0), np.inf).ravel()
@@ -59,8 +57,8 @@ def factor(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net:
 def _found(
     squares: np.ndarray, variances: np.ndarray, samples: np.ndarray, net: int, order: np.ndarray, groups: int
 ) -> np.ndarray:
-    """The factors of pixels by the ``order`` in which they are put into so many ``groups`` at most, all (N); 1 of those
-    that are not there."""
+    """The factors of pixels, which are put into at most ``groups`` groups in this ``order``, all (N). Pixels that are
+    not in ``order`` have the factor 1."""
     found = np.ones(len(squares))
     if not len(order):
         return found
@@ -80,9 +78,9 @@ def _found(
 def _likely(ratio: float, expected: np.ndarray, contrasts: float, pixels: float) -> np.ndarray:
     """How likely each law is, (laws), by the ``ratio`` of squared contrasts to variances, and what laws ``expected``.
 
-    A sample variance is a mean over so many orthogonal ``contrasts``. The one that is seen is held against all others:
-    over what a law expects, the ratio of both has an F distribution. Its degrees of freedom are one and the number of
-    the others, for each of so many ``pixels`` of equal noise.
+    A sample variance is a mean over this number of orthogonal ``contrasts``. The observed contrast is compared with all
+    others: divided by what a law expects, their ratio has an F distribution. Its degrees of freedom are one and the
+    number of the others, for each of the ``pixels`` of equal noise.
     """
     others = contrasts - 1
     if others < 1e-6:

@@ -50,7 +50,7 @@ _HALVES_BYTES = 2 * 21 * 4 + 7 * 3 * 4
 _HALVES_BYTES_WITHOUT = 2 * 9 * 4 + 3 * 3 * 4
 # Per pixel, of a pass that is one batch: the mean over the batch, splats and their sums, of one name.
 _BATCH_BYTES = 3 * 8 + 3 * SPLAT_BYTES + 4 + 3 * 8
-# Pixels that tell the mean noise of features well enough
+# Enough pixels to estimate the mean noise of features
 _ENOUGH = 1 << 13
 # With fewer pixels than this, several strands of samples share a pixel: a few long loops would leave cores idle.
 _STRANDS = 1 << 15
@@ -66,7 +66,7 @@ class GradientFilm:
     two ends of a pair of pixels. Each direction of a difference is a mean over the base paths of its own end.
 
     Variances are computed over samples, as if these were independent. If samples are points of rounds, and the first
-    round is a ``net`` of so many points per pixel, the variances are scaled to the noise that is observed, see
+    round is a ``net`` with this number of points per pixel, the variances are scaled to the noise that is observed, see
     ``data_gen.film.claims``. If samples of a pass share photons, reservoirs or the state of a chain, or lanes splat
     onto other pixels, the film is made with ``batches``: each pass is one batch, a pixel's value is its mean over the
     batch, and variances are computed over batches. Batches are weighted by their samples: the last one may have fewer.
@@ -108,7 +108,7 @@ class GradientFilm:
         self._splats: dict[str, Splats] = {}
 
     def begin_pass(self, camera: Celled) -> None:
-        """Takes note of the subpixels that the samples of the next pass lie in, where the film has any."""
+        """Records the subpixel of each sample of the next pass, if the film has subpixels."""
         if self._fine:
             self._cell = camera.cells(self.subpixels)
 
@@ -160,7 +160,7 @@ class GradientFilm:
         cell, self._cell = self._cell, None
         if self._fine and cell is None:
             raise ValueError("a film with subpixels is told of each pass by begin_pass()")
-        # Reading single lanes evaluates an array: without this, each would trace the paths again.
+        # Reading single lanes evaluates an array: without this, each read would trace the paths again.
         dr.eval(values, cell)
         if some is not None:
             self._add_some(values, block, some, cell)
@@ -193,7 +193,7 @@ class GradientFilm:
         self.blocks += spp // block
 
     def forget_pass(self) -> None:
-        """Leaves out what was put since the last pass ended: it was broken off."""
+        """Drops what was put since the last pass ended, because the pass was aborted."""
         self._pass, self._splats, self._cell = {}, {}, None
 
     def _add_some(self, values: dict, block: int | None, some: np.ndarray, cell: mi.UInt32 | None) -> None:
@@ -244,7 +244,7 @@ class GradientFilm:
             if name in splats:
                 sums, lost_splats = splats[name].totals(), splats[name].lost
                 share = dr.opaque(dr.float64_array_t(mi.Float), 1 / spp)
-                # Where nothing was put, splats are all there is; where all that was put is lost, the pixel is unknown.
+                # Where nothing was put, the value is the splats. Where all that was put is lost, the pixel is unknown.
                 mean = [(m if mean else 0) + s * share for m, s in zip(mean or sums, sums, strict=True)]
                 lost = lost + lost_splats
             number = opaque(self.blocks) + dr.zeros(mi.UInt32, self.pixels)
@@ -284,13 +284,13 @@ class GradientFilm:
         count = self._statistics("primal")[0]
         variances = {"primal_var": self._claimed("primal")}
         if "caustic" in layers:
-            # Samplers put it beside a primal without it, whose variance is the one that goes with dx and dy.
+            # Samplers put it beside a primal without it, whose variance belongs to dx and dy.
             layers["primal"] = layers["primal"] + layers["caustic"]
             variances["caustic_var"] = self._claimed("caustic")
         if "shared" in layers:
             if layers["shared"].any():
                 variances["primal_var"] = variances["primal_var"] + shared_variance(layers["shared"])
-            else:  # paths could share, and did not
+            else:  # paths could share their tails, and did not
                 del layers["shared"]
         for layer in _SPLIT:
             if layer in layers:
@@ -392,8 +392,8 @@ class GradientFilm:
         return self._as_seen(self._image(self._statistics(name)[2]), [(name, np.s_[:, :], 1.0)])
 
     def _as_seen(self, variance: np.ndarray, terms: list[tuple[str, tuple, float]]) -> np.ndarray:
-        """A sample ``variance`` (H, W, 3), brought to the noise that is seen where samples are points of nets; of the
-        sum of ``terms``: name, which pixels, factor."""
+        """A sample ``variance`` (H, W, 3), scaled to the observed noise where samples are points of nets. It is the
+        variance of the sum of ``terms``: name, which pixels, factor."""
         if not self.net:
             return variance
         seen = sum(factor * self._image(self._contrast(name))[pixels] for name, pixels, factor in terms)
@@ -419,7 +419,7 @@ class GradientFilm:
 
 
 def bytes_of_shared(pixels: int) -> int:
-    """What the layer ``shared`` of so many pixels takes."""
+    """The bytes that the layer ``shared`` takes for this number of pixels."""
     return _SHARED_BYTES * (1 << (max(pixels, _STRANDS) - 1).bit_length())
 
 

@@ -29,8 +29,8 @@ class Moments:
 class Earlier:
     """The samples of a strand before the last one whose number is a power of two, and those before half that number.
 
-    Two of the first ones for each: how many count, UInt32, and their means, a Float32 for each channel: beside the
-    noise of a mean its rounding is nothing. ``bits`` is how many bits the number of the last sample has.
+    For each set: how many samples count, UInt32, and their means, a Float32 for each channel, whose rounding is far
+    below the noise. ``bits`` is the number of bits in the number of the last sample.
     """
 
     bits: mi.UInt32
@@ -64,7 +64,7 @@ def one_more(old: Moments, x: list, exists, number: mi.UInt32, weight: mi.UInt32
 
 
 def _one_later(earlier: Earlier, old: Moments, number: mi.UInt32) -> Earlier:
-    """What is earlier than the sample with this ``number``, before which the statistics were the ``old`` ones."""
+    """The samples before the one with this ``number``, for which the statistics were the ``old`` ones."""
     Float32 = dr.float32_array_t(mi.Float)
     bits = 32 - dr.lzcnt(number)
     begins = bits != earlier.bits

@@ -18,19 +18,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-# The family: V(m) = share / m + (1 - share) fall(m), from independent samples alone (share 1) to none. Most light is
-# between: steps or smooth light beside light that is found by luck.
-# - Steps of the integrand: fall(m) = m^-3/2. Those along an axis, as at edges of lamps, up to m^-2. But a row of pixels
-#   that such an edge cuts at the same place looks as smooth, where this number of samples happens to suit that place.
-# - Smooth integrands: fall(m) = m^-2, and 3/2 times as much where m is an odd power of two. Points are nets in pairs of
-#   dimensions. 4^k points are one in each of as many squares. Twice as many cut these squares along one axis alone.
-# - Worse than independent samples, as a few pixels may seem to be by chance: fall(m) = m^-rate with rates below 1.
+# The family: V(m) = share / m + (1 - share) fall(m), from independent samples alone (share 1) to none. Most light is in
+# between: steps or smooth light, mixed with light that is found by chance. - Steps of the integrand: fall(m) = m^-3/2.
+# Those along an axis, as at edges of lamps, up to m^-2. But a row of pixels that such an edge cuts at the same place
+# looks as smooth, where this number of samples happens to suit that place. - Smooth integrands: fall(m) = m^-2, and 3/2
+# times as much where m is an odd power of two. Points are nets in pairs of dimensions. 4^k points are one in each of as
+# many squares. Twice as many cut these squares along one axis alone. - Worse than independent samples, as a few pixels
+# may seem to be by chance: fall(m) = m^-rate with rates below 1.
 _MIXED = np.linspace(1.0, 0.0, 21)
 SHARES = np.concatenate([np.zeros(10), _MIXED, np.zeros(10), _MIXED[1:]])
 RATES = np.concatenate([np.linspace(0.5, 0.95, 10), np.full(21, 1.5), np.linspace(1.55, 2.0, 10), np.full(20, 2.0)])
 ODD = np.concatenate([np.ones(41), np.full(20, 1.5)])  # times as much at odd powers of two
-# How usual each law is: independent samples the most, both ends of the rates the least. Chosen on renders of seven
-# samplers and five scenes, over 2 to 40 samples; anew with smooth integrands, on ``gpt`` at 8 to 128 samples.
+# The prior of each law: independent samples have the largest, both ends of the rates the smallest. Chosen on renders of
+# seven samplers and five scenes, over 2 to 40 samples; anew with smooth integrands, on ``gpt`` at 8 to 128 samples.
 USUAL = np.concatenate([np.full(10, 0.6), [40.0], np.ones(20), np.full(10, 0.5), np.ones(20)])
 USUAL /= USUAL.sum()
 
@@ -38,7 +38,7 @@ USUAL /= USUAL.sum()
 class Law(NamedTuple):
     """What ``n`` samples of a pixel show, and the variance of their mean, for each law of the family; both (laws).
 
-    Both are over the variance that the spread of the samples claims, which takes them for independent.
+    Both are divided by the variance that follows from the spread of independent samples.
     """
 
     seen: np.ndarray  # the expected square of the contrast of data_gen.film.claims
@@ -46,7 +46,7 @@ class Law(NamedTuple):
 
 
 def split(n: int) -> int:
-    """How many of ``n`` samples are held against those after them, n > 1: so that either part has a third or more.
+    """How many of ``n`` > 1 samples are compared with those after them: either part has a third or more.
 
     It is the last power of two before n, or half of that.
     """

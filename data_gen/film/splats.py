@@ -22,15 +22,15 @@ SPLAT_BYTES = BINS * 8
 class Splats:
     """For each pixel the exact sum of what is put on it.
 
-    ``add`` may be called within symbolic loops. What is finer than 2^-71 is cut off; values of 2^64 or more, and those
-    that are not finite, are lost and counted, as nothing else.
+    ``add`` may be called within symbolic loops. Digits below 2^-71 are cut off. Values of 2^64 or more, and values that
+    are not finite, are dropped and counted.
     """
 
     def __init__(self, pixels: int, channels: int):
         self.pixels = pixels
         self.channels = channels
-        # Ordered by pixel, then by range from the smallest up, then by channel. So channels lie side by side in memory:
-        # most of the time of a splat is memory access.
+        # Ordered by pixel, then by range from the smallest up, then by channel. So the channels of a pixel are adjacent
+        # in memory: most of the time of a splat is memory access.
         self.sums = dr.zeros(dr.int64_array_t(mi.Float), pixels * BINS * channels)
         self.lost = dr.zeros(mi.UInt32, pixels)
 
@@ -62,7 +62,7 @@ class Splats:
             range_ = dr.maximum(exponent - _LOWEST, 0) // _BITS
             digits = Int64(Float64(component) / _unit(range_))
             place = (pixel * BINS + mi.UInt32(range_)) * self.channels + channel
-            # Neighbouring lanes hardly ever meet at a pixel: looking for such lanes costs more than it saves.
+            # Neighbouring lanes rarely add to the same pixel: looking for such lanes costs more than it saves.
             dr.scatter_add(self.sums, digits, place, active & good, mode=dr.ReduceMode.Direct)
 
     def totals(self) -> list:
@@ -80,6 +80,6 @@ class Splats:
 
 
 def _unit(range_: mi.Int32):
-    """What an integer of a range counts: the last digit of its smallest values, a power of two."""
+    """The unit of a range's integers: the last digit of its smallest values, a power of two."""
     exponent = mi.UInt32(range_ * _BITS + (_LOWEST - 23 + 127))
     return dr.float64_array_t(mi.Float)(dr.reinterpret_array(mi.Float, exponent << 23))

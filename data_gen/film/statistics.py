@@ -38,8 +38,8 @@ def statistics(moments: Moments, strands: int, batch: int = 0) -> tuple[np.ndarr
 
 
 def contrast(moments: Moments, strands: int, values: np.ndarray) -> np.ndarray:
-    """The later samples of each pixel against the earlier ones, (pixels, C), as ``claims.factors`` wants it; a
-    pixel has so many ``values``."""
+    """The later samples of each pixel against the earlier ones, (pixels, C), as ``claims.factors`` wants it; ``values``
+    is the number of values of each pixel."""
     earlier = moments.earlier[0]
     counts = [np.array(each, np.int64).reshape(strands, -1) for each in (*earlier.counts[::-1], moments.count)]
     bits = np.array(earlier.bits, np.int64).reshape(strands, -1)

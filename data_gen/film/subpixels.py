@@ -1,7 +1,8 @@
 """What denoisers read, summed by the K x K subpixels of each pixel.
 
-The place of a sample in its pixel tells its subpixel. Points are spread evenly over a pixel, so that each subpixel has
-the same number of them where the number of samples is a multiple of K², and the points are the default ones.
+The position of a sample in its pixel determines its subpixel. Points are spread evenly over a pixel, so that each
+subpixel has the same number of them where the number of samples is a multiple of K², and the points are the default
+ones.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class Celled(Protocol):
 
 @dataclass
 class Subpixels:
-    """Sums over the samples of each subpixel, for films with so many ``pixels``, each in several ``strands``.
+    """Sums over the samples of each subpixel, for films of ``pixels`` pixels, each in several ``strands``.
 
     Subpixel c of strand s of pixel p has number (s * pixels + p) * K² + c, and c counts row by row.
     """

@@ -2,7 +2,7 @@
 
 A pixel shows what the ray through its centre meets first that scatters smoothly. The hit is looked up in the scene of
 the frame before by shape, primitive and barycentric coordinates, which holds for any deformation of a mesh; shapes that
-are no meshes, and instances, move by their ``to_world``. Of the scene before, a ``Snapshot`` keeps the geometry.
+are no meshes, and instances, move by their ``to_world``. A ``Snapshot`` keeps the geometry of the scene before.
 
 What is seen in mirrors and through glass stands where it seems to: at the end of the straight ray of the path's length.
 That is exact for plane mirrors in a scene at rest, and takes no notice of things that move behind curved ones. Rays

@@ -59,7 +59,7 @@ def _partners(camera: CameraSamples, motion: np.ndarray) -> mi.Vector2f:
 def difference(
     now: list[tuple[int, np.ndarray]], before: list[tuple[int, np.ndarray]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """dt and dt_var, (H, W, 3) float32, of the batches of ``light`` in both frames; of one batch the latter is NaN."""
+    """dt and dt_var, (H, W, 3) float32, of the batches of ``light`` in both frames. With one batch, dt_var is NaN."""
     weights = [count for count, _ in now]
     total = sum(weights)
     batches = [(here - there).astype(np.float64) for (_, here), (_, there) in zip(now, before, strict=True)]

@@ -3,7 +3,7 @@
 Mitsuba turns the density of a point on a mesh into one of directions by the vertex normals, where it samples the point
 and where it is asked for the density (its issue 1952). The solid angle of a face depends on the normal of the face.
 Here such lamps are sampled by the normals of their faces. Where they shine stays as Mitsuba has it: in front of their
-vertex normals. What is in front of only one of the two normals is not sampled.
+vertex normals. Places in front of only one of the two normals are not sampled.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class BentLamps:
     @staticmethod
     def of(scene: mi.Scene) -> BentLamps | None:
         """None where no lamp is bent."""
-        # Shapes that their emitters tell of are not always known to be meshes.
+        # Shapes that are found by their emitters are not always known to be meshes.
         found = [shape for shape in scene.shapes() if shape.is_emitter() and is_bent(shape)]
         numbers = {emitter.ptr: number for number, emitter in enumerate(scene.emitters())} if found else {}
         bent = {numbers[shape.emitter().ptr]: shape for shape in found}
@@ -61,7 +61,7 @@ class BentLamps:
         return dr.gather(mi.UInt32, self.faces, lamp, active) > 0
 
     def number(self, emitter: mi.EmitterPtr, active: mi.Bool = True) -> mi.UInt32:
-        """The number of that emitter; what is none has the number behind the last."""
+        """The number of that emitter, or one more than the last number if it is none."""
         return dr.gather(mi.UInt32, self.indices, dr.reinterpret_array(mi.UInt32, emitter), active)
 
     def point(self, lamp: mi.UInt32, u: mi.Point2f, active: mi.Bool) -> Point:
@@ -121,7 +121,7 @@ class BentLamps:
     def corrected(self, p: mi.Float, light: mi.DirectionSample3f, si: mi.SurfaceInteraction3f, choice, active):
         """Density ``p`` of sampling the emitter that was met at ``si``, and the normal there; right for bent lamps too.
 
-        ``choice`` (lamp, active) tells with which probability a lamp is chosen.
+        ``choice`` (lamp, active) returns the probability of choosing a lamp.
         """
         lamp = self.number(light.emitter, active)
         bent = active & self.has(lamp, active)

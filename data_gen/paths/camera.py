@@ -83,7 +83,7 @@ class CameraSamples:
         return camera
 
     def _see(self, sensor: mi.Sensor) -> None:
-        """Takes note of a sensor and of its size: ``columns`` of pixels, ``ends`` of the film, ``steps`` of a pixel."""
+        """Stores the sensor and its size: ``columns`` of pixels, ``ends`` of the film, ``steps`` of a pixel."""
         self.sensor, self.size = sensor, mi.ScalarVector2u(sensor.film().crop_size())
         self.columns = dr.opaque(mi.UInt32, self.size.x)
         self.ends = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in self.size))
@@ -103,7 +103,8 @@ class CameraSamples:
     def cells(self, k: int) -> mi.UInt32:
         """Which of the K x K subpixels of its pixel each sample is in, counted row by row.
 
-        By its place in the pixel as it was drawn: ``position`` is rounded to what is left of digits beside the column.
+        It depends on the place in the pixel as it was drawn: ``position`` has fewer digits, since it includes the
+        column.
         """
         place = sample_streams(self.seed, self.pixel, self.sample, int(self.size.x), self.net).next_2d()
         size = dr.opaque(mi.UInt32, k)
@@ -151,7 +152,7 @@ class CameraSamples:
     def look(self, *shifts: tuple[int, int] | str) -> Self:
         """These samples, for a function that is recorded once and asks for their rays by these ``shifts``.
 
-        The function cannot ask most cameras, since Dr.Jit 1.5 does not find their arrays. So they are asked before.
+        The function cannot ask most cameras, since Dr.Jit 1.5 does not find their arrays. So they are evaluated before.
         """
         if bytes_of_rays(self.sensor):
             rays = [self.rays(shift) for shift in shifts]
@@ -161,12 +162,13 @@ class CameraSamples:
 
 
 def bytes_of_rays(sensor: mi.Sensor) -> int:
-    """What a lane may take for rays that are kept of the camera: see ``look``."""
+    """The bytes that a lane may take for camera rays that are kept: see ``look``."""
     return 0 if camera_name(sensor) == "perspective" else _SEEN_BYTES
 
 
 def in_packets(lanes: np.ndarray, camera: CameraSamples) -> tuple[np.ndarray, np.ndarray]:
-    """The ``lanes`` with gaps, and which of them exist: so that no two blocks of samples share a packet of rays.
+    """The ``lanes`` with gaps between blocks, and which of them exist: no two blocks of samples then share a packet of
+    rays.
 
     The results of a ray depend, in the last bits, on those traced with it; blocks must not depend on their pass.
     """

@@ -22,7 +22,7 @@ from data_gen.paths.vertex import DELTA, SMOOTH
 def classes(rough: mi.Bool, late: mi.Bool, found: mi.Bool, kind: mi.UInt32, connectable: mi.Bool) -> tuple:
     """``rough`` and ``late`` behind a vertex that is ``connectable`` or not, left by an event of that ``kind``.
 
-    Where no direction was ``found``, the path ends, and nothing changes: what its copies go on to find is theirs.
+    Where no direction was ``found``, the path ends, and nothing changes for its copies.
     """
     smooth = found & (kind == SMOOTH)
     sharp = (found & (kind == DELTA)) | (smooth & ~connectable)

@@ -2,15 +2,12 @@
 
 In a grid the transmittance can only be estimated. So a path holds not only its vertices, but also the null collisions
 on its way, which happen at the density of the majorant μ and change nothing. In this larger path space all densities
-are known. A list of n null collisions with a vertex at the end has the density
-
-    exp(-M) ∏ σn(x_i) / μ · σ,        M the majorant's optical depth of the segment, only in grids
-
-and the integrand has σs in place of σ, and has colours. Collisions are exponential steps along the optical depth m of
-the majorant, which uses the same units in all grids and gaps that the segment crosses. A replay takes the same steps
-and random numbers: r = 1. A reconnection takes the list of the base path, m_i' = m_i M' / M, with the Jacobian
-(M' / M)^n; its steps are generated again from the base path's key, so only n has to be kept. Homogeneous media use one
-exponential number for each segment, and no list.
+are known. A list of n null collisions with a vertex at the end has the density exp(-M) ∏ σn(x_i) / μ · σ, M the
+majorant's optical depth of the segment, only in grids and the integrand has σs in place of σ, and has colours.
+Collisions are exponential steps along the optical depth m of the majorant, which uses the same units in all grids and
+gaps that the segment crosses. A replay takes the same steps and random numbers: r = 1. A reconnection takes the list of
+the base path, m_i' = m_i M' / M, with the Jacobian (M' / M)^n; its steps are generated again from the base path's key,
+so only n has to be kept. Homogeneous media use one exponential number for each segment, and no list.
 
 [Miller et al. 2019, "A null-scattering path integral formulation of light transport"; docs/samplers/media.md]
 """

@@ -1,4 +1,4 @@
-"""The camera as an end of paths, of those too that come from a light: what they need to know of it, and no more."""
+"""The camera as an end of paths, also of paths that start at a light: only what these need."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from data_gen.scenes.cameras import camera_name
 
 @dataclass
 class ThinLens:
-    """Mitsuba's camera ``thinlens`` in our terms: Dr.Jit 1.5 does not find its arrays, and records no function amid
-    which it is asked."""
+    """Mitsuba's camera ``thinlens`` in our terms: Dr.Jit 1.5 does not find its arrays, and cannot freeze a function
+    that calls it."""
 
     radius: mi.Float
     focus: mi.Float
@@ -134,7 +134,7 @@ class Eye:
 
 @dataclass
 class Sight:
-    """What both paths of a camera sample begin with: the one from the camera, and the one from a light."""
+    """What both paths of a camera sample begin with: the path from the camera and the path from a light."""
 
     eye: Eye
     random: Any  # the stream of random numbers of the paths to come

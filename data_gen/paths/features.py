@@ -14,7 +14,7 @@ MAX_SPECULAR_VERTICES = 32
 # Steps of a ray through a medium whose density varies
 MEDIUM_STEPS = 8
 
-# Materials that turn the shading frame; Mitsuba tells of the turn only through its `aov` integrator.
+# Materials that turn the shading frame. Only Mitsuba's `aov` integrator gives the turned normal.
 _TURNS_NORMALS = ("BumpMap", "NormalMap")
 
 
@@ -101,7 +101,7 @@ def through_medium(medium, ray, length, sampler, steps: int):
         scattering, _, extinction = medium.get_scattering_coefficients(mei, inside)
         passed = dr.exp(-mi.unpolarized_spectrum(extinction) * step)
         own = mi.unpolarized_spectrum(scattering) / mi.unpolarized_spectrum(extinction)
-        # Spectra become plain arrays where they meet masks; loops want what they began with.
+        # Spectra combined with masks become plain arrays, but the state of a loop must keep its types.
         albedo = spectrum(albedo + transmittance * (1 - passed) * dr.select(own > 0, own, 0))
         transmittance = spectrum(transmittance * passed)
         i += 1
@@ -128,11 +128,11 @@ def first_nonspecular_vertex(scene, sampler, ray, medium=None, steps=0):
     searching = mi.Bool(True)
     while searching:
         last = mi.Ray3f(ray)
-        # Camera rays of one pixel go together, for which Embree has a way of its own.
+        # Camera rays of one pixel are coherent, and Embree traces coherent rays faster.
         si = scene.ray_intersect(ray, mi.RayFlags.All, vertices == 0)
         depth += si.t
         if dr.hint(steps > 0, mode="scalar"):
-            # Light that escapes has come from far, but not from so far that float32 has no number for it.
+            # Escaped paths are far away, but at a distance that float32 can hold.
             length = dr.minimum(dr.minimum(si.t, ray.maxt), 1e9)
             passed, albedo = through_medium(medium, ray, length, sampler, steps)
             scattered = type(scattered)(scattered + tint * albedo)

@@ -77,7 +77,8 @@ class _Recorded:
 
     def __init__(self, f: Callable, state: list):
         self.f, self.state, this = f, state, weakref.ref(self)
-        # Maps of as many vertices as there are pixels, and the like, are recorded once more: no reason to warn.
+        # Maps with as many vertices as the image has pixels, and similar cases, are recorded once more: no reason to
+        # warn.
         options = {"warn_after": 1 << 30, "auto_opaque": False, "state_fn": lambda *_: this().state}
         self.launch = dr.freeze(lambda *args: this().f(*args), **options)
 
@@ -108,9 +109,8 @@ def _say(f: Callable, reason: str) -> None:
 
 
 def _wake_lamps(scene: mi.Scene) -> None:
-    """Has lamps of all scenes in the process make what they are sampled by, such as the distribution of a texture.
-
-    They make it when they are first asked, and a call asks them all. Dr.Jit records no function amid which that is.
+    """Makes all lamps in the process build the tables that they are sampled by, such as the distribution of a texture.
+    Lamps build them on first use, and a call uses all lamps. Dr.Jit cannot record a function in which that happens.
     """
     if scene.emitters():
         scene.emitters_dr().sample_direction(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5), True)
@@ -136,7 +136,7 @@ def as_wide_as_arguments(f: Callable) -> Callable:
 
 
 def _always(leaf: Any) -> Any:
-    """True, but Dr.Jit does not know."""
+    """True, but Dr.Jit does not know that it is constant."""
     mask = leaf if dr.is_mask_v(leaf) else leaf == 0
     return (dr.select(mask, dr.uint32_array_t(mask)(1), 2)) > 0
 
@@ -201,7 +201,8 @@ def evaluated(f: Callable) -> Callable:
 def arrays(owner: Any) -> list:
     """The arrays in the attributes of an object, and of objects there, which become copies.
 
-    Kernels tell arrays by how their memory is aligned, and NumPy's is so or so: they would have to be compiled again.
+    Kernels depend on how the memory of arrays is aligned, which varies for arrays of NumPy: kernels would be compiled
+    again.
     """
     found: list = []
     for name, value in list(vars(owner).items()) if hasattr(owner, "__dict__") else ():

@@ -1,4 +1,4 @@
-"""Holes: what of a surface lets light go straight on, weakened, as masks and thin panes do.
+"""Holes: surfaces that let a part of the light go straight on, as masks and thin panes do.
 
 A path that meets a hole passes it by chance, at a vertex of its own (``vertex.NULL``). A ray toward an emitter goes
 straight on and is weakened by T, as in Mitsuba's ``volpath``. Both techniques find the same light, so holes leave the
@@ -37,9 +37,8 @@ class _Straight:
 
 @dataclass
 class Aim(_Straight):
-    """From where a path has come straight on, and the density ``p`` of its direction there.
-
-    ``p`` is infinite where no sampled emitter is in competition: from the camera, and behind mirrors.
+    """The point from which a path has come straight on, and the density ``p`` of its direction there. ``p`` is infinite
+    where emitters cannot be sampled: from the camera, and behind mirrors.
     """
 
     p: mi.Float
@@ -70,7 +69,7 @@ class Edge(_Straight):
 
 
 class Holes:
-    """Materials that light goes straight through, by a share that they know."""
+    """Materials that light goes straight through, with a known share."""
 
     def __init__(self, bsdfs: list[mi.BSDF]):
         numbers = {dr_number(bsdf) for bsdf in bsdfs}
@@ -82,7 +81,7 @@ class Holes:
         return (kind == NULL) & self.known.of(bsdf)[1]
 
     def share(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
-        """What goes straight through at ``si``; 0 where nothing does, or the material does not know."""
+        """The share that goes straight through at ``si``; 0 where nothing does, or where it is unknown."""
         bsdf = si.bsdf()
         listed, known = self.known.of(bsdf, active)
         known &= listed

@@ -34,7 +34,7 @@ TOLERANCE = 1e-4
 RETURNS = 1e-3
 
 
-# Asked of each event but the first: whether a chain would have ended there, whatever the event.
+# Called at each event but the first: would a chain have ended here, whatever the event?
 Ends = Callable[["mi.SurfaceInteraction3f"], "mi.Bool"]
 
 

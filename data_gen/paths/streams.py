@@ -116,7 +116,7 @@ def _stream_class(variant: str) -> type:
             return self.random.next_uint32()
 
         def skip(self, count):
-            """Leaves out so many numbers of each lane, UInt32."""
+            """Skips ``count`` numbers of each lane, UInt32."""
             self.random += mi.Int64(count)
 
         def clone(self):

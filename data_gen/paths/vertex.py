@@ -151,7 +151,7 @@ def evaluate(
 ) -> tuple[mi.Spectrum, mi.Float]:
     """f cos θ of a material and the density of sampling ``wo``, for directions that nobody sampled there.
 
-    Such directions may lie below the horizon, where some materials (``roughplastic``) answer with NaN: zero it is.
+    Such directions may lie below the horizon, where some materials (``roughplastic``) return NaN. Then the value is 0.
     """
     f, p = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
     good = dr.isfinite(p) & dr.isfinite(dr.sum(f))

@@ -188,8 +188,8 @@ class GradientIntegrator(mi.SamplingIntegrator):
 
     def first_surface(self, scene, media: Media, ray, medium, active) -> mi.PreliminaryIntersection3f:
         """``first_hit()`` for a piece of such a ray; as in ``volpath``, lamps in a medium are dark there, but seen."""
-        # Where a boundary lies in a surface, coherent rays meet the boundary half as often as others; rays of
-        # ``volpath`` are never coherent.
+        # Where a boundary coincides with a surface, coherent rays meet the boundary half as often as other rays. Rays
+        # of ``volpath`` are never coherent.
         coherent = not media.boundaries
         hit = self.first_hit(scene, ray, active, coherent=coherent)
         if self.hide_emitters:

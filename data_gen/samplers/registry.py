@@ -123,8 +123,8 @@ class Sampler(Entry):
     # density, by photons)
     finds: tuple[str, ...] = ()
     diagnoses: bool = False  # whether it counts failed shifts (--diagnostics): ``make`` takes ``diagnostics=True``
-    # 0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass has so many,
-    # and variances are over passes
+    # 0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass has this
+    # number, and variances are over passes
     batch: int = 0
     together: bool = False  # whether pixels share paths, so that a pass has all of them, with as many samples each
     lane_bytes: int = LANE_BYTES  # memory that a lane, one sample of one pixel, takes in a pass

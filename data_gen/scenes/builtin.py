@@ -158,7 +158,7 @@ def lens() -> dict:
 
 
 def _volume(box: tuple, medium: dict) -> dict:
-    """A box from the corner ``box[0]`` to ``box[1]`` that nobody sees but for the medium in it."""
+    """A box from the corner ``box[0]`` to ``box[1]``. Only the medium in it is visible."""
     low, high = np.array(box, float)
     to_world = _transform().translate(list((low + high) / 2)).scale(list((high - low) / 2))
     return {"type": "cube", "to_world": to_world, "bsdf": {"type": "null"}, "interior": medium}

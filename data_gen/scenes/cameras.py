@@ -21,7 +21,7 @@ _PLUGINS = {
     "DistantSensorImpl": "distant",
     "BatchSensor": "batch",
 }
-# As for Mitsuba's own perspective camera: of a rotation in float32 that is none
+# As in Mitsuba's own perspective camera: rounding of a rotation in float32 stays below it
 _SCALE = 1e-3
 
 

@@ -1,4 +1,4 @@
-"""Why an image is black: said in one line, where nothing else would tell."""
+"""One line that says why an image is black, where nothing else would."""
 
 from __future__ import annotations
 

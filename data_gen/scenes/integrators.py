@@ -95,7 +95,7 @@ def objects_in(thing: mi.Object, kind: type) -> list:
 
 
 def lack(plugin: str, nested: int, from_camera: bool = True) -> str:
-    """Why an integrator around so many others renders no image for a stack, "" if it does.
+    """Why an integrator around this number of others renders no image for a stack; "" if it does.
 
     ``from_camera``: it traces paths from the camera, unless its name says otherwise.
     """
@@ -110,7 +110,7 @@ def lack(plugin: str, nested: int, from_camera: bool = True) -> str:
 
 
 def check_integrator(integrator: mi.Integrator) -> None:
-    """Raises NgptError for an integrator that does not tell radiance along a camera ray."""
+    """Raises NgptError for an integrator that does not compute radiance along a camera ray."""
     from_camera = isinstance(integrator, mi.SamplingIntegrator)
     if reason := lack(plugin_name(integrator), len(objects_in(integrator, mi.Integrator)), from_camera):
         raise NgptError(reason)

@@ -21,7 +21,7 @@ import numpy as np
 
 # Camera paths of the pilot, and vertices of each that lamps are sampled at
 _PATHS, _VERTICES = 1 << 14, 3
-# Paths of a pilot that tells lamps by place, and from how many lamps on there is one
+# Paths of a pilot that weighs lamps by place, and the number of lamps from which on there is one
 _PATHS_BY_PLACE, MANY = 1 << 17, 8
 # Lamps are chosen by place if this is expected to lower the variance of direct light to less than this share. In matt
 # scenes the expectation holds; glossy materials, which the pilot does not consider, were seen to cost a factor of two.
@@ -91,8 +91,8 @@ def lamp_places(scene: mi.Scene, weights: np.ndarray, found: Found) -> Places | 
 def promised(found: Found, weights: np.ndarray) -> tuple[float, Table | None]:
     """What choosing by place promises to leave of the variance of direct light, and by what table.
 
-    One half of a pilot's samples tells how often each lamp is chosen, and the other how much better that is. Where the
-    pilot meets nothing there is no table.
+    One half of a pilot's samples determines how often each lamp is chosen. The other half measures how much better that
+    is. Where the pilot meets nothing there is no table.
     """
     lamp, squares, at = found.lamp, np.square(found.L), found.at
     half = np.random.default_rng(0).random(len(lamp)) < 0.5
@@ -114,13 +114,13 @@ class Found:
     path: np.ndarray
 
     def first(self, paths: int) -> Found:
-        """What a pilot of only the first so many paths would have found."""
+        """What a pilot of only the first ``paths`` paths would have found."""
         some = self.path < paths
         return Found(self.lamp[some], self.L[some], self.at[some], self.path[some])
 
 
 def _pilot(scene: mi.Scene, paths: int) -> Found:
-    """Samples of lamps by so many paths.
+    """Samples of lamps by this number of paths.
 
     What a lamp brings counts by its weight beside BSDF sampling: lamps that are large, or close, count for less.
     """

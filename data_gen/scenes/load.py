@@ -185,7 +185,7 @@ def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int |
 
 
 def parsed(path: str, parameters: Mapping[str, str] = MappingProxyType({})) -> tuple:
-    """Mitsuba's configuration and state of a scene file that is read, but of which nothing is made yet."""
+    """Mitsuba's configuration and state of a scene file that was parsed but not instantiated."""
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
     # In parallel objects are numbered as they come, which differs from process to process, and with it the kernel: it

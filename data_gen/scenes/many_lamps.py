@@ -20,7 +20,7 @@ from data_gen.scenes.lamp_mesh import Table, lamps, mesh_of
 from data_gen.scenes.lost import is_bent
 from data_gen.scenes.nodes import MESHES, added, is_part, parts_of
 
-# From so many lamps of one material on
+# The number of lamps of one material from which on they are merged
 MANY = 256
 # How often they are halved: they become 64 meshes
 _HALVINGS = 6
@@ -89,7 +89,7 @@ def _candidates(state: mi.parser.ParserState) -> Iterator[tuple[str, int | None,
 
 
 def _radiance(lamp: mi.Properties) -> np.ndarray | None:
-    """Of an area emitter that has one colour and nothing else."""
+    """The radiance of an area emitter with one colour and no other settings; None for all others."""
     if lamp.plugin_name() != "area" or [name for name, _ in lamp.items()] != ["radiance"]:
         return None
     value = lamp["radiance"]

@@ -19,7 +19,8 @@ from data_gen.scenes.nodes import MESHES, added, parts_of
 
 # Settings of meshes that change normals
 _NORMALS = ("face_normals", "flip_normals")
-# Instances of a group become meshes if their files together have no more bytes: copies take memory, and instances none
+# Instances of a group become meshes if their files have at most this number of bytes in all: copies take memory, unlike
+# instances
 _MOST_BYTES = 1 << 24
 
 

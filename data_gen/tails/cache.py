@@ -65,21 +65,21 @@ _LOG = logging.getLogger(f"ngpt.{__name__}")
 
 # Cells that there is room for, and the share of them that may be taken
 CELLS, _FULL = 1 << 20, 0.5
-# A cell is trusted once either half has so many records in it, whatever they hold: see ``Cache``. Few are enough, since
-# there are about as many paths that read a cell as there are records in it.
+# A cell is trusted once each half has this number of records in it, whatever their values: see ``Cache``. Few are
+# enough, since about as many paths read a cell as there are records in it.
 LEAST = 4
-# Paths that feed the cache read only cells with so many in each half, and a share of them make further records there
-# instead: else cells that many of them read would keep the noise of their first few.
+# Paths that feed the cache read only cells with this number of records in each half. A share of these paths make
+# further records instead: otherwise cells that many paths read would keep the noise of their first records.
 LEAST_TO_FEED, RENEW = 16, 0.25
 # A cell is torn where the light in its two parts along an axis differs by more than this share of their sum, at the
-# coarsest fineness, and by so many standard errors.
+# coarsest fineness, and by more than this number of standard errors.
 TORN, _CERTAIN, _ENOUGH = 0.2, 2.5, 3
 # The unit in which the light of a record counts for that: 1 is all that a record can have, whatever its light.
 _PARTS = 4095
 # The weight of a new record, as an integer that can be halved often: see ``fade``
 _WHOLE = 256
-# A record may be so many times as bright as the mean of all so far, or have such a part of their light. What is
-# brighter is cut: one path would make a spot that no denoiser removes.
+# The light of a record is at most this multiple of the mean of all records so far, or this part of their sum. Brighter
+# records are cut: a single path would make a spot that no denoiser removes.
 MOST, PARTS = 3000, 200
 # The light of the brightest record of the first round, and the brightest light that can be represented, in units of
 # sums, both as powers of two
@@ -101,7 +101,7 @@ class Known:
     def place_of(self, x: mi.SurfaceInteraction3f, spread: mi.Float, kind: mi.UInt32 | int) -> Place:
         """Where vertex ``x`` lies among the cells that are ``fineness`` times smaller than the ``spread``.
 
-        ``kind`` tells vertices apart that have no light in common.
+        Vertices of different ``kind`` share no light.
         """
         level = mi.Int32(dr.floor(dr.log2(dr.maximum(spread / self.fineness, 1e-20))))
         normal = octahedral(mi.Normal3f(dr.mulsign(x.sh_frame.n, x.wi.z)))
@@ -139,7 +139,7 @@ class Known:
 
 
 class Cache:
-    """Growing sums by cell of so many ``sorts`` of light, and what is known of them.
+    """Growing sums of ``sorts`` kinds of light by cell, and what paths may read of them.
 
     The number of a cell's records decides whether the cell is trusted, not the light in them. Where light is rare, a
     cell that has found some looks uncertain, and a cell that has missed it looks certain. Trusting only the certain

@@ -1,4 +1,4 @@
-"""How many paths feed the cache: as many as pay.
+"""The number of paths that feed the cache, chosen so that the noise at equal time is least.
 
 The noise of a render has two parts: each pixel's own, which falls with the samples of the image, and what pixels share,
 which falls with the paths that feed the cache. With V and S the variances that one path of either kind would give, and

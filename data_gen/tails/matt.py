@@ -30,7 +30,7 @@ _BUMPS = re.compile("(Bump|Normal)Map")
 
 
 class Matt:
-    """What the cache needs to know of a scene's materials."""
+    """What the cache needs to know about a scene's materials."""
 
     def __init__(self, scene: mi.Scene):
         bsdfs = materials_of(scene)
@@ -94,7 +94,7 @@ class Plain:
 def reflectance(bsdf: mi.BSDF | mi.BSDFPtr, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
     """ρ as a material itself says it."""
     context = mi.BSDFContext()
-    # Materials of several lobes leave the others out, but for ``principled``.
+    # Materials of several lobes leave out the other lobes, except ``principled``.
     context.type_mask = mi.BSDFFlags.DiffuseReflection
     along = mi.Vector2f(x.wi.x, x.wi.y)
     across = dr.rsqrt(dr.maximum(dr.squared_norm(along), 1e-12)) * along
@@ -113,7 +113,7 @@ def is_lambertian(bsdf: mi.BSDF) -> bool:
 
 
 def is_constant(bsdf: mi.BSDF) -> bool:
-    """Whether a matt material has no texture: all that it knows of itself is a reflectance."""
+    """Whether a matt material has no texture: its only parameter is a reflectance."""
     keys = list(mi.traverse(bsdf).keys())
     return bool(keys) and all(key.split(".")[-2:] == ["reflectance", "value"] for key in keys)
 

@@ -1,23 +1,23 @@
 """When the cache is fed, how much, and how fine its cells are: all by the number of paths of the image.
 
-So large images have as many rounds as small ones with more samples; and the cache is the same after so many paths,
-whatever is to end the render.
+So large images have as many rounds as small ones with more samples; and the cache is the same after the same number of
+paths, whatever is to end the render.
 """
 
 from __future__ import annotations
 
-# The cache begins with the first round before which the image has so many paths, or at once where that many pixels
-# are. Small images of few samples have none: it would take longer to compile than they take.
+# The cache begins with the first round before which the image has this number of paths, or at once if the image has
+# this number of pixels. Small images of few samples have none: it would take longer to compile than they take.
 BEGIN = 1 << 14
 # Paths of the image at the end of the first round, or more
 FIRST = 1 << 16
 # The fineness of cells: how many times smaller they are than the spread of a path. It grows slowly with the paths of
-# the image, from so many on. Bias falls with the square of the size of cells, and so at the rate of noise.
+# the image, from this number on. Bias falls with the square of the size of cells, and so at the rate of noise.
 FINENESS, _COARSE, _RATE = 8.0, 1 << 20, 1 / 4
 
 
 def enough(pixels: int, spp: int | None) -> bool:
-    """Whether a render of so many pixels and samples has a cache, if it can; ``spp`` None: it is not known."""
+    """Whether a render with this number of pixels and samples has a cache, if it can; ``spp`` None: not known."""
     return spp is None or spp > first_sample(pixels)
 
 
@@ -32,7 +32,7 @@ def end_of_round(sample: int, pixels: int) -> int:
 
 
 def fineness(paths: int) -> float:
-    """The fineness of cells in a round at whose end the image has so many ``paths``."""
+    """The fineness of cells in a round after which the image has this number of ``paths``."""
     return FINENESS * max(1.0, paths / _COARSE) ** _RATE
 
 

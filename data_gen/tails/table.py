@@ -1,4 +1,4 @@
-"""A table of cells: cubes of a grid, apart by what else tells their places apart, found by a hash of both."""
+"""A table of cells: cubes of a grid, separated further by direction and kind, and found by a hash of both."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from data_gen.paths.streams import mixed
 
-# Places beside each other in the table, in which a cell may be: so many that each cell finds one, whatever comes first
+# The number of adjacent places in the table in which a cell may be: enough for each cell to find one, in any order
 _PLACES = 512
 # Directions along an axis of the octahedral map
 _DIRECTIONS = 8

@@ -140,7 +140,7 @@ class Denoiser:
     """Reconstructs images of one size, called as ``mi.OptixDenoiser`` is.
 
     ``input_size``  (width, height) in pixels
-    ``albedo``, ``normals``  whether they will be given; what is not announced is refused
+    ``albedo``, ``normals`` whether they will be given; layers that were not announced are refused
     ``temporal``    whether the calls are frames of one shot, in order, with ``flow``: each result is blended with those
                     before it (``ngpt.Temporal``)
     ``denoise_alpha``  whether an alpha channel is denoised as well, as a grey image; otherwise it comes back as it is,

@@ -11,7 +11,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 
-# Channels of colour, albedo and normal: with so many, a tensor may be what an integrator with AOVs rendered.
+# Channels of colour, albedo and normal: a tensor with this number may be the output of an integrator with AOVs.
 _OF_A_STACK = 9
 
 

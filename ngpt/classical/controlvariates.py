@@ -66,7 +66,8 @@ def wcv(
     """Variance-weighted control variates, (H, W, C) in the units of ``primal``.
 
     ``*_var`` (H, W, C) are variances of the pixel means; missing values may be NaN (``ngpt.classical.variances``).
-    Other arguments as of ``ngpt.classical.poisson.l2``. ``sweeps``: only the first so many of ``schedule``.
+    Other arguments as of ``ngpt.classical.poisson.l2``. ``sweeps``: only this number of the first sweeps of
+    ``schedule``.
     """
     equations = Equations(primal, dx, dy, trusted)
     variances = smooth_variances(primal_var, dx_var, dy_var, trusted)

@@ -26,7 +26,7 @@ def keep_energy(image: np.ndarray, primal: np.ndarray) -> np.ndarray:
     """
     double = empty(image[..., 0], 2, dtype=np.float64)
     brightness, _ = by_rows(lambda i, j: (np.stack([over_colours(x[i:j]) for x in (primal, image)]),), double)
-    # Averaged over REACH pixels but for a factor, which the ratio does not know; sums stay.
+    # Averaged over REACH pixels up to a factor, which cancels in the ratio; sums are kept.
     local = solve(brightness, 1 / REACH**2)
 
     def rows(first: int, last: int) -> tuple:

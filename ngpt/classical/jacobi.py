@@ -137,7 +137,8 @@ class _Strip:
 
 
 class _Scratch:
-    """The memory a thread needs beside the strip for so many rows; ``above`` has an entry for each sweep under way.
+    """The memory a thread needs, besides the strip, for this number of rows; ``above`` has an entry for each sweep
+    under way.
 
     ``arrays`` (..., pixels): the weights of the neighbours, their sum with the pixel's own weight, dx and dy, dx and dy
     of the pixels to the left and above, and as much scratch space. ``rows`` (C, pixels) is dy with one more row on top.

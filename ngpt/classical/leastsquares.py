@@ -111,7 +111,7 @@ def solve(b: np.ndarray, screen: float, mean: np.ndarray | float | None = None) 
     """
     height, width = b.shape[-2:]
     λy, λx = ((4 * np.sin(np.pi / 2 * np.arange(n) / n) ** 2).astype(b.dtype) for n in (height, width))
-    # With all channels and in their layout: NumPy is slow where the axes of arrays lie in different order in memory.
+    # With all channels and in their layout: NumPy is slow if the axes of arrays have different orders in memory.
     screened = np.zeros_like(b[:, :1]) + screen
     screened += λx
     coefficients = dct2(b)
@@ -140,7 +140,7 @@ class Weighted:
     """The matrix screen + ∇ᵀ weights ∇ and its preconditioner D^-1/2 (σ + ∇ᵀ∇)⁻¹ D^-1/2, by cosine transforms.
 
     D is the mean weight around a pixel where ``screen`` varies, and 1 where it does not [Concus and Golub 1973, "Use of
-    Fast Direct Methods for the Efficient Numerical Solution of Nonseparable Elliptic Equations"]. In the latter case
+    Fast Direct Methods for the Efficient Numerical Solution of Nonseparable Elliptic Equations"]. In that second case
     the mean of the solution is 0, like the mean of the right-hand side.
     """
 

@@ -136,7 +136,7 @@ def least_norms(
     u, free = solve(b, alpha**2, mean=0.0), [empty(b, channels), empty(b, channels)]
     s, norms, _ = by_rows(start, empty(r, 3, channels), empty(r, 3, 1))
     # In units of the mean residual, the iteration follows the exposure of the image. Outliers must not set this unit.
-    # Nor must they decide when to stop, with an energy that dwarfs the rest of the image.
+    # They must not decide when to stop either, with an energy that dwarfs the rest of the image.
     mean = robust_mean(norms)
     limit, stride = 1000 * mean, max(FIRST_STRIDE * mean, float(norms.max()) / 10)
     threshold = mean + stride

@@ -156,7 +156,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 def denoise(args: argparse.Namespace, console: Console) -> int:
     pairs = output_paths(arguments.stack_files(args.stacks), args.output)
     files, options, reference = asked(args, pairs)
-    # One stack has no progress to tell, but somebody who looks on sees that it is at work.
+    # One stack has no progress to report, but a user who watches sees that it is being denoised.
     bar = console.progress("denoise", "frames") if len(pairs) > 1 or console.terminal else nullcontext(_unseen)
     frames = results(args, pairs, files, options, reference, console)
     reports = []
@@ -271,7 +271,9 @@ def read_frame(
 
 
 def _check_result(source: Path, target: Path, args: argparse.Namespace) -> None:
-    """Raises NgptError where a result was made of another stack, or with other settings than are asked for."""
+    """Raises NgptError if a result was made from another stack, or with settings that differ from the requested
+    ones.
+    """
     result, stack = first_attributes(target), first_attributes(source)
     asked: dict[str, Any] = {name: stack.get(name) for name in ("ngpt:spp", "ngpt:seed") if name in stack}
     asked[REDUCED] = args.reduce if args.reduce > 1 else None

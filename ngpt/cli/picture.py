@@ -104,7 +104,9 @@ def write_each(folder: Path, pictures, overwrite: bool) -> None:
 
 
 def check_picture(target: Path, args: argparse.Namespace) -> None:
-    """For ``ngpt denoise``: raises an error for what is no picture, and for options that no picture has room for."""
+    """For ``ngpt denoise``: raises an error for files that are not pictures, and for options that pictures cannot
+    have.
+    """
     check_image(target, args.transform)
     for option, given in (("--error", args.error), ("--groups", args.groups or args.group), ("--into", args.into)):
         if given:

@@ -8,7 +8,7 @@ Pixels exchange less light the more their surfaces differ, and the more they dif
 [variances travel along as in Schied et al. 2017, "Spatiotemporal variance-guided filtering"].
 
 Photons are the same case: neighbouring pixels gather the same ones, and OIDN takes their blotches for detail, but the
-variance tells them. So method `oidn` leaves them to the diffusion (``ngpt.layers.GATHERED``). They are divided by the
+variance reveals them. So method `oidn` leaves them to the diffusion (``ngpt.layers.GATHERED``). They are divided by the
 albedo of the surface that they were gathered at, and multiplied again, so that its texture stays sharp.
 
 Methods from gradients that call OIDN anyway take its image of this light (``ngpt.network.inputs.Oidn``): what OIDN

@@ -5,7 +5,7 @@ import numpy as np
 from ngpt.repair import Repaired
 
 # Features are clean enough to be taken as they are if their variance is at most this share of the primal's relative
-# one. Their variance by itself does not tell: at 7e-4 prefiltering is worth a fifth of the error in simple scenes, as
+# one. Their variance by itself does not decide: at 7e-4 prefiltering is worth a fifth of the error in simple scenes, as
 # their images have little noise, and at 2e-3 nothing in rooms (docs/lab/log).
 CLEAN = 0.003
 # A share of the mean: light below its square root is dark, and its relative variance counts less.

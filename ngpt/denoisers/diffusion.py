@@ -16,7 +16,7 @@ from ngpt.classical.arrays import map_silent
 
 # Distances in pixels, one after the other; the last two even out what the grids of the others leave.
 DISTANCES = (1, 2, 4, 8, 16, 32, 1, 2)
-# Two pixels that differ by so many standard deviations of their noise, beyond it, exchange 1/e of their light.
+# Two pixels exchange 1/e of their light if they differ, beyond their noise, by this number of its standard deviations.
 SIGNIFICANT = 3.0
 # The neighbours of one half plane at distance 1, and their weights in the binomial filter of 3x3 pixels.
 NEIGHBOURS = ((0, 1, 1 / 8), (1, 0, 1 / 8), (1, 1, 1 / 16), (1, -1, 1 / 16))
@@ -38,7 +38,7 @@ def diffused(light: np.ndarray, variance: np.ndarray, surfaces: np.ndarray) -> n
     layout = _Layout(*variance.shape)
     now = layout.laid(light, 0), layout.laid(variance[None], 0)
     after = np.zeros_like(now[0]), np.zeros_like(now[1])
-    # Without any surface, one that is the same everywhere tells pixels from gaps.
+    # If no surface is known, a constant one separates pixels from gaps.
     surface = layout.laid(surfaces if len(surfaces) else np.zeros((1, *variance.shape), np.float32), _FAR)
     shares = np.zeros((3, 3, layout.size + layout.margin), np.float32)
     for distance in DISTANCES:

@@ -47,7 +47,7 @@ def nfor(image: np.ndarray, variance: np.ndarray, features: list[np.ndarray]) ->
     image = np.clip(np.ldexp(image, -power), -FAR, FAR)
     variance = np.minimum(np.ldexp(variance, -2 * power), np.float32(FAR**2))
     design = _design(features, image.shape[:2])
-    # Squares of fireflies beyond all measure would be infinite, and patches are no more alike for their exact light.
+    # Squares of extreme fireflies would be infinite, and their exact light makes patches no more alike.
     most = bound(image)
     seen = image if most == np.inf else np.clip(image, -most, most)
     variance = np.minimum(variance, np.float32(most) ** 2)

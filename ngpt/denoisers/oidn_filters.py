@@ -96,7 +96,7 @@ def _filtered(
 
 
 def _made(where: tuple[str, int], weights: bytes | None, kind: str, settings: Mapping[str, Any]) -> Any:
-    """A filter on the device of that name, which has so many threads of its own if it is a processor."""
+    """A filter on the device of that name. A processor gets this number of threads of its own."""
     import mitsuba_oidn
 
     if where not in _devices:
@@ -114,7 +114,7 @@ def _made(where: tuple[str, int], weights: bytes | None, kind: str, settings: Ma
 
 
 def _run(device: Any, made: Any, images: Mapping[str, np.ndarray], result: np.ndarray) -> None:
-    """Arrays are used where they lie if the device can, and by buffers otherwise; the filter keeps none of them."""
+    """The device reads arrays in place if it can, and through buffers otherwise. The filter keeps none of them."""
     height, width = result.shape[:2]
     buffers = {}
     for name, image in {**images, "output": result}.items():

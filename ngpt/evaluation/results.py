@@ -25,9 +25,8 @@ def summarised(results: dict[str, Any]) -> list[dict[str, Any]]:
     """A row for each scene, spp and method: median and quartiles over seeds; then geometric means over scenes.
 
     ``error`` is the primary metric's median. Means, with scene None, are of methods that are there on all scenes; a
-    metric that is not an error (PSNR, SSIM) has its arithmetic mean. An error below 0, which is one that the halves
-    of a reference cannot tell from 0, has no geometric mean. ``pareto`` says that no cell of the
-    scene is both faster and better.
+    metric that is not an error (PSNR, SSIM) has its arithmetic mean. An error below 0 has no geometric mean: the halves
+    of the reference cannot distinguish it from 0. ``pareto`` says that no cell of the scene is both faster and better.
     """
     rows: list[dict[str, Any]] = []
     groups: dict[tuple, list[dict[str, Any]]] = {}

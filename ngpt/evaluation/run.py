@@ -30,7 +30,8 @@ from ngpt.system.machine import metadata
 def evaluate(
     config: Config, out: Path, console: Console, command: str, renderer: Renderer, cache: Path | None = None
 ) -> dict[str, Any]:
-    """Fills the folder ``out`` and returns what its results.json holds; ``renderer`` renders what is not there yet.
+    """Fills the folder ``out`` and returns what its results.json holds; ``renderer`` renders stacks that do not exist
+    yet.
 
     What is in the cache, ``out``/cache by default, is not computed again: an interrupted run goes on when it is started
     again. Whatever a scene or a method lacks becomes a row that says so. Raises NgptError, before anything is rendered,

@@ -180,9 +180,8 @@ def choose(condition: Value, then: Callable[[], Value], otherwise: Callable[[], 
 
 
 def repeat(most: int, step: Callable[[Value, Value], tuple[Value, Value | bool]], state: Value, shape: Shape) -> Value:
-    """``state``, float32, after at most so many steps.
-
-    ``step`` is given the number of the step, from 0, and the state; it returns the next state, and whether to go on.
+    """``state``, float32, after at most this number of steps. ``step`` takes the number of the step, from 0, and the
+    state. It returns the next state, and whether to go on.
     """
     graph = state.graph
 

@@ -37,7 +37,7 @@ def network_model(weights: str | Path, name: str, precision: str = "float32") ->
 
 
 def statistics_model(weights: str | Path, name: str) -> onnx.ModelProto:
-    """The graph that tells what the tiles of an image share, for the model of these weights."""
+    """The graph that computes what the tiles of an image share, for the model of these weights."""
     model, _ = _load(weights)
     tell = {"version": __version__, "method": name, "statistics": ", ".join(STATISTICS)}
     return statistics(model.config).model(tell)
@@ -106,7 +106,7 @@ def _load(weights: str | Path) -> tuple[Reconstructor, dict]:
 
 
 class _Half(torch.nn.Module):
-    """The network in float16, but for its head, which predicts logarithms."""
+    """The network in float16, except its head, which predicts logarithms."""
 
     def __init__(self, network: torch.nn.Module):
         super().__init__()
@@ -126,7 +126,9 @@ def network_body(model: Reconstructor, precision: str = "float32") -> onnx.Model
 def convolutions(
     network: torch.nn.Module, inputs: int, alignment: int, given: str, made: str, precision: str = "float32"
 ) -> onnx.ModelProto:
-    """A network of ``ngpt.network.unet`` with so many input channels; ``given`` and ``made`` name input and output."""
+    """A network of ``ngpt.network.unet`` with this number of input channels; ``given`` and ``made`` name input and
+    output.
+    """
     for module in network.modules():
         if isinstance(module, Convolution):
             # Normalised once and for all, rather than in each run of the graph.
@@ -137,7 +139,7 @@ def convolutions(
     # Sizes that are not special: the exporter takes 0 and 1 for constants.
     example = torch.zeros(2, inputs, 5 * alignment, 7 * alignment)
     tiles, rows, columns = (torch.export.Dim(name, min=2, max=1 << 16) for name in ("tiles", "r", "c"))
-    # It would tell everyone that torchvision is not installed, which is not needed.
+    # It would report that torchvision is not installed, which is not needed.
     logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -13,7 +13,7 @@ from torch import Tensor
 from ngpt.network import features, padding
 from ngpt.network.model import Reconstructor
 
-# What lies farther away changes an image by less than this of its value: ten times less than tiles may.
+# Pixels farther away change an image by less than this share of its value: ten times less than tiles may.
 TOLERANCE = 1e-6
 # How many examples are tried, and the side of the middle of each that is compared.
 EXAMPLES, MIDDLE = 3, 64
@@ -24,7 +24,7 @@ BESIDE, NEAR = 24, 48
 def reach(model: Reconstructor) -> int:
     """Pixels, a multiple of the alignment: ``radius`` rounded up, or less where more makes no difference.
 
-    Less are those that leave every pixel of all examples within ``TOLERANCE``, and ``BESIDE`` more.
+    The result is the least distance that keeps every pixel of all examples within ``TOLERANCE``, plus ``BESIDE``.
     """
     step = model.alignment
     whole = -(-model.radius // step)

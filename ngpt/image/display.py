@@ -67,7 +67,7 @@ def auto_exposure(reference: np.ndarray) -> float:
     """The exposure, in stops, that brings the log-average luminance of (H, W, 3) to middle grey, 0.18.
 
     Only finite pixels count. Pixels 13 stops or more under the bright end are background, not subject, and are left
-    out; fireflies count no more than the 99th percentile of the lit pixels. An all-black image gives 0.
+    out; fireflies count as the 99th percentile of the lit pixels. An all-black image gives 0.
     """
     with np.errstate(invalid="ignore"):  # Inf - Inf, left out below
         luminance = (_rgb(reference) @ LUMINANCE).ravel()

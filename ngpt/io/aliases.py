@@ -11,7 +11,7 @@ class Alias(NamedTuple):
 
     ``only``     demands these channel suffixes, the layer's own first
     ``factors``  of the channels, where a renderer has another sign or unit
-    ``writer``   demands a file by this program, as ``writer_of`` tells
+    ``writer`` demands a file by this program, according to ``writer_of``
     """
 
     layer: str
@@ -85,7 +85,7 @@ ALIASES: tuple[Alias, ...] = (
 )
 
 # Parts of names, in small letters without blanks and underscores, that make a layer look like one of the contract. Only
-# the user can tell the direction and unit of most motion vectors.
+# the user knows the direction and unit of most motion vectors.
 LOOKS = {
     "albedo": ("albedo", "diffusefilter", "diffusecol", "basecol", "diffcol", "reflectance"),
     "normal": ("normal",),
@@ -94,9 +94,9 @@ LOOKS = {
     "dy": ("gradienty", "grady"),
     "motion": ("motionvec", "velocity", "vector"),
 }
-# Parts of names of what is none of them: V-Ray's depth is a shade of grey between two distances.
+# Parts of names that are none of these layers: V-Ray's depth is a shade of grey between two distances.
 NOT_LOOKS = {"depth": ("zdepth",)}
-# Parts of names of what is no light, whatever its channels.
+# Parts of names of layers that are not light, whatever their channels.
 NO_LIGHT = ("crypto", "position", "matte", "mask", "noise", "samples")
 # How names of variances and errors end.
 NOISE = ("var", "variance", "mse", "error")
@@ -117,7 +117,7 @@ def plain(name: str) -> str:
 
 
 def writer_of(attributes: Iterable[str]) -> str:
-    """The program that wrote a file with these header attributes, as far as they tell; "" if not."""
+    """The program that wrote a file with these header attributes; "" if they do not say."""
     names = tuple(attributes)
     return next((who for start, who in _WRITERS.items() for name in names if name.startswith(start)), "")
 

@@ -155,7 +155,9 @@ def layers_in(path: str | os.PathLike, layers: Mapping[str, str] | None = None) 
 
 
 def views_in(path: str | os.PathLike) -> list[View]:
-    """The views of a file, and the names of what they hold, by its header; raises NgptError for what is no image."""
+    """The views of a file, and the names of what they hold, by its header; raises NgptError for a file that is not an
+    image.
+    """
     return _views_in(path)[0]
 
 

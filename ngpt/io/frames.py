@@ -40,8 +40,8 @@ def shot_files(name: str) -> list[Path]:
     """The frames of a folder (its .exr files) or a pattern, in order, without hidden files such as macOS's ``._*``.
 
     Patterns are shell patterns or names of frames (``ngpt.io.framenames``). Folders and files of that very name win,
-    also within a pattern: ``dir[1]/*.exr``. Results that lie beside what they were made of (``*_denoised``) are left
-    out. Raises NgptError where there are none.
+    also within a pattern: ``dir[1]/*.exr``. Results in the folder of their inputs (``*_denoised``) are left out. Raises
+    NgptError where there are none.
     """
     return in_order(without_results(_files(name)) or _none(name, "no .exr files there"))
 
@@ -55,7 +55,7 @@ def input_files(name: str) -> list[Path]:
 
 
 def without_results(files: Sequence[Path]) -> list[Path]:
-    """The files without results that lie beside their inputs."""
+    """The files, without results in the folder of their inputs."""
     known = set(files)
     inputs = {path: path.with_name(frame_name(path) + path.suffix) for path in files}
     return [path for path in files if inputs[path] == path or inputs[path] not in known]
@@ -107,9 +107,9 @@ def series(files: Iterable[Path]) -> list[Series]:
 
 
 def remarks(name: str, files: Sequence[Path], results: bool = True) -> list[str]:
-    """What to say of the frames of a shot before they are shown or blended: a line each, none where all is well.
+    """Lines about the frames of a shot, before they are shown or blended; none if all is well.
 
-    ``results``  whether to tell how many results were left out
+    ``results`` whether to say how many results were left out
     """
     said = []
     if left := len(set(_files(name)) - set(files)) if results else 0:

@@ -239,7 +239,7 @@ def check_size(parts: list[PartHeader], length: int, path: str) -> None:
         )
     if any(part.deep for part in parts):
         return
-    # Each chunk has an entry in a table and a size before its data, and data of no more bytes than it can stand for.
+    # Each chunk has an entry in a table, a size before its data, and at most as many bytes as its pixels can take.
     least = sum(16 * part.chunks + (part.bytes // part.ratio) for part in parts)
     wanted = sum(part.bytes for part in parts)
     if least > length:

@@ -172,7 +172,7 @@ def _state(file: BinaryIO) -> tuple[int, int]:
 
 
 def _decode(file: BinaryIO, path: Path, headers: list[PartHeader]) -> list[Any]:
-    """The parts as OpenEXR reads them; raises NgptError unless they hold all that ``headers`` tell."""
+    """The parts as OpenEXR reads them; raises NgptError unless they hold all that ``headers`` announce."""
     name = _numbered(file)
     # OpenEXR skips a part whose pixels it cannot read, and only prints a warning to Python's stdout.
     printed = io.StringIO()
@@ -281,7 +281,7 @@ def _plain(value: Any) -> Any:
 
 
 def _fits(value: Any) -> bool:
-    """Says whether OpenEXR can store ``value`` with no more loss than rounding to 32-bit float."""
+    """Whether OpenEXR can store ``value``, except for rounding to 32-bit float."""
     match value:
         case int():
             return -(2**31) <= value < 2**31

@@ -1,6 +1,6 @@
 """Which red, green and blue a file means, by its header; and linear Rec. 709, in which it is shown.
 
-These attributes tell; the first that is there wins: ``acesImageContainerFlag`` (SMPTE ST 2065-4), ``colorInteropID``
+The attributes, of which the first one present wins: ``acesImageContainerFlag`` (SMPTE ST 2065-4), ``colorInteropID``
 (the names of the Color Interop Forum), ``chromaticities`` and ``oiio:ColorSpace`` (OpenImageIO). By OpenEXR's rule a
 file without them is of Rec. 709: https://openexr.com/en/latest/TechnicalIntroduction.html
 """
@@ -21,10 +21,10 @@ REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 REC2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
 P3_D65 = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
 ADOBE_RGB = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
-XYZ_D65 = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.3127, 0.3290)  # told by name alone: it means CIE's own units
+XYZ_D65 = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.3127, 0.3290)  # known by its name: it means CIE's own units
 ACES_AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
 ACES_AP1 = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
-# Names of linear spaces, in small letters and digits alone.
+# Names of linear spaces, in lower-case letters and digits only.
 _NAMES = {
     REC709: "linrec709scene linrec709 linsrgb linearrec709 linearrec709srgb linearsrgb utilitylinearrec709",
     REC2020: "linrec2020scene linrec2020 linearrec2020 utilitylinearrec2020",
@@ -35,7 +35,7 @@ _NAMES = {
     ACES_AP1: "linap1scene linap1 acescg acesacescg",
 }
 _SPACES = {name: primaries for primaries, names in _NAMES.items() for name in names.split()}
-# Names that tell no primaries.
+# Names that say nothing about primaries.
 _NO_SPACE = ("", "unknown", "data", "raw", "linear", "scenelinear")
 # Cone responses of Bradford, in which a white is adapted to another.
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
@@ -46,8 +46,8 @@ _SAME = 1e-4  # of a coordinate; files hold 32-bit floats, and standards four di
 def to_rec709(attributes: Mapping[str, Any]) -> np.ndarray | None:
     """The matrix (3, 3) that takes colours of a file with such header attributes to linear Rec. 709.
 
-    None where it is of Rec. 709 already, where it does not say what it is of, and where what it says is nonsense, of
-    which the log has a warning. White becomes white: where the two differ, by Bradford's adaptation.
+    None if the file has Rec. 709 already, if it does not say, and if what it says makes no sense, which the log warns
+    about. White becomes white: where the two differ, by Bradford's adaptation.
     """
     found = _primaries(attributes)
     if found is None:
@@ -67,7 +67,7 @@ def to_rec709(attributes: Mapping[str, Any]) -> np.ndarray | None:
 
 
 def _primaries(attributes: Mapping[str, Any]) -> Any:
-    """x, y of the primaries and white that a header tells, as they are in it; None where it tells none."""
+    """x, y of the primaries and white in a header, as they are; None where it has none."""
     if attributes.get("acesImageContainerFlag") == 1:
         return ACES_AP0
     for name in ("colorInteropID", "chromaticities", "oiio:ColorSpace"):

@@ -92,7 +92,8 @@ def check_reducible(stack: GradientStack, k: int) -> None:
 
 
 def reduced(image: ExrImage, k: int, stacks: Sequence[GradientStack]) -> ExrImage:
-    """The file with each K x K pixels as one, of the ``stacks`` of its views; raises NgptError for what has no rule.
+    """The file with each K x K pixels as one, of the ``stacks`` of its views; raises NgptError for channels without a
+    rule.
 
     Tiles keep their size in pixels.
     """
@@ -256,7 +257,7 @@ def _ranks(names: Sequence[str], blocks: dict[str, Any]) -> dict[str, np.ndarray
     total = coverage.cumsum(axis=-1)
     ends = np.ones(ids.shape, bool)
     ends[..., :-1] = starts[..., 1:]
-    # The sum of a run, at its end: what there is by then less what there was before it began.
+    # The sum of a run, at its end: the running total less the total before the run.
     before = np.maximum.accumulate(np.where(starts, total - coverage, -np.inf), axis=-1)
     each = np.where(ends, total - before, 0.0) / pixels
     order = np.argsort(-each, axis=-1, kind="stable")[..., : len(names) // 2]

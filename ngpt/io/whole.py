@@ -16,7 +16,7 @@ _MULTIPART = 0x1000
 
 
 def finished(path: str | os.PathLike) -> bool:
-    """Whether ``path`` is there and whole: its headers make sense, and all chunks that its tables tell of end in it.
+    """Whether ``path`` is there and whole: its headers make sense, and all chunks in its tables end within it.
 
     Some kilobytes are read. Damage within a chunk is not seen. What is there and no file (a folder, a device) counts as
     finished, for it is not ours to replace.

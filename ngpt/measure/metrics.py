@@ -7,7 +7,7 @@ are left out and counted, since one of them would hide all others.
 A reference has noise. With one image r = t + n, t the truth, the mean of (x - r)² is the mean of (x - t)² plus the mean
 of n². With two halves the square becomes the product (x - a)(x - b). The noises of a and b are independent with mean
 zero, so the expectation of the product is (x - t)², whatever the noise. The product in a pixel, and even a mean, may be
-negative if the image is nearer to the truth than the reference can tell. Denominators use the mean m = (a + b) / 2,
+negative if the image is nearer to the truth than the reference can resolve. Denominators use the mean m = (a + b) / 2,
 whose noise is not corrected for: a relative variance v of m adds about 6 v² to relMSE, and 4 v times a relative bias of
 the image.
 """

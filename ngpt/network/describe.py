@@ -100,7 +100,7 @@ def _reads(names: Collection[str], base: str, runtime: str) -> dict[str, Any]:
 
 
 def _training(record: Any) -> dict[str, Any]:
-    """The facts of a record that anybody may have written: what is not as we write it is left out."""
+    """The facts of a record that anybody may have written. Entries that are not in our form are left out."""
     if not isinstance(record, dict):
         return {}
     facts = {name: value for name, value in record.items() if isinstance(value, int | float | str)}

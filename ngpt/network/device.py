@@ -1,4 +1,4 @@
-"""The device that PyTorch computes on where none is asked for, and how precisely."""
+"""The default device of PyTorch, and its precision."""
 
 import os
 

@@ -143,8 +143,7 @@ def exposure(primal: Tensor) -> Tensor:
     """The typical radiance of images (N, 3, H, W), over ``KEY``: (N, 1, 1, 1), positive; 1 for black images.
 
     The median over blocks of 16x16 pixels, those that are not black, of their means: proportional to the image's
-    brightness, the same at any sample count but for noise, and indifferent to what a few pixels hold. Wants finite
-    values.
+    brightness, the same at any sample count except for noise, and unaffected by a few pixels. Wants finite values.
     """
     size = min(BLOCK, primal.shape[-2]), min(BLOCK, primal.shape[-1])
     blocks = avg_pool2d(primal.float().clamp(min=0).mean(1, keepdim=True), size, ceil_mode=True).flatten(1)

@@ -80,7 +80,7 @@ class Reconstructor(nn.Module):
         both = torch.cat([layer.mean(1, keepdim=True) for layer in (noise, light)], 1)
         variance, mean = avg_pool2d(both, WINDOW, 1, WINDOW // 2, count_include_pad=False).split(1, 1)
         share = (variance.sqrt() / (self.config.quiet * (mean + DARK))).clamp(max=1)
-        # None at all is what is not known, or a light that no sample has met yet.
+        # No noise at all means that it is unknown, or that no sample has met the light yet.
         return torch.where(variance > 0, share, 1)
 
     @staticmethod

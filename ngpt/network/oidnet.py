@@ -22,8 +22,8 @@ SHAPES: dict[tuple[int, ...], tuple[int, ...]] = {
 # The layers that it reads beside the colour.
 FEATURES = ("albedo", "normal")
 
-# Exposure: what the geometric mean of the luminances of bins of about so many pixels is brought to. Darker ones than
-# the least do not count.
+# Exposure: the target of the geometric mean of luminances of bins, and the approximate pixels of a bin. Darker ones
+# than the least do not count.
 KEY, BIN, LEAST = 0.18, 16, 1e-8
 LUMINANCE = (0.212671, 0.715160, 0.072169)
 # The curve between radiance y and its code x, in three pieces; the largest half-precision y has the code 1.

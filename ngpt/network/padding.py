@@ -53,7 +53,7 @@ def extended(image: Tensor, radius: int) -> Tensor:
 
 
 def _mirror(size: int, before: int, after: int, device: torch.device) -> Tensor:
-    """Which pixel lies at -before, ..., size - 1 + after, and one beyond."""
+    """The index of the pixel at each of the places -before, ..., size - 1 + after, and one beyond."""
     period = max(2 * (size - 1), 1)
     wave = torch.arange(-before, size + after + 1, device=device) % period
     return torch.where(wave < size, wave, period - wave)

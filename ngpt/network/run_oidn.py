@@ -18,7 +18,7 @@ def reads(path: Path) -> tuple[tuple[str, ...], str]:
 
 
 def check_device(device: str) -> None:
-    """Raises NgptError where OIDN is not installed, and for a name that is none of its devices'."""
+    """Raises NgptError where OIDN is not installed, and for a name that none of its devices has."""
     require_oidn()
     if device not in DEVICES:
         raise NgptError(f"device '{device}' is unknown; OIDN has: {', '.join(DEVICES)}")

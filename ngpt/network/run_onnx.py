@@ -1,6 +1,6 @@
 """Runs our networks by ONNX Runtime: without PyTorch, in tiles within a given memory, on a chosen device.
 
-export/CONTRACT.md tells what the files expect; this is the host that comes with ngpt.
+export/CONTRACT.md says what the files expect. This is the host that comes with ngpt.
 """
 
 import logging
@@ -217,8 +217,8 @@ class Network:
 def floats(session, path: Path) -> tuple[dict[str, type], str]:
     """The type of each input of a network, and the name of its first output.
 
-    Files of elsewhere may take and give anything. Single, half and double precision are converted; NgptError is raised
-    for whole numbers, texts, sequences, maps and what else ONNX has.
+    Files of other programs may have any inputs and outputs. Single, half and double precision are converted; NgptError
+    is raised for whole numbers, texts, sequences, maps and what else ONNX has.
     """
     inputs = [*session.get_inputs(), *session.get_overridable_initializers()]
     output = next(iter(session.get_outputs()))

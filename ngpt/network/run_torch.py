@@ -52,7 +52,7 @@ def layers_of(
 def reconstruct(model: Reconstructor, layers: dict[str, Tensor], tile: int = TILE) -> Tensor:
     """What ``model(layers)`` returns, computed in tiles whose padded side is at most ``tile`` pixels.
 
-    Exposure and bounds are computed from the whole image. Layers may lie on another device than the model. A network of
+    Exposure and bounds are computed from the whole image. Layers may be on another device than the model. A network of
     OIDN's shape is computed in one piece, since OIDN makes its own tiles.
     """
     if model.config.network == "oidn":

@@ -20,7 +20,7 @@ def spans(length: int, step: int, margin: int) -> list[tuple[slice, slice]]:
 
 
 def within(inner: slice, outer: slice) -> slice:
-    """Where the one lies in the other."""
+    """The position of the one within the other."""
     return slice(inner.start - outer.start, inner.stop - outer.start)
 
 

@@ -61,7 +61,7 @@ def read(path: Path) -> tuple[bytes, str]:
 
 
 def _shapes(data: bytes, path: Path) -> dict[str, tuple[int, ...]]:
-    """Name -> shape of the tensors of a file; raises NgptError if a tensor does not lie within the file."""
+    """Name -> shape of the tensors of a file; raises NgptError if a tensor is not within the file."""
     try:
         magic, version, _, place = struct.unpack_from("<HBBQ", data)
         if magic != MAGIC or version != VERSION:

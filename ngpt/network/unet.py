@@ -143,7 +143,7 @@ class Unit(nn.Module):
 
 
 def radius(convolutions: list[int], pooling: str) -> int:
-    """How far, in pixels, a pixel's influence reaches, with so many 3x3 convolutions at each level.
+    """How far, in pixels, a pixel's influence reaches, with this number of 3x3 convolutions at each level.
 
     Each convolution reaches as far as the width of its level's pixels. A coarsest pixel spreads the values of its
     pixels over its whole area; bilinear interpolation at each level spreads them to the next pixel too.

@@ -8,8 +8,8 @@ from ngpt.system.text import markup
 
 
 def document(title: str, body: str, *, command: str = "", style: str = "", refresh: int = 0) -> str:
-    """The HTML of a page; ``body`` is markup, ``style`` more rules. With ``refresh`` it is read anew every so many
-    seconds, as long as it is open."""
+    """The HTML of a page; ``body`` is markup, ``style`` more rules. With ``refresh`` it is reloaded after every period
+    of this many seconds, as long as it is open."""
     sheet = (package_files("ngpt.report") / "report.html").read_text(encoding="utf-8")
     sheet = sheet.split("<style>")[1].split("</style>")[0] + style
     allowed = "sha256-" + base64.b64encode(hashlib.sha256(sheet.encode()).digest()).decode()

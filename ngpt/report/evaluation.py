@@ -92,7 +92,7 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
             values = [math.nan if value is None else value for value in found]
             metrics[metric] = values[0] if len(values) == 1 else values
         entries.append(Entry(method, read_image(folder / pictured["image"]), seconds, metrics))
-    # The first metric is the one of the captions, and the one the best method is chosen by.
+    # The captions show the first metric, and the best method is chosen by it.
     for entry in entries:
         entry.metrics = dict(sorted(entry.metrics.items(), key=lambda item: item[0] != results["primary"]))
     reference = scene["reference"] or {"image": None}
@@ -159,7 +159,7 @@ def _costs(results: dict) -> dict[str, list[list[str]]]:
 
 
 def _cell(row: dict, metric: str, doubt: float | None) -> str:
-    """The numbers of a row; ~ where the error is below ``doubt``, what the reference can tell."""
+    """The numbers of a row; ~ where the error is below ``doubt``, which the reference cannot resolve."""
     value = row["metrics"].get(metric)
     if not value or value["median"] is None:
         return "-"

@@ -24,7 +24,7 @@ from ngpt.system.text import markup, printable
 from ngpt.version import __version__
 
 ADDRESS, PORT = "127.0.0.1", 8642
-# Seconds after which somebody who asked no more has gone; and that those who look on are waited for at the end.
+# Seconds without a request after which a viewer counts as gone; and seconds that viewers are waited for at the end.
 _GONE, _FAREWELL = 5.0, 2.5
 # The most connections at a time, each with its own thread: enough for some browsers, which open up to six each.
 MOST = 32

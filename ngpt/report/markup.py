@@ -61,7 +61,9 @@ def _figure(name: str, picture: np.ndarray, note: str = "", maps: Mapping[str, n
 
 
 def _map(values: np.ndarray) -> str:
-    """A map of differences as a picture in the colours of the heat table; what is not a number is worst."""
+    """A map of differences as a picture in the colours of the heat table; NaN has the colour of the largest
+    difference.
+    """
     places = np.rint(255 * np.clip(np.nan_to_num(values, nan=1.0), 0.0, 1.0)).astype(np.uint8)
     return "data:image/png;base64," + base64.b64encode(encode_palette_png(places, display.heat_table())).decode()
 

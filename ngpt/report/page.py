@@ -121,7 +121,7 @@ def _printable(value: Any) -> Any:
 
 
 def oversize(path: str | os.PathLike) -> str:
-    """What to tell of a page that is larger than PAGE_LIMIT, "" of others."""
+    """The message about a page that is larger than PAGE_LIMIT; "" for others."""
     size = os.path.getsize(path)
     if size <= PAGE_LIMIT:
         return ""
@@ -171,7 +171,7 @@ def _check(path: Path, scene: Scene) -> None:
 
 
 def _facts(scene: Scene, stops: float, steps: list[int]) -> dict:
-    """What the script has to know of a scene, besides the pixels."""
+    """What the script needs about a scene, besides the pixels."""
     best = scene.best(next(iter(scene.entries[0].metrics), ""))
     names = [entry.name for entry in scene.entries]
     first = scene.baseline.name

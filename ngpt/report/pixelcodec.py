@@ -1,4 +1,4 @@
-"""Pictures of a report: scene-linear numbers in few bytes, each off by no more than a stated share.
+"""Pictures of a report: scene-linear numbers in few bytes, each within a stated relative error.
 
 A value v, exposed so that middle grey is near 0.18, becomes the whole number nearest
 sgn(v) · steps · log2(1 + |v| / TOE). At most half a step is lost: |stored - v| / (|v| + TOE) is up to
@@ -19,7 +19,7 @@ INFINITE, UNDEFINED = 32001, 32002
 
 
 def codes(image: np.ndarray, steps: int) -> np.ndarray:
-    """(..., 3) exposed floats -> int16; ±INFINITE and UNDEFINED stand for what is not finite."""
+    """(..., 3) exposed floats -> int16; ±INFINITE and UNDEFINED stand for values that are not finite."""
     image = np.asarray(image, dtype=np.float64)
     with np.errstate(invalid="ignore"):
         code = np.sign(image) * np.minimum(np.rint(steps * np.log2(1.0 + np.abs(image) / TOE)), MAX_CODE)

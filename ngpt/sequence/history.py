@@ -39,7 +39,7 @@ from ngpt.sequence.warp import warped
 from ngpt.stack import GradientStack
 from ngpt.windows import Place
 
-# Frames that history may count for: what changes slowly, and is not seen by the evidence, lags by no more.
+# The most frames that history may count for: slow changes, which the evidence does not see, lag by at most this number.
 LONGEST = 16
 # Motion in image widths per frame at which history counts for half as many frames: surfaces look different from another
 # viewpoint.
@@ -86,7 +86,7 @@ class Temporal:
 
         It is ``image`` itself for a first frame, and after a cut. There is a cut if the stack has no layer ``motion``,
         is a picture of another size, or names another frame before it (``ngpt:previousFrame``). Frames may be parts
-        of a picture that move and change their size: history is looked up where they lie. ``previous`` (H, W, 3)
+        of a picture that move and change their size: history is looked up at their place in it. ``previous`` (H, W, 3)
         is the last frame's result, if it is another one than this method returned. It may also be given for a first
         frame; the features of the frame before are then unknown.
         """
@@ -147,7 +147,7 @@ class Temporal:
 
 
 def _shift(stack: GradientStack, before: _History) -> tuple[int, int] | None:
-    """Where the stack's first pixel lies in the last frame; None unless that is the one its motion leads to."""
+    """The position of the stack's first pixel in the last frame; None unless that is the one its motion leads to."""
     previous = stack.number("ngpt:previousFrame")
     follows = previous is None or before.frame is None or previous == before.frame
     return stack.place.shift_in(before.place) if follows and "motion" in stack else None

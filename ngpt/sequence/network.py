@@ -5,8 +5,8 @@
 D_s are the bands of h - x, fine to coarse, which add up to h - x. b and t are share and trust of the rules, f is the b
 of the variances (``ngpt.sequence.evidence``), and c_s is the output of the network for ``Blend.inputs``. If c_s = 0, y
 is the result of the rules. The network corrects the rules by at most C: so clear evidence, as after a change of all
-light, still decides. Changes of light have coarse scales, and moving reflections fine ones; noise that is
-left in x has both. Whatever the network says, y lies between x and h at each scale, and a surface that comes into sight
+light, still decides. Changes of light have coarse scales, and moving reflections fine ones; noise that is left in x has
+both. Whatever the network says, y is between x and h at each scale, and a surface that comes into sight
 takes nothing from what hid it. The network was trained on frames of moving shots, with histories that it made itself
 (``ngpt.training.temporal``).
 """

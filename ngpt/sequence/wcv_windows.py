@@ -51,7 +51,7 @@ def reconstruct_shot(
 
 
 def _shift(stack: GradientStack, before: GradientStack) -> tuple[int, int] | None:
-    """Where the stack's first pixel lies in the one before; None at a cut."""
+    """The position of the stack's first pixel in the one before; None at a cut."""
     frame, previous = before.number("ngpt:frame"), stack.number("ngpt:previousFrame")
     follows = previous is None or frame is None or previous == frame
     return stack.place.shift_in(before.place) if follows and all(name in stack for name in LINK) else None

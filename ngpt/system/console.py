@@ -63,7 +63,7 @@ def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "
 
 
 def _explanation(error: BaseException) -> str:
-    """What to tell of an error that users can act on; raises it again if it is none."""
+    """The message of an error that users can act on; raises all other errors again."""
     match error:
         case NgptError() | OSError():
             return str(error)

@@ -140,7 +140,9 @@ def _umask() -> int:
 
 
 def _temporary(path: Path) -> tuple[Path, int | None]:
-    """A new file beside ``path``, and a handle whose lock tells other processes that its writer lives, if it can."""
+    """A new file beside ``path``, and a handle. Where the system has locks, its lock shows other processes that the
+    writer is alive.
+    """
     while True:
         handle, name = tempfile.mkstemp(prefix=_PREFIX, suffix=path.suffix, dir=path.parent)
         if fcntl is None:

@@ -48,8 +48,8 @@ def raised() -> Iterator[Interrupt]:
 def noted(told: Callable[[], None] = lambda: None) -> Iterator[Interrupt]:
     """In the block, the first signal is only recorded; any further one has its previous effect.
 
-    ``told`` is called at once when it comes. A signal that is switched off stays so, and outside of the main thread
-    none arrives.
+    ``told`` is called as soon as the signal arrives. A signal that is switched off stays so, and outside of the main
+    thread none arrives.
     """
     found = Interrupt()
 

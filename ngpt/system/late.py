@@ -5,7 +5,7 @@ from typing import Any
 
 
 class Late:
-    """A module of that name, imported when something of it is asked for."""
+    """A module of that name, imported when one of its attributes is first used."""
 
     def __init__(self, name: str):
         self.name = name

@@ -1,4 +1,4 @@
-"""What this process may use: memory, address space, processors. Systems that set no such limit are asked for none."""
+"""What this process may use: memory, address space, processors. Systems without such limits are not queried."""
 
 import ctypes
 import math
@@ -73,7 +73,7 @@ def _of_groups(name: str, controller: str) -> list[str]:
 
 
 def limit_threads(most: int) -> None:
-    """From now on work of this package takes at most so many threads. A later call replaces the limit of an earlier.
+    """From now on this package uses at most this number of threads. A later call replaces the limit of an earlier.
 
     PyTorch and renderers have limits of their own, and so has BLAS (OPENBLAS_NUM_THREADS and the like), which no
     reconstruction needs. Raises WrongUse unless ``most`` is a whole number of at least 1.
@@ -128,7 +128,7 @@ def free_address_space() -> int:
 
 
 def limit_address_space(limit: int) -> None:
-    """Limits what this process may map to so many bytes, where the system can; its crashes write no memory to disk."""
+    """Limits the bytes that this process may map, where the system can; its crashes write no memory to disk."""
     if resource is None:
         return
     own = resource.getrlimit(resource.RLIMIT_AS)[1]

@@ -81,7 +81,7 @@ def _only(group: str) -> Any:
 class Registry(dict[str, T]):
     """Entries by name: ours, and those that other packages bring by entry points of a ``group``.
 
-    An entry of another package is imported when it is asked for by its name. Iteration goes over ours, and over others'
+    An entry of another package is imported when it is requested by name. Iteration goes over ours, and over others'
     that have been imported; call ``load`` first to list all. Finding one of ours does not search for others.
 
     ``what``   the word for an entry in messages: "method"

@@ -1,4 +1,4 @@
-"""Input files: regular ones, and no more of them than makes sense."""
+"""Input files: only regular files, and only up to a sensible size."""
 
 import os
 import stat

@@ -29,7 +29,7 @@ def read_json(path: str | Path) -> Any:
 
 
 def parse_json(text: str, where: str) -> Any:
-    """Raises NgptError for what is no JSON; ``where`` begins the message."""
+    """Raises NgptError for text that is not JSON; ``where`` begins the message."""
     return _call(json.loads, text, where)
 
 
@@ -79,8 +79,8 @@ def from_table(kind: type[T], values: Any, where: str) -> T:
     """The dataclass ``kind`` from a table of settings, whose values must have the annotated types.
 
     Lists become tuples, tables become dataclasses, where the annotations say so: ``tuple[int, ...]``,
-    ``tuple[Files, ...]``. A whole number does where a number is asked for. What ``kind`` refuses itself, it refuses by
-    NgptError.
+    ``tuple[Files, ...]``. A whole number is accepted where a number is expected. What ``kind`` refuses itself, it
+    refuses by NgptError.
 
     Raises NgptError, which begins with ``where``, for settings that are unknown, missing, or of another type.
     """

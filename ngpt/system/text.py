@@ -1,4 +1,4 @@
-"""Text of elsewhere, fit to be shown: names in files may hold what controls a terminal, or hides and turns text."""
+"""Makes text of unknown origin safe to show: names in files may control a terminal, or hide and reverse text."""
 
 import re
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ _INVISIBLE = re.compile(
 )
 
 
-# Files that stand for what has no file, by path: what it is called in all that is said.
+# Names in messages for files that stand for something without a file, by path.
 _names: dict[str, str] = {}
 
 

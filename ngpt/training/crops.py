@@ -16,7 +16,7 @@ from ngpt.stack import GradientStack
 class Crop(Protocol):
     """One view with a reference and several inputs, from ``ngpt.training.dataset`` or ``stack_folder``.
 
-    Of a crop without a reference, only ``paired`` and its two stacks are used.
+    A crop without a reference is used only for ``paired``, by its two stacks.
     """
 
     scene: str

@@ -33,7 +33,7 @@ _MANIFEST: Shape = {"config": dict, "planned": int, "shards": [_ENTRY]}
 
 @dataclass(frozen=True)
 class Crop:
-    """One crop; cheap: pixels are read when they are asked for.
+    """One crop; cheap: pixels are read when they are first used.
 
     ``spp`` holds the samples per pixel of its inputs. ``frame`` is its number in a shot, from 0; None for a single
     image.

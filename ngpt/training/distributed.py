@@ -1,4 +1,4 @@
-"""One process or several: what training needs to know of ``torchrun``."""
+"""One process or several: what training needs to know about ``torchrun``."""
 
 import os
 

@@ -41,7 +41,7 @@ STYLE = """
 
 @dataclass(frozen=True)
 class Run:
-    """What a run's folder tells: ``entries`` of its log, ``settings`` and ``record`` ({} where there are none)."""
+    """The contents of a run's folder: ``entries`` of its log, ``settings`` and ``record`` ({} where there are none)."""
 
     folder: Path
     name: str

@@ -156,7 +156,7 @@ def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]
     for name, tensor in tensors.items():
         if not np.isfinite(tensor).all():
             raise NgptError(f"{path}: tensor '{name}' has {np.sum(~np.isfinite(tensor))} values that are not finite")
-    # safetensors writes the bytes as they lie in memory, so arrays must be contiguous in C order.
+    # safetensors writes the bytes in the order of memory, so arrays must be contiguous in C order.
     tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
     data = save(tensors, {"ngpt": json.dumps(record)})
     files.save(path, lambda path, overwrite: write_bytes(path, data, overwrite), alike=True)
@@ -216,7 +216,7 @@ class Shard:
         return _single(self._part(name, crop, k))
 
     def _part(self, name: str, *index: int) -> np.ndarray:
-        """What the first indices leave of a tensor; raises NgptError where the file does not hold it any more."""
+        """The part of a tensor at these first indices. Raises NgptError if the file no longer holds it."""
         shape = self.shape(name)
         array = np.empty(shape[len(index) :], _TYPES[self.type(name)])
         place = int(np.ravel_multi_index(index, shape[: len(index)])) if index else 0

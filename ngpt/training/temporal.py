@@ -8,9 +8,10 @@ to work with any method. The loss of a frame is
     E |y - r|² / E_x + FLICKER E |(y - r) - W (y' - r')|² / F_x
 
 relative to the reference r, where W looks up values along motion and ' marks the frame before. E_x and F_x are the same
-errors of x, so all shots count alike. Added is the square of how much darker or brighter y is than x, in the mean of a
-batch: otherwise the easiest way to remove specks would be to lose their light. The effect of y on later frames is left
-out: among filters that know their own variance, the one with the least error now is also the best for later.
+errors of x, so all shots count alike. A further term is the square of the difference between the mean brightness of y
+and of x, over a batch: otherwise the easiest way to remove specks would be to lose their light. The effect of y on
+later frames is left out: among filters that know their own variance, the one with the least error now is also the best
+for later.
 """
 
 import copy
@@ -46,8 +47,8 @@ RELIT = 0.4
 class Blending(Task):
     """Learns to blend the frames of ``clips``, and is measured by ``held_out``.
 
-    Everything random is a function of the seed and the number of the round or step. Beside them a batch depends on
-    the weights by which its round was played: these are the ``state`` of the task.
+    Everything random is a function of the seed and the number of the round or step. A batch depends, in addition, on
+    the weights that its round was played with. These are the ``state`` of the task.
     """
 
     def __init__(self, settings: Settings, clips: Sequence[Clip], held_out: Sequence[Clip]):
@@ -91,7 +92,7 @@ class Blending(Task):
                 frames = self._played(model, number)
             rng = np.random.default_rng((self.settings.run.seed, 1, step))
             picked = rng.integers(len(frames), size=self.settings.run.batch)[mine]
-            # Motion is in the arrays no more: they may be turned as they are.
+            # The arrays no longer contain motion, so they may be rotated as they are.
             turns = rng.integers(2, size=(self.settings.run.batch, 3)).astype(bool)[mine]
             chosen = [(frames[i], turn) for i, turn in zip(picked, turns, strict=True)]
             batch = {name: [turned(frame[name], *turn) for frame, turn in chosen] for name in frames[0]}
@@ -171,9 +172,9 @@ def loss(corrections: Tensor, batch: Mapping[str, Tensor]) -> tuple[Tensor, dict
     errors = robust(error.square() * batch["weight"]).mean((1, 2, 3))
     changes = (batch["seen"] * robust((error - batch["before"]).square() * batch["weight"])).mean((1, 2, 3))
     of_x, of_changes = batch["errors"].flatten(), batch["changes"].flatten()
-    # Where light changes in earnest, or there is next to none, it is not the specks that count.
+    # Specks do not count where light really changes, or where there is hardly any.
     darker = (taken.mean((1, 2, 3)) / (batch["level"].flatten() + 1e-20)).clamp(-0.05, 0.05).mean()
-    # What is nearly free of noise is nothing to learn from.
+    # There is nothing to learn from frames with hardly any noise.
     parts = {"error": (errors / (of_x + LEAST)).mean(), "flicker": (changes / (of_changes + LEAST)).mean()}
     parts["light"] = darker.square()
     return parts["error"] + FLICKER * parts["flicker"] + ENERGY * parts["light"], parts

@@ -127,7 +127,7 @@ class Trainer:
         """Trains until the last step, the wall-clock budget or a signal; True if the last step was reached.
 
         ``progress`` is called with (steps done, all steps), before the first step of this run and after each. Raises
-        NgptError when the loss or its gradient is not finite any more; the batch is saved then.
+        NgptError when the loss or its gradient is no longer finite, and saves the batch.
         """
         run, start, before = self.settings.run, time.monotonic(), self.seconds
         batches = self.task.batches(self.model, self.step, self.processes)
@@ -252,7 +252,7 @@ class Trainer:
     def _log(self, values: dict[str, float]) -> None:
         if self.processes.rank:
             return
-        # NaN is not JSON; what is not there is left out.
+        # NaN is not JSON; missing values are left out.
         values = {"step": self.step} | {k: v for k, v in values.items() if not math.isnan(v)}
         path = self.out / LOG
         try:

@@ -3,7 +3,6 @@
 import pytest
 
 from bench.rivals import POINTS, RIVALS, mitsuba_scene, over, rows
-from ngpt.errors import NgptError
 
 
 def cell(render, spp, **ways):
@@ -41,24 +40,22 @@ def test_a_line_for_each_number_of_samples_of_the_default():
     assert line == ["room 8x8", "4", "2.00", "0.25, 0.25", "0.50, 0.50", "1.00, 1.00", "-, -"]
 
 
+FILTER = '<rfilter type="gaussian"><float name="stddev" value=".4"/></rfilter>'
 SCENE = """<scene version="3.0.0"><integrator type="path"/>
-<sensor type="perspective">{sampler}<film type="hdrfilm"><rfilter type="gaussian"><float name="stddev" value=".4"/>
-</rfilter></film></sensor><shape type="sphere"><emitter type="area"/></shape></scene>"""
+<sensor type="perspective">{sampler}<film type="hdrfilm">{filter}</film></sensor>
+<shape type="sphere"><emitter type="area"/></shape></scene>"""
+WITH, WITHOUT = {"sampler": '<sampler type="independent"/>', "filter": FILTER}, {"sampler": "", "filter": ""}
 
 
 @pytest.mark.parametrize("points", POINTS.values())
-def test_mitsuba_has_the_points_and_a_box_filter(renderer, tmp_path, points):
+@pytest.mark.parametrize(
+    "parts", [{"sampler": '<sampler type="independent"/>', "filter": FILTER}, {"sampler": "", "filter": ""}]
+)
+def test_mitsuba_has_the_points_and_a_box_filter(renderer, tmp_path, points, parts):
     file = tmp_path / "scene.xml"
-    file.write_text(SCENE.format(sampler='<sampler type="independent"/>'))
+    file.write_text(SCENE.format(**parts))
     for name in (str(file), "diffuse"):
         (sensor,) = mitsuba_scene(name, (16, 8), points).sensors()
         assert points in sensor.sampler().class_name().lower()
         assert "Box" in sensor.film().rfilter().class_name()
         assert list(sensor.film().size()) == [16, 8]
-
-
-def test_a_scene_without_a_sampler_is_named(renderer, tmp_path):
-    file = tmp_path / "scene.xml"
-    file.write_text(SCENE.format(sampler=""))
-    with pytest.raises(NgptError, match=r"scene\.xml: has no Sampler.*add one"):
-        mitsuba_scene(str(file), (16, 8), "multijitter")

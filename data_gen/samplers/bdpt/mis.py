@@ -39,7 +39,7 @@ import mitsuba as mi
 
 @dataclass
 class Partial:
-    """What one end of a path knows of the strategies, at its last vertex, or on the way from there."""
+    """What one end of a path stores about the strategies, at its last vertex or on the way from there."""
 
     vcm: mi.Float
     vc: mi.Float

@@ -64,7 +64,9 @@ class Plan(World):
         return mis.arrive(end, cosine(si, d), dr.square(si.t) if edge is None else edge.length2(si))
 
     def sees(self, si: mi.SurfaceInteraction3f, target: mi.Point3f, most: mi.UInt32, active) -> tuple[Any, Any]:
-        """What comes from the ``target`` to ``si``, through at most so many holes, and how many there are."""
+        """The transmittance from the ``target`` to ``si`` through at most this number of holes, and the number of
+        holes.
+        """
         ray = si.spawn_ray_to(target)
         if self.holes is None:
             return dr.select(self.scene.ray_test(ray, active), mi.Float(0), 1), 0

@@ -1,4 +1,4 @@
-"""The camera path of ``gbdpt``, vertex by vertex: as in ``bdpt``, with what offset paths need to know of it."""
+"""The camera path of ``gbdpt``, vertex by vertex: as in ``bdpt``, with what offset paths need."""
 
 from __future__ import annotations
 
@@ -127,8 +127,8 @@ def base_step(
 ) -> tuple[Step, Past]:
     """Samples an emitter and the next vertex from vertex ``z``; returns the step, and the ``past`` of that vertex.
 
-    ``brightest_offset`` is the most that any offset path may yet bring: Russian roulette is to starve none. Light is
-    asked for where paths are ``completed`` at z; random numbers are drawn all the same.
+    ``brightest_offset`` is the most that any offset path may still contribute: Russian roulette is to starve none.
+    Emitters are sampled where paths are ``completed`` at z. Random numbers are drawn in any case.
     """
     scene, lights, materials = plan.scene, plan.lights, plan.materials
     si, end, bsdf = z.si, z.end, z.si.bsdf()

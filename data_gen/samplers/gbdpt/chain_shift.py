@@ -111,7 +111,7 @@ class Chain:
 
 
 def no_chain(lanes: int) -> Chain:
-    """The chains of base paths that have none yet, one for each of so many ``lanes``."""
+    """The chains of base paths that have none yet, one for each of the ``lanes``."""
     return Chain(
         x1=dr.zeros(mi.SurfaceInteraction3f, lanes),
         ω=mi.Vector3f(0),

@@ -14,7 +14,7 @@ from data_gen.samplers.gbdpt.offset_path import Offset, own_vertex
 
 def connect(plan: Plan, step: Step, y: Vertex, times, offsets: list[Offset], Δ: list) -> tuple:
     """C and ``others`` of the connection of the vertex of ``step`` to ``y``, one of the light path; and the sums Δ with
-    it, where it counts so many ``times``."""
+    it; it counts ``times`` times."""
     z = step.z
     g, edge, through = connection(plan, z, z.si.bsdf(), y, mi.Bool(True))
     C, others = z.β * g, mis.others_connected(z.end, y.end, edge)

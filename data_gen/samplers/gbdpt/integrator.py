@@ -123,7 +123,7 @@ def both_paths(plan: Plan, camera: CameraSamples, visitor: Visitor | None, alone
 
 def shift_bent(frozen: Frozen, plan: Plan, camera: CameraSamples, bent: mi.Bool, Δ: list[mi.Color3f]) -> None:
     """Adds to Δ the differences of ``bent`` camera paths, which are traced anew: see ``chain_shift``."""
-    # Copies: kernels tell arrays by how their memory is aligned, and NumPy's is so or so.
+    # Copies: kernels depend on how the memory of arrays is aligned, which varies for arrays of NumPy.
     lanes, exists = (dr.opaque(mi.UInt32(part)) for part in in_packets(np.array(dr.compress(bent)), camera))
     if not dr.width(lanes):
         return

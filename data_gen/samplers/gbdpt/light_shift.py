@@ -58,7 +58,7 @@ def splat_differences(
 ) -> mi.Bool:
     """Splats the differences of light paths that end at vertices that the camera sees, one for each of its samples.
 
-    These vertices are at ``depth`` edges from the light, and each counts so many ``times``. A path is bent if it ends
+    These vertices are at ``depth`` edges from the light, and each counts ``times`` times. A path is bent if it ends
     behind mirrors or glass. With ``bent`` only the differences of bent paths are splatted, else only all others.
     Returns which are bent.
     """

@@ -83,7 +83,7 @@ def own_vertex(offset: Offset, x: mi.SurfaceInteraction3f) -> mi.SurfaceInteract
 
 
 def brightest(offsets: list[Offset]) -> mi.Float:
-    """The most that any of the offset paths may yet bring to Δ."""
+    """The most that any of the offset paths may still contribute to Δ."""
     largest = mi.Float(0)
     for y in offsets:
         largest = dr.fmax(largest, dr.max(y.β) / (1 + y.r))

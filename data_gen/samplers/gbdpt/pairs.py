@@ -6,11 +6,8 @@ their densities, J the Jacobian of T, b = f(x) / p_s(x), b' = f(y) J / p_s(x), a
     Δ = 2 (b' - b) / (W(x) + r W(y))        W = Σ p_j / p_s = 1 + others (see ``bdpt.mis``), r = p_s(y) J / p_s(x)
 
 The 2 is there since the film averages both directions of a difference. That holds if T depends only on the path,
-whichever strategy has found it. A path whose copy does not exist or carries no light is no pair:
-
-    Δ = -2 b / W(x)
-
-and from its dark copy there is nothing to say.
+whichever strategy has found it. A path whose copy does not exist or carries no light is not a pair: Δ = -2 b / W(x),
+and its dark copy contributes nothing.
 
 A single strategy may shift a class of paths, by any map that does not leave the class, if all others reject its paths.
 Each has weights of its own then, and the strategy that shifts has

@@ -46,7 +46,7 @@ class Worth:
 
     @classmethod
     def nothing(cls, lanes: int, longest: int) -> Worth:
-        """The worth of so many ``lanes`` of light paths, of at most ``longest`` edges, before they are traced."""
+        """The worth of ``lanes`` light paths, of at most ``longest`` edges, before they are traced."""
         places = lanes * min(RATED, longest - 1)
         worth = cls(dr.zeros(mi.Float, places), dr.zeros(mi.UInt32, places), mi.UInt32(lanes))
         dr.make_opaque(worth)
@@ -81,7 +81,7 @@ def thresholds(camera: CameraSamples, light: mi.Color3f, splats: Splats) -> mi.F
     """√(I I0) for each pixel, from the ``light`` of camera paths and the light of ``splats``."""
     seen = np.array(dr.mean(light)).reshape(camera.pixels, -1)
     total = seen.mean(axis=1) + np.mean(splats.totals(), axis=0) / seen.shape[1]
-    # The film loses what is not finite, and a spectral sum may be negative.
+    # The film drops values that are not finite, and a spectral sum may be negative.
     root = np.sqrt(np.maximum(np.nan_to_num(total, nan=0.0, posinf=0.0, neginf=0.0), 0.0))
     return mi.Float((root * root.mean()).astype(np.float32))
 

@@ -1,4 +1,4 @@
-"""The base path of ``gpt``, vertex by vertex: Mitsuba's ``path``, and what offset paths need to know of it."""
+"""The base path of ``gpt``, vertex by vertex: Mitsuba's ``path``, and what offset paths need from it."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class Step:
     # In scenes with holes: whether x was one, and in which aim the path is behind x
     passed: mi.Bool | None = None
     aim: Aim | None = None
-    # Of a matt surface of reflectance 1 at x: f m Le V / p, and f / p, survival included. None where no path ends in
+    # For a matt surface of reflectance 1 at x: f m Le V / p, and f / p, survival included. None where no path ends in
     # the cache
     E_light: mi.Spectrum | None = None
     E_p: mi.Float | None = None
@@ -163,7 +163,7 @@ def base_step(
     if path.ρ is not None:
         E_light, smooth = matt.matt_lobe(x, to_light), event_kind(sample.sampled_type) == SMOOTH
         E_p = dr.select(smooth & (sample.pdf > 0), matt.matt_lobe(x, sample.wo) / sample.pdf, 0)
-        # What the cache has answered for already is left out. Of the little that may be left, little is followed.
+        # What the cache has answered for already is left out. Where little may be left, few paths follow it.
         f, survival_of_light = rest(f, path.ρ * E_light)
         f_p, survival_of_rest = rest(f_p, path.ρ * E_p)
         followed = u_survival < survival_of_light
@@ -299,8 +299,8 @@ def brightest(β1: mi.Spectrum, f_p: mi.Spectrum, offsets: list) -> mi.Float:
     """The throughput of the brightest of all five paths behind a step, by which they survive: so none is starved."""
     largest = dr.max(dr.abs(β1))
     for y in offsets:
-        # What an offset path may yet bring to Δ / 2: w β' until it is settled, with its β' of before this step, since
-        # its f is not known yet; then w |β' - β|, which is |a| / 2.
+        # The most that an offset path may still contribute to Δ / 2: w β' until it is settled, with its β' of before
+        # this step, since its f is not known yet; then w |β' - β|, which is |a| / 2.
         ahead = dr.select(y.apart | y.joined, dr.max(y.β) / (1 + y.r), 0)
         largest = dr.fmax(largest, dr.fmax(ahead, dr.max(dr.abs(y.a * f_p)) / 2))
     return largest

@@ -122,7 +122,7 @@ def next_steps(scene, plan: Plan, step: Step, offsets: list[Offset], first: bool
         return i + 1, *others, y
 
     if not first:
-        # What a step at a shared vertex does not know of stays outside: it would be moved about for nothing.
+        # What a step at a shared vertex does not use stays outside: it would be moved for nothing.
         some = (replace(y, hit=None, place=None, apart=None, sky=None, rough=None) for y in offsets)
         now = dr.while_loop((mi.UInt32(0), *some), lambda i, *_: joined & (i < count), join, label="joined paths")[1:]
         offsets = [
@@ -348,7 +348,7 @@ def step_joined(step: Step, path: Offset) -> Offset:
     β1 = dr.select(good, β1, 0)
     L_bsdf = step.Le * mis_weight(p, step.p_light)
     w2 = gradient_weight(r1, good)
-    # All later factors of both paths are the same: r and w stay, and a is all that is left to know of y.
+    # All later factors of both paths are the same: r and w stay, and only a depends on y.
     a, Δ = w2 * (β1 - step.β1), Δ + w2 * (β1 * L_bsdf - step.β1 * step.L_bsdf)
     A = path.A + w2_light * step.β * step.L_light + w2 * step.β1 * step.L_bsdf
     return replace(

@@ -89,7 +89,7 @@ class SharedTails:
             self.next_round(sensor, seed, max(self.fed + more, FEWEST), fineness(self.until * self.pixels))
 
     def next_round(self, sensor: mi.Sensor, seed: int, wanted: int, size: float) -> None:
-        """Feeds the cache until so many paths have done so; its cells get a ``size``, which is their fineness."""
+        """Feeds the cache until this number of paths have done so. ``size`` is the fineness of its cells."""
         parts = [wanted]
         if self.cache is None:
             parts = [round(_FIRST_PART * wanted), wanted]
@@ -107,7 +107,7 @@ class SharedTails:
                 self.cache.settle(size)
 
     def feed(self, sensor: mi.Sensor, seed: int, n: int) -> float:
-        """Has so many paths feed the cache; returns the share of them that come by a place to end."""
+        """Lets this number of paths feed the cache. Returns the share of paths that pass a place to end."""
         # Spread over the image, row by row: rays side by side are quick.
         number = np.arange(n, dtype=np.int64)
         some, first = number * self.pixels // n, self.fed + number % -(-n // self.pixels)

@@ -1,8 +1,8 @@
 """Paths of ``gpt`` and ``primal`` that end in the cache (``data_gen.tails``), and those that feed it.
 
 A path may end at the first vertex from the second on where the material has a diffuse part, the path's spread is large,
-and the cell is trusted; of ``gpt``, where no offset path is apart any more. What it would have found behind the vertex,
-as far as the surface scatters like a matt one (``data_gen.tails.matt``), is then
+and the cell is trusted. A path of ``gpt`` ends only where all offset paths have joined it. What it would have found
+behind the vertex, as far as the surface scatters like a matt one (``data_gen.tails.matt``), is then
 
     ρ C,
 
@@ -37,7 +37,7 @@ from data_gen.tails.table import Place
 
 # Records that a path may have
 RECORDS = 3
-# Light of so many more bounces is all there is: cells of shorter paths are kept apart by how many are left.
+# The number of bounces that are left. Cells are kept apart by it where few bounces are left.
 _ALL = 16
 
 

@@ -19,8 +19,8 @@ from data_gen.paths.light_ends import World
 class Passes:
     """The passes of a render, and the memory that one takes.
 
-    ``integrator`` has ``sample_pass(passes, camera, film)``, ``lane_bytes`` and ``instead(lane_bytes)``: what else than
-    a smaller image would fit into so many bytes for each camera sample.
+    ``integrator`` has ``sample_pass(passes, camera, film)``, ``lane_bytes`` and ``instead(lane_bytes)``: what, besides
+    a smaller image, would fit into this number of bytes for each camera sample.
     """
 
     integrator: Any

@@ -72,7 +72,7 @@ def our_samples(view, plan: Plan, camera: CameraSamples, known: Known | None, *,
 def samples(scene, integrator, radiance, features: bool, camera: CameraSamples) -> dict:
     """Layers: one sample of ``radiance``, and of features, for each camera sample.
 
-    Where ``features`` tell what is emission seen directly, that is the mean over a pixel's quarters.
+    Where there are ``features``, directly seen emission is the mean over a pixel's quarters.
     """
     ray, importance, _ = camera.rays()
     medium, all_lanes = camera.sensor.get_medium(), mi.Bool(True)

@@ -157,7 +157,7 @@ def evaluate_some(
     active: mi.Bool,
     request: Request,
 ) -> Requests:
-    """E, which is ``evaluate``, of the ``active`` ones of so many requests to records of the ``pool``."""
+    """E, by ``evaluate``, for those requests to records of the ``pool`` that are ``active``."""
     slot = dr.full(mi.UInt32, _NONE, lanes)
     index = dr.compress(active)
     count = dr.width(index)

@@ -38,7 +38,7 @@ class Map:
 
     @classmethod
     def empty(cls, paths: int, size: int) -> Map:
-        """An empty map for so many light paths of at most ``size`` vertices."""
+        """An empty map for this number of light paths of at most ``size`` vertices."""
         n, kind = paths * size, record_class(mi.variant())
         vertices = kind(*(dr.empty(t, n) for t in get_type_hints(kind, {"mi": mi}).values()))
         # Where nothing was kept

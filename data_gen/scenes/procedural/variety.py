@@ -51,7 +51,7 @@ def further_sights(
 
 
 def add_sights(stage: Stage, sights: frozenset[str], rng: np.random.Generator) -> list[Lamp]:
-    """Puts them on the stage, but for media; returns the lamps among them, ``EMITTERS`` or none."""
+    """Puts all of them except media on the stage. Returns the lamps among them, ``EMITTERS`` or none."""
     before, stage.rng = stage.rng, rng
     lamps: list[Lamp] = []
     if "partition" in sights:

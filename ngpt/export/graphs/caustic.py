@@ -1,8 +1,8 @@
 """After ``ngpt.denoisers.caustic`` and ``diffusion``: light that gradients hold nothing of, with less noise.
 
 Pixels exchange light with four neighbours of one half plane, at one distance after the other. What a pixel says to one
-of them comes back from there with the opposite sign, so that no light is lost. Beyond the border lie surfaces so far
-away that nothing is exchanged with them.
+of them comes back from there with the opposite sign, so that no light is lost. Surfaces beyond the border are so far
+away that no light is exchanged with them.
 """
 
 from collections.abc import Mapping

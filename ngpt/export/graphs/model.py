@@ -107,7 +107,7 @@ def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto
 
 
 def statistics(config: ModelConfig) -> Graph:
-    """The graph that tells what the tiles of an image share, and makes what another denoiser is to be given."""
+    """The graph that computes what the tiles of an image share, and the input of another denoiser."""
     graph = Graph("statistics_of")
     used = {"primal", "direct", "caustic", "depth", *(("dx", "dy", *_VARIANCES) if config.base else ())}
     denoised = [name for name in DENOISED if name in config.layers]

@@ -56,7 +56,9 @@ class Mirror:
 
 
 def _pixels(layer: Value, side: Side) -> Value:
-    """The layer with its borders along one side. What lies between them is copied whole: to gather it takes longer."""
+    """The layer with its borders along one side. The pixels between them are copied as a block: gathering them takes
+    longer.
+    """
     before, after = (op.Gather(layer, places, axis=side.axis) for places in side.borders(side.here, 0))
     return op.Concat(before, layer, after, axis=side.axis)
 
@@ -76,7 +78,7 @@ def _differences(layer: Value, side: Side, signed: bool) -> Value:
 
 def _side(axis: int, size: Value, alignment: int) -> Side:
     after = op.Mod(-(size + 2 * MARGIN), alignment) + MARGIN
-    # Which pixel lies at -MARGIN, ..., size - 1 + after, and one beyond.
+    # The index of the pixel at each of the places -MARGIN, ..., size - 1 + after, and one beyond.
     period = op.Max((size - 1) * 2, 1)
     wave = op.Mod(op.Range(-MARGIN, size + after + 1, 1), period)
     pixels = op.Where(op.Less(wave, size), wave, period - wave)

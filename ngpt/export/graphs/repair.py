@@ -30,7 +30,7 @@ class Repaired:
 
 
 def finite(x: Value) -> Value:
-    """Where values are: what is not finite is not 0 less than itself."""
+    """Where values are finite: x - x is not 0 for other values."""
     return op.Equal(x - x, 0.0)
 
 

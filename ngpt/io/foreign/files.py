@@ -52,7 +52,7 @@ def read_file(path: str | os.PathLike) -> ExrImage:
 
 
 def file_headers(file: BinaryIO, path: str) -> list[PartHeader]:
-    """What ``ngpt.io.header.read_headers`` tells of OpenEXR, of an open file of any of the formats."""
+    """What ``ngpt.io.header.read_headers`` returns for OpenEXR, for an open file of any of these formats."""
     reader = _reader(file)
     return [_header(_form(path, file, reader))] if reader else read_headers(file, path)
 

@@ -1,4 +1,4 @@
-"""What the readers of all formats share: what they tell of an image before they decode it, and their one error."""
+"""What the readers of all formats share: the facts about an image before it is decoded, and one error."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

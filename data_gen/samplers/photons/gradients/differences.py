@@ -18,7 +18,7 @@ from data_gen.samplers.photons.gradients.camera import Level
 from data_gen.samplers.photons.gradients.pairs import Near, Pairs, pieces
 from data_gen.samplers.photons.passes import Passes, begun
 
-# Levels are joined until they have so many paths for each camera sample.
+# Levels are joined until they have this number of paths for each camera sample.
 LEVELS = 3
 # Pairs of a point and a photon that are in memory together, for each camera sample; and the bytes of one.
 PAIRS = 16
@@ -88,7 +88,7 @@ def gradient_pass(passes: Passes, camera: CameraSamples, film: GradientFilm, nea
 
 
 def groups(levels: Iterable[Level], most: int) -> Iterator[list[Level]]:
-    """The levels, as many at a time as have at most so many paths: a kernel for few takes as long as one for many."""
+    """The levels, in groups of at most this number of paths: a kernel for few paths takes as long as one for many."""
     group: list[Level] = []
     for level in levels:
         if group and sum(dr.width(one.lanes) for one in (*group, level)) > most:

@@ -77,7 +77,9 @@ class Rays:
 
 
 def pieces(near, points: Receivers, active: mi.Bool, most: int, frozen: Callable = call) -> Iterator[Pairs]:
-    """All pairs of ``active`` points and what is ``near`` to them (its grid, its radius), at most so many at a time."""
+    """All pairs of ``active`` points and what is ``near`` to them (its grid, its radius), at most this number at a
+    time.
+    """
     around = near.grid, near.radius2
     count = frozen(counts, around, points, active)
     first = dr.prefix_sum(count)

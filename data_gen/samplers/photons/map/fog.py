@@ -35,7 +35,7 @@ class Fog:
 
     @dr.syntax
     def around(self, scene, p: mi.Point3f) -> mi.MediumPtr:
-        """The medium around points ``p``: lamps know of none, unless they are boundaries themselves.
+        """The medium around points ``p``. Lamps do not know their medium, unless they are boundaries themselves.
 
         It is that on this side of the first boundary of media toward the camera, or the camera's if there is none.
         Other surfaces are in the same medium on both sides, and may be in the way.

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# Cells beyond so many for each photon are empty: larger ones cost less.
+# With more cells than this for each photon, most are empty, and larger cells cost less.
 _CELLS_PER_PHOTON = 4
 _LEAST_CELLS = 1 << 12
 

@@ -47,7 +47,7 @@ def shrunk(i: int, dimension: int = 2) -> float:
 def pixel_width(scene: mi.Scene, sensor: mi.Sensor) -> float:
     """How wide a pixel of ``sensor`` is where that sees something, in world units: the median over the image.
 
-    Where it sees nothing, or knows of no rays side by side, a thousandth of the scene's diagonal.
+    A thousandth of the scene's diagonal where the camera sees nothing, or has no adjacent rays.
     """
     camera = CameraSamples(sensor, 0, 1)
     ray, _, _ = camera.rays()

@@ -244,7 +244,7 @@ class BEAMS(BRE):
 
 
 def parts_of(passes: Passes, traced: Traced, most: int) -> Iterator[Any]:
-    """The beams of a map in parts, at most so many at a time, and some that are empty if there are none."""
+    """The beams of a map in parts, at most this number at a time; empty ones if there are none."""
     kind, photons, frozen = parts_class(mi.variant()), traced.photons, passes.frozen
     rate = dr.opaque(mi.Float, 1 / (PART * traced.radius(1)))
     count = frozen(counted, passes.world, photons, rate)
