@@ -23,9 +23,10 @@ _Segment = tuple[tuple[float, float], tuple[float, float]]
 
 
 def first_at(error: float, points: Points) -> tuple[float, str] | None:
-    """The place where a curve first falls to ``error``, and its mark; None if it cannot be known.
+    """The place where a curve first falls to ``error``, and its mark.
 
-    A curve that never falls has only its first point. All numbers must be positive.
+    A curve that never falls gives its first point as an upper bound if its error is low enough, and None otherwise. All
+    numbers must be positive.
     """
     curve, falls = _curve(points)
     target, reach = math.log(error), math.log(REACH)

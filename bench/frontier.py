@@ -28,7 +28,7 @@ class Point:
 
 
 def pareto(points: list[Point]) -> list[bool]:
-    """For each point whether no other is at least as fast and as good, and better in one of the two."""
+    """For each point, whether it is Pareto optimal: no other is as fast and as good, and better in one of the two."""
     return [
         not any(
             (o.seconds <= p.seconds and o.error <= p.error) and (o.seconds < p.seconds or o.error < p.error)
@@ -39,7 +39,7 @@ def pareto(points: list[Point]) -> list[bool]:
 
 
 def points_against(results: dict[str, Any], scenes: list[str]) -> list[Point]:
-    """Geometric means over the scenes of the columns that are no rival's setting, and each rival at its best."""
+    """Geometric means over the scenes: columns other than settings of rivals, and each rival at its best setting."""
     rivals = results["settings"]["against"]
     points = [
         Point(rival, 0, seconds, error, rival)

@@ -4,9 +4,10 @@
     python -m bench.gallery --wipe glossy --size 640 360 --cache out/gallery
 
 SCENES has the scenes that are files. Each row of SCENES_SHOWN is rendered with the command that the page gives, and
-denoised by the method that `ngpt denoise` takes; the reference is rendered without shared paths, in two halves of other
-seeds. Renders are kept in the cache. Written are docs/images/gallery, bench/results/gallery.json, and the table between
-the marks of the page; with --wipe docs/images/wipe.webp, a line that moves over the noisy image and leaves the result.
+denoised by the default method of `ngpt denoise`; the reference is rendered without shared paths, in two halves of other
+seeds. Renders are kept in the cache. It writes docs/images/gallery, bench/results/gallery.json, and the table between
+the marks of the page. With --wipe it writes docs/images/wipe.webp: a line that moves over the noisy image and leaves
+the result.
 """
 
 import argparse
@@ -102,7 +103,7 @@ def options(row: Shown) -> str:
 
 
 def images(args: argparse.Namespace, row: Shown) -> tuple[list[np.ndarray], dict[str, Any]]:
-    """Noisy image, result and reference, (H, W, 3) scene-linear, and what the table says of them."""
+    """Noisy image, result and reference, (H, W, 3) scene-linear, and their values in the table."""
     stack = rendered(args, row, row.sampler, row.spp, 0, unbiased=False)
     ngpt.reconstruct(stack)  # loads what the method needs
     start = time.process_time()

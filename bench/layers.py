@@ -3,8 +3,8 @@ layers of a stack") and docs/use/from-your-renderer.md ("What auto takes").
 
     python -m bench.layers --cache /tmp/stacks --scenes diffuse glossy environment lens SCENE.xml ...
 
-Renders stacks with gradients and references (kept in the cache folder), measures what `auto` takes of every choice of
-their layers, with OIDN and without, and of files with the layer names of each renderer. Writes
+Renders stacks with gradients and references (kept in the cache folder). Measures which method `auto` takes for every
+choice of their layers, with OIDN and without, and for files with the layer names of each renderer. Writes
 bench/results/layers.json and prints both tables as Markdown. Errors are geometric means of the trimmed relMSE over the
 scenes.
 """
@@ -38,7 +38,7 @@ NEED_OIDN = ("ngpt-combine", "ngpt-primal", "oidn")
 # Samples per pixel for the table of renderers
 RENDERER_SPP = 16
 
-# Renderer -> layer -> what its channels are called: the prefix, and what follows its dot.
+# Renderer -> layer -> the names of its channels: the prefix, and the letters after its dot.
 RENDERERS: dict[str, dict[str, tuple[str, str]]] = {
     "Cycles": {
         "primal": ("ViewLayer.Noisy Image", "RGB"),
@@ -82,9 +82,9 @@ CHOICES: tuple[tuple[str, ...], ...] = (
 
 @dataclass(frozen=True)
 class Row:
-    """A renderer's file with some layers beside the colour: what `auto` took, and mean errors over the scenes.
+    """A renderer's file with some layers in addition to the colour: the method of `auto`, and mean errors over scenes.
 
-    ``oidn``   whether OIDN was there
+    ``oidn``   whether OIDN was available
     ``error``  of what `auto` gave; ``by_oidn``: of `oidn` on the same file, None without it; ``before``: of the input
     """
 
@@ -146,7 +146,7 @@ def used(method: str, layers: Container[str]) -> tuple[str, ...]:
 
 
 def error_of(scenes: Sequence[tuple[GradientStack, np.ndarray]], method: str, layers: Sequence[str]) -> float:
-    """The geometric mean over (stack, reference) of what a method leaves of these layers."""
+    """The geometric mean over (stack, reference) of a method's error with these layers."""
     return geometric_mean(
         relmse_trimmed(reconstruct(part(stack, layers), method).image, truth) for stack, truth in scenes
     )

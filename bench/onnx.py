@@ -37,7 +37,7 @@ from ngpt.stack import GradientStack
 
 SIZES = ("1280x720", "1920x1080")
 FAST = WEIGHTS / "ngpt-fast.onnx"
-# The file of weights that it was made of.
+# The file of weights that the network was exported from.
 TWIN = Path(__file__).parents[1] / "export" / "weights" / "ngpt-fast.safetensors"
 
 
@@ -149,7 +149,7 @@ def start_up(folder: Path, repeats: int) -> dict:
 
 
 def peak(size: str) -> float:
-    """MiB that ngpt-fast takes at most beside the stack, in a process of its own."""
+    """The peak memory of ngpt-fast in MiB, beyond the stack, in a process of its own."""
     code = f"""
 from bench.onnx import stack_of
 from ngpt.methods import reconstruct

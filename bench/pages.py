@@ -4,9 +4,9 @@
     python eval.py --config configs/eval-640.toml --out out/eval-640 --scenes ...
     python -m bench.pages out/eval out/eval-640
 
-keeps what the tables are made of in bench/results/main.json, and puts each table between its marks: in the README,
+stores the numbers of the tables in bench/results/main.json, and puts each table between its marks: in the README,
 docs/lab/RESULTS.md, docs/methods/methods.md, docs/samplers/points.md and the model cards; plots go to docs/images. A
-folder takes the place of what is kept of its size. Without folders the tables are written anew from that file.
+folder replaces the stored numbers of its size. Without folders the tables are written again from that file.
 """
 
 import argparse
@@ -33,7 +33,7 @@ SHARED = {"ngpt-primal-shared": "`ngpt-primal`, shared tails", "oidn-shared": "`
 COMPARED = ("l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal")
 # Groups whose frontiers are shown
 DRAWN = ("blind", "all")
-# A constant of points or lamps was chosen by looking at them
+# Scenes that influenced the choice of a constant of points or lamps
 TUNED = ("diffuse", "glossy", "coffee", "living-room", "staircase")
 # Ratios over OIDN from which a loss is listed by name
 LOSS = 1.1
@@ -70,7 +70,7 @@ def picture(size: dict[str, Any], group: str) -> str:
 
 
 def kept(results: dict[str, Any]) -> dict[str, Any]:
-    """What the tables need of an evaluation: medians over seeds, ratios at equal whole time, and worth over cost."""
+    """The numbers of an evaluation for the tables: medians over seeds, ratios at equal whole time, worth over cost."""
     facts = {name: results[name] for name in ("command", "date", "metadata")}
     settings = {name: results["settings"][name] for name in ("size", "spp", "groups", "against")}
     cells = [
@@ -125,7 +125,7 @@ class Size:
         found = {group for group, *_ in self.means}
         self.groups = [name for name in (*kept["groups"], "all") if name in found]
         if "blind" in self.groups and self.members("blind") == self.scenes:
-            self.groups.remove("all")  # it would say the same once more
+            self.groups.remove("all")  # it would repeat the only group
 
     def members(self, group: str) -> list[str]:
         return [scene for scene in self.scenes if group == "all" or scene in self.kept["groups"][group]]
@@ -135,7 +135,7 @@ class Size:
         return ", ".join(filter(None, (ratio(row, "error"), ratio(row, "FLIP"))))
 
     def won(self, group: str, method: str, rival: str, key: str = "") -> str:
-        """In how many cells, at all numbers of samples, a method has less error than the rival, or less FLIP."""
+        """The number of cells, over all numbers of samples, in which a method has less error or FLIP than the rival."""
         rows = [row for n in self.counts if (row := self.means.get((group, n, method, rival)))]
         return f"{sum(row[f'less{key}'] for row in rows)} of {sum(row[f'scenes{key}'] for row in rows)}"
 

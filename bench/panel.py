@@ -7,9 +7,9 @@
 
 A cell is a scene, a number of samples and a pipeline, named SAMPLER+METHOD:
 
-    auto+auto        what `render_scene` and `reconstruct` take by default
+    auto+auto        the defaults of `render_scene` and `reconstruct`
     mitsuba+oidn     the rival: OIDN on Mitsuba's own points and lamps and whole paths (``bench.tails.RIVAL``)
-    primal+oidn      the rival of whatever has gradients: OIDN on our samples
+    primal+oidn      the rival of pipelines with gradients: OIDN on our samples
     all others       the methods that ship
 
 The error is ``bench.tails.steady_error``, by two halves of a reference; FLIP is over their mean. Seconds are
@@ -57,12 +57,12 @@ OURS = [f"{sampler}+{method}" for sampler in ("gpt", "primal") for method in MET
 PIPELINES = [DEFAULT, *OURS, "mitsuba+oidn"]
 SEEDS = tuple(range(1, 1 + verdict.LEAST_SEEDS))
 EQUAL = ("samples", "seconds")
-# Where the halves of the reference cannot tell how small an error is
+# Where the error is too small for the halves of the reference to measure
 _LEAST_ERROR = 1e-6
 
 
 class Case(NamedTuple):
-    """What a scene is in the panel for, what to open it by, and the samples of each half of its reference."""
+    """The purpose of a scene in the panel, how to open it, and the samples of each half of its reference."""
 
     kind: str
     scene: str
@@ -172,7 +172,7 @@ def cells_of(name: str, loaded: Any, reference: Reference, seeds: Sequence[int])
 
 
 def of_seed(loaded: Any, spp: int, seed: int, reference: Reference, clean: np.ndarray) -> dict[str, dict[str, float]]:
-    """Values by pipeline. What the default takes is neither rendered nor denoised a second time."""
+    """Values by pipeline. The pipeline that the default chooses is neither rendered nor denoised a second time."""
     found: dict[str, dict[str, float]] = {}
     stacks: dict[str, tuple[GradientStack, float]] = {}
     for sampler, methods in METHODS.items():

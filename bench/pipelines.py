@@ -34,9 +34,9 @@ from ngpt.stack import GradientStack
 
 LADDER = (16, 64, 256)
 PARTS = 4
-# Samples of the first sampler that a sampler's trial may cost: twice what the pilot of a 14 times larger image allows,
-# in the time of 256 samples, since half of a pass of so small images goes by with recording it. What is dearer is left
-# out of the comparison, too.
+# The most that a sampler's trial may cost, in samples of the first sampler: twice the limit of the pilot for a 14 times
+# larger image in the time of 256 samples, since recording takes half of a pass of such small images. Samplers that cost
+# more are left out of the comparison, too.
 DEAREST = 1400
 _REFERENCE, _SHARED = 1 << 20, 1 << 21
 
@@ -64,7 +64,7 @@ def main() -> None:
 
 
 class Kept:
-    """Stacks and numbers of a scene in a folder: what is there is not made again."""
+    """A cache of the stacks and numbers of a scene in a folder."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -81,7 +81,7 @@ class Kept:
 
 
 def bench_scene(path: str, args: argparse.Namespace) -> dict:
-    """What the pilot saw, and what is true: rows of sampler, method, shared -> errors by samples."""
+    """The measurements of the pilot and the true ones: rows of sampler, method, shared -> errors by samples."""
     load_scene, render_stack = common.renderer()
     from data_gen.adaptive import LEAST, Adaptive
     from data_gen.choosing import pipelines
@@ -221,7 +221,7 @@ def cells(entry: dict) -> list[dict]:
     unit = next(row["seconds"] for row in entry["rows"] if row["pilot"]["sampler"] == entry["first"])
     found = []
     for n in LADDER:
-        # So much that the slowest of the methods fits too.
+        # The time includes the slowest method.
         seconds = n * unit + max(row["after"] for row in entry["rows"])
         errors = {}
         for p, row in zip(pipelines, entry["rows"], strict=True):

@@ -1,4 +1,4 @@
-"""Times the classical reconstructions against what they are made of and what they replace.
+"""Times the classical reconstructions, their parts, and the solvers that they replace.
 
     python -m bench.reconstruction --out bench/results/reconstruction.json
 
@@ -9,8 +9,8 @@ Per size, on synthetic stacks of three float32 channels:
     cg         l2 by plain conjugate gradients, to the residual that l2 itself has
     irls       l1 by the reference schedule: 20 reweightings of 50 conjugate gradient steps (once; it is long)
 
-cg and irls use the same threaded stencils as ours. The energies of l1 and irls are given over the minimum, which ADMM
-gives when it runs for long.
+cg and irls use the same threaded stencils as ours. The energies of l1 and irls are relative to the minimum, which a
+long run of ADMM gives.
 """
 
 import argparse

@@ -55,7 +55,7 @@ def main() -> None:
     for scene in args.scenes:
         known = {}
         for shot in args.shots:
-            # What the camera's way takes is the same for all of its speeds.
+            # The cost of a moving camera is the same at all speeds.
             changes = shot not in SPEEDS
             cost = known[changes] = known.get(changes) or costs(args, scene, shot if changes else "slow")
             print(
@@ -83,7 +83,7 @@ def costs(args: argparse.Namespace, scene: str, shot: str) -> dict[str, dict[str
         for name, gradients in (("restir", "pairs"), ("after", "after"))
     }
     gpt = SAMPLERS["gpt"].made(loaded)
-    # What the slow shot moves by, everywhere: for the time that it takes.
+    # The motion of the slow shot in every pixel, only to measure its time.
     width, height = map(int, args.cost_size.split("x"))
     motion = np.full((height, width, 2), (0.5, 0.0))
     clock: dict[str, list[float]] = {}

@@ -10,8 +10,9 @@ A scene is rendered by each of RENDERS:
                  `sh_normal`; also at twice the size with a quarter of the samples per pixel
     multijitter  the same with Mitsuba's best points
 
-What rivals render, OIDN denoises in each of the WAYS: at K times the size, and told that features are prefiltered (it
-denoises them first), clean or noisy. An image at twice the size is then scaled down. Each cell has, by way:
+OIDN denoises the renders of rivals in each of the WAYS: at K times the size, with features that are declared as
+prefiltered (it denoises them first), clean or noisy. An image at twice the size is then scaled down. Each cell has, by
+way:
 
     seconds  of processors, of the render and of OIDN, both warmed up
     error    after ``steady`` of ``bench.tails``, since references of some rooms are noisy; FLIP is over their mean
@@ -51,7 +52,7 @@ from ngpt.measure.metrics import scores
 from ngpt.subpixels import FEWEST, means
 
 RENDERS = ("default", "ours", "mitsuba", "multijitter")
-# Name -> K, and what OIDN is told of the features
+# Name -> K, and how the features are declared to OIDN
 WAYS = {
     "1 prefiltered": (1, "prefiltered"),
     "2 noisy": (2, "noisy"),
@@ -72,7 +73,7 @@ AOVS = "albedo:albedo,normal:sh_normal"
 
 
 class Images(NamedTuple):
-    """What a denoiser is given, each (H, W, 3) float32."""
+    """The inputs of a denoiser, each (H, W, 3) float32."""
 
     primal: np.ndarray
     albedo: np.ndarray
@@ -170,7 +171,7 @@ def by_ways(images: Callable[[int, int, int], Images]) -> Callable[[int, int], M
 
 
 def images_of(file: str, size: tuple[int, int], render: str) -> Callable[[int, int, int], Images]:
-    """What renders so many samples per pixel by a seed, at K times the size."""
+    """A function of (samples per pixel, seed, K) that renders at K times the size."""
     if render in POINTS:
         return mitsubas(file, size, POINTS[render])
     load_scene, render_stack = renderer()

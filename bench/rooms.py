@@ -1,4 +1,4 @@
-"""Weights compared to the weights that ship, in rooms that nobody trains on, at equal samples:
+"""Compares weights to the shipped weights, in rooms outside of all training sets, at equal samples:
 
     python -m bench.rooms SCENE.xml ... --weights ARM=FILE ARM=FILE ... [--start FILE] --cache FOLDER
 

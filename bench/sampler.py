@@ -1,4 +1,4 @@
-"""What gradients cost and what they are worth, scene by scene, in one run: bench/results/sampler.json.
+"""The cost and the value of gradients, scene by scene, in one run: bench/results/sampler.json.
 
     python -m bench.sampler --folder SCENES [--maps NAME ...]
 
@@ -40,7 +40,7 @@ from ngpt.stack import GradientStack
 
 METHODS = ("l2", "l1", "wcv")
 METRIC = "relMSE trimmed"
-# Far from the seeds 0, 1 ... of what is judged.
+# Far from the seeds 0, 1 ... of the measured renders.
 REFERENCE_SEED, EQUAL_TIME_SEED = 1 << 20, 1 << 21
 
 
@@ -60,7 +60,7 @@ def main() -> None:
     parser.add_argument("--docs", type=Path, default=Path("docs"))
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/sampler.json"))
     args = parser.parse_args()
-    # Kernels from an earlier run would hide what it takes to compile them. To be set before Dr.Jit is loaded.
+    # Kernels from an earlier run would hide the time to compile them. This must be set before Dr.Jit is loaded.
     with tempfile.TemporaryDirectory() as empty:
         os.environ["DRJIT_CACHE_DIR"] = empty
         run(args)

@@ -82,7 +82,7 @@ def main() -> None:
     if args.code:
         return
     if args.against and args.scenes:
-        # The file itself, without its folder: the other version has modules of its own, and may lack this one.
+        # The file runs without its folder: the other version has its own modules, and may lack this one.
         given = [sys.executable, "-P", __file__, *sys.argv[1:], "--code", args.against.resolve().name]
         path = f"{args.against.resolve()}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
         subprocess.run(given, check=True, env=os.environ | {"PYTHONPATH": path})
@@ -96,7 +96,7 @@ def place(cell: dict[str, Any]) -> tuple:
 
 @contextmanager
 def opened(scene: str):
-    """The name of a scene in tables and files, and what to load it by."""
+    """The name of a scene in tables and files, and the argument that loads it."""
     kind, *parts = scene.split(":")
     if kind != "generator" or len(parts) != 2:
         yield scene_name(scene), scene
@@ -147,9 +147,11 @@ def errors(values: list[float]) -> dict[str, float]:
 
 
 def noise(stacks: list[dict[str, np.ndarray]]) -> dict[str, Any]:
-    """Real over claimed: ``deviation`` of the light of the image, ``blocks`` of variances by side of the block; None
-    where nothing is claimed. Of ``primal``, ``primal_var`` and, if paths share their tails, ``shared`` of two or more
-    seeds, (H, W, 3) each."""
+    """Real over claimed noise: ``deviation`` of the image's light, and ``blocks`` of variances by side of the block.
+
+    ``stacks`` are two seeds or more with ``primal``, ``primal_var`` and, if paths share their tails, ``shared``,
+    (H, W, 3) each. Values without a claim are None.
+    """
     primal, own = (np.array([stack[name] for stack in stacks], np.float64) for name in ("primal", "primal_var"))
     shared = np.zeros_like(primal)
     if all("shared" in stack for stack in stacks):

@@ -66,7 +66,7 @@ def crops(folder: Path, results: dict, row: dict, size: int) -> tuple[list[np.nd
 
 
 def count(key: list[dict], answers: str) -> Counter:
-    """How often each method was preferred, in rows of the key; ``-`` is nobody."""
+    """How often each method was preferred, over the rows of the key; ``-`` counts for none."""
     letters = [letter for letter in answers.upper() if not letter.isspace()]
     if len(letters) != len(key):
         raise NgptError(f"{len(letters)} answers to {len(key)} rows; one letter for each row, - for none")

@@ -3,13 +3,13 @@
     python -m bench.shots --folder SCENES --scenes diffuse glossy coffee --out OUT
     python -m bench.shots --folder SCENES --scenes diffuse glossy --shots slow fast object light --pairs 2 --out OUT
 
-Three shots move a scene's own camera sideways: ``static``, ``slow`` (half a pixel a frame, at the distance of what it
-sees in the median) and ``fast`` (8 pixels a frame, to and fro). ``object`` and ``light`` move a shape, ``MOVES``.
+Three shots move a scene's own camera sideways: ``static``, ``slow`` (half a pixel per frame, at the median distance of
+visible surfaces) and ``fast`` (8 pixels per frame, to and fro). ``object`` and ``light`` move a shape, see ``MOVES``.
 relMSE is without the worst 0.1 % of the pixels, flicker is ``ngpt.measure.flicker``; both are means over all frames but
-the first, less what the references' own noise adds. ``+ temporal`` is `ngpt denoise --temporal`, ``+ rules`` the same
-without its network. With ``--plain``, methods that read no gradients have stacks without, of so many samples. With
-``--pairs``, there is a row more, ``wcv + dt``, at ``--spp``; all others are then of stacks without differences in time,
-at ``--spp-without``, for pairs take their time.
+the first, minus the contribution of the references' noise. ``+ temporal`` is `ngpt denoise --temporal`, ``+ rules`` the
+same without its network. With ``--plain``, methods that read no gradients get stacks without gradients, of this number
+of samples. With ``--pairs``, there is one more row, ``wcv + dt``, at ``--spp``. Since pairs take time, all other rows
+then use stacks without differences in time, at ``--spp-without``.
 """
 
 import argparse
@@ -155,7 +155,7 @@ def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path)
 
 
 def shot_of(folder: Path | None, scene: str, shot: str, size: str) -> Any:
-    """A scene, of the folder or built in, with what moves in that shot."""
+    """A scene, from the folder or built in, with the motion of that shot."""
     from data_gen.frames.shot import Shot
 
     pixels = tuple(map(int, size.split("x")))
@@ -167,7 +167,7 @@ def shot_of(folder: Path | None, scene: str, shot: str, size: str) -> Any:
 
 
 def mover(shape: str, way: tuple[float, float, float]):
-    """What moves a shape so far a frame: see ``data_gen.frames.shot.Shot``."""
+    """A function that moves a shape by ``way`` in each frame: see ``data_gen.frames.shot.Shot``."""
     import mitsuba as mi
 
     from data_gen.scenes.geometry import put_vertices, vertices, vertices_name
@@ -210,7 +210,7 @@ def sideways(scene, speed: float):
 
     if speed < 4:
         return CameraPath([key(-1, 0), key(999, 1000 * speed)])
-    # To and fro, that it stays in the room.
+    # To and fro, so that the camera stays in the room.
     return CameraPath([key(frame, speed * (2 if frame % 8 == 2 else -2)) for frame in range(-2, 200, 4)])
 
 

@@ -1,4 +1,4 @@
-"""What reconstructions take beside OIDN, and what they took at an earlier commit: bench/results/speed.json.
+"""The time of reconstructions compared to OIDN and to an earlier commit: bench/results/speed.json.
 
     python -m bench.speed --before f72936e
 
@@ -110,7 +110,7 @@ def stacks(size: str) -> dict[str, Any]:
 
     noisy = stack_of(*map(int, size.split("x")))
     clean = noisy.replace()
-    # Known since ngpt renders it; earlier commits do not ask.
+    # Marks the features as clean, as stacks by ngpt do; earlier commits do not read it.
     clean.attributes["ngpt:featureNoise"] = 0.0
     random = np.random.default_rng(2)
     lit = random.random(noisy["depth"].shape) < 0.005
@@ -165,7 +165,7 @@ def ask(worker: subprocess.Popen, name: str) -> tuple[float, float]:
 
 
 def work(size: str) -> None:
-    """Runs each method that comes in, and tells what it took."""
+    """Runs each method that it reads from standard input, and prints its seconds."""
     from ngpt.methods import reconstruct
 
     given = stacks(size)

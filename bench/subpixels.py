@@ -1,4 +1,4 @@
-"""What subpixels are worth: errors and seconds of denoisers on K x K subpixels of each pixel, over those on pixels.
+"""The value of subpixels: errors and seconds of denoisers on K x K subpixels of each pixel, relative to pixels.
 
     python -m bench.subpixels living-room/scene.xml generator:20261211:partition --references FOLDER
 
@@ -9,7 +9,7 @@ denoise are in WAYS. Each cell has, of each way:
     seconds  of processors, warmed up
     error    relMSE by two halves of a reference, without the worst 0.1 % of the pixels; FLIP is over their mean
 
-and the noise of features, with whether that is little beside the image's (``ngpt.denoisers.clean``).
+and the noise of features, and whether it is small compared to the image's (``ngpt.denoisers.clean``).
 
 The table shows the ratio of each value to the value of ``BASE``: the median over seeds.
 """
@@ -34,7 +34,7 @@ from ngpt.repair import repair
 from ngpt.stack import GradientStack
 from ngpt.subpixels import means, subpixels
 
-# Name -> method, K, features as OIDN is told of them; "" leaves that to the method
+# Name -> method, K, and how features are declared to OIDN; "" leaves that to the method
 WAYS = {
     "1 prefiltered": ("oidn", 1, "prefiltered"),
     "1 noisy": ("oidn", 1, "noisy"),

@@ -69,7 +69,7 @@ def means(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-# Columns of evaluations, and what tables call them: OIDN on our own samples, and what a user would take instead
+# Columns of evaluations and their names in tables: OIDN on our own samples, and the usual alternative of a user
 RIVALS = {"oidn": "OIDN", "mitsuba": "Mitsuba + OIDN"}
 
 

@@ -1,4 +1,4 @@
-"""What shared tails are worth: seconds and errors with tails=shared relative to tails=paths.
+"""The value of shared tails: seconds and errors with tails=shared relative to tails=paths.
 
     python -m bench.tails kitchen/scene.xml bedroom/scene.xml --references FOLDER --groups rooms=kitchen,bedroom
 
@@ -7,15 +7,15 @@ Samplers are `primal`, `gpt`, and `mitsuba`: `primal` with Mitsuba's own points 
 
     seconds    of processors, of the render and of the reconstruction, both warmed up; whole: both together
     error      relMSE by two halves of a reference, without the worst 0.1 % of the pixels; FLIP is over their mean
-    steady     the same error, relative to the denoised reference, which also says which pixels are the worst: where a
-               reference is noisy most of its pixels are too dark, and ``error`` rewards images that are too dark
-    blocks     root of the same error of means over 8x8 pixels; none where it is below what the halves can tell
+    steady     the same error, relative to the denoised reference, which also selects the worst pixels. Most pixels of a
+               noisy reference are too dark, so ``error`` rewards images that are too dark
+    blocks     root of the same error of means over 8x8 pixels; none if it is too small for the halves to measure
     energy     mean of the image over the mean of the reference
     auto       the method that the stack gets by default, in cells of the sampler that `ngpt render` takes by default
 
-References are NAME-WxH-a.exr and -b.exr of the folder; what is missing is rendered there, without shared tails. At
-equal whole time a cell with shared tails is over the errors of its own sampler and method with tails=paths; for the
-marks see ``bench.curves``. W, C and W/C of gradients are against `primal` with the same tails. Cells that the
+References are NAME-WxH-a.exr and -b.exr of the folder; missing ones are rendered there, without shared tails. At equal
+whole time, the errors of a cell with shared tails are divided by those of its own sampler and method with tails=paths;
+for the marks see ``bench.curves``. W, C and W/C of gradients are against `primal` with the same tails. Cells that the
 file has are not measured again. Values are medians over seeds, means over scenes geometric.
 """
 
@@ -53,7 +53,7 @@ VALUES = ("error", "steady", "FLIP", "blocks", "energy")
 ERRORS = VALUES[:-1]
 # Far from the seeds of images
 REFERENCE_SEED = 1 << 20
-# With these a render comes to its second round of samples: all kernels are compiled.
+# With this number of samples a render reaches its second round, so that all kernels are compiled.
 WARM_SPP = 9
 CELL = ("scene", "size", "sampler", "tails", "spp", "seed")
 
@@ -180,7 +180,7 @@ def clean_image(reference: Reference) -> np.ndarray:
 
 
 def steady_error(image: np.ndarray, reference: Reference, clean: np.ndarray) -> float:
-    """relMSE by both halves of the reference, relative to the ``clean`` one, without the worst 0.1 % by that."""
+    """relMSE by both halves of the reference, relative to the ``clean`` one, without the 0.1 % that are worst by it."""
     each = (squared_error(image, *halves) / (clean**2 + EPSILON) for halves in (reference.images, (clean,)))
     return trimmed_mean(*each, share=0.001)
 
@@ -267,7 +267,7 @@ def show(cells: list[dict], groups: dict[str, list[str]]) -> None:
 
 
 def pipelines() -> dict[str, dict[str, str]]:
-    """Columns of an evaluation; `oidn` knows no gradients."""
+    """Columns of an evaluation; `oidn` reads no gradients."""
     pairs = [(sampler, method) for sampler, methods in METHODS.items() for method in methods]
     return {
         f"{sampler}+{method}": {"sampler": sampler, "stack": "gradients" if sampler == "gpt" else "primal"}
@@ -356,7 +356,7 @@ def marked(value: tuple[float, str] | None) -> str:
 
 
 def over(values: list[tuple[float, str] | None]) -> str:
-    """Their geometric mean, where all are there."""
+    """The geometric mean of the values as text, with its mark, if none is missing."""
     known = [value for value in values if value]
     if len(known) < len(values):
         return "-"
