@@ -76,7 +76,7 @@ def _found(
 
 
 def _likely(ratio: float, expected: np.ndarray, contrasts: float, pixels: float) -> np.ndarray:
-    """The likelihood of each law, (laws), by the ``ratio`` of squared contrasts to variances and the ``expected`` ones.
+    """The probability of each law, (laws), by the ``ratio`` of squared contrasts to variances and those ``expected``.
 
     A sample variance is a mean over this number of orthogonal ``contrasts``. The observed contrast is compared with all
     others: divided by what a law expects, their ratio has an F distribution. Its degrees of freedom are one and the

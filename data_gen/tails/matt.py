@@ -92,7 +92,7 @@ class Plain:
 
 
 def reflectance(bsdf: mi.BSDF | mi.BSDFPtr, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
-    """ρ by the material's own diffuse reflectance."""
+    """ρ by the material itself: π times f of its diffuse lobe, see ``Matt.reflectance``."""
     context = mi.BSDFContext()
     # Materials of several lobes leave out the other lobes, except ``principled``.
     context.type_mask = mi.BSDFFlags.DiffuseReflection
