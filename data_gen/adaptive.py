@@ -1,4 +1,4 @@
-"""Samples where they pay: after a few samples everywhere, more of them where the result's error is large.
+"""Adaptive samples: a few samples everywhere first, then more of them where the result's error is large.
 
 Before each step the chosen method reconstructs the image twice, which gives the standard error of its result
 (``ngpt.api.uncertainty``); docs/use/adaptive.md says how the samples of a step follow from it. The samples that decide
@@ -54,7 +54,7 @@ _PART = 96
 
 @dataclass(frozen=True)
 class Adaptive:
-    """How samples are shared out.
+    """How samples are distributed.
 
     The ``error`` is relative: the root of the mean of (x - r)² / (r² + 1e-3) over all but the worst 0.1 % of the
     pixels, for the result x of the ``method`` and the converged image r, as far as standard errors foretell it.
@@ -152,7 +152,7 @@ class Assessment:
 
 
 def assess(stack: GradientStack, method: str) -> Assessment:
-    """The expected error of what a method would make of the stack."""
+    """The expected error of the method's result for the stack."""
     result, again = reconstruct(stack, method), reconstruct(noisier(stack), method)
     light = ndimage.uniform_filter(np.nan_to_num(result.image).astype(np.float64), (3, 3, 1))
     unit = np.sqrt(np.square(light) + EPSILON)

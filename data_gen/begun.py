@@ -27,7 +27,7 @@ from ngpt.stack import GradientStack
 from ngpt.subpixels import SUBPIXELS
 from ngpt.system.files import save
 
-# The fraction of the time asked for that is too little to go on for
+# A rest below this fraction of the requested time is not worth rendering
 _NOTHING = 0.02
 # Samples per pixel that are too few to be shared out: what is left is rendered evenly then.
 SHARED = 32
@@ -46,7 +46,7 @@ def part_seed(seed: int, part: int) -> int:
 
 
 class Unfinished(NgptError):
-    """What failed amid a render, and the ``stack`` of the samples that were done by then."""
+    """A failure amid a render, with the ``stack`` of the samples that were done by then."""
 
     def __init__(self, message: str, stack: GradientStack):
         super().__init__(message)
@@ -112,7 +112,7 @@ def _same(request: RenderRequest, path: Path, attributes: Mapping[str, Any], fra
         )
     for what, ours in request.identity(frame).items():
         if (theirs := said.get(what)) != ours:
-            # Names alike differ in the checksum, which says nothing to anybody.
+            # Scenes of the same name differ in the checksum, which tells a user nothing.
             alike = what == "scene" and str(theirs).rpartition(" ")[0] == str(ours).rpartition(" ")[0]
             why = " (its file, -D, --sensor, --camera, --fps or --dt was another)" if alike else ""
             raise NgptError(

@@ -1,4 +1,4 @@
-"""What a render may spend, and who watches it: two small records that go down to each pass."""
+"""The budget of a render and the functions that watch it: two small records that are passed down to each pass."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Budget:
     clock: Callable[[], float] = wall  # or time.process_time, which other work on the machine hardly moves
 
     def check(self) -> None:
-        """Raises WrongUse for what no scene could be rendered with."""
+        """Raises WrongUse for budgets with which no scene could be rendered."""
         if self.spp is not None and not 1 <= self.spp < 2**31:
             raise WrongUse(f"{self.spp} samples per pixel: from 1 to 2^31 - 1 can be rendered")
         if self.seconds is not None and not 0 < self.seconds < float("inf"):

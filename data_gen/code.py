@@ -1,4 +1,4 @@
-"""Which code a render runs: what cached stacks are keyed by, so that no other code can have made them.
+"""Which code a render runs. Its hash is part of the key of cached stacks, so a change of code makes new ones.
 
 The files are found by following imports, anywhere in a file, from the sampler's own module and from
 ``data_gen.render``, which all samplers share. Nothing is listed by hand. Nothing is imported either: Mitsuba need not

@@ -36,7 +36,7 @@ from ngpt.version import __version__
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
-# The share of light cut from the cache that is said
+# The share of light cut from the cache from which on a message reports it
 _MUCH_CUT = 0.01
 
 
@@ -179,7 +179,7 @@ def render(
 
 
 def options_as_attribute(entry: Entry, settings: dict[str, Any]) -> dict[str, str]:
-    """What a header says of a sampler's options, where some are not the defaults."""
+    """The header's attribute with a sampler's options, if some differ from the defaults."""
     unusual = entry.unusual(settings)
     return {"ngpt:samplerOptions": unusual} if unusual else {}
 

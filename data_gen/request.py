@@ -24,7 +24,7 @@ from ngpt.merging import REQUEST
 from ngpt.options import as_text
 
 DEFAULT_SPP = 32
-# Parts of a variant's name that say where and how precisely it computes, and nothing of the light
+# Parts of a variant's name for its backend and precision, which do not change the light
 _MACHINES = {"scalar", "llvm", "cuda", "metal", "ad", "double"}
 
 
@@ -70,7 +70,7 @@ class RenderRequest:
     ``camera``     its path: key frames (.json), or a file with an animated camera (.glb, .gltf) at so many ``fps``
     ``dt``         pairs of paths a pixel, 2 or more, for differences to the frame before; 0: none
 
-    Raises NgptError for what makes no sense for any scene: what is made is checked.
+    Raises NgptError for values that make no sense for any scene.
     """
 
     scene: Any
@@ -107,7 +107,7 @@ class RenderRequest:
         self._set("scene", str(self.scene) if isinstance(self.scene, Path) else self.scene)
         self._set("parameters", dict(self.parameters or {}))
         self._set("options", dict(self.options or {}))
-        # What is made over time of a shot may need gradients.
+        # A method that denoises a shot over time may need gradients.
         self._set("gradients", self.gradients or bool(self.frames))
         remembers = FRAME_SAMPLERS.get(self.sampler) if self.frames else None
         timed = self.seconds is not None or self.cpu_seconds is not None
@@ -164,7 +164,7 @@ class RenderRequest:
         return Budget(self.spp, self.cpu_seconds, memory, time.process_time)
 
     def header(self, frame: int | None = None) -> dict[str, str]:
-        """The attribute of the header that says what was asked for, of a ``frame`` or an image, in canonical form."""
+        """The header's attribute with the request for a ``frame`` or an image, in canonical form."""
         budget = {"spp": self.spp, "seconds": self.seconds, "error": self.error}
         return {REQUEST: json.dumps(self.identity(frame) | budget, sort_keys=True)}
 
@@ -223,7 +223,7 @@ _WATCHED = {each.name for each in fields(Watch)}
 
 
 def asked(scene: Any, given: Mapping[str, Any], frames: Iterable[int] = ()) -> tuple[RenderRequest, Watch]:
-    """The request of a call by keywords, and who watches it. What neither of the two knows is an option of the sampler.
+    """The request and the watch of a call by keywords. Keywords that neither of them has are options of the sampler.
 
     A ``scene`` that is a request already is returned as it is; raises WrongUse if anything else is ``given``.
     """

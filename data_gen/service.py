@@ -1,4 +1,4 @@
-"""What ngpt asks of a renderer: this module is a ``ngpt.renderer.Renderer``, which says more of each function."""
+"""The renderer for ngpt: this module is a ``ngpt.renderer.Renderer``, which documents each function."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def load(source: str, size: tuple[int, int]) -> mi.Scene:
 def render(scene: mi.Scene, options: Options, spp: int | None, seed: int, *, seconds: float | None) -> GradientStack:
     from data_gen.render import render_stack
 
-    # References and what is compared are unbiased, unless a row's options name tails=shared.
+    # References and compared renders are unbiased, unless a row's options name tails=shared.
     return render_stack(scene, spp, seed, **{"seconds": seconds, "unbiased": True, "gradients": True, **options})
 
 

@@ -47,7 +47,7 @@ def render_scene(
     """Renders the stack of a scene: a Mitsuba scene, a scene file, or a built-in scene by name.
 
     ``given`` are fields of ``data_gen.request.RenderRequest``, which says what they mean, functions of
-    ``data_gen.budget.Watch``, which hear of the render (``progress``, ``stop``, ...), and options of the sampler. A
+    ``data_gen.budget.Watch``, which follow the render (``progress``, ``stop``, ...), and options of the sampler. A
     request may be given in place of the scene, and then only functions with it.
 
     The same seed and number of samples give the same bits. Raises NgptError for options that do not exist or make no
@@ -90,12 +90,12 @@ def render_frames(
 ) -> Iterator[tuple[int, GradientStack]]:
     """(frame, its stack with motion vectors) of each of the ``frames`` of a shot, one after the other.
 
-    ``skip``     asked when a frame's turn has come whether to leave it out
-    ``progress`` frame -> what is called as the ``progress`` of ``render_scene``
+    ``skip``     called when a frame's turn has come; returns whether to leave the frame out
+    ``progress`` frame -> a function that is called as the ``progress`` of ``render_scene``
 
-    All else is as of ``render_scene``; ``data_gen.frames.shot`` says more of seeds and motion. After a frame that
-    ``stop`` has broken off, which has ``ngpt:unfinished`` (with ``dt`` it is not given), there is none. A shot that
-    changes by other means than a file's parameters is a ``data_gen.frames.shot.Shot``. Raises NgptError as
+    All else is as in ``render_scene``; ``data_gen.frames.shot`` describes seeds and motion. A frame that ``stop`` ended
+    early is the last one, with ``ngpt:unfinished``; with ``dt`` it is not yielded. A shot that changes by other means
+    than a file's parameters is a ``data_gen.frames.shot.Shot``. Raises NgptError as
     ``render_scene``, and for cameras without a projection.
     """
     request, watch = asked(scene, {"spp": spp, "seed": seed, "sampler": sampler, **given}, frames)

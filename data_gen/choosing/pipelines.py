@@ -106,7 +106,7 @@ class Pipeline:
 
     @property
     def _begins(self) -> float:
-        """What the error is taken for at ``spp``."""
+        """The error assumed at ``spp``."""
         return (self.error + _DOUBT * self.doubt) * self.gain
 
 
@@ -172,7 +172,7 @@ def _need(stack: GradientStack, clock: Callable[[], float]) -> tuple[float, floa
 
 
 def methods_for(sampler: str, only: str = "auto") -> list[str]:
-    """What may reconstruct the sampler's stacks, of what runs here."""
+    """The methods that can reconstruct the sampler's stacks and run here."""
     names: tuple[str, ...] = WITH_GRADIENTS if SAMPLERS[sampler].gradients else WITHOUT
     if only != "auto":
         needs = runnable(only).needs

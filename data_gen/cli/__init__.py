@@ -6,7 +6,7 @@ from ngpt.cli import CONTINUES, Verb
 
 ROOM = "data_gen.cli"
 
-# What the first pass of a render is at for seconds, where no earlier render of the scene has left them
+# Shown during the first pass of a render, which takes long unless an earlier render left its kernels
 KERNELS = "compiling kernels ..."
 
 VERBS = {

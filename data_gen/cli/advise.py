@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 # More are not advised.
 LARGEST_SPP = 1 << 20
-# What an advice may take, in seconds
+# Seconds that the trials may take
 _LONGEST = 60.0
 
 
@@ -109,7 +109,7 @@ def rows_of(pipelines: list[Pipeline], seconds: float | None, error: float | Non
 
 
 def commands_of(row: Row, args: argparse.Namespace) -> list[str]:
-    """What to type for that row: a line that renders the stack, and one that denoises it."""
+    """The commands for that row: a line that renders the stack, and one that denoises it."""
     stem = f"{Path(args.scene).stem}-{row.spp}spp"
     adaptive = ["--adaptive"] if row.adaptive else []
     render = ["ngpt", "render", args.scene, "-o", f"{stem}.exr", "--spp", str(row.spp), "--sampler", row.sampler]

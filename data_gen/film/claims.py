@@ -29,7 +29,7 @@ _AROUND = 5
 
 
 def factors(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net: int) -> np.ndarray:
-    """By how much the sample ``variance`` of the mean is to be multiplied, (H, W, 1).
+    """The factor (H, W, 1) that corrects the sample ``variance`` of the mean.
 
     ``contrast``, as defined above, and ``variance`` are (H, W, C). Pixels where one of them is NaN are not used.
     ``samples`` (H, W) is the number of samples of each pixel, and ``net`` the number of points in the first round.
@@ -48,7 +48,7 @@ def factors(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net
 
 
 def factor(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net: int) -> np.ndarray:
-    """As ``factors``, (N, 1), for pixels (N, C) that form one group, however much noise each of them has."""
+    """As ``factors``, (N, 1), for pixels (N, C) that all count as one group."""
     squares, variances = np.square(contrast).sum(axis=-1), variance.sum(axis=-1)
     good = np.flatnonzero(np.isfinite(squares) & np.isfinite(variances))
     return _found(squares, variances, samples, net, good, 1)[:, None]
@@ -76,7 +76,7 @@ def _found(
 
 
 def _likely(ratio: float, expected: np.ndarray, contrasts: float, pixels: float) -> np.ndarray:
-    """How likely each law is, (laws), by the ``ratio`` of squared contrasts to variances, and what laws ``expected``.
+    """The probability of each law, (laws), by the ``ratio`` of squared contrasts to variances and those ``expected``.
 
     A sample variance is a mean over this number of orthogonal ``contrasts``. The observed contrast is compared with all
     others: divided by what a law expects, their ratio has an F distribution. Its degrees of freedom are one and the

@@ -20,7 +20,7 @@ from ngpt.stack import GradientStack
 from ngpt.subpixels import SUBPIXELS, means
 from ngpt.windows import Place
 
-# What samplers shift paths by, (x, y) in pixels, y down: each difference of the contract, and back. The film keeps the
+# The shifts of samplers, (x, y) in pixels, y down: each difference of the contract, and back. The film keeps the
 # differences "neighbour - base" at the base pixel and combines both directions when it develops.
 SHIFTS = {
     f"{layer}{sign}": (factor * x, factor * y)
@@ -34,7 +34,7 @@ DISCARDED = "diagnostics.discarded"
 
 # Parts of the primal, by the lobe of the first scattering event
 _SPLIT = ("diffuse", "specular")
-# Features whose noise is said in one number, see ``GradientFilm.feature_noise``
+# Features whose noise is given as one number, see ``GradientFilm.feature_noise``
 _FEATURES = ("albedo", "normal")
 _WITH_VARIANCE = frozenset({"primal", "caustic", *_SPLIT, *SHIFTS, *_FEATURES})
 # Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 21; and the moments of
@@ -74,7 +74,7 @@ class GradientFilm:
     With ``subpixels`` K > 1 the film also keeps what denoisers read by K x K subpixels of each pixel
     (``ngpt.subpixels``). Each pass is then announced by ``begin_pass``. Batches have no subpixels.
 
-    ``bytes`` are what it takes at most; less where it is said that no ``gradients`` will be put.
+    ``bytes`` is the most memory that the film takes; it takes less without ``gradients``.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class GradientFilm:
         self.splats(name, len(components)).add(pixel, components, mi.Bool(active))
 
     def splats(self, name: str, channels: int = 3) -> Splats:
-        """What collects the splats of a name in this pass: its ``add`` may be called within symbolic loops."""
+        """The splats of a name in this pass; ``add`` of it may be called within symbolic loops."""
         if not self.batches:
             raise ValueError("this film takes samples for independent, which splats are not: make it with batches")
         if name not in self._splats:
@@ -405,7 +405,7 @@ class GradientFilm:
 
     @property
     def _numbers(self) -> np.ndarray:
-        """How many values the variance of each pixel is taken over, (pixels): samples, or batches."""
+        """The number of values behind the variance of each pixel, (pixels): samples, or batches."""
         return np.full(self.pixels, self.blocks) if self.batches else self.samples_each
 
     @property

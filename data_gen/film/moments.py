@@ -48,8 +48,8 @@ def no_moments(width: int, channels: int, variance: bool, halves: bool = False) 
 
 
 def one_more(old: Moments, x: list, exists, number: mi.UInt32, weight: mi.UInt32 | int = 1) -> Moments:
-    """The statistics with one more sample ``x``, which has this ``number``, for each strand where it ``exists``; one
-    that is not finite is lost. A mean of several samples counts as many times: its ``weight``."""
+    """The statistics with one more sample ``x``, which has this ``number``, for each strand where it ``exists``.
+    A sample that is not finite counts as lost. ``weight`` is the number of samples that ``x`` is the mean of."""
     Float64 = dr.float64_array_t(mi.Float)
     finite = dr.all([dr.isfinite(component) for component in x])
     good = exists & finite
@@ -129,7 +129,7 @@ def put_back(moments: Moments, some: Moments, place: mi.UInt32) -> Moments:
 
 
 def _each(moments: Moments, f: Callable, *others: Moments) -> Moments:
-    """The statistics whose arrays are those that ``f`` makes of the arrays of ``moments`` and of the ``others``."""
+    """Applies ``f`` to each array of ``moments`` and the same array of the ``others``; returns new statistics."""
 
     def of(value, *more):
         if isinstance(value, list):

@@ -20,7 +20,7 @@ SPLAT_BYTES = BINS * 8
 
 
 class Splats:
-    """For each pixel the exact sum of what is put on it.
+    """The exact sum of the values that each pixel receives.
 
     ``add`` may be called within symbolic loops. Digits below 2^-71 are cut off. Values of 2^64 or more, and values that
     are not finite, are dropped and counted.

@@ -1,4 +1,4 @@
-"""What denoisers read, summed by the K x K subpixels of each pixel.
+"""Sums of the inputs of denoisers over the K x K subpixels of each pixel.
 
 The position of a sample in its pixel determines its subpixel. Points are spread evenly over a pixel, so that each
 subpixel has the same number of them where the number of samples is a multiple of K², and the points are the default
@@ -110,5 +110,5 @@ class Subpixels:
 
 
 def bytes_of_subpixels(k: int, caustic: bool) -> int:
-    """What a strand takes for K x K subpixels; ``caustic``: whether light may be put by that name."""
+    """Bytes of a strand for K x K subpixels; ``caustic``: whether light may be put under that name."""
     return k * k * (BYTES + (BYTES_OF_CAUSTIC if caustic else 0)) if k > 1 else 0

@@ -63,7 +63,7 @@ class CameraPath:
 
 
 def look_at(origin, target, up) -> np.ndarray:
-    """The (4, 4) matrix of a Mitsuba camera at ``origin`` that looks at ``target``; raises ValueError if there is none.
+    """The (4, 4) matrix of a Mitsuba camera at ``origin`` that looks at ``target``; ValueError if there is none.
 
     A camera looks along its +z, with +x to the left of the image.
     """
@@ -181,7 +181,7 @@ def _numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
 
 
 def horizontal(fov: float, axis: str, aspect: float) -> float:
-    """A field of view along the width, in degrees, of one along ``axis``; ``aspect`` is width over height."""
+    """Converts a field of view along ``axis`` to one along the width, degrees; ``aspect`` is width over height."""
     if axis == "x":
         return fov
     return 2 * math.degrees(math.atan(aspect * math.tan(math.radians(fov) / 2)))

@@ -42,7 +42,7 @@ def read_gltf_camera(path: str | Path, fps: float) -> CameraPath:
         return _path(Path(path), content, binary, fps)
     except NgptError:
         raise
-    # What is missing, or of another type than it should be, shows where it is used.
+    # Missing entries and wrong types raise errors where they are used.
     except (LookupError, AttributeError, TypeError, ValueError, ArithmeticError, RecursionError, struct.error) as error:
         raise NgptError(f"{path}: is no glTF 2.0 file that can be understood: {error!r}") from error
 

@@ -1,12 +1,12 @@
-"""Motion vectors: where on the film what a pixel shows was one frame before.
+"""Motion vectors: from each pixel to the place on the film, one frame before, of the point that it shows.
 
-A pixel shows what the ray through its centre meets first that scatters smoothly. The hit is looked up in the scene of
+A pixel shows the first smoothly scattering point on the ray through its centre. The hit is looked up in the scene of
 the frame before by shape, primitive and barycentric coordinates, which holds for any deformation of a mesh; shapes that
 are no meshes, and instances, move by their ``to_world``. A ``Snapshot`` keeps the geometry of the scene before.
 
-What is seen in mirrors and through glass stands where it seems to: at the end of the straight ray of the path's length.
-That is exact for plane mirrors in a scene at rest, and takes no notice of things that move behind curved ones. Rays
-that escape show what is infinitely far. Surfaces count, media do not.
+A thing seen in a mirror or through glass counts where it seems to be: at the end of a straight ray as long as the path.
+This is exact for plane mirrors in a scene at rest. It ignores the motion of things seen in curved mirrors. Rays that
+escape show points at infinity. Surfaces count, media do not.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def _film(sensor: mi.Sensor) -> np.ndarray:
 
 
 class _Middle:
-    """In place of random numbers: of two ways, always the likelier."""
+    """A sampler of constants: it always takes the likelier of two ways."""
 
     def next_1d(self, active=True) -> mi.Float:
         return mi.Float(0.5)
@@ -72,7 +72,7 @@ class _Middle:
 
 @dataclass(frozen=True)
 class Seen:
-    """What the rays through the centres of all N pixels meet, row by row."""
+    """The hits of the rays through the centres of all N pixels, row by row."""
 
     points: np.ndarray  # (N, 4) homogeneous, in the world: where it seems to be; directions where rays escape
     straight: np.ndarray  # whether it is there: no mirror and no lens on the way
@@ -152,7 +152,7 @@ def window_moved(now: Snapshot, before: Snapshot) -> tuple[int, int]:
 
 
 def _displacement(now: Geometry, old: Geometry, what: Seen, here: np.ndarray) -> np.ndarray | None:
-    """(n, 3): from where the pixels ``here`` see a shape to where that was; None where that cannot be known."""
+    """(n, 3) from the points of a shape seen by the pixels ``here`` to their previous places; None if not known."""
     if isinstance(now, Mesh) and isinstance(old, Mesh) and now.faces.shape == old.faces.shape:
         b1, b2 = what.barycentric[here].T
         weights = np.stack([1 - b1 - b2, b1, b2], axis=-1)[..., None]

@@ -29,7 +29,7 @@ from ngpt.stack import GradientStack
 
 
 class Remembering:
-    """The frames of one shot, by a sampler that remembers those before.
+    """The frames of one shot, by a sampler that remembers previous frames.
 
     ``changes``: whether more than the camera may change from frame to frame.
     """
@@ -80,7 +80,7 @@ class Shot:
                   they change; kernels are compiled once, as long as frames consist of the same kinds of things.
     ``camera``    moves the first sensor
     ``sensor``    number or id of the sensor to render; None: the first
-    ``update``    changes ``mi.traverse(scene)`` for a frame; what it sets once it must set in every frame
+    ``update``    changes ``mi.traverse(scene)`` for a frame; it must set the same parameters in every frame
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Shot:
         self._shapes: tuple[Geometry, ...] | None = None
 
     def at(self, frame: int) -> mi.Scene:
-        """The scene in the state of a frame; what was returned before changes, or is no longer used."""
+        """The scene in the state of a frame. A scene returned earlier changes with it or is out of use."""
         name, parameters = self.describe(frame)
         wanted = (name, dict(parameters))
         if self._scene is None or wanted != self._loaded:
@@ -193,7 +193,7 @@ def render_shot(
                     f"frame {frame} is {now.place.data} and frame {previous} {before.place.data}: --dt and "
                     "samplers that reuse frames need crop windows of one size; only move them"
                 )
-            # What cannot be rendered, for lack of memory for example, is refused before motion is computed.
+            # A frame that cannot be rendered, for lack of memory for example, is refused before motion is computed.
             failed: Exception | None = None
             if remembering is not None:
                 remembering.begin(scene)

@@ -137,8 +137,8 @@ class BentLamps:
 
 
 def sample_emitter(scene: mi.Scene, bent: BentLamps | None, x: mi.Interaction3f, u: mi.Point2f, active) -> tuple:
-    """``scene.sample_emitter_direction(x, u, False, active)``, right for ``bent`` lamps too; and the ``front`` there,
-    None in scenes without them."""
+    """``scene.sample_emitter_direction(x, u, False, active)``, also right for ``bent`` lamps; and their ``front``,
+    None in scenes without bent lamps."""
     if not bent:
         return *scene.sample_emitter_direction(x, u, False, active), None
     return bent.sample(x, Chosen.of_scene(scene, u, active), active)

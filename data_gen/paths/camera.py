@@ -93,7 +93,7 @@ class CameraSamples:
         return mi.Point2f(self.pixel % self.columns, self.pixel // self.columns)
 
     def _draw(self, seed: int, pixel: mi.UInt32, sample: mi.UInt32, net: int) -> None:
-        """All random numbers of a camera sample; ``position`` is that within the pixel."""
+        """Draws all random numbers of a camera sample; ``position`` is its place within the pixel."""
         self.random = sample_streams(seed, pixel, sample, int(self.size.x), net)
         self.position = self.random.next_2d()
         self.lens = self.random.next_2d() if self.sensor.needs_aperture_sample() else mi.Point2f(0.5)
@@ -112,7 +112,7 @@ class CameraSamples:
         return y * size + x
 
     def at(self, lanes: mi.UInt32) -> CameraSamples:
-        """The samples of only these ``lanes``, as far as rays and random numbers go."""
+        """The samples of only these ``lanes``, with their rays and random numbers and no other fields."""
 
         def gather(value):
             return dr.gather(type(value), value, lanes) if dr.width(value) > 1 else value

@@ -45,5 +45,5 @@ def ends_late(smooth: mi.Bool, connectable: mi.Bool, sharp_next: mi.Bool) -> mi.
 
 
 def split(late: mi.Bool, light: mi.Spectrum) -> tuple[mi.Spectrum, mi.Spectrum]:
-    """``light`` as what does not belong to the layer, and what does."""
+    """Splits ``light`` into the part outside the layer and the part in it."""
     return dr.select(late, 0, light), dr.select(late, light, 0)

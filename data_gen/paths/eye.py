@@ -1,4 +1,4 @@
-"""The camera as an end of paths, also of paths that start at a light: only what these need."""
+"""The camera as an end of paths, including paths that start at a light."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class ThinLens:
 
 @dataclass
 class Eye:
-    """A camera, and what each lane has drawn of its lens, its shutter and its spectrum."""
+    """A camera, with a point on the lens, a time and a wavelength for each lane."""
 
     sensor: mi.Sensor
     lens: mi.Point2f  # place on the lens, in [0, 1]²
@@ -106,10 +106,10 @@ class Eye:
     def toward(self, si: mi.Interaction3f, lens: mi.Point2f, active: mi.Bool | bool = True) -> tuple:
         """From ``si`` to the place ``lens`` on the lens: a DirectionSample3f, and the camera's W / distance².
 
-        ``uv`` of it is the place on the film, in pixels; ``p`` is where the ray from there begins, on the near plane;
-        ``pdf`` is 0 where the camera does not see ``si``, whatever is in between, else 1. W = 1 / (A cos³), with A the
-        film's area at distance 1. Mitsuba 3.9's own importance is 0 in the part of the film that an offset of the
-        principal point adds, and its thin lens sees what is before the near plane.
+        Its ``uv`` is the place on the film, in pixels. Its ``p`` is the point on the near plane where the camera ray
+        begins. Its ``pdf`` is 1 if ``si`` is in the camera's view, else 0; occlusion does not count.
+        W = 1 / (A cos³), with A the film's area at distance 1. Mitsuba 3.9's own importance is 0 in the part of the
+        film that an offset of the principal point adds, and its thin lens sees things before the near plane.
         """
         if self.thin:
             to = self.thin.toward(self.sensor.world_transform(), si, lens, mi.Vector2f(self.size))
@@ -134,7 +134,7 @@ class Eye:
 
 @dataclass
 class Sight:
-    """What both paths of a camera sample begin with: the path from the camera and the path from a light."""
+    """The start of both paths of a camera sample: the path from the camera and the path from a light."""
 
     eye: Eye
     random: Any  # the stream of random numbers of the paths to come

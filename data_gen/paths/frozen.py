@@ -71,8 +71,9 @@ class Frozen:
 class _Recorded:
     """A function that ``dr.freeze`` records, with arrays that it uses beside its arguments.
 
-    ``dr.freeze`` makes a class, which only Python's collector of circles frees. Until then all would live that the
-    class knows: scenes of earlier renders, which make kernels larger, and whose end has them recorded anew.
+    ``dr.freeze`` makes a class, which only Python's collector of reference cycles frees. Until then everything that the
+    class refers to would live. Scenes of earlier renders make kernels larger, and freeing them has functions recorded
+    again.
     """
 
     def __init__(self, f: Callable, state: list):

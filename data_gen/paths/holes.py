@@ -18,7 +18,7 @@ from data_gen.paths.vertex import NULL, SMOOTH, ByMaterial, dr_number
 from data_gen.scenes.facts import shapes_of
 from data_gen.scenes.integrators import objects_in
 
-# Materials that know how much goes straight through, if those within them do
+# Materials that return the share of light that goes straight through, if the materials within them do
 _KNOWN = ("MaskBSDF", "Null", "ThinDielectric", "BlendBSDF")
 
 
@@ -56,7 +56,7 @@ class Aim(_Straight):
 
 @dataclass
 class Edge(_Straight):
-    """An edge of a path from either end, however many holes it leads through."""
+    """An edge of a path from either end, which may lead through several holes."""
 
     first: mi.Bool  # it begins at the camera or at a lamp
 
@@ -77,7 +77,7 @@ class Holes:
         self.known = ByMaterial(mi.Bool(table))
 
     def passed(self, bsdf: mi.BSDFPtr, kind: mi.UInt32) -> mi.Bool:
-        """Whether an event of that ``kind`` goes through a hole as rays toward emitters do."""
+        """Whether an event of that ``kind`` goes straight through a hole, like rays toward emitters."""
         return (kind == NULL) & self.known.of(bsdf)[1]
 
     def share(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
@@ -89,7 +89,7 @@ class Holes:
 
     @classmethod
     def of(cls, scene: mi.Scene, passed: Callable[[mi.Shape], bool] = lambda shape: False) -> Holes | None:
-        """The holes of a scene, but in shapes that are ``passed``; None where there are none."""
+        """The holes of a scene, except in shapes that are ``passed``; None if it has no holes."""
         bsdfs = (shape.bsdf() for shape in shapes_of(scene) if not passed(shape))
         some = [bsdf for bsdf in bsdfs if bsdf is not None and has_holes(bsdf) and knows(bsdf)]
         return cls(some) if some else None

@@ -1,8 +1,8 @@
-"""Walks on the manifold of specular paths: how a copy of a path goes through the same mirrors and glass to one point.
+"""Walks on the manifold of specular paths: they lead a copy of a path through the same mirrors and glass to one point.
 
 A path leaves a rough vertex z in direction ω, meets k specular events, and arrives at x_c. From another vertex z' the
-same events lead to the same x_c along some other ω', if along any: two equations for two unknowns, which Newton's
-method solves from ω on. [Hanika et al. 2015, "Manifold next event estimation"; Hua et al. 2019, "A Survey on
+same events may lead to the same x_c along another direction ω'. These are two equations for two unknowns; Newton's
+method solves them from ω on. [Hanika et al. 2015, "Manifold next event estimation"; Hua et al. 2019, "A Survey on
 Gradient-Domain Rendering", section 3.4]
 
     B     dx_c/dω, a 2x2 matrix, by ray differentials [Igehy 1999, "Tracing ray differentials"]; x_c moves on the plane
@@ -39,7 +39,7 @@ Ends = Callable[["mi.SurfaceInteraction3f"], "mi.Bool"]
 
 
 def nowhere(si: mi.SurfaceInteraction3f) -> mi.Bool:
-    """A chain ends nowhere but behind its events."""
+    """False everywhere: a chain ends only behind its last event."""
     return mi.Bool(False)
 
 
@@ -57,7 +57,7 @@ class Shot:
     """A chain from a vertex z in some direction, up to the plane of the target."""
 
     good: mi.Bool  # it has met all its events, and arrives from before the plane
-    miss: mi.Vector2f  # on the plane, the way from the target to where it arrives
+    miss: mi.Vector2f  # from the target to the point of arrival, on the plane
     reach: mi.Float  # the length that ``miss`` compares with
     B0: mi.Vector2f  # columns of B, for two orthogonal turns of ω
     B1: mi.Vector2f

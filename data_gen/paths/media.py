@@ -1,9 +1,9 @@
 """Media, and the vertices of paths in them.
 
-A vertex of a path is on a surface or in a medium. One in a medium is a ``SurfaceInteraction3f`` too, of no shape, with
-a normal of 0 and the world's axes for a frame, so that what holds for any vertex is written once; its ``Place`` says
-which of the two it is. The ways between vertices are in ``data_gen.paths.segments``. Nothing of either is compiled into
-the kernel of a scene without media.
+A vertex of a path is on a surface or in a medium. A vertex in a medium is also a ``SurfaceInteraction3f``, without a
+shape, with a normal of 0 and the world's axes as its frame. So the same code handles both kinds; the ``Place`` of a
+vertex says which kind it is. The segments between vertices are in ``data_gen.paths.segments``. The kernel of a scene
+without media contains none of this code.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def evaluate_and_sample(
     u_lobe: mi.Float,
     u_direction: mi.Point2f,
 ) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum]:
-    """Both at once: materials are virtual functions, and calls to them dear."""
+    """Both in one call, because calls to virtual functions of materials are expensive."""
     context = mi.BSDFContext()
     if place is None:
         f, p, sample, f_p = bsdf.eval_pdf_sample(context, x, wo, u_lobe, u_direction)
@@ -162,7 +162,7 @@ def choose_channel(u: mi.Float) -> mi.UInt32:
 
 
 def pick(value: mi.Spectrum, channel: mi.UInt32) -> mi.Float:
-    """Its value in one colour."""
+    """The component of ``value`` in colour ``channel``."""
     if not mi.is_rgb:
         return value[0]
     return dr.select(channel == 0, value[0], dr.select(channel == 1, value[1], value[2]))
@@ -203,8 +203,8 @@ def beyond(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, medium: mi.MediumPt
 def onward(ray, hit, medium, reach: mi.Float, target: mi.Point3f | None) -> tuple[mi.Ray3f, mi.MediumPtr, mi.Float]:
     """``beyond()``, and what is left of ``reach``; aimed at the ``target`` anew, where there is one and it is finite.
 
-    Behind a boundary a ray is displaced along the normal. If it grazes the surface of its target it would meet that
-    before the target, by more than rays to a point are shortened, and seem to be blocked.
+    Behind a boundary a ray is displaced along the normal. A displaced ray that grazes the target's surface could meet
+    this surface before the target and seem to be blocked.
     """
     after, there = beyond(ray, hit, medium)
     left = reach - hit.t

@@ -1,4 +1,4 @@
-"""Weights of techniques that could all have made a path, and of the two paths of a pair."""
+"""MIS weights: of the techniques that can sample a path, and of the two paths of a pair."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import mitsuba as mi
 
 
 def mis_weight(chosen: mi.Float, other: mi.Float) -> mi.Float:
-    """Power heuristic of two techniques' densities by their ratio: squares of densities would leave float32."""
+    """Power heuristic of two densities. It uses their ratio, because squared densities could overflow float32."""
     return dr.select(chosen > 0, dr.rcp(1 + dr.square(other / chosen)), 0)
 
 

@@ -51,7 +51,7 @@ def draw(random, media: Media) -> Numbers:
 
 
 def next_surface(scene):
-    """What ``fly()`` and ``cross()`` trace pieces of rays with."""
+    """The function ``trace`` of ``fly()`` and ``cross()``."""
     return lambda ray, medium, active: scene.ray_intersect_preliminary(ray, active=active)
 
 
@@ -113,7 +113,7 @@ def cross(passes, trace, ray, medium, reach, *, active, target):
     crossing = mi.Bool(active)
     while dr.hint(crossing, label="transmittance"):
         hit = trace(ray, medium, crossing)
-        # A ray that was shortened, not to meet what it leads to, goes all the way in the medium.
+        # A ray shortened so as not to meet its target still crosses the medium over its full length.
         τ += depth(extinction(medium, ray), dr.select(hit.is_valid(), hit.t, reach))
         crossing &= hit.is_valid() & passes(hit.shape)
         if crossing:
@@ -129,7 +129,7 @@ def see(media: Media, trace, ray, medium, reach, *, channel, key, active) -> tup
     if not media.grids:
         τ, hit, ray, medium = cross(media.passes, trace, ray, medium, reach, active=active, target=None)
         return dr.exp(-τ), hit, ray, medium
-    # Ratio tracking: at each collision of the majorant what is null goes on.
+    # Ratio tracking: each collision of the majorant multiplies T by the share of null collisions.
     every = {"channel": channel, "key": key, "scale": mi.Float(1), "most": mi.UInt32(0xFFFFFFFF), "target": None}
     τ, hit, ray, medium, _, N = collisions.cross(media.passes, trace, ray, medium, reach, **every, active=active)
     return dr.exp(-τ) * N, hit, ray, medium
@@ -199,7 +199,7 @@ def reconnect(scene, media: Media, y, place: Place, ray, *, x1, base: Segment, c
     else:
         τ, hit, _, medium = cross(media.passes, trace, ray, medium, reach, active=active, target=target)
         N, N_c = 1, 1
-    # In what is around x1 both paths must have come: a boundary may have holes.
+    # Both paths must arrive through the same medium: a boundary may have holes.
     blocked = hit.is_valid() | (medium != base.place.medium)
     τ_c = pick(τ, channel)
     return dr.exp(base.τ_c - τ) * base.albedo * N, dr.exp(base.τ_c - τ_c) * N_c, blocked

@@ -44,8 +44,8 @@ def replay_inverts(offset_kind: mi.UInt32, offset: mi.Bool, offset_next: mi.Bool
 def keeps_joined(kind: mi.UInt32) -> mi.Bool:
     """Whether a path that has come to the shared vertex from elsewhere may leave it as its companion does.
 
-    A mirror or a hole, unlike a smooth event, sends light from elsewhere elsewhere. From either side the shift is
-    rejected then: the mirror that one path has sampled, the other cannot have sampled in the same direction.
+    It may after a smooth event. A mirror or a hole gives each incoming direction its own outgoing one. Then the shift
+    is rejected from both sides, since neither path can sample the direction of the other.
     """
     return kind == SMOOTH
 
@@ -102,6 +102,6 @@ def copy_half_vector(
     J = dr.select(bends, length2_offset / length2 / cosines, cosines)
     wo_offset.z = dr.select(thin, -wo_offset.z, wo_offset.z)
     exists = ((wi_offset.z * wo_offset.z < 0) == refracts) & (~refracts | (same & (wi.z * wi_offset.z > 0)))
-    # What is no refraction about h to begin with has no inverse.
+    # A pair of directions that is no refraction about h has no inverse.
     exists &= (~bends | ((cos2 > 0) & (dr.dot(wi, h) * dr.dot(wo, h) < 0))) & dr.isfinite(J) & (J > 0)
     return dr.select(exists, wo_offset, mi.Vector3f(0, 0, 1)), dr.select(exists, J, 0), exists

@@ -1,7 +1,7 @@
-"""What is between the surfaces of a scene: nothing, or media. The paths of ``gpt`` ask it, and nothing else does.
+"""The space between the surfaces of a scene: empty, or filled with media. Only the paths of ``gpt`` use it.
 
-Nothing of media is compiled into the kernel of a scene without them: there a vertex has no ``Place``, a path draws no
-numbers for its segments, and a segment is the ray to the next surface.
+The kernel of a scene without media contains no code for them. There a vertex has no ``Place``, a path draws no numbers
+for its segments, and a segment is the ray to the next surface.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from data_gen.paths.segments import Numbers, Segment
 
 @dataclass
 class Drawn:
-    """What a path has drawn for one step through media."""
+    """Random numbers of a path for one step through media."""
 
     channel: mi.UInt32  # the colour by which it samples its distances, the same in all steps
     numbers: Numbers  # of the segment
@@ -45,7 +45,7 @@ class Space:
         return None
 
     def draw(self, random, channel: mi.UInt32 | None) -> Drawn | None:
-        """What another step needs, of a path that samples distances by that ``channel``."""
+        """Random numbers of one more step of a path that samples distances by that ``channel``."""
         return None
 
     def first(self, view, ray, within, drawn: Drawn | None) -> Segment:

@@ -84,7 +84,7 @@ class ByMaterial:
         dr.eval(self.values)
 
     def of(self, bsdf: mi.BSDFPtr, active: mi.Bool | bool = True) -> tuple[mi.Bool, mi.Bool | mi.Float]:
-        """Whether each of the ``active`` materials has a value, and that, 0 where not."""
+        """Whether each of the ``active`` materials has a value, and the value, else 0."""
         number = dr.reinterpret_array(mi.UInt32, bsdf)
         listed = active & (number < self.size)
         return listed, dr.gather(type(self.values), self.values, number, listed)
@@ -149,7 +149,7 @@ def consistent(
 def evaluate(
     bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: bool | mi.Bool = True
 ) -> tuple[mi.Spectrum, mi.Float]:
-    """f cos θ of a material and the density of sampling ``wo``, for directions that nobody sampled there.
+    """f cos θ of a material and the density of sampling ``wo``, for directions that were not sampled there.
 
     Such directions may lie below the horizon, where some materials (``roughplastic``) return NaN. Then the value is 0.
     """

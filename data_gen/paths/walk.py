@@ -1,6 +1,6 @@
-"""What all walks of paths have in common: how long they may be, who survives, and what is seen where one escapes.
+"""Rules of all random walks: the largest depth, Russian roulette, and the environment that an escaping path sees.
 
-Every rule stands here once, since samplers must agree in it: two that end their paths otherwise render two images.
+Each rule is written once, because samplers must agree: different ends of paths would give different images.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ngpt.errors import NgptError
 
 UNLIMITED = 0xFFFFFFFF
 
-# None survives a step for certain, were it at a perfect mirror: so all paths end.
+# The largest probability to survive, even at a perfect mirror: below 1, so that all paths end.
 _MOST = 0.95
 
 
@@ -65,7 +65,7 @@ class Limits:
 
 
 def roulette(throughput: mi.Float, plays: mi.Bool | bool, η: mi.Float | None = None) -> mi.Float:
-    """Russian roulette: the probability to survive, by which what survives is to be divided; 1 where none ``plays``.
+    """Russian roulette: the probability to survive, which survivors are divided by; 1 where a path does not ``plays``.
 
     For a path from the camera, ``throughput`` is the largest channel of its weight behind the step, and ``η`` the
     product of the relative indices of refraction up to there: η² undoes what refraction does to radiance, as in
@@ -77,7 +77,7 @@ def roulette(throughput: mi.Float, plays: mi.Bool | bool, η: mi.Float | None = 
 
 
 def brightest(paths: Iterable[Any]) -> mi.Float:
-    """The largest throughput of all these paths, which have ``β``, and count where they are ``alive``."""
+    """The largest throughput ``β`` of those paths that are ``alive``."""
     largest = mi.Float(0)
     for path in paths:
         largest = dr.fmax(largest, dr.select(path.alive, dr.max(path.β), 0))

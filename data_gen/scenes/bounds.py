@@ -15,7 +15,7 @@ from ngpt.errors import NgptError
 
 
 def mend_bounds(scene: mi.Scene) -> None:
-    """Computes wrong boxes of a scene's meshes again, and what depends on them.
+    """Corrects wrong bounding boxes of a scene's meshes, and updates everything that depends on them.
 
     Raises NgptError for a mesh whose box stays wrong.
     """

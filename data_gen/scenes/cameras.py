@@ -1,4 +1,4 @@
-"""Cameras of Mitsuba: what they are called, which part of a picture they show, and which no sampler renders."""
+"""Cameras of Mitsuba: their names, the part of a picture that they show, and cameras that no sampler renders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One line that says why an image is black, where nothing else would."""
+"""A warning in one line that explains a black image."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def warn_if_black(scene: mi.Scene, image: np.ndarray) -> None:
 
 
 def why_black(scene: mi.Scene) -> str:
-    """What rays of the first sensor meet, where that explains a black image of a scene with lamps."""
+    """Why the first sensor of a scene with lamps sees black, by the hits of its rays; "" if they do not explain it."""
     random, sensor = mi.PCG32(_RAYS, 0x1A3B), scene.sensors()[0]
     film, lens = (mi.Point2f(random.next_float32(), random.next_float32()) for _ in range(2))
     ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), random.next_float32(), film, lens)

@@ -1,4 +1,4 @@
-"""What the choice of a sampler depends on."""
+"""Facts about a scene that decide which sampler renders it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Mitsuba's integrators: what each is called, and which other one renders the same image where ours follow it only."""
+"""Mitsuba's integrators: their names, and which one our samplers follow in place of another with the same image."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _PLUGINS = {
     "PRBVolpathIntegrator": "prbvolpath",
     "BasicVolumetricPrimitiveRadianceFieldIntegrator": "volprim_rf_basic",
 }
-# What renders the same image; the second where emitters hide from the camera, which Mitsuba's projective ones do
-# otherwise
+# Integrators that render the same image. The second is for emitters that hide from the camera, which Mitsuba's
+# projective integrators treat differently.
 _SAME = {
     "prb": ("path", "path"),
     "prb_basic": ("path", "path"),
@@ -47,7 +47,7 @@ AROUND = ("aov", "moment", "stokes")
 def plugin_name(integrator: mi.Integrator) -> str:
     """The plugin name of an integrator, or the name of its class where it is not one of Mitsuba's."""
     name = integrator.class_name()
-    if name not in _PLUGINS:  # What is written in Python gives the name of Mitsuba's class that it derives from.
+    if name not in _PLUGINS:  # An integrator in Python gives the name of its base class in Mitsuba.
         name = type(integrator).__name__
     return _PLUGINS.get(name, name)
 
@@ -76,7 +76,7 @@ def followed(integrator: mi.Integrator) -> mi.Integrator:
 
 
 def objects_in(thing: mi.Object, kind: type) -> list:
-    """The objects of a ``kind`` right within another: integrators of an integrator, materials of a mask."""
+    """The direct children of an object that are of a ``kind``: integrators of an integrator, materials of a mask."""
 
     # The class must refer only to its arguments: reference cycles would keep other objects, and their scene, alive.
     class Inside(mi.TraversalCallback):
@@ -117,9 +117,9 @@ def check_integrator(integrator: mi.Integrator) -> None:
 
 
 def own_estimate(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[..., mi.Spectrum]:
-    """(sampler, ray, medium, active) -> what the integrator itself estimates along camera rays.
+    """A function (sampler, ray, medium, active) -> the integrator's own estimate of radiance along camera rays.
 
-    That raises NgptError where the integrator fails.
+    The function raises NgptError if the integrator fails.
     """
     call: Callable[..., Any] = partial(integrator.sample, scene)
     if isinstance(integrator, mi.CppADIntegrator):

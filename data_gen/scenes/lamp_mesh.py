@@ -1,4 +1,4 @@
-"""One emitter for many lamps that share a mesh: what ``many_lamps`` makes of them."""
+"""One emitter for many lamps that share a mesh; ``many_lamps`` makes it."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def mesh_of(props: mi.Properties) -> mi.Mesh:
 
 @cache
 def _emitter(variant: str) -> type:
-    """The class for that variant, which must be the current one: Mitsuba's own classes are others in each."""
+    """The class for that variant, which must be the current one: each variant has its own base classes."""
 
     class Lamps(mi.Emitter):
         """Many area lamps of one mesh, each with its radiance, on the side that its faces turn to.

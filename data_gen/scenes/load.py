@@ -34,8 +34,8 @@ def load_scene(
     """Loads a Mitsuba 3 scene file, or the built-in scene of that name.
 
     ``size`` is (width, height) in pixels and replaces the scene's film size; a crop window stays the same part of
-    it. ``parameters`` sets the file's ``<default>`` values. Meshes of one material are ``merged`` into one, which
-    renders the same and starts much sooner; where they are to move, or to be found by name, they must not be.
+    it. ``parameters`` sets the file's ``<default>`` values. ``merged`` joins the meshes of each material into one,
+    which renders the same and starts much sooner; it must be off if meshes move or are looked up by name.
     ``sensor``, a number or an id, is the only one that the scene then has. Raises NgptError with Mitsuba's complaint.
     """
     parameters = parameters or {}
@@ -67,9 +67,9 @@ def load_scene(
 
 
 def check_scene(scene: object) -> mi.Scene:
-    """The scene, where it is one of the current variant, with right bounding boxes: see ``bounds``.
+    """Returns the scene, with corrected bounding boxes (see ``bounds``).
 
-    Raises NgptError for what has to be loaded first.
+    Raises NgptError for an object that is no loaded scene of the current variant.
     """
     if isinstance(scene, mi.Scene):
         mend_bounds(scene)
@@ -86,7 +86,7 @@ def check_scene(scene: object) -> mi.Scene:
 
 
 def complaint(error: Exception) -> str:
-    """What Mitsuba says is wrong with a scene, in one line, and in our words where its own do not help."""
+    """Mitsuba's error about a scene in one line, rewritten where it does not help."""
     text = " ".join(str(error).split())
     if "<animation>" in text:
         return f"animated transforms (motion blur) are not known to Mitsuba {mi.__version__}; remove <animation>"
@@ -145,7 +145,7 @@ def at_most(scene: mi.Scene, pixels: int):
 
 
 def _scaled(begin: int, length: int, whole: int, new: int) -> tuple[int, int]:
-    """Begin and length of a part of ``new`` pixels that was one of a ``whole``: a pixel at least."""
+    """Scales the part ``begin``, ``length`` of a ``whole`` to ``new`` pixels; it keeps at least one pixel."""
     first, end = ((2 * int(edge) * new + int(whole)) // (2 * int(whole)) for edge in (begin, begin + length))
     first = min(first, new - 1)
     return first, max(end - first, 1)
@@ -161,18 +161,18 @@ def path_depths(path: mi.SamplingIntegrator) -> dict[str, int]:
 
 
 def reference_integrator(scene: mi.Scene) -> mi.SamplingIntegrator:
-    """What decides which transport is rendered: the scene's own integrator, or the one of the same image that is
-    followed in its place, or Mitsuba's ``path`` if it has none. Raises NgptError for one without camera rays."""
+    """The integrator that defines the rendered transport: the scene's own, or the one followed in its place, or
+    Mitsuba's ``path`` if the scene has none. Raises NgptError for an integrator without camera rays."""
     integrator = scene.integrator() or mi.load_dict({"type": "path"})
     check_integrator(integrator)
     return followed(integrator)
 
 
 def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int | str | None) -> object:
-    """What ``mi.load_file`` gives, with no sensor but the one of that number or id, where one is named.
+    """The result of ``mi.load_file``, with only the given ``sensor`` (a number or an id) unless that is None.
 
-    Where ``merged``, meshes are as ``data_gen.scenes.merge`` has them. Merged as Mitsuba would (``optimize=True``),
-    shapes and emitters come in another order each time, and with them other bits.
+    ``merged`` merges meshes by ``data_gen.scenes.merge``. Mitsuba's own merging (``optimize=True``) changes the order
+    of shapes and emitters from call to call, and with it the bits of the image.
     """
     with found_beside(path):
         config, state = parsed(path, parameters)
@@ -213,7 +213,7 @@ def _keep(state: mi.parser.ParserState, sensor: int | str, path: str) -> None:
 
 @contextmanager
 def found_beside(path: str):
-    """While in it, files that a scene names are looked for beside it first."""
+    """Within the block, Mitsuba looks for the files of a scene in the scene's folder first."""
     resolver = mi.file_resolver()
     before = list(resolver)
     resolver.prepend(str(Path(path).resolve().parent))

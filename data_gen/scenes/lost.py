@@ -1,4 +1,4 @@
-"""Lamps whose light is hard to find, or wrong, and what in a scene makes it so."""
+"""Lamps whose light is hard to find or wrong, and the causes in a scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from data_gen.scenes.lamp_mesh import table_of
 _SHARP = ("SmoothConductor", "SmoothDielectric")
 # Lamps smaller than this share of the scene's diagonal are met by hardly any path.
 _TINY = 1 / 500
-# By the part of its class's name that all kinds of it have: the disk of a sun fills 7e-5 of a hemisphere.
+# Part of the class name of all emitters with a sun, whose disk fills 7e-5 of a hemisphere.
 _SUN = "Sunsky"
 # Below this mean cosine, that of 2.6 degrees, vertex normals are not those of the faces.
 _BENT = 0.999
@@ -41,7 +41,7 @@ def _has_no_size(emitter: mi.Emitter) -> bool:
 
 
 def has_holes(scene: mi.Scene) -> bool:
-    """Whether light goes straight through something, media apart."""
+    """Whether light goes straight through a surface of the scene; media do not count."""
     bsdfs = (shape.bsdf() for shape in shapes_of(scene) if not shape.is_medium_transition())
     return any(bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
 
@@ -78,5 +78,5 @@ def is_bent(shape: mi.Shape) -> bool:
 
 
 def _is_sharp(bsdf: mi.BSDF | None) -> bool:
-    """Whether it is a mirror or clear glass, or one within it."""
+    """Whether a material is a mirror or clear glass, or contains one."""
     return bsdf is not None and (bsdf.class_name() in _SHARP or any(map(_is_sharp, objects_in(bsdf, mi.BSDF))))

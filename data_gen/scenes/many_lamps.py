@@ -102,7 +102,7 @@ def _has_texture(state: mi.parser.ParserState, number: int) -> bool:
 
 
 def _lamp(shape: mi.Properties, radiance: np.ndarray) -> Lamp | None:
-    """What a node of a mesh describes; None where its vertex normals are not those of its faces."""
+    """The lamp of a mesh's node; None if its vertex normals are not those of its faces."""
     flipped = bool(shape.get("flip_normals", False))
     normals = None
     if shape.plugin_name() == "rectangle":

@@ -9,7 +9,7 @@ MESHES = ("obj", "ply", "serialized", "cube", "rectangle")
 
 
 def parts_of(props: mi.Properties) -> list[tuple[str, int]]:
-    """(name, number of the node) of what a node refers to."""
+    """(name, number) of each node that a node refers to."""
     return [(name, part.index()) for name, part in props.items() if is_part(part)]
 
 

@@ -34,7 +34,7 @@ from data_gen.paths.streams import mixed
 from data_gen.tails.schedule import FINENESS
 from data_gen.tails.table import Grid, Place, in_table, key, octahedral
 
-# MiB that the cache takes, and of those a render may use, what makes this little
+# MiB that the cache takes, and the MiB of a render from which on this is little
 MIB, LEAST_MIB = 320, 640
 # A path may end where its spread has reached this share of its way to the first rough surface.
 NEAR = 1 / 8
@@ -88,7 +88,7 @@ _BITS, _MOST_BITS = 24, 40
 
 @dataclass
 class Known:
-    """What paths may read by cell: the mean of each sort of light, RGB, and how many records the smaller half has; and
+    """The values that paths read, by cell: the mean of each sort of light, RGB; the records of the smaller half; and
     half of the difference between the two halves, with 1 where the first half says that the cell is torn, plus 2 where
     the second one does."""
 
@@ -99,7 +99,7 @@ class Known:
     grid: Grid
 
     def place_of(self, x: mi.SurfaceInteraction3f, spread: mi.Float, kind: mi.UInt32 | int) -> Place:
-        """Where vertex ``x`` lies among the cells that are ``fineness`` times smaller than the ``spread``.
+        """The place of vertex ``x`` among the cells that are ``fineness`` times smaller than the ``spread``.
 
         Vertices of different ``kind`` share no light.
         """
@@ -113,9 +113,9 @@ class Known:
         """The light of each sort at a place, a sample of its error, and whether it is known, by the ``least`` number of
         records in each half; to all, or to paths that feed a ``half``.
 
-        What one half has found says nothing of whether its own light may be read, only of the other half's: else cells
-        that have found rare light would look torn, and light would be lost. So where just one half says that a cell
-        is torn, the light of that one is read every other time, and else the path goes on.
+        The records of one half decide only whether the light of the other half may be read. Otherwise cells that have
+        found rare light would look torn, and light would be lost. Where just one half says that a cell is torn, the
+        path reads the light of that half every other time, and goes on the other times.
         """
         h, name, _ = key(place)
         slot, found = in_table(self.keys, h, name, active)
@@ -139,12 +139,12 @@ class Known:
 
 
 class Cache:
-    """Growing sums of ``sorts`` kinds of light by cell, and what paths may read of them.
+    """Growing sums of ``sorts`` kinds of light by cell, and the means of them that paths may read.
 
     The number of a cell's records decides whether the cell is trusted, not the light in them. Where light is rare, a
     cell that has found some looks uncertain, and a cell that has missed it looks certain. Trusting only the certain
-    cells would lose light: see docs/samplers/tails.md. A *torn* cell is not trusted either: one whose two parts along
-    an axis have other light, as where a wall goes through it. Paths go on from there by themselves.
+    cells would lose light: see docs/samplers/tails.md. A *torn* cell is not trusted either: its two parts along an axis
+    have different light, for example because a wall goes through it. Paths do not end in such a cell.
 
     """
 
@@ -208,10 +208,10 @@ class Cache:
     def fade(self) -> None:
         """Halves the weight of what is known, before paths add records that end in it.
 
-        Such records repeat the noise of what they have read. Let g be the share of their light that comes from there,
+        Such records repeat the noise of the cells they read. Let g be the share of their light that comes from there,
         and let the number of records double in each round. With equal weights, the noise of the first records would be
         (1 + g) / 2 of itself a round later. Where light is rare, g is large, and that is more than sqrt(1/2), the rate
-        of independent records. With half the weight it is (1 + 2 g) / 3. The noise of records' own grows by 13 %. A
+        of independent records. With half the weight it is (1 + 2 g) / 3. The records' own noise grows by 13 %. A
         cell keeps the weight of ``LEAST`` records, so that it is not forgotten.
         """
         much = self.weight >= 2 * LEAST * _WHOLE
@@ -258,7 +258,7 @@ class Cache:
         dr.eval(self.known.keys, means, differences)
 
     def torn(self, fineness: float) -> mi.Bool:
-        """By half and cell: where a half has found other light in one part of the cell than in the other.
+        """By half and cell: whether the half has found different light in the two parts of the cell along an axis.
 
         Finer cells are judged more strictly, as their light may differ less: so the light that passes through walls
         vanishes with the size of cells.
@@ -279,13 +279,13 @@ class Cache:
 def _mean_and_variance(n: mi.Float, light: mi.Float, squares: mi.Float) -> tuple[mi.Float, mi.Float]:
     """The mean of n values and the variance of that mean, from their sums in _PARTS."""
     mean = light / dr.maximum(_PARTS * n, 1)
-    # No less than what rounding makes of it
+    # At least the error of rounding
     spread = dr.maximum(squares / dr.maximum(_PARTS * n, 1) - dr.square(mean), 1 / _PARTS)
     return mean, spread / dr.maximum(n - 1, 1)
 
 
 def joined(parts: Iterable[Any]) -> Any:
-    """Arrays one behind the other. ``dr.concat`` compiles their widths into its kernels, which are others each time."""
+    """Concatenates arrays. ``dr.concat`` would compile their widths into a new kernel each time."""
     parts = list(parts)
     whole, begin = dr.empty(type(parts[0]), sum(map(dr.width, parts))), 0
     for part in parts:

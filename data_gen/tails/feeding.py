@@ -23,7 +23,7 @@ from data_gen.film import GradientFilm
 BEGIN, LEAST, MOST = 1 / 2, 1 / 16, 1.0
 # Side of a block, in pixels, and the share of blocks with the most noise that do not count
 _BLOCK, _TRIM = 16, 0.01
-# What is dark counts less: light is relative to its own block and to this share of the mean.
+# Dark blocks count less: light is relative to its own block plus this share of the mean.
 _DARK = 0.05
 
 
@@ -50,7 +50,7 @@ def share(film: GradientFilm, fed: float) -> float | None:
 
 
 def _blocks(image: np.ndarray) -> np.ndarray:
-    """Means over blocks of an image (H, W, C); at its ends, over what is there."""
+    """Means over blocks of an image (H, W, C); blocks at its borders may be smaller."""
     for axis in (0, 1):
         begins = np.arange(0, image.shape[axis], _BLOCK)
         counts = np.diff(np.append(begins, image.shape[axis]))

@@ -1,4 +1,4 @@
-"""Which materials let a path end in the cache, and how much of what arrives there they scatter like a matt surface.
+"""Which materials let a path end in the cache, and the share of arriving light that they scatter like a matt surface.
 
 The cache knows the light that *arrives* at a surface, weighted by the cosine: its irradiance over π. Every material
 with a diffuse part scatters some of that light as a matt surface of reflectance ρ would,
@@ -23,20 +23,20 @@ from data_gen.paths.vertex import SMOOTH, ByMaterial, consistent, evaluate, even
 # The tangent of the angle between the normal and the direction that ρ is read off: as far from a mirror direction as
 # from the horizon
 _TILT = 1.0
-# Flags of whatever else a material may do
+# Flags of all other lobes
 _ELSE = ("Delta", "Delta1D", "Null", "Glossy", "DiffuseTransmission")
-# What disturbs the normal of the material that it wraps
+# Materials that disturb the normal of the material inside
 _BUMPS = re.compile("(Bump|Normal)Map")
 
 
 class Matt:
-    """What the cache needs to know about a scene's materials."""
+    """Facts about a scene's materials that the cache needs."""
 
     def __init__(self, scene: mi.Scene):
         bsdfs = materials_of(scene)
         table = np.zeros(max(bsdfs, default=0) + 1, bool)
         table[[number for number, bsdf in bsdfs.items() if is_lambertian(bsdf)]] = True
-        # What is inside shape groups is not listed.
+        # Materials inside shape groups are not listed.
         groups = any(shape.class_name() == "Instance" for shape in scene.shapes())
         self.any = groups or any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) for bsdf in bsdfs.values())
         self.nothing_else = ByMaterial(mi.Bool(table))
@@ -52,7 +52,7 @@ class Matt:
         return active & mi.has_flag(x.bsdf().flags(), mi.BSDFFlags.DiffuseReflection)
 
     def lambertian(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-        """Whether it has nothing else: a path that ends there does not go on for a rest."""
+        """Whether the diffuse part is all of the material: a path that ends there has no rest to go on for."""
         listed, lambertian = self.nothing_else.of(x.bsdf(), active)
         return listed & lambertian
 
@@ -92,7 +92,7 @@ class Plain:
 
 
 def reflectance(bsdf: mi.BSDF | mi.BSDFPtr, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
-    """ρ as a material itself says it."""
+    """ρ by the material itself: π times f of its diffuse lobe, see ``Matt.reflectance``."""
     context = mi.BSDFContext()
     # Materials of several lobes leave out the other lobes, except ``principled``.
     context.type_mask = mi.BSDFFlags.DiffuseReflection

@@ -1,7 +1,7 @@
 """When the cache is fed, how much, and how fine its cells are: all by the number of paths of the image.
 
 So large images have as many rounds as small ones with more samples; and the cache is the same after the same number of
-paths, whatever is to end the render.
+paths, whether samples or time end the render.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ FINENESS, _COARSE, _RATE = 8.0, 1 << 20, 1 / 4
 
 
 def enough(pixels: int, spp: int | None) -> bool:
-    """Whether a render with this number of pixels and samples has a cache, if it can; ``spp`` None: not known."""
+    """Whether a render of this size should have a cache; ``spp`` None: the number of samples is not known."""
     return spp is None or spp > first_sample(pixels)
 
 

@@ -18,7 +18,7 @@ _DIRECTIONS = 8
 
 @dataclass
 class Place:
-    """A vertex as the cache knows it."""
+    """The place of a vertex in the grid of the cache."""
 
     p: mi.Point3f  # from the origin of the grid of its level
     code: mi.UInt32  # direction of the normal on the side that is seen, and what else tells cells apart
@@ -57,8 +57,8 @@ def octahedral(n: mi.Vector3f) -> mi.UInt32:
 
 
 def key(place: Place) -> tuple[mi.UInt32, mi.UInt32, list[mi.Bool]]:
-    """Where in a table the cell may be looked for, what it is known by there, which is never 0, and in which half of
-    the cell the place is along each axis: whether the upper one."""
+    """The first slot of a table to search for the cell, the cell's check value there, which is never 0, and whether the
+    place is in the upper half of the cell along each axis."""
     q = place.p * dr.exp2(mi.Float(-place.level))
     corner = [dr.floor(q[i]) for i in range(3)]
     x, y, z = (mi.UInt32(mi.Int32(c)) for c in corner)

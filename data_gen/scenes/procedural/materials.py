@@ -1,4 +1,4 @@
-"""What things are made of: the same plugins in every scene, with other pictures and numbers.
+"""Materials of things: the same plugins in every scene, with other pictures and numbers.
 
 Dr.Jit compiles one kernel for each *set* of plugins, in 10 s and more, and keeps it. Every scene has one material of
 each entry of ``SLOTS``, so the kernels of the first scene serve all others. What plugins take for a constant of the

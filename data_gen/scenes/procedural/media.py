@@ -99,7 +99,7 @@ def liquid(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
         spot = stage.free_spot(stage.area)
         stage.standing.append((spot[0], spot[1], 1.5 * size))
         write_ply(folder / f"liquid{i}.ply", mesh.placed([spot[0], 0, spot[1]], rng.uniform(0, 6.3)))
-        # What passes through it keeps a tenth of its dimmest colour, or most of all.
+        # Light that passes through keeps between a tenth of its dimmest colour and most of its colours.
         clear = np.clip(colour(rng, 0.1, 0.95, 2.5), 0.02, 0.98)
         sigma_t = -np.log(clear) / size * np.exp(rng.uniform(np.log(0.5), np.log(3)))
         albedo = np.clip(float(rng.choice([0, 0.5, 0.9, 0.98])) * _tinted(rng), 0, 0.99)

@@ -194,7 +194,7 @@ def make_scene(seed: int | tuple[int, ...], folder: Path, shares: Mapping[str, f
     root.append(inside(_camera(rng, origin, target), *media.camera))
     palette = Palette(rng, save)
     for slot in SLOTS:
-        # Far below, where nobody looks: what holds the place of a material that this scene has no use for.
+        # Far below, where nobody looks: a placeholder for each material that this scene does not use.
         mesh = merge(stage.meshes.get(slot, [box([0.01] * 3, [0, -50, 0])]))
         root.append(_shape(folder, slot, mesh, palette.material(slot)))
     black = plugin("bsdf", "diffuse", reflectance=(0.0, 0.0, 0.0))

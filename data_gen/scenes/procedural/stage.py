@@ -21,7 +21,7 @@ class Stage:
         self.meshes: dict[str, list[Mesh]] = {}
         self.standing: list[tuple[float, float, float]] = []
         self.sky = False
-        # What a room has to stand in, or an open set, in metres: x and z, and y.
+        # The space of a room or an open set, in metres: x and z, and y.
         self.area, self.height, self.closed = (4.0, 4.0), 2.4, False
         # Every role is played by one slot at a time; few slots make a scene of one mind, many a jumble.
         self.cast = {role: rng.permutation(slots)[: rng.integers(1, len(slots) + 1)] for role, slots in ROLES.items()}
