@@ -1,7 +1,7 @@
 """Camera paths of a pixel and its neighbours through media, side by side from segment to segment: for ``gvpm``.
 
 As ``camera``, but a segment ends where the path scatters in a medium, or on the surface behind. All paths replay the
-random number that gives the optical depth of that event, in one colour for all of them. So they fly equally far in one medium,
+random number that gives the optical depth of that event, in one colour for all. So they fly equally far in one medium,
 and a path and its copy are the same numbers in two pixels: J = 1 and r = 1, wherever either of them ends.
 """
 
