@@ -13,11 +13,11 @@ neighbour, one for each sign. Values that change sign have no density to choose 
 A pixel's paths come from its whole area, and a path keeps its place on the film to a fraction of a pixel. With the
 motion m of a pixel, paths that were at p in the frame before are now at p - m. So the pixel's area, moved by m, lies on
 up to four pixels of the frame before, and what they have kept there is taken over. This would leave a fifth of the
-pixels without history: the nearest of the four has kept one path, and that may lie beside the area.
-So everything is taken over from the nearest pixel. What lies beside the area is moved by a whole pixel: it *wraps*. A
-path may then have been found in three ways: by this frame's candidate, straight, and wrapped. The MIS weights of the
-three sum to 1, whatever m is. Confidence is handed on in proportion to the areas. [Zhang et al. 2024, "Area ReSTIR";
-Wang et al. 2026, "Gradient-Domain ReSTIR Path Tracing", section 4.3.1]
+pixels without history: the nearest of the four has kept one path, and that may lie beside the area. So everything is
+taken over from the nearest pixel. What lies beside the area is moved by a whole pixel: it *wraps*. A path may then have
+been found in three ways: by this frame's candidate, straight, and wrapped. The MIS weights of the three sum to 1,
+whatever m is. Confidence is handed on in proportion to the areas. [Zhang et al. 2024, "Area ReSTIR"; Wang et al. 2026,
+"Gradient-Domain ReSTIR Path Tracing", section 4.3.1]
 
 That is unbiased as long as motion depends on no random numbers. Where more than the camera changes there are two
 scenes, and records are carried into the one where E is evaluated: see ``data_gen.samplers.restir.carry``. The
