@@ -36,8 +36,8 @@ def loses_light(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> bool:
     """Whether the integrator is ``path`` in a scene where that is biased.
 
     ``path`` returns 0 for a path that escapes after passing only holes, even if emitter sampling has lit it where the
-    material of a mask is partly there; scenes with an environment are not affected. What lamps without size send
-    through holes it never finds.
+    material of a mask is partly there; scenes with an environment are not affected. It also never finds the light that
+    lamps without size send through holes.
     """
     if integrator.class_name() != "PathIntegrator":
         return False
@@ -57,9 +57,9 @@ def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[...
 def recorded(
     scene: mi.Scene, samples: Callable[[CameraSamples], dict], *owners: object, shifts: Iterable = QUARTERS
 ) -> SamplePass:
-    """The pass that puts what ``samples`` gives, recorded once: see ``Frozen``, also for the ``owners``.
+    """A pass that puts the results of ``samples`` on the film, recorded once: see ``Frozen``, also for ``owners``.
 
-    Beside the rays of the camera samples it asks for those by the ``shifts``.
+    It also asks the camera for rays displaced by the ``shifts``.
     """
     frozen = Frozen(scene, *owners)
     return lambda camera, film: film.put_all(frozen(samples, camera.look((0, 0), *shifts)))
@@ -111,20 +111,20 @@ class GradientIntegrator(mi.SamplingIntegrator):
 
     @classmethod
     def parameters(cls, scene: mi.Scene) -> dict[str, Any]:
-        """What of the scene's own integrator this one has as well."""
+        """Those parameters of the scene's own integrator that this one also has."""
         return Limits.of(reference_integrator(scene)).parameters()
 
     def reference(self) -> mi.SamplingIntegrator:
         return mi.load_dict({"type": self.follows, **self.limits.parameters()})
 
     def facts(self, scene: mi.Scene, sensor: mi.Sensor) -> Facts:
-        """The facts about a scene that this integrator renders, whatever the scene's own is."""
+        """The facts about the scene if this integrator renders it instead of the scene's own."""
         return scene_facts(scene, sensor, self.reference())
 
     def prepare(self, scene: mi.Scene, sensor: mi.Sensor | None = None) -> SamplePass:
-        """What takes the samples of a pass of ``sensor``, or of the scene's first one.
+        """Returns the function that takes a pass of samples for ``sensor``, or for the scene's first sensor.
 
-        Raises NgptError for what the registry says that the sampler refuses.
+        Raises NgptError if the sampler refuses the scene by its rules in the registry.
         """
         sensor = sensor or scene.sensors()[0]
         find(self.name, self.facts(scene, sensor))
@@ -151,7 +151,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
             return render_passes(self.prepare(scene, sensor), sensor, seed, budget, **limits)
 
     def share_tails(self, scene: mi.Scene, sensor: mi.Sensor, budget: Budget) -> Budget:
-        """Decides whether paths share their tails, of a plugin that leaves it open; returns what the rest may spend."""
+        """Decides whether paths share their tails, if the plugin leaves it open; returns the remaining budget."""
         if "tails" not in self.options:
             return budget
         found = sharing_of(sensor, self.entry, self.facts(scene, sensor), self.options, budget)

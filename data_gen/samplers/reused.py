@@ -61,7 +61,7 @@ def _key(scene: mi.Scene, options: dict[str, Any]) -> tuple:
 def _values(thing: mi.Object) -> dict[str, Any]:
     """The parameters of a scene or a camera by name.
 
-    ``mi.SceneParameters`` fails where one is None, as ``sigma_a`` of hair is that has its colour from melanin.
+    ``mi.SceneParameters`` fails where one is None, as is ``sigma_a`` of hair with a colour from melanin.
     """
     found = mi.traverse(thing).properties.items()
     return {

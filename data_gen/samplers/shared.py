@@ -20,7 +20,7 @@ def polarised(facts: Facts, name: str) -> str:
 
 
 def spectra(facts: Facts, name: str) -> str:
-    """What paths share with others must have the same wavelengths."""
+    """Paths that share light with others must have the same wavelengths."""
     reason = f"in variant '{facts.spectral}' each path has wavelengths of its own, and '{name}' lets paths share light"
     return f"{reason}, as variant 'llvm_ad_rgb' allows" if facts.spectral else ""
 
@@ -92,7 +92,7 @@ TAILS = Option(
 
 
 def why_not_shared(media: bool, settings: Mapping[str, Any], variant: str) -> str:
-    """Why paths with these ``settings`` cannot share what they find, of a sampler with the option ``tails``.
+    """Why paths of a sampler with the option ``tails`` cannot share their tails under these ``settings``.
 
     ``media``: the paths go through media. "" where they can share.
     """

@@ -33,7 +33,7 @@ class Sharing(NamedTuple):
 
 
 def sharing_of(sensor: mi.Sensor, entry: Sampler, facts: Facts, settings: Mapping[str, Any], budget: Budget) -> Sharing:
-    """Whether a render may share, of a sampler with the option ``tails``.
+    """Whether the paths of a render may share their tails; the sampler has the option ``tails``.
 
     What fits into some memory must fit into more: the cache is there only where film and paths fit beside it.
     """
@@ -50,6 +50,6 @@ def sharing_of(sensor: mi.Sensor, entry: Sampler, facts: Facts, settings: Mappin
         not_now = not_now or "there are few paths"
     if budget.memory < needed:
         not_now = not_now or f"it needs --memory {needed}"
-    # Whoever insists on the cache where memory is too little for both has it beside what the rest may use.
+    # If the user insists on the cache and memory is too small for both, the cache comes on top of the budget.
     beside = 0 if budget.memory < needed else own
     return Sharing(never, not_now, replace(budget, memory=budget.memory - beside))

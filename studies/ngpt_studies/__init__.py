@@ -1,1 +1,1 @@
-"""Samplers and methods that were measured and lost: kept for comparison, on the entry points of ngpt alone."""
+"""Samplers and methods that were measured and lost: kept for comparison. They use only the entry points of ngpt."""

@@ -110,7 +110,7 @@ class Tiles:
         return balanced(members) + dr.select(count > 0, direct / count, 0)
 
     def trace(self, camera: CameraSamples) -> tuple[mi.Spectrum, Paths]:
-        """The layer ``direct``, and the path of each pixel: its first vertex, its suffix, and what it is worth here."""
+        """The layer ``direct``, and the path of each pixel: its first vertex, its suffix, and its contribution here."""
         scene, materials, random = self.scene, self.materials, camera.random.clone()
         limit = self.integrator.limits.max_depth
         ray, importance, _ = camera.rays()
@@ -200,7 +200,7 @@ class Tiles:
 
 @dataclass
 class Suffix:
-    """A path from its second vertex on, and what it takes to connect another first vertex to it."""
+    """A path from its second vertex on, with the data to connect another first vertex to it."""
 
     shared: mi.Bool  # whether others may
     u_light: mi.Point2f  # the numbers of emitter sampling at the first vertex
@@ -226,7 +226,7 @@ class Suffix:
 
 @dataclass
 class Connection:
-    """What one suffix is worth to one pixel: contributions and densities, in the lane of the pixel."""
+    """Contributions and densities of one suffix for one pixel, in the lane of that pixel."""
 
     C1: mi.Color3f
     C2: mi.Color3f

@@ -1,6 +1,6 @@
 """The path from the camera, vertex by vertex: each is joined to lamps, to a light path, and to photons near by.
 
-Which vertex of the light path a vertex of the camera path is connected to: one of all, chosen by its likely worth.
+Each vertex of the camera path is connected to one vertex of the light path, chosen by its estimated contribution.
 
 Connections to all of them would take half the time of a sample, most of it for little light. One, its light divided by
 the probability of the choice, has the same mean: weights of strategies stay as they are. The better the guess of what
@@ -61,7 +61,7 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
     active = si.is_valid() & (depth < limits.max_depth)
     toward, density = sight.eye.toward(si, sight.eye.lens, active)
     end = mis.begin_camera(density, cosine(si, ray.d))  # what the path knows of the other strategies, at si
-    edge = plan.begins(si.p + toward.d * toward.dist)  # that has led there
+    edge = plan.begins(si.p + toward.d * toward.dist)  # the edge that leads to si
     while dr.hint(active, label="camera path"):
         z = Vertex(si, β, end, depth, edge)
         bsdf = si.bsdf()
@@ -113,7 +113,7 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
         if dr.hint(edge is not None, mode="scalar"):
             # Nothing is connected to the camera itself.
             p, e = dr.select(edge.first, 0, p), dr.select(edge.first, 0, e)
-        # Longer paths are not found by light paths.
+        # Light paths do not find longer paths.
         end.vc = dr.select(depth <= plan.longest, end.vc, 0)
         L += dr.select(met, β * Le_met / (1 + mis.others_emitted(end, e, p)), 0)
         si = reached
@@ -129,7 +129,7 @@ def known(end: Partial, joined: mi.Bool) -> Partial:
 
 @dr.syntax
 def connection(plan: Plan, z: Vertex, bsdf, active, light_path: LightPath, u: mi.Float) -> Any:
-    """The light of all paths that join vertex ``z`` to one of a light path's, by one of them that ``u`` chooses."""
+    """Estimates the light of all connections of ``z`` to a light path by one connection, which ``u`` chooses."""
     L = dr.zeros(mi.Spectrum, dr.width(z.depth))
     chosen, times = choose(z, active, light_path, plan.longest, u)
     if active & (times > 0):
@@ -151,15 +151,15 @@ def choose(z: Vertex, active, light: LightPath, longest: int, u: mi.Float):
     """
     kept, end = light.kept, dr.minimum(light.count, longest - 1 - z.depth)
     come_from = cosine(z.si, z.si.to_world(z.si.wi))
-    i = mi.UInt32(0)  # the vertex that is looked at
-    chosen = mi.UInt32(0)  # one of those before it, each with a probability in proportion to its worth
+    i = mi.UInt32(0)  # the current vertex
+    chosen = mi.UInt32(0)  # a vertex before i, chosen in proportion to its worth
     total, own = mi.Float(0), mi.Float(0)  # their worth, and the worth of the chosen one
     while dr.hint(active & (i < end), label="choice"):
         w = worth(z, come_from, kept.read(i))
         total += w
         share = w / total
         taken = (w > 0) & (u < share)
-        # What is left of the random number is one again.
+        # Rescales the random number to [0, 1), so that it can be used again.
         u = dr.select(taken, u / share, (u - share) / (1 - share))
         u = dr.select(dr.isfinite(u), u, 0)
         chosen = dr.select(taken, i, chosen)
@@ -169,9 +169,9 @@ def choose(z: Vertex, active, light: LightPath, longest: int, u: mi.Float):
 
 
 def worth(z: Vertex, come_from: mi.Float, y) -> mi.Float:
-    """The light of ``z`` connected to the record ``y`` times its MIS weight, were both surfaces white and matte.
+    """Light of the connection from ``z`` to the record ``y`` times its MIS weight, as if both were white and matte.
 
-    ``come_from`` is the cosine at ``z`` of the direction that its path has come from.
+    ``come_from`` is the cosine, at ``z``, of the direction to the previous vertex.
     """
     to = mi.Vector3f(y.o + y.d * y.t - z.si.p)
     distance2 = dr.squared_norm(to)

@@ -58,7 +58,7 @@ class End:
 class LightPath:
     """The vertices of a path from a light, as they are kept."""
 
-    kept: Any  # ``read(i)`` is the ``record`` of the vertex i + 1 edges from the light
+    kept: Any  # ``read(i)`` is the ``record`` of the vertex that is i + 1 edges from the light
     count: mi.UInt32  # how many vertices it has
 
 
@@ -89,7 +89,7 @@ def go_on(plan: Plan, random, start: LightRay, y: Vertex, bsdf, active) -> tuple
     # Behind a hole nothing has been gathered yet.
     end, edge = plan.onward(y, bsdf, sample, end)
     β = y.β * dr.select(sample.pdf > 0, f_p, 0)
-    # Russian roulette by what is left of the light that the path began with
+    # Russian roulette by the fraction of the path's initial light that is left
     survives = roulette(dr.max(β) * dr.rcp(dr.max(start.β)), y.depth >= plan.limits.rr_depth)
     active = active & (sample.pdf > 0) & (dr.max(β) > 0) & (u_survival < survives)
     ray = y.si.spawn_ray(d)

@@ -1,4 +1,4 @@
-r"""How the ways to find a path share it: the balance heuristic over all of them, by recursion along either end.
+r"""MIS weights of all strategies that find a path: the balance heuristic, by recursion along both subpaths.
 
 A path x0 (camera) x1 ... xk (light) is found by k + 1 strategies: s of its vertices come from the light, the others
 from the camera. With p_s the density of strategy s, its weight is p_s / Σ p_j = 1 / (1 + others), where
@@ -17,13 +17,13 @@ of choosing the end to connect to, per unit area facing the end. Delta events ca
 summands are 0, and the densities of both directions cancel in what is behind them.
 
 Holes that connections go through are no vertices: an edge leads through them, and is as long as from vertex to vertex.
-That a path passes one by chance is no density, but a weight, as it is for a connection.
+Passing one by chance enters as a weight and not as a density, as it does for a connection.
 
 Both ends may also come to one vertex, and merge: η = π r² N times as many such pairs of N light paths lie within the
 radius r as there are pairs that end in a given unit of area. Paths merge at vertices where photons are gathered, and
 there only if light came from a delta event: else a connection finds the path, and blurs nothing. So a light path knows
 at once, its ``vcm`` is 0 there, and ``gathered`` adds η to it as one more summand; a camera path knows when it leaves
-the next vertex, and η is ``waiting`` until then. Where nothing merges all is as without.
+the next vertex, and η is ``waiting`` until then. Where nothing merges, the formulas are those of ``bdpt``.
 
 ``p`` are densities in solid angle, ``q`` the same with both directions of the vertex swapped; cosines are absolute, to
 the geometric normal. All quotients are taken one by one: squares of densities would leave float32.

@@ -1,4 +1,4 @@
-"""What paths from either end of a scene have to agree in: how long they are, what the camera sees, where they merge."""
+"""What camera paths and light paths agree on: their length, what the camera sees, and where they merge."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Plan(World):
         return self.carried(passed, x, end), x.edge.behind(passed, x.si)
 
     def carried(self, passed: mi.Bool, x: Vertex, end: Partial) -> Partial:
-        """``end`` behind ``x``; where the path has ``passed`` a hole there, what it knew before the hole."""
+        """``end`` behind ``x``; where the path has ``passed`` a hole there, ``end`` before the hole."""
         same = mis.passed(x.end, cosine(x.si, x.si.to_world(x.si.wi)), x.edge.length2(x.si))
         parts = ((getattr(same, name), getattr(end, name)) for name in ("vcm", "vc", "waiting"))
         return Partial(*(dr.select(passed, a, b) for a, b in parts))

@@ -1,4 +1,4 @@
-"""The four ways to complete a path: by its last vertex, s or t of them from an end, each with its MIS weight.
+"""The four ways to complete a path with s vertices from the light and t from the camera, each with its MIS weight.
 
     emitted     s = 0: the camera path has met an emitter
     to_light    s = 1: its last vertex is connected to a sampled point of an emitter

@@ -19,7 +19,7 @@ RADIANCE, IMPORTANCE = "Radiance", "Importance"
 
 
 def context(mode: str) -> mi.BSDFContext:
-    """What a path carries, for Mitsuba's materials."""
+    """The context for Mitsuba's materials: whether a path carries radiance or importance."""
     return mi.BSDFContext(getattr(mi.TransportMode, mode))
 
 
@@ -31,7 +31,7 @@ class Vertex:
     β: mi.Spectrum  # throughput of the path so far
     end: Partial
     depth: mi.UInt32
-    edge: Edge | None = None  # that has led there; None where no edge leads through holes
+    edge: Edge | None = None  # the edge to this vertex; None where no edge leads through holes
 
 
 @cache
@@ -107,7 +107,7 @@ def evaluate(mode, si, bsdf, wo: mi.Vector3f, active=True) -> tuple[mi.Spectrum,
 
 
 def reverse_density(si, bsdf, wo: mi.Vector3f, active) -> mi.Float:
-    """Density of sampling the direction that the path comes from, had it come along ``wo``."""
+    """Density of sampling the direction to the previous vertex, if the path arrived along ``wo`` instead."""
     q = bsdf.pdf(context(RADIANCE), _come_along(si, wo), si.wi, active)
     return dr.select(dr.isfinite(q), q, 0)
 
@@ -162,7 +162,7 @@ def light_leaves(
 
 
 def _come_along(si, wo: mi.Vector3f) -> mi.SurfaceInteraction3f:
-    """A vertex, had the path come there along ``wo``."""
+    """The interaction ``si`` as if the path had arrived along ``wo``."""
     swapped = mi.SurfaceInteraction3f(si)
     swapped.wi = wo
     return swapped
@@ -173,5 +173,5 @@ def _quotient(a: mi.Float, b: mi.Float) -> mi.Float:
 
 
 def cosine(si, d: mi.Vector3f) -> mi.Float:
-    """Absolute, to the geometric normal, along which densities per area are converted."""
+    """Absolute cosine between ``d`` and the geometric normal; converts densities per solid angle and per area."""
     return dr.abs(dr.dot(si.n, d))

@@ -37,13 +37,13 @@ class Plan(both_ends.Plan):
         return T if self.holes is None else dr.select(apart, dr.select(holes == like[1], T, 0), like[0])
 
     def outside(self, p: mi.Point3f, d: mi.Vector3f) -> mi.Point3f:
-        """A point behind all of the scene that is seen from ``p`` along ``d``."""
+        """A point on the ray from ``p`` along ``d``, outside the scene."""
         return p + d * (4 * self.lights.radius)
 
 
 @dataclass
 class Way:
-    """How a base path has come from its last vertex that was no hole."""
+    """How a base path got here from its last vertex that was not a hole."""
 
     o: mi.Point3f  # that vertex
     p: mi.Float  # density of the direction there
@@ -59,7 +59,7 @@ class Way:
 
 @dataclass
 class Past:
-    """What a base path has gone through."""
+    """The history of a base path."""
 
     η: mi.Float  # product of the relative indices of refraction
     sky: Sky

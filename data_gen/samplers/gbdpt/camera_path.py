@@ -1,4 +1,4 @@
-"""The camera path and its four copies, vertex by vertex: what completes one completes the others, as far as they go."""
+"""The camera path and its four copies, vertex by vertex; the same strategies complete all five."""
 
 from __future__ import annotations
 

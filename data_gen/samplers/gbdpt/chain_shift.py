@@ -6,14 +6,14 @@ r"""Camera paths that go through mirrors or glass right behind the vertex that i
     F, P      products of the events' reflectances, and of the probabilities to take them
     J         dω' / dω at a fixed y
 
-The copy walks to y (``data_gen.paths.manifold``) and shares all that comes behind, for whichever strategy completes the
-path there. So, of all that ends at y or goes on from there,
+The copy walks to y (``data_gen.paths.manifold``) and shares everything behind y, whichever strategy completes the path
+there. For every path that ends at y or goes on from there:
 
     b' / b    f'(ω') F' J / (f(ω) F)
     r         p'(ω') P' J / (p(ω) P)
 
-Behind x1 no strategy but one has made any of the path from the light's end: that which joins x1 to the camera, which
-is ``vc`` of ``mis`` there, and which shifts such paths by a walk of its own (``light_shift``). Each strategy has
+Only one strategy builds the path beyond x1 from the light's end: the one that joins x1 to the camera. It is ``vc`` of
+``mis`` there, and shifts such paths by a walk of its own (``light_shift``). Each strategy has
 weights of its own, so that they need not agree which walks succeed.
 
 Paths with mirrors or glass and holes between x1 and y are rejected.
@@ -58,7 +58,7 @@ def straight(exists: mi.Bool | bool = True) -> Course:
 
 
 def next_course(course: Course, step: Step) -> Course:
-    """The course at the next vertex; what is met by chance there already belongs to it."""
+    """The course at the next vertex; emission met by chance at that vertex already belongs to it."""
     smooth = step.kind == SMOOTH
     # This depends on the sampled event, not on whether the path survives it, so that both kernels agree.
     bends = course.second & ~smooth & (step.p > 0) & ~mi.Bool(step.passed)
@@ -86,14 +86,14 @@ def along(
 
 
 def matters(course: Course | None, chain: Chain | None) -> mi.Bool:
-    """Whether a path that is here may have a share in Δ, or in the image, which it has where there is no ``chain``."""
+    """Whether the path may still contribute to Δ or to the image; without a ``chain`` it contributes to the image."""
     if course is None or chain is None:
         return mi.Bool(True)
     return course.ahead | course.second | course.bent
 
 
 def completes(course: Course | None, chain: Chain | None) -> mi.Bool:
-    """Whether what joins a path that is here to light has a share in Δ, or in the image."""
+    """Whether a connection of the path to light, at the current vertex, contributes to Δ or to the image."""
     return mi.Bool(True) if course is None or chain is None else course.bent
 
 
@@ -124,7 +124,7 @@ def no_chain(lanes: int) -> Chain:
 
 
 def ends(plan: Plan, y: mi.SurfaceInteraction3f) -> mi.Bool:
-    """Whether a chain ends at ``y``, if by no other event: its copies do not go on there either."""
+    """Whether a chain ends at ``y`` because of that vertex; its copies do not go on there either."""
     return ~y.is_valid() | plan.materials.connectable(y.bsdf()) | (y.emitter(plan.scene) != None)  # noqa: E711 - pointers
 
 

@@ -54,7 +54,7 @@ def connect(plan: Plan, step: Step, y: Vertex, times, offsets: list[Offset], Δ:
 
 
 def pick(offsets: list[Offset], i: mi.UInt32) -> Offset:
-    """The offset path of that number."""
+    """The offset path number ``i``."""
     found = offsets[0]
     for k, offset in enumerate(offsets[1:], 1):
         found = dr.select(i == k, offset, found)

@@ -46,7 +46,7 @@ class Marker:
 
 
 class Unseen:
-    """Where what light paths bring to the camera is of no matter."""
+    """A visitor for light paths whose connections to the camera are not needed."""
 
     def start(self) -> None:
         return None
@@ -67,7 +67,7 @@ def marked(state: mi.UInt64, longest: int) -> tuple[mi.UInt32, mi.UInt32]:
 
 @dataclass
 class Link:
-    """What lies between the last vertex of a light path and the one that light has left smoothly before it."""
+    """The part of a light path between its last vertex and the last vertex before it with a smooth event."""
 
     depth: mi.UInt32  # of that one; 0 is the light's end
     p: mi.Float  # density with which it was left

@@ -1,6 +1,6 @@
 """Light paths that end at the camera, shifted: the last vertex moves to where a neighbouring pixel looks.
 
-The vertex before it stays. So camera paths are shifted in the same way, seen from the other end. Where mirrors and
+The vertex before it stays. This is the shift of camera paths, seen from the other end. Where mirrors and
 glass lie between the two, the vertex before them stays, and the copy goes through the same ones: see ``through_glass``.
 """
 
@@ -28,7 +28,7 @@ from data_gen.samplers.gbdpt.pairs import difference, difference_of_one
 
 @dataclass
 class Splatted:
-    """A light path that ends at the camera, and what of it a shift needs."""
+    """A light path that ends at the camera, with the data that a shift needs."""
 
     y: Vertex  # the last vertex
     d: mi.Vector3f  # the direction in which the path came there
@@ -67,7 +67,7 @@ def splat_differences(
     y, link = again.end.y, again.link
     bsdf = y.si.bsdf()
     joined = again.there & scatters_smoothly(bsdf)
-    # It has been seen: nothing is in between, or holes.
+    # The first kernel found it visible: nothing but holes can be in between.
     T, holes_seen = 1, 0
     if plan.holes:
         T, holes_seen = plan.through_holes_to_camera(y, eye.toward(y.si, again.lens, joined)[0], joined)

@@ -41,7 +41,7 @@ class Traced:
     first_radius: float  # that photons are gathered within in pass 0
 
     def radius(self, dimension: int = 2) -> float:
-        """The radius of this pass, if photons are counted in this number of dimensions."""
+        """The radius of this pass for photons counted in ``dimension`` dimensions."""
         return self.first_radius * shrunk(self.number, dimension)
 
 
@@ -69,7 +69,7 @@ class PhotonIntegrator(GradientIntegrator):
         return self.camera_bytes + self.photons * self.map_bytes
 
     def instead(self, lane_bytes: int) -> str:
-        """What, besides a smaller image, would fit into this number of bytes for each camera sample."""
+        """The advice, besides a smaller image, that fits a camera sample into ``lane_bytes``; "" if there is none."""
         fits = (lane_bytes - self.camera_bytes) // self.map_bytes
         return f", or no more than -O photons={fits}" if fits > 0 else ""
 

@@ -12,16 +12,16 @@ neighbour, one for each sign. Values that change sign have no density to choose 
 
 A pixel's paths come from its whole area, and a path keeps its place on the film to a fraction of a pixel. With the
 motion m of a pixel, paths that were at p in the frame before are now at p - m. So the pixel's area, moved by m, lies on
-up to four pixels of the frame before, and what they have kept there is taken over. With that only, a fifth of the
-pixels would find nothing of what they could: the nearest of the four has kept one path, and it may lie beside the area.
-So everything is taken over from the nearest pixel. What lies beside the area is moved by a whole pixel: it *wraps*. A
-path may then have been found in three ways: by this frame's candidate, straight, and wrapped. The MIS weights of the
-three sum to 1, whatever m is. Confidence is handed on in proportion to the areas. [Zhang et al. 2024, "Area ReSTIR";
-Wang et al. 2026, "Gradient-Domain ReSTIR Path Tracing", section 4.3.1]
+up to four pixels of the frame before, and what they have kept there is taken over. This would leave a fifth of the
+pixels without history: the nearest of the four has kept one path, and that may lie beside the area. So everything is
+taken over from the nearest pixel. What lies beside the area is moved by a whole pixel: it *wraps*. A path may then have
+been found in three ways: by this frame's candidate, straight, and wrapped. The MIS weights of the three sum to 1,
+whatever m is. Confidence is handed on in proportion to the areas. [Zhang et al. 2024, "Area ReSTIR"; Wang et al. 2026,
+"Gradient-Domain ReSTIR Path Tracing", section 4.3.1]
 
 That is unbiased as long as motion depends on no random numbers. Where more than the camera changes there are two
-scenes, and records are carried into the one that E is of: see ``data_gen.samplers.restir.carry``. Lanes of ``chains``
-of a pixel know nothing of each other. One chain has no variance: its frames are correlated, over ``cap`` of them, and
+scenes, and records are carried into the one where E is evaluated: see ``data_gen.samplers.restir.carry``. The
+``chains`` of a pixel are independent. One chain has no variance: its frames are correlated, over ``cap`` of them, and
 must not be put into a film as if they were samples. Several have the variance over chains.
 """
 
@@ -113,7 +113,7 @@ class History:
         return frame
 
     @property
-    def _ends(self) -> int:  # pixels that a value is of
+    def _ends(self) -> int:  # number of pixels that a value depends on
         return 2 if self.pairs else 1
 
     @contextmanager

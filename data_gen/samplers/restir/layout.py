@@ -10,7 +10,7 @@ import numpy as np
 
 from data_gen.samplers.restir.reservoir import CORNERS, Reservoir
 
-# What reservoirs are of, and of pairs the step to the second pixel. Reservoirs are numbered in the order 0 primal,
+# Kinds of reservoirs; for pairs, the step to the second pixel. Reservoirs are numbered in the order 0 primal,
 # 1 dx+, 2 dx-, 3 dy+, 4 dy-.
 STEPS = {"primal": (0, 0), "dx": (1, 0), "dy": (0, 1)}
 RESERVOIRS = 5

@@ -41,7 +41,7 @@ class Merging:
     """What the reservoirs of a frame are offered."""
 
     at: Layout
-    ends: int  # pixels that a value is of
+    ends: int  # number of pixels that a value depends on
     found: Candidate  # of this frame
     kept: Reservoir | None  # of the frame before, in this one's scene
     e: Evaluated

@@ -1,11 +1,11 @@
-r"""Reservoirs: of many paths one, with a weight that makes up for the others. Pure functions on arrays.
+r"""Reservoirs: each keeps one of many paths, with a weight that accounts for the others. Pure functions on arrays.
 
 A reservoir holds one path of its pixel, or of its pair of pixels. ``value`` · ``W`` is unbiased for the integral over
 all paths, for whatever path it holds: W is an estimate of 1 / density. M, the confidence, says how many candidates have
 been seen; it weighs reservoirs against each other and is held below a cap, so that a chain can forget: that is
 ``confidence_after``.
 
-All values are light, or one sign of a difference: never negative. What paths are chosen by, p̂, is their luminance.
+All values are light, or one sign of a difference: never negative. Paths are chosen in proportion to p̂, their luminance.
 
 | quantity | formula | identity |
 |---|---|---|
@@ -66,7 +66,7 @@ def weigh(own: mi.Float, others: mi.Float, target: mi.Float, W: mi.Float) -> tup
 def choose(weights: list[mi.Float], u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
     """The number of the path that is kept, by a random number in [0, 1), and the sum of all resampling weights.
 
-    It is one whose weight is not 0, wherever there is one.
+    The weight of the chosen path is positive if any weight is.
     """
     total = sum(weights, start=mi.Float(0))
     chosen, below, place = mi.UInt32(0), mi.Float(0), u * total

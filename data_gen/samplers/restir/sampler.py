@@ -81,7 +81,7 @@ class Restir:
 
     @property
     def confidence(self) -> float:
-        """The frames that reservoirs of pixels count for, the mean over pixels."""
+        """Mean confidence of the pixels' reservoirs, in frames."""
         return float(self._history.confidence[0].mean())
 
     def _film(self) -> GradientFilm:

@@ -45,7 +45,7 @@ class Pose:
 
     @contextmanager
     def of(self, sensor: mi.Sensor) -> Iterator[None]:
-        """The sensor in this pose, for a while. What is computed with it must be evaluated before the end of that."""
+        """The sensor in this pose, for a while. Evaluate all results within the block."""
         now = Pose(sensor)
         now._to(self, sensor)
         try:

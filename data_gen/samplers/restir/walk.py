@@ -81,7 +81,7 @@ class _Kept:
     L: mi.Spectrum  # Σ of their contributions f W
 
     def offered(self, new: _Choice, W: mi.Float, u: mi.Float, exists: mi.Bool | bool = True) -> _Kept:
-        """Behind one more path: weighted reservoir sampling by a random number ``u``."""
+        """The state after one more path: weighted reservoir sampling by a random number ``u``."""
         L = self.L + dr.select(exists, new.f * W, 0)
         weight = mi.luminance(new.f) * W
         weight = dr.select(dr.isfinite(weight) & (weight > 0), weight, 0)
@@ -118,7 +118,7 @@ class _State:
 
 
 def choices(seed: int, camera: CameraSamples, sample: mi.UInt32) -> mi.Sampler:
-    """Random numbers by which reservoirs choose. They are none of those that a replay must find in their place."""
+    """Random numbers for the choices of reservoirs, independent of those that a replay draws again."""
     own = int(np.random.SeedSequence([seed, 1]).generate_state(1, np.uint64)[0])
     return sample_streams(own, camera.pixel, sample)
 

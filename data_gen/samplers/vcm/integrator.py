@@ -67,7 +67,7 @@ class VCM(BDPT):
         return self.sample_bytes + places * VERTEX_BYTES
 
     def instead(self, lane_bytes: int) -> str:
-        """What, besides a smaller image, would fit into this number of bytes for each camera sample."""
+        """The advice, besides a smaller image, that fits a camera sample into ``lane_bytes``; "" if there is none."""
         places = (lane_bytes - self.sample_bytes) // VERTEX_BYTES
         fits = 1 + (1 << (places.bit_length() - 1)) if places > 0 else 0
         return f", or no more than -O joined_depth={fits}" if fits else ""

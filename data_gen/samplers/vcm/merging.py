@@ -1,8 +1,8 @@
 """What is kept of the light paths of a pass, as a map; and merging: photons of it that are gathered at a camera path.
 
-The photons that are gathered at z, the last vertex of a camera path, are all that lie within the radius r, of whatever
-light path. Each ends a path of its own there. The density of that path is η times the density of connecting z to its
-light path at a given place; η = π r² N. So ``mis`` has a weight for it beside all connections of that path.
+All photons within the radius r are gathered at z, the last vertex of a camera path, whichever light path they belong
+to. Each ends a path of its own there. The density of that path is η times the density of connecting z to its light path
+at a given place; η = π r² N. So ``mis`` has a weight for it beside all connections of that path.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class Merging:
         return photons.K * L * self.spread(z.si, active & (dr.max(L) > 0))
 
     def spread(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
-        """What K is to be multiplied by at a vertex: along edges there is less area. Weights stay as they are."""
+        """Factor of the kernel K at a vertex: near edges there is less area. MIS weights do not change."""
         return spread(self.plan, x, self.photons.radius2, self.photons.number, active)
 
     def photon(self, i: mi.UInt32, z: Vertex, near: mi.Bool) -> tuple[Photon, Partial, mi.Bool]:

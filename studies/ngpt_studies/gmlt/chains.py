@@ -1,4 +1,4 @@
-"""Markov chains of paths, side by side: what they find, splatted; and mutations of the random numbers of a path.
+"""Markov chains of paths, side by side, which splat what they find; and mutations of a path's random numbers.
 
 [Kelemen et al. 2002, "A Simple and Robust Mutation Strategy for the Metropolis Light Transport Algorithm"]
 """
@@ -44,7 +44,7 @@ def acceptance(f: mi.Float, proposed: mi.Float) -> mi.Float:
 
 @dataclass
 class Proposal:
-    """The numbers of a mutation, one after the other; instead of a sampler."""
+    """Draws the numbers of a mutation one after the other, in place of a sampler."""
 
     vector: dr.Local  # the numbers of the chain's state
     random: mi.PCG32  # one number for each of them
@@ -116,7 +116,7 @@ class Paths:
 
 @dataclass
 class State:
-    """A chain: its numbers, the path of these, and what that path has to splat yet."""
+    """A chain: its random numbers, the path they give, and the light that this path has yet to splat."""
 
     vector: dr.Local
     pixel: mi.UInt32
@@ -137,7 +137,7 @@ def run(
     steps: int,
     scale: Callable[[mi.Float], mi.Float],
 ) -> mi.Float:
-    """Runs chains of so many ``steps``; returns the share of mutations that each has accepted.
+    """Runs chains for ``steps`` mutations; returns the share of mutations that each chain accepted.
 
     They begin with the paths of the lanes ``start``, among all paths of the ``camera``, whose ``layers`` and values
     ``f`` are known. A state of value f counts ``scale(f)`` for each step that a chain is expected to be there: the

@@ -1,4 +1,4 @@
-r"""Gradient-domain Metropolis light transport: where a path of ``gpt`` has found light, small changes make others.
+r"""Gradient-domain Metropolis light transport: small mutations of a path of ``gpt`` that has found light.
 
 A pass is a render of its own. It takes one independent path, a candidate, for each camera sample, as ``gpt`` does, and
 then runs Markov chains over the random numbers of such paths, which visit paths in proportion to their value.

@@ -1,1 +1,1 @@
-"""What photons give to the gradients: their copies for the neighbours' camera paths."""
+"""Gradients of photons: copies of photons for the camera paths of neighbouring pixels."""

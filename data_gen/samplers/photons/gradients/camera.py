@@ -50,10 +50,10 @@ class Level:
     """Base paths that have come to some level, and their offset paths; with what is needed to go on."""
 
     paths: list  # the base path, and the four offset paths
-    lanes: mi.UInt32  # the camera samples that they are of
+    lanes: mi.UInt32  # the camera samples that they belong to
     depth: mi.UInt32  # edges from the camera
     η: mi.Float  # the product of the base path's relative indices of refraction
-    numbers: mi.PCG32  # random, of what is to come
+    numbers: mi.PCG32  # random numbers for the levels to come
     channel: mi.UInt32 | None = None  # the colour by which distances are sampled, where they are
     # At the first level: what each path has seen through grids, if there are any
     behind: list = field(default_factory=list)
@@ -100,7 +100,7 @@ class CameraPaths:
         return replace(start, paths=paths)
 
     def onward(self, level: Level, random) -> Level:
-        """The paths behind their next event, their hits still unknown."""
+        """The paths after their next event, before their rays are traced."""
         random = random.clone()
         u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
         steps = [scattered(path, self.world.materials, u_lobe, u_direction) for path in level.paths]
@@ -154,14 +154,14 @@ def scattered(path: Path, materials: Materials, u_lobe, u_direction) -> tuple[Pa
     sample, f_p = bsdf.sample(context(RADIANCE), si, u_lobe, u_direction, here)
     kind = event_kind(sample.sampled_type)
     β = path.β * f_p
-    # What is scattered widely is gathered, and the path ends.
+    # Photons are gathered where the material scatters widely, and the path ends.
     alive = here & (sample.pdf > 0) & ((kind != SMOOTH) | ~materials.connectable(bsdf)) & (dr.max(β) > 0)
     ray = si.spawn_ray(si.to_world(sample.wo))
     return Path(ray, path.hit, β, alive, path.sky.behind(kind, alive)), sample.eta
 
 
 def survive(paths: list, u: mi.Float, plays: mi.Bool, η: mi.Float) -> None:
-    """Russian roulette, of those lanes that play: all five paths survive together."""
+    """Russian roulette in the lanes where ``plays`` is true: all five paths survive together."""
     survival = roulette(brightest(paths), plays, η)
     paths[0].alive &= u < survival
     for path in paths:

@@ -124,7 +124,7 @@ class PathsByPieces(CameraPaths):
         return paths
 
     def ends(self, pieces: list[Piece]) -> list[Path]:
-        """All paths where they end at a surface, or nowhere; those that go on behind a boundary are not alive."""
+        """All paths that end at a surface or escape; those that go on behind a boundary are not alive."""
         passes = self.goes_through(pieces[0])
         return [piece.end(piece.alive & ~passes & ~self.goes_through(piece)) for piece in pieces]
 

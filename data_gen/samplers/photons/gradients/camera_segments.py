@@ -1,7 +1,7 @@
 """Camera paths of a pixel and its neighbours through media, side by side from segment to segment: for ``gvpm``.
 
 As ``camera``, but a segment ends where the path scatters in a medium, or on the surface behind. All paths replay the
-number that says at what optical depth that is, in one colour for all of them. So they fly equally far in one medium,
+random number that gives the optical depth of that event, in one colour for all. So they fly equally far in one medium,
 and a path and its copy are the same numbers in two pixels: J = 1 and r = 1, wherever either of them ends.
 """
 
@@ -66,7 +66,7 @@ class PathsBySegments(CameraPaths):
         random, η, after = random.clone(), level.η, []
         u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
         for k, flight in enumerate(level.paths):
-            # What is scattered in a medium is gathered, and the path ends.
+            # Photons are gathered where the path scatters in a medium, and the path ends.
             path, eta = scattered(flight.on_surface(), self.world.materials, u_lobe, u_direction)
             medium = flight.place().toward(flight.vertex(), path.ray.d)
             after.append(Flight(**vars(path), medium=medium, scatters=flight.scatters))

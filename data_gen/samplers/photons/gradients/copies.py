@@ -5,9 +5,9 @@
     p, p'       densities of the directions d and d' at a, without Russian roulette: it is on top of a pair of paths
     r           p' J / p
 
-A photon that came from a by a mirror, or through glass, has no copy: light goes there in one direction. There is none
-either where anything is in the way, or where the copy lies outside the radius or on a surface that faces another way.
-What a photon must fulfil the copy must, too, so that both directions of a difference reject alike.
+A photon that came from a by a mirror, or through glass, has no copy: light goes there in one direction. Nor
+is there one where anything is in the way, or where the copy lies outside the radius or on a surface that faces another
+way. A copy must meet the same conditions as a photon, so that both directions of a difference reject alike.
 
 In media a may be where light was scattered. Distances have densities, in the colour c of the light path: T' is in Φ',
 and T'_c / T_c in r. Boundaries that do not bend light may be between a and b, or b'. There b' must be in the medium of

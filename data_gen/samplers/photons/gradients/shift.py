@@ -58,7 +58,7 @@ def mirror(v, across):
 
 
 def rotate(v, n, m):
-    """``v`` turned by the smallest rotation from the unit vector ``n`` to ``m``, which is not opposite."""
+    """``v`` turned by the smallest rotation from the unit vector ``n`` to ``m``; ``m`` must not be -``n``."""
     axis, cos = dr.cross(n, m), dr.dot(n, m)
     return v * cos + dr.cross(axis, v) + axis * (dr.dot(axis, v) / (1 + cos))
 

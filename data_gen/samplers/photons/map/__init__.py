@@ -1,1 +1,1 @@
-"""The photon map: light traced from the lamps, kept, and found again."""
+"""The photon map: its light paths, its radius, and the search for photons."""

@@ -60,7 +60,7 @@ class Grid:
 
     @staticmethod
     def cells(extents: np.ndarray, edge: float, most: int) -> tuple[float, np.ndarray]:
-        """The edge of a cell, ``edge`` or as much longer as it takes to have at most ``most``, and their numbers."""
+        """The edge of a cell and the numbers of cells; ``edge`` grows until there are at most ``most`` cells."""
         while True:
             cells = np.floor(extents / edge).astype(np.int64) + 3
             if np.prod(cells.astype(np.float64)) <= most:
@@ -146,7 +146,7 @@ class Grid:
         return dr.while_loop(begun, goes_on, step, label="gather")[3]
 
     def gather(self, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, value, total):
-        """``total`` plus the sum of ``value`` (place in the list, near) over all points nearer to ``p`` than that.
+        """``total`` plus the sum of ``value`` (place in the list, near) over all points within the radius of ``p``.
 
         ``value`` gives the type of ``total``, and 0 where not ``near``. May be called within symbolic loops.
         """

@@ -1,4 +1,4 @@
-r"""How far photons are gathered from: in pixels at first, and less and less.
+r"""The radius within which photons are gathered: given in pixels, and smaller from pass to pass.
 
 Pass i gathers within r_i, with r_(i+1)^d = r_i^d (i + α) / (i + 1); d is 2 on surfaces and 3 in media, the dimension of
 what photons are counted in. So r^d falls like i^(α - 1): slowly enough that the noise of the mean over passes goes to
@@ -45,7 +45,7 @@ def shrunk(i: int, dimension: int = 2) -> float:
 
 
 def pixel_width(scene: mi.Scene, sensor: mi.Sensor) -> float:
-    """How wide a pixel of ``sensor`` is where that sees something, in world units: the median over the image.
+    """The width of a pixel of ``sensor`` at the surfaces it sees, in world units: the median over the image.
 
     A thousandth of the scene's diagonal where the camera sees nothing, or has no adjacent rays.
     """
@@ -73,7 +73,7 @@ ROUNDS = 8
 
 
 def number_of(seed: int, number: int) -> mi.UInt32:
-    """A number for pass ``number`` of a render with that ``seed``: another one for each."""
+    """A number that differs for each pass ``number`` and each ``seed``."""
     return dr.opaque(mi.UInt32, (seed * 0x9E3779B1 + number * 0x85EBCA77) % (1 << 32))
 
 

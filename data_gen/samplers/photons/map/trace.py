@@ -39,7 +39,7 @@ MAP_BYTES = VERTICES_PER_PATH * VERTEX_BYTES + PATH_BYTES
 
 @dataclass
 class Paths:
-    """Light paths on their way, where their next edge begins."""
+    """The state of light paths at the start of their next edge."""
 
     ray: mi.Ray3f  # along that edge
     β: mi.Spectrum  # power there, times the number of light paths

@@ -18,7 +18,7 @@ NORMAL_COSINE = 0.7
 
 @dataclass
 class Photon:
-    """A photon, or a copy of one: where it is, from where it came along ``d``, and the power Φ it brings."""
+    """A photon or its copy: its place, the direction ``d`` along which it came, and its power Φ."""
 
     p: mi.Point3f
     n: mi.Normal3f
@@ -41,7 +41,7 @@ def faces(photon: Photon, x: mi.SurfaceInteraction3f) -> mi.Bool:
 
 
 def light(photon: Photon, x: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active) -> mi.Spectrum:
-    """f Φ, what a photon adds to radiance at ``x``, of material ``bsdf``; the kernel is not in it."""
+    """f Φ, what a photon adds to radiance at ``x`` with material ``bsdf``, without the kernel."""
     f = bsdf.eval(context(RADIANCE), x, x.to_local(-photon.d), active)
     # f has a cosine; the photons lie as densely as the geometric one is large.
     L = f * photon.Φ / dr.abs(dr.dot(photon.n, photon.d))
@@ -156,12 +156,12 @@ def on_surfaces(photons) -> mi.Bool:
 
 
 def in_media(photons) -> mi.Bool:
-    """Which are photons where light scatters in a medium."""
+    """Which vertices of a map are photons in a medium."""
     return (photons.depth > 0) & (dr.squared_norm(photons.n) == 0)
 
 
 def put(photons, vertex, place: mi.UInt32, active) -> None:
-    """Enters vertices at these places of a map."""
+    """Writes vertices to these places of a map."""
     for f in fields(vertex):
         dr.scatter(getattr(photons, f.name), getattr(vertex, f.name), place, active)
 

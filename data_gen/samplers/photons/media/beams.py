@@ -1,4 +1,4 @@
-r"""Photon beams: in media light is gathered from the edges of light paths, not from where they scatter.
+r"""Photon beams: in media, light is gathered from the edges of light paths and not from their vertices.
 
     d, Φ        direction of a beam, its power where it begins, times σs
     s, t        distances along the beam and along the camera ray to where both are nearest to each other
@@ -56,7 +56,7 @@ def parts_class(variant: str) -> type:
 
     @dataclass
     class Parts:
-        """Parts of beams, an array of each field: 18 words a part."""
+        """Parts of beams as a structure of arrays: 18 words a part."""
 
         p: mi.Point3f  # the middle
         d: mi.Vector3f

@@ -87,7 +87,7 @@ class AlongRays:
 
 
 def seen_along(ray, medium: mi.MediumPtr) -> mi.MediumInteraction3f:
-    """Places in a ``medium`` as its phase function knows them, for light that is scattered against the ray."""
+    """Interactions for the phase function of a ``medium``, for light scattered against the ray."""
     seen = dr.zeros(mi.MediumInteraction3f, dr.width(ray.d))
     seen.p, seen.time, seen.wavelengths, seen.medium = ray.o, ray.time, ray.wavelengths, medium
     seen.wi, seen.sh_frame = -ray.d, mi.Frame3f(-ray.d)

@@ -44,7 +44,7 @@ PATHS_BYTES = 4096
 
 @dataclass
 class Beside:
-    """A piece of a ray that photons are gathered along."""
+    """A piece of a ray along which photons are gathered."""
 
     o: mi.Point3f
     d: mi.Vector3f
@@ -63,7 +63,7 @@ class Beside:
         return t, self.alive & (t > 0) & (t < self.length) & (dr.squared_norm(p - self.at(t)) < radius2)
 
     def reaches(self, t: mi.Float) -> mi.Bool:
-        """Whether a photon may have its copy at that distance."""
+        """Whether a photon may have its copy at this distance along the ray."""
         return t < self.length
 
     def image(self, p: mi.Point3f, other: Beside) -> mi.Point3f:
@@ -72,7 +72,7 @@ class Beside:
         return shift.moved(p, self.at(t), self.d, other.at(t), other.d)
 
     def light(self, photon: Photon, t: mi.Float, active: mi.Bool) -> mi.Spectrum:
-        """β T(t) f Φ; the kernel is not in it."""
+        """β T(t) f Φ, without the kernel."""
         seen = seen_along(mi.Ray3f(self.o, self.d), self.medium)
         f, _ = self.medium.phase_function().eval_pdf(mi.PhaseFunctionContext(), seen, -photon.d, active)
         L = self.β * dr.exp(-self.σ * t) * f * photon.Φ

@@ -42,7 +42,7 @@ from data_gen.samplers.photons.surfaces.gpm import GPM, OnSurfaces
 
 @dataclass
 class InBall:
-    """A vertex of a camera path in a medium, which photons are gathered near to."""
+    """A vertex of a camera path in a medium, near which photons are gathered."""
 
     p: mi.Point3f
     d: mi.Vector3f
@@ -64,7 +64,7 @@ class InBall:
         return shift.image(p, self.p, other.p)
 
     def light(self, photon: Photon, distance2: mi.Float, active: mi.Bool) -> mi.Spectrum:
-        """β f Φ; the kernel is not in it."""
+        """β f Φ, without the kernel."""
         seen = seen_along(mi.Ray3f(self.p, self.d), self.medium)
         f, _ = self.medium.phase_function().eval_pdf(mi.PhaseFunctionContext(), seen, -photon.d, active)
         L = self.β * f * photon.Φ

@@ -1,4 +1,5 @@
-r"""Photon planes: light that was scattered twice in media is found where a camera ray meets what two edges sweep.
+r"""Photon planes: a plane is swept by two edges of a light path; light scattered twice is gathered where a camera
+ray meets it.
 
     a, d        where an edge enters a medium, and its direction; S: how far the edge might go in that medium
     e           the direction in which light was scattered there, somewhere on the edge
@@ -50,7 +51,7 @@ def planes_class(variant: str) -> type:
 
     @dataclass
     class Planes:
-        """Planes of light paths, an array of each field."""
+        """Planes of light paths as a structure of arrays."""
 
         a: mi.Point3f
         d: mi.Vector3f
@@ -155,7 +156,7 @@ def after_scattering(photons) -> mi.Bool:
 
 
 def only_beams(traced: Traced) -> Traced:
-    """The map with only the edges that no plane ends with."""
+    """The map with only those edges that are the last edge of no plane."""
     photons = traced.photons
     others = replace(photons, bounce=dr.select(after_scattering(photons), 0, photons.bounce))
     dr.eval(others.bounce)
@@ -186,7 +187,7 @@ def planes_of(passes: Passes, traced: Traced) -> AcrossPlanes:
 
 
 def swept(scene, photons, edges: mi.UInt32, weight: mi.Float):
-    """The planes that end with these edges."""
+    """The planes whose last edges are these."""
     before = dr.gather(mi.UInt32, photons.parent, edges)
     p, d = dr.gather(mi.Point3f, photons.p, before), dr.gather(mi.Vector3f, photons.d, before)
     since, channel = dr.gather(mi.Float, photons.t, before), dr.gather(mi.UInt32, photons.channel, before)
