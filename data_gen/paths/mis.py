@@ -7,7 +7,7 @@ import mitsuba as mi
 
 
 def mis_weight(chosen: mi.Float, other: mi.Float) -> mi.Float:
-    """Power heuristic of two densities. It uses their ratio, because squared densities could overflow float32."""
+    """Power heuristic of two densities. It uses their ratio, because squares could leave the range of float32."""
     return dr.select(chosen > 0, dr.rcp(1 + dr.square(other / chosen)), 0)
 
 
