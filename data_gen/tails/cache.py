@@ -30,6 +30,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths import media
 from data_gen.paths.streams import mixed
 from data_gen.tails.schedule import FINENESS
 from data_gen.tails.table import Grid, Place, in_table, key, octahedral
@@ -53,10 +54,13 @@ class Trail:
         """The trail of a path at its first vertex."""
         return cls(mi.Float(x.t), dr.zeros(mi.Float, dr.width(x.t)))
 
-    def on(self, x: mi.SurfaceInteraction3f, smooth: mi.Bool, p: mi.Float, active: mi.Bool) -> Trail:
+    def on(
+        self, x: mi.SurfaceInteraction3f, place: media.Place | None, smooth: mi.Bool, p: mi.Float, active: mi.Bool
+    ) -> Trail:
         """At the next vertex ``x``, if there is one, behind an event of density ``p`` that was ``smooth``, or not."""
         there = active & x.is_valid()
-        wider = x.t * dr.rsqrt(dr.maximum(p * dr.abs(x.wi.z), 1e-6))
+        cosine = dr.select(media.scatters(place), 1, dr.abs(x.wi.z))
+        wider = x.t * dr.rsqrt(dr.maximum(p * cosine, 1e-6))
         further = there & ~smooth & (self.spread == 0)
         return Trail(self.reach + dr.select(further, x.t, 0), self.spread + dr.select(there & smooth, wider, 0))
 
@@ -98,13 +102,14 @@ class Known:
     fineness: mi.Float
     grid: Grid
 
-    def place_of(self, x: mi.SurfaceInteraction3f, spread: mi.Float, kind: mi.UInt32 | int) -> Place:
+    def place_of(self, x: mi.SurfaceInteraction3f, inside: mi.Bool, spread: mi.Float, kind: mi.UInt32 | int) -> Place:
         """The place of vertex ``x`` among the cells that are ``fineness`` times smaller than the ``spread``.
 
         Vertices of different ``kind`` share no light.
         """
         level = mi.Int32(dr.floor(dr.log2(dr.maximum(spread / self.fineness, 1e-20))))
-        normal = octahedral(mi.Normal3f(dr.mulsign(x.sh_frame.n, x.wi.z)))
+        # Cells of the volume have a direction of their own.
+        normal = dr.select(inside, mi.UInt32(64), octahedral(mi.Normal3f(dr.mulsign(x.sh_frame.n, x.wi.z))))
         return Place(self.grid.place_of(x.p, level), normal + (mi.UInt32(kind) << 16), level)
 
     def look(

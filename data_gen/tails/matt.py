@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from data_gen.paths import media
 from data_gen.paths.vertex import SMOOTH, ByMaterial, consistent, evaluate, event_kind, materials_of
 
 # The tangent of the angle between the normal and the direction that ρ is read off: as far from a mirror direction as
@@ -47,24 +48,28 @@ class Matt:
         self.tilts = ByMaterial(mi.Bool(tilted))
         self.plain = Plain(bsdfs)
 
-    def at(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-        """Whether the material at a vertex has a diffuse part."""
-        return active & mi.has_flag(x.bsdf().flags(), mi.BSDFFlags.DiffuseReflection)
+    def at(self, x: mi.SurfaceInteraction3f, place: media.Place | None, active: mi.Bool) -> mi.Bool:
+        """Whether a vertex is in a medium, or its material has a diffuse part."""
+        return active & (media.scatters(place) | mi.has_flag(x.bsdf().flags(), mi.BSDFFlags.DiffuseReflection))
 
-    def lambertian(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-        """Whether the diffuse part is all of the material: a path that ends there has no rest to go on for."""
+    def lambertian(self, x: mi.SurfaceInteraction3f, place: media.Place | None, active: mi.Bool) -> mi.Bool:
+        """Whether a path that ends at the vertex has no rest to go on for: a material of nothing but a diffuse part, or
+        a medium that scatters alike in all directions."""
         listed, lambertian = self.nothing_else.of(x.bsdf(), active)
-        return listed & lambertian
+        return (listed & lambertian) | (active & media.scatters(place))
 
     def tilted(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
         """Whether its diffuse part may be tilted by a bump or normal map, and so miss directions of a matt surface."""
         listed, tilted = self.tilts.of(x.bsdf(), active)
         return active & (~listed | tilted)
 
-    def reflectance(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
-        """ρ in [0, 1]: π times the diffuse lobe's f in a direction on the side of ``wi``."""
-        known, ρ = self.plain.of(x, active)
-        return dr.select(known, ρ, reflectance(x.bsdf(), x, active & ~known))
+    def reflectance(self, x: mi.SurfaceInteraction3f, place: media.Place | None, active: mi.Bool) -> mi.Color3f:
+        """ρ in [0, 1]: π times the diffuse lobe's f in a direction on the side of ``wi``; 1 in media, whose albedo
+        is in the throughput."""
+        inside = media.scatters(place)
+        known, ρ = self.plain.of(x, active & ~inside)
+        ρ = dr.select(known, ρ, reflectance(x.bsdf(), x, active & ~known & ~inside))
+        return dr.select(active & inside, 1, ρ)
 
 
 class Plain:
@@ -126,6 +131,7 @@ def matt_lobe(x: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.Float:
 def evaluate_and_sample(
     bsdf: mi.BSDFPtr,
     x: mi.SurfaceInteraction3f,
+    place: media.Place | None,
     wo: mi.Vector3f,
     u_lobe: mi.Float,
     u_direction: mi.Point2f,
@@ -133,7 +139,7 @@ def evaluate_and_sample(
 ) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum]:
     """As ``data_gen.paths.media.evaluate_and_sample``, but half of the directions of ``both`` lanes come by the cosine,
     as at a matt surface. Each density is the mean of both ways."""
-    by_cosine = both & (u_lobe < 0.5)
+    by_cosine, u_phase = both & (u_lobe < 0.5), mi.Float(u_lobe)
     u_lobe = dr.select(both, 2 * u_lobe - dr.select(by_cosine, mi.Float(0), 1), u_lobe)
     f, p, sample, f_p = bsdf.eval_pdf_sample(mi.BSDFContext(), x, wo, u_lobe, u_direction)
     sample = consistent(bsdf, x, sample, f_p)
@@ -151,4 +157,10 @@ def evaluate_and_sample(
     scattered = dr.select(by_cosine, f_own, f_p * p_material)
     f_p = dr.select(both, scattered * dr.rcp(dr.maximum(together, 1e-20)), f_p)
     sample.pdf = dr.select(both, together, sample.pdf)
-    return f, p, sample, f_p
+    if place is None:
+        return f, p, sample, f_p
+    phase = place.medium.phase_function()
+    inside = media.in_medium(x, place)
+    f_phase, p_phase = phase.eval_pdf(mi.PhaseFunctionContext(), inside, wo, place.scatters)
+    f, p = dr.select(place.scatters, f_phase, f), dr.select(place.scatters, p_phase, p)
+    return f, p, *media.scattered(x, place, u_phase, u_direction, sample, f_p)

@@ -128,7 +128,8 @@ class SharedTails:
 def paths(view, plan: Plan, known: Known, camera: CameraSamples, half: mi.UInt32) -> tuple[mi.UInt32, list[list]]:
     """How many records each path has, and these: place, half of the cache, and light of each sort, RGB."""
     ray, importance, _ = camera.rays()
-    count, records = feed(view, plan, known, camera.random.clone(), (ray, importance), half)
+    within = mi.MediumPtr(camera.sensor.get_medium()) if plan.space.media else None
+    count, records = feed(view, plan, known, camera.random.clone(), (ray, importance, within), half)
     colours = ([each for E in r.E for each in mi.Color3f(E)] for r in records)
     return count, [
         [*r.place.p, r.place.code, r.place.level, half, *its] for r, its in zip(records, colours, strict=True)

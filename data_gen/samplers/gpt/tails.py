@@ -45,13 +45,13 @@ def place(plan: Plan, known: Known, path: Path) -> tuple[Place, mi.Bool]:
     """Where a path is in the cache, and whether it may end there, or open a record."""
     x, trail = path.x, path.trail
     able = path.walks & x.is_valid() & (path.depth < plan.limits.max_depth) & (trail.spread > NEAR * trail.reach)
-    able = plan.matt.at(x, able)
+    able = plan.matt.at(x, path.place, able)
     if plan.replays:
         # Elsewhere all light is late, also what a diffuse part scatters.
-        able &= plan.materials.connectable(x.bsdf())
+        able &= plan.materials.connectable(x.bsdf()) | media.scatters(path.place)
     most = plan.limits.max_depth
     late = mi.UInt32(0) if most == UNLIMITED else path.depth - dr.minimum(path.depth, max(most - _ALL, 0))
-    return known.place_of(x, trail.spread, late), able
+    return known.place_of(x, media.scatters(path.place), trail.spread, late), able
 
 
 def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.Spectrum, mi.Spectrum, mi.Spectrum]:
@@ -61,12 +61,12 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
     what is theirs, but for what is in that layer.
     """
     where, able = place(plan, known, path)
-    lambertian = plan.matt.lambertian(path.x, able)
+    lambertian = plan.matt.lambertian(path.x, path.place, able)
     for y in offsets:
         # A joined path has come from elsewhere, and the rest of what the material does is another one for it.
         able &= ~(y.apart | (y.joined & ~lambertian))
     sorts, errors, ends = known.look(where, LEAST, able)
-    ρ = plan.matt.reflectance(path.x, ends)
+    ρ = plan.matt.reflectance(path.x, path.place, ends)
     found, *late = [ρ * C for C in sorts]
     found, caustic_found = caustic.split(path.late, found)
     caustic_found = sum(late, caustic_found)
@@ -96,12 +96,13 @@ class Record:
 
 
 def feed(view, plan: Plan, known: Known, random, camera_ray: tuple, half: mi.UInt32) -> tuple[mi.UInt32, list[Record]]:
-    """Paths that feed a ``half`` of the cache, from a camera ray and its importance: how many records each has, and
-    these."""
-    (ray, importance), space = camera_ray, plan.space
-    first = space.first(view, ray, None, space.begin(random))
+    """Paths that feed a ``half`` of the cache, from a camera ray, its importance, and the medium around the camera: how
+    many records each has, and these."""
+    (ray, importance, within), space = camera_ray, plan.space
+    drawn = space.begin(random)
+    first = space.first(view, ray, within, drawn)
     x = media.vertex(mi.Ray3f(first.ray), first.hit, first.place)
-    path = begin(plan, x, first.place, None, importance * first.weight)
+    path = begin(plan, x, first.place, drawn.channel if drawn else None, importance * first.weight)
     path.trail, path.ρ, lanes = Trail.to(x), mi.Color3f(0), dr.width(x.t)
     blank = Place(dr.zeros(mi.Point3f, lanes), mi.UInt32(0), mi.Int32(0))
     dark = [dr.zeros(mi.Spectrum, lanes) for _ in known.means]
@@ -133,7 +134,7 @@ def walk(plan: Plan, known: Known, random, path: Path, records: list, half: mi.U
         sorts, _, ends = known.look(where, LEAST_TO_FEED, able, half)
         # The first vertex is where others will end: it has a record in any case.
         ends &= (count > 0) & ((count == RECORDS) | (random.next_1d() >= RENEW))
-        ρ = plan.matt.reflectance(path.x, ends)
+        ρ = plan.matt.reflectance(path.x, path.place, ends)
         fresh = able & ~ends & (count < RECORDS)
         for i in range(RECORDS):
             r, this = records[i], fresh & (count == i)
@@ -146,6 +147,6 @@ def walk(plan: Plan, known: Known, random, path: Path, records: list, half: mi.U
         # Which paths survive, those decide that are to find the light of the newest record.
         path.β = dr.select(fresh, 1, path.β)
         path.ρ = ρ
-        path.walks = path.walks & ~(ends & plan.matt.lambertian(path.x, ends))
+        path.walks = path.walks & ~(ends & plan.matt.lambertian(path.x, path.place, ends))
         active = path.goes_on(plan, [])
     return count, records
