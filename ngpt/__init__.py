@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from ngpt.stack import GradientStack
     from ngpt.system.limits import limit_threads
 
-# Official builds of ONNX Runtime send telemetry by themselves (SECURITY.md). It reads this once, as it is loaded, and
-# who loads it first may not be us: exporters of PyTorch do, too.
+# Official builds of ONNX Runtime send telemetry by themselves (SECURITY.md). It reads this variable once, when it is
+# loaded, and others may load it first, such as PyTorch's exporters.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 # Quiet, unless a program asks: logging.getLogger("ngpt").setLevel("INFO"), with a handler of its own.
@@ -55,8 +55,8 @@ __all__ = [
     "write",
 ]
 
-# Imported on first use. So the commands are at work, and handle what interrupts them, before NumPy and SciPy have been
-# loaded, which comes with this package otherwise.
+# Imported on first use. So commands start, and handle interrupts, before NumPy and SciPy are loaded, which importing
+# this package would do.
 _HOMES = {"GradientStack": "stack", "NgptError": "errors", "merge": "merging"}
 _HOMES |= dict.fromkeys(("Denoiser", "denoise"), "api.arrays")
 _HOMES |= dict.fromkeys(("read", "read_image", "read_views", "write"), "io.exr")

@@ -3,9 +3,9 @@
 Light is premultiplied by alpha, so light at alpha 0 is legal: fire and glare add to what is behind them. It stays, and
 so do the dark pixels among it.
 
-Light that a method spread into empty pixels may be missed beside them: where hair covers a tenth of each pixel, a
-method evens out what few samples found. So it goes back to the covered pixels around, in proportion to their alpha, as
-far as the input has more light there than is left.
+Light that a method spread into empty pixels is missing in the covered ones: where hair covers a tenth of each pixel, a
+method evens out what few samples found. So this light is given back to the covered pixels around, in proportion to
+their alpha, up to the light that the input has there.
 """
 
 import numpy as np
@@ -13,14 +13,14 @@ import numpy as np
 from ngpt.stack import GradientStack
 from ngpt.system.late import ndimage
 
-# Pixels around light at alpha 0 in which darkness may be chance, as the side of a square.
+# Side of the square, around light at alpha 0, where black pixels may be chance.
 _CHANCE = 5
-# Standard deviation, in pixels, of the window in which light goes back.
+# Standard deviation, in pixels, of the window over which light is given back.
 _WINDOW = 2.0
 
 
 def empty_pixels(stack: GradientStack) -> np.ndarray:
-    """(H, W) booleans; none where most of the light is at alpha 0: such an alpha says nothing of what is there."""
+    """(H, W) booleans; none where most of the light is at alpha 0: such an alpha is not coverage."""
     if "alpha" not in stack:
         return np.zeros((stack.height, stack.width), bool)
     uncovered = stack["alpha"][..., 0] == 0
@@ -48,8 +48,8 @@ def kept_within(image: np.ndarray, stack: GradientStack) -> np.ndarray:
 def mirrored(image: np.ndarray, empty: np.ndarray) -> np.ndarray:
     """The image (H, W, C) with its ``empty`` pixels filled from the covered ones that they would see in a mirror.
 
-    The mirror stands on the covered pixel that is nearest. Where it shows no covered pixel of the same island, that one
-    is taken itself. So each island goes on with light and noise like its own.
+    The mirror is at the nearest covered pixel. Where it shows no covered pixel of the same island, the nearest pixel
+    itself is taken. So each island is continued by light and noise like its own.
     """
     if not empty.any() or empty.all():
         return image

@@ -1,4 +1,4 @@
-"""The one exception that users of ngpt meet, its kind for wrong calls, and interrupts, which others hide."""
+"""The one exception that users of ngpt meet, its subclass for wrong calls, and interrupts that other libraries hide."""
 
 from collections.abc import Iterable
 
@@ -9,8 +9,8 @@ class NgptError(ValueError):
     """A problem the user can act on.
 
     The message is one line that names the file, the layer and the number that is wrong, and says what to do about it.
-    What a broken file puts into it, line breaks or a megabyte of text, is brought down to that. The library only raises
-    it; the command line prints it and turns it into an exit status.
+    Text from a broken file, with line breaks or a megabyte long, is shortened to one line. The library only raises it;
+    the command line prints it and turns it into an exit status.
     """
 
     def __init__(self, message: str):
@@ -20,14 +20,15 @@ class NgptError(ValueError):
 
 
 class WrongUse(NgptError):
-    """The request makes no sense whatever the files hold: an option, a value, or two that exclude each other.
+    """A request that makes no sense, whatever the files hold: an unknown option, a wrong value, or two options that
+    exclude each other.
 
     The command line ends with status 2 for it, and with 1 for any other ``NgptError``.
     """
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """The text before a list of the known names if a word is none of them: a question, or nothing."""
+    """The text before a list of the known names if a word is unknown: a question, or ""."""
     from difflib import get_close_matches  # only for those who mistype
 
     near = get_close_matches(word.lower(), names := {name.lower(): name for name in known}, 1)
@@ -37,8 +38,8 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 class Interrupted(KeyboardInterrupt):
     """What Ctrl-C and SIGTERM raise in a command.
 
-    Python 3.11 ends itself by SIGINT, whatever exit status it is given, once a plain KeyboardInterrupt has passed
-    through code that was compiled from a string, such as the code of dataclasses and named tuples.
+    Once a plain KeyboardInterrupt has passed through code compiled from a string, such as that of dataclasses and named
+    tuples, Python 3.11 ends itself by SIGINT, whatever exit status it is given.
     """
 
 

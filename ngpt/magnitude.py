@@ -1,4 +1,4 @@
-"""Light of any exposure, brought to where single precision holds its squares, and back.
+"""Scales light of any exposure so that single precision holds its squares, and scales results back.
 
 Methods square light and weigh by variances in single precision, which ends at 2^±127. So a stack whose typical light is
 beyond 2^±``ORDINARY`` is multiplied by a power of two before a method sees it, and the result is multiplied back. Both
@@ -18,7 +18,7 @@ import numpy as np
 from ngpt.layers import LAYERS, RGB
 from ngpt.stack import GradientStack
 
-# Binary digits between typical light and 1 that methods are made for: a millionth to a million.
+# The powers of two of typical light that methods are made for: a millionth to a million.
 ORDINARY = 20
 # The largest light has at most this number of binary digits before the point: its square is a float.
 _LARGEST = 62
@@ -37,8 +37,8 @@ VARIANCES = tuple(name for name in LIGHT if name.endswith("_var"))
 def magnitude(stack: GradientStack) -> int:
     """The power of two of the typical light of a stack; 0 where that is ordinary, and where there is no light.
 
-    Typical is the median of the primal's finite values but 0. Where the largest are so far beyond it that their squares
-    would not be finite, it is larger.
+    The typical light is the median of the primal's finite values other than 0. It is larger where the squares of the
+    largest values would not be finite otherwise.
     """
     primal = stack["primal"]
     flat = primal.reshape(-1)

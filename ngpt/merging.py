@@ -7,8 +7,8 @@ With n_i samples per pixel, means m_i and variances of the mean v_i, the stack o
 
 [Chan, Golub, LeVeque 1983, "Algorithms for computing the sample variance", eq. 2.1]
 
-Its expectation is the variance of m for any weights n_i that no sample has a say in, whatever the v_i: so it holds for
-differences too, whose two directions may have samples in different numbers.
+Its expectation is the variance of m for any weights n_i that do not depend on the samples, whatever the v_i. So it
+holds for differences too, whose two directions may have different numbers of samples.
 
 Stacks in different places of one picture are tiles: each counts in its own pixels.
 """
@@ -35,9 +35,9 @@ _LOG = logging.getLogger(__name__)
 VARIANCES = {name: f"{name}_var" for name in ("primal", "dx", "dy", "caustic", "diffuse", "specular", "dt")}
 # The prefix of further channels that are means over samples.
 DIAGNOSTICS = "diagnostics."
-# Attribute: what broke a render off before all that was asked for was done, "interrupted" or "failed"
+# Attribute: why a render ended before its request was complete, "interrupted" or "failed"
 UNFINISHED = "ngpt:unfinished"
-# Attribute: what was asked for, all in one (``data_gen.request``); of stacks that are merged nobody asked so
+# Attribute: the whole request (``data_gen.request``); merged stacks have none
 REQUEST = "ngpt:request"
 # Attribute: the sampler's options that are not defaults, with commas between
 OPTIONS = "ngpt:samplerOptions"
@@ -242,7 +242,7 @@ def _variance_of_shared(tiles: Sequence[_Tile], total: np.ndarray) -> np.ndarray
 
 def _options(stacks: Sequence[GradientStack]) -> dict[str, str]:
     """The attribute that has the options of all stacks; none where all are defaults."""
-    # What holds of a part holds of the whole, such as that paths share their tails, which biases it.
+    # A property of a part is one of the whole, such as shared tails, which bias it.
     each = [[option for option in str(stack.attributes.get(OPTIONS, "")).split(", ") if option] for stack in stacks]
     options = dict.fromkeys(option for part in each for option in part)
     if SHARED_TAILS in options and not all(SHARED_TAILS in part for part in each):

@@ -45,7 +45,8 @@ class Method:
     ``estimates``  layers that it estimates from the others where the stack lacks them
     ``variant``  the method that it is with other options, "" for a method of its own
     ``apart``    whether what photons brought is taken out of the image and denoised by ``ngpt.denoisers.caustic``
-    ``rec709``   whether it was made for colours of Rec. 709: others are converted for it, as far as they are within
+    ``rec709`` whether it was made for colours of Rec. 709: others are converted for it, as far as they are within its
+    gamut
     """
 
     summary: str
@@ -126,7 +127,7 @@ def _network(
 
 
 def _variant(method: str, summary: str, **options: Any) -> Method:
-    """The method with other defaults, under a name of its own: rows of tables are names that can be asked for."""
+    """The method with other defaults, under a name of its own: every row of a table has a name that can be used."""
     entry = _OURS[method]
     other = {name: replace(entry.options[name], default=value) for name, value in options.items()}
     return replace(entry, summary=summary, options=entry.options | other, variant=method)
@@ -291,13 +292,13 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     own = options.get("weights")
     name = method
     if method == "auto":
-        # Weights say themselves what they need: any method that runs them will do.
+        # Weights say what they need: any method that runs them will do.
         name = "ngpt" if own else choose(stack)
     if name not in METHODS:
         raise unknown_method(name)
     entry = METHODS[name]
     if method == "auto":
-        # Where and in how much memory concerns only some of those it may stand for.
+        # Device and memory concern only some of the methods that "auto" may stand for.
         idle = {"device", "memory"} - entry.options.keys()
         options = {option: value for option, value in options.items() if option not in idle}
     try:
@@ -307,7 +308,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         raise error if method == name else NgptError(str(error)) from None
     if entry.missing() and not own:
         raise NgptError(f"method '{name}': {entry.missing()}")
-    # What the weights of a network need, they say themselves.
+    # The weights of a network say what they need.
     stack.require(*(("primal",) if own else entry.needs), why=f"weights {own}" if own else f"method '{name}'")
     reads = Shipped(name).reads(**values) if "weights" in entry.options else entry.needs
     given, matrix = stack, inside_rec709(stack) if entry.rec709 else None
@@ -322,7 +323,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         data = replace(data, empty=empty_pixels(stack))
     if set(DENOISED) & set(reads):
         data = replace(data, by_oidn=Oidn(data))
-    # Extreme values may leave the range of float32 inside; what comes out is checked.
+    # Extreme values may leave the range of float32 on the way; the result is checked.
     with np.errstate(over="ignore", invalid="ignore"):
         image = _run(name, entry, data, values, stack.path) + data.direct
         if data.caustic is not None:
@@ -359,7 +360,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
 
 
 def _run(name: str, entry: Method, data: Repaired, values: Mapping[str, Any], path: str) -> np.ndarray:
-    """What the method returns; what one of another package raises is an NgptError."""
+    """The result of the method. Exceptions of other packages' methods become an NgptError."""
     try:
         return entry.run(data, **values)
     except Exception as error:

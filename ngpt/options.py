@@ -8,7 +8,7 @@ from typing import Any
 
 from ngpt.errors import WrongUse, did_you_mean
 
-# Whom samplers and methods are for: users; users who know why; those who study them
+# The audience of a sampler or method: all users; users with a reason; those who study it
 STANDINGS = ("use", "niche", "study")
 
 Value = bool | int | float | str

@@ -1,4 +1,4 @@
-"""Images of 360 degrees: their left and right borders are neighbours, so methods see them continued on both sides.
+"""Images of 360 degrees: their left and right borders are adjacent, so methods get them continued on both sides.
 
 An image is one if its header says so: by OpenEXR's ``envmap`` for latitude and longitude, or by our ``ngpt:wrap``.
 """

@@ -1,4 +1,4 @@
-"""The renderer as ngpt sees it: what the evaluation and ``ngpt info`` ask of it, and ``ngpt train``.
+"""The interface of a renderer: what the evaluation, ``ngpt info`` and ``ngpt train`` need from it.
 
 ``ngpt.system.parts.find_renderer`` finds the one that is installed, ``data_gen.service``: an entry point of the group
 "ngpt.renderers" names it. Nothing in ngpt imports it.
@@ -27,7 +27,7 @@ class Renderer(Protocol):
         """A stack of ``spp`` samples per pixel, or rendered in this many ``seconds``."""
 
     def warm_up(self, scene: Any, options: Options) -> GradientStack:
-        """Has the kernels of a render compiled; its stack of one sample."""
+        """Compiles the kernels of a render; returns its stack of one sample."""
 
     def timed(self, scene: Any, options: Options, spp: int, seed: int, clock: str) -> tuple[GradientStack, float]:
         """A stack and its seconds, by the ``clock`` "wall" or "processor"."""
@@ -38,10 +38,10 @@ class Renderer(Protocol):
         """Seconds per sample of each of the ``renders`` by name, and the last stack of the first of them."""
 
     def batch(self, sampler: str) -> int:
-        """Samples per pixel that depend on each other; 0: none do."""
+        """The number of samples per pixel that depend on each other; 0 if all are independent."""
 
     def gradients(self, sampler: str) -> bool:
-        """Whether it renders them; of an unknown one nobody knows better."""
+        """Whether the sampler renders gradients; True for an unknown one."""
 
     def unusual(self, sampler: str, options: Options) -> str:
         """The sampler's options that are not defaults: "radius=1, photons=2". Raises NgptError for wrong ones."""

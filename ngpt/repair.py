@@ -83,7 +83,7 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
         raise NgptError(f"{stack.path}: layer 'primal' has no finite pixel among {good.size}; render it again")
     # Copies only of what changes: layers of large images are large.
     image = primal
-    # What is not finite may be Inf - Inf here; it is replaced below.
+    # Inf - Inf may occur here; such values are replaced below.
     with np.errstate(invalid="ignore"):
         if direct.any():
             image = image - direct

@@ -56,7 +56,7 @@ def noise_of_light(primal: np.ndarray, primal_var: np.ndarray, shared: np.ndarra
 def box_means(image: np.ndarray, size: int) -> np.ndarray:
     """Means over ``size`` x ``size`` pixels around each of (H, W), mirrored at the edges: SciPy's ``uniform_filter``.
 
-    To the bit; but SciPy takes longer to import than the rest of a small render takes for all of its variances.
+    The bits are the same, but importing SciPy would take longer than all variances of a small render.
     """
     if not image.size:  # the differences within a single row or column of pixels
         return image

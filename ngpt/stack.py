@@ -64,7 +64,8 @@ class GradientStack(Mapping[str, np.ndarray]):
     def from_aovs(
         cls, tensor: ArrayLike, names: Sequence[str], attributes: Mapping[str, Any] | None = None
     ) -> "GradientStack":
-        """A stack of the (height, width, channels) tensor that ``mi.render(scene)`` returns of one of our integrators.
+        """A stack from the (height, width, channels) tensor that ``mi.render(scene)`` returns with one of our
+        integrators.
 
         ``names`` are the integrator's ``aov_names()``, one for each channel: "primal.R". Raises NgptError if there are
         more or fewer names than channels, for a name of no layer, and for a layer with missing channels.

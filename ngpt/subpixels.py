@@ -3,7 +3,7 @@
 A pixel on an edge mixes two surfaces, and no denoiser can take them apart again. So ``primal``, ``albedo`` and
 ``normal`` may be kept by subpixels, (K H, K W, 3) float32: subpixel (i, j) of pixel (y, x), row by row, is at
 [K y + i, K x + j]. They are ``GradientStack.fine``. A pixel of the stack is the mean of its subpixels, to the bit, as
-``means`` computes it. So subpixels that belong to other pixels are found out, whoever changed these.
+``means`` computes it. So subpixels that no longer belong to their pixels are detected, whatever program changed these.
 """
 
 import logging

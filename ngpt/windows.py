@@ -1,4 +1,4 @@
-"""Where images lie: the rectangle of their pixels, in the rectangle of the whole picture.
+"""The place of an image: the rectangle of its pixels, within the rectangle of the whole picture.
 
 OpenEXR calls them data window and display window. Pixels of two images belong together where their windows say so, not
 where their arrays have the same index.
@@ -152,7 +152,7 @@ def overlap(names: Sequence[str], places: Sequence[Place]) -> Overlap:
 def put(image: np.ndarray, window: Window, canvas: Window, outside: float = 0.0) -> np.ndarray:
     """An image (H, W, C) of the pixels of ``window``, cut to ``canvas`` and filled up to it with ``outside``.
 
-    Raises NgptError for a canvas that is out of all proportion, as a header may ask for with a few bytes.
+    Raises NgptError for an absurdly large canvas, which a few bytes of a header can ask for.
     """
     if window == canvas:
         return image

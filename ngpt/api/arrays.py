@@ -1,4 +1,4 @@
-"""Reconstructions of the arrays that a renderer has in its hands: NumPy, PyTorch, Dr.Jit, Mitsuba's bitmaps.
+"""Reconstruction of arrays in memory: NumPy, PyTorch, Dr.Jit, Mitsuba's bitmaps.
 
 clean = ngpt.denoise(noisy, albedo=albedo, normal=normal)        # the same kind comes back
 denoiser = ngpt.Denoiser(size, albedo=True, normals=True)        # or called as mi.OptixDenoiser is
@@ -75,7 +75,7 @@ def denoise(
 ) -> Kind: ...
 
 
-# In the first form the layers of ``layers_and_options`` are those that stand here by name.
+# In the first form, ``layers_and_options`` has the layers that are named here.
 @_with_methods  # type: ignore[misc]
 def denoise(
     image: Image | GradientStack,
@@ -324,7 +324,7 @@ def _check_options(where: str, method: str, options: Iterable[str], layers: tupl
 
 
 def _first(value: Any, channel: str) -> Any:
-    """What was given as an array, or as a channel's name; None for neither: so are "" and tensors without elements."""
+    """The argument, an array or the name of a channel; None for "" and for tensors without elements."""
     value = channel if value is None else value
     return None if (isinstance(value, str) and not value) or 0 in getattr(value, "shape", ()) else value
 

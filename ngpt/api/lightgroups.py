@@ -1,7 +1,7 @@
-"""Light groups, denoised so that they still add up to the image: for those who set the lights anew in compositing.
+"""Light groups, denoised so that they still add up to the image, for relighting in compositing.
 
-Each group is denoised by itself, since it has shadows of its own. What their sum then lacks of the reconstruction of
-the whole, or has too much, is divided among them, in each pixel in proportion to the light that they have there:
+Each group is denoised by itself, since it has shadows of its own. The difference between the reconstruction of the
+whole and their sum is divided among them, in each pixel in proportion to the light that they have there:
 
     o_i = d_i + (D - Σ d_j) |d_i| / Σ |d_j|
 

@@ -1,4 +1,5 @@
-"""Images of NumPy, PyTorch, Dr.Jit and others, and Mitsuba's bitmaps: as NumPy arrays, and results as what came in.
+"""Images of NumPy, PyTorch, Dr.Jit and others, and Mitsuba's bitmaps: as NumPy arrays, and results as the kind of the
+input.
 
 No library is imported here: arrays are known by what they can do.
 """
@@ -45,7 +46,7 @@ def to_numpy(value: Any, name: str = "the array") -> np.ndarray:
     """Arrays of any library, from any device, as NumPy's; shared where that is possible.
 
     Raises NgptError, which begins with ``name``, for what NumPy cannot read, for bitmaps that are not linear, and for
-    tensors with gradients, which would end here in silence.
+    tensors with gradients, which would be lost here in silence.
     """
     if isinstance(value, np.ndarray):
         return value
@@ -72,7 +73,7 @@ def to_numpy(value: Any, name: str = "the array") -> np.ndarray:
 
 
 def _detached(value: Any, name: str) -> str:
-    """The code that takes gradients off ``value``, called ``name``; "" where nobody expects them of it."""
+    """The code that detaches ``value``, called ``name``, from its gradients; "" if it has none."""
     torch = sys.modules.get("torch")
     if torch is not None and isinstance(value, torch.Tensor):
         return f"{name}.detach()" if value.requires_grad and torch.is_grad_enabled() else ""
@@ -81,9 +82,9 @@ def _detached(value: Any, name: str) -> str:
 
 
 def like(image: np.ndarray, example: Any) -> Any:
-    """The image (H, W, C) as whatever ``example`` is: its library, device and type of numbers.
+    """The image (H, W, C) in the library, on the device and with the number type of ``example``.
 
-    A bitmap of many channels gives one of as many as the image has: RGB or RGBA. What is of no library gives NumPy's.
+    A bitmap of many channels gives one of as many as the image has: RGB or RGBA. Other objects give NumPy arrays.
     """
     if isinstance(example, np.ndarray):
         return _of_type(image, example.dtype) if example.dtype.kind == "f" else image

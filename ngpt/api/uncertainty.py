@@ -2,8 +2,8 @@
 
 The method runs a second time, with more noise added to primal, dx, dy and caustic, of the variances of the stack. Noise
 that pixels share is added as the layer ``shared`` has it: a denoiser leaves it in, and removes white noise. The
-change of the image over about 9x9 pixels, times a factor that is measured for each method, is the standard error. How
-good that is, and where it fails: docs/use/uncertainty.md.
+change of the image over about 9x9 pixels, times a factor that is measured for each method, is the standard error.
+docs/use/uncertainty.md says how good that is, and where it fails.
 """
 
 from dataclasses import replace
@@ -23,7 +23,7 @@ from ngpt.system.late import ndimage
 
 SPREAD = 2.6  # pixels, the standard deviation of the window over which the change is averaged: as large as 9x9 pixels
 SEED = 20261122
-# By `python -m bench.uncertainty`, on scenes named there; of methods that are not here, the most frequent.
+# By `python -m bench.uncertainty`, on scenes named there. Other methods have the most frequent factor.
 FACTORS = {"primal": 0.9, "l2": 0.9, "l1": 1.7, "cv": 0.85, "wcv": 1.1, "wl2": 1.4}
 FACTOR = 1.2
 
@@ -72,9 +72,8 @@ def _check_halves(stack: GradientStack, halves: tuple[GradientStack, GradientSta
 
 
 def known_noise(stack: GradientStack) -> np.ndarray:
-    """Where all variances are finite of what images are made of, (H, W) booleans.
-
-    Differences beyond the border do not count, for there are none, nor those that are not finite, which are left out.
+    """Where all variances that images depend on are finite, (H, W) booleans. Differences beyond the border do not exist
+    and do not count. Differences that are not finite are left out and do not count either.
     """
     known = np.ones((stack.height, stack.width), bool)
     inside: Any
@@ -88,7 +87,7 @@ def known_noise(stack: GradientStack) -> np.ndarray:
 
 
 def noisier(stack: GradientStack) -> GradientStack:
-    """The stack with noise added, of the variances that it holds, none where they are not finite; raises NgptError
+    """The stack with added noise of the variances that it holds, and none where they are not finite; raises NgptError
     where it lacks them. The layer ``shared`` is added as it is, and its variance is not added once more."""
     stack.require("primal_var", why="an estimate of the error")
     for name in ("dx", "dy"):
@@ -124,7 +123,7 @@ def noisier(stack: GradientStack) -> GradientStack:
 def _noisier_subpixels(
     stack: GradientStack, noise: np.ndarray, rng: np.random.Generator, k: int
 ) -> dict[str, np.ndarray]:
-    """The subpixels with so much ``noise`` of their pixels, and beside it noise of their own, whose means are 0.
+    """The subpixels with the ``noise`` of their pixels, plus noise of their own whose mean over each pixel is 0.
 
     The variance of a subpixel is K² times its pixel's, without what pixels share.
     """

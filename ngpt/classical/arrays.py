@@ -1,4 +1,4 @@
-"""What the solvers share beyond NumPy's operations: cosine transforms, bands of rows, layouts.
+"""Operations that the solvers share: cosine transforms, bands of rows, layouts.
 
 Arrays are (..., H, W), float32 or float64, unless a function says otherwise.
 """
@@ -28,7 +28,9 @@ def image(planes: np.ndarray) -> np.ndarray:
 
 
 def over_colours(image: np.ndarray) -> np.ndarray:
-    """(H, W, C) summed over C in double precision; channel by channel, ten times as fast as over an axis of three."""
+    """(H, W, C) summed over C in double precision; channel by channel, which is ten times as fast as a sum over an axis
+    of three.
+    """
     total = image[..., 0].astype(np.float64)
     for channel in range(1, image.shape[-1]):
         total = total + image[..., channel]
@@ -43,7 +45,9 @@ def empty(array: np.ndarray, *lead: int, channels_last: bool = False, dtype: Any
 
 
 def map_rows(function: Callable[[int, int], Any], *like: np.ndarray) -> list:
-    """What ``function(first, last)`` returns for bands of rows first .. last - 1, top to bottom, made on all cores."""
+    """The results of ``function(first, last)`` for bands of rows first .. last - 1, top to bottom, computed on all
+    cores.
+    """
     height = like[0].shape[-2]
     rows = max(1, BAND * height // max(1, sum(array.size for array in like)))
     return map_silent(lambda first: function(first, min(first + rows, height)), range(0, height, rows))

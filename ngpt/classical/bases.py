@@ -1,6 +1,6 @@
 """The classical reconstructions of a repaired stack: what each needs, its options, and which a network may start from.
 
-The solvers beside this file know arrays only. Here is what they are given of a stack, for all who call them by name.
+The solvers in this package take arrays only. This module gives them the arrays of a stack, and calls them by name.
 """
 
 from collections.abc import Callable
@@ -82,8 +82,8 @@ CLASSICAL = {
     "wl2": Classical(_ALL, partial(_keeping_energy, weighted.wl2), {}),
 }
 
-# The methods a network can start from: they cost less than the network. wcv is reduced to its sweeps, which see no more
-# of the image than a tile has.
+# The methods a network can start from: they cost less than the network. wcv is reduced to its sweeps, which need only
+# the pixels of a tile.
 BASES = {
     "l2": CLASSICAL["l2"],
     "cv": CLASSICAL["cv"],

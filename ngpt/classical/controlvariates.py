@@ -1,13 +1,14 @@
-"""Reconstruction by iterative control variates: every pixel becomes the mean of what its neighbours say it is.
+"""Reconstruction by iterative control variates: every pixel becomes the mean of its neighbours' estimates of it.
 
     I_p  <-  Σ_q w_pq (I_q + ΔI_qp)        q over p itself and its four neighbours, ΔI_qp the sampled difference
 
     cv     w_pq equal                                        [survey eq. 14]
     wcv    w_pq ~ 1 / (f_n var I_p + var ΔI_qp)              [survey eq. 20 - 22]
 
-repeated 50 times from the primal. var I_p, not var I_q: weights of the sender would lose energy. f_n is by how much n
-iterations have lowered the variance of a pixel; the reference implementation of Rousselle et al. takes 1 / Π_k≤n
-(1.01 + 4 · 2⁻ᵏ). It adds 1e-4 to all variances, which depends on exposure; ``ngpt.classical.variances`` has what we do.
+repeated 50 times from the primal. var I_p, not var I_q: weights of the sender would lose energy. f_n is the factor by
+which n iterations have lowered the variance of a pixel; the reference implementation of Rousselle et al. takes 1 /
+Π_k≤n (1.01 + 4 · 2⁻ᵏ). It adds 1e-4 to all variances, which depends on exposure; ``ngpt.classical.variances`` has what
+we do.
 
 After the first few iterations f_n hardly changes. From there on, ``wcv`` takes 12 steps of different lengths in place
 of 44 iterations [scheduled relaxation: Yang and Mittal 2014, "Acceleration of the Jacobi iterative method by factors
@@ -43,8 +44,8 @@ def cv(
 ) -> np.ndarray:
     """Uniform control variates, (H, W, C) in the units of ``primal``; arguments as of ``ngpt.classical.poisson.l2``.
 
-    Linear in (primal, dx, dy). ``sweeps`` of the Jacobi iteration: more take more from further pixels, down to a
-    constant plus the integrated gradients.
+    Linear in (primal, dx, dy). ``sweeps`` of the Jacobi iteration: with more of them, farther pixels count more, up to
+    a constant plus the integrated gradients.
     """
     equations = Equations(primal, dx, dy, trusted)
     # Exact differences give equal weights.
@@ -88,8 +89,8 @@ def _sweep(
 ) -> np.ndarray:
     """Jacobi sweeps on the correction u = I - P, by ``schedule``.
 
-    With weights relative to a pixel's own, a = f var I / (f var I + var Δ) <= 1, what a neighbour says beyond the
-    pixel's value e is weighted by a: u += s Σ a e / (1 + Σ a).
+    With weights relative to a pixel's own, a = f var I / (f var I + var Δ) <= 1, a neighbour's estimate less the
+    pixel's value, e, is weighted by a: u += s Σ a e / (1 + Σ a).
     """
     r, scale = equations.scaled_residual()
     return equations.image(jacobi(r, primal_var, difference_var, schedule), scale)

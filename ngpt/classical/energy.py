@@ -1,9 +1,9 @@
-"""Energy that weights lose, given back where it was lost.
+"""Restores the light that data-dependent weights lose, near the place where it was lost.
 
 Weights are estimated from the samples that they weigh. A pixel that a bright sample hit is trusted less than its
-neighbours that none hit, so weighted means are dark. Brightened by the ratio of what is there in a wide neighbourhood
-before and after, an image keeps the energy of the primal, which is unbiased; dark regions beside bright ones get little
-of it.
+neighbours that none hit, so weighted means are dark. So an image is brightened by the ratio of the light in a wide
+neighbourhood before and after, and keeps the energy of the primal, which is unbiased. Dark regions beside bright ones
+get little of it.
 """
 
 import numpy as np

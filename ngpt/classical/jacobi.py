@@ -110,7 +110,8 @@ class _Strip:
     ) -> None:
         """One sweep over rows top .. end - 1.
 
-        ``above`` (C, pitch) is what the last row of those before said of this sweep's first, and will be of the next.
+        ``above`` (C, pitch) is the estimate of this sweep's first row by the last row before it. It is replaced by the
+        one for the next rows.
         """
         pitch, first, last = self.pitch, top * self.pitch, end * self.pitch
         size = last - first

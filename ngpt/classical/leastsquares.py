@@ -1,4 +1,4 @@
-"""Least squares over an image and its differences: what the linear reconstructions and the inner solves share.
+"""Least squares over an image and its differences, shared by the linear reconstructions and the inner solves.
 
 The equations are I ≈ P and ∇I ≈ G. All solvers look for the correction u = I - P, for which they read u ≈ 0 and
 ∇u ≈ r with r = G - ∇P: exact gradients have r = 0 and give u = 0, whatever the weights.
@@ -16,7 +16,7 @@ from ngpt.errors import NgptError
 # over the other: such inputs are solved in double precision.
 FLOAT32_RANGE = 2.0**16
 
-# How many times the mean a value counts at most, see ``robust_mean``.
+# A value counts as at most this multiple of the mean, see ``robust_mean``.
 CLIP = 100
 
 
@@ -77,7 +77,9 @@ class Equations:
         return r, scale
 
     def _holds(self, peaks: list) -> bool:
-        """Whether the precision does for these largest values of r in each band; turns to double precision if not."""
+        """Whether the precision suffices for these largest values of r in each band. Switches to double precision if
+        not.
+        """
         peak = float(np.max(peaks))
         if not math.isfinite(peak):
             raise NgptError("primal, dx or dy holds values that are not finite; ngpt.reconstruct() repairs them first")
@@ -106,8 +108,9 @@ def _peak(*arrays: np.ndarray) -> float:
 def solve(b: np.ndarray, screen: float, mean: np.ndarray | float | None = None) -> np.ndarray:
     """The planes u (C, H, W) with (screen + ∇ᵀ∇) u = b; b is overwritten.
 
-    The cosine transform of type II diagonalises ∇ᵀ∇ under Neumann boundaries [Bhat et al. 2008]. ``mean`` (C) is that
-    of u where the caller knows it: differences have none, and what rounding leaves of it is divided by ``screen``.
+    The cosine transform of type II diagonalises ∇ᵀ∇ under Neumann boundaries [Bhat et al. 2008]. ``mean`` (C) is the
+    mean of u where the caller knows it. Differences do not determine it, and its rounding error would be divided by
+    ``screen``.
     """
     height, width = b.shape[-2:]
     λy, λx = ((4 * np.sin(np.pi / 2 * np.arange(n) / n) ** 2).astype(b.dtype) for n in (height, width))

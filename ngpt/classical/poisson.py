@@ -125,7 +125,8 @@ def least_norms(
         # variable, previous - shrunk, is scaled by the threshold and falls with it.
         new = (fall + (1 - fall - RELAXATION) * factor[:, :, first:last]) * previous
         new += RELAXATION * e
-        # The proximal operator of the norm shortens each colour by the threshold; what does not count stays.
+        # The proximal operator of the norm shortens each colour by the threshold; equations that do not count are left
+        # as they are.
         shorter = (1 - threshold * counts[:, :, first:last] / norm(new)).clip(0, None)
         v = (2 * shorter - 1) * new
         total = v[0].sum((1, 2), dtype=np.float64)

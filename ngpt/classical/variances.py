@@ -1,7 +1,7 @@
-"""Variances of a stack made fit for weights, and the α they suggest.
+"""Variances of a stack, prepared as weights, and the α that follows from them.
 
 The input is sample variances of pixel means, from as few as two samples. They are too noisy to be used pixel by pixel,
-zero where all samples missed the light, and larger where a sample hit it, as the values are. Weights computed directly
+zero where all samples missed the light, and, like the values, larger where a sample hit it. Weights computed directly
 from them would trust the pixels that saw nothing.
 
 For the primal, such weights darken the image. So its variances are averaged over a neighbourhood.
@@ -38,7 +38,7 @@ TYPICAL = 3
 # (docs/lab/log).
 SHARED = 0.6
 
-# What a count of values that are there, a mean, is divided by at least.
+# The least divisor for the share of valid values.
 FEW = 1e-9
 
 # Share of the largest variances that do not count for α.
@@ -125,7 +125,7 @@ def _over_colours(variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def smoothed(variance: np.ndarray, outliers: bool = False) -> np.ndarray:
     """(H, W, C) -> (H, W): twice the mean over 3 x 3 sums that are good, and the mean of all where there are none.
 
-    With ``outliers``, means of fourth roots, and a sum that is larger than what comes of them stays as it is.
+    With ``outliers`` it averages fourth roots, and a sum that is larger than the result is kept.
     """
     height = len(variance)
 
@@ -148,7 +148,7 @@ def smoothed(variance: np.ndarray, outliers: bool = False) -> np.ndarray:
         smooth = total / count.clip(FEW, None)
         if outliers:
             smooth = np.maximum(TYPICAL * (smooth * smooth) ** 2, raw)
-        # No variance is negative: what is missing.
+        # Negative marks missing values, since no variance is negative.
         return np.where(count > 0, smooth, -1)[own], *sums
 
     smooth, bands = by_rows(rows, empty(variance[..., 0], dtype=np.float64))

@@ -1,6 +1,6 @@
 """The command ``ngpt``: one verb, one module, which is imported only when its verb is called.
 
-Verbs that render are in ``data_gen.cli``, and come by an entry point: nothing here imports the renderer.
+Verbs that render are in ``data_gen.cli``, and are found by an entry point: nothing here imports the renderer.
 
 Exit status, of all verbs: 0 when everything asked for was done; 1 when work failed, for some file or for all, and when
 images differ; 2 for a call that makes no sense (``WrongUse``); 130 and 143 after Ctrl-C and SIGTERM.
@@ -72,7 +72,7 @@ def all_verbs() -> dict[str, Verb]:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Reports a wrong call in one line, as all other errors are."""
+    """Reports a wrong call in one line, like all other errors."""
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
@@ -177,7 +177,7 @@ def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
 
 
 def _filled(parser: argparse.ArgumentParser, name: str, verb: Verb) -> argparse.ArgumentParser:
-    """The parser, with what its verb is and the arguments of it."""
+    """The parser, with the description and the arguments of its verb."""
     parser.description = f"{verb.summary[0].upper()}{verb.summary[1:]}."
     parser.set_defaults(verb=name, parser=parser)
     loud = parser.add_mutually_exclusive_group()
@@ -192,7 +192,7 @@ def _work(parser: argparse.ArgumentParser, verbs: Mapping[str, Verb], words: lis
     if unknown:
         meant = did_you_mean(unknown[0].partition("=")[0], args.parser._option_string_actions)
         args.parser.error(f"unrecognized argument '{unknown[0]}'{f'; {meant}' if meant else ''}".rstrip())
-    # Shells leave the tilde of --output=~/it.exr to us.
+    # Shells do not expand the tilde in --output=~/it.exr.
     for name in ("output", "out"):
         if isinstance(path := getattr(args, name, None), str | Path):
             setattr(args, name, type(path)(os.path.expanduser(path)))

@@ -44,7 +44,7 @@ def add_options(parser: argparse._ActionsContainer, owner: str, name: str) -> No
 def output_file(path: str | Path, args: argparse.Namespace) -> Path:
     """The path of a file to write, whose folder is made; raises NgptError where that cannot be, and for what exists.
 
-    ``args`` has ``force``, and ``skip_existing`` where the verb knows it, which is of use for OpenEXR.
+    ``args`` has ``force``, and ``skip_existing`` where the verb has that option, which helps with OpenEXR.
     """
     skip = getattr(args, "skip_existing", None)
     make_folder(Path(path).parent)
@@ -81,7 +81,9 @@ def write_template(args: argparse.Namespace, text: str, verb: str, console: Cons
 
 
 class Names(Container[str]):
-    """The names of a registry and "auto", as choices of an option. Others' entries are listed once imported."""
+    """The names of a registry and "auto", as choices of an option. Entries of other packages are listed once they are
+    imported.
+    """
 
     def __init__(self, registry: Registry):
         self.registry = registry
@@ -186,14 +188,14 @@ def stack_files(names: list[str]) -> list[Path]:
     """The files meant by names, folders (every .exr in them) and patterns, in order and without repeats.
 
     Folders and patterns (``ngpt.io.frames``) leave out results of earlier runs. Raises NgptError for a folder or
-    pattern without a file; a plain name is taken as it is, for its reader to complain about.
+    pattern without a file; a plain name is passed on, and its reader reports errors.
     """
     files = [path for name in names for path in (input_files(name) if is_shot(name) else [Path(name)])]
     return list(dict.fromkeys(files))
 
 
 def tell_lacks(lacks: Mapping[str, str], console: Console) -> None:
-    """Says which metrics are left out; why, which is the same each time, is for --verbose."""
+    """Says which metrics are left out. The reason, which is always the same, is shown with --verbose."""
     for lack in lacks.values():
         _LOG.info(lack)
     if lacks:

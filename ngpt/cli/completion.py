@@ -1,4 +1,6 @@
-"""``ngpt --completion SHELL``: a script that makes a shell complete verbs, options and values, made of the parsers."""
+"""``ngpt --completion SHELL``: a script, made from the parsers, with which a shell completes verbs, options and
+values.
+"""
 
 import argparse
 import re
@@ -12,7 +14,7 @@ def script(shell: str, top: argparse.ArgumentParser, verbs: dict[str, argparse.A
     """The script for bash, zsh or fish; ``verbs`` are the parsers below ``top``."""
     if shell == "fish":
         return _fish(top, verbs)
-    # zsh runs what is written for bash.
+    # zsh runs scripts for bash.
     return (_ZSH if shell == "zsh" else "") + _bash(top, verbs)
 
 

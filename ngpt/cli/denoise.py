@@ -174,7 +174,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
             progress(i, len(pairs))
     if args.temporal and (hint := motion_hint(pairs, reports, args)):
         console.say(hint)
-    # Features that nobody recognized are a loss that the result does not show.
+    # The result does not show that features went unrecognized.
     overlooked: dict = next((report for report in reports if report.get("proposed")), {"proposed": {}})
     for name, layer in overlooked["proposed"].items():
         console.say(
@@ -194,7 +194,9 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
 def asked(
     args: argparse.Namespace, pairs: list[tuple[Path, Path]]
 ) -> tuple[dict[str, str], dict[str, Any], Reference | None]:
-    """Files of further layers, the method's options, and the reference; raises an error for what cannot be done."""
+    """Files of further layers, the method's options, and the reference. Raises an error for requests that cannot be
+    met.
+    """
     files = arguments.given_files(args)
     if len(pairs) > 1 and (files or args.halves):
         of_one = f"--{next(iter(files))} belongs" if files else "--halves belong"
@@ -232,10 +234,10 @@ def results(
         for name in filter(is_shot, args.stacks):
             for remark in remarks(name, arguments.stack_files([name]), results=False):
                 console.say(remark)
-    # Their results may be there, but later frames are made of them.
+    # These results may exist, but later frames need their history.
     again = {target for _, target in (pairs if windows else pairs[: missing[-1]])} if args.temporal and missing else ()
     read = partial(read_frame, args=args, files=files, again=again)
-    # One of several frames is not kept elsewhere if the disk is full: the next call makes it again.
+    # If the disk is full, one of several frames is not kept elsewhere: the next call makes it again.
     write = partial(write_frame, args=args, keep=len(pairs) == 1)
     if windows:
         return windowed(pairs, read, write, reference)
@@ -245,15 +247,15 @@ def results(
 
 
 def _unseen(done: int, total: int) -> None:
-    """Progress that nobody is shown."""
+    """Progress that is not shown."""
 
 
 def read_frame(
     pair: tuple[Path, Path], args: argparse.Namespace, files: dict[str, str], again: Container[Path]
 ) -> Frame:
-    """``again``: results that are made again where they are there, since others build on them."""
+    """``again``: existing results that are made again because later frames build on them."""
     source, target = pair
-    # Only now, for several machines may be at work on one folder.
+    # Checked only now, because several machines may work on one folder.
     there = args.skip_existing and finished(target)
     if there and target.suffix.lower() == ".exr":
         _check_result(source, target, args)

@@ -1,4 +1,4 @@
-"""The files of ``ngpt denoise``: where results go, how they are written, and what there is to say of them."""
+"""The files of ``ngpt denoise``: where results go, how they are written, and what is reported about them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ngpt.version import __version__
 
 @dataclass(frozen=True)
 class Frame:
-    """A stack, its file and the file for its result; ``there`` says that the result was there already."""
+    """A stack, its file and the file for its result; ``there`` says that the result existed already."""
 
     source: Path
     target: Path

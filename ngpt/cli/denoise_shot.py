@@ -1,4 +1,4 @@
-"""``ngpt denoise --temporal``: which way a shot goes, and the way by windows, of the frames before and after."""
+"""``ngpt denoise --temporal``: how a shot is blended, and blending by windows of the frames before and after."""
 
 import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -39,7 +39,7 @@ def way(sources: Sequence[Path], names: Mapping[str, str], by_wcv: bool) -> tupl
 
 
 def motion_hint(pairs: Sequence[tuple[Path, Path]], reports: Sequence[dict], args: argparse.Namespace) -> str:
-    """What to say of a shot without motion, and of layers that may hold it; "" for a shot with motion."""
+    """The message about a shot without motion, and about layers that may hold it; "" for a shot with motion."""
     why = [report["why no history"] for report in reports[1:] if "why no history" in report]
     if not why or any(reason != NO_MOTION for reason in why):
         return ""

@@ -38,7 +38,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         return write_template(args, template(path.read_text(encoding="utf-8"), {"": Config}), "evaluate", console)
     if not args.out:
         raise WrongUse("--out is missing: the folder of the results")
-    # Here and not above: a mistyped option is said at once.
+    # Imported here, so that a mistyped option is reported at once.
     from ngpt.evaluation.config import read_config
     from ngpt.evaluation.run import evaluate
     from ngpt.report.evaluation import write_evaluation_report

@@ -83,7 +83,7 @@ def told(args: argparse.Namespace, console: Console) -> int:
 
 
 def file(args: argparse.Namespace, console: Console) -> int:
-    """An image file; where not all of it is understood, what is in it all the same."""
+    """Describes an image file. If not all of it is understood, it still lists the contents."""
     views = views_in(args.file)
     names = {"views": [view.name for view in views]} if len(views) > 1 else {}
     try:
@@ -122,7 +122,7 @@ def method(name: str) -> dict:
 
 
 def other(name: str, parameters: dict[str, str]) -> dict:
-    """What a name is that is no file of ours: a method, a sampler, or a scene and how it would be rendered."""
+    """Describes a name that is not one of our files: a method, a sampler, or a scene and how it would be rendered."""
     if Path(name).suffix.lower() in (".exr", *NETWORKS):
         raise NgptError(f"{name}: not found; check the name")
     found = {} if Path(name).exists() else method(name)
@@ -142,7 +142,7 @@ def other(name: str, parameters: dict[str, str]) -> dict:
 
 
 def stack(stack: GradientStack) -> dict:
-    """What an image file holds, what of it is understood, and what can be done with it."""
+    """The contents of an image file, the parts that are understood, and what can be done with them."""
     assert stack.source is not None
     parts, resolution = stack.source.image.parts, stack.source.resolution
     main = parts[resolution["primal"].part]
@@ -203,7 +203,7 @@ def stack(stack: GradientStack) -> dict:
 
 
 def _noise(stack: GradientStack) -> dict:
-    """What pixels have of it by themselves, and in common; nothing where they have none in common."""
+    """The noise of single pixels and the noise that they share; nothing where they share none."""
     if "shared" not in stack or "primal_var" not in stack:
         return {}
     return noise_of_light(stack["primal"], stack["primal_var"], stack["shared"])
@@ -218,7 +218,9 @@ def _tails(stack: GradientStack) -> str:
 
 
 def _missing(stack: GradientStack) -> list[str]:
-    """Layers that methods could use: of a file without gradients, which other renderers write, only features."""
+    """Missing layers that methods could use. For a file without gradients, which other renderers write, only
+    features.
+    """
     wanted = [name for name in LAYERS if name not in _OPTIONAL]
     if "dx" not in stack and "ngpt:sampler" not in stack.attributes:
         wanted = ["albedo", "normal", "depth"]
@@ -252,7 +254,9 @@ def _shortened(text: str) -> str:
 
 
 def _fitted(line: str, indent: int) -> None:
-    """Prints a line: on a terminal broken between words, and indented where it goes on; elsewhere as it is."""
+    """Prints a line: on a terminal it is broken between words, and further lines are indented; elsewhere it is printed
+    as it is.
+    """
     if sys.stdout.isatty():
         width, start = shutil.get_terminal_size().columns, len(line) - len(line.lstrip())
         wrapper = textwrap.TextWrapper(width, " " * start, " " * indent, break_long_words=False, break_on_hyphens=False)

@@ -93,7 +93,9 @@ def shot(args: argparse.Namespace, folder: str, target: Path, console: Console) 
 
 
 def write_each(folder: Path, pictures, overwrite: bool) -> None:
-    """A picture of each (file, pixels): a PNG in a folder, which is made if there is none, or by names of frames."""
+    """A picture of each (file, pixels): a PNG in a folder, which is made if it does not exist, or by names of
+    frames.
+    """
     each = varies(str(folder))
     if not each:
         make_folder(folder)

@@ -129,7 +129,7 @@ def run_trainings(args: argparse.Namespace, target: Path, console: Console) -> i
 
 
 def run_shots(args: argparse.Namespace, names: list[str], target: Path, console: Console) -> int:
-    """Folders of frames of equal names: a page that plays them, and what is measured over all of them."""
+    """Folders of frames of equal names: a page that plays them, and measurements over all frames."""
     folders = [*args.images, *([args.ref] if args.ref else [])]
     shots = [shot_files_of(folder) for folder in folders]
     frames = frames_of(folders, shots)
@@ -278,7 +278,7 @@ def add_errors(
 
 
 def print_table(rows: list[list[str]]) -> None:
-    """The numbers of the page, for those who do not open it."""
+    """Prints the numbers of the page, for users who do not open it."""
     width = max(len(row[0]) for row in rows)
     for row in rows:
         tell(f"{row[0]:{width}}" + "".join(f"{cell:>16}" for cell in row[1:]))

@@ -15,7 +15,7 @@ STREAM = "-"
 
 @contextmanager
 def standard_input(names: Sequence[str]) -> Iterator[list[str]]:
-    """The names with a file in the place of ``-``, which holds what comes by standard input; messages call it that.
+    """The names, with a file in the place of ``-`` that holds standard input; messages call it "standard input".
 
     Raises WrongUse for two of them.
     """
@@ -34,10 +34,9 @@ def standard_input(names: Sequence[str]) -> Iterator[list[str]]:
 
 @contextmanager
 def as_files(stacks: list[str], output: str | None) -> Iterator[tuple[list[str], str | None]]:
-    """The names of inputs and output with files in the place of ``-``.
-
-    What comes by standard input is there when the block begins. What the block has written goes to standard output when
-    it ends. OpenEXR files are read and written here and there, so neither can do without a file.
+    """The names of inputs and output, with files in the place of ``-``. Standard input has been read when the block
+    begins. The file that the block has written goes to standard output when it ends. OpenEXR needs random access, so
+    both need a file.
 
     Raises NgptError for ``-`` beside other inputs, without an output, and for images that would go to a terminal.
     """
@@ -61,7 +60,7 @@ def as_files(stacks: list[str], output: str | None) -> Iterator[tuple[list[str],
                 with called(str(target), "standard output"):
                     yield inputs, str(target)
             finally:
-                # Also of a render that failed, which has written what was done before.
+                # Also after a render that failed: it has written the samples done before.
                 if target.exists():
                     with target.open("rb") as file:
                         shutil.copyfileobj(file, sys.stdout.buffer)

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     config = config_of(args, configs.TRAINING)
-    # Here and not above: a mistyped option is said at once, not after the seconds that torch takes to come in.
+    # Imported here, so that a mistyped option is reported at once, and not after the seconds of importing torch.
     from ngpt.training.cost import cost
     from ngpt.training.crops import open_crops
     from ngpt.training.distributed import Processes
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if not args.out:
         raise WrongUse("--out is missing: the folder for checkpoint, weights and log")
     for folder in _on_disk(settings):
-        open_crops(folder)  # its errors come before anything is made
+        open_crops(folder)  # its errors are raised before anything is made
     out = make_folder(args.out)
     say = (lambda text: None) if console.quiet else show
     processes = Processes()
@@ -82,12 +82,12 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def _on_disk(settings: Any) -> list[str]:
-    """The folders of training sets that are not rendered meanwhile."""
+    """The folders of training sets, except sets that are rendered during the training."""
     return [folder for folder in settings.data.folders if not folder.endswith(".toml")]
 
 
 def _task(settings: Any, out: Path, stack: ExitStack, processes: Any, say: Callable[[str], None]) -> Any:
-    """What the settings say to train, on the data in their folders; ``stack`` closes those that are being rendered."""
+    """The task of the settings, on the data in their folders; ``stack`` closes sets that are being rendered."""
     from ngpt.system.parts import find_crops
     from ngpt.training.clips import clips
     from ngpt.training.crops import Mixture, open_crops

@@ -1,9 +1,9 @@
-"""The light that no gradient holds, and the light of photons, with less noise: all methods get it from here.
+"""Denoises the light that gradients do not hold, and the light of photons, for all methods.
 
 Such light is rare and bright: most pixels hold none of it, and a few hold what their whole neighbourhood should. So it
 is spread by a diffusion [Perona and Malik 1990, "Scale-space and edge detection using anisotropic diffusion"] over
 distances of 1, 2, 4, ... pixels [Dammertz et al. 2010, "Edge-avoiding à-trous wavelet transform for fast global
-illumination filtering"]: ``ngpt.denoisers.diffusion``. What one pixel gives is what another gets: no light is lost.
+illumination filtering"]: ``ngpt.denoisers.diffusion``. One pixel gets exactly what another gives: no light is lost.
 Pixels exchange less light the more their surfaces differ, and the more they differ themselves beyond their noise
 [variances travel along as in Schied et al. 2017, "Spatiotemporal variance-guided filtering"].
 
@@ -57,7 +57,7 @@ def of_photons(data: Repaired) -> np.ndarray:
 
 
 def given_back(found: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """What a denoiser has made of ``light``, with as much light as there was, see ``MOST``; both (H, W, 3)."""
+    """The denoised ``light``, scaled so that its sum is kept, see ``MOST``; both are (H, W, 3)."""
     # OIDN may go below zero where no light does.
     found = np.maximum(found, min(float(light.min()), 0))
     before, after = light.sum(dtype=np.float64), found.sum(dtype=np.float64)

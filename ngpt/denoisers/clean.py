@@ -13,7 +13,7 @@ DARK = 1e-3
 
 
 def features_are_clean(data: Repaired) -> bool:
-    """Whether the noise of albedo and normal is known, and little beside the image's, see ``CLEAN``."""
+    """Whether the noise of albedo and normal is known and small compared with the image's, see ``CLEAN``."""
     if data.feature_noise is None or data.noise is None:
         return data.feature_noise == 0
     light = data.image.mean(axis=-1, dtype=np.float64)

@@ -27,7 +27,7 @@ def library_hash() -> str:
 
 
 def code_of(function: Any) -> str:
-    """SHA-256 of the package that a function is from; "" of our own, which ``library_hash`` is of."""
+    """SHA-256 of the package that a function is from; "" for our own package, whose hash is ``library_hash``."""
     root = getattr(function, "func", function).__module__.partition(".")[0]
     file = getattr(sys.modules.get(root), "__file__", None)
     if root == "ngpt" or not file:

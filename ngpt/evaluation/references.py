@@ -1,4 +1,4 @@
-"""What a scene's images are judged by: two independent halves of a reference, or one image from elsewhere.
+"""The reference of a scene: two independent halves, or one image from elsewhere.
 
 Two halves take the reference's noise off every squared metric (``ngpt.measure.metrics``); one image cannot.
 """
@@ -78,7 +78,7 @@ class Reference:
         return _number(3 * np.sqrt(np.sum(deviation**2)) / deviation.size)
 
     def check(self, stack: GradientStack) -> None:
-        """Raises NgptError if the reference is of something else than ``stack``."""
+        """Raises NgptError if the reference does not show the same image as ``stack``."""
         names = " and ".join(self.files)
         try:
             check_size(stack["primal"], self.mean)
@@ -124,5 +124,5 @@ def find_reference(folder: Path) -> Reference:
 
 
 def _number(value: np.floating | float) -> float | None:
-    """None for what JSON does not know."""
+    """None for values that JSON does not have."""
     return float(value) if np.isfinite(value) else None

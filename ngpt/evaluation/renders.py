@@ -1,4 +1,4 @@
-"""What a method is given: a kind of stack, by a sampler."""
+"""The input of a method: a kind of stack, by a sampler."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -38,5 +38,5 @@ class Render:
         return {"sampler": self.sampler} | given | ({"with_features": False} if self.kind == "path" else {})
 
 
-# What every scene is measured with, so that tables say what gradients cost.
+# Every scene is measured with these, so that tables show the cost of gradients.
 DEFAULTS = tuple(Render(kind, sampler) for kind, sampler in KINDS.items())

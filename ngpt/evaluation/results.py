@@ -1,4 +1,4 @@
-"""What the folder of results holds beside the pictures: results.json and results.csv, both from the cells."""
+"""The files of results besides the pictures: results.json and results.csv, both made from the cells."""
 
 from pathlib import Path
 from typing import Any

@@ -33,9 +33,9 @@ def evaluate(
     """Fills the folder ``out`` and returns what its results.json holds; ``renderer`` renders stacks that do not exist
     yet.
 
-    What is in the cache, ``out``/cache by default, is not computed again: an interrupted run goes on when it is started
-    again. Whatever a scene or a method lacks becomes a row that says so. Raises NgptError, before anything is rendered,
-    for scenes, references and samplers of all scenes that do not exist.
+    Cells in the cache, ``out``/cache by default, are not computed again: an interrupted run continues when it is
+    started again. If a scene or a method lacks something, its row says so. Raises NgptError, before anything is
+    rendered, for scenes, references and samplers of all scenes that do not exist.
     """
     scenes = config.scene_files()
     check_named(config, scenes, renderer)
@@ -133,7 +133,7 @@ def _scene(
     out: Path,
     advance: Callable[[int], None],
 ) -> None:
-    """Adds a scene and its cells to ``results``; raises NgptError for what concerns all of them."""
+    """Adds a scene and its cells to ``results``. Raises NgptError for errors that concern all cells."""
     config, name = stacks.config, stacks.name
     reference = stacks.reference()
     costs = stacks.costs(column.render for column in columns if not lacks[column.name])
@@ -142,7 +142,7 @@ def _scene(
     pilot = _pilot([render for n, render in renders.items() if not lacks[n]])
     first = stacks.stack(pilot, stacks.samples(pilot, config.spp[0], costs), 0)
     if stacks.given or name in config.references:
-        # Not our own, where fireflies of few samples could pass for another exposure.
+        # Not for our own stacks, where fireflies of few samples could pass for another exposure.
         reference.check(first)
     entry: dict[str, Any] = {"file": stacks.source, "size": [first.width, first.height], "cost": costs}
     entry["exposure"] = auto_exposure(reference.mean)

@@ -37,7 +37,7 @@ Costs = dict[str, dict[str, Any]]
 
 
 class SceneStacks:
-    """What one scene's cells are made of.
+    """The stacks, reference and costs that one scene's cells are made from.
 
     ``lacks``  why a render's columns are absent on this scene, by the render's name; filled by ``costs``
     """
@@ -106,8 +106,8 @@ class SceneStacks:
         """Seconds per sample of the whole image for the usual renders, the clock and ``renders``, by name.
 
         ``median`` and quartiles ``low`` and ``high`` of alternating renders, kernels compiled, and the ``sampler`` that
-        rendered. What is not in the cache is measured in turn with the clock, and put into the unit of the clock's time
-        there. Empty for a folder of stacks that were rendered elsewhere.
+        rendered. Costs that are not in the cache are measured in turn with the clock, and scaled to the clock's cached
+        time. Empty for a folder of stacks that were rendered elsewhere.
         """
         if self.given:
             return {}
@@ -171,7 +171,7 @@ class SceneStacks:
             stack, seconds = self.renderer.timed(self.load(), render.options, spp, seed, self.config.time)
             stack.attributes["ngpt:seconds"] = seconds
             _keep(path, stack)
-        # Without gradients beside it the reader takes this name for direct light, not for emission seen directly.
+        # In a file without gradients, the reader takes this name for direct light, not for emission seen directly.
         return read(path, {"direct": "direct"} if render.kind == "features" and not self.given else None)
 
     def stack_key(self, render: Render, spp: int, seed: int) -> list:
@@ -190,7 +190,7 @@ class SceneStacks:
         return self.folder(render.sampler) / f"{render.name.replace(' ', '-')}-{spp}-{seed}.exr"
 
     def _warm_up(self, render: Render) -> GradientStack:
-        """Has the kernels compiled, and returns the stack of one sample."""
+        """Compiles the kernels, and returns the stack of one sample."""
         if render.name not in self._warm:
             self._warm[render.name] = self.renderer.warm_up(self.load(), render.options)
         return self._warm[render.name]

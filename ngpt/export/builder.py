@@ -23,7 +23,7 @@ from ngpt.version import __version__
 OPSET = 18
 IR_VERSION = 9
 FLOAT, INT64, BOOL = onnx.TensorProto.FLOAT, onnx.TensorProto.INT64, onnx.TensorProto.BOOL
-# As the end of a slice: all that there is.
+# The end of a slice that goes to the end of its axis.
 END = 2**63 - 1
 
 Shape = Sequence[int | str]
@@ -32,7 +32,7 @@ Shape = Sequence[int | str]
 class Value:
     """A tensor in a graph: an input, or the result of a node."""
 
-    # So that arrays leave operators to us.
+    # Makes NumPy arrays use our operators.
     __array_ufunc__ = None
 
     def __init__(self, graph: "Graph", name: str):
@@ -102,7 +102,8 @@ class Graph:
         """The value, or tuple of values, that a new node makes of ``inputs``; None leaves an optional one out."""
         names = ["" if value is None else self._value(value).name for value in inputs]
         results = tuple(self._new(kind) for _ in range(outputs))
-        # Named: an optimizer of ONNX Runtime 1.21 gives what it makes the name of a node, and refuses one name twice.
+        # Nodes need names: an optimizer of ONNX Runtime 1.21 reuses them for nodes that it makes, and refuses
+        # duplicates.
         outputs_of = [result.name for result in results]
         self._bodies[-1].append(helper.make_node(kind, names, outputs_of, f"node of {outputs_of[0]}", **attributes))
         return results[0] if outputs == 1 else results
@@ -174,7 +175,7 @@ def channels(x: Value, first: int, last: int) -> Value:
 
 
 def choose(condition: Value, then: Callable[[], Value], otherwise: Callable[[], Value], shape: Shape) -> Value:
-    """What ``then`` makes where ``condition``, a scalar, holds, and else what ``otherwise`` makes, float32."""
+    """The result of ``then`` if ``condition``, a scalar, holds, else that of ``otherwise``; float32."""
     branches = [condition.graph.body(lambda make=make: [make()], {}, [(FLOAT, shape)]) for make in (then, otherwise)]
     return op.If(condition, then_branch=branches[0], else_branch=branches[1])
 

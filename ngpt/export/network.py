@@ -156,7 +156,7 @@ def convolutions(
     assert program is not None
     proto = program.model_proto
     proto.ir_version = IR_VERSION
-    # The exporter's notes on where each node comes from, paths of this machine among them, are no one else's business.
+    # Removes the exporter's notes on the origin of each node, which contain paths of this machine.
     for item in (*proto.graph.node, *proto.graph.value_info, *proto.graph.input, *proto.graph.output, proto.graph):
         del item.metadata_props[:]
     del proto.graph.value_info[:]

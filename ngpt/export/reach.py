@@ -17,7 +17,7 @@ from ngpt.network.model import Reconstructor
 TOLERANCE = 1e-6
 # How many examples are tried, and the side of the middle of each that is compared.
 EXAMPLES, MIDDLE = 3, 64
-# Pixels more than examples need, since images differ; what is so near is not measured.
+# Pixels added to what the examples need, because images differ; smaller distances are not measured.
 BESIDE, NEAR = 24, 48
 
 
@@ -36,7 +36,7 @@ def reach(model: Reconstructor) -> int:
 
 @torch.inference_mode()
 def _least(model: Reconstructor, whole: int, seed: int) -> int:
-    """So many times the alignment is what one example needs."""
+    """The multiples of the alignment that one example needs."""
     step = model.alignment
     middle = -(-MIDDLE // step) * step
     scaled, _ = features.normalised(_example(model, middle + 2 * whole * step, seed))

@@ -18,7 +18,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
 ERROR_EPSILON = 1e-2  # keeps the relative error of black pixels finite; of an image at automatic exposure
 ERROR_RANGE = (1e-4, 1.0)  # relative squared error at the two ends of the heat table: 1 % and 100 %
 
-MOST_ASPECT = 16.0  # of pixels: what a header says beyond it is nonsense
+MOST_ASPECT = 16.0  # of pixels: larger values in a header make no sense
 
 # "inferno" of Smith and van der Walt at nine even steps: lightness grows evenly, and it survives colour blindness.
 _INFERNO = ("000004", "210c4a", "57106e", "8a226a", "bc3754", "e45a31", "f98e09", "f9cb35", "fcffa4")

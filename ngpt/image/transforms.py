@@ -1,4 +1,4 @@
-"""View transforms: from scene-linear light of Rec. 709 to 8-bit sRGB, as pictures for people have it.
+"""View transforms: from scene-linear light of Rec. 709 to 8-bit sRGB, for pictures that people look at.
 
 standard  the sRGB curve (IEC 61966-2-1); what is above 1 is white
 filmic    AgX: highlights roll off and lose their colour, as on film
@@ -45,7 +45,7 @@ def aces(light: np.ndarray) -> np.ndarray:
 
 
 def check_transform(name: str) -> None:
-    """Raises NgptError for a transform that this machine cannot do."""
+    """Raises NgptError for a transform that needs a missing package."""
     if name == "aces":
         _aces()
 

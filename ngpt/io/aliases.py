@@ -23,7 +23,7 @@ class Alias(NamedTuple):
     writer: str = ""
 
 
-# Names of ours that mean something else in files that are not, and what shows that a file is.
+# Our names that mean something else in other programs' files, and the attributes that show that a file is ours.
 OWN: dict[str, set[str]] = {
     "direct": {"dx", "dy"},
     "caustic": {"dx", "dy", "caustic_var"},

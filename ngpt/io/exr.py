@@ -91,7 +91,7 @@ def read_views(
 
 
 def _opened(path: str | os.PathLike, isolated: bool) -> tuple[ExrImage, ExrPart | None]:
-    """All that a file holds but its subpixels, and the part that has these."""
+    """The contents of a file except its subpixels, and the part that has these."""
     return fine.apart(read_exr_isolated(path) if isolated else read_file(path))
 
 
@@ -110,10 +110,10 @@ def _one_view(image: ExrImage, wanted: str | None, path: str) -> View:
 def _resolved(
     view: View, layers: Mapping[str, str] | None, attributes: Iterable[Mapping[str, Any]], path: str
 ) -> Resolution:
-    """Where the layers of a view are; ``attributes`` are the headers of the parts."""
+    """The places of the layers of a view; ``attributes`` are the headers of the parts."""
     headers, wanted = list(attributes), {name: view.without(text) for name, text in (layers or {}).items()}
     origin = next((str(header["ngpt:pass"]) for header in headers if "ngpt:pass" in header), "")
-    # In a result the input is elsewhere by now.
+    # In a result, the input has been moved.
     if origin and f".{origin}".endswith(f".{wanted.get('primal')}"):
         del wanted["primal"]
     writer = writer_of(name for header in headers for name in header)
@@ -155,7 +155,7 @@ def layers_in(path: str | os.PathLike, layers: Mapping[str, str] | None = None) 
 
 
 def views_in(path: str | os.PathLike) -> list[View]:
-    """The views of a file, and the names of what they hold, by its header; raises NgptError for a file that is not an
+    """The views of a file, and the names of their layers, by its header; raises NgptError for a file that is not an
     image.
     """
     return _views_in(path)[0]
@@ -244,11 +244,11 @@ def write(
     removed), or else as one scanline part at its ``place``, compressed with ZIP, primal in the root R G B.
 
     A result, ``image`` (H, W, 3) with ``like`` the stack it was made of, is that file with ``image`` in the root R G B
-    of its first part, which is what viewers show, and the input in primal.R/G/B. Should the first part be another than
-    the one that holds primal, or show something else in its root, then it stays as it is and a new part goes in front.
-    Alpha is copied into the root if the file has it elsewhere. ``image`` also replaces the layer that the input was
-    read from (``ViewLayer.Combined``), which the attribute ``ngpt:pass`` then names; a ``Noisy Image`` stays. ``into``
-    names another layer to replace, or "root" for none.
+    of its first part, which is what viewers show, and the input in primal.R/G/B. If the first part is not the one that
+    holds primal, or shows something else in its root, it stays as it is and a new part goes in front. Alpha is copied
+    into the root if the file has it elsewhere. ``image`` also replaces the layer that the input was read from
+    (``ViewLayer.Combined``), which the attribute ``ngpt:pass`` then names; a ``Noisy Image`` stays. ``into`` names
+    another layer to replace, or "root" for none.
 
     Results of the views of one file go together: lists of them, and of their stacks (``read_views``). Each is then the
     root of its view.

@@ -21,7 +21,7 @@ from ngpt.windows import Window
 _LOG = logging.getLogger(__name__)
 
 PART = "fine"
-# What the part of the pixels is called beside it, where it has no name: parts of a file with several have one.
+# The name of the part of the pixels, if it has none: in files with several parts, each needs a name.
 _PIXELS = "stack"
 # Attributes that OpenEXR wants to be the same in all parts of a file
 _COMMON = ("displayWindow", "pixelAspectRatio", "timeCode", "chromaticities")

@@ -1,1 +1,3 @@
-"""What surrounds a network in its ONNX file: each file does what the module of that name does in the library."""
+"""The parts of an ONNX file around the network. Each module repeats the library's module of the same name as a
+graph.
+"""

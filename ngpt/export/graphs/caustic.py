@@ -1,8 +1,8 @@
-"""After ``ngpt.denoisers.caustic`` and ``diffusion``: light that gradients hold nothing of, with less noise.
+"""After ``ngpt.denoisers.caustic`` and ``diffusion``: denoises the light that is not in gradients.
 
-Pixels exchange light with four neighbours of one half plane, at one distance after the other. What a pixel says to one
-of them comes back from there with the opposite sign, so that no light is lost. Surfaces beyond the border are so far
-away that no light is exchanged with them.
+Pixels exchange light with four neighbours of one half plane, at one distance after the other. Each exchange is added to
+one pixel and subtracted from the other, so no light is lost. Surfaces beyond the border are so far away that no light
+is exchanged with them.
 """
 
 from collections.abc import Mapping

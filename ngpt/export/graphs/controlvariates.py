@@ -47,12 +47,12 @@ def wcv(
 
 
 def _before(x: Value, axis: int, border: float) -> Value:
-    """What the pixel on the left (above) has, ``border`` where there is none."""
+    """The value of the pixel on the left (above); ``border`` where there is none."""
     return op.Pad(op.Slice(x, [0], [-1], [axis]), [1, 0], border, [axis])
 
 
 def _slopes(image: Value) -> Value:
-    """(N, 12, H, W): what the pixels right, below, left and above are more than a pixel, RGB each."""
+    """(N, 12, H, W): the differences of the pixels right, below, left and above to a pixel, RGB each."""
     weights = np.zeros((12, 3, 3, 3), np.float32)
     for direction, (y, x) in enumerate(((1, 2), (2, 1), (1, 0), (0, 1))):
         for colour in range(3):

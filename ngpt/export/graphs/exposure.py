@@ -28,7 +28,7 @@ def statistics(clean: Mapping[str, Value], variance_layers: tuple[Value, ...] | 
 def exposure(primal: Value) -> Value:
     """The typical radiance over ``KEY``, a scalar; 1 for black images, see ``ngpt.network.features.exposure``."""
     brightness = op.ReduceMean(op.Max(primal, 0.0), [1], keepdims=1)
-    # Blocks at the border hold fewer pixels: sums of what is there over how many they are.
+    # Blocks at the border hold fewer pixels, so sums are divided by their number.
     here = brightness * 0.0 + 1.0
     missing = op.Mod(-op.Shape(primal, start=2, end=4), [BLOCK, BLOCK])
     padded = op.Pad(op.Concat(brightness, here, axis=1), op.Concat([0, 0], missing, axis=0), 0.0, [2, 3])

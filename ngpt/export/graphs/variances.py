@@ -1,4 +1,4 @@
-"""After ``ngpt.classical.variances``: variances made fit for weights. Channels: of the primal, of dx, of dy."""
+"""After ``ngpt.classical.variances``: variances prepared as weights. Channels: of the primal, of dx, of dy."""
 
 from ngpt.classical.leastsquares import CLIP
 from ngpt.classical.variances import FEW, TYPICAL

@@ -35,7 +35,7 @@ READERS: dict[bytes, Callable[[BinaryIO], Form]] = {
     **dict.fromkeys(tiff.MAGICS, tiff.describe),
     jpeg.MAGIC: jpeg.describe,
 }
-# What libraries and struct make of files that are not what they say.
+# Exceptions that libraries and struct raise for damaged files.
 _BROKEN = (Damage, struct.error, zlib.error, ValueError, TypeError, LookupError, ArithmeticError, AttributeError)
 
 
@@ -66,7 +66,7 @@ def first_attributes(path: Path) -> dict[str, Any]:
 
 
 def tell_conversion(path: Path) -> None:
-    """Logs, as ``read_file`` does, of a file that another process has read, how its light was made."""
+    """Logs, as ``read_file`` does, how the light of a file was converted that another process has read."""
     with regular_file(path) as file:
         reader = _reader(file)
         if reader is not None:
@@ -79,7 +79,7 @@ def _tell(path: Path, form: Form) -> None:
 
 
 def _reader(file: BinaryIO) -> Callable[[BinaryIO], Form] | None:
-    """Who reads the file, None for OpenEXR and what nobody knows."""
+    """The reader of the file; None for OpenEXR and unknown formats."""
     start = file.read(8)
     file.seek(0)
     return next((reader for magic, reader in READERS.items() if start.startswith(magic)), None)
@@ -137,7 +137,7 @@ def linear_srgb(values: np.ndarray) -> np.ndarray:
 
 
 def _guarded(path: str | Path, work: Callable):
-    """What ``work`` returns; its errors as NgptErrors, which name the file."""
+    """The result of ``work``. Its errors become NgptErrors, which name the file."""
     try:
         return work()
     except Unread as error:

@@ -7,11 +7,11 @@ import numpy as np
 
 
 class Damage(Exception):
-    """What is wrong with the file, in a few words."""
+    """The damage of a file, in a few words."""
 
 
 class Unread(Exception):
-    """What of a whole file is not read here, and the remedy."""
+    """A feature of an intact file that is not read here, and the remedy."""
 
 
 @dataclass(frozen=True)
