@@ -77,7 +77,7 @@ def main(name, seeds="8", reference_spp="2048"):
             for seed in range(int(seeds)):
                 stack, seconds = render(scene, spp, seed, tails)
                 image = stack["primal"].astype(float)
-                clean = np.asarray(ngpt.denoise(stack, "oidn").image, float)
+                clean = np.asarray(ngpt.denoise(stack, "oidn"), float)
                 rows.append((seconds, relmse(image, truth), relmse(clean, truth), image.mean() / truth.mean()))
                 images.append(image)
             rows = np.array(rows)
