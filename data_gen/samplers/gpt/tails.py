@@ -42,7 +42,7 @@ _ALL = 16
 
 
 def place(plan: Plan, known: Known, path: Path) -> tuple[Place, mi.Bool]:
-    """Where a path is in the cache, and whether it may end there, or open a record."""
+    """Returns the path's place in the cache, and whether it may end there or open a record."""
     x, trail = path.x, path.trail
     able = path.walks & x.is_valid() & (path.depth < plan.limits.max_depth) & (trail.spread > NEAR * trail.reach)
     able = plan.matt.at(x, able)
@@ -63,7 +63,7 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
     where, able = place(plan, known, path)
     lambertian = plan.matt.lambertian(path.x, able)
     for y in offsets:
-        # A joined path has come from elsewhere, and the rest of what the material does is another one for it.
+        # A joined path has come from elsewhere, so the rest of the material's scattering differs for it.
         able &= ~(y.apart | (y.joined & ~lambertian))
     sorts, errors, ends = known.look(where, LEAST, able)
     ρ = plan.matt.reflectance(path.x, ends)
@@ -106,7 +106,7 @@ def feed(view, plan: Plan, known: Known, random, camera_ray: tuple, half: mi.UIn
     blank = Place(dr.zeros(mi.Point3f, lanes), mi.UInt32(0), mi.Int32(0))
     dark = [dr.zeros(mi.Spectrum, lanes) for _ in known.means]
     none = [Record(blank, mi.Spectrum(0), mi.Bool(False), list(dark)) for _ in range(RECORDS)]
-    # What is late is not so from the camera on, but from each record on.
+    # Here light is late counted from each record, and not from the camera.
     whole = replace(plan, caustic=False)
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
         return walk(whole, known, random, path, none, half)
@@ -143,7 +143,7 @@ def walk(plan: Plan, known: Known, random, path: Path, records: list, half: mi.U
             r.place = dr.select(this, where, r.place)
         count = dr.select(fresh, count + 1, count)
         path.trail.spread = dr.select(fresh, 0, path.trail.spread)
-        # Which paths survive, those decide that are to find the light of the newest record.
+        # The throughput since the newest record decides which paths survive.
         path.β = dr.select(fresh, 1, path.β)
         path.ρ = ρ
         path.walks = path.walks & ~(ends & plan.matt.lambertian(path.x, ends))
