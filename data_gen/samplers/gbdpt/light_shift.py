@@ -217,7 +217,7 @@ def through_glass(plan: Plan, path: Splatted, x, active) -> tuple:
     target = Target(dr.select(path.first, path.start.end.p, before.si.p), beside, far)
     point = path.first & path.start.delta & ~far
     target.n = dr.select(far, -path.start.ray.d, dr.select(point, path.start.ray.d, target.n))
-    # Light came from the other side, by rays that began elsewhere: not quite to the point that it is walked to.
+    # Light came from the other side, by rays with other origins, so the walk does not end exactly at its point.
     ω, base, active = walk(scene, y.si, ω, path.events, target, active)
     ω1, shot, J, found = follow(scene, y.si, ω, base, x, path.events, target=target, active=active)
     away, away1 = dr.abs(dr.dot(target.n, base.ray.d)), dr.abs(dr.dot(target.n, shot.ray.d))

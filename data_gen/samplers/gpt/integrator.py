@@ -23,8 +23,9 @@ four offsets cost about as much as the base path and not four times that.
 
 An offset path is *apart* from its base path, then *joined* to it for one step (it shares the vertex, but arrives there
 from elsewhere), then *settled*: joined for longer, ended, or rejected. A base path that ends while offset paths are
-apart walks on as a ghost. Its offset paths replay numbers that it has no use for, so that what their pixels see serves
-this pixel too, with w = 1/2, as it does in random sequence replay; to reject them would double their variance.
+apart walks on as a ghost. Its offset paths replay random numbers that it does not use. So the light that their pixels
+see counts for this pixel too, with w = 1/2, as in random sequence replay. Rejecting these paths would double their
+variance.
 
 All paths begin in ``trace``; the rules of shifting are in ``data_gen.paths.shift``; ``plan`` decides which code a scene
 needs in its kernel. ``data_gen.paths.space`` knows whether a vertex is in a medium.
@@ -153,7 +154,8 @@ class GPT(GradientIntegrator):
 
 
 def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f:
-    """L of each sample as the mean over the four pairs with neighbours: what either path of a pair says of this pixel.
+    """Returns L of each sample as the mean over its four pairs with neighbours, where both paths of a pair estimate
+    this pixel.
 
     A pair is sampled from here, with the base path's part ``A``, and from the neighbour, with the offset path's part
     A + Δ of the same sample there. [Kettunen et al. 2015, section 5]

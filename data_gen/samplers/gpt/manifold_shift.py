@@ -10,10 +10,10 @@ goes through the same events to the same point x_c of the lamp, by the walks of 
     r           p' P' J / (p P)
     Δ           2 (b' - b) / (1 + r), or -2 b where no walk leads there and back
 
-Up to z_b' the offset path replays the base path's random numbers, with r = 1. A single technique finds this light,
-since no emitter sampling finds a lamp behind glass, and it is a class of paths by itself. So it is shifted apart from
-all other light, and the kernel of ``gpt`` knows nothing of it. That kernel leaves one record for each lane. Such paths
-are rare, so this kernel runs only on the few lanes that have a record, four times as wide, one for each direction.
+Up to z_b' the offset path replays the base path's random numbers, with r = 1. Only BSDF sampling finds this light,
+since emitter sampling finds no lamp behind glass. These paths are a class of their own, so they are shifted apart from
+all other light. The kernel of ``gpt`` only leaves one record for each lane. Such paths are rare, so this kernel runs
+only on the few lanes that have a record, four times as wide, one for each direction.
 
 [Hua et al. 2019, sections 3.4 and 3.5]
 """

@@ -77,9 +77,9 @@ def start(plan: Plan, base: Path, first: Segment, importance: mi.Spectrum, insid
     hit, none = first.hit, dr.zeros(mi.Spectrum, dr.width(first.hit.t))
     lives = inside & hit.is_valid()
     ended = inside & ~hit.is_valid() & base.x.is_valid()
-    # Seen from the neighbour, a base path that has ended there would walk on as a ghost with this one replayed beside
-    # it: both have the same random numbers, hence r = 1 and w = 1/2. Without ghosts nothing shifts back, and w = 1
-    # (survey, section 3.5).
+    # From the neighbour's side, a base path that has ended there would walk on as a ghost, and this path would be
+    # replayed beside it. Both have the same random numbers, hence r = 1 and w = 1/2. Without ghosts nothing shifts
+    # back, and w = 1 (survey, section 3.5).
     w2_ended = 1 if plan.replays else 2
     return Offset(
         ray=mi.Ray3f(first.ray),
@@ -102,8 +102,8 @@ def start(plan: Plan, base: Path, first: Segment, importance: mi.Spectrum, insid
 
 
 def next_steps(scene, plan: Plan, step: Step, offsets: list[Offset], first: bool = False) -> list[Offset]:
-    """Takes all offset paths along a step, which may be known to be the ``first``: all of them are apart there, and
-    none is joined. Most later steps find all of them settled.
+    """Takes all offset paths along a step. In the ``first`` step all of them are apart, and none is joined. In most
+    later steps all of them are settled.
 
     Loops over the four of them keep the kernel small, and are recorded in a fraction of the time. Their state rotates,
     so that each path stays in registers when its turn comes. Rare branches are real ones, not masks: they cost 2.5
@@ -146,7 +146,8 @@ def settle(step: Step, offsets: list[Offset]) -> None:
         y.A = y.A + y.w2 * step.β * C
         y.a = y.a * step.f_p
         if y.aim is not None:
-            # But for m, where both have come straight on through holes from where one had arrived from elsewhere.
+            # Only m differs: one had arrived from elsewhere at the vertex from which both came straight on through
+            # holes.
             β1 = y.a + y.w2 * step.β1  # 2 w β'
             m = mis_weight(y.aim.p, step.p_light) - mis_weight(step.aim.p, step.p_light)
             y.Δ = y.Δ + dr.select(step.passed & (dr.max(dr.abs(β1)) > 0), β1 * step.Le * m, 0)

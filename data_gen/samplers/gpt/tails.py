@@ -8,8 +8,8 @@ behind the vertex, as far as the surface scatters like a matt one (``data_gen.ta
 
 the vertex's reflectance times the mean light of the cell; an offset path adds a ρ C to its difference, with the factor
 ``a`` that it would have had for all that follows (``offset_path.settle``). Where the material has nothing else the path
-is over. Elsewhere it goes on for the rest. Emission at the vertex itself is found by the step before, and weighted as
-ever.
+is over. Elsewhere it goes on for the rest. The step before finds the emission at the vertex itself, with its usual MIS
+weight.
 
 Where there is the layer ``caustic``, the cache keeps the light apart that belongs to it from the vertex on, because it
 has come over a sharp surface behind it (``data_gen.paths.caustic``). It goes into the layer and into no difference.
@@ -55,7 +55,8 @@ def place(plan: Plan, known: Known, path: Path) -> tuple[Place, mi.Bool]:
 
 
 def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.Spectrum, mi.Spectrum, mi.Spectrum]:
-    """Ends paths where the cache knows what follows; returns them, and that, in the layer ``caustic`` or not.
+    """Ends paths where the cache knows the light that follows. Returns the paths, and that light, in the layer
+    ``caustic`` or not.
 
     The last value is a sample of the error of all that comes from the cache (``data_gen.tails.cache``). Differences get
     what is theirs, but for what is in that layer.
@@ -71,7 +72,8 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
     found, caustic_found = caustic.split(path.late, found)
     caustic_found = sum(late, caustic_found)
     for y in offsets:
-        # For a joined path: what it would settle with at this vertex, which scatters alike in all directions
+        # For a joined path: the factor with which it would settle at this vertex, which scatters alike in all
+        # directions
         joined = gradient_weight(y.r, True) * (y.β - path.β)
         y.Δ = y.Δ + dr.select(y.joined, joined, y.a) * found
     path.walks = path.walks & ~(ends & lambertian)

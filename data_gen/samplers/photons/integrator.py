@@ -1,4 +1,4 @@
-"""What all photon plugins share: parameters, the world of a scene, and the photon maps of a pass."""
+"""The shared part of all photon plugins: parameters, the world of a scene, and the photon maps of a pass."""
 
 from __future__ import annotations
 
@@ -98,9 +98,8 @@ class PhotonIntegrator(GradientIntegrator):
 
 
 def _refuse_lamps_never_chosen(scene, sampler: str) -> None:
-    """No photons start at a lamp of weight 0, so that its light would be missing. Mitsuba's paths meet it by chance.
-
-    Points and single directions of weight 0 are met by nothing: they are off, in Mitsuba as well.
+    """No photons start at a lamp of weight 0, so its light would be missing. Mitsuba's paths meet it by chance. No path
+    meets points and single directions of weight 0. They are off in Mitsuba as well.
     """
     for index, emitter in enumerate(scene.emitters()):
         if visible(emitter) and scene.pdf_emitter(mi.UInt32(index))[0] == 0:

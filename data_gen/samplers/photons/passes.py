@@ -1,4 +1,4 @@
-"""What the passes of one render share, for integrators that gather photons."""
+"""The state that the passes of one render share, for integrators that gather photons."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ class Carry:
         A = mi.Matrix3f([row[:3] for row in rows])
         P = mi.Point3f(A @ mi.Vector3f(record.P) + mi.Vector3f(*(row[3] for row in rows)))
         moved = replace(record, P=P, shape=shape)
-        # A bound for any viewpoint: rounding errs no more than from the distance of the predecessor
+        # Any viewpoint serves. This one is about as far off as the predecessor was, so rounding errors stay alike.
         hit, ray = moved.hit(P + record.w * dr.rsqrt(dr.maximum(record.geometry, 1e-20)))
         x = hit.compute_surface_interaction(ray, active=known)
         face = dr.gather(mi.Bool, self.stretched, at)

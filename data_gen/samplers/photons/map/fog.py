@@ -71,7 +71,7 @@ class Fog:
         if self.media.grids:
             return segment.weight
         σ_c = pick(extinction(segment.place.medium, segment.ray), channel)
-        # Where nothing is scattered, of a colour, photons have none of it either.
+        # If a medium scatters nothing of a colour, its photons have none of this colour either.
         weight = dr.select(segment.albedo > 0, segment.weight / (segment.albedo * σ_c), 0)
         return mi.Spectrum(dr.select(segment.place.scatters, weight, segment.weight))
 

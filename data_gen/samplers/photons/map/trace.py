@@ -1,7 +1,7 @@
 """Light paths as a map of vertices: all paths side by side, in one kernel, each with places of its own in the map.
 
 So vertices lie in the map by path, then by bounce: the same seed gives the same map. (Places handed out by a counter
-would come in the order of threads.) Places that a path does not need stay empty, their edges have the length 0.
+would come in the order of threads.) Places that a path does not need stay empty. Their edges have the length 0.
 
 In media, vertices are also where light scatters. Their normal is 0, and their power is the power scattered there. Its
 sum over a volume is σs times the light that goes through, so a camera path contributes only its transmittance.
@@ -93,7 +93,7 @@ def _start(world: World, random) -> tuple:
 
 
 def _maps(world: World, paths: Paths, random, depths: tuple, frozen: Callable, edges: bool) -> Iterator[Any]:
-    """Map after map, while paths are alive: each of those that are."""
+    """Yields map after map while paths are alive, each with the living paths."""
     kind = _vertices_of(world, edges)
     map_before = None
     while dr.width(lanes := dr.compress(paths.alive)):
@@ -108,7 +108,7 @@ def _maps(world: World, paths: Paths, random, depths: tuple, frozen: Callable, e
         place = dr.arange(mi.UInt32, dr.width(lanes)) * dr.opaque(mi.UInt32, VERTICES_PER_PATH)
         end = place + dr.opaque(mi.UInt32, VERTICES_PER_PATH)
         if map_before is not None:
-            # What has been gathered of it is not gathered again.
+            # A vertex that was gathered in the map before is not gathered again.
             vertex = at(map_before, paths.parent)
             vertex.depth = dr.zeros(mi.UInt32, len(vertex))
             if edges:

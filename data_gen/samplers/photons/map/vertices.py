@@ -43,7 +43,7 @@ def faces(photon: Photon, x: mi.SurfaceInteraction3f) -> mi.Bool:
 def light(photon: Photon, x: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active) -> mi.Spectrum:
     """f Φ, what a photon adds to radiance at ``x`` with material ``bsdf``, without the kernel."""
     f = bsdf.eval(context(RADIANCE), x, x.to_local(-photon.d), active)
-    # f has a cosine; the photons lie as densely as the geometric one is large.
+    # f contains the shading cosine, but the density of photons follows the geometric one.
     L = f * photon.Φ / dr.abs(dr.dot(photon.n, photon.d))
     return dr.select(active & dr.isfinite(dr.sum(L)), L, 0)
 
@@ -144,7 +144,7 @@ def _met(photons, index: mi.UInt32, active) -> tuple[mi.Ray3f, mi.PreliminaryInt
     for name in ("t", "prim_uv", "prim_index", "shape", "instance"):
         value = getattr(photons, name)
         setattr(hit, name, dr.gather(type(value), value, index, active))
-    # No other field says so: without this the vertex would be void.
+    # Without this field the vertex would be invalid: no other field marks it.
     hit.valid = mi.Bool(active)
     p, d = dr.gather(mi.Point3f, photons.p, index, active), dr.gather(mi.Vector3f, photons.d, index, active)
     return mi.Ray3f(p - d * hit.t, d), hit

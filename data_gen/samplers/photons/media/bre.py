@@ -6,7 +6,7 @@ r"""The beam radiance estimate: photons in media are gathered along whole rays, 
     L           Σ T(t) f(d) Φ / (π r² N),    f: the phase function, N: light paths of the pass
 
 Camera paths go through media up to the next surface. So no distance is sampled, each segment gathers from all of its
-length, and what is blurred is two-dimensional: less noise, and less bias, than with ``vpm``, of the same photons.
+length, and the blur is two-dimensional. The same photons give less noise and less bias than with ``vpm``.
 
 In media whose density varies T is not known. Rays go through them by null collisions, and end at the first real one: a
 ray comes so far with the probability T. Photons count as Φ / σs of their place there, times σs beside them on the ray.
@@ -108,7 +108,7 @@ def scattering_along(ray, medium: mi.MediumPtr) -> Callable[[mi.Float, mi.Bool],
 
 @dataclass
 class Along:
-    """What is near to camera paths that go piece by piece."""
+    """The things near to camera paths that go piece by piece."""
 
     on_surfaces: Gathering | None
     in_media: Any  # photons, beams or planes, with ``light`` (piece of a ray, length, medium, σ, depth, where)
@@ -177,7 +177,7 @@ def by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, em
         if dr.hint(emission, mode="scalar"):
             met = active & ~first & (found | sky.seen)
             if dr.hint(grids and limits.shows, mode="scalar"):
-                # What comes through a grid is not in Le, nor is the sky: see ``behind_grids()``.
+                # Le contains neither light that comes through a grid nor the sky: see ``behind_grids()``.
                 behind |= stop.passed > 0
                 met |= active & first & (behind | ~found)
             L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)

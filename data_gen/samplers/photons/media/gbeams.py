@@ -156,7 +156,7 @@ def turned(world: World, paths: LightPaths, beam: Beam, A: Beside, B: Beside, ra
     J = (other.sin / met.sin) * shift.jacobian_in_medium(way.base_length2, way.length2)
     r = way.ratio * J
     good = other.near & way.leads(target, r)
-    # Past A it would be gathered as it is, not as a copy: the shift back would be another.
+    # The copy must not be near to A: the shift back would then take it as its own copy.
     good &= ~copy.past(A, radius).near
 
     # ------------------- What comes through, and is scattered there -------------------

@@ -97,9 +97,8 @@ def inside_of(base: Piece) -> mi.Bool:
 
 @dataclass
 class InMedia:
-    """``Near``, of photons in media where they are gathered near to points or beside rays: what both have in common.
-
-    The receivers ``near()`` know whether a photon is near, and the ``image()`` of its place near to another.
+    """``Near``, the common part for photons in media that are gathered near to points or beside rays. A receiver's
+    ``near()`` says whether a photon is near, and its ``image()`` where the copy lies near to another receiver.
     """
 
     paths: LightPaths
@@ -133,7 +132,7 @@ def copy_beside(world: World, paths: LightPaths, photon: Photon, A, B, radius2: 
     """(copy, t', r, whether it exists) of the ``photon`` that is gathered at A and not at B."""
     target = A.image(photon.p, B)
     t, there = B.near(target, radius2)
-    # At A it would be gathered as it is, not as a copy: the shift back would be another.
+    # The copy must not be near to A: the shift back would then take it as its own copy.
     there &= ~A.near(target, radius2)[1]
     moved, r, good = copy_in_medium(world, paths, photon, target, there)
     return moved, t, r, good & (photon.medium == B.medium)

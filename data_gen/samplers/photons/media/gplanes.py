@@ -9,8 +9,8 @@ r"""Gradients of photon planes: ``planes``, and each plane that a camera ray mee
     r           p(e') J / p(e)
 
 The plane turns about its edge, up to the point on B. The angle between d and e stays, so phase functions and their
-densities do. Shifting the copy back gives the plane. What 1 / |d · (e × w)| has of noise, where rays graze a plane,
-falls out: C' has it of A.
+densities do. Shifting the copy back gives the plane. The noise of 1 / |d · (e × w)|, where rays graze a plane, cancels:
+C' has the factor of A.
 
 [Gruson et al. 2018, "Gradient-Domain Volumetric Photon Density Estimation", section 5.3; its eq. 18 is in a local frame
 of the plane, and is not J: J is checked by finite differences]

@@ -8,8 +8,8 @@ r"""Progressive photon mapping in media and on surfaces: ``ppm``, and photons wh
 media whose density varies it is Φ / σs(b), and the camera path has σs(x). Paths of both ends go by null collisions.
 
 Each segment of a camera path has one vertex: where it scatters in a medium, or on the surface behind. All light that is
-scattered in a medium comes from photons there. What of it lamps send directly comes from photons, too: a beam of light
-in haze is what the photons of its lamp draw.
+scattered in a medium comes from photons there. This includes light that arrives directly from lamps: the photons of a
+lamp draw its beam in haze.
 
 [Jensen and Christensen 1998, "Efficient Simulation of Light Transport in Scenes with Participating Media using Photon
 Maps"; Knaus and Zwicker 2011, section 5]

@@ -125,5 +125,5 @@ class GPM(PhotonIntegrator):
         gradient_pass(passes, camera, film, self.near, self.pairs)
 
     def near(self, passes: Passes, traced: Traced) -> Iterator[Gathered]:
-        """What is near to camera paths in a photon map, one part after another."""
+        """Yields the things near to camera paths in a photon map, one part after another."""
         yield Gathered(OnSurfaces(traced))

@@ -107,12 +107,12 @@ class PPM(PhotonIntegrator):
         film.put_all(values)
 
     def near(self, passes: Passes, traced: Traced) -> Iterator[Any]:
-        """What is gathered of a photon map, one part after another."""
+        """Yields what is gathered from a photon map, one part after another."""
         yield Gathering(passes.world, traced, self.limits.max_depth)
 
     def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """L and Le of camera paths (world, start, near, emission), with what is gathered from ``near``, and with the
-        ``emission`` that they meet or without."""
+        """Returns L and Le of camera paths (world, start, near, emission). L contains the light gathered from ``near``,
+        and the ``emission`` that the paths meet if that is asked for."""
         return by_vertices(self, *path)
 
 
