@@ -1,6 +1,6 @@
 """View transforms: from scene-linear light of Rec. 709 to 8-bit sRGB, for pictures that people look at.
 
-standard the sRGB curve (IEC 61966-2-1); values above 1 are white
+standard  the sRGB curve (IEC 61966-2-1); values above 1 are white
 filmic    AgX: highlights roll off and lose their colour, as on film
 aces      ACES 1.3, "ACES 1.0 - SDR Video", by OpenColorIO's built-in configuration; needs its package
 """

@@ -17,9 +17,9 @@ def wcv(
 ) -> Value:
     """The base (N, 3, H, W) of finite layers.
 
-    ``trusted`` (N, 1, H, W) for dx and dy, true where they can be trusted ``variance`` of primal, dx and dy, as the
-    renderer writes them
-    ``mean`` a scalar: the mean variance of the whole image, by which variances are divided
+    ``trusted``   (N, 1, H, W) for dx and dy, true where they can be trusted
+    ``variance``  of primal, dx and dy, as the renderer writes them
+    ``mean``      a scalar: the mean variance of the whole image, by which variances are divided
     """
     smooth, inside = variances.smoothed(primal, *variance)
     noisy = op.Greater(mean, 0.0)

@@ -10,10 +10,10 @@ from ngpt.network.padding import MARGIN
 class Side:
     """One padded axis of an image: for each place, the pixel that is copied to it, and its difference to the next.
 
-    ``axis`` the axis in (N, C, H, W)
-    ``size`` pixels along the axis, a scalar
+    ``axis``     the axis in (N, C, H, W)
+    ``size``     pixels along the axis, a scalar
     ``here``     which pixel lies at each place
-    ``nearest`` which difference stands between this place and the next
+    ``nearest``  which difference stands between this place and the next
     ``step``     with which sign: 1, -1, or 0 where the image is one pixel wide
     """
 

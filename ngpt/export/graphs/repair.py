@@ -20,10 +20,10 @@ _LEVELS = 5
 class Repaired:
     """The inputs of the rest of a graph; (N, C, H, W).
 
-    ``layers`` all of them by name: without direct emission, finite, 0 where not trusted; variances are NaN where
-    unknown. "primal" excludes "caustic" if the network reads gradients
+    ``layers``   all of them by name: without direct emission, finite, 0 where not trusted; variances are NaN where
+                 unknown. "primal" excludes "caustic" if the network reads gradients
     ``direct``   direct emission, finite, to be added back
-    ``trusted``  of dx and dy, where there are any: (N, 1, H, W), true where they are
+    ``trusted``  of dx and dy, where there are any: (N, 1, H, W), true where they can be trusted
     """
 
     layers: dict[str, Value]
@@ -44,7 +44,7 @@ def clean(x: Value) -> Value:
 def repaired(raw: Mapping[str, Value], gradients: bool) -> Repaired:
     """The layers that a renderer gives, ``primal`` and ``direct`` among them, as ``ngpt.repair`` leaves them.
 
-    ``gradients`` whether the network reads gradients: such a network works on light without ``caustic``
+    ``gradients``  whether the network reads gradients: such a network works on light without ``caustic``
     """
     light = raw["primal"] - raw["direct"]
     rest = light - raw["caustic"] if "caustic" in raw else light
