@@ -43,8 +43,9 @@ def add_options(parser: argparse._ActionsContainer, owner: str, name: str) -> No
 
 def output_file(path: str | Path, args: argparse.Namespace) -> Path:
     """The path of a file to write; its folder is made. Raises NgptError if the folder cannot be made, or the file
-    exists. ``args`` has ``force``. It also has ``skip_existing`` if the verb has that option, which applies to OpenEXR
-    files.
+    exists.
+
+    ``args`` has ``force``. It also has ``skip_existing`` if the verb has that option, which applies to OpenEXR files.
     """
     skip = getattr(args, "skip_existing", None)
     make_folder(Path(path).parent)

@@ -45,8 +45,9 @@ class Frame:
 
 
 def write_frame(frame: Frame, args: argparse.Namespace, keep: bool) -> dict:
-    """Writes the result, and returns its report. With ``keep``, a result that cannot be written there goes
-    elsewhere.
+    """Writes the result, and returns its report.
+
+    With ``keep``, a result that cannot be written there goes elsewhere.
     """
     target, stack, result = frame.target, frame.stack, frame.result
     report: dict[str, Any] = {"input": str(frame.source), "output": str(target)}

@@ -251,9 +251,7 @@ def frames_of(folders: list[str], shots: list[list[Path]]) -> list[tuple[Path, .
 
 
 def labels(paths: list[str]) -> list[str]:
-    """A name for each file: its own without the ending, after as many folders as are needed to make all names
-    differ.
-    """
+    """A name for each file: its own without the ending, after the folders needed to make all names differ."""
     places = [Path(os.path.abspath(path)) for path in paths]
     for place, path in zip(places, paths, strict=True):
         if places.count(place) > 1:

@@ -16,6 +16,7 @@ STREAM = "-"
 @contextmanager
 def standard_input(names: Sequence[str]) -> Iterator[list[str]]:
     """The names, where a file with the contents of standard input replaces ``-``; messages call it "standard input".
+
     Raises WrongUse if ``-`` occurs twice.
     """
     if STREAM not in names:

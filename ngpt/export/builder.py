@@ -138,8 +138,9 @@ class Graph:
         )
 
     def model(self, metadata: Mapping[str, str]) -> onnx.ModelProto:
-        """The checked model, with its producer, and ``metadata`` under names ``ngpt.*``. It has no nodes and constants
-        that no output depends on.
+        """The checked model, with its producer, and ``metadata`` under names ``ngpt.*``.
+
+        It has no nodes and constants that no output depends on.
         """
         (nodes,) = self._bodies
         graph = helper.make_graph(nodes, self.name, self._inputs, self._outputs)

@@ -1,5 +1,6 @@
-"""One of our networks as ONNX: it reads the raw buffers of a renderer and returns the image. CONTRACT.md is for those
-who run it.
+"""One of our networks as ONNX: it reads the raw buffers of a renderer and returns the image.
+
+CONTRACT.md is for those who run it.
 """
 
 import json

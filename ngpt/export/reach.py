@@ -63,8 +63,8 @@ def _least(model: Reconstructor, whole: int, seed: int) -> int:
 
 
 def _example(model: Reconstructor, side: int, seed: int) -> dict[str, Tensor]:
-    """Layers (1, C, side, side): rectangles of all brightnesses under noise; in 1 % of the pixels, the noise is a
-    hundred times stronger.
+    """Layers (1, C, side, side): rectangles of all brightnesses under noise, a hundred times stronger in 1 % of the
+    pixels.
     """
     rng = np.random.default_rng(seed)
     image = np.ones((3, side, side))

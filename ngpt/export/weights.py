@@ -1,6 +1,4 @@
-"""Weights in 16 bits: in the form that the repository keeps, with their training curve, and in the form that OIDN
-reads.
-"""
+"""Weights in 16 bits: the repository's files, with their training curve, and the files that OIDN reads."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -69,8 +67,9 @@ def curve(entries: list[dict[str, float]], last: int) -> dict[str, list[Any]]:
 
 
 def oidn_weights(weights: str | Path) -> bytes:
-    """The .tza file of weights that `ngpt train` wrote. Raises NgptError for networks of a shape other than OIDN's, and
-    for numbers beyond 16-bit floats.
+    """The .tza file of weights that `ngpt train` wrote.
+
+    Raises NgptError for networks of a shape other than OIDN's, and for numbers beyond 16-bit floats.
     """
     model, _ = load_weights(weights)
     if model.config.network != "oidn":

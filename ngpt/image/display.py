@@ -53,8 +53,9 @@ def to_display8(image: np.ndarray, transform: Callable[[np.ndarray], np.ndarray]
 
 
 def squared(image: np.ndarray, aspect: float) -> np.ndarray:
-    """An image (H, W, C) with square pixels, made from pixels whose width is ``aspect`` times their height. Pixels are
-    repeated, so a picture only becomes larger.
+    """An image (H, W, C) with square pixels, made from pixels whose width is ``aspect`` times their height.
+
+    Pixels are repeated, so a picture only becomes larger.
     """
     if not (1 / MOST_ASPECT <= aspect <= MOST_ASPECT) or aspect == 1:
         return image
@@ -94,9 +95,10 @@ def signed_map(gradient: np.ndarray) -> np.ndarray:
 
 
 def layer_view(name: str, layer: np.ndarray) -> np.ndarray:
-    """A layer of a stack, (H, W), (H, W, 1) or (H, W, 3), as (H, W, 3) uint8: each kind in its own way. Gradients are
-    shown as in :func:`signed_map`, normals as colours, depth up to its 99th percentile, light and variances at
-    automatic exposure, and other layers unchanged.
+    """A layer of a stack, (H, W), (H, W, 1) or (H, W, 3), as (H, W, 3) uint8: each kind in its own way.
+
+    Gradients are shown as in :func:`signed_map`, normals as colours, depth up to its 99th percentile, light and
+    variances at automatic exposure, and other layers unchanged.
     """
     layer = np.atleast_3d(np.asarray(layer, dtype=np.float64))
     layer = np.broadcast_to(layer, (*layer.shape[:2], 3))

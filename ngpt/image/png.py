@@ -19,9 +19,7 @@ def encode_png(image: np.ndarray, level: int = 9) -> bytes:
 
 
 def encode_palette_png(places: np.ndarray, table: np.ndarray, level: int = 6) -> bytes:
-    """Encodes (H, W) uint8 indices into a ``table`` of at most 256 colours, (N, 3) uint8: a third of the size of
-    RGB.
-    """
+    """Encodes (H, W) uint8 indices into a ``table`` of at most 256 colours, (N, 3) uint8: a third of RGB's size."""
     if places.dtype != np.uint8 or places.ndim != 2 or places.size == 0 or places.max() >= len(table):
         raise NgptError(f"PNG: needs non-empty (H, W) uint8 places in a table, got {places.shape} {places.dtype}")
     # Rows without a filter, as the standard advises for palettes.

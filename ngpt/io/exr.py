@@ -83,9 +83,7 @@ def read_views(
     files: Mapping[str, str | os.PathLike] | None = None,
     view: str | None = None,
 ) -> list[GradientStack]:
-    """Like ``read``, but returns a stack for each view of the file, or for the named view; one stack for a file without
-    views.
-    """
+    """Like ``read``, but returns a stack for each view, or for the named view; one stack for a file without views."""
     image, subpixels = _opened(path, isolated)
     found = choose_views(file_views(image), view, str(path))
     if len(found) == 1:
@@ -152,9 +150,7 @@ def _stack(
 
 
 def layers_in(path: str | os.PathLike, layers: Mapping[str, str] | None = None) -> frozenset[str]:
-    """The names of the layers that ``read`` would find, from the file's header; raises the same errors as ``read``
-    about them.
-    """
+    """The names of the layers that ``read`` would find, by the file's header; raises its errors about them."""
     views, texts = _views_in(path)
     return frozenset(_resolved(views[0], layers, texts, str(path)))
 
@@ -305,9 +301,7 @@ def write(
 
 
 def layers_of_result(stack: GradientStack, into: str | None = None) -> tuple[list[str], list[str]]:
-    """The layers that ``write`` replaces by a result, the root first, and the layers that are named like images and
-    stay noisy.
-    """
+    """The layers that ``write`` replaces by a result, the root first, and those named like images that stay noisy."""
     if stack.source is None:
         return ["root"], []
     origin, source = str(stack.attributes.get("ngpt:pass", "")), stack.source
@@ -339,6 +333,7 @@ def _result(
 
 def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> GradientStack:
     """Returns a stack that was made, not read, with further channels, (H, W) each, to be written beside its layers.
+
     Their names are outside the contract, for example ``diagnostics.discarded``. They are kept as unknown channels of a
     file are, and ``pass_through`` reads them.
     """
@@ -381,9 +376,7 @@ def layers_of_light(stack: GradientStack) -> dict[str, np.ndarray]:
 
 
 def replace_layers_of_light(stack: GradientStack, layers: Mapping[str, np.ndarray]) -> GradientStack:
-    """The stack with some of its ``layers_of_light`` replaced by ``layers``, (H, W, 3), which are stored in the old
-    layers' types.
-    """
+    """The stack with some of its ``layers_of_light`` replaced by ``layers``, (H, W, 3); half stays half if possible."""
     image = ExrImage([replace(part, channels=dict(part.channels)) for part in stack.source.image.parts])
     changed = replace(stack, source=replace(stack.source, image=image))
     places = _light(changed)

@@ -51,9 +51,7 @@ def named(name: str, frame: int) -> str:
 
 
 def number_of(path: Path, wanted: str) -> int:
-    """A file's frame: the last number in its name. Raises WrongUse, which names ``wanted``, if the name has no
-    number.
-    """
+    """A file's frame: the last number in its name. Raises WrongUse, naming ``wanted``, if there is none."""
     numbers = NUMBER.findall(path.stem)
     if not numbers:
         raise WrongUse(f"{path}: has no number, which {wanted} asks for; name the output without")

@@ -108,8 +108,9 @@ def series(files: Iterable[Path]) -> list[Series]:
 
 
 def remarks(name: str, files: Sequence[Path], results: bool = True) -> list[str]:
-    """Warnings about the frames of a shot, one line each, before they are shown or blended. ``results`` whether to say
-    how many results were left out
+    """Warnings about the frames of a shot, one line each, before they are shown or blended; none if all is well.
+
+    ``results``  whether to say how many results were left out
     """
     said = []
     if left := len(set(_files(name)) - set(files)) if results else 0:
@@ -157,9 +158,7 @@ def _none(name: str, what: str) -> list[Path]:
 
 
 def _frame(path: Path) -> float | None:
-    """The attribute ``ngpt:frame`` of a file; None if it has none, or cannot be read, which its reader reports
-    later.
-    """
+    """The attribute ``ngpt:frame`` of a file; None if it has none or cannot be read; its reader reports that."""
     try:
         with regular_file(path) as file:
             numbers = [part.number("ngpt:frame") for part in read_headers(file, str(path))]

@@ -21,9 +21,7 @@ _FAR = 3e38
 
 
 def spread(layers: Mapping[str, Value], depth: Value) -> Value:
-    """The layer ``caustic`` of repaired ``layers``, spread over its neighbourhood; ``depth`` is the largest in the
-    image.
-    """
+    """The layer ``caustic`` of repaired ``layers``, spread over its neighbourhood; ``depth`` is the image's largest."""
     light = layers["caustic"]
     scale = op.ReduceMax(abs(light), keepdims=0)
     return choose(op.Greater(scale, 0.0), lambda: _spread(layers, depth, scale), lambda: op.Identity(light), IMAGE)

@@ -1,6 +1,4 @@
-"""After ``ngpt.repair``: subtracts direct emission, replaces non-finite pixels, and marks differences that cannot be
-trusted.
-"""
+"""After ``ngpt.repair``: subtracts direct emission, replaces non-finite pixels, and marks untrusted differences."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

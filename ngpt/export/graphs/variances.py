@@ -7,9 +7,10 @@ from ngpt.export.graphs.repair import finite
 
 
 def smoothed(primal: Value, primal_var: Value, dx_var: Value, dy_var: Value) -> tuple[Value, Value]:
-    """The mean over 3x3 known values, taken twice, and ``inside``. Where none is known, it is the mean of all values.
-    For differences it is the fourth power of the mean of fourth roots, times ``TYPICAL``; larger values stay as they
-    are.
+    """The mean over 3x3 known values, taken twice, and ``inside``.
+
+    Where none is known, it is the mean of all values. For differences it is the fourth power of the mean of fourth
+    roots, times ``TYPICAL``; larger values stay as they are.
     """
     there = inside(primal)
     (vp, gp), (vx, gx), (vy, gy) = (_over_colours(layer) for layer in (primal_var, dx_var, dy_var))
@@ -47,8 +48,10 @@ def robust_mean(values: Value, there: Value) -> Value:
 
 
 def _rows(x: Value) -> Value:
-    """Sums of rows, which a sum over an image adds. The WebAssembly runtime adds one number after another in 32 bits:
-    without row sums it lost 0.2 % of the sum of 640x360 numbers, and more in larger images.
+    """Sums of rows, which a sum over an image adds.
+
+    The WebAssembly runtime adds one number after another in 32 bits: without row sums it lost 0.2 % of the sum of
+    640x360 numbers, and more in larger images.
     """
     return op.ReduceSum(x, [3], keepdims=1)
 

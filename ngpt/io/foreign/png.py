@@ -56,8 +56,9 @@ def describe(file: BinaryIO) -> Form:
 
 
 def _before_pixels(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
-    """The chunks before the first one with pixels, with the data of the palette and the transparent colour. The file is
-    then at the first chunk with pixels.
+    """The chunks before the first one with pixels, with the data of the palette and the transparent colour.
+
+    The file is then at the first chunk with pixels.
     """
     while True:
         length, kind = _next(file)

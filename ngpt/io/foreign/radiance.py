@@ -75,9 +75,7 @@ def _pixels(data: bytes, width: int, height: int) -> np.ndarray:
 
 
 def _old_runs(pixels: np.ndarray, repeats: np.ndarray, count: int) -> np.ndarray:
-    """A pixel 1 1 1 n repeats the pixel before it n times; in a sequence of these, each n counts 256 times as much as
-    the n before.
-    """
+    """A pixel 1 1 1 n repeats the pixel before it n times; in a row of these, each n counts 256 times the last one."""
     places = np.arange(len(pixels))
     last = np.maximum.accumulate(np.where(repeats, -1, places))
     if repeats[0]:
