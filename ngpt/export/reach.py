@@ -63,9 +63,7 @@ def _least(model: Reconstructor, whole: int, seed: int) -> int:
 
 
 def _example(model: Reconstructor, side: int, seed: int) -> dict[str, Tensor]:
-    """Layers (1, C, side, side): rectangles of all brightnesses under noise, a hundred times stronger in 1 % of the
-    pixels.
-    """
+    """Layers (1, C, side, side): rectangles of all brightnesses under noise, 1 % of it a hundred times stronger."""
     rng = np.random.default_rng(seed)
     image = np.ones((3, side, side))
     for _ in range(side):
