@@ -9,7 +9,7 @@ from ngpt.layers import LAYERS
 class Alias(NamedTuple):
     """A name under which ``producer`` stores ``layer``; ``""`` is the root.
 
-    ``only``     the required channel suffixes, in the order of the layer's own
+    ``only``     the required channel suffixes; those of the layer come first
     ``factors``  by which channels are multiplied, where a renderer uses another sign or unit
     ``writer``   the alias holds only in files by this program, according to ``writer_of``
     """

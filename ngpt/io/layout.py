@@ -70,7 +70,7 @@ def as_stored(image: ExrImage, found: Found, main: int) -> bool:
 
 
 def holds(part: ExrPart, names: tuple[str, ...], values: np.ndarray) -> bool:
-    """Whether the channels ``names``, as float32, are bit for bit ``values`` (H, W, C), which are float32."""
+    """Whether the channels ``names``, as float32, are bit for bit the float32 ``values`` (H, W, C); else False."""
     if values.dtype != np.float32:
         return False
     return values.shape[:2] == part.channels[names[0]].shape and all(
