@@ -23,7 +23,8 @@ class Reference(NamedTuple):
         return cls(path, *read_picture(path, isolated))
 
     def errors(self, image: np.ndarray, stack: GradientStack) -> dict[str, Any]:
-        """The metrics of an image (H, W, 3) made from ``stack``, and which pixels were compared, if not all of both.
+        """The metrics of an image (H, W, 3) made from ``stack``, and which pixels were compared, unless it was all
+        pixels of both.
 
         Raises NgptError without pixels in common.
         """

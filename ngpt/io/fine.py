@@ -1,7 +1,7 @@
-"""Subpixels in files: one more part, ``fine``, which readers that do not know it may ignore.
+"""Subpixels in files: one more part, ``fine``, which other readers may ignore.
 
-It holds R G B, ``albedo.R/G/B`` and ``normal.X/Y/Z`` in K times the data window of the pixels, K in ``ngpt:subpixels``.
-The display window is the one of the pixels: OpenEXR wants it to be the same in all parts of a file.
+It holds R G B, ``albedo.R/G/B`` and ``normal.X/Y/Z`` in K times the data window of the pixels, with K in
+``ngpt:subpixels``. The display window is that of the pixels: OpenEXR requires the same one in all parts of a file.
 """
 
 import logging
@@ -23,7 +23,7 @@ _LOG = logging.getLogger(__name__)
 PART = "fine"
 # The name of the part of the pixels, if it has none: in files with several parts, each needs a name.
 _PIXELS = "stack"
-# Attributes that OpenEXR wants to be the same in all parts of a file
+# Attributes that OpenEXR requires to be the same in all parts of a file
 _COMMON = ("displayWindow", "pixelAspectRatio", "timeCode", "chromaticities")
 
 
@@ -41,7 +41,7 @@ def apart(image: ExrImage) -> tuple[ExrImage, ExrPart | None]:
 
 
 def subpixels_of(part: ExrPart, stack: GradientStack) -> dict[str, np.ndarray]:
-    """The subpixels in a part, of the pixels of a stack; none, with a warning, where they are of other pixels."""
+    """The subpixels in a part; none, with a warning, if they do not match the pixels of the stack."""
     data, window = stack.place.data, data_window(part)
     k = part.header[SUBPIXELS]
     if not isinstance(k, int) or k < 2 or window != _window(data, k):

@@ -16,23 +16,23 @@ from ngpt.stack import GradientStack
 from ngpt.system.threads import map_parts
 from ngpt.windows import put
 
-# Attributes that describe how a part is stored, rather than what it shows; a stack's attributes are all others.
+# Attributes that describe how a part is stored, rather than what it shows; all others are attributes of the stack.
 STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"} | {
     "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type"
 }  # fmt: skip
-# Attributes that say what made a result; the stack's own attributes are others, and stay.
+# Attributes that say what made a result; the stack's own attributes stay.
 MADE_BY = (
     *("ngpt:method", "ngpt:weights", "ngpt:options", "ngpt:estimated", "ngpt:reconstructSeconds"),
     *("ngpt:temporal", "ngpt:history", "ngpt:historyWeights", "ngpt:pass", "ngpt:reduced"),
 )
-# A primal with this in its name says itself that it is noisy: nobody takes it for the image.
+# A primal with this in its name is known to be noisy: nobody mistakes it for the final image.
 _NOISY = "noisy"
 
 
 def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> tuple[ExrImage, Resolution, int]:
     """Returns the stack as a file, where the layers are in it, and the index of the part that has the attributes.
 
-    ``base``: the file as it is by now, where other views of it have results already.
+    ``base``: the file with the results that other views have already.
     """
     if stack.source is None:
         stack.require("primal", why=f"writing {path}")
@@ -66,7 +66,7 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
         values, half = stack[name], False
         if unchanged.get(name):
             continue
-        # Channels in another renderer's units, or on other pixels, stay as they are, and ours go beside them.
+        # Channels in another renderer's units, or on other pixels, stay as they are, and ours are added beside them.
         if name in resolution and as_stored(image, resolution[name], main):
             part, names = image.parts[resolution[name].part], resolution[name].channels
             half = is_half(part, names) and not LAYERS[name].float_on_disk
@@ -81,7 +81,7 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
 
 
 def new_header(stack: GradientStack) -> dict[str, Any]:
-    """The header of the part for a stack that comes from no file."""
+    """The header of the part for a stack that was not read from a file."""
     windows = {"dataWindow": stack.place.data.box, "displayWindow": stack.place.display.box}
     aspect = {} if stack.place.aspect == 1 else {"pixelAspectRatio": stack.place.aspect}
     return {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | windows | aspect
@@ -96,7 +96,7 @@ def leave_out_old_error(stack: GradientStack, image: ExrImage) -> None:
 
 
 def replaced_layer(resolution: Resolution, view: View, origin: str, into: str | None, path: str) -> Found | None:
-    """The layer that holds a result beside the root: who loads that layer wants the image too.
+    """The layer that holds a result besides the root: users who load that layer want the result too.
 
     ``into`` names it, whole or by its tail after a dot; "root" is none. By default it is the layer that the input came
     from, unless its name says that it is noisy; ``origin`` is its name where the input was moved before.
@@ -149,7 +149,7 @@ def with_result(
         if view.name:
             header = {key: value for key, value in header.items() if key != "multiView"} | {"view": view.name}
         root, kept = suffixes, tuple(f"primal.{suffix}" for suffix in suffixes)
-        # At the end the numbers of the other views' parts stay what they are.
+        # A part at the end leaves the numbers of the other views' parts unchanged.
         place = 0 if place == 0 else len(parts)
         parts.insert(place, ExrPart(name, header, {}))
     channels = parts[place].channels
