@@ -26,9 +26,8 @@ _LEFTOVER = re.compile(r"\.ngpt-[a-z0-9_]{8}(\.[^.]*)?")
 _MOST = 99  # names that are tried for a file that cannot be written under its own
 _one_at_a_time = Lock()
 hold_while_forking(_one_at_a_time)
-_FORGOTTEN = (
-    24 * 3600.0
-)  # seconds since the last change after which temporary files are removed on systems without locks
+# Seconds since the last change after which temporary files are removed on systems without locks
+_FORGOTTEN = 24 * 3600.0
 
 
 def make_folder(folder: str | os.PathLike) -> Path:
