@@ -454,3 +454,17 @@ def test_a_point_that_is_chosen_never_is_off(renderer):
     without = render_stack(load(renderer, box(1.0)), 64, 0, "ppm", lamps="uniform", unbiased=True)["primal"].mean()
     found = render_stack(load(renderer, description), 64, 0, "ppm", unbiased=True)["primal"].mean()
     assert found == pytest.approx(without, rel=0.05)
+
+
+def test_claims_of_a_pixel_go_by_the_noise_around_it():
+    """In an even area, the factor hardly depends on whether a pixel has a rare sample itself.
+
+    Grouped by their own variance, pixels without one have a fourteenth of the factor.
+    """
+    random, size, n = np.random.default_rng(5), (64, 64), 16
+    rare = random.random(size) < 0.02
+    variance = np.where(rare, 100.0, 1.0)[..., None]
+    # Points cancel the noise of smooth light, and not that of rare samples.
+    contrast = random.normal(size=(*size, 1)) * np.sqrt(variance * np.where(rare, 1.0, 0.05)[..., None])
+    found = factors(contrast, variance, np.full(size, n), n)[..., 0]
+    assert found[~rare].mean() > 0.4 * found[rare].mean()

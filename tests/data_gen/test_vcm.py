@@ -209,6 +209,33 @@ def test_the_light_of_photons_is_a_layer_of_its_own(renderer):
     assert GATHERED not in render_stack(scene, 2, 3, "bdpt", unbiased=True).attributes
 
 
+def beam():
+    """A spot that lights only a mirror, which lights a matt floor: all light has come by three edges."""
+    import mitsuba as mi
+
+    from data_gen.scenes.builtin import _camera, _diffuse, _rgb, _wall
+
+    toward = mi.ScalarTransform4f().look_at(origin=[0, 1, 0], target=[1, 0.7, 0], up=[0, 1, 0])
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 3},
+        "sensor": _camera([-1.33, 2, 1.5], [-1.33, 0, 0], 50),
+        "floor": _wall([0, 0, 0], [0, 1, 0], (8, 8), _diffuse(0.5, 0.5, 0.5)),
+        "mirror": _wall([1, 0.7, 0], [-1, 0, 0], (1, 1), {"type": "conductor"}),
+        "spot": {"type": "spot", "to_world": toward, "intensity": _rgb(9, 9, 9), "cutoff_angle": 10},
+    }
+
+
+def test_the_longest_paths_merge_too(renderer):
+    """``max_depth`` edges: as bright as with room for longer paths, of which there are none."""
+    longer = beam() | {"integrator": {"type": "path", "max_depth": 5}}
+    light = [
+        render_stack(load(renderer, scene, (24, 16)), 16, 3, "vcm", unbiased=True)["primal"].mean()
+        for scene in (beam(), longer)
+    ]
+    assert light[1] > 1e-3 and light[0] == pytest.approx(light[1], rel=0.02)
+
+
 # ------------------------- Where nothing merges -------------------------
 
 
