@@ -123,7 +123,7 @@ def main() -> int:
     worse = [each for each in judged if each.worse]
     for each in worse:
         limit = f"limit {verdict.LIMITS[each.value]:g}, {verdict.DEVIATIONS:g} deviations {each.reach:.2f}"
-        print(f"worse: {', '.join(each.key)}: {each.value} {each.ratio:.3f} times that of before ({limit})")
+        print(f"worse: {', '.join(each.key)}: {each.value} {each.ratio:.3f} times as large as before ({limit})")
     print(f"{len(worse)} of {len(judged)} ratios are worse beyond noise")
     return 1 if worse else 0
 
@@ -247,7 +247,7 @@ def over_best(of: dict[verdict.Key, dict[str, Any]], scene: str, spp: int, equal
 
 
 def ratio_table(judged: list[verdict.Judged]) -> list[str]:
-    """Lines: error and FLIP over those of before; what is worse beyond noise is bold."""
+    """Lines of a table of ratios to the earlier error and FLIP. Ratios that are worse beyond noise are bold."""
     shown: dict[tuple[str, str], dict[str, list[str]]] = {}
     for each in judged:
         scene, spp, pipeline = each.key
