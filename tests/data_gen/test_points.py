@@ -456,6 +456,16 @@ def test_a_point_that_is_chosen_never_is_off(renderer):
     assert found == pytest.approx(without, rel=0.05)
 
 
+def test_pixels_that_lost_their_samples_say_nothing_about_others():
+    """Points take most of the noise away in all of them, also in those that are grouped last."""
+    random, size, n = np.random.default_rng(5), (32, 32), 16
+    variance = random.gamma(4, size=(*size, 1))
+    contrast = 0.2 * random.normal(size=(*size, 1)) * np.sqrt(variance)
+    variance[3, 4] = contrast[3, 4] = np.nan
+    found = factors(contrast, variance, np.full(size, n), n)[..., 0]
+    assert found[3, 4] == 1 and np.delete(found.ravel(), 3 * 32 + 4).max() < 0.7
+
+
 def test_claims_of_a_pixel_go_by_the_noise_around_it():
     """In an even area, the factor hardly depends on whether a pixel has a rare sample itself.
 
