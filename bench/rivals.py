@@ -11,7 +11,8 @@ A scene is rendered by each of RENDERS:
     multijitter  the same with Mitsuba's best points
 
 OIDN denoises the renders of rivals in each of the WAYS: at K times the size, with features that are declared as
-prefiltered (it denoises them first), clean or noisy. An image at twice the size is then scaled down. Each cell has, by
+prefiltered (it denoises them first), clean or noisy. An image at twice the size is then scaled down. "1 and 2" is what
+ngpt does with subpixels (``ngpt.denoisers.oidn.with_subpixels``): the mean of an image of each size. Each cell has, by
 way:
 
     seconds  of processors, of the render and of OIDN, both warmed up
@@ -49,6 +50,7 @@ from bench.tails import (
 from ngpt.evaluation.references import Reference
 from ngpt.measure.averages import geometric_mean
 from ngpt.measure.metrics import scores
+from ngpt.stack import GradientStack
 from ngpt.subpixels import FEWEST, means
 
 RENDERS = ("default", "ours", "mitsuba", "multijitter")
@@ -58,13 +60,18 @@ WAYS = {
     "2 noisy": (2, "noisy"),
     "2 clean": (2, "clean"),
     "2 prefiltered": (2, "prefiltered"),
+    "1 and 2": (2, "auto"),
 }
+OWN = "1 and 2"
+KNOWN = tuple(way for way in WAYS if way != OWN)  # what people can do without ngpt
 # Name -> renders and ways that a rival may choose from
 RIVALS = {
     "Mitsuba + OIDN": (("mitsuba",), ("1 prefiltered",)),
-    "Mitsuba + OIDN, K = 1 or 2": (("mitsuba",), tuple(WAYS)),
-    "its best points, K = 1 or 2": (("mitsuba", "multijitter"), tuple(WAYS)),
-    "OIDN on our samples, K = 1 or 2": (("ours",), tuple(WAYS)),
+    "Mitsuba + OIDN, K = 1 or 2": (("mitsuba",), KNOWN),
+    "its best points, K = 1 or 2": (("mitsuba", "multijitter"), KNOWN),
+    "OIDN on our samples, K = 1 or 2": (("ours",), KNOWN),
+    "Mitsuba's best points, mean of both K": (("mitsuba", "multijitter"), (OWN,)),
+    "our samples, mean of both K": (("ours",), (OWN,)),
 }
 POINTS = {"mitsuba": "independent", "multijitter": "multijitter"}
 CELL = ("scene", "size", "render", "spp", "seed")
@@ -161,9 +168,12 @@ def by_ways(images: Callable[[int, int, int], Images]) -> Callable[[int, int], M
         for way, (k, auxiliary) in WAYS.items():
             given, seconds = rendered[k]
             start = processor_seconds()
-            features = {"albedo": given.albedo, "normal": given.normal}
-            image = ngpt.denoise(given.primal, "oidn", auxiliary=auxiliary, **features)
-            image = means(image, k) if k > 1 else image
+            layers = given._asdict()
+            if k > 1:
+                stack = GradientStack({name: means(layer, k) for name, layer in layers.items()}, fine=layers)
+            else:
+                stack = GradientStack(layers)
+            image = ngpt.reconstruct(stack, "oidn", auxiliary=auxiliary).image
             made[way] = image, seconds + processor_seconds() - start
         return made
 

@@ -1,13 +1,13 @@
 """Intel Open Image Denoise as a method: it needs the primal and features, no gradients. Imported when first called."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
 from ngpt.coverage import mirrored
-from ngpt.denoisers.clean import features_are_clean
 from ngpt.denoisers.oidn_filters import filtered
 from ngpt.errors import NgptError
 from ngpt.options import Option
@@ -17,6 +17,8 @@ from ngpt.system.install import package_command
 
 AUXILIARY = ("prefiltered", "clean", "noisy", "none")
 QUALITIES = {"high": "High", "balanced": "Balanced", "fast": "Fast"}
+# Of the models for features. "High" takes more than twice as long, and images are as good (docs/lab/log).
+PREFILTER = "Balanced"
 # What OIDN's filter and its settings are.
 FILTERS: dict[str, dict[str, Any]] = {
     "image": {"hdr": True},
@@ -27,7 +29,7 @@ FILTERS: dict[str, dict[str, Any]] = {
 OPTIONS = {
     "auxiliary": Option(
         "auto",
-        "what OIDN is told of albedo and normal; auto: clean for subpixels, else prefiltered",
+        "how albedo and normal are used; auto: prefiltered, and the mean of that and of noisy subpixels if there are any",
         choices=("auto", *AUXILIARY),
     ),
     "filter": Option(
@@ -46,15 +48,13 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
 
     OIDN takes no normals without albedo: they are left out then.
 
-    Where there are subpixels (``ngpt.subpixels``), these are denoised, and the image is their means. With "auto" they
-    are only where features are clean: noisy ones, as behind a lens, would have to be prefiltered, which takes four
-    times as long, and without that subpixels have more error than pixels (docs/lab/log).
+    Where there are subpixels (``ngpt.subpixels``), these are denoised, and the image is their means. With "auto" it is
+    ``with_subpixels``.
 
-    ``auxiliary``  how OIDN uses the features: "prefiltered" denoises them with its own models first and then marks
-                   them as clean, which its documentation recommends for the best quality; "clean" marks them as clean
-                   as they are; "noisy" does not; "none" leaves them out; "auto" is "clean" for
-                   subpixels, and else "prefiltered"
-    ``quality``    "high", "balanced" or "fast", for the image and for features that are denoised first
+    ``auxiliary``  how OIDN uses the features: "prefiltered" denoises them first with its own models, of quality
+                   ``PREFILTER``, and then marks them as clean, which its documentation recommends for the best quality;
+                   "clean" marks them as clean as they are; "noisy" does not; "none" leaves them out
+    ``quality``    "high", "balanced" or "fast", of the network for the image
     ``filter``     one of ``FILTERS``: "lightmap" and "directional" are OIDN's for lightmaps, which take no features
 
     Without features, empty pixels become what the covered ones beside them would be in a mirror: OIDN would darken the
@@ -68,13 +68,12 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
     if filter != "image":
         auxiliary = "none"
     elif auxiliary == "auto":
-        auxiliary = "clean" if k > 1 and (not data.features or features_are_clean(data)) else "prefiltered"
-        k = k if auxiliary == "clean" else 1
+        return with_subpixels(data, "prefiltered", quality)
     if k > 1:
         image, layers = data.fine["primal"], data.fine
     image = np.ascontiguousarray(image, np.float32)
     if auxiliary == "prefiltered":
-        features = prefiltered(layers, quality)
+        features = prefiltered(layers)
     elif auxiliary != "none":
         features = _in_range(layers)
     clean = bool(features) and auxiliary in ("prefiltered", "clean")
@@ -89,14 +88,29 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
     return (means(image, k) if k > 1 else image) - data.direct
 
 
-def prefiltered(features: Mapping[str, np.ndarray], quality: str) -> dict[str, np.ndarray]:
-    """Albedo and normal (H, W, 3) denoised by OIDN's own models for them, whether they are noisy or not.
+def with_subpixels(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
+    """``oidn`` on pixels, with features as ``auxiliary`` says; where there are K x K subpixels, the mean of this image
+    and of those at K, K / 2 ... times the size.
 
-    With ``quality`` "high" this takes longer than the image itself, with "balanced" less than half of that, and images
-    denoised with their help are as good (docs/lab/log).
+    Small pixels keep edges, and large ones keep what is smooth. The errors of these images differ so much that their
+    mean has less error than each of them in nearly every scene. The features of subpixels are taken as noisy: taken as
+    clean they leave noise behind a lens, and to prefilter them takes four times as long (docs/lab/log).
     """
+    images = [oidn(replace(data, fine={}), auxiliary, quality)]
+    k, fine = subpixels(data.fine, data.image.shape[1]), data.fine
+    while k > 1:
+        images.append(oidn(replace(data, fine=fine), "noisy", quality))
+        k, odd = divmod(k, 2)
+        if odd:
+            break
+        fine = {name: means(layer, 2) for name, layer in fine.items()}
+    return np.mean(images, axis=0, dtype=np.float32)
+
+
+def prefiltered(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Albedo and normal (H, W, 3) denoised by OIDN's own models for them, whether they are noisy or not."""
     require_oidn()
-    return {name: _prefiltered(name, layer, quality) for name, layer in _in_range(features).items()}
+    return {name: _prefiltered(name, layer) for name, layer in _in_range(features).items()}
 
 
 def _in_range(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -106,8 +120,8 @@ def _in_range(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return layers | {"albedo": np.clip(layers["albedo"], 0, 1)}
 
 
-def _prefiltered(name: str, layer: np.ndarray, quality: str) -> np.ndarray:
-    return filtered({name: layer}, "cpu", quality=QUALITIES[quality]) if layer.any() else layer
+def _prefiltered(name: str, layer: np.ndarray) -> np.ndarray:
+    return filtered({name: layer}, "cpu", quality=PREFILTER) if layer.any() else layer
 
 
 def require_oidn() -> None:
