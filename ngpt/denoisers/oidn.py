@@ -29,7 +29,7 @@ FILTERS: dict[str, dict[str, Any]] = {
 OPTIONS = {
     "auxiliary": Option(
         "auto",
-        "how albedo and normal are used; auto: prefiltered, and the mean of that and of noisy subpixels if there are any",
+        "how albedo and normal are used; auto: prefiltered, and with subpixels the mean of that and of noisy subpixels",
         choices=("auto", *AUXILIARY),
     ),
     "filter": Option(
