@@ -1,4 +1,4 @@
-"""Intel Open Image Denoise as a method: it needs the primal and features, no gradients. Imported when first called."""
+"""Intel Open Image Denoise as a method: it reads the primal and features, no gradients."""
 
 from collections.abc import Mapping
 from importlib.util import find_spec
@@ -17,7 +17,7 @@ from ngpt.system.install import package_command
 
 AUXILIARY = ("prefiltered", "clean", "noisy", "none")
 QUALITIES = {"high": "High", "balanced": "Balanced", "fast": "Fast"}
-# What OIDN's filter and its settings are.
+# The values of ``filter``: OIDN's own filter and its settings.
 FILTERS: dict[str, dict[str, Any]] = {
     "image": {"hdr": True},
     "lightmap": {"kind": "RTLightmap"},
@@ -27,13 +27,13 @@ FILTERS: dict[str, dict[str, Any]] = {
 OPTIONS = {
     "auxiliary": Option(
         "auto",
-        "what OIDN is told of albedo and normal; auto: clean for subpixels, else prefiltered",
+        "how OIDN uses albedo and normal; auto: clean for subpixels, else prefiltered",
         choices=("auto", *AUXILIARY),
     ),
     "filter": Option(
-        "image", "OIDN's for images, or for lightmaps of light or of coefficients in [-1, 1]", choices=tuple(FILTERS)
+        "image", "for images, for lightmaps, or for lightmaps of coefficients in [-1, 1]", choices=tuple(FILTERS)
     ),
-    "quality": Option("high", "of its network: less is quicker", choices=tuple(QUALITIES)),
+    "quality": Option("high", "quality of OIDN's network: a lower one is faster", choices=tuple(QUALITIES)),
 }
 
 
@@ -42,27 +42,28 @@ def missing() -> str:
 
 
 def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") -> np.ndarray:
-    """Intel Open Image Denoise, its filter "RT" for HDR images, with albedo, or albedo and normal, where there are any.
+    """The image that OIDN makes of the primal, albedo and normal: (H, W, 3) float32 without direct emission.
 
-    OIDN takes no normals without albedo: they are left out then.
+    OIDN takes no normals without albedo, so they are left out if there is no albedo.
 
-    Where there are subpixels (``ngpt.subpixels``), these are denoised, and the image is their means. With "auto" they
-    are only where features are clean: noisy ones, as behind a lens, would have to be prefiltered, which takes four
-    times as long, and without that subpixels have more error than pixels (docs/lab/log).
+    If the stack has subpixels (``ngpt.subpixels``), they are denoised, and their means are the image. "auto" does this
+    only if features are clean. Noisy features, as behind a lens, would have to be prefiltered at four times the cost;
+    without prefiltering, subpixels have more error than pixels (docs/lab/log).
 
-    ``auxiliary``  how OIDN uses the features: "prefiltered" denoises them with its own models first and then marks
+    ``auxiliary``  how OIDN uses the features: "prefiltered" denoises them first with its own models and then marks
                    them as clean, which its documentation recommends for the best quality; "clean" marks them as clean
-                   as they are; "noisy" does not; "none" leaves them out; "auto" is "clean" for
+                   without denoising them; "noisy" does neither; "none" leaves them out; "auto" is "clean" for
                    subpixels, and else "prefiltered"
     ``quality``    "high", "balanced" or "fast", for the image and for features that are denoised first
     ``filter``     one of ``FILTERS``: "lightmap" and "directional" are OIDN's for lightmaps, which take no features
 
-    Without features, empty pixels become what the covered ones beside them would be in a mirror: OIDN would darken the
-    borders of the islands of a lightmap, and let their light leak from one to the other.
+    Without features, OIDN reads mirror images of the covered pixels in place of empty ones. Otherwise it would darken
+    the borders of the islands of a lightmap, and light would leak from one island to another. Empty pixels of the
+    result are those of the primal.
     """
     require_oidn()
     features = {}
-    # With the light sources seen, as a renderer hands it over and OIDN was trained.
+    # With light sources that are seen directly: OIDN was trained on such images.
     image, layers = data.image + data.direct, data.features
     k = subpixels(data.fine, image.shape[1]) if filter == "image" else 1
     if filter != "image":
@@ -92,8 +93,8 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
 def prefiltered(features: Mapping[str, np.ndarray], quality: str) -> dict[str, np.ndarray]:
     """Albedo and normal (H, W, 3) denoised by OIDN's own models for them, whether they are noisy or not.
 
-    With ``quality`` "high" this takes longer than the image itself, with "balanced" less than half of that, and images
-    denoised with their help are as good (docs/lab/log).
+    With ``quality`` "high", this takes longer than denoising the image. With "balanced", it takes less than half of
+    that, and images denoised with these features are as good (docs/lab/log).
     """
     require_oidn()
     return {name: _prefiltered(name, layer, quality) for name, layer in _in_range(features).items()}
