@@ -102,7 +102,7 @@ class Paths:
         self.shifts = {name: mi.Vector2f(*(dr.opaque(mi.Float, s) for s in shift)) for name, shift in SHIFTS.items()}
 
     def trace(self, camera: CameraSamples, random) -> tuple[dict[str, mi.Color3f], mi.Color3f, dict[str, mi.Bool]]:
-        """For paths with these ``random`` numbers: layers, light seen directly, and which neighbours are on the film."""
+        """For paths with these ``random`` numbers: layers, light seen directly, which neighbours are on the film."""
         ray, importance, _ = camera.rays(mi.Vector2f(0))
         shifted = {name: camera.rays(shift) for name, shift in self.shifts.items()}
         paths = trace(self.gpt, self.plan, random, (ray, importance), list(shifted.values()))

@@ -72,7 +72,7 @@ class GMLT:
         film.put_all(features(self.paths.scene, camera.sensor, camera.random.clone(), ray))
 
     def candidates(self, camera: CameraSamples):
-        """For one path of each camera sample: its layers, light seen directly, the neighbours on the film, its value."""
+        """For one path of each camera sample: layers, light seen directly, the neighbours on the film, and value."""
         layers, Le, inside = self.paths.trace(camera, camera.random.clone())
         f = value_of(layers)
         dr.eval(layers, Le, inside, f)
