@@ -3,8 +3,9 @@
     python -m bench.subpixels living-room/scene.xml generator:20261211:partition --references FOLDER
 
 The sampler is `primal`, with shared tails where they work. A scene, number of samples and seed is rendered once, with
-as many subpixels as any way needs; fewer are their means. Scenes and references are as of `bench.seeds`. Ways to
-denoise are in WAYS. Each cell has, of each way:
+as many subpixels as any way needs; fewer are their means. A way with K x K subpixels is left out below K² samples per
+pixel, where some subpixels would have none. Scenes and references are as of `bench.seeds`, and scenes of `bench.panel`
+have their names there. Ways to denoise are in WAYS. Each cell has, of each way:
 
     seconds  of processors, warmed up
     error    relMSE by two halves of a reference, without the worst 0.1 % of the pixels; FLIP is over their mean
