@@ -1,4 +1,4 @@
-"""Intel Open Image Denoise as a method: it needs the primal and features, no gradients. Imported when first called."""
+"""Intel Open Image Denoise as a method: it reads the primal and features, no gradients."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -17,9 +17,10 @@ from ngpt.system.install import package_command
 
 AUXILIARY = ("prefiltered", "clean", "noisy", "none")
 QUALITIES = {"high": "High", "balanced": "Balanced", "fast": "Fast"}
-# Of the models for features. "High" takes more than twice as long, and images are as good (docs/lab/log).
+# The quality of OIDN's models for features. "High" takes more than twice as long, and images are no better
+# (docs/lab/log).
 PREFILTER = "Balanced"
-# What OIDN's filter and its settings are.
+# The values of ``filter``: OIDN's own filter and its settings.
 FILTERS: dict[str, dict[str, Any]] = {
     "image": {"hdr": True},
     "lightmap": {"kind": "RTLightmap"},
@@ -33,9 +34,9 @@ OPTIONS = {
         choices=("auto", *AUXILIARY),
     ),
     "filter": Option(
-        "image", "OIDN's for images, or for lightmaps of light or of coefficients in [-1, 1]", choices=tuple(FILTERS)
+        "image", "for images, for lightmaps, or for lightmaps of coefficients in [-1, 1]", choices=tuple(FILTERS)
     ),
-    "quality": Option("high", "of its network: less is quicker", choices=tuple(QUALITIES)),
+    "quality": Option("high", "quality of OIDN's network: a lower one is faster", choices=tuple(QUALITIES)),
 }
 
 
@@ -44,25 +45,24 @@ def missing() -> str:
 
 
 def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") -> np.ndarray:
-    """Intel Open Image Denoise, its filter "RT" for HDR images, with albedo, or albedo and normal, where there are any.
+    """The image that OIDN makes of the primal, albedo and normal: (H, W, 3) float32 without direct emission.
 
-    OIDN takes no normals without albedo: they are left out then.
-
-    Where there are subpixels (``ngpt.subpixels``), these are denoised, and the image is their means. With "auto" it is
-    ``with_subpixels``.
+    OIDN takes no normals without albedo, so they are left out if there is no albedo. If the stack has subpixels
+    (``ngpt.subpixels``), they are denoised, and their means are the image. "auto" stands for ``with_subpixels``.
 
     ``auxiliary``  how OIDN uses the features: "prefiltered" denoises them first with its own models, of quality
                    ``PREFILTER``, and then marks them as clean, which its documentation recommends for the best quality;
-                   "clean" marks them as clean as they are; "noisy" does not; "none" leaves them out
-    ``quality``    "high", "balanced" or "fast", of the network for the image
+                   "clean" marks them as clean without denoising them; "noisy" does neither; "none" leaves them out
+    ``quality``    "high", "balanced" or "fast": the quality of the network for the image
     ``filter``     one of ``FILTERS``: "lightmap" and "directional" are OIDN's for lightmaps, which take no features
 
-    Without features, empty pixels become what the covered ones beside them would be in a mirror: OIDN would darken the
-    borders of the islands of a lightmap, and let their light leak from one to the other.
+    Without features, OIDN reads mirror images of the covered pixels in place of empty ones. Otherwise it would darken
+    the borders of the islands of a lightmap, and light would leak from one island to another. Empty pixels of the
+    result are those of the primal.
     """
     require_oidn()
     features = {}
-    # With the light sources seen, as a renderer hands it over and OIDN was trained.
+    # With light sources that are seen directly: OIDN was trained on such images.
     image, layers = data.image + data.direct, data.features
     k = subpixels(data.fine, image.shape[1]) if filter == "image" else 1
     if filter != "image":
@@ -89,12 +89,14 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
 
 
 def with_subpixels(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
-    """``oidn`` on pixels, with features as ``auxiliary`` says; where there are K x K subpixels, the mean of this image
-    and of those at K, K / 2 ... times the size.
+    """The mean of OIDN's image of the pixels and its images at K, K / 2 ... times the size; (H, W, 3) float32.
 
-    Small pixels keep edges, and large ones keep what is smooth. The errors of these images differ so much that their
-    mean has less error than each of them in nearly every scene. The features of subpixels are taken as noisy: taken as
-    clean they leave noise behind a lens, and to prefilter them takes four times as long (docs/lab/log).
+    Without subpixels, it is the image of the pixels. ``auxiliary`` says how the features of pixels are used. Those of
+    subpixels are marked as noisy. Marked as clean, they would leave noise behind a lens, and prefiltering them would
+    take four times as long (docs/lab/log).
+
+    Small pixels keep edges, and large ones keep smooth areas. The errors of these images differ so much that their mean
+    has less error than each of them in nearly every scene.
     """
     images = [oidn(replace(data, fine={}), auxiliary, quality)]
     k, fine = subpixels(data.fine, data.image.shape[1]), data.fine
