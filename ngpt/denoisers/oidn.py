@@ -106,7 +106,7 @@ def with_subpixels(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
         if odd:
             break
         fine = {name: means(layer, 2) for name, layer in fine.items()}
-    return np.mean(images, axis=0, dtype=np.float32)
+    return np.asarray(np.mean(images, axis=0, dtype=np.float32))
 
 
 def prefiltered(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
