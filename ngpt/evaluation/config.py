@@ -259,7 +259,7 @@ def _with_base(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
         return values
     above = (*above, path.resolve())
     if not isinstance(base, str) or (path.parent / base).resolve() in above:
-        raise NgptError(f"{path}: base = {base!r}: must be the name of another file, one that is not built on this one")
+        raise NgptError(f"{path}: base = {base!r}: must be the name of another file, which is not built on this one")
     return _merged(_with_base(path.parent / base, above), values)
 
 
