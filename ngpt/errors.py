@@ -39,7 +39,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 class Interrupted(KeyboardInterrupt):
-    """What Ctrl-C and SIGTERM raise in a command.
+    """The exception that Ctrl-C and SIGTERM raise in a command.
 
     Once a plain KeyboardInterrupt has passed through code compiled from a string, such as that of dataclasses and named
     tuples, Python 3.11 ends itself by SIGINT, whatever exit status it is given.
@@ -47,10 +47,10 @@ class Interrupted(KeyboardInterrupt):
 
 
 def stop_if_interrupted(error: BaseException) -> None:
-    """Raises KeyboardInterrupt if ``error`` comes from one: from Ctrl-C within a library that wraps exceptions.
+    """Raises KeyboardInterrupt if ``error`` was caused by one, as after Ctrl-C in a library that wraps exceptions.
 
-    Dr.Jit's loops and recordings turn it into a RuntimeError with the cause; Mitsuba's plugins into one with only a
-    text.
+    Dr.Jit's loops and recordings turn a KeyboardInterrupt into a RuntimeError that holds its cause. Mitsuba's plugins
+    turn it into a RuntimeError with only a text.
     """
     cause: BaseException | None = error
     while cause is not None:

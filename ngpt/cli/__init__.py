@@ -24,7 +24,7 @@ from ngpt.version import __version__
 
 class Verb(NamedTuple):
     """A verb: its summary, the package that holds its module (named after the verb), the extra of ngpt-recon that
-    installs what it needs, what an interrupt means for its work, and its heading in help, one of ``HEADINGS``."""
+    installs what it needs, the message after an interrupt, and its heading in help, one of ``HEADINGS``."""
 
     summary: str
     room: str = "ngpt.cli"

@@ -35,7 +35,7 @@ class Frame:
     there: bool = False
     cut: bool = False  # whether an incomplete file is in its place
     over_time: Mapping[str, Any] = field(default_factory=dict)  # use of other frames, as header attributes
-    told: Mapping[str, Any] = field(default_factory=dict)  # what else is reported
+    told: Mapping[str, Any] = field(default_factory=dict)  # further entries of the report
     others: tuple[Frame, ...] = ()  # the other views of the file
 
     @property
@@ -47,7 +47,7 @@ class Frame:
 def write_frame(frame: Frame, args: argparse.Namespace, keep: bool) -> dict:
     """Writes the result, and returns its report.
 
-    With ``keep``, a result that cannot be written there goes elsewhere.
+    With ``keep``, a result that cannot be written to its place is written elsewhere.
     """
     target, stack, result = frame.target, frame.stack, frame.result
     report: dict[str, Any] = {"input": str(frame.source), "output": str(target)}

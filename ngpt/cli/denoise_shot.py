@@ -51,7 +51,7 @@ def motion_hint(pairs: Sequence[tuple[Path, Path]], reports: Sequence[dict], arg
 
 
 def one_view_only(target: Path, args: argparse.Namespace, files: Mapping[str, str]) -> str:
-    """The part of the options that allows only one view; "" if there is none."""
+    """The words of a message for an option that allows only one view; "" if there is no such option."""
     if target.suffix.lower() != ".exr":
         return f"{target} is of one"
     if args.ref:

@@ -83,7 +83,7 @@ def told(args: argparse.Namespace, console: Console) -> int:
 
 
 def file(args: argparse.Namespace, console: Console) -> int:
-    """Describes an image file. If not all of it is understood, it still lists the contents."""
+    """Describes an image file. Lists its contents even if not all of them are understood."""
     views = views_in(args.file)
     names = {"views": [view.name for view in views]} if len(views) > 1 else {}
     try:

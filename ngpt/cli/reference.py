@@ -26,7 +26,7 @@ class Reference(NamedTuple):
         """The metrics of an image (H, W, 3) made from ``stack``, and which pixels were compared, unless it was all
         pixels of both.
 
-        Raises NgptError without pixels in common.
+        Raises NgptError if the two images have no pixel in common.
         """
         both = overlap([stack.path, self.path], [stack.place, self.place])
         light = converted(image, to_rec709(stack.attributes))

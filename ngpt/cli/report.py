@@ -183,7 +183,7 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
             means = [float(np.mean([scene.entries[place].metrics[metric] for scene in scenes])) for metric in metrics]
             rows.append([name, *(f"{value:.4g}" for value in (*means, flicker(images, references, motions)))])
         if all(motion is None for motion in motions[1:]):
-            what = "no frame after the first has motion vectors (layer 'motion'), to tell it from what moves"
+            what = "no frame after the first has motion vectors (layer 'motion'), which tell flicker from movement"
             console.say(f"flicker is nan: {what}")
         tables = {f"Means over {len(frames)} frames": rows}
         print_table(rows)

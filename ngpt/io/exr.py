@@ -335,10 +335,10 @@ def _result(
 
 
 def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> GradientStack:
-    """Adds channels, (H, W) each, to a stack that was not read from a file; ``write`` writes them beside its layers.
+    """Returns ``stack`` with further channels, (H, W) each, which ``write`` writes beside its layers.
 
-    Their names are outside the contract, for example ``diagnostics.discarded``. They are kept like the unknown channels
-    of a file, and ``pass_through`` returns them.
+    ``stack`` must not come from a file. The names of channels are outside the contract, for example
+    ``diagnostics.discarded``. They are kept like the unknown channels of a file, and ``pass_through`` returns them.
     """
     stack.require("primal", why="carrying further channels")
     part, found = ExrPart("", new_header(stack), {}), {}

@@ -75,7 +75,8 @@ def pyramid(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def flip(prediction: Tensor, target: Tensor) -> Tensor:
-    """Mean HDR-FLIP in [0, 1), the larger at two exposures: the difference that a viewer sees when flipping images.
+    """Mean HDR-FLIP in [0, 1), the larger value of two exposures: the difference that a viewer sees when flipping
+    images.
 
     It filters by the resolution of the eye and compares in the Lab colour space [Andersson et al. 2020 and 2021].
     """

@@ -142,8 +142,8 @@ def smallest_float(tensor: np.ndarray) -> np.ndarray:
 def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]) -> None:
     """Writes a shard and the record of its rendering. It may hold no crop, if all have failed.
 
-    An existing shard is kept: another worker has made it, it differs only in the times of its record, and its checksum
-    may be in the manifest already.
+    An existing shard is kept: another worker has made it. It differs from this one only in the times of its record, and
+    its checksum may be in the manifest already.
 
     Raises NgptError for a tensor with numbers that are not finite, and if the file cannot be written.
     """
