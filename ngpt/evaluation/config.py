@@ -52,7 +52,8 @@ class Config:
               takes longer to reconstruct
     ``seeds``     renders of each stack
     ``methods``   of `ngpt info`, or variants: tables [variants.NAME] with method, options, stack and sampler
-    ``samplers``, ``rivals``  samplers of stacks with gradients, and without; tables [samplers.NAME] give them options
+    ``samplers``, ``rivals``  samplers of stacks with gradients, and without; tables [samplers.NAME] give them options,
+              and ``subpixels`` of ``ngpt render``
     ``clock``     the sampler whose samples ``spp`` counts
     ``time``      "wall", or "processor": all cores together, which other work on the machine does not change
     ``metrics``   the first is measured always; E-LPIPS needs a table [elpips] with backbone and weights
@@ -177,7 +178,11 @@ class Config:
         return Render("features" if kind == "path" and name != KINDS["path"] else kind, name, given)
 
     def sampler(self, name: str) -> tuple[str, str]:
-        """What the renderer calls the sampler that is called ``name`` here, and its options that are not defaults."""
+        """What the renderer calls the sampler that is called ``name`` here, and its options that are not defaults.
+
+        Subpixels count among the options. By default there are none, though `ngpt render` may keep some: so a
+        configuration keeps its meaning, and gives the table that it gave before.
+        """
         table = dict(self.sampler_options.get(name, {}))
         if not table:
             return name, ""
