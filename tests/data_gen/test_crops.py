@@ -68,6 +68,8 @@ def made_set(around, tmp_path, monkeypatch):
     monkeypatch.setattr(cameras, "Surroundings", lambda scene, box: around)
     monkeypatch.setattr(loading, "load_scene", lambda *arguments, merged: None)
     monkeypatch.setattr(crops, "made_scene", lambda *arguments: None)
+    # The room outlives its shards, and so must its kernels: Dr.Jit ends the process where they are gone.
+    monkeypatch.setattr("drjit.flush_kernel_cache", lambda: None)
 
     def make(**changes):
         jobs.generate(config_of(**changes), tmp_path, jobs.Serial())
