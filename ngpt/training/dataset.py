@@ -60,7 +60,8 @@ class Crop:
     def stack(self, k: int) -> GradientStack:
         """Input ``k`` with all layers of its rendered stack; gradients only if its sampler has them. Values are finite.
 
-        If the set has subpixels, so has the stack, and its pixels are their means, to the bit. Frames of shots also have the layer ``motion``. It is NaN where it is unknown: everywhere in the first frame.
+        If the set has subpixels, so has the stack, and its pixels are their means, to the bit. Frames of shots also
+        have the layer ``motion``. It is NaN where it is unknown: everywhere in the first frame.
         """
         if not 0 <= k < self.inputs:
             raise NgptError(f"{self.shard.path}: there is no input {k}; the crop has inputs 0 .. {self.inputs - 1}")

@@ -232,7 +232,9 @@ def test_a_column_with_subpixels_is_its_method_on_stacks_with_them(renderer, tmp
         return reconstruct(*given, **options)
 
     monkeypatch.setattr(cells, "reconstruct", counted)
-    text = SETTINGS.replace('methods = ["primal", "wcv"]', "").replace("[8]", "[8, 32]").replace("seeds = 2", "seeds = 1")
+    text = (
+        SETTINGS.replace('methods = ["primal", "wcv"]', "").replace("[8]", "[8, 32]").replace("seeds = 2", "seeds = 1")
+    )
     text += SUBPIXELS.replace('points = "independent"', "").replace('"oidn"', '"clean"')
     text += '[variants.clean]\nmethod = "oidn"\nauxiliary = "clean"\n'
     results = evaluated(read(text, tmp_path), tmp_path)
@@ -250,7 +252,11 @@ def test_a_column_with_subpixels_is_its_method_on_stacks_with_them(renderer, tmp
     # OIDN begins for images of either size, before its time counts.
     assert len(calls) == 6 + 2
     names = {path.name for path in tmp_path.glob("cache/diffuse-*/features*")}
-    assert {"features-16-0.exr", "features-primal-subpixels=2-16-0.exr", "features-primal-subpixels=auto-64-0.exr"} < names
+    assert {
+        "features-16-0.exr",
+        "features-primal-subpixels=2-16-0.exr",
+        "features-primal-subpixels=auto-64-0.exr",
+    } < names
 
 
 def test_the_tiny_configuration_has_a_column_for_each_method():

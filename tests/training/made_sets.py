@@ -29,7 +29,9 @@ def crop_data(rng, caustic=False, halves=False, motion=None, k=1):
         if k == 1:
             return GradientStack(pixels)
         # About the pixels
-        fine = {name: stored(name, spread(pixels[name], k) + rng.normal(0, 0.1, (k * SIZE, k * SIZE, 3))) for name in FINE}
+        fine = {
+            name: stored(name, spread(pixels[name], k) + rng.normal(0, 0.1, (k * SIZE, k * SIZE, 3))) for name in FINE
+        }
         pixels |= {name: means(layer, k) for name, layer in fine.items()}
         return GradientStack(pixels, {FEATURE_NOISE: 1e-9}, fine=fine)
 

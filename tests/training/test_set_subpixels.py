@@ -15,7 +15,7 @@ from ngpt.errors import NgptError
 from ngpt.network.inputs import Oidn
 from ngpt.network.model import ModelConfig
 from ngpt.repair import repair
-from ngpt.subpixels import FINE, means, spread
+from ngpt.subpixels import FINE, means
 from ngpt.training.augment import Augmentation, quieter
 from ngpt.training.dataset import Dataset, problems, summary
 from ngpt.training.examples import Examples
@@ -89,7 +89,10 @@ def changed(folder, change):
         (lambda t: t.pop("feature_noise"), "tensors feature_noise are missing"),
         (lambda t: t.update(fine_primal=t["fine_primal"][:, 0]), r"'fine_primal' is \(1, 16, 16, 3\), it must be"),
         (lambda t: t.update(fine_normal=t["normal"]), r"'fine_normal' is \(1, 2, 8, 8, 3\), it must be \(1, 2, 16, 16"),
-        (lambda t: t.update(fine_primal=t["indirect"]), r"'fine_primal' is \(1, 2, 8, 8, 3\), it must be \(1, 2, 16, 16"),
+        (
+            lambda t: t.update(fine_primal=t["indirect"]),
+            r"'fine_primal' is \(1, 2, 8, 8, 3\), it must be \(1, 2, 16, 16",
+        ),
     ],
 )
 def test_shards_with_other_subpixels_are_refused(given, tmp_path, change, message):
