@@ -229,8 +229,8 @@ def problems(folder: Path) -> list[str]:
             if bad:
                 found.append(f"{shard.path}: tensor '{name}' has {bad} values that are not finite")
         for i, told in enumerate(entry["crops"]):
-            crop = Crop(shard, i, entry["scene"], tuple(told["spp"]))
-            for k in filter(crop.strays, range(crop.inputs)):
+            read = Crop(shard, i, entry["scene"], tuple(told["spp"]))
+            for k in filter(read.strays, range(read.inputs)):
                 found.append(f"{shard.path}: the subpixels of crop {i}, input {k} are of another image; make it again")
         if entry["crops"] and shards.REFERENCES[0] not in shard.names:
             one, other = shard.tensor("indirect").swapaxes(0, 1)
