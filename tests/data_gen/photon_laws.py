@@ -13,9 +13,9 @@ from data_gen.paths.streams import sample_streams
 from data_gen.paths.vertex import Materials
 from data_gen.samplers import find
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
-from data_gen.samplers.photons.gradients.copies import LightPaths, start_of
 from data_gen.samplers.photons.map.trace import trace
 from data_gen.samplers.photons.map.vertices import Photon, photon_of, vertex_in_media_of, vertex_of
+from ngpt_studies.photons.gradients.copies import LightPaths, start_of
 
 
 def largest(value) -> float:

@@ -12,10 +12,10 @@ from references import REFERENCES, references
 from unbiased import light_of_gradients, load, render_ours
 
 from data_gen.render import render_stack
-from data_gen.samplers.photons.gradients.differences import Gathered
 from data_gen.scenes import builtin
 from data_gen.scenes.builtin import _camera, _light, _wall
 from ngpt.io.exr import pass_through
+from ngpt_studies.photons.gradients.differences import Gathered
 
 # Rooms whose images are stored, (16, 16), and where no light is seen directly
 STORED = ("haze", "colours", "forward", "dense", "nested", "fog")
@@ -210,8 +210,8 @@ def without_glass():
 @pytest.fixture
 def by_planes_alone(monkeypatch):
     """What changes a sampler of that name into one without beams."""
-    from data_gen.samplers.photons.media.gplanes import GPLANES, NearPlanes
-    from data_gen.samplers.photons.media.planes import planes_of
+    from ngpt_studies.photons.media.gplanes import GPLANES, NearPlanes
+    from ngpt_studies.photons.media.planes import planes_of
 
     def near(integrator, passes, traced):
         yield Gathered(None, NearPlanes(planes_of(passes, traced)))

@@ -63,7 +63,7 @@ def test_the_grid_finds_what_brute_force_finds(renderer, points, radius):
 @pytest.mark.parametrize("radius", [0.3, 0.05, 0.01])
 def test_the_grid_finds_what_is_beside_a_ray(renderer, points, radius):
     """Each point once, whatever its cell, on and beyond the box too; rays without end are cut at the box."""
-    from data_gen.samplers.photons.media.bre import BALL
+    from data_gen.samplers.photons.bre import BALL
 
     mi, (rng, points, exist, number) = renderer, points
     grid = Grid(mi.Point3f(points.T), mi.Bool(exist), BALL * radius)
@@ -171,7 +171,7 @@ def test_kernels_are_recorded_once_and_make_the_same_bits(renderer, monkeypatch,
 @pytest.mark.parametrize("kind", [KeyboardInterrupt, Interrupted])
 def test_an_interrupt_while_a_plugin_is_made_is_one(renderer, monkeypatch, kind):
     """Mitsuba makes a text of what a plugin raises."""
-    from data_gen.samplers.photons.surfaces.ppm import PPM
+    from data_gen.samplers.photons.ppm import PPM
 
     def interrupted(self, props):
         raise kind
@@ -249,7 +249,7 @@ def test_boundaries_within_one_medium_change_nothing(renderer):
 @pytest.mark.slow
 def test_beams_are_cut_the_same_in_windows(renderer, monkeypatch):
     """All parts at once, or few at a time: the same light."""
-    from data_gen.samplers.photons.media import beams
+    from ngpt_studies.photons.media import beams
 
     scene = load(renderer, media_scenes.haze, (8, 8))
     whole = render_stack(scene, 2, 0, "beams", photons=4, unbiased=True)["primal"]
@@ -279,7 +279,7 @@ def black_room(max_depth=6):
 
 @pytest.fixture
 def planes_alone(monkeypatch):
-    from data_gen.samplers.photons.media.beams import BEAMS
+    from ngpt_studies.photons.media.beams import BEAMS
 
     monkeypatch.setattr(BEAMS, "near", lambda *_: iter(()))
 

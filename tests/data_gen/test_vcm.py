@@ -121,7 +121,7 @@ class Beside:
     """Copies at their vertex ``t``, the same the other way, and a photon beside each vertex on the same surface."""
 
     def __init__(self, copies, t, radius, number=4096):
-        from data_gen.samplers.vcm.gvcm import ShiftedMerging
+        from ngpt_studies.photons.gvcm import ShiftedMerging
 
         connectable = copies.materials.connectable
         base, own, offset = copies.from_camera[t - 1], copies.copied[t - 1], copies.offsets[t - 1]

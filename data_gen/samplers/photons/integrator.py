@@ -52,12 +52,10 @@ class PhotonIntegrator(GradientIntegrator):
     ``edges``         photon maps have the edges of light paths, too
     ``camera_bytes``  that a camera sample takes
     ``map_bytes``     that a map takes for each light path
-    ``walk``          class of how camera paths go with the neighbours' paths: ``gradients.camera.CameraPaths``
     """
 
     edges = False
     camera_bytes, map_bytes = CAMERA_BYTES, MAP_BYTES
-    walk: type | None = None
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
@@ -82,7 +80,7 @@ class PhotonIntegrator(GradientIntegrator):
         passed = {"passed": media.index_matched, "media": True} if fog else {}
         materials = Materials(scene, self.options["roughness_threshold"], **passed)
         world = World(scene, lights, materials, fog)
-        return Passes(self, world, pixel_width(scene, sensor), self.walk and self.walk(self, world))
+        return Passes(self, world, pixel_width(scene, sensor))
 
     def maps(self, passes: Passes, camera: CameraSamples) -> Iterator[Traced]:
         """The photon maps of the pass: of ``photons`` light paths for each sample of the ``camera``."""

@@ -32,13 +32,13 @@ import mitsuba as mi
 
 from data_gen.paths import collisions, media
 from data_gen.paths.light_ends import World
+from data_gen.samplers.photons.bre import BALL, BRE, Along, scattering_along, seen_along
 from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.trace import EDGE_BYTES, VERTICES_PER_PATH
 from data_gen.samplers.photons.map.vertices import put
-from data_gen.samplers.photons.media.bre import BALL, BRE, Along, scattering_along, seen_along
 from data_gen.samplers.photons.passes import Passes
-from data_gen.samplers.photons.surfaces.ppm import Gathering
+from data_gen.samplers.photons.ppm import Gathering
 
 # Length of a part, in radii. Shorter parts are more to enter. Longer parts are more often near to no ray.
 PART = 6
