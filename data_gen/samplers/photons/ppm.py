@@ -61,8 +61,9 @@ class Gathering:
         longest = self.max_depth - depth
 
         def one(i, near):
-            photon = photon_of(self.photons, dr.gather(mi.UInt32, self.grid.index, i, near), near)
-            return light(photon, si, bsdf, near & faces(photon, si) & (photon.depth <= longest))
+            j = dr.gather(mi.UInt32, self.grid.index, i, near)
+            photon, depth = photon_of(self.photons, j, near), dr.gather(mi.UInt32, self.photons.depth, j, near)
+            return light(photon, si, bsdf, near & faces(photon, si) & (depth <= longest))
 
         zero = dr.zeros(mi.Spectrum, dr.width(depth))
         L = self.grid.gather(si.p, self.radius2, active, one, zero)

@@ -27,9 +27,8 @@ import numpy as np
 
 from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.bre import BALL, seen_along
-from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.vertices import Photon, in_media, photon_of
+from data_gen.samplers.photons.map.vertices import in_media
 from data_gen.samplers.photons.passes import Passes
 from ngpt_studies.photons.gpm import GPM, OnSurfaces
 from ngpt_studies.photons.gradients import shift
@@ -37,6 +36,8 @@ from ngpt_studies.photons.gradients.camera_in_media import PathsByPieces, Piece
 from ngpt_studies.photons.gradients.copies import LightPaths, copy_in_medium
 from ngpt_studies.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen
 from ngpt_studies.photons.gradients.pairs import Rays
+from ngpt_studies.photons.map.vertices import Photon, photon_of
+from ngpt_studies.photons.map.whole import MEDIA_MAP_BYTES, Traced
 
 # Bytes of a camera sample beside pairs: levels of five pieces of paths, what they end at, and as many sums
 PATHS_BYTES = 4096

@@ -26,10 +26,9 @@ import numpy as np
 
 from data_gen.paths.light_ends import World
 from data_gen.samplers.photons.bre import seen_along
-from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.vertices import Photon, in_media
+from data_gen.samplers.photons.map.vertices import in_media
 from data_gen.samplers.photons.passes import Passes
 from ngpt_studies.photons.gpm import GPM, OnSurfaces
 from ngpt_studies.photons.gradients import shift
@@ -37,6 +36,8 @@ from ngpt_studies.photons.gradients.camera_segments import Flight, PathsBySegmen
 from ngpt_studies.photons.gradients.copies import LightPaths
 from ngpt_studies.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen
 from ngpt_studies.photons.gradients.pairs import Points
+from ngpt_studies.photons.map.vertices import Photon
+from ngpt_studies.photons.map.whole import MEDIA_MAP_BYTES, Traced
 from ngpt_studies.photons.media.gbre import PATHS_BYTES, InMedia
 
 
