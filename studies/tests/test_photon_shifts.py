@@ -6,7 +6,8 @@ import media_scenes
 import numpy as np
 import pytest
 from bdpt_scenes import SCENES
-from photon_laws import assert_copies_are_light_paths, largest, traced, world_of
+from photon_copies import assert_copies_are_light_paths, largest, traced
+from photon_laws import world_of
 from renders import dr
 from scipy.spatial import cKDTree
 from unbiased import load
@@ -17,9 +18,9 @@ from data_gen.paths.light_ends import LightEnds, World
 from data_gen.paths.vertex import Materials
 from data_gen.samplers import find
 from data_gen.samplers.photons.map.fog import Fog
-from data_gen.samplers.photons.map.vertices import is_near, vertex_of
 from ngpt_studies.photons.gradients import shift as shifts
 from ngpt_studies.photons.gradients.copies import LightPaths, copy
+from ngpt_studies.photons.map.vertices import is_near, vertex_of
 
 
 @pytest.fixture(scope="module")
