@@ -1,7 +1,6 @@
 """Cameras: every sampler before every one of Mitsuba's, right or refused; and what samplers know of a camera."""
 
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,13 +29,11 @@ from data_gen.frames.motion import motion_vectors, seen, snapshot
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.eye import Eye
 from data_gen.paths.light_ends import LightEnds
-from data_gen.paths.walk import Limits
 from data_gen.render import render_stack
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.radius import pixel_width
 from data_gen.scenes.facts import Facts
 from data_gen.scenes.lamps import lamp_weights
-from ngpt_studies.photons.gradients.camera import CameraPaths
 
 FROM_BOTH_ENDS = ("bdpt", "gbdpt", "vcm", "gvcm")
 # Where light paths end at the camera, and elsewhere

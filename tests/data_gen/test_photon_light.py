@@ -8,14 +8,10 @@ from lamps_scenes import lamps, lit_by
 from photon_laws import world_of
 from references import references
 from renders import dr, mi
-from unbiased import differences, far_shifts, load, render_ours
+from unbiased import differences, load, render_ours
 
-from data_gen.film import SHIFTS, GradientFilm
-from data_gen.film.statistics import statistics
-from data_gen.paths.camera import CameraSamples
 from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.streams import sample_streams
-from data_gen.samplers import find
 from data_gen.samplers.photons.map.radius import spread
 from data_gen.scenes.builtin import _camera, _diffuse
 

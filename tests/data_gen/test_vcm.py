@@ -1,23 +1,16 @@
 """What is particular to ``vcm``: weights with merging, and the light of photons as a layer."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from bdpt_ends import (
-    Copies,
     Ends,
-    check_copies_to_the_camera,
-    check_going_straight_and_back,
     check_weights,
     compare,
-    compare_copies,
     plan_of,
     without_hole,
 )
 from bdpt_scenes import SCENES
 from renders import dr, mi
-from scipy.spatial import cKDTree
 from unbiased import light_of_gradients, load
 
 from data_gen.paths.vertex import Materials
@@ -25,7 +18,7 @@ from data_gen.render import render_stack
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, cosine, evaluate, scatters_smoothly
 from data_gen.samplers.photons.map.vertices import Photon
-from data_gen.samplers.vcm.merging import Map, Merging, Photons
+from data_gen.samplers.vcm.merging import Merging
 from ngpt.layers import GATHERED
 
 ETA = 0.05

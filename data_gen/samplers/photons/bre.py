@@ -111,13 +111,17 @@ class Along:
     """The things near to camera paths that go piece by piece."""
 
     on_surfaces: Gathering | None
-    in_media: Any  # photons, beams or planes, with ``light`` (piece of a ray, length, medium, σ, depth, where)
+    in_media: Any  # photons, with ``light`` (piece of a ray, length, medium, σ, depth, where)
 
 
 class BRE(PPM):
     """Progressive photon mapping by the beam radiance estimate in media, and on surfaces; no gradients.
 
-    Plugin ``bre``. Parameters, bias and what is not handled: as for ``vpm``.
+    Plugin ``bre``. Parameters: as for ``ppm``; the ``radius`` of the first pass is also used for photons in media.
+
+    Biased, and consistent: the mean over passes converges to the image of ``volpath``.
+
+    Not handled: light from infinitely far away through a medium without end, and what ``ppm`` does not handle.
     """
 
     follows, map_bytes = "volpath", MEDIA_MAP_BYTES

@@ -91,11 +91,7 @@ class InBoth:
 class VPM(PPM):
     """Progressive photon mapping in media and on surfaces; no gradients.
 
-    Plugin ``vpm``. Parameters: as for ``ppm``; the ``radius`` of the first pass is also used for photons in media.
-
-    Biased, and consistent: the mean over passes converges to the image of ``volpath``.
-
-    Not handled: light from infinitely far away through a medium without end, and what ``ppm`` does not handle.
+    Plugin ``vpm``. Parameters, bias and what is not handled: as for ``bre``.
     """
 
     follows, map_bytes = "volpath", MEDIA_MAP_BYTES
