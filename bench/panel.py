@@ -39,6 +39,7 @@ from ngpt.evaluation.references import Reference
 from ngpt.measure.averages import geometric_mean
 from ngpt.measure.flip import flip
 from ngpt.stack import GradientStack
+from ngpt.subpixels import FEWEST
 from ngpt.system.writing import markdown_table
 
 ROOT = Path(__file__).parents[1]
@@ -157,9 +158,11 @@ def cells_of(name: str, loaded: Any, reference: Reference, seeds: Sequence[int])
     """The cells of a scene, with error, FLIP and seconds by seed."""
     clean = clean_image(reference)
     for sampler, methods in METHODS.items():
-        stack, _ = render(loaded, sampler, WARM_SPP, 0)
-        for method in methods:
-            ngpt.reconstruct(stack, method)
+        # The default has subpixels, and so other kernels, from FEWEST samples on.
+        for few in (WARM_SPP, FEWEST):
+            stack, _ = render(loaded, sampler, few, 0)
+            for method in methods:
+                ngpt.reconstruct(stack, method)
     cells = []
     for spp in SPP:
         by_pipeline: dict[str, dict[str, Any]] = {pipeline: {} for pipeline in PIPELINES}

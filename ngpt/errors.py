@@ -28,7 +28,10 @@ class WrongUse(NgptError):
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """The text before a list of the known names if a word is unknown: a question, or ""."""
+    """The question "did you mean '...'? " if an unknown ``word`` is near one of the ``known`` names, else "".
+
+    Messages put it before the list of the known names.
+    """
     from difflib import get_close_matches  # only for those who mistype
 
     near = get_close_matches(word.lower(), names := {name.lower(): name for name in known}, 1)

@@ -4,12 +4,12 @@
 |---|---|
 | colours, light, albedo, alpha, masks, mist, all others | mean of the values that are finite |
 | normals | mean, as ours are: not of length 1 on edges |
-| depth | least that is above 0, and 0 where all are 0: no distance lies between two surfaces |
-| positions, texture coordinates | those of the pixel with that depth; without depth in their part, of the first |
-| ids: whole numbers, and ``IndexOB``, ``IndexMA`` and the like | the most frequent, of equal ones the first |
-| Cryptomatte | coverages of an id are added up and divided by K²; the ranks that there are keep the largest |
-| motion vectors | mean over K, for they count pixels |
-| variances of the pixel mean (``*_var``) | mean over K² |
+| depth | least value above 0, or 0 if all are 0: a mean would lie between two surfaces |
+| positions, texture coordinates | those of the pixel with that depth; of the first pixel if their part has no depth |
+| ids: whole numbers, and ``IndexOB``, ``IndexMA`` and the like | the most frequent; of equal ones the first |
+| Cryptomatte | coverages are added up by id and divided by K²; the existing ranks keep the largest |
+| motion vectors | mean divided by K, because their unit is the pixel |
+| variances of the pixel mean (``*_var``) | mean divided by K² |
 | ``samples`` | sum |
 
 Gradients are refused, because differences between small pixels are not differences between large ones. Motion vectors
@@ -242,14 +242,14 @@ def _cryptomattes(part: ExrPart, listed: list[str]) -> dict[str, list[str]]:
 
 
 def _ranks(names: Sequence[str], blocks: dict[str, Any]) -> dict[str, np.ndarray]:
-    """The ids and coverages of a Cryptomatte: those of a block, added up by id, the largest first.
+    """The ids and coverages of a Cryptomatte: coverages of each block are added up by id; the largest come first.
 
     Ids are compared and kept as bits. Coverage beyond the existing ranks is lost, as in any Cryptomatte.
     """
     ids = np.concatenate([blocks[name].view(np.uint32) for name in names[::2]], axis=-1)
     coverage = np.concatenate([blocks[name] for name in names[1::2]], axis=-1).astype(np.float64)
     pixels = blocks[names[0]].shape[-1]
-    # The same id is in several places: all of it is added to the first of them.
+    # The same id is in several places. Sorted by id, its coverages are added up at the last of these.
     order = np.argsort(ids, axis=-1, kind="stable")
     ids, coverage = (np.take_along_axis(each, order, axis=-1) for each in (ids, coverage))
     starts = np.ones(ids.shape, bool)
@@ -257,7 +257,7 @@ def _ranks(names: Sequence[str], blocks: dict[str, Any]) -> dict[str, np.ndarray
     total = coverage.cumsum(axis=-1)
     ends = np.ones(ids.shape, bool)
     ends[..., :-1] = starts[..., 1:]
-    # The sum of a run, at its end: the running total less the total before the run.
+    # The sum of a run, at its end: the running total minus the total before the run.
     before = np.maximum.accumulate(np.where(starts, total - coverage, -np.inf), axis=-1)
     each = np.where(ends, total - before, 0.0) / pixels
     order = np.argsort(-each, axis=-1, kind="stable")[..., : len(names) // 2]

@@ -21,7 +21,7 @@ import numpy as np
 
 from ngpt.classical.bases import BASES, CLASSICAL
 from ngpt.denoisers import caustic, clean
-from ngpt.denoisers.oidn import oidn, prefiltered
+from ngpt.denoisers.oidn import oidn, prefiltered, with_subpixels
 from ngpt.errors import NgptError
 from ngpt.network.estimates import with_variances
 from ngpt.repair import Repaired
@@ -131,19 +131,15 @@ class Oidn:
     @property
     def _of_all_light(self) -> np.ndarray:
         data = self._with_clean_features
-        # OIDN makes a better image of subpixels only where their features are clean (docs/lab/log).
-        data = data if clean.features_are_clean(self._data) else replace(data, fine={})
         if data.caustic is not None:
             data = replace(data, image=data.image + data.caustic)
-        return oidn(data, "clean", "high")
+        return with_subpixels(data, "clean", "high")
 
     @cached_property
     def _with_clean_features(self) -> Repaired:
         if clean.features_are_clean(self._data):
             return self._data
-        # "high" takes more than twice as long and makes networks no better.
-        features = prefiltered(self._data.features, "balanced")
-        return replace(self._data, features=self._data.features | features)
+        return replace(self._data, features=self._data.features | prefiltered(self._data.features))
 
 
 def denoised(by_oidn: Oidn, base: np.ndarray | None, names: Collection[str]) -> dict[str, np.ndarray]:

@@ -15,7 +15,7 @@ from ngpt.io.foreign.form import Damage, Form, Unread
 MAGIC = b"\x89PNG\r\n\x1a\n"
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
-_LONGEST = 2**16  # pixels of a side: filters go along the diagonals of an image, one after the other
+_LONGEST = 2**16  # of a side, in pixels: filters take a step for each diagonal of an image
 # x and y of the first pixel of each pass, and the steps to the next ones.
 _ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
 
@@ -30,7 +30,7 @@ def describe(file: BinaryIO) -> Form:
     if depth not in _DEPTHS.get(colour, ()) or compression or filters or interlaced > 1 or not (width and height):
         raise Damage("its header makes no sense")
     if max(width, height) > _LONGEST:
-        raise Unread(f"is {width}x{height} pixels, and {_LONGEST} are the longest side that is read; cut it up")
+        raise Unread(f"is {width}x{height} pixels, but sides longer than {_LONGEST} are not read; cut it up")
     chunks = list(_before_pixels(file))
     palette = next((data for kind, data in chunks if kind == b"PLTE"), b"")
     clear = next((data for kind, data in chunks if kind == b"tRNS"), b"")
@@ -137,7 +137,7 @@ def _unfiltered(lines: np.ndarray, step: int) -> np.ndarray:
     """
     filters, coded = lines[:, 0], lines[:, 1:]
     if filters.max(initial=0) > 4:
-        raise Damage(f"row {int(filters.argmax())} has filter {filters.max()}, which is none")
+        raise Damage(f"row {int(filters.argmax())} has filter {filters.max()}; filters are 0 to 4")
     rows, columns = len(lines), coded.shape[1] // step
     # One row above and one column to the left are zeros.
     out = np.zeros((rows + 1, columns + 1, step), np.int16)
