@@ -74,7 +74,7 @@ def trace(world: World, random: mi.Sampler, max_depth: int, rr_depth: int, froze
         paths, numbers, photons = frozen(_walk, world, paths, random, depths, photons, (place + used, end))
         dr.eval(paths, numbers, photons)
         random = type(random)(numbers)
-        # The first place of further maps stays empty: sums over photons are grouped, and rounded, as they always were.
+        # The first place of further maps stays empty, so that sums over photons keep their groups and their last bits.
         used = 1
         yield photons
 
