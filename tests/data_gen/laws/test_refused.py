@@ -66,7 +66,7 @@ def is_refused(renderer, sampler, scene, options, message):
 
 
 def test_plugins_refuse_too(renderer):
-    with pytest.raises(NgptError, match=r"'gpt-simple' knows only 'path'; use --sampler gpt, .* bre \(no gradients\)"):
+    with pytest.raises(NgptError, match=r"media \(interior\), which 'gpt-simple' does not see; use --sampler "):
         renderer.load_dict({"type": "gpt_simple"}).prepare(load(renderer, media_scenes.smoke, (8, 8)))
 
 
