@@ -17,9 +17,6 @@ from ngpt.system.install import package_command
 
 AUXILIARY = ("prefiltered", "clean", "noisy", "none")
 QUALITIES = {"high": "High", "balanced": "Balanced", "fast": "Fast"}
-# The quality of OIDN's models for features. "High" takes more than twice as long, and images are no better
-# (docs/lab/log).
-PREFILTER = "Balanced"
 # The values of ``filter``: OIDN's own filter and its settings.
 FILTERS: dict[str, dict[str, Any]] = {
     "image": {"hdr": True},
@@ -48,12 +45,13 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
     """The image that OIDN makes of the primal, albedo and normal: (H, W, 3) float32 without direct emission.
 
     OIDN takes no normals without albedo, so they are left out if there is no albedo. If the stack has subpixels
-    (``ngpt.subpixels``), they are denoised, and their means are the image. "auto" stands for ``with_subpixels``.
+    (``ngpt.subpixels``), they are denoised, and their means are the image; "auto" makes ``of_both``.
 
-    ``auxiliary``  how OIDN uses the features: "prefiltered" denoises them first with its own models, of quality
-                   ``PREFILTER``, and then marks them as clean, which its documentation recommends for the best quality;
-                   "clean" marks them as clean without denoising them; "noisy" does neither; "none" leaves them out
-    ``quality``    "high", "balanced" or "fast": the quality of the network for the image
+    ``auxiliary``  how OIDN uses the features: "prefiltered" denoises them with its own models first and then
+                   marks them as clean, which its documentation recommends for the best quality;
+                   "clean" marks them as clean without denoising them; "noisy" does neither; "none" leaves them out;
+                   "auto" is "prefiltered" without subpixels
+    ``quality``    "high", "balanced" or "fast": the quality for the image, and for features that are denoised first
     ``filter``     one of ``FILTERS``: "lightmap" and "directional" are OIDN's for lightmaps, which take no features
 
     Without features, OIDN reads mirror images of the covered pixels in place of empty ones. Otherwise it would darken
@@ -67,13 +65,15 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
     k = subpixels(data.fine, image.shape[1]) if filter == "image" else 1
     if filter != "image":
         auxiliary = "none"
+    elif auxiliary == "auto" and k > 1:
+        return of_both(with_clean_features(data), quality)
     elif auxiliary == "auto":
-        return with_subpixels(data, "prefiltered", quality)
+        auxiliary = "prefiltered"
     if k > 1:
         image, layers = data.fine["primal"], data.fine
     image = np.ascontiguousarray(image, np.float32)
     if auxiliary == "prefiltered":
-        features = prefiltered(layers)
+        features = prefiltered(layers, quality)
     elif auxiliary != "none":
         features = _in_range(layers)
     clean = bool(features) and auxiliary in ("prefiltered", "clean")
@@ -88,17 +88,17 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
     return (means(image, k) if k > 1 else image) - data.direct
 
 
-def with_subpixels(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
+def of_both(data: Repaired, quality: str) -> np.ndarray:
     """The mean of OIDN's image of the pixels and its images at K, K / 2 ... times the size; (H, W, 3) float32.
 
-    Without subpixels, it is the image of the pixels. ``auxiliary`` says how the features of pixels are used. Those of
-    subpixels are marked as noisy. Marked as clean, they would leave noise behind a lens, and prefiltering them would
-    take four times as long (docs/lab/log).
+    Without subpixels, it is the image of the pixels. The features of pixels are marked as clean, those of subpixels as
+    noisy. Marked as clean, they would leave noise behind a lens, and prefiltering them would take four times as long
+    (docs/lab/log).
 
     Small pixels keep edges, and large ones keep smooth areas. The errors of these images differ so much that their mean
     has less error than each of them in nearly every scene.
     """
-    images = [oidn(replace(data, fine={}), auxiliary, quality)]
+    images = [oidn(replace(data, fine={}), "clean", quality)]
     k, fine = subpixels(data.fine, data.image.shape[1]), data.fine
     while k > 1:
         images.append(oidn(replace(data, fine=fine), "noisy", quality))
@@ -109,10 +109,19 @@ def with_subpixels(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
     return np.asarray(np.mean(images, axis=0, dtype=np.float32))
 
 
-def prefiltered(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def with_clean_features(data: Repaired) -> Repaired:
+    """The data with albedo and normal of pixels prefiltered, for images that something else corrects.
+
+    The quality is "balanced": "high" takes more than twice as long, and neither means of two sizes nor networks gain by
+    it (docs/lab/log).
+    """
+    return replace(data, features=data.features | prefiltered(data.features, "balanced"))
+
+
+def prefiltered(features: Mapping[str, np.ndarray], quality: str) -> dict[str, np.ndarray]:
     """Albedo and normal (H, W, 3) denoised by OIDN's own models for them, whether they are noisy or not."""
     require_oidn()
-    return {name: _prefiltered(name, layer) for name, layer in _in_range(features).items()}
+    return {name: _prefiltered(name, layer, quality) for name, layer in _in_range(features).items()}
 
 
 def _in_range(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -122,8 +131,8 @@ def _in_range(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return layers | {"albedo": np.clip(layers["albedo"], 0, 1)}
 
 
-def _prefiltered(name: str, layer: np.ndarray) -> np.ndarray:
-    return filtered({name: layer}, "cpu", quality=PREFILTER) if layer.any() else layer
+def _prefiltered(name: str, layer: np.ndarray, quality: str) -> np.ndarray:
+    return filtered({name: layer}, "cpu", quality=QUALITIES[quality]) if layer.any() else layer
 
 
 def require_oidn() -> None:

@@ -21,7 +21,7 @@ import numpy as np
 
 from ngpt.classical.bases import BASES, CLASSICAL
 from ngpt.denoisers import caustic, clean
-from ngpt.denoisers.oidn import oidn, prefiltered, with_subpixels
+from ngpt.denoisers.oidn import of_both, oidn, with_clean_features
 from ngpt.errors import NgptError
 from ngpt.network.estimates import with_variances
 from ngpt.repair import Repaired
@@ -133,13 +133,13 @@ class Oidn:
         data = self._with_clean_features
         if data.caustic is not None:
             data = replace(data, image=data.image + data.caustic)
-        return with_subpixels(data, "clean", "high")
+        return of_both(data, "high")
 
     @cached_property
     def _with_clean_features(self) -> Repaired:
         if clean.features_are_clean(self._data):
             return self._data
-        return replace(self._data, features=self._data.features | prefiltered(self._data.features))
+        return with_clean_features(self._data)
 
 
 def denoised(by_oidn: Oidn, base: np.ndarray | None, names: Collection[str]) -> dict[str, np.ndarray]:

@@ -102,7 +102,7 @@ def test_oidn_is_given_what_is_best_for_it(room, monkeypatch):
         oidn, "filtered", lambda images, device="auto", **settings: calls.append(images | settings) or images["color"]
     )
     monkeypatch.setattr(oidn, "find_spec", lambda name: object())
-    monkeypatch.setattr(oidn, "_prefiltered", lambda name, layer: layer * 0.5)
+    monkeypatch.setattr(oidn, "_prefiltered", lambda name, layer, quality: layer * 0.5)
     stack, _ = room
     stack = stack.replace(albedo=stack["albedo"] * 2)
     for auxiliary in oidn.AUXILIARY:
@@ -131,7 +131,7 @@ def test_a_combiner_is_given_oidns_images_by_clean_features(noise, scale):
     data = repair(stack)
     base = 0.9 * data.image
     clean = noise in (0.0, 0.99)
-    features = data.features | ({} if clean else oidn.prefiltered(data.features))
+    features = data.features | ({} if clean else oidn.prefiltered(data.features, "balanced"))
     images = inputs.denoised(inputs.Oidn(data), base, inputs.DENOISED)
     for name, image, quality in (("denoised", data.image, "high"), ("denoised_base", base, "fast")):
         expected = oidn.oidn(replace(data, image=image, features=features), "clean", quality)
