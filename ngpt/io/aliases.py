@@ -10,7 +10,7 @@ class Alias(NamedTuple):
     """A name under which ``producer`` stores ``layer``; ``""`` is the root.
 
     ``only``     the required channel suffixes; those of the layer come first
-    ``factors``  by which channels are multiplied, where a renderer uses another sign or unit
+    ``factors``  the factors of the channels, if a renderer uses another sign or unit
     ``writer``   the alias holds only in files by this program, according to ``writer_of``
     """
 
@@ -106,7 +106,7 @@ _WRITERS = {"ngpt:sampler": "ngpt", "vrayInfo": "V-Ray", "generatedBy": "Mitsuba
 
 
 def is_image(name: str) -> bool:
-    """Whether renderers give that name to their image, rather than to the noisy one."""
+    """Whether renderers give this name to their final image, and not to the noisy one."""
     known = {alias.name for alias in ALIASES if alias.layer == "primal"} - {"", "primal", "Noisy Image"}
     return name.rpartition(".")[2] in known
 

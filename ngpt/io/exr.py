@@ -53,10 +53,10 @@ def read(
     toolkit does not know stay in ``stack.source`` and come back on writing. In a result file primal is the kept input,
     so that reconstructing a result gives the result again.
 
-    ``view`` is one of a stereo file (``ngpt.io.views``): by default the first.
+    ``view`` names a view of a stereo file (``ngpt.io.views``); by default, it is the first.
 
-    ``files`` maps names of the contract to files of their own, ``{"albedo": "albedo.exr"}``, which win over layers of
-    that name in ``path``. If such a file has several layers, the one with a known name counts, else the root.
+    ``files`` maps names of the contract to separate files, ``{"albedo": "albedo.exr"}``. These win over layers of that
+    name in ``path``. If such a file has several layers, the one with a known name is read, else the root.
 
     ``isolated`` decodes the file in a separate process: a file from a stranger that crashes the decoder then raises
     NgptError (``ngpt.io.isolated``).
@@ -65,8 +65,8 @@ def read(
 
     Light that is encoded for displays, as in PNG, is made scene-linear (``ngpt.io.foreign.files``).
 
-    A layer whose part has another data window than the primal is put onto the pixels of the primal, with 0 outside its
-    own.
+    A layer whose data window differs from the primal's is put onto the pixels of the primal. Pixels outside its own
+    window are 0.
 
     Raises NgptError if the file cannot be read, holds no primal, or holds layers without a pixel in common with the
     primal; and if the size or place of a layer in ``files`` is not that of the primal.
@@ -150,7 +150,8 @@ def _stack(
 
 
 def layers_in(path: str | os.PathLike, layers: Mapping[str, str] | None = None) -> frozenset[str]:
-    """The names of the layers that ``read`` would find, by the file's header; raises its errors about them."""
+    """The names of the layers that ``read`` would find, from the file's header. Raises the errors of ``read`` about
+    layers."""
     views, texts = _views_in(path)
     return frozenset(_resolved(views[0], layers, texts, str(path)))
 
@@ -172,7 +173,8 @@ def _views_in(path: str | os.PathLike) -> tuple[list[View], list[dict[str, str]]
 
 
 def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: ExrPart, isolated: bool) -> np.ndarray:
-    """Layer ``name`` (H, W, C) from a separate file, of the size and place of ``main``, the part that holds primal."""
+    """Layer ``name`` (H, W, C) from a separate file. It must have the size and place of ``main``, the part with the
+    primal."""
     if name not in LAYERS or name == "primal":
         raise NgptError(f"{file}: layer '{name}' cannot be read from a separate file")
     parts = (read_exr_isolated(file) if isolated else read_file(file)).parts
@@ -195,14 +197,14 @@ def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: 
 
 
 class Picture(NamedTuple):
-    """The picture that a viewer shows of a file, (H, W, 3) float32, and where it lies."""
+    """The picture that a viewer shows for a file, (H, W, 3) float32, and where it lies."""
 
     pixels: np.ndarray
     place: Place
 
 
 def read_image(path: str | os.PathLike, isolated: bool = False, view: str | None = None) -> np.ndarray:
-    """Reads the picture that a viewer would show of a file, (H, W, 3) float32: the pixels of ``read_picture``."""
+    """Reads the picture that a viewer would show for a file, (H, W, 3) float32: the pixels of ``read_picture``."""
     return read_picture(path, isolated, view).pixels
 
 
@@ -210,9 +212,9 @@ def read_picture(path: str | os.PathLike, isolated: bool = False, view: str | No
     """Reads the picture that a viewer would show: the root R G B of the first part.
 
     That is the reconstruction in a result file and the primal in a stack; in a file without a root image, it is the
-    layer that ``read`` takes as the primal. ``view`` is one of a stereo file, by default the first. Unlike ``read``, it
-    converts light of other primaries to linear Rec. 709 (``ngpt.io.primaries``), because pictures are looked at and
-    compared.
+    layer that ``read`` takes as the primal. ``view`` names a view of a stereo file; by default, it is the first. Unlike
+    ``read``, it converts light of other primaries to linear Rec. 709 (``ngpt.io.primaries``), because pictures are
+    looked at and compared.
     """
     image, _ = _opened(path, isolated)
     part, chosen = image.parts[0], _one_view(image, view, str(path))
@@ -260,7 +262,7 @@ def write(
     below 6.1e-5). Gradients, variances and depth are written as float. An ``image`` without ``like`` is written as
     float R G B.
 
-    With ``reduce`` K, a result is written with K x K pixels as one (``ngpt.io.reduced`` has the rules).
+    With ``reduce`` K, each K x K pixels of a result become one (``ngpt.io.reduced`` has the rules).
 
     ``attributes`` go into the header beside the attributes of the stack; ``Result.attributes`` say what made a result.
     If the stack is itself a result, the attributes on how it was made (``MADE_BY``) are left out of the new result, and
@@ -301,7 +303,8 @@ def write(
 
 
 def layers_of_result(stack: GradientStack, into: str | None = None) -> tuple[list[str], list[str]]:
-    """The layers that ``write`` replaces by a result, the root first, and those named like images that stay noisy."""
+    """The layers that ``write`` replaces by a result, the root first; and other layers named like images, which stay
+    noisy."""
     if stack.source is None:
         return ["root"], []
     origin, source = str(stack.attributes.get("ngpt:pass", "")), stack.source
@@ -332,10 +335,10 @@ def _result(
 
 
 def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> GradientStack:
-    """Returns a stack that was made, not read, with further channels, (H, W) each, to be written beside its layers.
+    """Adds channels, (H, W) each, to a stack that was not read from a file; ``write`` writes them beside its layers.
 
-    Their names are outside the contract, for example ``diagnostics.discarded``. They are kept as unknown channels of a
-    file are, and ``pass_through`` reads them.
+    Their names are outside the contract, for example ``diagnostics.discarded``. They are kept like the unknown channels
+    of a file, and ``pass_through`` returns them.
     """
     stack.require("primal", why="carrying further channels")
     part, found = ExrPart("", new_header(stack), {}), {}

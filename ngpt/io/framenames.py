@@ -1,7 +1,7 @@
 """Names of a shot's frames as studios write them: ``shot.%04d.exr``, ``shot.####.exr``, ``shot.$F4.exr``, ``<frame>``.
 
-``{frame:04d}``, which ``ngpt render`` takes, is one of them. The number after % and $F, and the count of #, is the
-least number of digits. A file with exactly that name wins, as with other patterns.
+``{frame:04d}``, the form of ``ngpt render``, is accepted too. The number after % or $F, or the count of #, is the least
+number of digits. If a file has exactly such a name, the name means that file, as with other patterns.
 """
 
 import glob
@@ -54,7 +54,7 @@ def number_of(path: Path, wanted: str) -> int:
     """A file's frame: the last number in its name. Raises WrongUse, naming ``wanted``, if there is none."""
     numbers = NUMBER.findall(path.stem)
     if not numbers:
-        raise WrongUse(f"{path}: has no number, which {wanted} asks for; name the output without")
+        raise WrongUse(f"{path}: has no number, which {wanted} asks for; give an output name without a frame number")
     return int(numbers[-1])
 
 

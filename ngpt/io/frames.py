@@ -158,7 +158,8 @@ def _none(name: str, what: str) -> list[Path]:
 
 
 def _frame(path: Path) -> float | None:
-    """The attribute ``ngpt:frame`` of a file; None if it has none or cannot be read; its reader reports that."""
+    """The attribute ``ngpt:frame`` of a file; None if it has none or cannot be read: the code that reads the file later
+    reports that."""
     try:
         with regular_file(path) as file:
             numbers = [part.number("ngpt:frame") for part in read_headers(file, str(path))]

@@ -23,8 +23,8 @@ MAGIC = b"\x76\x2f\x31\x01"
 _DEEP, _MULTIPART = 0x800, 0x1000
 _TYPES = {0: 4, 1: 2, 2: 4}  # uint, half, float: bytes
 # Number of the compression -> lines in a chunk, and the most bytes that a byte of a file can stand for. The bound is
-# 1032 for deflate and 64 for run lengths. Others store blocks without detail in very few bytes, so their bounds are
-# generous.
+# 1032 for deflate and 64 for run lengths. Other compressions store blocks without detail in very few bytes, so their
+# bounds are generous.
 _COMPRESSIONS = {
     **{0: (1, 1), 1: (1, 64), 2: (1, 1032), 3: (16, 1032), 4: (32, 2**12), 5: (16, 2**11), 6: (32, 12), 7: (32, 12)},
     **{8: (32, 2**16), 9: (256, 2**16), 10: (256, 2**16), 11: (32, 2**16)},
@@ -42,7 +42,7 @@ class PartHeader:
     ``channels``  name -> (bytes of a value, x and y step of its subsampling)
     ``deep``      whether pixels hold lists of samples
     ``chunks``    pieces that its full-size image is stored in
-    ``table``     number of entries in the table of where pieces begin, with those for smaller levels if known
+    ``table``     number of entries in the table of offsets of pieces, including those of smaller levels if known
     ``tiled``     whether pieces are tiles
     ``ratio``     the most bytes of image that one byte of the file can stand for
     ``attributes``  name -> type and data, as they are in the file
@@ -87,7 +87,7 @@ class PartHeader:
 
 
 def read_headers(file: BinaryIO, path: str) -> list[PartHeader]:
-    """The headers of an open file's parts, after checks: the size of the file does not forbid decoding it.
+    """The headers of an open file's parts, after checks that the file is small enough to be decoded.
 
     Raises NgptError if the file is not OpenEXR, if a header is damaged or contradicts itself or the file's length, if
     it exceeds a limit above, and if the pixels need more than half of the memory.
@@ -222,7 +222,7 @@ def _channels(data: bytes, label: str) -> Iterator[tuple[str, tuple[int, tuple[i
 
 
 def check_size(parts: list[PartHeader], length: int, path: str) -> None:
-    """Raises NgptError for parts that a file of ``length`` bytes cannot hold, and for those beyond the limits above."""
+    """Raises NgptError for parts that a file of ``length`` bytes cannot hold, and for parts beyond the limits above."""
     if not parts:
         raise NgptError(f"{path}: damaged or incomplete (it has no parts); render or copy it again")
     for part in parts:
@@ -240,7 +240,8 @@ def check_size(parts: list[PartHeader], length: int, path: str) -> None:
         )
     if any(part.deep for part in parts):
         return
-    # Each chunk has an entry in a table, a size before its data, and at most as many bytes as its pixels can take.
+    # The least length of the file: 16 bytes for each chunk (its entry in a table, and its size and place), and the data
+    # of all pixels, compressed as far as possible.
     least = sum(16 * part.chunks + (part.bytes // part.ratio) for part in parts)
     wanted = sum(part.bytes for part in parts)
     if least > length:

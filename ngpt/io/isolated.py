@@ -2,7 +2,7 @@
 here.
 
 The other process reads the file and writes an uncompressed copy to a folder that only this user can read; this process
-reads the copy. The other process has limits on memory (on Linux) and on time, and its death is an NgptError.
+reads the copy. The memory (on Linux) and the time of the other process are limited. If it dies, NgptError is raised.
 
     python -P -m ngpt.io.isolated FILE COPY BYTES         the other process
 """
@@ -23,7 +23,7 @@ from ngpt.io.openexr import ExrImage, read_exr, write_exr
 from ngpt.system.limits import limit_address_space
 from ngpt.system.reading import regular_file
 
-# Added to twice the size of the pixels: Python, NumPy and the stacks of OpenEXR's threads.
+# Bytes added to three times the size of the pixels, for Python, NumPy and the stacks of OpenEXR's threads.
 _BASE = 2**31
 _SECONDS = 30.0  # plus the time to read the file at 10 MB/s
 _REFUSED = 3
@@ -39,7 +39,7 @@ def read_exr_isolated(path: str | os.PathLike) -> ExrImage:
         size = sum(header.bytes for header in file_headers(file, str(path)))
     with tempfile.TemporaryDirectory(prefix="ngpt-") as folder:
         copy = Path(folder) / "copy.exr"
-        # -P: a folder of strangers' files may hold a numpy.py, and might be the current one.
+        # -P keeps the current folder out of the module path: a folder of strangers' files may hold a numpy.py.
         command = [sys.executable, "-P", "-m", "ngpt.io.isolated", str(path), str(copy), str(_BASE + 3 * size)]
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in map(os.path.abspath, sys.path) if p)}
         seconds = _SECONDS + size / 10e6

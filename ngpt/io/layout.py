@@ -17,7 +17,7 @@ _ROWS = 16  # gathered at a time
 
 @dataclass(frozen=True)
 class StackSource:
-    """The file a stack was read from, where the layers are in it, and the view, which names its layers."""
+    """The file that a stack was read from, the places of the layers in it, and the view that the stack shows."""
 
     image: ExrImage
     resolution: Resolution
@@ -70,7 +70,7 @@ def as_stored(image: ExrImage, found: Found, main: int) -> bool:
 
 
 def holds(part: ExrPart, names: tuple[str, ...], values: np.ndarray) -> bool:
-    """Whether the channels ``names``, as float32, are bit for bit the float32 ``values`` (H, W, C); else False."""
+    """Whether the channels ``names``, as float32, are bit for bit the float32 ``values`` (H, W, C)."""
     if values.dtype != np.float32:
         return False
     return values.shape[:2] == part.channels[names[0]].shape and all(

@@ -220,8 +220,8 @@ def _without_native_stderr() -> Iterator[None]:
 def _all_cores() -> Iterator[None]:
     """Lets OpenEXR decode and encode on all cores, which is not its default, with threads that end with the call.
 
-    A forked process would not have threads that live on, and would wait for them for ever. If address space is short,
-    no threads are made. If the caller has set a number of threads, it stays.
+    A forked process would lack threads that outlive the call, and would wait for them for ever. If address space is
+    short, no threads are made. If the caller has set a number of threads, it stays.
     """
     short = free_address_space() < processors() * _THREAD
     if short or OpenEXR.global_thread_count():

@@ -47,8 +47,8 @@ _SAME = 1e-4  # of a coordinate; files hold 32-bit floats, and standards four di
 def to_rec709(attributes: Mapping[str, Any]) -> np.ndarray | None:
     """The matrix (3, 3) that takes colours of a file with such header attributes to linear Rec. 709.
 
-    None if the file is in Rec. 709 already, if its header names no primaries, and if they make no sense, which is
-    logged as a warning. White becomes white: if the two whites differ, by Bradford's adaptation.
+    Returns None if the file is in Rec. 709 already, if its header names no primaries, or if they make no sense, which
+    is logged as a warning. If the two whites differ, Bradford's adaptation maps one to the other.
     """
     found = _primaries(attributes)
     if found is None:
@@ -86,7 +86,7 @@ def _primaries(attributes: Mapping[str, Any]) -> Any:
 def inside_rec709(stack: GradientStack) -> np.ndarray | None:
     """``to_rec709`` of a stack if nearly all of its light is within Rec. 709, else None.
 
-    Light outside has negative components there, which cost OIDN more accuracy than other primaries do
+    Light outside Rec. 709 has negative components in it. They cost OIDN more accuracy than other primaries do
     (docs/use/pictures.md).
     """
     matrix = to_rec709(stack.attributes)

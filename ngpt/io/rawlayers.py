@@ -1,4 +1,4 @@
-"""Layers as raw files that any language reads in three lines: hosts of networks read them, also as test data.
+"""Layers as raw files that any language reads in three lines, for programs that run networks, and for their tests.
 
 A folder holds NAME.f32 for each layer, float32, little-endian, (1, C, height, width) in C order, and ``layers.json``,
 which lists their shapes and SHA-256 sums.

@@ -5,7 +5,7 @@
 | colours, light, albedo, alpha, masks, mist, all others | mean of the values that are finite |
 | normals | mean, as ours are: not of length 1 on edges |
 | depth | least value above 0, or 0 if all are 0: a mean would lie between two surfaces |
-| positions, texture coordinates | those of the pixel with that depth; of the first pixel if their part has no depth |
+| positions, texture coordinates | those of the pixel with that depth, or the first if their part has no depth |
 | ids: whole numbers, and ``IndexOB``, ``IndexMA`` and the like | the most frequent; of equal ones the first |
 | Cryptomatte | coverages are added up by id and divided by K²; the existing ranks keep the largest |
 | motion vectors | mean divided by K, because their unit is the pixel |
@@ -42,8 +42,8 @@ _DEEPEST = "Z"
 
 
 def reduced_window(window: Window, k: int) -> Window:
-    """The window of the large pixels, K x K pixels of this window each; those that its borders cut are left out. Raises
-    NgptError if none is whole."""
+    """The window in large pixels, each of K x K pixels of ``window``. Large pixels that its borders cut are left out.
+    Raises NgptError if none is whole."""
     left, top = -(-window.left // k), -(-window.top // k)
     width, height = (window.left + window.width) // k - left, (window.top + window.height) // k - top
     if width < 1 or height < 1:
@@ -249,7 +249,7 @@ def _ranks(names: Sequence[str], blocks: dict[str, Any]) -> dict[str, np.ndarray
     ids = np.concatenate([blocks[name].view(np.uint32) for name in names[::2]], axis=-1)
     coverage = np.concatenate([blocks[name] for name in names[1::2]], axis=-1).astype(np.float64)
     pixels = blocks[names[0]].shape[-1]
-    # The same id is in several places. Sorted by id, its coverages are added up at the last of these.
+    # An id may occur several times in a block. After sorting by id, its coverages are added up at its last place.
     order = np.argsort(ids, axis=-1, kind="stable")
     ids, coverage = (np.take_along_axis(each, order, axis=-1) for each in (ids, coverage))
     starts = np.ones(ids.shape, bool)

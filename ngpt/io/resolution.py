@@ -13,8 +13,8 @@ from ngpt.errors import NgptError, did_you_mean
 from ngpt.io.aliases import ALIASES, LOOKS, NO_LIGHT, NOISE, NOT_LOOKS, OWN, Alias, plain
 from ngpt.layers import LAYERS, RGB, XY, XYZ, Layer
 
-# The name of each part of a file, and its channels. If the names to match differ from those in the file, it is a
-# mapping from the former to the latter (``ngpt.io.views``).
+# The name of each part of a file, and its channels. If the names to match differ from those in the file, the channels
+# are a mapping from names to match to names in the file (``ngpt.io.views``).
 Parts = Sequence[tuple[str, Sequence[str] | Mapping[str, str]]]
 
 _COLOUR = (("R", "r", "red"), ("G", "g", "green"), ("B", "b", "blue"))
@@ -68,16 +68,16 @@ def resolve(
     """Finds the layers of the contract among the channel names of a file.
 
     ``parts`` lists each part's name and its channel names. ``overrides`` maps names of the contract to the name of a
-    layer in the file, whole or its tail, and wins over the aliases; or to its channels with signs and factors,
-    "-velocity.R,velocity.G". ``path`` is for messages. ``writer`` is the program that wrote the file, by ``writer_of``.
-    In a file by "ngpt", ``direct`` and ``caustic`` have the meaning of the contract; in others they do only beside
-    layers that no other program writes. ``origin`` is the layer that the input of a result was read from.
+    layer in the file (whole or its tail), or to channels with signs and factors, "-velocity.R,velocity.G". It wins over
+    the aliases. ``path`` is for messages. ``writer`` is the program that wrote the file, by ``writer_of``. In a file by
+    "ngpt", ``direct`` and ``caustic`` have the meaning of the contract; in others they do only beside layers that no
+    other program writes. ``origin`` is the layer that the input of a result was read from.
 
-    A channel without a dot belongs to the root, and in a file of several parts to the layer named like its part; there
-    other layers can also be called ``part.layer``. Where a name fits several layers, the one whose name begins like
-    the primal's name wins (``Near.Combined``, ``Near.Depth``), then the one it fits whole, then the one in the part
-    that holds the primal. Layers that begin like another image that could be the primal belong to that one. Where no
-    name is known, the only layer of colour is the primal.
+    A channel without a dot belongs to the root, and in a file of several parts to the layer named like its part. In
+    such a file, other layers can also be called ``part.layer``. If a name fits several layers, the layer whose name
+    begins like the primal's name wins (``Near.Combined``, ``Near.Depth``), then the layer whose whole name it is, then
+    the layer in the primal's part. A layer whose name begins like that of another possible primal belongs to that
+    image. If no name is known, the only layer of colour is the primal.
 
     Raises NgptError if there is no primal, a name fits several layers, a layer lacks channels or has one twice, or an
     override names something that is not there.
@@ -127,8 +127,8 @@ def resolve_alone(parts: Parts, name: str, path: str) -> Found:
 
 
 
-    That is the layer with one of its names, else the root of the first part, else the only layer with such channels.
-    Raises NgptError if there is none, or there are several and none has a known name.
+    This is the layer in the file under one of the known names of ``name``, else the root of the first part, else the
+    only layer with such channels. Raises NgptError if there is none, or there are several and none has a known name.
     """
     groups, layer = _group(parts), LAYERS[name]
     for alias in (alias for alias in ALIASES if alias.layer == name and not alias.writer):
@@ -149,7 +149,7 @@ def propose(parts: Parts, found: Resolution) -> dict[str, str]:
     """Layers of a file that look like ones of the contract that ``found`` lacks: layer -> its name in the file.
 
     A guess from names, for the user to judge: ``--layer albedo="NAME"`` takes it. Each layer is proposed once. Motion
-    is proposed by its channels, as if it led to the next frame with y up, which most renderers write.
+    is proposed by its channels. The proposal assumes vectors to the next frame with y up, as most renderers write.
     """
     taken = {(layer.part, channel) for layer in found.values() for channel in layer.channels}
     proposed: dict[str, str] = {}
@@ -332,7 +332,7 @@ def _home(groups: list[_Group], primal: Found, origin: str) -> _Home:
 def _channels(layer: Layer, group: _Group, only: tuple[str, ...], path: str) -> tuple[str, ...]:
     """Returns the channels of ``group`` in canonical order, or () if it has none of those that ``layer`` needs.
 
-    With ``only``, a group that lacks one of these is another layer.
+    If ``only`` is given, a group that lacks one of these channels counts as another layer.
     """
     if only:
         there = all(suffix in group.channels for suffix in only)

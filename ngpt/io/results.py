@@ -1,4 +1,4 @@
-"""Stacks and results as files: what a stack was read from, with its layers brought up to date, and a result in it."""
+"""Stacks and results as files: the file that a stack was read from, with its layers brought up to date and a result."""
 
 from dataclasses import replace
 from typing import Any
@@ -40,7 +40,7 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
     else:
         own = stack.source.image.parts
         image = ExrImage([replace(part, channels=dict(part.channels)) for part in (base.parts if base else own)])
-        # The file does not yet have other changes to this view, such as changes to its light groups.
+        # ``base`` lacks other changes to this view, such as changes to its light groups.
         for part, source, (_, channels) in zip(image.parts, own, stack.source.view.parts, strict=False):
             part.channels.update({name: source.channels[name] for name in channels.values() if base})
         resolution = dict(stack.source.resolution)
@@ -99,7 +99,8 @@ def replaced_layer(resolution: Resolution, view: View, origin: str, into: str | 
     """The layer that holds a result besides the root: users who load that layer want the result too.
 
     ``into`` names it, whole or by its tail after a dot; "root" is none. By default it is the layer that the input came
-    from, unless its name says that it is noisy; ``origin`` is its name where the input was moved before.
+    from, unless its name says that it is noisy; ``origin`` is the name of that layer if an earlier result moved the
+    input.
 
     Raises NgptError unless ``into`` fits one layer of colour.
     """
@@ -127,8 +128,8 @@ def with_result(
 ) -> tuple[ExrImage, int]:
     """Returns the file with ``pixels`` (H, W, 3) float32 as the root of a view's first part, the input as primal.R/G/B.
 
-    They also replace the layer ``shown``, whose name goes into the header as ``ngpt:pass``. The second value is the
-    index of the part with the result.
+    ``pixels`` also replace the layer ``shown``, whose name goes into the header as ``ngpt:pass``. The second value is
+    the index of the part with the result.
     """
     primal, alpha = resolution["primal"], resolution.get("alpha")
     source, parts, place = image.parts[primal.part], list(image.parts), view.first

@@ -4,9 +4,9 @@
 |---|---|---|
 | OpenEXR's, one part | ``right.R``, ``albedo.right.R``; the first may lack its name | the attribute ``multiView`` |
 | OpenEXR's, many parts | ``R`` in a part of its own | that part's attribute ``view`` |
-| others | ``right.albedo.R`` | ``multiView``, or ``left`` and ``right`` in names alike |
+| others | ``right.albedo.R`` | ``multiView``, or ``left`` and ``right`` in names that are otherwise equal |
 
-A view's layers go by names without the view's name, ``albedo.R``, so that all are found in one way.
+The layers of a view are named without the view's name, ``albedo.R``, so that all layouts are searched in one way.
 https://openexr.com/en/latest/MultiViewOpenEXR.html
 """
 
@@ -22,7 +22,8 @@ _EYES = ("left", "right")
 
 
 class Part(NamedTuple):
-    """The names in a part of a file: of the part, its channels, its view, and the views among its channels."""
+    """The names in a part of a file: its own name, its channels, its view, and the views that its channels belong
+    to."""
 
     name: str
     channels: Sequence[str]
@@ -47,7 +48,7 @@ class View(NamedTuple):
         return next(index for index, (_, channels) in enumerate(self.parts) if channels)
 
     def without(self, name: str) -> str:
-        """A layer's name, or names of channels, without the name of this view: "right.albedo" is its "albedo"."""
+        """A layer's name, or names of channels, without the name of this view: "right.albedo" becomes "albedo"."""
         word = re.escape(self.name)
         return re.sub(rf"\b{word}\.|\.{word}\b", "", name) if self.name else name
 
@@ -83,7 +84,7 @@ def choose_views(views: Sequence[View], wanted: str | None, path: str) -> list[V
 
 
 def _eyes(parts: Sequence[Part]) -> list[str]:
-    """Left and right, if both have a part or a channel in common."""
+    """Left and right, if each has a part of its own, or a channel that the other has too."""
     left, right = _EYES
     if {left, right} <= {part.name for part in parts}:
         return list(_EYES)

@@ -1,5 +1,5 @@
 """Whether a file is a complete OpenEXR image, without decoding it: interrupted copies and full disks leave incomplete
-ones.
+files.
 
 Layout of the format: https://openexr.com/en/latest/OpenEXRFileLayout.html
 """

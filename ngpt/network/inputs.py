@@ -41,7 +41,7 @@ CLEAN, _DARK = clean.CLEAN, clean.DARK
 # The inputs that are made from the layers of a stack.
 MADE = ("base", *DENOISED)
 
-# Estimated where a stack with gradients lacks them.
+# Variances that are estimated if a stack with gradients lacks them.
 ESTIMATED = ("primal_var", "dx_var", "dy_var")
 
 
@@ -101,8 +101,8 @@ class Oidn:
     OIDN sees all light of the primal, as in its training. Networks get its image minus its image of ``caustic``, which
     is added to their result again. So caustics in the result are as sharp as in OIDN's image.
 
-    The primal is denoised by OIDN's largest network, with which the combination has 8 % less error than with smaller
-    ones, the base by its smallest: larger ones change the combination by less than 1 % in rooms (docs/lab/log).
+    The primal is denoised by OIDN's largest network: the combination then has 8 % less error than with smaller ones.
+    The base is denoised by the smallest: larger ones change the combination by less than 1 % in rooms (docs/lab/log).
     """
 
     def __init__(self, data: Repaired):
@@ -154,7 +154,7 @@ def denoised(by_oidn: Oidn, base: np.ndarray | None, names: Collection[str]) -> 
 
 
 def _layer(name: str) -> str:
-    """The layer of a stack that an input is, or whose root it is."""
+    """The layer of a stack that equals an input, or whose square root the input is."""
     return name.replace("_se", "_var")
 
 

@@ -23,7 +23,7 @@ def describe(file: BinaryIO) -> Form:
     text, gap, rest = start.partition(b"\n\n")
     line = re.match(rb"([-+])Y +(\d{1,9}) +([-+])X +(\d{1,9})\n", rest)
     if gap and not line and re.match(rb"[-+]X ", rest):
-        raise Unread("has columns for rows; turn it, pfilt or another program does")
+        raise Unread("has columns for rows; turn it with pfilt or another program")
     if not line:
         raise Damage("its header does not end in a size, such as -Y 360 +X 640")
     if (form := re.search(rb"^FORMAT *= *(\S+)", text, re.MULTILINE)) and form[1] != b"32-bit_rle_rgbe":
@@ -75,7 +75,8 @@ def _pixels(data: bytes, width: int, height: int) -> np.ndarray:
 
 
 def _old_runs(pixels: np.ndarray, repeats: np.ndarray, count: int) -> np.ndarray:
-    """A pixel 1 1 1 n repeats the pixel before it n times; in a row of these, each n counts 256 times the last one."""
+    """A pixel 1 1 1 n repeats the pixel before it n times; in a row of such pixels, each n counts 256 times as much as
+    the one before."""
     places = np.arange(len(pixels))
     last = np.maximum.accumulate(np.where(repeats, -1, places))
     if repeats[0]:
