@@ -5,8 +5,8 @@
 The sampler is `primal`, with shared tails where they work. A scene, number of samples and seed is rendered once, with
 as many subpixels as any way needs; fewer are their means. Ways that need more subpixels than there are samples in a
 pixel are left out. Scenes are those of `bench.panel`, by their names there, or as of `bench.seeds`, and so are their
-references. A way of WAYS is the mean of one or more images, by K and by how the features are declared to OIDN. Each
-cell has, of each way:
+references. A way of WAYS is the mean of one or more images, by K and by how the features are declared to OIDN; "auto"
+is what `oidn` does with subpixels by default. Each cell has, of each way:
 
     seconds  of processors, warmed up
     error    ``bench.tails.steady_error``; FLIP is over the mean of the reference's halves
@@ -41,10 +41,10 @@ WAYS: dict[str, tuple[tuple[int, str], ...]] = {
     "2 noisy": ((2, "noisy"),),
     "2 clean": ((2, "clean"),),
     "2 prefiltered": ((2, "prefiltered"),),
-    "1 and 2 noisy": ((1, "prefiltered"), (2, "noisy")),
     "1 and 2 clean": ((1, "prefiltered"), (2, "clean")),
     "1 and 2 prefiltered": ((1, "prefiltered"), (2, "prefiltered")),
-    "1, 2 and 4 noisy": ((1, "prefiltered"), (2, "noisy"), (4, "noisy")),
+    "2 auto": ((2, "auto"),),
+    "4 auto": ((4, "auto"),),
 }
 BASE = "1 prefiltered"
 CELL = ("scene", "size", "spp", "seed")

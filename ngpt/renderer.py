@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from ngpt.stack import GradientStack
 
-# The options of a render: its sampler's name, the sampler's own options, and whether features are rendered
+# The options of a render: its sampler's name, the sampler's own options, whether features are rendered, and subpixels
 Options = Mapping[str, Any]
 
 
@@ -44,7 +44,10 @@ class Renderer(Protocol):
         """Whether the sampler renders gradients; True for an unknown one."""
 
     def unusual(self, sampler: str, options: Options) -> str:
-        """The sampler's options that are not defaults: "radius=1, photons=2". Raises NgptError for wrong ones."""
+        """The sampler's options, and ``subpixels``, that are not defaults: "radius=1, photons=2, subpixels=2".
+
+        Raises NgptError for wrong ones.
+        """
 
     def code(self, sampler: str) -> str:
         """A hash of the code that a render by the sampler runs; "auto" is a sampler too."""

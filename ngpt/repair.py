@@ -102,7 +102,8 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
     said = stack.number(FEATURE_NOISE)
     apart: dict[str, Any] = {"parts": _parts(stack, good), "feature_noise": said if said is None or said >= 0 else None}
     if stack.fine:
-        apart["fine"] = _finite_subpixels(stack, image + direct, features)
+        light = image + direct if caustic is None or not gradients else image + direct + caustic
+        apart["fine"] = _finite_subpixels(stack, light, features)
     if caustic is not None and gradients:
         variance = _where(good, stack["caustic_var"]) if "caustic_var" in stack else None
         apart |= {"caustic": caustic, "caustic_var": variance}
@@ -163,14 +164,14 @@ def finite_pixels(layer: np.ndarray) -> np.ndarray:
 
 
 def _finite_subpixels(
-    stack: GradientStack, image: np.ndarray, features: dict[str, np.ndarray]
+    stack: GradientStack, light: np.ndarray, features: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """The subpixels of a stack; those that are not finite have the value of their pixel in the repaired layers."""
     k = subpixels(stack.fine, stack.width)
     fine = {}
     for name, layer in stack.fine.items():
         good = finite_pixels(layer)
-        pixels = image if name == "primal" else features[name]
+        pixels = light if name == "primal" else features[name]
         fine[name] = layer if good.all() else np.where(good[..., None], layer, spread(pixels, k))
     return fine
 

@@ -158,6 +158,22 @@ def test_stacks_of_different_subpixels_merge_without_them_and_say_so(rng, caplog
     assert f"1.exr has 2x2, 2.exr has {told}" in caplog.text
 
 
+def test_subpixels_that_are_not_finite_get_all_light_of_their_pixel(rng):
+    """With the light of photons, whether it is left to another method or not."""
+    stack = fine_stack(rng)
+    fine = stack.fine | {"primal": stack.fine["primal"].copy()}
+    fine["primal"][2, 3] = np.nan
+    light = np.full_like(stack["primal"], 0.25)
+    layers = {"primal": means(fine["primal"], 2), "caustic": light, "direct": light}
+    given = replace(stack.replace(**layers), fine=fine)
+    for gradients in (True, False):
+        data = repair(given, gradients)
+        pixel = data.image + data.direct + (data.caustic if gradients else 0)
+        assert np.allclose(data.fine["primal"][2, 3], pixel[1, 1])
+        kept = np.isfinite(fine["primal"])
+        assert np.array_equal(data.fine["primal"][kept], fine["primal"][kept])
+
+
 # ------------------------- methods -------------------------
 
 

@@ -15,6 +15,7 @@ from data_gen.budget import LANE_BYTES
 from ngpt.errors import NgptError, WrongUse
 from ngpt.methods import METHODS
 from ngpt.options import STANDINGS, Option, as_text, settings, unusual
+from ngpt.subpixels import best, choice
 from ngpt.system.parts import Registry
 
 if TYPE_CHECKING:
@@ -165,6 +166,23 @@ class Sampler(Entry):
     def even(self) -> bool:
         """Whether all pixels must have as many samples."""
         return bool(self.batch) or self.together
+
+    def subpixels(self, asked: int | str, spp: int | None) -> int:
+        """K of the K x K subpixels that a render keeps: the number ``asked``, or for "auto" what suits ``spp`` samples.
+
+        Raises WrongUse if it cannot keep the requested ones.
+        """
+        k = choice(asked)
+        if not self.batch:
+            # With gradients, networks combine images that they were trained to find without subpixels.
+            return int(k) if k != "auto" else 1 if self.gradients else best(spp)
+        if k in ("auto", 1):
+            return 1
+        able = ", ".join(name for name, other in SAMPLERS.items() if not other.batch)
+        raise WrongUse(
+            f"sampler '{self.name}' puts light on any pixel and has no subpixels: leave subpixels out, or name one of: "
+            f"{able}"
+        )
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from ngpt.io.exr import write
 from ngpt.measure.metrics import METRICS, scores
 from ngpt.methods import METHODS, check_request, reconstruct, unknown_method
 from ngpt.stack import GradientStack
+from ngpt.subpixels import subpixels
 from ngpt.system.files import make_folder
 from ngpt.system.machine import versions
 from ngpt.system.writing import write_json
@@ -61,7 +62,7 @@ class Scorer:
             return json.loads(path.read_text())
         try:
             data = stack()
-            warm = (column.family, data.height, data.width)
+            warm = (column.family, data.height, data.width, subpixels(data.fine, data.width))
             if warm not in self._warm:
                 # The first run also reads weights, compiles kernels and makes filters, so it is not timed.
                 reconstruct(data, column.method, **column.options)

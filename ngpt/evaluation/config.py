@@ -54,7 +54,8 @@ class Config:
               reach the whole time of methods that take longer to reconstruct
     ``seeds``     the number of renders of each stack, each with its own seed
     ``methods``   methods of `ngpt info`, or variants: tables [variants.NAME] with method, options, stack and sampler
-    ``samplers``, ``rivals``  samplers of stacks with gradients, and without; tables [samplers.NAME] give them options
+    ``samplers``, ``rivals``  samplers of stacks with gradients, and without; tables [samplers.NAME] give them options,
+              and ``subpixels`` as for ``ngpt render``; without, there are none
     ``clock``     the sampler whose samples ``spp`` counts
     ``time``      "wall", or "processor": all cores together, which other work on the machine hardly changes
     ``metrics``   the metrics to measure; E-LPIPS needs a table [elpips] with backbone and weights
@@ -186,7 +187,9 @@ class Config:
     def sampler(self, name: str) -> tuple[str, str]:
         """The renderer's name of the sampler that the configuration calls ``name``, and its options, as text.
 
-        The text has only options that differ from their defaults. Raises NgptError for options that it does not take.
+        The text has only options that differ from their defaults. Subpixels count as one, whose default is 1, and not
+        "auto" as in `ngpt render`: so a configuration keeps its meaning, and stored tables stay what they were. Raises
+        NgptError for options that it does not take.
         """
         table = dict(self.sampler_options.get(name, {}))
         if not table:

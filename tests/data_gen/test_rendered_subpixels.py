@@ -158,7 +158,7 @@ def test_what_cannot_be_kept_is_refused(renderer):
     scene = load(renderer, "diffuse", SIZE)
     with pytest.raises(WrongUse, match=r"sampler 'bdpt' puts light on any pixel.*one of: .*primal"):
         render_stack(scene, 4, 3, "bdpt", subpixels=2)
-    with pytest.raises(WrongUse, match="3 subpixels: choose one of 1, 2, 4, auto"):
+    with pytest.raises(WrongUse, match="'3' subpixels cannot be kept; write 1, 2, 4, or auto"):
         render_stack(scene, 4, 3, "primal", subpixels=3)
     with pytest.raises(WrongUse, match="'restir' reuses earlier frames"):
         next(render_frames("diffuse", [0], sampler="restir", subpixels=2))

@@ -14,9 +14,9 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.light_ends import World
 from data_gen.paths.mis import gradient_weight
 from data_gen.paths.spectrum import to_rgb
-from data_gen.samplers.photons.gradients.camera import Level
-from data_gen.samplers.photons.gradients.pairs import Near, Pairs, pieces
 from data_gen.samplers.photons.passes import Passes, begun
+from ngpt_studies.photons.gradients.camera import CameraPaths, Level
+from ngpt_studies.photons.gradients.pairs import Near, Pairs, pieces
 
 # Levels are joined until they have this number of paths for each camera sample.
 LEVELS = 3
@@ -33,7 +33,16 @@ class Gathered:
     in_media: Near | None = None
 
 
-def gradient_pass(passes: Passes, camera: CameraSamples, film: GradientFilm, near: Callable, pairs: int) -> None:
+@dataclass
+class GradientPasses(Passes):
+    """Passes whose camera paths go side by side with those of the neighbouring pixels."""
+
+    walk: CameraPaths
+
+
+def gradient_pass(
+    passes: GradientPasses, camera: CameraSamples, film: GradientFilm, near: Callable, pairs: int
+) -> None:
     """One photon map, and one camera path and its four shifts for each camera sample; a pixel has one sample.
 
     ``near`` (passes, photon map) yields what is ``Gathered`` of a map; ``pairs`` are in memory together for each camera
@@ -129,7 +138,7 @@ def add_to(sums: list, lanes: mi.UInt32, parts: list) -> None:
 # ------------------------------- Pairs --------------------------------
 
 
-def parts(passes: Passes, near: Gathered, level: Level, longest: mi.UInt32, most: int) -> Iterator[list]:
+def parts(passes: GradientPasses, near: Gathered, level: Level, longest: mi.UInt32, most: int) -> Iterator[list]:
     """The differences from what is ``near`` to a level's paths."""
     at_surfaces = passes.walk.at_surfaces(level, passes.frozen)
     if near.on_surfaces is not None:

@@ -35,11 +35,11 @@ import mitsuba as mi
 
 from data_gen.paths import media, segments
 from data_gen.paths.light_ends import World
-from data_gen.samplers.photons.integrator import Traced
+from data_gen.samplers.photons.bre import Along, seen_along
 from data_gen.samplers.photons.map.trace import VERTICES_PER_PATH
-from data_gen.samplers.photons.media.beams import BEAMS
-from data_gen.samplers.photons.media.bre import Along, seen_along
 from data_gen.samplers.photons.passes import Passes
+from ngpt_studies.photons.map.whole import Traced
+from ngpt_studies.photons.media.beams import BEAMS
 
 # Bytes of a plane, and of the edge of a map that it may be swept from
 PLANE_BYTES = (18 + 3) * 4

@@ -27,8 +27,8 @@ from data_gen.paths import collisions, media, segments
 from data_gen.paths.collisions import Collisions
 from data_gen.paths.light_ends import LightRay, World
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
-from data_gen.samplers.photons.gradients import shift
-from data_gen.samplers.photons.map.vertices import Photon, is_near, vertex_in_media_of, vertex_of
+from ngpt_studies.photons.gradients import shift
+from ngpt_studies.photons.map.vertices import Photon, is_near, vertex_in_media_of, vertex_of
 
 
 @dataclass

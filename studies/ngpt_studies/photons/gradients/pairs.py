@@ -20,8 +20,8 @@ import mitsuba as mi
 
 from data_gen.paths.frozen import call
 from data_gen.paths.light_ends import World
-from data_gen.samplers.photons.gradients.camera import Path
 from data_gen.samplers.photons.map.grid import Grid
+from ngpt_studies.photons.gradients.camera import Path
 
 
 @dataclass

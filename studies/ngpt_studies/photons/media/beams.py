@@ -31,14 +31,16 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import collisions, media
+from data_gen.paths.camera import CameraSamples
 from data_gen.paths.light_ends import World
-from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
+from data_gen.samplers.photons.bre import BALL, BRE, Along, scattering_along, seen_along
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.trace import EDGE_BYTES, VERTICES_PER_PATH
+from data_gen.samplers.photons.map.trace import VERTICES_PER_PATH
 from data_gen.samplers.photons.map.vertices import put
-from data_gen.samplers.photons.media.bre import BALL, BRE, Along, scattering_along, seen_along
 from data_gen.samplers.photons.passes import Passes
-from data_gen.samplers.photons.surfaces.ppm import Gathering
+from data_gen.samplers.photons.ppm import Gathering
+from ngpt_studies.photons.map.trace import EDGE_BYTES
+from ngpt_studies.photons.map.whole import GRID_BYTES, MEDIA_MAP_BYTES, Traced, whole_maps
 
 # Length of a part, in radii. Shorter parts are more to enter. Longer parts are more often near to no ray.
 PART = 6
@@ -232,7 +234,10 @@ class BEAMS(BRE):
     ``radius`` shrinks faster.
     """
 
-    edges, map_bytes = True, BEAM_BYTES + PARTS * PART_BYTES
+    map_bytes, grid_bytes = BEAM_BYTES + PARTS * PART_BYTES, GRID_BYTES
+
+    def maps(self, passes: Passes, camera: CameraSamples) -> Iterator[Traced]:
+        return whole_maps(self, passes, camera, edges=True)
 
     def near(self, passes: Passes, traced: Traced) -> Iterator[Along]:
         max_depth, fog = self.limits.max_depth, passes.world.fog

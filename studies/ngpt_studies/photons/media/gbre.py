@@ -26,17 +26,18 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.paths.light_ends import World
-from data_gen.samplers.photons.gradients import shift
-from data_gen.samplers.photons.gradients.camera_in_media import PathsByPieces, Piece
-from data_gen.samplers.photons.gradients.copies import LightPaths, copy_in_medium
-from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen
-from data_gen.samplers.photons.gradients.pairs import Rays
-from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
+from data_gen.samplers.photons.bre import BALL, seen_along
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.vertices import Photon, in_media, photon_of
-from data_gen.samplers.photons.media.bre import BALL, seen_along
+from data_gen.samplers.photons.map.vertices import in_media
 from data_gen.samplers.photons.passes import Passes
-from data_gen.samplers.photons.surfaces.gpm import GPM, OnSurfaces
+from ngpt_studies.photons.gpm import GPM, OnSurfaces
+from ngpt_studies.photons.gradients import shift
+from ngpt_studies.photons.gradients.camera_in_media import PathsByPieces, Piece
+from ngpt_studies.photons.gradients.copies import LightPaths, copy_in_medium
+from ngpt_studies.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen
+from ngpt_studies.photons.gradients.pairs import Rays
+from ngpt_studies.photons.map.vertices import Photon, photon_of
+from ngpt_studies.photons.map.whole import MEDIA_MAP_BYTES, Traced
 
 # Bytes of a camera sample beside pairs: levels of five pieces of paths, what they end at, and as many sums
 PATHS_BYTES = 4096
