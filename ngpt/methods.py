@@ -46,7 +46,7 @@ class Method:
     ``variant``  the method that it runs with other options; "" for a method of its own
     ``apart``    whether the light of photons is taken out of the image and denoised by ``ngpt.denoisers.caustic``
     ``rec709``   whether it was made for colours of Rec. 709: other colours are converted for it if they lie in that
-    gamut
+                 gamut
     """
 
     summary: str
