@@ -12,7 +12,7 @@ A scene is rendered by each of RENDERS:
 
 OIDN denoises the renders of rivals in each of the WAYS: at K times the size, with features that are declared as
 prefiltered (it denoises them first), clean or noisy. An image at twice the size is then scaled down. "1 and 2" is what
-ngpt does with subpixels (``ngpt.denoisers.oidn.with_subpixels``): the mean of an image of each size. Each cell has, by
+ngpt does with subpixels (``ngpt.denoisers.oidn.of_both``): the mean of an image of each size. Each cell has, by
 way:
 
     seconds  of processors, of the render and of OIDN, both warmed up

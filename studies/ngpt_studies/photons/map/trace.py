@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, get_type_hints
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -19,7 +19,8 @@ from data_gen.paths.light_ends import LightRay, World
 from data_gen.paths.segments import next_surface
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.paths.walk import UNLIMITED
-from data_gen.samplers.photons.map.trace import PATH_BYTES, VERTICES_PER_PATH, begun, event, lives
+from data_gen.samplers.photons.map import trace as trace_of_photons
+from data_gen.samplers.photons.map.trace import PATH_BYTES, VERTICES_PER_PATH, begun, empty_map, event, lives
 from data_gen.samplers.photons.map.vertices import at, put
 from ngpt_studies.photons.map.vertices import vertices_class
 
@@ -32,19 +33,12 @@ MAP_BYTES = VERTICES_PER_PATH * VERTEX_BYTES + PATH_BYTES
 
 
 @dataclass
-class Paths:
-    """The state of light paths at the start of their next edge."""
+class Paths(trace_of_photons.Paths):
+    """The state of light paths at the start of their next edge, with the vertex there."""
 
-    ray: mi.Ray3f  # along that edge
-    β: mi.Spectrum  # power there, times the number of light paths
-    brightest: mi.Float  # one over what they began with
     density: mi.Float  # with which the ray's direction was sampled; infinite by a mirror or alike; 0 of a first edge
     survival: mi.Float  # the probability to have survived Russian roulette there
     parent: mi.UInt32  # the place of the vertex there; of a first edge the number of the light path
-    bounce: mi.UInt32  # the number of the edge, from 1
-    alive: mi.Bool
-    channel: mi.UInt32 | None  # the colour by which distances are sampled; None in scenes without media
-    medium: mi.MediumPtr | None  # that the edge begins in
 
 
 def trace(
@@ -85,13 +79,10 @@ def _maps(world: World, paths: Paths, random, depths: tuple, frozen: Callable, e
         paths, random = at(paths, lanes), random.at(lanes)
         dr.eval(paths)
         random.schedule_state()
-        n = dr.width(lanes) * VERTICES_PER_PATH
-        photons = kind(*(dr.empty(t, n) for t in get_type_hints(kind).values()))
-        photons.t, photons.depth = dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n)
+        photons, place, end = empty_map(kind, dr.width(lanes))
+        photons.t = dr.zeros(mi.Float, len(photons))
         if edges:
-            photons.bounce = dr.zeros(mi.UInt32, n)
-        place = dr.arange(mi.UInt32, dr.width(lanes)) * dr.opaque(mi.UInt32, VERTICES_PER_PATH)
-        end = place + dr.opaque(mi.UInt32, VERTICES_PER_PATH)
+            photons.bounce = dr.zeros(mi.UInt32, len(photons))
         if map_before is not None:
             # A vertex that was gathered in the map before is not gathered again.
             vertex = at(map_before, paths.parent)
@@ -180,7 +171,7 @@ def _walk(world: World, paths: Paths, random, depths: tuple, photons, places: tu
         bounce += 1
         alive &= bounce <= max_depth
     ray = mi.Ray3f(ray.o, ray.d)
-    on = Paths(ray, β, brightest, density, survival, parent, bounce, alive, channel, medium)
+    on = Paths(ray, β, brightest, bounce, alive, channel, medium, density, survival, parent)
     return on, random.state, photons
 
 

@@ -44,26 +44,20 @@ def vertices_class(variant: str, in_media: bool = False, grids: bool = False, ed
     Mitsuba's types belong to a variant.
     """
 
-    @dataclass
-    class Vertices:
-        """Vertices of light paths: 22 words each."""
+    base = vertices.vertices_class(variant, in_media)
 
-        p: mi.Point3f
-        n: mi.Normal3f  # geometric; 0 where light scatters in a medium
-        d: mi.Vector3f  # of the light that arrives
-        β: mi.Spectrum  # its power, times the number of light paths
+    @dataclass
+    class Vertices(base):  # type: ignore[misc, valid-type]
+        """Vertices of light paths: 22 words each, in media 23. Those with a ``depth`` of 0 are only parents."""
+
         density: mi.Float  # with which d was sampled at the parent: infinite by a mirror or alike; 0 at a first vertex
         survival: mi.Float  # the probability to survive Russian roulette at the parent
-        depth: mi.UInt32  # edges from the light; 0 where nothing is gathered: the vertex is only a parent
         parent: mi.UInt32  # its place in the map; of a first vertex, the number of its light path
         t: mi.Float  # the length of the edge from there
         prim_uv: mi.Point2f
         prim_index: mi.UInt32
         shape: mi.ShapePtr
         instance: mi.ShapePtr
-
-        def __len__(self) -> int:
-            return dr.width(self.t)
 
     kind: type = Vertices
     if in_media:
@@ -72,7 +66,6 @@ def vertices_class(variant: str, in_media: bool = False, grids: bool = False, ed
         class VerticesInMedia(kind):  # type: ignore[misc, valid-type]
             """24 words each."""
 
-            medium: mi.MediumPtr  # around it
             channel: mi.UInt32  # the colour by which the light path samples its distances
 
         kind = VerticesInMedia
