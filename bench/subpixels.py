@@ -3,10 +3,10 @@
     python -m bench.subpixels product lens living-room/scene.xml --references FOLDER
 
 The sampler is `primal`, with shared tails where they work. A scene, number of samples and seed is rendered once, with
-as many subpixels as any way needs; fewer are their means. Ways that need more subpixels than there are samples in a
-pixel are left out. Scenes are those of `bench.panel`, by their names there, or as of `bench.seeds`, and so are their
-references. A way of WAYS is the mean of one or more images, by K and by how the features are declared to OIDN; "auto"
-is what `oidn` does with subpixels by default. Each cell has, of each way:
+as many subpixels as any way needs; fewer are their means. Ways that need more subpixels than a pixel has samples are
+skipped. A scene is a name of `bench.panel`, or a file or generated scene as in `bench.seeds`. References are made and
+stored as there. Each of WAYS is the mean of one or more images, given by K and by how OIDN is to use the features.
+"auto" is the default of `oidn` with subpixels. Each cell has, for each way:
 
     seconds  of processors, warmed up
     error    ``bench.tails.steady_error``; FLIP is over the mean of the reference's halves

@@ -136,7 +136,7 @@ def least_norms(
     u, free = solve(b, alpha**2, mean=0.0), [empty(b, channels), empty(b, channels)]
     s, norms, _ = by_rows(start, empty(r, 3, channels), empty(r, 3, 1))
     # The unit of the iteration is the mean residual, so it follows the exposure of the image. Outliers must not set
-    # this unit. Nor may their energy, which can exceed that of all other pixels, decide when to stop.
+    # this unit. Their energy may exceed the energy of all other pixels, so it must not decide when to stop.
     mean = robust_mean(norms)
     limit, stride = 1000 * mean, max(FIRST_STRIDE * mean, float(norms.max()) / 10)
     threshold = mean + stride

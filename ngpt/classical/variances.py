@@ -6,7 +6,7 @@ from them would trust the pixels that saw nothing.
 
 For the primal, such weights darken the image. So its variances are averaged over a neighbourhood.
 
-For differences, such weights only smooth. But few differences hold most of the variance: those of light that no shift
+For differences, such weights only smooth. But most of the variance belongs to a few differences, whose light no shift
 mapping follows. An average over neighbours would pass their variance on to clean differences, and make the noisy ones
 look better than they are. So a difference keeps its own variance if that is large. Otherwise it gets a typical variance
 of its neighbourhood: the fourth power of the mean of fourth roots, which outliers do not dominate.
