@@ -66,7 +66,7 @@ def trace(world: World, random: mi.Sampler, max_depth: int, rr_depth: int, froze
         paths, random = at(paths, lanes), random.at(lanes)
         dr.eval(paths)
         random.schedule_state()
-        photons, place, end = empty_map(kind, dr.width(lanes))
+        photons, place, end = empty_map(kind, dr.width(lanes), VERTICES_PER_PATH)
         paths, numbers, photons = frozen(_walk, world, paths, random, depths, photons, (place + used, end))
         dr.eval(paths, numbers, photons)
         random = type(random)(numbers)
@@ -75,15 +75,16 @@ def trace(world: World, random: mi.Sampler, max_depth: int, rr_depth: int, froze
         yield photons
 
 
-def empty_map(kind: type, paths: int) -> tuple[Any, mi.UInt32, mi.UInt32]:
-    """A map of this kind of vertices for so many light paths, the first place of each path, and the place behind its
-    last.
+def empty_map(kind: type, paths: int, places: int) -> tuple[Any, mi.UInt32, mi.UInt32]:
+    """A map of this kind of vertices with so many places for each light path.
+
+    Returns the map, the first place of each path, and the place behind its last.
     """
-    n = paths * VERTICES_PER_PATH
+    n = paths * places
     photons = kind(*(dr.empty(t, n) for t in get_type_hints(kind).values()))
     photons.depth = dr.zeros(mi.UInt32, n)
-    place = dr.arange(mi.UInt32, paths) * dr.opaque(mi.UInt32, VERTICES_PER_PATH)
-    return photons, place, place + dr.opaque(mi.UInt32, VERTICES_PER_PATH)
+    place = dr.arange(mi.UInt32, paths) * dr.opaque(mi.UInt32, places)
+    return photons, place, place + dr.opaque(mi.UInt32, places)
 
 
 def begun(world: World, random) -> tuple:

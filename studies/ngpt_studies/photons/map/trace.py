@@ -79,7 +79,7 @@ def _maps(world: World, paths: Paths, random, depths: tuple, frozen: Callable, e
         paths, random = at(paths, lanes), random.at(lanes)
         dr.eval(paths)
         random.schedule_state()
-        photons, place, end = empty_map(kind, dr.width(lanes))
+        photons, place, end = empty_map(kind, dr.width(lanes), VERTICES_PER_PATH)
         photons.t = dr.zeros(mi.Float, len(photons))
         if edges:
             photons.bounce = dr.zeros(mi.UInt32, len(photons))
