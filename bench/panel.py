@@ -39,6 +39,7 @@ from ngpt.evaluation.references import Reference
 from ngpt.measure.averages import geometric_mean
 from ngpt.measure.flip import flip
 from ngpt.stack import GradientStack
+from ngpt.subpixels import FEWEST
 from ngpt.system.writing import markdown_table
 
 ROOT = Path(__file__).parents[1]
@@ -123,7 +124,7 @@ def main() -> int:
     worse = [each for each in judged if each.worse]
     for each in worse:
         limit = f"limit {verdict.LIMITS[each.value]:g}, {verdict.DEVIATIONS:g} deviations {each.reach:.2f}"
-        print(f"worse: {', '.join(each.key)}: {each.value} {each.ratio:.3f} times that of before ({limit})")
+        print(f"worse: {', '.join(each.key)}: {each.value} {each.ratio:.3f} times as large as before ({limit})")
     print(f"{len(worse)} of {len(judged)} ratios are worse beyond noise")
     return 1 if worse else 0
 
@@ -157,9 +158,11 @@ def cells_of(name: str, loaded: Any, reference: Reference, seeds: Sequence[int])
     """The cells of a scene, with error, FLIP and seconds by seed."""
     clean = clean_image(reference)
     for sampler, methods in METHODS.items():
-        stack, _ = render(loaded, sampler, WARM_SPP, 0)
-        for method in methods:
-            ngpt.reconstruct(stack, method)
+        # The default has subpixels, and so other kernels, from FEWEST samples on.
+        for few in (WARM_SPP, FEWEST):
+            stack, _ = render(loaded, sampler, few, 0)
+            for method in methods:
+                ngpt.reconstruct(stack, method)
     cells = []
     for spp in SPP:
         by_pipeline: dict[str, dict[str, Any]] = {pipeline: {} for pipeline in PIPELINES}
@@ -247,7 +250,7 @@ def over_best(of: dict[verdict.Key, dict[str, Any]], scene: str, spp: int, equal
 
 
 def ratio_table(judged: list[verdict.Judged]) -> list[str]:
-    """Lines: error and FLIP over those of before; what is worse beyond noise is bold."""
+    """Lines of a table of ratios to the earlier error and FLIP. Ratios that are worse beyond noise are bold."""
     shown: dict[tuple[str, str], dict[str, list[str]]] = {}
     for each in judged:
         scene, spp, pipeline = each.key

@@ -4,14 +4,15 @@
 
 A scene is rendered by each of RENDERS:
 
-    default      what `ngpt render` does: sampler, subpixels and method by default
+    default      what `ngpt render -o image` does: sampler, features, subpixels and method by default
     ours         `primal` with whole paths
     mitsuba      Mitsuba's own renderer: the scene's integrator, box filter, `independent` points, and its `albedo` and
                  `sh_normal`; also at twice the size with a quarter of the samples per pixel
     multijitter  the same with Mitsuba's best points
 
 OIDN denoises the renders of rivals in each of the WAYS: at K times the size, with features that are declared as
-prefiltered (it denoises them first), clean or noisy. An image at twice the size is then scaled down. Each cell has, by
+prefiltered (it denoises them first), clean or noisy. An image at twice the size is then scaled down. "1 and 2" is what
+ngpt does with subpixels (``ngpt.denoisers.oidn.of_both``): the mean of an image of each size. Each cell has, by
 way:
 
     seconds  of processors, of the render and of OIDN, both warmed up
@@ -25,7 +26,7 @@ references are as of `bench.seeds`. Cells that the file has are not measured aga
 import argparse
 import gc
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,6 +50,7 @@ from bench.tails import (
 from ngpt.evaluation.references import Reference
 from ngpt.measure.averages import geometric_mean
 from ngpt.measure.metrics import scores
+from ngpt.stack import GradientStack
 from ngpt.subpixels import FEWEST, means
 
 RENDERS = ("default", "ours", "mitsuba", "multijitter")
@@ -58,13 +60,18 @@ WAYS = {
     "2 noisy": (2, "noisy"),
     "2 clean": (2, "clean"),
     "2 prefiltered": (2, "prefiltered"),
+    "1 and 2": (2, "auto"),
 }
+OWN = "1 and 2"
+KNOWN = tuple(way for way in WAYS if way != OWN)  # what people can do without ngpt
 # Name -> renders and ways that a rival may choose from
 RIVALS = {
     "Mitsuba + OIDN": (("mitsuba",), ("1 prefiltered",)),
-    "Mitsuba + OIDN, K = 1 or 2": (("mitsuba",), tuple(WAYS)),
-    "its best points, K = 1 or 2": (("mitsuba", "multijitter"), tuple(WAYS)),
-    "OIDN on our samples, K = 1 or 2": (("ours",), tuple(WAYS)),
+    "Mitsuba + OIDN, K = 1 or 2": (("mitsuba",), KNOWN),
+    "its best points, K = 1 or 2": (("mitsuba", "multijitter"), KNOWN),
+    "OIDN on our samples, K = 1 or 2": (("ours",), KNOWN),
+    "Mitsuba's best points, mean of both K": (("mitsuba", "multijitter"), (OWN,)),
+    "our samples, mean of both K": (("ours",), (OWN,)),
 }
 POINTS = {"mitsuba": "independent", "multijitter": "multijitter"}
 CELL = ("scene", "size", "render", "spp", "seed")
@@ -87,6 +94,8 @@ def main() -> None:
     parser.add_argument("--size", default="320x180")
     parser.add_argument("--spp", type=int, nargs="+", default=[4, 16, 64])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--renders", nargs="+", default=list(RENDERS), choices=RENDERS)
+    parser.add_argument("--ways", nargs="+", default=list(WAYS), choices=list(WAYS))
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/rivals.json"))
     args = parser.parse_args()
     check_references(parser, args)
@@ -111,9 +120,9 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterato
     with opened(scene) as (name, file):
         reference = reference_of(load_scene(file, size), name, args)
         clean = clean_image(reference)
-        for render in RENDERS:
+        for render in args.renders:
             gc.collect()  # a kernel knows the shapes of all scenes in memory
-            make = by_default(file, size) if render == "default" else by_ways(images_of(file, size, render))
+            make = by_default(file, size) if render == "default" else by_ways(images_of(file, size, render), args.ways)
             warm = False
             for spp in args.spp:
                 for seed in args.seeds:
@@ -138,13 +147,13 @@ def judged(image: np.ndarray, seconds: float, reference: Reference, clean: np.nd
 
 def by_default(file: str, size: tuple[int, int]) -> Callable[[int, int], Made]:
     load_scene, render_stack = renderer()
-    from data_gen.choosing.plans import plan_sampler
+    from data_gen.choosing.plans import plan_sampler, without_features
 
     scene = load_scene(file, size)
 
     def make(spp: int, seed: int) -> Made:
         start = processor_seconds()
-        plan = plan_sampler(scene, spp, None)
+        plan = without_features(scene, plan_sampler(scene, spp, None))
         how = {"unbiased": False, "subpixels": "auto", **plan.options}
         image = ngpt.reconstruct(render_stack(scene, spp, seed, plan.sampler, **how), plan.method or "auto").image
         return {"default": (image, processor_seconds() - start)}
@@ -152,18 +161,22 @@ def by_default(file: str, size: tuple[int, int]) -> Callable[[int, int], Made]:
     return make
 
 
-def by_ways(images: Callable[[int, int, int], Images]) -> Callable[[int, int], Made]:
+def by_ways(images: Callable[[int, int, int], Images], ways: Sequence[str]) -> Callable[[int, int], Made]:
     def make(spp: int, seed: int) -> Made:
         rendered, made = {}, {}
-        for k in sorted({k for k, _ in WAYS.values()}):
+        for k in sorted({WAYS[way][0] for way in ways}):
             start = processor_seconds()
             rendered[k] = images(spp, seed, k), processor_seconds() - start
-        for way, (k, auxiliary) in WAYS.items():
+        for way in ways:
+            k, auxiliary = WAYS[way]
             given, seconds = rendered[k]
             start = processor_seconds()
-            features = {"albedo": given.albedo, "normal": given.normal}
-            image = ngpt.denoise(given.primal, "oidn", auxiliary=auxiliary, **features)
-            image = means(image, k) if k > 1 else image
+            layers = given._asdict()
+            if k > 1:
+                stack = GradientStack({name: means(layer, k) for name, layer in layers.items()}, fine=layers)
+            else:
+                stack = GradientStack(layers)
+            image = ngpt.reconstruct(stack, "oidn", auxiliary=auxiliary).image
             made[way] = image, seconds + processor_seconds() - start
         return made
 

@@ -1,15 +1,15 @@
-"""The value of subpixels: errors and seconds of denoisers on K x K subpixels of each pixel, relative to pixels.
+"""The value of subpixels: errors and seconds of OIDN on K x K subpixels of each pixel, relative to pixels.
 
-    python -m bench.subpixels living-room/scene.xml generator:20261211:partition --references FOLDER
+    python -m bench.subpixels product lens living-room/scene.xml --references FOLDER
 
 The sampler is `primal`, with shared tails where they work. A scene, number of samples and seed is rendered once, with
-as many subpixels as any way needs; fewer are their means. Scenes and references are as of `bench.seeds`. Ways to
-denoise are in WAYS. Each cell has, of each way:
+as many subpixels as any way needs; fewer are their means. Ways that need more subpixels than a pixel has samples are
+skipped. A scene is a name of `bench.panel`, or a file or generated scene as in `bench.seeds`. References are made and
+stored as there. Each of WAYS is the mean of one or more images, given by K and by how OIDN is to use the features.
+"auto" is the default of `oidn` with subpixels. Each cell has, for each way:
 
     seconds  of processors, warmed up
-    error    relMSE by two halves of a reference, without the worst 0.1 % of the pixels; FLIP is over their mean
-
-and the noise of features, and whether it is small compared to the image's (``ngpt.denoisers.clean``).
+    error    ``bench.tails.steady_error``; FLIP is over the mean of the reference's halves
 
 The table shows the ratio of each value to the value of ``BASE``: the median over seeds.
 """
@@ -17,33 +17,34 @@ The table shows the ratio of each value to the value of ``BASE``: the median ove
 import argparse
 import gc
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import ngpt
 from bench.common import metadata, renderer, save
+from bench.panel import CASES
 from bench.seeds import opened
-from bench.tails import add_references, check_references, processor_seconds, reference_of
-from ngpt.denoisers.clean import features_are_clean
-from ngpt.evaluation.references import Reference
-from ngpt.layers import FEATURE_NOISE
+from bench.tails import add_references, check_references, clean_image, processor_seconds, reference_of, steady_error
 from ngpt.measure.averages import geometric_mean, median
-from ngpt.measure.metrics import scores
-from ngpt.repair import repair
+from ngpt.measure.flip import flip
 from ngpt.stack import GradientStack
 from ngpt.subpixels import means, subpixels
 
-# Name -> method, K, and how features are declared to OIDN; "" leaves that to the method
-WAYS = {
-    "1 prefiltered": ("oidn", 1, "prefiltered"),
-    "1 noisy": ("oidn", 1, "noisy"),
-    "2 noisy": ("oidn", 2, "noisy"),
-    "2 clean": ("oidn", 2, "clean"),
-    "2 prefiltered": ("oidn", 2, "prefiltered"),
-    "4 noisy": ("oidn", 4, "noisy"),
-    "1 ngpt-primal": ("ngpt-primal", 1, ""),
-    "2 ngpt-primal": ("ngpt-primal", 2, ""),
+# Name -> the images whose mean it is: K, and how features are declared
+WAYS: dict[str, tuple[tuple[int, str], ...]] = {
+    "1 prefiltered": ((1, "prefiltered"),),
+    "1 noisy": ((1, "noisy"),),
+    "2 noisy": ((2, "noisy"),),
+    "2 clean": ((2, "clean"),),
+    "2 prefiltered": ((2, "prefiltered"),),
+    "1 and 2 clean": ((1, "prefiltered"), (2, "clean")),
+    "1 and 2 prefiltered": ((1, "prefiltered"), (2, "prefiltered")),
+    "2 auto": ((2, "auto"),),
+    "4 auto": ((4, "auto"),),
 }
 BASE = "1 prefiltered"
 CELL = ("scene", "size", "spp", "seed")
@@ -53,8 +54,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="none: only the table")
     add_references(parser)
-    parser.add_argument("--size", default="320x180")
-    parser.add_argument("--spp", type=int, nargs="+", default=[4, 8, 16, 32, 64, 128])
+    parser.add_argument("--size", default="192x108")
+    parser.add_argument("--spp", type=int, nargs="+", default=[8, 16, 64, 256])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--ways", nargs="+", default=list(WAYS), choices=list(WAYS))
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/subpixels.json"))
@@ -64,81 +65,77 @@ def main() -> None:
     result = {"benchmark": "subpixels", "metadata": metadata("mitsuba", "drjit", "mitsuba-oidn"), "cells": cells}
     known = {tuple(cell[name] for name in CELL) for cell in cells}
     for scene in args.scenes:
-        with opened(scene) as (name, file):
-            for cell in measured(name, file, args, known):
-                cells.append(cell)
-                save(args.output, result)
-                print(*(cell[key] for key in CELL), f"{cell['seconds']:.2f} s", flush=True)
+        for cell in measured(scene, args, known):
+            cells.append(cell)
+            save(args.output, result)
+            print(*(cell[key] for key in CELL), f"{cell['seconds']:.2f} s", flush=True)
     show(cells)
 
 
-def measured(name: str, file: str, args: argparse.Namespace, known: set[tuple]):
+def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterator[dict[str, Any]]:
     """The cells of a scene that are not ``known``, one after the other."""
     load_scene, render_stack = renderer()
     gc.collect()  # a kernel knows the shapes of all scenes in memory
-    loaded = load_scene(file, tuple(map(int, args.size.split("x"))))
+    with opened(CASES[scene].scene if scene in CASES else scene) as (name, file):
+        name = scene if scene in CASES else name
+        loaded = load_scene(file, tuple(map(int, args.size.split("x"))))
     reference = reference_of(loaded, name, args)
-    warm, most = False, max(WAYS[way][1] for way in args.ways)
+    clean, warm = clean_image(reference), False
     for spp in args.spp:
+        able = [way for way in args.ways if max(k for k, _ in WAYS[way]) ** 2 <= spp]
+        most = max(k for way in able for k, _ in WAYS[way])
         for seed in args.seeds:
             place = (name, args.size, spp, seed)
             if place in known:
                 continue
+            if not warm:
+                warm = bool([render_stack(loaded, spp, 0, "primal", unbiased=False, subpixels=k) for k in (1, most)])
             start = processor_seconds()
             stack = render_stack(loaded, spp, seed, "primal", unbiased=False, subpixels=most)
             seconds = processor_seconds() - start
-            if not warm:
-                warm = bool([judged(stack, way, reference) for way in args.ways])
-            ways = {way: judged(stack, way, reference) for way in args.ways}
-            noise = {"feature noise": stack.number(FEATURE_NOISE), "clean": features_are_clean(repair(stack))}
-            yield dict(zip(CELL, place, strict=True)) | {"seconds": seconds, "ways": ways} | noise
+            images = {part: denoised(stack, *part) for part in {part for way in able for part in WAYS[way]}}
+            ways = {}
+            for way in able:
+                each = [images[part] for part in WAYS[way]]
+                image = np.mean([one for one, _ in each], axis=0, dtype=np.float32)
+                ways[way] = {
+                    "seconds": sum(taken for _, taken in each),
+                    "error": steady_error(image, reference, clean),
+                    "FLIP": flip(image, reference.mean)[0],
+                }
+            yield dict(zip(CELL, place, strict=True)) | {"seconds": seconds, "ways": ways}
 
 
-def with_subpixels(stack: GradientStack, k: int) -> GradientStack:
-    """The stack with the means of its subpixels, so that K is ``k``."""
-    fine = (
-        {name: means(layer, subpixels(stack.fine, stack.width) // k) for name, layer in stack.fine.items()}
-        if k > 1
-        else {}
-    )
-    return replace(stack, fine=fine)
-
-
-def judged(stack: GradientStack, way: str, reference: Reference) -> dict[str, float]:
-    method, k, auxiliary = WAYS[way]
-    options: dict[str, Any] = {"auxiliary": auxiliary} if auxiliary else {}
-    given = with_subpixels(stack, k)
+def denoised(stack: GradientStack, k: int, auxiliary: str) -> tuple[np.ndarray, float]:
+    """OIDN's image of K x K subpixels, and its seconds at the second call."""
+    has = subpixels(stack.fine, stack.width)
+    fine = {name: means(layer, has // k) for name, layer in stack.fine.items()} if k > 1 else {}
+    given = replace(stack, fine=fine)
+    ngpt.reconstruct(given, "oidn", auxiliary=auxiliary)
     start = processor_seconds()
-    image = ngpt.reconstruct(given, method, **options).image
-    seconds = processor_seconds() - start
-    found = scores(["relMSE trimmed", "FLIP"], image, *reference.images)
-    return {"seconds": seconds, "error": found["relMSE trimmed"], "FLIP": found["FLIP"]}
+    image = ngpt.reconstruct(given, "oidn", auxiliary=auxiliary).image
+    return image, processor_seconds() - start
 
 
 def show(cells: list[dict]) -> None:
-    """Tables of ratios: a line for each size, number of samples and way, with a column for each scene."""
-    scenes = list(dict.fromkeys(cell["scene"] for cell in cells))
-    sizes = sorted({(cell["size"], cell["spp"]) for cell in cells}, key=lambda each: (each[0], each[1]))
-    print("| size, spp | way | " + " | ".join(scenes) + " | mean | FLIP | seconds |")
-    print("|---|---|" + "--:|" * (len(scenes) + 3))
-    for size, spp in sizes:
-        of = {
-            scene: [c["ways"] for c in cells if (c["scene"], c["size"], c["spp"]) == (scene, size, spp)]
-            for scene in scenes
-        }
-        for way in WAYS:
-            ratios = {
+    """A line for each size, number of samples and way: ratios of errors by scene, and means of all values."""
+    for size, spp in sorted({(cell["size"], cell["spp"]) for cell in cells}):
+        here = [cell for cell in cells if (cell["size"], cell["spp"]) == (size, spp)]
+        scenes = list(dict.fromkeys(cell["scene"] for cell in here))
+        print(f"\n{size}, {spp} spp: {', '.join(scenes)}\n")
+        print("| way | error: mean | worst | FLIP: mean | worst | seconds | errors |\n|---|--:|--:|--:|--:|--:|---|")
+        for way in (way for way in WAYS if way != BASE and way in here[0]["ways"]):
+            by = {
                 name: [
-                    median([ways[way][name] / ways[BASE][name] for ways in of[scene] if way in ways])
+                    median([c["ways"][way][name] / c["ways"][BASE][name] for c in here if c["scene"] == scene])
                     for scene in scenes
                 ]
                 for name in ("error", "FLIP", "seconds")
             }
-            if way == BASE or not any(ratios["error"]):
-                continue
-            each = " | ".join("-" if r is None else f"{r:.2f}" for r in ratios["error"])
-            ends = " | ".join(f"{geometric_mean([r for r in ratios[name] if r]):.2f}" for name in ratios)
-            print(f"| {size}, {spp} | {way} | {each} | {ends} |")
+            ends = [geometric_mean(by["error"]), max(by["error"]), geometric_mean(by["FLIP"]), max(by["FLIP"])]
+            ends += [geometric_mean(by["seconds"])]
+            each = " ".join(f"{ratio:.2f}" for ratio in by["error"])
+            print(f"| {way} | " + " | ".join(f"{end:.2f}" for end in ends) + f" | {each} |")
 
 
 if __name__ == "__main__":

@@ -13,10 +13,10 @@ Samplers are `primal`, `gpt`, and `mitsuba`: `primal` with Mitsuba's own points 
     energy     mean of the image over the mean of the reference
     auto       the method that the stack gets by default, in cells of the sampler that `ngpt render` takes by default
 
-References are NAME-WxH-a.exr and -b.exr of the folder; missing ones are rendered there, without shared tails. At equal
-whole time, the errors of a cell with shared tails are divided by those of its own sampler and method with tails=paths;
-for the marks see ``bench.curves``. W, C and W/C of gradients are against `primal` with the same tails. Cells that the
-file has are not measured again. Values are medians over seeds, means over scenes geometric.
+References are NAME-WxH-a.exr and -b.exr of the folder; missing ones are rendered there, without shared tails. A cell
+with shared tails is compared at equal whole time: its error is divided by the error of the same sampler and method with
+tails=paths. ``bench.curves`` explains the marks. W, C and W/C of gradients are against `primal` with the same tails.
+Cells that the file has are not measured again. Values are medians over seeds, means over scenes geometric.
 """
 
 import argparse

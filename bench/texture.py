@@ -3,9 +3,9 @@
     python -m bench.texture --cache out/texture
 
 A point lamp shines through a ball of glass and into a ring of gold, onto a floor with checks, or with a cloudy texture.
-`vcm` renders it, and OIDN denoises all light except that of photons. It prints the error with the light of photons as
-gathered (`ngpt.denoisers.caustic.denoised`), and divided by the albedo (`of_photons`). The reference has two halves of
-other seeds, with a smaller radius. Renders are kept in the cache.
+`vcm` renders the scene. OIDN denoises the light that is not from photons. The benchmark prints two errors: with
+photons' light as gathered (`ngpt.denoisers.caustic.denoised`), and divided by the albedo (`of_photons`). The reference
+has two halves of other seeds, with a smaller radius. Renders are kept in the cache.
 """
 
 from __future__ import annotations

@@ -117,7 +117,7 @@ def spreads(cells: Sequence[dict[str, Any]], value: str) -> dict[Key, float]:
             )
         variance = float(np.var(np.log(list(cell[value].values())), ddof=1))
         own[key] = math.sqrt(variance)
-        # Of Gaussian noise, the median of variances over (seeds - 1) is that of chi squared.
+        # With Gaussian noise, variance * (seeds - 1) follows a chi-squared distribution, so this divides by its median.
         others.setdefault(key[1:], []).append(variance * (seeds - 1) / float(chdtri(seeds - 1, 0.5)))
     usual = {place: math.sqrt(np.median(variances)) for place, variances in others.items()}
     return {key: max(each, usual[key[1:]]) for key, each in own.items()}

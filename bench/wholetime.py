@@ -1,4 +1,4 @@
-"""Errors divided by those of rivals after the same whole time, which is rendering plus reconstruction.
+"""Ratios of a method's error to a rival's error after the same whole time: rendering plus reconstruction.
 
 A rival is a family of columns, the settings of one denoiser on the samples of one renderer (``against`` in the
 configuration). Each setting has a curve of errors over whole seconds (``bench.curves``). At each time the rival gets

@@ -17,8 +17,8 @@ from data_gen.budget import Progress, Watch
 from data_gen.film import GradientFilm
 from data_gen.passes import render_passes, rounds_of
 from data_gen.request import RenderRequest, asked
-from data_gen.samplers import SAMPLERS, described, find
-from data_gen.samplers.registry import Entry, Sampler, own
+from data_gen.samplers import described, find
+from data_gen.samplers.registry import Entry, own
 from data_gen.samplers.reused import Made
 from data_gen.samplers.sharing import sharing_of
 from data_gen.scenes.cameras import place_of
@@ -31,7 +31,7 @@ from ngpt.layers import GATHERED
 from ngpt.merging import UNFINISHED
 from ngpt.shared import CUT, TAILS
 from ngpt.stack import GradientStack
-from ngpt.subpixels import CHOICES, SUBPIXELS, best
+from ngpt.subpixels import SUBPIXELS, best
 from ngpt.version import __version__
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
@@ -118,7 +118,7 @@ def render(
     adaptive = Adaptive(request.error, request.method or "auto") if request.shares else None
     if adaptive is not None:
         check_adaptive(adaptive, entry, settings, spp)
-    kept = subpixels_of(entry, request.subpixels, spp)
+    kept = entry.subpixels(request.subpixels, spp)
     _LOG.info("sampler %s, options %s", sampler, options_as_attribute(entry, settings) or "as by default")
     start, begun = time.perf_counter(), clock()
     how_made = {"diagnostics": True} if request.diagnostics and entry.diagnoses else {}
@@ -207,19 +207,3 @@ def stack_of(
     }
     stack = film.stack(attributes | more, place_of(sensor))
     return with_channels(stack, film.diagnose()) if diagnostics else stack
-
-
-def subpixels_of(entry: Sampler, asked: int | str, spp: int | None) -> int:
-    """K of the K x K subpixels that a render keeps. Raises WrongUse if it cannot keep the requested ones."""
-    if asked != "auto" and asked not in CHOICES:
-        raise WrongUse(f"{asked} subpixels: choose one of {', '.join(map(str, CHOICES))}, auto")
-    if not entry.batch:
-        # With gradients, networks combine images that they were trained to find without subpixels.
-        return int(asked) if asked != "auto" else 1 if entry.gradients else best(spp)
-    if asked in ("auto", 1):
-        return 1
-    able = ", ".join(name for name, other in SAMPLERS.items() if not other.batch)
-    raise WrongUse(
-        f"sampler '{entry.name}' puts light on any pixel and has no subpixels: leave --subpixels out, or name one of: "
-        f"{able}"
-    )

@@ -22,6 +22,7 @@ from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, check_options, find
 from ngpt.errors import NgptError, WrongUse
 from ngpt.merging import REQUEST
 from ngpt.options import as_text
+from ngpt.subpixels import choice
 
 DEFAULT_SPP = 32
 # Parts of a variant's name for its backend and precision, which do not change the light
@@ -107,6 +108,7 @@ class RenderRequest:
         self._set("scene", str(self.scene) if isinstance(self.scene, Path) else self.scene)
         self._set("parameters", dict(self.parameters or {}))
         self._set("options", dict(self.options or {}))
+        self._set("subpixels", choice(self.subpixels))
         # A method that denoises a shot over time may need gradients.
         self._set("gradients", self.gradients or bool(self.frames))
         remembers = FRAME_SAMPLERS.get(self.sampler) if self.frames else None

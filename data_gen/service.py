@@ -12,6 +12,7 @@ from data_gen.code import code as code
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, by_standing, find
 from ngpt.renderer import Options
 from ngpt.stack import GradientStack
+from ngpt.subpixels import choice
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -35,8 +36,11 @@ def render(scene: mi.Scene, options: Options, spp: int | None, seed: int, *, sec
 
 
 def warm_up(scene: mi.Scene, options: Options) -> GradientStack:
-    # Kernels do not depend on the number of samples.
-    return render(scene, options, 1, 0, seconds=None)
+    stack = render(scene, options, 1, 0, seconds=None)
+    # Kernels depend on the number of samples only where this decides whether there are subpixels.
+    if options.get("subpixels") == "auto" and (k := find(options["sampler"]).subpixels("auto", None)) > 1:
+        render(scene, {**options, "subpixels": k}, 1, 0, seconds=None)
+    return stack
 
 
 def timed(scene: mi.Scene, options: Options, spp: int, seed: int, clock: str) -> tuple[GradientStack, float]:
@@ -69,8 +73,11 @@ def gradients(sampler: str) -> bool:
 
 
 def unusual(sampler: str, options: Options) -> str:
-    entry = find(sampler)
-    return entry.unusual(entry.settings(options))
+    entry, own = find(sampler), dict(options)
+    kept = choice(own.pop("subpixels", 1))
+    entry.subpixels(kept, None)  # raises WrongUse where it cannot keep them
+    given = entry.unusual(entry.settings(own))
+    return ", ".join(filter(None, (given, "" if kept == 1 else f"subpixels={kept}")))
 
 
 def scene_code(name: str) -> str:

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from ngpt.stack import GradientStack
     from ngpt.system.limits import limit_threads
 
-# Official builds of ONNX Runtime send telemetry by themselves (SECURITY.md). It reads this variable once, when it is
-# loaded, and others may load it first, such as PyTorch's exporters.
+# Official builds of ONNX Runtime send telemetry by themselves (SECURITY.md). ONNX Runtime reads this variable once,
+# when it is loaded. Other code, such as PyTorch's exporters, may load it first.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 # Quiet, unless a program asks: logging.getLogger("ngpt").setLevel("INFO"), with a handler of its own.
@@ -55,8 +55,8 @@ __all__ = [
     "write",
 ]
 
-# Imported on first use. So commands start, and handle interrupts, before NumPy and SciPy are loaded, which importing
-# this package would do.
+# Imported on first use, so that importing this package does not load NumPy and SciPy. Commands then start, and handle
+# interrupts, at once.
 _HOMES = {"GradientStack": "stack", "NgptError": "errors", "merge": "merging"}
 _HOMES |= dict.fromkeys(("Denoiser", "denoise"), "api.arrays")
 _HOMES |= dict.fromkeys(("read", "read_image", "read_views", "write"), "io.exr")

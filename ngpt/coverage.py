@@ -1,11 +1,11 @@
 """Pixels that are empty: alpha is 0 there and the input has no light there, so a result has none either.
 
-Light is premultiplied by alpha, so light at alpha 0 is legal: fire and glare add to what is behind them. It stays, and
-so do the dark pixels among it.
+Light is premultiplied by alpha, so light at alpha 0 is legal: fire and glare add to what is behind them. Such light
+stays, and so do dark pixels among it.
 
-Light that a method spread into empty pixels is missing in the covered ones: where hair covers a tenth of each pixel, a
-method evens out what few samples found. So this light is given back to the covered pixels around, in proportion to
-their alpha, up to the light that the input has there.
+Light that a method spreads into empty pixels is missing in the covered ones. Hair, for example, may cover a tenth of
+each pixel, so that few samples hit it and a method blurs it. The light in empty pixels is therefore given back to the
+covered pixels around, in proportion to their alpha, up to the light that the input has there.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ _WINDOW = 2.0
 
 
 def empty_pixels(stack: GradientStack) -> np.ndarray:
-    """(H, W) booleans; none where most of the light is at alpha 0: such an alpha is not coverage."""
+    """(H, W) booleans. If most of the light is at alpha 0, alpha is not coverage, and no pixel counts as empty."""
     if "alpha" not in stack:
         return np.zeros((stack.height, stack.width), bool)
     uncovered = stack["alpha"][..., 0] == 0

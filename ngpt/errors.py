@@ -28,7 +28,10 @@ class WrongUse(NgptError):
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """The text before a list of the known names if a word is unknown: a question, or ""."""
+    """The question "did you mean '...'? " if an unknown ``word`` is near one of the ``known`` names, else "".
+
+    Messages put it before the list of the known names.
+    """
     from difflib import get_close_matches  # only for those who mistype
 
     near = get_close_matches(word.lower(), names := {name.lower(): name for name in known}, 1)
@@ -36,7 +39,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 class Interrupted(KeyboardInterrupt):
-    """What Ctrl-C and SIGTERM raise in a command.
+    """The exception that Ctrl-C and SIGTERM raise in a command.
 
     Once a plain KeyboardInterrupt has passed through code compiled from a string, such as that of dataclasses and named
     tuples, Python 3.11 ends itself by SIGINT, whatever exit status it is given.
@@ -44,10 +47,10 @@ class Interrupted(KeyboardInterrupt):
 
 
 def stop_if_interrupted(error: BaseException) -> None:
-    """Raises KeyboardInterrupt if ``error`` comes from one: from Ctrl-C within a library that wraps exceptions.
+    """Raises KeyboardInterrupt if ``error`` was caused by one, as after Ctrl-C in a library that wraps exceptions.
 
-    Dr.Jit's loops and recordings turn it into a RuntimeError with the cause; Mitsuba's plugins into one with only a
-    text.
+    Dr.Jit's loops and recordings turn a KeyboardInterrupt into a RuntimeError that holds its cause. Mitsuba's plugins
+    turn it into a RuntimeError with only a text.
     """
     cause: BaseException | None = error
     while cause is not None:

@@ -55,10 +55,10 @@ LAYERS: dict[str, Layer] = {
 # The differences of the contract: layer -> offset (x, y, frames) from a pixel to the one it is compared with; y down.
 DIFFERENCES: dict[str, tuple[int, int, int]] = {"dx": (1, 0, 0), "dy": (0, 1, 0)}
 
-# Header attribute: the variance of a pixel's mean of ``albedo`` or ``normal``, the mean over pixels and channels;
-# whichever is larger
+# Header attribute: the variance of the pixel mean of ``albedo`` or ``normal``, whichever is larger, averaged over
+# pixels and channels
 FEATURE_NOISE = "ngpt:featureNoise"
 
-# Header attribute: 1 where photons, gathered within a radius, found the light in ``caustic``. Neighbouring pixels
-# gather the same photons, so they share its noise, which OIDN takes for detail.
+# Header attribute: 1 if photons, gathered within a radius, found the light in ``caustic``. Neighbouring pixels gather
+# the same photons, so they share its noise, which OIDN takes for detail.
 GATHERED = "ngpt:gathered"

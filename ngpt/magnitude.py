@@ -24,7 +24,7 @@ ORDINARY = 20
 _LARGEST = 62
 # For typical light below 2^-_DIM, variances of 0 say nothing: a millionth of its square is below 2^-148.
 _DIM = 64
-# How many numbers are sampled for the typical light; their distance is no multiple of 3, so all colours occur.
+# The number of values sampled for the typical light. Their distance is no multiple of 3, so all colours occur.
 _LOOKED_AT = 1 << 16
 
 # Sums of squares of light beyond this leave single precision.
@@ -37,8 +37,8 @@ VARIANCES = tuple(name for name in LIGHT if name.endswith("_var"))
 def magnitude(stack: GradientStack) -> int:
     """The power of two of the typical light of a stack; 0 where that is ordinary, and where there is no light.
 
-    The typical light is the median of the primal's finite values other than 0. It is larger where the squares of the
-    largest values would not be finite otherwise.
+    The typical light is the median of the primal's finite values other than 0. The result is raised if the squares of
+    the largest values would otherwise not be finite.
     """
     primal = stack["primal"]
     flat = primal.reshape(-1)

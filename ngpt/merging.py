@@ -7,8 +7,8 @@ With n_i samples per pixel, means m_i and variances of the mean v_i, the stack o
 
 [Chan, Golub, LeVeque 1983, "Algorithms for computing the sample variance", eq. 2.1]
 
-Its expectation is the variance of m for any weights n_i that do not depend on the samples, whatever the v_i. So it
-holds for differences too, whose two directions may have different numbers of samples.
+The expectation of this variance is the variance of m, for any v_i and any weights n_i that do not depend on the
+samples. So the formula also holds for differences, whose two directions may have different numbers of samples.
 
 Stacks in different places of one picture are tiles: each counts in its own pixels.
 """
@@ -41,8 +41,8 @@ UNFINISHED = "ngpt:unfinished"
 REQUEST = "ngpt:request"
 # Attribute: the sampler's options that are not defaults, with commas between
 OPTIONS = "ngpt:samplerOptions"
-# The attribute among these that says how a path finds light behind its first steps: in a cache of other paths' light,
-# or by itself, which is the default where the attribute is missing.
+# The option among these that says how a path finds light after its first steps: in a cache of other paths' light, or by
+# itself, which is the default.
 SHARED_TAILS, WHOLE_PATHS = "tails=shared", "tails=paths"
 # The most samples of a pixel: headers count them in 32 bits.
 _MOST = 2.0**31
@@ -63,22 +63,21 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     pixel has no variances and needs none. ``diagnostics.*`` channels are averaged as layers are. So are subpixels, if
     all stacks have the same number of them; else they are left out with a warning.
 
-    Tiles (``GradientStack.place``) give the smallest rectangle that holds them all, and must fill it. They may overlap;
-    those that do not may have the same seed. The difference from a tile's last column or row to the pixel beyond it was
-    not sampled: it is NaN if no other tile has it, and counts nothing in a reconstruction.
+    Tiles (``GradientStack.place``) are merged into the smallest rectangle that holds them all, and must fill it. They
+    may overlap. Tiles that do not overlap may have the same seed. The difference from a tile's last column or row to
+    the pixel beyond it was not sampled: it is NaN if no other tile has it, and counts nothing in a reconstruction.
 
-    The result's ``ngpt:seed`` lists all seeds, ``ngpt:spp`` is the mean over pixels of the samples that they have,
-    ``ngpt:seconds`` and ``ngpt:discarded`` are sums, ``ngpt:samplerOptions`` has the options of all stacks, and also
-    tails=paths where only some of them have tails=shared, ``ngpt:tails`` says what it says in each stack,
-    ``ngpt:tailsCut`` is the mean over all samples, ``ngpt:gathered`` is 1 where any stack has it, ``ngpt:featureNoise``
-    is the noise of the merged features where all stacks have it, ``ngpt:unfinished`` and ``ngpt:request`` are left out,
-    and all other attributes come from the first stack.
+    The result's ``ngpt:seed`` lists all seeds. ``ngpt:spp`` is the number of samples, averaged over pixels.
+    ``ngpt:seconds`` and ``ngpt:discarded`` are sums. ``ngpt:samplerOptions`` has the options of all stacks, and also
+    tails=paths if only some of them have tails=shared. ``ngpt:tails`` has the sentences of all stacks.
+    ``ngpt:tailsCut`` is the mean over all samples. ``ngpt:gathered`` is 1 if any stack has it. ``ngpt:featureNoise`` is
+    the noise of the merged features if all stacks have it. ``ngpt:unfinished`` and ``ngpt:request`` are left out. All
+    other attributes come from the first stack.
 
-    Raises NgptError for fewer than two stacks, stacks that differ in layers or
-    sampler, or are of pictures of different size, tiles that leave pixels out, a seed that occurs twice in one place,
-    missing ``ngpt:spp`` or ``ngpt:seed``, ``samples`` that are negative or not finite, ``ngpt:seconds``,
-    ``ngpt:discarded``, ``ngpt:featureNoise`` or ``ngpt:tailsCut`` that are no numbers, results of a reconstruction, and
-    channels of unknown meaning.
+    Raises NgptError for fewer than two stacks, stacks that differ in layers, sampler or size of the picture, tiles that
+    leave pixels out, a seed that occurs twice in one place, missing ``ngpt:spp`` or ``ngpt:seed``, ``samples`` that are
+    negative or not finite, ``ngpt:seconds``, ``ngpt:discarded``, ``ngpt:featureNoise`` or ``ngpt:tailsCut`` that are no
+    numbers, results of a reconstruction, and channels of unknown meaning.
     """
     if len(stacks) < 2:
         raise NgptError(f"merging needs at least two stacks, and got {len(stacks)}")
@@ -242,7 +241,7 @@ def _variance_of_shared(tiles: Sequence[_Tile], total: np.ndarray) -> np.ndarray
 
 def _options(stacks: Sequence[GradientStack]) -> dict[str, str]:
     """The attribute that has the options of all stacks; none where all are defaults."""
-    # A property of a part is one of the whole, such as shared tails, which bias it.
+    # An option of one stack holds for the merged stack too: shared tails, for example, bias both.
     each = [[option for option in str(stack.attributes.get(OPTIONS, "")).split(", ") if option] for stack in stacks]
     options = dict.fromkeys(option for part in each for option in part)
     if SHARED_TAILS in options and not all(SHARED_TAILS in part for part in each):
@@ -253,7 +252,7 @@ def _options(stacks: Sequence[GradientStack]) -> dict[str, str]:
 def _tails(stacks: Sequence[GradientStack], spp: Sequence[int]) -> dict[str, Any]:
     """The attributes that say how the cache of shared tails was used, where any stack has them."""
     found: dict[str, Any] = {}
-    # Sentences, not parts of them: a merged stack may be merged again.
+    # A merged stack may be merged again, so a text may hold several sentences. Each sentence is kept once.
     each = (str(stack.attributes.get(TAILS, "")).split("; ") for stack in stacks)
     if told := dict.fromkeys(sentence for part in each for sentence in part if sentence):
         found[TAILS] = "; ".join(told)
@@ -356,7 +355,7 @@ def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
 
 
 def _means(stack: GradientStack) -> set[str]:
-    """What is averaged over samples: layers and diagnostics."""
+    """The names of layers and diagnostics that are averaged over samples."""
     return {*stack.names, *pass_through(stack)} - {*VARIANCES.values(), "samples"}
 
 

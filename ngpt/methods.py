@@ -36,17 +36,17 @@ class Method:
     """How to call one reconstruction.
 
     ``summary``  one line for the user
-    ``needs``    layers of the stack it cannot do without
-    ``run``      Repaired, options -> (H, W, 3) float32 of the light that Repaired's ``image`` is of
+    ``needs``    layers that the stack must hold
+    ``run``      (Repaired, options) -> (H, W, 3) float32, a reconstruction of the light in Repaired's ``image``
     ``options``  the options it takes
     ``standing`` one of ``ngpt.options.STANDINGS``: which methods help shows first
     ``missing``  why it cannot be used here ("" if it can): the package or file that is not installed
-    ``uses``     layers that it takes where the stack has them
-    ``estimates``  layers that it estimates from the others where the stack lacks them
-    ``variant``  the method that it is with other options, "" for a method of its own
-    ``apart``    whether what photons brought is taken out of the image and denoised by ``ngpt.denoisers.caustic``
-    ``rec709`` whether it was made for colours of Rec. 709: others are converted for it, as far as they are within its
-    gamut
+    ``uses``     further layers that it uses if the stack has them
+    ``estimates``  layers that it estimates from the others if the stack lacks them
+    ``variant``  the method that it runs with other options; "" for a method of its own
+    ``apart``    whether the light of photons is taken out of the image and denoised by ``ngpt.denoisers.caustic``
+    ``rec709``   whether it was made for colours of Rec. 709: other colours are converted for it if they lie in that
+                 gamut
     """
 
     summary: str
@@ -64,17 +64,17 @@ class Method:
 
 @dataclass(frozen=True)
 class Result:
-    """A reconstruction and what is worth knowing about it.
+    """A reconstruction and the facts about its making.
 
     ``image``      (H, W, 3) float32, scene-linear, in the units of the stack's primal
     ``method``     the method that made it ("auto" resolved); "own network FILE" for weights that are not ours
     ``seconds``    wall time of repair and reconstruction, without file access
     ``repaired``   pixels of the primal that were not finite and were replaced
-    ``untrusted``  differences that were left out because they, or a pixel of theirs, were not finite
+    ``untrusted``  differences that were left out because they, or one of their two pixels, were not finite
     ``weights``    the file of the network that ran, None for methods without one
-    ``options``    those that are not the method's defaults, weights left out
+    ``options``    the options that are not the method's defaults, except ``weights``
     ``estimated``  layers that the stack lacks and the method estimated
-    ``error``      (H, W, 3) float32, the standard error of the image where it was asked for (``ngpt.api.uncertainty``)
+    ``error``      (H, W, 3) float32, the standard error of the image if it was requested (``ngpt.api.uncertainty``)
     """
 
     image: np.ndarray
@@ -89,7 +89,7 @@ class Result:
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """What made the image, as header attributes: ``ngpt.write(path, image, like=stack, attributes=...)``."""
+        """Header attributes on how the image was made: ``ngpt.write(path, image, like=stack, attributes=...)``."""
         made: dict[str, Any] = {"ngpt:method": self.method, "ngpt:reconstructSeconds": self.seconds}
         if self.weights:
             made["ngpt:weights"] = str(self.weights)
@@ -193,12 +193,12 @@ METHODS = Registry("ngpt.methods", "method", Method, _OURS)
 
 
 def by_standing(*standings: str) -> dict[str, Method]:
-    """The methods of these standings, by name, without those that are others with options of their own."""
+    """The methods of these standings, by name, without variants of other methods."""
     return {name: entry for name, entry in METHODS.items() if entry.standing in standings and not entry.variant}
 
 
 def unknown_method(name: str) -> WrongUse:
-    """The error for a name that is no method's."""
+    """The error for a name that no method has."""
     return METHODS.unknown(name, ("auto", *METHODS), f"auto, {', '.join(by_standing('use', 'niche'))}")
 
 
@@ -211,8 +211,8 @@ def runnable(name: str) -> Method:
     return METHODS[name]
 
 
-# The best first, by the errors that docs/lab/RESULTS.md has for the layers of a stack. ngpt-primal is not in it: after
-# the same whole time it has OIDN's error in blind rooms, and more in simple scenes.
+# The best first, by the errors in docs/lab/RESULTS.md for the layers of a stack. ngpt-primal is left out: in the same
+# total time, its error equals OIDN's in blind rooms, and is larger in simple scenes.
 ORDER = ("ngpt-combine", "oidn", "ngpt-fast", "wcv", "l1", "nfor")
 
 
@@ -233,10 +233,10 @@ def choose(layers: Container[str], usable: Callable[[str], bool] | None = None) 
 
 
 def check_request(method: str, options: Mapping[str, Any]) -> None:
-    """Raises NgptError for what no stack can be denoised with; ``method`` and ``options`` are as in ``reconstruct``.
+    """Raises NgptError for a request that no stack can meet; ``method`` and ``options`` are as in ``reconstruct``.
 
-    This is a method that does not run here, an option that does not exist or has no such value, weights that cannot be
-    loaded, or a device that cannot be used.
+    Such a request has a method that does not run here, an unknown option, a value that the option does not allow,
+    weights that cannot be loaded, or a device that cannot be used.
     """
     own = options.get("weights")
     if own:
@@ -261,7 +261,7 @@ def check_request(method: str, options: Mapping[str, Any]) -> None:
 
 
 def _check_value(owners: Mapping[str, dict[str, Option]], name: str, value: Any) -> None:
-    """Raises WrongUse where none of the ``owners`` of an option takes the value."""
+    """Raises WrongUse if none of the methods in ``owners`` allows this value of the option."""
     refusals = []
     for owner, options in owners.items():
         try:
@@ -278,7 +278,7 @@ def _check_network(method: str, values: dict[str, Any]) -> None:
 
 
 def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result:
-    """Runs a method on a stack and says what it did. The borders of panoramas are neighbours (``ngpt.panorama``).
+    """Runs a method on a stack. The left and right borders of panoramas count as neighbours (``ngpt.panorama``).
 
     ``method`` is ``auto`` or a name in ``METHODS``; ``options`` are the method's own: for l2 and l1 ``alpha``, a number
     or "auto" to derive it from the variances. Raises NgptError for an unknown method or option, missing layers, and a
@@ -304,7 +304,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     try:
         values = settings(f"method '{name}'", entry.options, options)
     except WrongUse as error:
-        # `auto` may choose a method that has the option for another stack, so this is no wrong use.
+        # For another stack, `auto` may choose a method that has the option, so this is no wrong use.
         raise error if method == name else NgptError(str(error)) from None
     if entry.missing() and not own:
         raise NgptError(f"method '{name}': {entry.missing()}")

@@ -20,8 +20,8 @@ class Option:
     """An option, of the type of its ``default``.
 
     ``meaning``  one line for the user
-    ``choices``  the values there are; () for all within the range
-    ``range``    least and greatest value of a number; with ``choices`` too, either will do: a number, or "auto"
+    ``choices``  the allowed values; () for all within the range
+    ``range``    least and greatest value of a number; if there are ``choices`` too, numbers and choices are allowed
     """
 
     default: Value
@@ -34,7 +34,7 @@ class Option:
 
     @property
     def allowed(self) -> str:
-        """What values it takes, in words."""
+        """The allowed values, in words."""
         if isinstance(self.default, bool):
             return "true or false"
         words = ", ".join(written(choice) for choice in self.choices)
@@ -46,7 +46,7 @@ class Option:
         return f"{kind}, or {words}" if words else kind
 
     def check(self, value: Any) -> Value:
-        """The ``value``, or what a text says, as the option's type. Raises WrongUse for what is not allowed."""
+        """The ``value``, which may be a text, as the option's type. Raises WrongUse for values that are not allowed."""
         if self.choices and (given := self._typed(value, type(self.choices[0]))) in self.choices:
             assert given is not None
             return given
@@ -109,5 +109,5 @@ def unusual(options: Mapping[str, Option], values: Mapping[str, Any]) -> dict[st
 
 
 def as_text(values: Mapping[str, Any]) -> str:
-    """Options as ``-O`` takes them, with commas between."""
+    """Options in the form of ``-O``, separated by commas."""
     return ", ".join(f"{name}={written(value)}" for name, value in values.items())

@@ -1,6 +1,6 @@
-"""Images of 360 degrees: their left and right borders are adjacent, so methods get them continued on both sides.
+"""Images of 360 degrees: their left and right borders are adjacent, so methods get images that continue on both sides.
 
-An image is one if its header says so: by OpenEXR's ``envmap`` for latitude and longitude, or by our ``ngpt:wrap``.
+The header marks such an image by OpenEXR's ``envmap`` for latitude and longitude, or by our ``ngpt:wrap``.
 """
 
 import numpy as np
@@ -9,26 +9,26 @@ from ngpt.stack import GradientStack
 from ngpt.subpixels import subpixels
 
 WRAP = "ngpt:wrap"  # a header attribute, 1: the image wraps
-# Columns that are added on each side. OIDN looks so far around a pixel, and classical methods hardly farther.
+# Columns that are added on each side. OIDN reads pixels up to this distance, and classical methods hardly farther ones.
 MARGIN = 96
 
 
 def wraps(stack: GradientStack) -> bool:
-    """Whether the first column comes after the last: of a panorama that is whole from left to right."""
+    """Whether the first column continues the last one, as in a panorama that is whole from left to right."""
     said = stack.attributes.get("envmap", "")
     whole = (stack.place.data.left, stack.width) == (stack.place.display.left, stack.place.display.width)
     return whole and (stack.attributes.get(WRAP) == 1 or getattr(said, "name", said) == "ENVMAP_LATLONG")
 
 
 def wrapping(stack: GradientStack) -> GradientStack:
-    """The stack of an image that wraps, whatever its header says."""
+    """The stack with the mark of an image that wraps, whatever its header says."""
     return GradientStack(stack.layers, stack.attributes | {WRAP: 1}, stack.source, stack.path, stack.place, stack.fine)
 
 
 def continued(stack: GradientStack) -> GradientStack:
     """The stack (H, W) as one that does not wrap, (H, W + 2 MARGIN), with the image's other side beside each border.
 
-    Differences between the last column and the first are not known, and count as lost ones do.
+    Differences between the last column and the first are not known, and count as lost.
     """
     columns = np.arange(-MARGIN, stack.width + MARGIN) % stack.width
     layers = {name: stack[name][:, columns] for name in stack.names}
@@ -42,5 +42,5 @@ def continued(stack: GradientStack) -> GradientStack:
 
 
 def middle(image: np.ndarray) -> np.ndarray:
-    """(H, W, C) of an image that belongs to what ``continued`` made."""
+    """The image (H, W, C) without the columns that ``continued`` added."""
     return image[:, MARGIN:-MARGIN]

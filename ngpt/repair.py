@@ -11,32 +11,35 @@ from ngpt.stack import GradientStack
 from ngpt.subpixels import spread, subpixels
 from ngpt.system.late import ndimage
 
-# Sides of the blocks from which the insides of holes are filled: powers of it. Tiles of networks begin at multiples.
+# The insides of holes are filled from blocks whose sides are powers of this number. Tiles of networks begin at its
+# multiples.
 BLOCK = 8
 
 
 @dataclass(frozen=True)
 class Repaired:
-    """What reconstruction works on.
+    """The data that a reconstruction works on.
 
-    ``image``    (H, W, 3) primal without direct emission, finite; for methods that read gradients without ``caustic``
+    ``image``    (H, W, 3) primal without direct emission, finite; for methods that read gradients, also without
+                 ``caustic``
     ``direct``   (H, W, 3) direct emission, finite, to be added back
     ``dx, dy``   (H, W, 3) gradients, finite (0 where they are not trusted), None where the stack has none
-    ``trusted``  for dx and dy, (H, W) booleans, None if all of them are
-    ``variances``  of image, dx and dy, (H, W, 3), NaN where not known; None where the stack lacks a layer of them
-    ``noise``    the variance of image by itself, (H, W, 3), NaN where not known; None where the stack lacks it
+    ``trusted``  for dx and dy, (H, W) booleans, None if all differences are trusted
+    ``variances``  of image, dx and dy, (H, W, 3), NaN where not known; None if the stack lacks one of these layers
+    ``noise``    the variance of image only, (H, W, 3), NaN where not known; None where the stack lacks it
     ``pixels``   number of pixels whose primal was replaced
     ``gradients``  number of differences left out
     ``features``  albedo, normal and depth, those the stack holds, with 0 where they are not finite
-    ``caustic``  (H, W, 3) the light that was taken out of image since gradients hold none of it, finite, to be denoised
-                 by itself and added back; None where there is none
+    ``caustic``  (H, W, 3) light that gradients exclude, finite: it is taken out of image, denoised separately and added
+                 back; None if there is none
     ``caustic_var``  its variance, (H, W, 3), NaN where not known; None where the stack lacks it
     ``feature_noise``  the variance of albedo or normal, whichever is larger, mean over the image; None: not known
     ``empty``    (H, W) booleans, the pixels that alpha says hold nothing (``ngpt.coverage``); None where there are none
     ``fine``     primal, albedo and normal by subpixels (``ngpt.subpixels``), finite; empty where there are none
     ``parts``    diffuse and specular light, finite, and their variances as ``diffuse_var`` and ``specular_var``, NaN
                  where not known; only the ones that the stack holds
-    ``by_oidn``  OIDN's images of this (``ngpt.network.inputs.Oidn``), for methods that read them; None: not made yet
+    ``by_oidn``  OIDN's images of these data (``ngpt.network.inputs.Oidn``), for methods that read them; None: not made
+                 yet
     """
 
     image: np.ndarray
@@ -67,8 +70,8 @@ class Repaired:
 def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
     """Separates direct emission, replaces non-finite pixels and finds the gradients that cannot be trusted.
 
-    ``gradients``  whether this is for a method that reads gradients, or leaves the light of photons to another: it
-                   works on light without ``caustic``. All others see the whole primal, and the variance of all of it.
+    ``gradients``  whether the method reads gradients, or leaves the light of photons to another method. Such a method
+                   works on light without ``caustic``. All others get the whole primal and its whole variance.
 
     A difference is not trusted if it is not finite itself or one of its two pixels was not. Raises NgptError when the
     primal has no finite pixel at all.
@@ -81,7 +84,7 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
         good &= finite_pixels(caustic)
     if not good.any():
         raise NgptError(f"{stack.path}: layer 'primal' has no finite pixel among {good.size}; render it again")
-    # Copies only of what changes: layers of large images are large.
+    # Only layers that change are copied, since layers may be large.
     image = primal
     # Inf - Inf may occur here; such values are replaced below.
     with np.errstate(invalid="ignore"):
@@ -99,7 +102,8 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
     said = stack.number(FEATURE_NOISE)
     apart: dict[str, Any] = {"parts": _parts(stack, good), "feature_noise": said if said is None or said >= 0 else None}
     if stack.fine:
-        apart["fine"] = _finite_subpixels(stack, image + direct, features)
+        light = image + direct if caustic is None or not gradients else image + direct + caustic
+        apart["fine"] = _finite_subpixels(stack, light, features)
     if caustic is not None and gradients:
         variance = _where(good, stack["caustic_var"]) if "caustic_var" in stack else None
         apart |= {"caustic": caustic, "caustic_var": variance}
@@ -129,7 +133,7 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
 
 
 def _parts(stack: GradientStack, good: np.ndarray) -> dict[str, np.ndarray]:
-    """``Repaired.parts``: pixels that are not ``good``, or lack a part, come from their neighbours."""
+    """``Repaired.parts``: pixels that are not ``good``, or lack a part, are filled from their neighbours."""
     held = [name for name in ("diffuse", "specular") if name in stack]
     for name in held:
         good = good & finite_pixels(stack[name])
@@ -138,9 +142,9 @@ def _parts(stack: GradientStack, good: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def variance_of_primal(stack: GradientStack, gradients: bool = False) -> np.ndarray:
-    """The variance of the primal, (H, W, 3): with ``gradients`` of what they are the differences of, else of all of it.
+    """The variance of the primal, (H, W, 3); with ``gradients``, only of the light that they are the differences of.
 
-    All of it is not known, and NaN, where there is light in ``caustic`` whose variance is not.
+    The variance of the whole primal is NaN where ``caustic`` holds light of unknown variance.
     """
     variance = stack["primal_var"]
     if gradients or "caustic" not in stack:
@@ -153,20 +157,21 @@ def variance_of_primal(stack: GradientStack, gradients: bool = False) -> np.ndar
 
 
 def finite_pixels(layer: np.ndarray) -> np.ndarray:
-    """Where all channels of (H, W, C) are finite; at once if all are, since short last axes are slow to look along."""
+    """Where all channels of (H, W, C) are finite. The whole array is tested first, since tests along a short last axis
+    are slow."""
     good = np.isfinite(layer)
     return np.ones(layer.shape[:2], bool) if good.all() else good.all(axis=-1)
 
 
 def _finite_subpixels(
-    stack: GradientStack, image: np.ndarray, features: dict[str, np.ndarray]
+    stack: GradientStack, light: np.ndarray, features: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """The subpixels of a stack; those that are not finite have the value of their pixel in the repaired layers."""
     k = subpixels(stack.fine, stack.width)
     fine = {}
     for name, layer in stack.fine.items():
         good = finite_pixels(layer)
-        pixels = image if name == "primal" else features[name]
+        pixels = light if name == "primal" else features[name]
         fine[name] = layer if good.all() else np.where(good[..., None], layer, spread(pixels, k))
     return fine
 
@@ -184,8 +189,8 @@ def _where(flags: np.ndarray, variance: np.ndarray) -> np.ndarray:
 def _from_neighbours(light: np.ndarray, good: np.ndarray) -> np.ndarray:
     """The light (H, W, 3), with pixels that are not good replaced.
 
-    By the mean of the good ones among their eight neighbours, or where there is none, in the inside of a larger hole,
-    by the mean of those in the smallest block that has any: of 8x8 pixels, 64x64 and so on.
+    A pixel gets the mean of the good pixels among its eight neighbours. Inside a larger hole, where there are none, it
+    gets the mean of the good pixels in the smallest block that has any: of 8x8 pixels, 64x64 and so on.
     """
     image = np.where(good[..., None], light, np.float32(0))
     weight = ndimage.uniform_filter(good.astype(np.float64), 3, mode="constant")

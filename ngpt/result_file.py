@@ -1,4 +1,4 @@
-"""The file of a result: OpenEXR, which has the whole stack in it, PFM, or a picture to look at."""
+"""The file of a result: OpenEXR with the whole stack, PFM, or a picture."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +24,8 @@ IMAGES = (".exr", ".pfm", *PICTURES)
 
 @dataclass(frozen=True)
 class Look:
-    """How a picture shows light: by which ``ngpt.image.transforms``, and at which exposure in stops, or "auto"."""
+    """How a picture shows light: its view transform (``ngpt.image.transforms``), and its exposure in stops, or
+    "auto"."""
 
     transform: str = "standard"
     exposure: float | str = 0.0
@@ -47,9 +48,9 @@ def write_result(
     into: str | None = None,
     reduce: int = 1,
 ) -> None:
-    """Writes images (H, W, 3), one of each of the ``views``, made of their stacks; other files than OpenEXR have one.
+    """Writes images (H, W, 3), one for each of the ``views``, with their stacks. Only OpenEXR files hold several views.
 
-    ``attributes`` say what made them; ``into``, ``reduce`` as of ``ngpt.write``.
+    ``attributes`` say how they were made; ``into`` and ``reduce`` are as in ``ngpt.write``.
     """
     if target.suffix.lower() == ".exr":
         images, stacks = (list(each) for each in zip(*views, strict=True))
@@ -64,7 +65,7 @@ def write_result(
 
 
 def check_image(target: Path, transform: str) -> None:
-    """Raises an error for what cannot be the file of a result, or of one that this machine cannot make."""
+    """Raises an error for a file that cannot hold a result, or that this machine cannot make."""
     kind = target.suffix.lower()
     if kind not in IMAGES:
         raise WrongUse(f"{target}: results are OpenEXR, PFM or pictures; let the name end in {' '.join(IMAGES)}")
@@ -74,7 +75,7 @@ def check_image(target: Path, transform: str) -> None:
 
 
 def in_picture(image: np.ndarray, place: Place) -> np.ndarray:
-    """What the display window shows of an image (H, W, 3): all but overscan. An image beside it is shown whole.
+    """The part of an image (H, W, 3) in the display window, without overscan. An image outside of it is shown whole.
 
     Pixels become as wide as they are high.
     """

@@ -1,29 +1,29 @@
-"""Noise that pixels share: the layer ``shared``, which renders have whose paths end in a cache.
+"""Noise that pixels share: the layer ``shared`` of renders whose paths end in a cache.
 
-It is a sample of that noise, with the distribution of the noise itself. For any weights w of pixels, the expected
-square of Σ w shared is the variance that the cache gives to Σ w primal: of a pixel, of a block, or of the whole image.
-Stacks are merged by means, and so are their layers ``shared``. ``primal_var`` holds its part of each pixel's variance.
+The layer is a sample of that noise, with the same distribution. For any weights w of pixels, the expected square of Σ w
+shared is the variance that the cache gives to Σ w primal: of a pixel, of a block, or of the whole image. Stacks are
+merged by means, and so are their layers ``shared``. ``primal_var`` includes the variance of this noise in each pixel.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-# Header attributes: whether paths shared their tails, and why not; the share of the cache's light that was cut from
-# records which were too bright
+# Header attributes: whether paths shared their tails, or why not; the share of the cache's light that was cut from
+# records that were too bright
 TAILS, CUT = "ngpt:tails", "ngpt:tailsCut"
-# Side of the square of pixels over which the squares of a pixel's variance are averaged
+# Side, in pixels, of the square over which squares of ``shared`` are averaged for a pixel's variance
 _AROUND = 5
 # Side of the square blocks whose noise is reported
 _BLOCK = 32
 
 
 def shared_variance(shared: np.ndarray) -> np.ndarray:
-    """The variance of each pixel that it shares with others, (H, W, C), of the layer ``shared``, (H, W, C).
+    """The variance of the noise that each pixel shares with others, (H, W, C), from the layer ``shared``, (H, W, C).
 
     Values that are not finite count as zero.
     """
-    # The sums of ``box_means`` would carry them on to all pixels that follow.
+    # The running sums of ``box_means`` would carry such values to all later pixels.
     squares = np.square(np.where(np.isfinite(shared), shared, 0).astype(np.float64))
     means = [box_means(squares[..., channel], _AROUND) for channel in range(squares.shape[-1])]
     return np.maximum(np.stack(means, axis=-1), 0)
@@ -32,8 +32,8 @@ def shared_variance(shared: np.ndarray) -> np.ndarray:
 def noise_of_light(primal: np.ndarray, primal_var: np.ndarray, shared: np.ndarray) -> dict[str, dict[str, float]]:
     """The standard error of the mean light of the whole image, and of blocks of ``_BLOCK`` pixels where there are any.
 
-    Noise of layers (H, W, C). "own" is the noise of single pixels, "shared" the noise that they have in common; both
-    are root mean squares over channels and blocks, relative to the mean light of the image. Values that are not finite
+    The layers are (H, W, C). "own" is the noise of single pixels, "shared" the noise that they have in common; both are
+    root mean squares over channels and blocks, relative to the mean light of the image. Values that are not finite
     count as zero.
     """
     light, variance, sample = (
@@ -54,9 +54,10 @@ def noise_of_light(primal: np.ndarray, primal_var: np.ndarray, shared: np.ndarra
 
 
 def box_means(image: np.ndarray, size: int) -> np.ndarray:
-    """Means over ``size`` x ``size`` pixels around each of (H, W), mirrored at the edges: SciPy's ``uniform_filter``.
+    """Means over ``size`` x ``size`` pixels around each pixel of (H, W), mirrored at the edges.
 
-    The bits are the same, but importing SciPy would take longer than all variances of a small render.
+    The result has the same bits as SciPy's ``uniform_filter``. Importing SciPy would take longer than computing all
+    variances of a small render.
     """
     if not image.size:  # the differences within a single row or column of pixels
         return image

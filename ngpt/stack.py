@@ -1,4 +1,4 @@
-"""The gradient stack: the data type between those who render gradients and those who reconstruct from them."""
+"""The gradient stack: the data type that renderers of gradients pass to reconstructions."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,17 +18,17 @@ from ngpt.windows import Place
 class GradientStack(Mapping[str, np.ndarray]):
     """The layers of one rendering, scene-linear, row 0 on top: a mapping from their names to arrays.
 
-    ``layers`` maps names of the contract (``ngpt.layers.LAYERS``) to C-contiguous float32 arrays (H, W, C): C is 3, and
-    1 for depth and alpha. Given are arrays of any real type and memory layout, (H, W) too where C is 1; they are
-    converted, without a copy where none is needed, and never modified. Every float value is legal, NaN and Inf
-    included. A layer of variances given in double precision stays so where float32 cannot hold it: light of 1e30 or
-    1e-30 has such variances. Files hold 32 bits of them. The last column of dx and the last row of dy are unused; they
-    are kept as they are.
+    ``layers`` maps names of the contract (``ngpt.layers.LAYERS``) to C-contiguous float32 arrays (H, W, C), where C is
+    the number of the layer's channels. The arrays passed may have any real type and memory layout, and shape (H, W) if
+    C is 1. They are converted, copied only if necessary, and never modified. Every float value is legal, including NaN
+    and Inf. Variances passed in double precision stay so if float32 cannot hold them: light of 1e30 or 1e-30 has such
+    variances. Files hold them with 32 bits. The last column of dx and the last row of dy are unused; they are kept as
+    they are.
 
-    ``attributes`` are the header attributes beyond those that OpenEXR itself needs, ``ngpt:spp`` and the like.
-    ``source`` is the file the stack was read from (``ngpt.io.layout.StackSource``), for what passes through it.
-    ``path`` is for messages. ``place`` is where the pixels lie in the whole picture; by default, and where it is
-    of another size, they are all of it. ``fine`` are the layers of subpixels, where there are any (``ngpt.subpixels``).
+    ``attributes`` are the header attributes that OpenEXR itself does not need, such as ``ngpt:spp``. ``source`` is the
+    file that the stack was read from (``ngpt.io.layout.StackSource``), with the channels that pass through. ``path`` is
+    for messages. ``place`` is where the pixels lie in the whole picture; by default, and if it has another size, they
+    are the whole picture. ``fine`` are the layers of subpixels, if there are any (``ngpt.subpixels``).
 
     Raises NgptError for unknown layers, types that are not real numbers, wrong shapes, layers that differ in size,
     images without pixels, and finite numbers that float32 cannot hold.
@@ -120,7 +120,7 @@ class GradientStack(Mapping[str, np.ndarray]):
         return f"<{self._title}: {', '.join(self.names)}>"
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: a small picture of the primal and a table of all layers."""
+        """HTML for notebooks: a small picture of the primal and a table of all layers."""
         return stack_html(self._title, {name: self.layers[name] for name in self.names})
 
     @property
@@ -129,7 +129,8 @@ class GradientStack(Mapping[str, np.ndarray]):
         return f"GradientStack {self.path}, {self.width}x{self.height}{samples}"
 
     def number(self, attribute: str) -> float | None:
-        """An attribute that is a finite number; None where there is none: files of other programs may hold anything."""
+        """An attribute as a finite number; None if it is missing or anything else, as files of other programs may
+        hold."""
         value = self.attributes.get(attribute)
         if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
             return None
@@ -163,14 +164,14 @@ class GradientStack(Mapping[str, np.ndarray]):
     def replace(self, **layers: ArrayLike) -> "GradientStack":
         """Returns a stack with these layers replaced or added, and the same attributes, source and place.
 
-        It has no subpixels where one of their layers is replaced: they are not those of the new one.
+        If a layer that has subpixels is replaced, the result has no subpixels: they belong to the old layer.
         """
         new = {name: np.asarray(array) for name, array in layers.items()}
         fine = {} if self.fine.keys() & new.keys() else self.fine
         return GradientStack({**self.layers, **new}, self.attributes, self.source, self.path, self.place, fine)
 
 
-# Where the largest variance is below this, float32 would lose digits of those that are 2^-40 of it.
+# If the largest variance is below this, float32 would lose digits of variances 2^-40 times as large.
 _DIM = 2.0**-86
 
 

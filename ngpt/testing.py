@@ -1,7 +1,8 @@
 """Statistical tests of renderings, for our own tests and for anyone who writes a sampler.
 
 A sampler is right if its mean is right. A single image and a fixed tolerance cannot show that. But independent renders
-of both sides give their own standard errors, and the number of comparisons sets the significance level of each.
+of the sampler and of a reference give their own standard errors, and the number of comparisons sets the significance
+level of each.
 """
 
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ class ZTest:
 
     ``z``        (rows, columns, C) differences of block means in standard errors
     ``p``        two-sided p-values of the same shape
-    ``level``    what each p-value is held against, after Šidák's correction for their number
+    ``level``    the significance level of each p-value, after Šidák's correction for their number
     """
 
     z: np.ndarray
@@ -45,10 +46,11 @@ def z_test(
     ``block``                    edge of the pixel blocks whose means are compared: averaging makes them nearly normal,
                                  which single pixels of path-traced images are not
     ``level``                    probability that two equal means fail the test as a whole
-    ``scale``                    largest value of the images that a layer is computed from, where it is not the layer's
+    ``scale``                    largest value of the images that a layer is computed from, if the layer's own is
+                                 smaller
 
     Welch's t-test per block and channel, with Šidák's correction 1 - (1 - level)^(1/n). Standard errors are bounded
-    from below by float32 rounding of the scale, so blocks without any variance must agree to that.
+    from below by float32 rounding of the scale, so blocks without any variance must agree up to that rounding.
     """
     means, errors = [], []
     for batches in (renders, references):

@@ -1,7 +1,7 @@
 """The place of an image: the rectangle of its pixels, within the rectangle of the whole picture.
 
-OpenEXR calls them data window and display window. Pixels of two images belong together where their windows say so, not
-where their arrays have the same index.
+OpenEXR calls them data window and display window. Pixels of two images correspond if they have the same place in the
+picture, not the same index in the arrays.
 """
 
 from collections.abc import Sequence
@@ -70,10 +70,10 @@ class Window:
 
 @dataclass(frozen=True)
 class Place:
-    """Where an image lies: ``data`` is the rectangle of its pixels, ``display`` the one of the whole picture.
+    """Where an image lies: ``data`` is the rectangle of its pixels, ``display`` is the rectangle of the whole picture.
 
     ``data`` may be a part of the picture, reach beyond it (overscan), or both. ``aspect`` is the width of a pixel over
-    its height, as pictures show it; it says nothing of where pixels lie.
+    its height, as pictures show it; it does not change where pixels lie.
     """
 
     data: Window
@@ -87,7 +87,7 @@ class Place:
 
     @property
     def known(self) -> bool:
-        """Whether it says more than a size."""
+        """Whether more than the size is known."""
         return self != Place.whole(*self.data.size)
 
     def __str__(self) -> str:
@@ -96,11 +96,12 @@ class Place:
         return f"{self.data} of {self.display if any(self.display.corner) else Place.whole(*self.display.size)}"
 
     def seen_from(self, other: "Place") -> "Window | None":
-        """The pixels in the coordinates of ``other``; None where the two are pictures of different sizes.
+        """The window of the pixels in the coordinates of ``other``; None if the two pictures have different
+        resolutions.
 
         If only the size of an image is known, it takes the place of the other image of that size: many programs lose
-        the place of a crop. Other pictures are side by side, except two of different sizes with one corner: their
-        resolutions differ.
+        the place of a crop. Other display windows share one coordinate system, unless they have the same corner and
+        different sizes: then the resolutions differ.
         """
         if self.display != other.display:
             if self.data.size == other.data.size and not (self.known and other.known):
@@ -110,21 +111,21 @@ class Place:
         return self.data
 
     def shift_in(self, other: "Place") -> tuple[int, int] | None:
-        """The column and row of an image at ``other`` where the first pixel of this one is; as ``seen_from``."""
+        """The column and row of this image's first pixel in an image at ``other``; None as in ``seen_from``."""
         window = self.seen_from(other)
         return None if window is None else (window.left - other.data.left, window.top - other.data.top)
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """Images upon each other: the ``windows`` of all, in the coordinates of the first, and the ``common`` pixels."""
+    """Overlaid images: the ``windows`` of all, in the coordinates of the first, and the ``common`` pixels."""
 
     windows: list[Window]
     common: Window
 
     @property
     def line(self) -> str:
-        """Says what is compared, where that is not the whole of each image; else ""."""
+        """A message about the compared pixels; "" if these are all pixels of all images."""
         if all(window == self.common for window in self.windows):
             return ""
         return f"compared are the pixels that all images have: {self.common}"

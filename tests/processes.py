@@ -272,7 +272,7 @@ def _evaluation(inputs: Path) -> Work:
 RENDERS = {
     "adaptive": ("--adaptive", "--spp", 64, "--sampler", "gpt"),
     "error": ("--error", 0.06, "--for", "wcv", "--sampler", "gpt"),
-    "photons": ("--sampler", "gpm", "--spp", 16),
+    "photons": ("--sampler", "ppm", "--spp", 16),
     "time": ("--time", 3, "--sampler", "gpt"),
 }
 

@@ -243,6 +243,19 @@ def test_merged_differences_of_uneven_counts_have_the_right_variance(rng):
     assert np.mean(variances) == pytest.approx(np.var(means), rel=0.08)
 
 
+def test_merged_differences_are_weighted_by_their_precision(rng):
+    """A mean over n samples of one pixel less one over m of the other has a variance of 1 / n + 1 / m of theirs."""
+    stacks = [
+        stack_of(rng.random((4, *SHAPE)), seed).replace(samples=rng.integers(1, 40, (*SHAPE[:2], 1)))
+        for seed in range(2)
+    ]
+    merged = merge(stacks)
+    for name, here, there in (("dx", np.s_[:, :-1], np.s_[:, 1:]), ("dy", np.s_[:-1], np.s_[1:])):
+        precision = [1 / (1 / stack["samples"][here] + 1 / stack["samples"][there]) for stack in stacks]
+        expected = sum(p * stack[name][here] for p, stack in zip(precision, stacks, strict=True)) / sum(precision)
+        assert np.allclose(merged[name][here], expected, rtol=1e-5), name
+
+
 def test_few_samples_are_not_none(rng):
     counts = np.zeros((*SHAPE[:2], 1), np.float32)
     counts[0, 0] = 1

@@ -43,7 +43,7 @@ _BEGINS, _FILES = 0.8, 3.7
 # (oidn, ngpt-primal) to 0.96 (ngpt-fast), from 57,600 on 0.89 to 1.1. A call takes some time whatever the size.
 _GROWS = 0.9
 # Seconds for a million pixels, on two cores, of methods that no pilot has measured; of methods that are not listed
-_METHOD_SECONDS, _OTHERS = {"auto": 18.0, "ngpt-combine": 18.0, "ngpt-primal": 7.0, "oidn": 8.0}, 3.0
+_METHOD_SECONDS, _OTHERS = {"auto": 18.0, "ngpt-combine": 18.0, "ngpt-primal": 14.0, "oidn": 13.0}, 3.0
 # Seconds from which on the pilot's images are as large as they ever are, and the least share of that
 LONG, LEAST_PIXELS = 400.0, 1 / 16
 # A rival's error must be smaller by this factor: smaller differences could be chance. The errors of networks and

@@ -24,7 +24,7 @@ from ngpt.cli.picture import add_look
 from ngpt.errors import WrongUse
 from ngpt.methods import METHODS
 from ngpt.result_file import IMAGES
-from ngpt.subpixels import CHOICES
+from ngpt.subpixels import choice
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -170,12 +170,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def subpixels(text: str) -> int | str:
     """K of the K x K subpixels of a pixel, or "auto"."""
-    choices: dict[str, int | str] = {"auto": "auto", **{str(k): k for k in CHOICES}}
-    if text not in choices:
-        raise argparse.ArgumentTypeError(
-            f"'{text}' subpixels cannot be kept; write {', '.join(map(str, CHOICES))}, or auto"
-        )
-    return choices[text]
+    try:
+        return choice(text)
+    except WrongUse as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 # More than anyone renders; a typing error must not fill the memory.

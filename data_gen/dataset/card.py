@@ -56,6 +56,8 @@ def card(data: Dataset, told: dict) -> str:
     edges = 2 ** np.arange(int(np.log2(config["spp"][0])), int(np.log2(config["spp"][1])) + 2)
     exposures = np.array([-auto_exposure(shown(crop)[1]) for crop in data])
     shots = f"{told['shots']} shots of up to {config['frames']} frames: " if "shots" in told else ""
+    k = told.get("subpixels", 1)
+    fine = f", with {k}x{k} subpixels" if k > 1 else ""
     sampler = config.get("sampler", "gpt")
     if config["reference_spp"]:
         what = "the noisiest input and the reference"
@@ -69,7 +71,7 @@ def card(data: Dataset, told: dict) -> str:
         "# Training set",
         "",
         f"{shots}{told['crops']} crops of {config['size']}x{config['size']} pixels from {told['scenes']} scenes "
-        f"({told['planned']} planned, {told['failed']} failed), {config['inputs']} inputs each; "
+        f"({told['planned']} planned, {told['failed']} failed), {config['inputs']} inputs each{fine}; "
         f"{told['megabytes']} MB in {told['shards']} shards. Verify it by `ngpt info DIR`.",
         "",
         f"{how} Seed {config['seed']}.",

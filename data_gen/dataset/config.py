@@ -12,6 +12,7 @@ from data_gen.scenes.procedural.variety import SHARES
 from ngpt.errors import NgptError
 from ngpt.io.frames import natural
 from ngpt.methods import METHODS
+from ngpt.subpixels import CHOICES
 from ngpt.system.records import from_table, read_toml
 
 
@@ -36,6 +37,7 @@ class Config:
     ``spp``        least and greatest samples per pixel of the inputs
     ``sampler``    of the inputs and references: a name of `ngpt info`, or "auto", chosen for each scene
     ``samplers``   options of that sampler, a table [samplers.NAME]
+    ``subpixels``  2 or 4: inputs keep 2x2 or 4x4 subpixels of each pixel (docs/use/subpixels.md); 1: none
     ``roll``       the camera's largest roll, degrees
     ``lens``       standard deviation of the aperture's radius, relative to the distance in focus
     ``crops_per_shard``  what one job makes, and what is lost when it is killed; all of a scene compile kernels once
@@ -56,6 +58,7 @@ class Config:
     spp: tuple[int, int] = (2, 64)
     sampler: str = "gpt"
     samplers: dict[str, dict[str, Any]] = field(default_factory=dict)
+    subpixels: int = 1
     roll: float = 20.0
     lens: float = 0.005
     crops_per_shard: int = 4
@@ -78,6 +81,7 @@ class Config:
             (self.size < 8, f"size = {self.size}: at least 8 pixels"),
             (min(self.inputs, self.frames, self.crops, self.crops_per_shard) < 1, "counts must be at least 1"),
             (few, f"reference_spp = {self.reference_spp}: at least 4, two for each of its halves; or 0, for pairs"),
+            (self.subpixels not in CHOICES, f"subpixels = {self.subpixels}: {', '.join(map(str, CHOICES))}"),
             (self.reference_method not in METHODS, f"reference_method: no method '{self.reference_method}'"),
             (bool(unknown), f"sights: no sight is called {unknown}; there are {', '.join(SHARES)}"),
             (not shares, f"sights = {self.sights}: each is the share of scenes that have it, 0 to 1"),
@@ -88,6 +92,8 @@ class Config:
             if name != self.sampler:
                 raise NgptError(f"data configuration: samplers.{name}: this set is rendered by '{self.sampler}'")
             check_options(name, options)
+        if self.sampler != "auto":
+            find(self.sampler).subpixels(self.subpixels, None)  # raises WrongUse where it cannot keep them
         if self.adaptive:
             self._check_adaptive()
         flat = self.sampler != "auto" and not find(self.sampler).gradients

@@ -20,6 +20,7 @@ from ngpt.merging import merge
 from ngpt.methods import reconstruct
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
+from ngpt.subpixels import means, subpixels
 from ngpt.training.shards import CropData, write_shard
 from ngpt.version import __version__
 
@@ -120,7 +121,7 @@ def render_input(config: Config, scene, spp: int, seed: int, uneven: bool, made:
     """One input. All inputs of a set that has uneven ones have the layer ``samples``."""
     from data_gen.render import render_stack
 
-    options = {"made": made, "unbiased": True, "gradients": True, **config.options}
+    options = {"made": made, "unbiased": True, "gradients": True, "subpixels": config.subpixels, **config.options}
     stack = render_stack(scene, spp, seed, config.sampler, adaptive=uneven, **options)
     if config.adaptive and "samples" not in stack:
         stack = stack.replace(samples=np.full((stack.height, stack.width, 1), spp, np.float32))
@@ -253,7 +254,7 @@ def finite(stack: GradientStack) -> tuple[GradientStack, int]:
     """The stack without values that are not finite, and how many pixels or differences had some.
 
     Pixels are filled from their neighbours, and gradients become 0. An unknown variance becomes the square of the
-    value, as if the value were only noise.
+    value, as if the value were only noise. Pixels stay the means of their subpixels.
     """
     whole = repair(stack)
     layers = {"primal": whole.image + whole.direct, "direct": whole.direct}
@@ -271,4 +272,5 @@ def finite(stack: GradientStack) -> tuple[GradientStack, int]:
         layers[f"{name}_var"] = np.where(unknown, np.square(layers[name]), variance)
     for name in ("albedo", "normal", "depth"):
         layers[name] = np.nan_to_num(stack[name], posinf=0, neginf=0)
-    return stack.replace(**layers), bad
+    layers |= {name: means(layer, subpixels(whole.fine, stack.width)) for name, layer in whole.fine.items()}
+    return replace(stack.replace(**layers), fine=whole.fine), bad

@@ -25,6 +25,8 @@ STEPS = 64
 # log2 of the least number that is kept; smaller ones become 0.
 LEAST = -126
 IMAGES = (*REFERENCES, REFERENCE_CAUSTIC)
+# The entries of a configuration that references do not depend on
+_OF_INPUTS = ("inputs", "spp", "adaptive", "subpixels")
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Again:
 
 def home(config: Config, folder: Path) -> Path:
     """Where the references of ``config`` lie in ``folder``; configurations that differ only in inputs share them."""
-    told = {name: value for name, value in as_json(config).items() if name not in ("inputs", "spp", "adaptive")}
+    told = {name: value for name, value in as_json(config).items() if name not in _OF_INPUTS}
     return folder / f"{zlib.crc32(json.dumps(told, sort_keys=True).encode()):08x}"
 
 

@@ -38,14 +38,16 @@ def statistics(moments: Moments, strands: int, batch: int = 0) -> tuple[np.ndarr
 
 
 def contrast(moments: Moments, strands: int, values: np.ndarray) -> np.ndarray:
-    """The later samples of each pixel against the earlier ones, (pixels, C), as ``claims.factors`` wants it; ``values``
-    is the number of values of each pixel."""
+    """The contrast (pixels, C) of the later samples of each pixel with the earlier ones, see ``data_gen.film.claims``.
+
+    ``values`` is the number of values of each pixel.
+    """
     earlier = moments.earlier[0]
     counts = [np.array(each, np.int64).reshape(strands, -1) for each in (*earlier.counts[::-1], moments.count)]
     bits = np.array(earlier.bits, np.int64).reshape(strands, -1)
     numbers, kind = np.unique(values, return_inverse=True)
     splits = np.array([split(max(int(n), 2)) for n in numbers])[kind]
-    # The samples of a strand whose numbers are less than ``splits``: all, or as many as one of ``earlier``.
+    # The samples of a strand with numbers below ``splits``: one of the two sets of ``earlier``, or all samples.
     which = np.clip(np.log2(splits).astype(np.int64) + 2 - bits, 0, 2)
     before, n = np.choose(which, counts), counts[-1].sum(axis=0)
     n1 = before.sum(axis=0)

@@ -14,8 +14,8 @@ def mis_weight(chosen: mi.Float, other: mi.Float) -> mi.Float:
 def gradient_weight(r: mi.Float, good: mi.Bool) -> mi.Float:
     """2 w, twice the weight with which base path x is responsible for the pair (x, T(x)).
 
-    ``r`` = p(T(x)) |J| / p(x). Either path of a pair may be the one that was sampled, so the balance heuristic gives it
-    w = 1 / (1 + r), and its mirror image the rest (survey, eq. 16-17). A rejected shift has no mirror image: w = 1. The
-    film averages the two directions of a difference, hence twice.
+    ``r`` = p(T(x)) |J| / p(x). A pair can be found from x or from T(x). The balance heuristic gives the first case the
+    weight w = 1 / (1 + r), and the second case the rest (survey, eq. 16-17). If the shift is rejected, there is no
+    second case: w = 1. The film averages the two directions of a difference, hence twice.
     """
     return dr.select(good, 2 / (1 + r), 2)

@@ -5,11 +5,11 @@ from data_gen.samplers.registry import own
 from ngpt.options import written
 
 # Standing -> what the table calls it
-GROUPS = {"use": "", "niche": "for some scenes", "study": "for comparison: another sampler is better"}
+GROUPS = {"use": "", "niche": "for some scenes"}
 
 
 def table() -> str:
-    """All samplers in Markdown, by standing, with their options and defaults."""
+    """All samplers but studies in Markdown, by standing, with their options and defaults."""
     lines, others = ["| sampler | what it is | options |", "|---|---|---|"], SAMPLERS.load()
     for standing, title in GROUPS.items():
         lines += [f"| | *{title}* | |"] if title else []

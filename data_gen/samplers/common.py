@@ -111,7 +111,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
 
     @classmethod
     def parameters(cls, scene: mi.Scene) -> dict[str, Any]:
-        """Those parameters of the scene's own integrator that this one also has."""
+        """Returns the parameters that this integrator takes over from the scene's own."""
         return Limits.of(reference_integrator(scene)).parameters()
 
     def reference(self) -> mi.SamplingIntegrator:

@@ -1,7 +1,7 @@
-"""What a sampler says of itself, and how it is found by that: entries, their typed options, and the registry.
+"""The registry of samplers: their entries, and their typed options.
 
-Nothing here imports Mitsuba: a sampler's module, whose classes belong to a variant of Mitsuba, is imported when the
-sampler is made.
+Nothing here imports Mitsuba. The classes of a sampler's module belong to a variant of Mitsuba, so the module is
+imported when the sampler is made.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from data_gen.budget import LANE_BYTES
 from ngpt.errors import NgptError, WrongUse
 from ngpt.methods import METHODS
 from ngpt.options import STANDINGS, Option, as_text, settings, unusual
+from ngpt.subpixels import best, choice
 from ngpt.system.parts import Registry
 
 if TYPE_CHECKING:
@@ -25,7 +26,9 @@ Rule = Callable[["Facts", str], str]
 
 
 def integrator_of(module: str) -> Any:
-    """The class of the Mitsuba integrator that a module defines; None where it has a function ``make`` instead."""
+    """Returns the class of the Mitsuba integrator that a module defines, or None if it has a function ``make``
+    instead.
+    """
     found = import_module(module)
     own = (value for value in vars(found).values() if getattr(value, "__module__", "") == module)
     return None if hasattr(found, "make") else next(value for value in own if hasattr(value, "like_path"))
@@ -74,20 +77,19 @@ class Entry:
         return make(*args, **options)
 
     def refuses(self, facts: Facts) -> str:
-        """Why the sampler cannot render a scene of these ``facts``, "" if it can."""
+        """Returns why the sampler cannot render a scene of these ``facts``, or "" if it can."""
         return next(filter(None, (rule(facts, self.name) for rule in self.refusals)), "")
 
     def notes_on(self, facts: Facts) -> list[str]:
-        """What the user should know about rendering a scene of these ``facts``, a line each."""
+        """Returns what the user should know about rendering a scene of these ``facts``, one line for each note."""
         heads = {"transport": f"transport: Mitsuba's '{facts.integrator}', ", "noise": "noise: "}
         heads |= {"mirrors": "mirrors or clear glass: "} if facts.mirrors else {}
         heads |= {"media": "media: "} if facts.media else {}
         return [heads[subject] + text for subject, text in self.notes.items() if subject in heads]
 
     def settings(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """All options, those ``given``, which may be texts, and the others' defaults.
-
-        Raises NgptError for options that do not exist, and for values that are not allowed.
+        """Returns all options: the ``given`` ones, whose values may be texts, and the defaults of the others. Raises
+        NgptError for options that do not exist, and for values that are not allowed.
         """
         return settings(f"sampler '{self.name}'", self.options, given)
 
@@ -96,7 +98,9 @@ class Entry:
         return as_text(unusual(self.options, settings))
 
     def made(self, *args: Any, **options: Any) -> Any:
-        """What ``make`` makes, with ``options`` that may be texts, and the others' defaults; raises NgptError."""
+        """Returns what ``make`` makes with these ``options``, which may be texts, and the defaults of the others.
+        Raises NgptError.
+        """
         return self.make(*args, **own(self.settings(options)))
 
 
@@ -106,7 +110,7 @@ def own(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Sampler(Entry):
-    """What renders the layers of a gradient stack. It has its own options, and the options in ``COMMON``.
+    """A sampler that renders the layers of a gradient stack. It has its own options, and the options in ``COMMON``.
 
     Its ``make`` (scene, options) returns what takes the samples of a pass (``data_gen.passes.SamplePass``).
     """
@@ -143,7 +147,9 @@ class Sampler(Entry):
         return plugin_of(self.name)
 
     def integrator(self, scene: Any, **options: Any) -> Any:
-        """Its integrator with the parameters of the scene's own ``path``, and ``options`` that are checked."""
+        """Returns its integrator with the parameters of the scene's own ``path`` and the ``options``, which are
+        checked.
+        """
         return integrator_of(self.module).like_path(scene, self.plugin, **options)
 
     def make(self, scene: Any, **options: Any) -> Any:
@@ -161,10 +167,28 @@ class Sampler(Entry):
         """Whether all pixels must have as many samples."""
         return bool(self.batch) or self.together
 
+    def subpixels(self, asked: int | str, spp: int | None) -> int:
+        """K of the K x K subpixels that a render keeps: the number ``asked``, or for "auto" what suits ``spp`` samples.
+
+        Raises WrongUse if it cannot keep the requested ones.
+        """
+        k = choice(asked)
+        if not self.batch:
+            # With gradients, networks combine images that they were trained to find without subpixels.
+            return int(k) if k != "auto" else 1 if self.gradients else best(spp)
+        if k in ("auto", 1):
+            return 1
+        able = ", ".join(name for name, other in SAMPLERS.items() if not other.batch)
+        raise WrongUse(
+            f"sampler '{self.name}' puts light on any pixel and has no subpixels: leave subpixels out, or name one of: "
+            f"{able}"
+        )
+
 
 @dataclass(frozen=True)
 class FrameSampler(Entry):
-    """What renders the frames of a shot one after the other, for it remembers those before; no single images.
+    """A sampler that renders the frames of a shot in order, since it reuses earlier frames. It renders no single
+    images.
 
     Its ``make`` (scene, seed, samples per pixel, memory in MiB, options) returns an object whose ``film(index, motion,
     depth)`` is the film of a frame, numbered in the shot.
@@ -177,12 +201,12 @@ class FrameSampler(Entry):
 
 
 FRAME_SAMPLERS: dict[str, FrameSampler] = {}
-# Other packages bring theirs by entry points.
+# Other packages add theirs by entry points.
 SAMPLERS: Registry[Sampler] = Registry("ngpt.samplers", "sampler", Sampler, {}, FRAME_SAMPLERS)
 
 
 def plugin_of(name: str) -> str:
-    """What Mitsuba calls the integrator of a sampler."""
+    """Returns the name of a sampler's integrator in Mitsuba."""
     return name.replace("-", "_")
 
 
@@ -191,7 +215,7 @@ def by_plugin(plugin: str) -> Sampler:
 
 
 def register(entry: Sampler | FrameSampler) -> None:
-    """Adds a sampler, behind those there are. Raises NgptError if its name is taken."""
+    """Adds a sampler behind the existing ones. Raises NgptError if its name is taken."""
     if entry.name in ("auto", *SAMPLERS, *FRAME_SAMPLERS):
         raise NgptError(f"there is a sampler '{entry.name}' already")
     if isinstance(entry, FrameSampler):
@@ -215,8 +239,8 @@ def find(name: str, facts: Facts | None = None) -> Sampler:
     return sampler
 
 
-# Samples without gradients, and OIDN: nothing that takes longer to compile, to render or to explain is taken instead
-# of it unless that was measured to be better.
+# The default is samples without gradients, and OIDN. Anything that takes longer to compile, to render or to explain
+# replaces it only if it was measured to be better.
 SIMPLE = ("primal", "oidn")
 
 

@@ -45,10 +45,6 @@ def unrendered_media(facts: Facts, name: str) -> str:
     return f"there are media ({unseen}), which the integrator 'path' does not render" if unseen else ""
 
 
-def varying_media(facts: Facts, name: str) -> str:
-    return f"there are media whose density varies, which '{name}' does not render" if facts.grids else ""
-
-
 def hidden_emitters(facts: Facts, name: str) -> str:
     return "its integrator hides emitters" if facts.hides else ""
 

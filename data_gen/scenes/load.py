@@ -17,6 +17,7 @@ from data_gen.scenes.builtin import SCENES, no_scene
 from data_gen.scenes.cameras import sensor_number
 from data_gen.scenes.integrators import check_integrator, followed
 from data_gen.scenes.merge import merge
+from data_gen.scenes.nodes import parts_of
 from ngpt.errors import NgptError, stop_if_interrupted
 
 # Threads that it takes to load any scene
@@ -198,12 +199,9 @@ def parsed(path: str, parameters: Mapping[str, str] = MappingProxyType({})) -> t
 
 def _keep(state: mi.parser.ParserState, sensor: int | str, path: str) -> None:
     """Leaves out all sensors of the scene but that one. Raises WrongUse where it is not there."""
-    scene, found = state.root.props, {}
-    for name, reference in scene.items():
-        if isinstance(reference, mi.Properties.ResolvedReference):
-            node = state.nodes[reference.index()]
-            if node.type == mi.ObjectType.Sensor:
-                found[name] = node.props.id()
+    scene, nodes = state.root.props, state.nodes
+    sensors = [(name, nodes[number]) for name, number in parts_of(scene) if nodes[number].type == mi.ObjectType.Sensor]
+    found = {name: node.props.id() for name, node in sensors}
     if found:
         kept = sensor_number(sensor, list(found.values()), path)
         for number, name in enumerate(found):

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import mitsuba as mi
 import numpy as np
@@ -28,7 +29,6 @@ _HALVINGS = 6
 _RECTANGLE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
 _FACES = np.array([[0, 1, 2], [2, 3, 0]])
 _PLUGIN = "ngpt_lamps"
-_registered: set[str] = set()
 
 
 @dataclass
@@ -58,9 +58,7 @@ def merge_lamps(state: mi.parser.ParserState) -> None:
 
 def _merge(state: mi.parser.ParserState, material: int | None, known: dict[str, Lamp]) -> None:
     """Puts meshes in the place of lamps of one material, each in the place of its first lamp."""
-    if mi.variant() not in _registered:
-        mi.register_shape(_PLUGIN, mesh_of)
-        _registered.add(mi.variant())
+    _register(mi.variant())
     names = list(known)
     middles = np.array([lamp.corners.reshape(-1, 3).mean(axis=0) for lamp in known.values()])
     for part in _halved(np.arange(len(names)), middles, _HALVINGS):
@@ -71,6 +69,12 @@ def _merge(state: mi.parser.ParserState, material: int | None, known: dict[str, 
         state.root.props[names[part[0]]] = added(state, mi.ObjectType.Shape, props)
         for i in part[1:]:
             del state.root.props[names[i]]
+
+
+@cache
+def _register(variant: str) -> None:
+    """Registers the plugin with that variant, which must be the current one."""
+    mi.register_shape(_PLUGIN, mesh_of)
 
 
 def _candidates(state: mi.parser.ParserState) -> Iterator[tuple[str, int | None, int, np.ndarray]]:

@@ -12,8 +12,8 @@ from ngpt.system.late import fft
 from ngpt.system.limits import processors
 from ngpt.system.threads import map_parts
 
-# Values that one band of rows has in all results. The dozen or so temporaries of a stencil then stay in a core's own
-# cache, which makes plain NumPy expressions several times faster than over whole images.
+# The number of values in one band of rows, over all results. The dozen or so temporaries of a stencil then stay in the
+# cache of a core, where plain NumPy expressions are several times faster than over whole images.
 BAND = 3 << 17
 
 
@@ -28,8 +28,9 @@ def image(planes: np.ndarray) -> np.ndarray:
 
 
 def over_colours(image: np.ndarray) -> np.ndarray:
-    """(H, W, C) summed over C in double precision; channel by channel, which is ten times as fast as a sum over an axis
-    of three.
+    """(H, W, C) summed over C in double precision.
+
+    It adds channel by channel, which is ten times as fast as NumPy's sum over an axis of three.
     """
     total = image[..., 0].astype(np.float64)
     for channel in range(1, image.shape[-1]):
@@ -38,15 +39,19 @@ def over_colours(image: np.ndarray) -> np.ndarray:
 
 
 def empty(array: np.ndarray, *lead: int, channels_last: bool = False, dtype: Any = None) -> np.ndarray:
-    """Uninitialised (*lead, H, W) for ``array`` (..., H, W); one leading axis may lie innermost in memory."""
+    """An uninitialised array (*lead, H, W), with H and W of ``array`` (..., H, W).
+
+    With ``channels_last``, ``lead`` is one axis, which lies innermost in memory.
+    """
     shape = (*array.shape[-2:], *lead) if channels_last else (*lead, *array.shape[-2:])
     new = np.empty(shape, dtype or array.dtype)
     return planes(new) if channels_last else new
 
 
 def map_rows(function: Callable[[int, int], Any], *like: np.ndarray) -> list:
-    """The results of ``function(first, last)`` for bands of rows first .. last - 1, top to bottom, computed on all
-    cores.
+    """The results of ``function(first, last)`` for bands of rows first .. last - 1, top to bottom.
+
+    They are computed on all cores. Bands are as large as arrays of the shapes ``like`` need, see ``BAND``.
     """
     height = like[0].shape[-2]
     rows = max(1, BAND * height // max(1, sum(array.size for array in like)))
@@ -54,7 +59,7 @@ def map_rows(function: Callable[[int, int], Any], *like: np.ndarray) -> list:
 
 
 def map_silent(function: Callable[[Any], Any], parts: Iterable) -> list:
-    """``map_parts`` without NumPy's warnings, which are silenced per thread; reconstruct() checks what comes out."""
+    """``map_parts`` without NumPy's warnings: reconstruct() checks the results. NumPy silences them per thread."""
 
     def silent(part: Any) -> Any:
         with np.errstate(all="ignore"):
@@ -66,8 +71,8 @@ def map_silent(function: Callable[[Any], Any], parts: Iterable) -> list:
 def by_rows(function: Callable[[int, int], tuple], *out: np.ndarray) -> tuple:
     """The arrays ``out``, filled with the rows first .. last - 1 that ``function(first, last)`` returns.
 
-    Bands of rows are made on all cores. The function must read no rows of ``out`` but its own. What it returns beyond
-    these comes back as one last item, a list over the bands, from top to bottom.
+    Bands of rows are computed on all cores. The function may read only its own rows of ``out``. Further values that it
+    returns are the last item of the result: a list with one entry for each band, from top to bottom.
     """
 
     def band(first: int, last: int) -> tuple:

@@ -1,4 +1,4 @@
-"""The classical reconstructions of a repaired stack: what each needs, its options, and which a network may start from.
+"""The classical reconstructions of a repaired stack: their layers and options, and those that networks start from.
 
 The solvers in this package take arrays only. This module gives them the arrays of a stack, and calls them by name.
 """
@@ -55,7 +55,7 @@ def _keeping_energy(solver: Callable[..., np.ndarray], data: Repaired) -> np.nda
 
 
 def _alpha(data: Repaired, alpha: float | str, norm: int) -> float:
-    """The number that alpha stands for: "auto" is derived from the variances, and the fixed default without them."""
+    """``alpha`` as a number: "auto" is derived from the variances; without variances it is the fixed default."""
     if not isinstance(alpha, str):
         return alpha
     if data.variances is None:
@@ -74,7 +74,7 @@ def weight_of_primal(default: float | str) -> Option:
 
 
 CLASSICAL = {
-    # The derived alpha lowers the error of l2 by half, and is no better than the fixed one for l1.
+    # "auto" halves the error of l2. For l1, it is no better than the fixed number.
     "l2": Classical(_GRADIENTS, _l2, {"alpha": weight_of_primal("auto")}),
     "l1": Classical(_GRADIENTS, _l1, {"alpha": weight_of_primal(poisson.DEFAULT_ALPHA)}),
     "cv": Classical(_GRADIENTS, _cv, {}),
@@ -82,8 +82,8 @@ CLASSICAL = {
     "wl2": Classical(_ALL, partial(_keeping_energy, weighted.wl2), {}),
 }
 
-# The methods a network can start from: they cost less than the network. wcv is reduced to its sweeps, which need only
-# the pixels of a tile.
+# The methods that a network can start from: they cost less than the network. wcv has only its sweeps here, since they
+# need no pixels outside a tile.
 BASES = {
     "l2": CLASSICAL["l2"],
     "cv": CLASSICAL["cv"],

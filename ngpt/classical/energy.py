@@ -1,9 +1,9 @@
 """Restores the light that data-dependent weights lose, near the place where it was lost.
 
-Weights are estimated from the samples that they weigh. A pixel that a bright sample hit is trusted less than its
-neighbours that none hit, so weighted means are dark. So an image is brightened by the ratio of the light in a wide
-neighbourhood before and after, and keeps the energy of the primal, which is unbiased. Dark regions beside bright ones
-get little of it.
+Weights are estimated from the samples that they weigh. A pixel with a bright sample is trusted less than its neighbours
+without one, so weighted means are too dark. So the image is multiplied by a ratio: the light of the primal, which is
+unbiased, over the light of the image, both summed over a wide neighbourhood. Dark regions beside bright ones get little
+of the restored light.
 """
 
 import numpy as np
@@ -12,21 +12,23 @@ from ngpt.classical.arrays import by_rows, empty, over_colours
 from ngpt.classical.arrays import image as as_image
 from ngpt.classical.leastsquares import solve
 
-# Pixels over which energy is compared: the screened Poisson equation's length. 16 and 64 pixels are as good.
+# The size of the neighbourhood in pixels: the length scale of the screened Poisson equation. 16 and 64 are as good.
 REACH = 32
 
-# A neighbourhood becomes at most this many times brighter or darker: sums with pixels of 1e12 lose all other digits.
+# A neighbourhood becomes at most this many times brighter or darker. Beside a pixel of 1e12, rounding makes the sums,
+# and so the ratio, meaningless.
 MOST = 4.0
 
 
 def keep_energy(image: np.ndarray, primal: np.ndarray) -> np.ndarray:
-    """The reconstruction with the local brightness of ``primal``; both are (H, W, C), and so is the result.
+    """The reconstruction ``image`` with the local brightness of ``primal``; all are (H, W, C).
 
-    The factor is one for all colours, smooth, and 1 where the two agree. f(k image, k primal) = k f(image, primal).
+    All colours have the same factor, which is smooth, and 1 where the brightness of the two agrees. For this function
+    f, f(k image, k primal) = k f(image, primal).
     """
     double = empty(image[..., 0], 2, dtype=np.float64)
     brightness, _ = by_rows(lambda i, j: (np.stack([over_colours(x[i:j]) for x in (primal, image)]),), double)
-    # Averaged over REACH pixels up to a factor, which cancels in the ratio; sums are kept.
+    # Averages over REACH pixels, up to a factor that cancels in the ratio. The total light is kept.
     local = solve(brightness, 1 / REACH**2)
 
     def rows(first: int, last: int) -> tuple:

@@ -32,8 +32,8 @@ def differences(planes: np.ndarray, first: int, last: int) -> tuple[np.ndarray, 
 def adjoint(dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
     """The adjoint of ``differences``, i.e. the negative divergence, (..., rows, W).
 
-    The unused column of dx and row of dy must be 0. With it,
-    ``(differences(I) * (dx, dy)).sum() == (I * adjoint(dx, dy)).sum()``.
+    The unused column of dx and row of dy must be 0. Then ``(differences(I) * (dx, dy)).sum()`` equals
+    ``(I * adjoint(dx, dy)).sum()``.
     """
     total = -dx
     total -= dy
@@ -43,9 +43,9 @@ def adjoint(dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
 
 
 def adjoint_by_rows(function: Callable[[int, int], tuple], *out: np.ndarray) -> tuple:
-    """As ``by_rows``, but the function's first three values v, dx, dy are combined into v + adjoint(dx, dy).
+    """Like ``by_rows``, but the function's first three values v, dx, dy are combined into v + adjoint(dx, dy).
 
-    v may be None for 0.
+    v may be None, which stands for 0.
     """
 
     def band(first: int, last: int) -> tuple:
@@ -57,7 +57,7 @@ def adjoint_by_rows(function: Callable[[int, int], tuple], *out: np.ndarray) -> 
         return (total, *values[:others], last, dy[..., -1, :], *values[others:])
 
     total, *arrays, bands = by_rows(band, *out)
-    # The lowest differences of a band belong to the next band's first row, too.
+    # The differences dy of a band's last row also contribute to the first row of the next band.
     for last, lowest, *_ in bands[:-1]:
         total[..., last, :] += lowest
     return (total, *arrays, [values for _, _, *values in bands])

@@ -4,9 +4,9 @@ It uses only NumPy, and is faster than plain NumPy expressions over bands of an 
 
 - The image is cut into strips of rows, which threads work on. A strip has ``DEPTH`` more rows on both sides, copies of
   its neighbours' rows. So it needs no exchange for ``DEPTH`` sweeps: errors at its ends move in by one row a sweep.
-- Within a strip, sweeps follow each other one row apart, on some rows at a time. What they read stays in the cache.
-- There are few calls, and each does much: x and y, and all colours, in one. Each call of NumPy takes Python's lock at
-  its end, and a thread that finds it taken sleeps. With short calls, two threads take longer than one.
+- Within a strip, sweeps follow each other one row apart, on a block of rows at a time. Their data stays in the cache.
+- There are few calls of NumPy, and each does much: both directions and all colours. Each call takes Python's lock at
+  its end, and a thread that has to wait for the lock sleeps. With short calls, two threads are slower than one.
 - Rows are padded to whole vectors and laid end to end, so that operations see one long aligned array. The difference
   between the last pixel of a row and the first of the next has weight 0.
 """
@@ -23,19 +23,20 @@ from ngpt.classical.arrays import map_silent
 DEPTH = 6
 # Rows of a strip without the neighbours' rows. Fewer rows mean more copies; more rows leave threads without work.
 _STRIP = 180
-# Pixels that are worked on at a time: fewer make more calls, more leave the cache.
+# Pixels that are processed at a time: fewer make more calls, more do not fit into the cache.
 _PIXELS = 30720
-# Bytes of the widest vectors: operations on addresses that are no multiples take twice as long.
+# Bytes of the widest vectors. Operations on addresses that are not multiples of this take twice as long.
 _VECTOR = 64
 
 
 def jacobi(
     r: np.ndarray, primal_var: np.ndarray, difference_var: np.ndarray, schedule: list[tuple[float, float]]
 ) -> np.ndarray:
-    """The correction u (C, H, W) after one sweep from 0 for each entry of ``schedule``, as of ``controlvariates``.
+    """The correction u (C, H, W): from 0, one sweep for each entry (f, s) of ``schedule``, see ``controlvariates``.
 
-    ``r`` (2, C, H, W) residuals of the differences, ``primal_var`` (1, H, W) > 0, ``difference_var`` (2, 1, H, W),
-    infinite where there is no difference; float32 or float64. ``r`` is overwritten: u is in its memory.
+    ``r`` (2, C, H, W) are the residuals of the differences, ``primal_var`` is (1, H, W) > 0, and ``difference_var``
+    (2, 1, H, W), infinite where there is no difference. All are float32 or float64. ``r`` is overwritten: u is in its
+    memory.
     """
     height = r.shape[2]
     count = max(1, round(height / _STRIP))
@@ -70,7 +71,7 @@ class _Strip:
         image = slice(max(first - DEPTH, 0), min(last + DEPTH, height))
         strip = slice(image.start - first + DEPTH, image.stop - first + DEPTH)
         size = self.rows * self.pitch
-        # One row more on top, to which the first one has no difference, and below.
+        # With one more row above and one below; no differences lead to them.
         self.u = _aligned((channels, size + 2 * self.pitch), dtype, 0)
         self.r = _aligned((2, channels, size), dtype, 0)
         # For each pixel, its neighbours to the right and below.
@@ -110,8 +111,8 @@ class _Strip:
     ) -> None:
         """One sweep over rows top .. end - 1.
 
-        ``above`` (C, pitch) is the estimate of this sweep's first row by the last row before it. It is replaced by the
-        one for the next rows.
+        ``above`` (C, pitch) is d for dy of the row above ``top``, from before this sweep changed that row. It is
+        replaced by d of row end - 1, for the next call.
         """
         pitch, first, last = self.pitch, top * self.pitch, end * self.pitch
         size = last - first
@@ -123,7 +124,7 @@ class _Strip:
         share /= step
         np.subtract(self.neighbours[..., first:last], u, out=d)
         d -= self.r[..., first:last]
-        # dy of the row above, as it was before this sweep.
+        # d of the row above, as it was before this sweep changed that row.
         scratch.rows[:, :pitch] = above
         above[...] = scratch.rows[:, size : size + pitch]
         np.multiply(weights[2:, None], before, out=said)
@@ -138,11 +139,13 @@ class _Strip:
 
 
 class _Scratch:
-    """The memory a thread needs, besides the strip, for this number of rows; ``above`` has an entry for each sweep
-    under way.
+    """The memory that a thread needs besides the strip, for this number of rows.
 
-    ``arrays`` (..., pixels): the weights of the neighbours, their sum with the pixel's own weight, dx and dy, dx and dy
-    of the pixels to the left and above, and as much scratch space. ``rows`` (C, pixels) is dy with one more row on top.
+    ``arrays``  (..., pixels): the weights of the neighbours; the sum of these and the pixel's own; d, the estimates by
+                the right and lower neighbours minus the pixel, without weights; the same of the pixels to the left and
+                above; and as much scratch space
+    ``rows``    (C, pixels): d of the lower neighbours, with one more row on top
+    ``above``   (sweeps, C, pitch): for each sweep under way, d of the row above its next rows
     """
 
     def __init__(self, strip: _Strip, rows: int):

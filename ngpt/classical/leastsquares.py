@@ -12,8 +12,8 @@ from ngpt.classical.arrays import by_rows, dct2, empty, idct2, image, map_rows, 
 from ngpt.classical.gradients import adjoint_by_rows, differences
 from ngpt.errors import NgptError
 
-# Ratio of the largest value to a typical one beyond which float32 transforms would spread their rounding of the one
-# over the other: such inputs are solved in double precision.
+# If the ratio of the largest value to a typical one exceeds this, inputs are solved in double precision. In float32,
+# the transforms would spread the rounding errors of the largest value over all others.
 FLOAT32_RANGE = 2.0**16
 
 # A value counts as at most this multiple of the mean, see ``robust_mean``.
@@ -21,7 +21,7 @@ CLIP = 100
 
 
 class Equations:
-    """The right-hand sides as planes (C, H, W), in double precision where their range asks for it.
+    """The right-hand sides P and G as planes (C, H, W), in double precision if their range needs it.
 
     ``primal``, ``dx``, ``dy``  (H, W, C) float32 or float64, finite
     ``trusted``  for dx and dy, (H, W) booleans: a difference marked False has no equation; None trusts all
@@ -77,9 +77,7 @@ class Equations:
         return r, scale
 
     def _holds(self, peaks: list) -> bool:
-        """Whether the precision suffices for these largest values of r in each band. Switches to double precision if
-        not.
-        """
+        """Whether the precision suffices; ``peaks`` are the largest |r| of each band. If not, switches to double."""
         peak = float(np.max(peaks))
         if not math.isfinite(peak):
             raise NgptError("primal, dx or dy holds values that are not finite; ngpt.reconstruct() repairs them first")
@@ -100,7 +98,7 @@ class Equations:
 
 
 def _peak(*arrays: np.ndarray) -> float:
-    """The largest absolute value, which is not finite if one is not; 0 without any."""
+    """The largest absolute value, 0 for empty arrays. It is not finite if one of the values is not."""
     extremes = [abs(float(v)) for a in arrays if math.prod(a.shape) for v in (a.min(), a.max())]
     return float(np.max(extremes, initial=0))
 
@@ -109,12 +107,12 @@ def solve(b: np.ndarray, screen: float, mean: np.ndarray | float | None = None) 
     """The planes u (C, H, W) with (screen + ∇ᵀ∇) u = b; b is overwritten.
 
     The cosine transform of type II diagonalises ∇ᵀ∇ under Neumann boundaries [Bhat et al. 2008]. ``mean`` (C) is the
-    mean of u where the caller knows it. Differences do not determine it, and its rounding error would be divided by
-    ``screen``.
+    mean of u, if the caller knows it. Otherwise it is computed by a division by ``screen``, which enlarges its rounding
+    error if ``screen`` is small.
     """
     height, width = b.shape[-2:]
     λy, λx = ((4 * np.sin(np.pi / 2 * np.arange(n) / n) ** 2).astype(b.dtype) for n in (height, width))
-    # With all channels and in their layout: NumPy is slow if the axes of arrays have different orders in memory.
+    # With all channels of b, and in the same layout: NumPy is slow if axes have different orders in memory.
     screened = np.zeros_like(b[:, :1]) + screen
     screened += λx
     coefficients = dct2(b)
@@ -129,10 +127,10 @@ def solve_weighted(
 ) -> tuple[np.ndarray, int]:
     """The u (C, H, W) that minimises Σ screen |u|² + Σ weights |∇u - r|², and the number of iterations it took.
 
-    ``r`` (2, C, H, W), 0 in the unused column and row; ``weights`` (2, 1, H, W) >= 0; ``screen`` > 0, (1, H, W), or a
-    number for one that is the same everywhere.
+    ``r`` is (2, C, H, W), 0 in the unused column and row; ``weights`` (2, 1, H, W) >= 0; ``screen`` > 0, either
+    (1, H, W) or one number for all pixels.
 
-    Conjugate gradients until the residual in the norm of the preconditioner is ``tolerance`` of the first.
+    Conjugate gradients stop when the norm of the residual, by the preconditioner, is ``tolerance`` times the first one.
     """
     flux = weights * r
     b, _ = adjoint_by_rows(lambda i, j: (None, *flux[..., i:j, :]), empty(r, len(r[0])))
@@ -142,9 +140,9 @@ def solve_weighted(
 class Weighted:
     """The matrix screen + ∇ᵀ weights ∇ and its preconditioner D^-1/2 (σ + ∇ᵀ∇)⁻¹ D^-1/2, by cosine transforms.
 
-    D is the mean weight around a pixel where ``screen`` varies, and 1 where it does not [Concus and Golub 1973, "Use of
-    Fast Direct Methods for the Efficient Numerical Solution of Nonseparable Elliptic Equations"]. In that second case
-    the mean of the solution is 0, like the mean of the right-hand side.
+    If ``screen`` is an array, D is the mean weight around a pixel plus ``screen`` [Concus and Golub 1973, "Use of Fast
+    Direct Methods for the Efficient Numerical Solution of Nonseparable Elliptic Equations"]. If it is a number, D is 1;
+    the mean of the solution is then 0, like the mean of the right-hand side.
     """
 
     def __init__(self, screen: np.ndarray | float, weights: np.ndarray):
@@ -177,7 +175,7 @@ class Weighted:
         return u, max_iterations
 
     def _precondition(self, residual: np.ndarray, out: np.ndarray) -> tuple[np.ndarray, float]:
-        """z = D^-1/2 (σ + ∇ᵀ∇)⁻¹ D^-1/2 residual, and the product of the two."""
+        """z = D^-1/2 (σ + ∇ᵀ∇)⁻¹ D^-1/2 residual, and the scalar product of z and the residual."""
         out, _ = by_rows(lambda i, j: (self.scaling[:, i:j] * residual[:, i:j],), out)
         out = solve(out, self.σ, self.mean)
 
@@ -189,7 +187,7 @@ class Weighted:
         return z, total_of(products)
 
     def _apply(self, p: np.ndarray, out: np.ndarray) -> tuple[np.ndarray, list]:
-        """(screen + ∇ᵀ weights ∇) p, and its product with p in parts."""
+        """(screen + ∇ᵀ weights ∇) p, and its scalar product with p as a list of parts, one for each band."""
 
         def rows(i, j):
             dx, dy = differences(p, i, j)
@@ -225,12 +223,12 @@ def sum_of(values: np.ndarray) -> float:
 
 
 def total_of(bands: list) -> float:
-    """The sum of the one further value of each band, as ``by_rows`` lists them."""
+    """The sum over ``bands``, the lists of one value each that ``by_rows`` returns last."""
     return float(sum(value for (value,) in bands))
 
 
 def robust_mean(*layers: np.ndarray) -> float:
-    """The mean of values >= 0, in arrays of any shape, when none counts as more than ``CLIP`` times this mean.
+    """A mean of values >= 0 in arrays of any shape, where no value counts as more than ``CLIP`` times the mean.
 
     It is close to the ordinary mean for ordinary data; a few pixels of 1e12 do not move it.
     """

@@ -3,16 +3,16 @@
     l2   min  Σ α² |I - P|²   + Σ |∇I - G|²     exact, by cosine transforms
     l1   min  Σ α ‖I - P‖     + Σ ‖∇I - G‖      robust to outliers, by ADMM around the same transforms
 
-P is the primal image, G the sampled gradients; sums run over pixels and differences, ‖.‖ is the Euclidean norm over the
-colour channels, so that l1 treats a colour as one vector. Forward differences with Neumann boundaries: no equation
-crosses the border. α multiplies the residual, as in the reference implementations (0.2 there and here).
+P is the primal image, G the sampled gradients. Sums run over pixels and differences. ‖.‖ is the Euclidean norm over the
+colour channels, so l1 treats a colour as one vector. Differences are forward differences with Neumann boundaries: no
+equation crosses the border. α multiplies the residual, as in the reference implementations (0.2 there and here).
 
-Both solve for the correction u = I - P, whose right-hand side ∇ᵀ(G - ∇P) has mean zero: exact gradients return the
-primal as it is for every α, and the mean of the image is kept exactly by l2 even where α² vanishes beside rounding.
+Both solve for the correction u = I - P, whose right-hand side ∇ᵀ(G - ∇P) has mean zero. So with exact gradients the
+result is the primal for every α. l2 keeps the mean of the image exactly, even if α² is lost in rounding.
 
 Memory in bytes per pixel of three float32 channels, beyond the 36 of the input and with the 12 of the output: l2 16
-(and 10 MB for bands of rows), l1 165; ``tests/classical/test_classical.py`` holds them to it.
-Twice as much where the range of the input asks for double precision (``ngpt.classical.leastsquares.FLOAT32_RANGE``).
+(and 10 MB for bands of rows), l1 165; ``tests/classical/test_classical.py`` checks this. It is twice as much if the
+range of the input needs double precision (``ngpt.classical.leastsquares.FLOAT32_RANGE``).
 
 [Hua et al. 2019, "A Survey on Gradient-Domain Rendering", eq. 5 and section 5; Bhat et al. 2008, "Fourier Analysis of
 the 2D Screened Poisson Equation for Gradient Domain Problems"]
@@ -27,15 +27,15 @@ from ngpt.errors import NgptError
 
 DEFAULT_ALPHA = 0.2
 
-# ADMM: over-relaxation, and the threshold in units of the mean residual, 1 + FIRST_STRIDE · DECAYⁿ. Long strides at
-# first move the outliers; with only short strides this takes hundreds of iterations. Among twenty such schedules, this
-# one takes the fewest iterations to within 0.5 % of the minimum in the worst of eight stacks: 46, and 28 to 41 in the
+# ADMM: the over-relaxation, and the threshold 1 + FIRST_STRIDE · DECAYⁿ in units of the mean residual. The long strides
+# at first move the outliers; with only short strides, that takes hundreds of iterations. Of twenty such schedules, this
+# one comes within 0.5 % of the minimum in the fewest iterations on the worst of eight stacks: 46, and 28 to 41 on the
 # others.
 RELAXATION = 1.6
 FIRST_STRIDE = 300.0
 DECAY = 0.75
 
-# Iterations over which progress is judged, once the strides have become short.
+# The number of iterations over which progress is measured, once the strides are short.
 WINDOW = 5
 
 
@@ -49,11 +49,11 @@ def l2(
     """The exact minimiser of the squared energy, (H, W, C) in the units of ``primal``.
 
     ``primal``, ``dx``, ``dy``  (H, W, C) float32 or float64, finite; last column of dx and row of dy are ignored
-    ``alpha``    weight of the primal's residual, > 0: small trusts the gradients, large the primal
+    ``alpha``    weight of the primal's residual, > 0: a small one trusts the gradients, a large one the primal
     ``trusted``  for dx and dy, (H, W) booleans: a difference marked False gets no weight
 
-    Linear in (primal, dx, dy), so reconstructions of light groups add up to the reconstruction of their sum. Untrusted
-    differences are left to conjugate gradients (``leastsquares.solve_weighted``), to 1e-8 of the residual.
+    Linear in (primal, dx, dy), so reconstructions of light groups add up to the reconstruction of their sum. With
+    ``trusted``, the solver is conjugate gradients (``leastsquares.solve_weighted``), to 1e-8 of the residual.
     """
     check_alpha(alpha)
     equations = Equations(primal, dx, dy, trusted)
@@ -75,11 +75,11 @@ def l1(
     tolerance: float = 7e-4,
     max_iterations: int = 300,
 ) -> np.ndarray:
-    """The minimiser of the sum of norms, (H, W, C); arguments as of ``l2``.
+    """The minimiser of the sum of norms, (H, W, C); arguments are as for ``l2``.
 
-    Stops when five iterations lower the energy by less than ``tolerance`` of it, which leaves it within 0.5 % of the
-    minimum. Robust to outliers, but not linear, and it darkens where few bright samples carry the energy: the norm
-    seeks the median where l2 seeks the mean.
+    Stops when five iterations lower the sum of norms by less than the share ``tolerance``, which leaves it within 0.5 %
+    of the minimum. The result is robust to outliers, but not linear, and too dark where few bright samples carry the
+    light: the norm seeks the median where l2 seeks the mean.
     """
     check_alpha(alpha)
     equations = Equations(primal, dx, dy, trusted)
@@ -91,18 +91,17 @@ def l1(
 def least_norms(
     r: np.ndarray, alpha: float, trusted, tolerance: float, max_iterations: int
 ) -> tuple[np.ndarray, list[float]]:
-    """The correction u (C, H, W) that minimises Σ ‖K u - (0, r)‖, K = (α, ∂x, ∂y), and the energies on the way.
+    """The correction u (C, H, W) that minimises Σ ‖K u - (0, r)‖, K = (α, ∂x, ∂y), and the energy after each iteration.
 
-    (These begin once the strides are short; a norm beyond a thousand times the mean of the first counts as a thousand.)
-
-    ``r`` (2, C, H, W) of a magnitude near 1, as ``Equations.scaled_residual`` gives it.
+    The energies begin once the strides are short. In them, a norm counts as at most a thousand times the mean norm at
+    the start. ``r`` (2, C, H, W) has a magnitude near 1, as ``Equations.scaled_residual`` returns it.
 
     ADMM [Boyd et al. 2011, "Distributed Optimization and Statistical Learning via ADMM", section 3.4] on the residuals
-    e = K u - r, whose inner problem KᵀK u = Kᵀ(...) is again the one the transforms solve. In the form of Douglas and
-    Rachford, s = e + scaled dual variable is all the state: shrink(s) = factor · s is the residual to aim at.
+    e = K u - r. Its inner problem KᵀK u = Kᵀ(...) is again one that the cosine transforms solve. In the form of Douglas
+    and Rachford, the only state is s = e + scaled dual variable, and shrink(s) = factor · s is the residual to aim at.
     """
     channels = len(r[0])
-    # 1 for every equation that counts; the unused column and row have residual 0 and count for nothing.
+    # 1 for every equation that counts. The unused column and row need no 0, since their residual is 0.
     counts = np.ones_like(r[:1, :1]) if trusted is None else _counts(r, trusted)
 
     def residual(u, first, last):
@@ -125,8 +124,8 @@ def least_norms(
         # variable, previous - shrunk, is scaled by the threshold and falls with it.
         new = (fall + (1 - fall - RELAXATION) * factor[:, :, first:last]) * previous
         new += RELAXATION * e
-        # The proximal operator of the norm shortens each colour by the threshold; equations that do not count are left
-        # as they are.
+        # The proximal operator of the norm shortens each colour by the threshold, but not in equations that do not
+        # count.
         shorter = (1 - threshold * counts[:, :, first:last] / norm(new)).clip(0, None)
         v = (2 * shorter - 1) * new
         total = v[0].sum((1, 2), dtype=np.float64)
@@ -136,8 +135,8 @@ def least_norms(
     b, _ = adjoint_by_rows(lambda i, j: (None, *r[..., i:j, :]), empty(r, channels))
     u, free = solve(b, alpha**2, mean=0.0), [empty(b, channels), empty(b, channels)]
     s, norms, _ = by_rows(start, empty(r, 3, channels), empty(r, 3, 1))
-    # In units of the mean residual, the iteration follows the exposure of the image. Outliers must not set this unit.
-    # They must not decide when to stop either, with an energy that dwarfs the rest of the image.
+    # The unit of the iteration is the mean residual, so it follows the exposure of the image. Outliers must not set
+    # this unit. Their energy may exceed the energy of all other pixels, so it must not decide when to stop.
     mean = robust_mean(norms)
     limit, stride = 1000 * mean, max(FIRST_STRIDE * mean, float(norms.max()) / 10)
     threshold = mean + stride

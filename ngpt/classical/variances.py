@@ -6,10 +6,10 @@ from them would trust the pixels that saw nothing.
 
 For the primal, such weights darken the image. So its variances are averaged over a neighbourhood.
 
-For differences, such weights only smooth. But few differences hold most of the variance: differences of light that no
-shift follows. An average over neighbours would pass their variance on to clean differences, and make the noisy ones
-look better than they are. So a difference has its own variance where that is large. Elsewhere it has a typical one of
-its neighbourhood, the fourth power of the mean of fourth roots, which outliers do not dominate.
+For differences, such weights only smooth. But most of the variance belongs to a few differences, whose light no shift
+mapping follows. An average over neighbours would pass their variance on to clean differences, and make the noisy ones
+look better than they are. So a difference keeps its own variance if that is large. Otherwise it gets a typical variance
+of its neighbourhood: the fourth power of the mean of fourth roots, which outliers do not dominate.
 
 All variances are summed over colours (a colour is weighted as one vector), and bounded from below in proportion to
 their mean. The weights follow the exposure of the image: k times the image, with k² times the variances, has k⁻² times
@@ -24,34 +24,34 @@ import numpy as np
 from ngpt.classical.arrays import by_rows, empty
 from ngpt.classical.leastsquares import robust_mean, sum_of
 
-# What is added to every variance, as a share of the mean over primal and differences.
+# This share of the mean over primal and differences is added to every variance.
 FLOOR = 3e-3
 
 # A difference has at least this many times the typical variance around it: the mean of fourth roots is below the mean.
 # Among 2, 3 and 4, wcv has the least error with 2, by 1 %, and wl2 with 3.
 TYPICAL = 3
 
-# The factor on the variance of differences relative to the primal's. Neighbouring pixels share paths, so errors of
-# differences cancel in the sums that a reconstruction takes. Means of differences over blocks of 8x8 have .56 to .92 of
-# the variance that independent differences would have (96x64, eight scenes). Means of the primal have .8 to 1.
-# Among 1, .7, .5 and .35, wcv and wl2 have the least error with .7 at 4 samples and with .35 to .5 from 16 on
-# (docs/lab/log).
+# The variances of differences are multiplied by this, relative to the primal's. Neighbouring pixels share paths, so
+# errors of differences partly cancel in the sums that a reconstruction takes. Means of differences over blocks of 8x8
+# have .56 to .92 of the variance that independent differences would have (96x64, eight scenes). Means of the primal
+# have .8 to 1. Among 1, .7, .5 and .35, wcv and wl2 have the least error with .7 at 4 samples and with .35 to .5 from
+# 16 on (docs/lab/log).
 SHARED = 0.6
 
-# The least divisor for the share of valid values.
+# The least count of valid values that sums are divided by, against division by zero.
 FEW = 1e-9
 
-# Share of the largest variances that do not count for α.
+# This share of the variances, the largest ones, does not count for α.
 OUTLIERS = 1e-4
 
 
 def auto_alpha(primal_var: np.ndarray, dx_var: np.ndarray, dy_var: np.ndarray, norm: int = 2) -> float:
-    """The α that weights the primal against the gradients as their noise does; variances are (H, W, C).
+    """The α that weights the primal against the gradients by their noise; variances are (H, W, C).
 
     ``norm`` 2: the square root of mean gradient variance over mean primal variance, which weights the two terms of l2
     by inverse variance. ``norm`` 1: mean standard deviation of gradients over mean standard deviation of the primal.
-    Values that are not finite or negative are left out, and so are the largest: one in ten thousand, but at least one.
-    The result is in [1e-3, 1e3], and 1 without any noise.
+    Values that are negative or not finite are left out, and so are the largest: one in ten thousand, but at least one.
+    The result is in [1e-3, 1e3]; it is 1 if there is no noise at all.
     """
 
     def mean(*layers: np.ndarray) -> float:
@@ -73,11 +73,11 @@ def smooth_variances(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Variances of the primal (1, H, W) and of the differences (2, 1, H, W), summed over colours, relative, positive.
 
-    Variances of the primal are averaged twice over 3 x 3 pixels, over the valid values only: values that are negative
-    or not finite are left out. A difference has at least ``TYPICAL`` times the variance of its neighbourhood, which is
-    the fourth power of such an average of fourth roots. The result is divided by a robust mean of all three layers,
-    and ``FLOOR`` is added; without any noise it is 1 everywhere. Then variances of differences are multiplied by
-    ``SHARED``. Differences that are not ``trusted``, and differences that do not exist, have infinite variance.
+    Variances of the primal are averaged twice over 3 x 3 pixels. Values that are negative or not finite are left out of
+    the averages. A difference has at least ``TYPICAL`` times the typical variance of its neighbourhood: the fourth
+    power of such an average of fourth roots. All are divided by a robust mean of the three layers, and ``FLOOR`` is
+    added; without any noise, they are 1 everywhere. Then variances of the primal are divided by ``SHARED``. Differences
+    that are not ``trusted``, and differences that do not exist, have infinite variance.
     """
     layers = [smoothed(primal_var), *(smoothed(layer, True) for layer in (dx_var[:, :-1], dy_var[:-1]))]
     mean = robust_mean(*layers)
@@ -98,7 +98,7 @@ def relative(layer: np.ndarray, mean: float, dtype: Any) -> np.ndarray:
 
 
 def without_missing(variances: np.ndarray, trusted: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray:
-    """Variances (2, H, W) of differences as (2, 1, H, W), infinite where there is none or it is not ``trusted``."""
+    """Variances (2, H, W) of differences as (2, 1, H, W), infinite where one is missing or not ``trusted``."""
     variances[0, :, -1] = math.inf
     variances[1, -1] = math.inf
     if trusted is not None:
@@ -107,13 +107,16 @@ def without_missing(variances: np.ndarray, trusted: tuple[np.ndarray, np.ndarray
 
 
 def _positive_values(variance: np.ndarray) -> np.ndarray:
-    """The sums over colours that are usable, as a list."""
+    """The usable sums over colours, as an array (N)."""
     total, good = _over_colours(variance)
     return total[good]
 
 
 def _over_colours(variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, C) -> sum over C in double precision (squares of large radiances add up), and where it is usable."""
+    """(H, W, C) -> the sum over C, and where it is usable: finite, of values >= 0.
+
+    The sum is in double precision, since squares of large radiances are large.
+    """
     channels = [variance[..., i] for i in range(variance.shape[-1])]
     total, good = channels[0].astype(np.float64, copy=False), channels[0] >= 0
     for channel in channels[1:]:
@@ -123,9 +126,10 @@ def _over_colours(variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def smoothed(variance: np.ndarray, outliers: bool = False) -> np.ndarray:
-    """(H, W, C) -> (H, W): twice the mean over 3 x 3 sums that are good, and the mean of all where there are none.
+    """(H, W, C) -> (H, W): the usable sums over colours, averaged over 3 x 3 pixels twice.
 
-    With ``outliers`` it averages fourth roots, and a sum that is larger than the result is kept.
+    Where none of these is usable, the result is the mean over the image. With ``outliers``, fourth roots are averaged,
+    the fourth power is multiplied by ``TYPICAL``, and a sum that is larger than this is kept.
     """
     height = len(variance)
 
@@ -136,11 +140,11 @@ def smoothed(variance: np.ndarray, outliers: bool = False) -> np.ndarray:
         raw, sums = total, (sum_of(total[own]), int(good[own].sum()))
         if outliers:
             total = np.sqrt(np.sqrt(total))
-            # Roots of single precision are within it.
+            # The roots fit into single precision.
             total = (total if good.all() else np.where(good, total, 0)).astype(variance.dtype, copy=False)
         total = _box(_box(total))
         if good.all():
-            # The counts of rows times the counts of columns.
+            # The count of values is the count of rows times the count of columns.
             ones = np.ones_like(total)
             count = _box(_box(ones[:, :1])) * _box(_box(ones[:1]))
         else:

@@ -1,12 +1,12 @@
-"""Variance-weighted least squares: every equation counts by how well it is known.
+"""Variance-weighted least squares: every equation is weighted by its inverse variance.
 
     wl2   min  Σ |I - P|² / var P  +  Σ |∇I - G|² / var G
 
-The maximum-likelihood image for independent normal noise of these variances. Colours share a weight, see
-``ngpt.classical.variances``, and there is no α: the variances are what α stands in for.
+This is the maximum-likelihood image for independent normal noise of these variances. All colours of a pixel have the
+same weight (``ngpt.classical.variances``). There is no α: the variances take its place.
 
 Solved by conjugate gradients with the cosine transforms as preconditioner (``ngpt.classical.leastsquares``). Memory in
-bytes per pixel of three float32 channels, beyond the 72 of the input: 165 with the output.
+bytes per pixel of three float32 channels: 165 with the output, beyond the 72 of the input.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from ngpt.classical.leastsquares import Equations, solve_weighted
 from ngpt.classical.variances import smooth_variances
 
-# Relative residual at which to stop.
+# The relative residual at which the solver stops.
 TOLERANCE = 1e-4
 
 
@@ -29,7 +29,7 @@ def wl2(
 ) -> np.ndarray:
     """The variance-weighted least-squares image, (H, W, C) in the units of ``primal``.
 
-    ``*_var`` (H, W, C) are variances of the pixel means; missing values may be NaN. Other arguments as of
+    ``*_var`` (H, W, C) are variances of the pixel means; missing values may be NaN. Other arguments are as for
     ``ngpt.classical.poisson.l2``. Linear in (primal, dx, dy) for given variances.
     """
     equations = Equations(primal, dx, dy, trusted)

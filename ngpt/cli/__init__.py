@@ -2,8 +2,8 @@
 
 Verbs that render are in ``data_gen.cli``, and are found by an entry point: nothing here imports the renderer.
 
-Exit status, of all verbs: 0 when everything asked for was done; 1 when work failed, for some file or for all, and when
-images differ; 2 for a call that makes no sense (``WrongUse``); 130 and 143 after Ctrl-C and SIGTERM.
+All verbs share these exit statuses: 0 when everything requested was done; 1 when the work failed for at least one file,
+or images differ; 2 for a call that makes no sense (``WrongUse``); 130 after Ctrl-C and 143 after SIGTERM.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from ngpt.version import __version__
 
 class Verb(NamedTuple):
     """A verb: its summary, the package that holds its module (named after the verb), the extra of ngpt-recon that
-    installs what it needs, what an interrupt means for its work, and its heading in help, one of ``HEADINGS``."""
+    installs what it needs, the message after an interrupt, and its heading in help, one of ``HEADINGS``."""
 
     summary: str
     room: str = "ngpt.cli"
@@ -128,7 +128,8 @@ def parsers() -> dict[str, argparse.ArgumentParser]:
 def main(arguments: list[str] | None = None) -> int:
     """Runs a command line and returns its exit status."""
     words = sys.argv[1:] if arguments is None else arguments
-    # Only one option of ngpt itself has a value, and it ends the command. The first other word is the verb.
+    # Only one option of ngpt itself takes a value, and that option ends the command. The first word that is not an
+    # option is the verb.
     called = "" if words[:1] == ["--completion"] else next((word for word in words if not word.startswith("-")), "")
     # Looking for verbs of other packages takes time.
     verbs = VERBS if called in VERBS else all_verbs()
@@ -141,7 +142,7 @@ def door(
 ) -> int:
     """Runs a script of the repository that does what a verb does: ``python train.py``, ``python -m data_gen``.
 
-    ``name`` is what its errors begin with. ``verbs`` hold the verb, so that it need not be installed.
+    Its errors begin with ``name``. ``verbs`` contains the verb, so that its package need not be installed.
     """
     words = sys.argv[1:] if arguments is None else arguments
     parser = argparse.ArgumentParser(program)

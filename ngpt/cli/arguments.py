@@ -20,7 +20,7 @@ from ngpt.system.writing import write_text
 
 _LOG = logging.getLogger(__name__)
 
-# Layers that many renderers write into files of their own.
+# Layers that many renderers write into separate files.
 FILES = ("albedo", "normal", "depth")
 
 
@@ -42,9 +42,10 @@ def add_options(parser: argparse._ActionsContainer, owner: str, name: str) -> No
 
 
 def output_file(path: str | Path, args: argparse.Namespace) -> Path:
-    """The path of a file to write, whose folder is made; raises NgptError where that cannot be, and for what exists.
+    """The path of a file to write; its folder is made. Raises NgptError if the folder cannot be made, or the file
+    exists.
 
-    ``args`` has ``force``, and ``skip_existing`` where the verb has that option, which helps with OpenEXR.
+    ``args`` has ``force``. It also has ``skip_existing`` if the verb has that option, which applies to OpenEXR files.
     """
     skip = getattr(args, "skip_existing", None)
     make_folder(Path(path).parent)
@@ -164,7 +165,7 @@ def duration(text: str) -> float:
 
 
 def relative(text: str) -> float:
-    """A number, or an error that has it for a percentage: 5% is 0.05."""
+    """A number. The error for a text such as "5%" suggests the fraction, 0.05."""
     try:
         return float(text)
     except ValueError:
@@ -174,7 +175,7 @@ def relative(text: str) -> float:
 
 
 def number(text: str, fits: Callable[[float], bool], refusal: str) -> float:
-    """The number in a text. Texts without one, and numbers that do not fit, are an error that ends in ``refusal``."""
+    """The number in a text. For other texts, and for numbers out of range, the error ends in ``refusal``."""
     try:
         found = float(text)
     except ValueError:
@@ -203,7 +204,7 @@ def tell_lacks(lacks: Mapping[str, str], console: Console) -> None:
 
 
 def print_json(value: object) -> None:
-    """Strict JSON: numbers that it does not know (infinite, not a number) become null; files as they are called."""
+    """Prints strict JSON: numbers that JSON does not have (infinite, NaN) become null, and paths become strings."""
     print(json.dumps(_strict(value), indent=2))
 
 

@@ -253,7 +253,7 @@ def _unseen(done: int, total: int) -> None:
 def read_frame(
     pair: tuple[Path, Path], args: argparse.Namespace, files: dict[str, str], again: Container[Path]
 ) -> Frame:
-    """``again``: existing results that are made again because later frames build on them."""
+    """Reads a frame. ``again`` contains existing results to make again, because later frames build on them."""
     source, target = pair
     # Checked only now, because several machines may work on one folder.
     there = args.skip_existing and finished(target)

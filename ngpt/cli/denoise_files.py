@@ -33,19 +33,22 @@ class Frame:
     stack: GradientStack | None
     result: Result | None = None
     there: bool = False
-    cut: bool = False  # whether a file is in its place that is not whole
-    over_time: Mapping[str, Any] = field(default_factory=dict)  # what other frames were to it, as header attributes
-    told: Mapping[str, Any] = field(default_factory=dict)  # what else is reported
+    cut: bool = False  # whether an incomplete file is in its place
+    over_time: Mapping[str, Any] = field(default_factory=dict)  # use of other frames, as header attributes
+    told: Mapping[str, Any] = field(default_factory=dict)  # further entries of the report
     others: tuple[Frame, ...] = ()  # the other views of the file
 
     @property
     def view(self) -> str:
-        """The name of the view that it is of; "" in a file without views."""
+        """The name of its view; "" in a file without views."""
         return self.stack.source.view.name if self.stack is not None and self.stack.source is not None else ""
 
 
 def write_frame(frame: Frame, args: argparse.Namespace, keep: bool) -> dict:
-    """Writes the result, with ``keep`` elsewhere where it must, and returns what there is to report."""
+    """Writes the result, and returns its report.
+
+    With ``keep``, a result that cannot be written to its place is written elsewhere.
+    """
     target, stack, result = frame.target, frame.stack, frame.result
     report: dict[str, Any] = {"input": str(frame.source), "output": str(target)}
     if frame.there or stack is None or result is None:

@@ -18,9 +18,9 @@ from ngpt.stack import GradientStack
 def way(sources: Sequence[Path], names: Mapping[str, str], by_wcv: bool) -> tuple[bool, str]:
     """Whether windows reconstruct the shot, and a message about it, from the headers of all its files.
 
-    They do if the method is ``wcv``, and all frames but the first have the layers that lead to the frame before.
-    ``names`` maps layer names, as for ``ngpt.io.exr.read``. Files that cannot be read do not count: each is a cut, and
-    is reported when its turn comes.
+    Windows do so if the method is ``wcv``, and all frames but the first have the layers that lead to the previous
+    frame. ``names`` maps layer names, as for ``ngpt.io.exr.read``. Files that cannot be read are ignored here: each one
+    counts as a cut, and is reported when it is processed.
     """
     history = "history, each frame by those before it"
     if not by_wcv:
@@ -51,7 +51,7 @@ def motion_hint(pairs: Sequence[tuple[Path, Path]], reports: Sequence[dict], arg
 
 
 def one_view_only(target: Path, args: argparse.Namespace, files: Mapping[str, str]) -> str:
-    """The part of the options that allows only one view; "" if there is none."""
+    """The words of a message for an option that allows only one view; "" if there is no such option."""
     if target.suffix.lower() != ".exr":
         return f"{target} is of one"
     if args.ref:
@@ -65,7 +65,7 @@ def windowed(
     write: Callable[[Any], dict],
     reference: Reference | None,
 ) -> Iterator[dict | NgptError]:
-    """The report on each pair, in order; files that cannot be read are cuts, and are reported.
+    """Yields the report on each pair, in order. A file that cannot be read counts as a cut, and is reported.
 
     ``read`` and ``write`` are the functions of ``ngpt.cli.denoise`` for frames. A frame marked ``there`` is read but
     not written.

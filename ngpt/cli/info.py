@@ -30,7 +30,7 @@ from ngpt.training.run_summary import is_run
 from ngpt.training.run_summary import summary as run_summary
 from ngpt.version import __version__
 
-# Letters of an attribute that are printed: manifests of Cryptomatte may have a million
+# The most characters of an attribute that are printed: a Cryptomatte manifest may have a million
 _LETTERS = 200
 # Layers that stacks lack for a good reason
 _OPTIONAL = ("error", "motion", "samples", "shared", "dt", "dt_var")
@@ -83,7 +83,7 @@ def told(args: argparse.Namespace, console: Console) -> int:
 
 
 def file(args: argparse.Namespace, console: Console) -> int:
-    """Describes an image file. If not all of it is understood, it still lists the contents."""
+    """Describes an image file. Lists its contents even if not all of them are understood."""
     views = views_in(args.file)
     names = {"views": [view.name for view in views]} if len(views) > 1 else {}
     try:
@@ -110,7 +110,7 @@ def overview() -> dict:
 
 
 def method(name: str) -> dict:
-    """What the registry says of a method; nothing where there is none of that name."""
+    """The description of a method in the registry; nothing if no method has that name."""
     if name not in METHODS:
         return {}
     entry = METHODS[name]
@@ -203,14 +203,14 @@ def stack(stack: GradientStack) -> dict:
 
 
 def _noise(stack: GradientStack) -> dict:
-    """The noise of single pixels and the noise that they share; nothing where they share none."""
+    """The noise of single pixels, and the noise that pixels share; nothing if they share none."""
     if "shared" not in stack or "primal_var" not in stack:
         return {}
     return noise_of_light(stack["primal"], stack["primal_var"], stack["shared"])
 
 
 def _tails(stack: GradientStack) -> str:
-    """What the header says of the cache in which paths end, in words; "" where it says nothing."""
+    """A sentence on the cache in which paths end, from the header; "" if the header does not mention one."""
     told = [str(stack.attributes[TAILS])] if TAILS in stack.attributes else []
     if (cut := stack.number(CUT)) is not None:
         told.append(f"{100 * cut:.3g} % of the cache's light was cut from records that were too bright")
@@ -218,8 +218,8 @@ def _tails(stack: GradientStack) -> str:
 
 
 def _missing(stack: GradientStack) -> list[str]:
-    """Missing layers that methods could use. For a file without gradients, which other renderers write, only
-    features.
+    """Missing layers that methods could use. A file without gradients comes from another renderer: only features are
+    listed.
     """
     wanted = [name for name in LAYERS if name not in _OPTIONAL]
     if "dx" not in stack and "ngpt:sampler" not in stack.attributes:

@@ -1,4 +1,4 @@
-"""``ngpt merge``: one gradient stack of several, with the samples and the pixels of all of them."""
+"""``ngpt merge``: makes one gradient stack from several, with the samples and the pixels of all."""
 
 import argparse
 

@@ -1,4 +1,4 @@
-"""``ngpt picture``: PNG, JPEG and WebP of images, and films of shots, by a view transform."""
+"""``ngpt picture``: writes images as PNG, JPEG or WebP, and shots as films, through a view transform."""
 
 import argparse
 from pathlib import Path
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def shot(args: argparse.Namespace, folder: str, target: Path, console: Console) -> int:
-    """A film of the frames of a folder or a pattern, or a picture of each."""
+    """Writes the frames of a folder or a pattern as one film, or as one picture each."""
     files = shot_files(folder)
     each = varies(str(target))
     film = bool(target.suffix) and not each
@@ -93,7 +93,7 @@ def shot(args: argparse.Namespace, folder: str, target: Path, console: Console) 
 
 
 def write_each(folder: Path, pictures, overwrite: bool) -> None:
-    """A picture of each (file, pixels): a PNG in a folder, which is made if it does not exist, or by names of
+    """Writes a picture for each (file, pixels): a PNG in a folder, which is made if needed, or a file by a name of
     frames.
     """
     each = varies(str(folder))
@@ -118,7 +118,7 @@ def check_picture(target: Path, args: argparse.Namespace) -> None:
 
 
 def add_look(parser: argparse.ArgumentParser) -> None:
-    """Options of how a picture shows light; ``ngpt.image.transforms``."""
+    """Adds the options of the view transform (``ngpt.image.transforms``)."""
     parser.add_argument(
         "--transform",
         default="standard",

@@ -23,9 +23,10 @@ class Reference(NamedTuple):
         return cls(path, *read_picture(path, isolated))
 
     def errors(self, image: np.ndarray, stack: GradientStack) -> dict[str, Any]:
-        """The metrics of an image (H, W, 3) made from ``stack``, and which pixels were compared, if not all of both.
+        """The metrics of an image (H, W, 3) made from ``stack``, and which pixels were compared, unless it was all
+        pixels of both.
 
-        Raises NgptError without pixels in common.
+        Raises NgptError if the two images have no pixel in common.
         """
         both = overlap([stack.path, self.path], [stack.place, self.place])
         light = converted(image, to_rec709(stack.attributes))

@@ -1,4 +1,4 @@
-"""``ngpt report``: one page to compare the images of any renderers and denoisers in."""
+"""``ngpt report``: one page that compares the images of any renderers and denoisers."""
 
 import argparse
 import os
@@ -29,7 +29,7 @@ from ngpt.windows import Place, overlap, put
 
 Slices = tuple[slice, slice]
 
-# Denoising moves the mean by a fraction of this.
+# Denoising changes the mean by much less than this.
 _STOPS = 0.5
 FLICKER = (
     "mean of (d - d_r)^2 / (m + 0.001), d the change along motion from the frame before, d_r that of the reference r, "
@@ -143,7 +143,7 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
     scenes: list[Scene] = []
     motions: list[np.ndarray | None] = []
     partly = 0
-    # The frames of each folder as they are measured: NaN where a frame has no pixel of the display window.
+    # The frames of each folder as they are measured: NaN where the frame does not cover the display window.
     known: list[list[np.ndarray]] = [[] for _ in folders]
     with console.progress("report", "frames") as progress:
         for done, frame in enumerate(frames):
@@ -183,7 +183,7 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
             means = [float(np.mean([scene.entries[place].metrics[metric] for scene in scenes])) for metric in metrics]
             rows.append([name, *(f"{value:.4g}" for value in (*means, flicker(images, references, motions)))])
         if all(motion is None for motion in motions[1:]):
-            what = "no frame after the first has motion vectors (layer 'motion'), to tell it from what moves"
+            what = "no frame after the first has motion vectors (layer 'motion'), which tell flicker from movement"
             console.say(f"flicker is nan: {what}")
         tables = {f"Means over {len(frames)} frames": rows}
         print_table(rows)
@@ -196,7 +196,7 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
 def finish(
     args: argparse.Namespace, target: Path, title: str, scenes: list[Scene], about: Overview, console: Console
 ) -> int:
-    """Writes the page of images, or of a shot, whose frames it plays, and says how to see it."""
+    """Writes the page of images, or the page that plays a shot, and prints how to open it."""
     facts, shot = {"ngpt": __version__}, any(is_shot(path) for path in args.images)
     write_report(
         target, title, scenes, command=args.command, footer=facts, overview=about, overwrite=args.force, shot=shot
@@ -208,7 +208,7 @@ def finish(
 
 
 def add_maps(scenes: list[Scene], place: int, name: str, changes: list[np.ndarray]) -> None:
-    """Maps of squared relative changes, one for each frame but the first, to the pictures at ``place``."""
+    """Adds maps of squared relative changes, one for each frame but the first, to the pictures at ``place``."""
     for scene, change in zip(scenes, [np.zeros((1, 1, 3)), *changes], strict=True):
         image = scene.entries[place].image
         values = np.clip(np.sqrt(np.nan_to_num(change.mean(axis=-1))), 0, 1)
@@ -216,7 +216,7 @@ def add_maps(scenes: list[Scene], place: int, name: str, changes: list[np.ndarra
 
 
 def motion_of(paths: list[str], place: Place) -> np.ndarray | None:
-    """The motion vectors of a frame, (H, W, 2), from the first of its files that has them; in its display window."""
+    """The motion vectors of a frame, (H, W, 2), in its display window, from the first of its files that has them."""
     for path in paths:
         stack = read(path)
         window = stack.place.seen_from(place)
@@ -235,7 +235,7 @@ def shot_files_of(folder: str) -> list[Path]:
 def frames_of(folders: list[str], shots: list[list[Path]]) -> list[tuple[Path, ...]]:
     """The file of each frame in every shot, in the order of the first; raises NgptError where one lacks a frame.
 
-    Frames go by the names of their files, or by their numbers where all shots are names of frames.
+    Frames are matched by the names of their files, or by their numbers if all shots are names of frames.
     """
     found: list[dict[Any, Path]] = [{frame_name(path): path for path in files} for files in shots]
     if all(map(varies, folders)):
@@ -251,7 +251,7 @@ def frames_of(folders: list[str], shots: list[list[Path]]) -> list[tuple[Path, .
 
 
 def labels(paths: list[str]) -> list[str]:
-    """A name for each file: its own without the ending, and as many folders as make all names differ."""
+    """A name for each file: its own without the ending, after the folders needed to make all names differ."""
     places = [Path(os.path.abspath(path)) for path in paths]
     for place, path in zip(places, paths, strict=True):
         if places.count(place) > 1:
@@ -261,13 +261,13 @@ def labels(paths: list[str]) -> list[str]:
         names = ["/".join(parts[-depth:]) for parts in bare]
         if len(set(names)) == len(names) and REFERENCE not in names:
             return names
-    return [str(place) for place in places]  # they differ in their endings only
+    return [str(place) for place in places]  # names that differ only in their endings
 
 
 def add_errors(
     entry: Entry, metrics: list[str], reference: np.ndarray, path: str, other: str, part: Slices = np.s_[:, :]
 ) -> None:
-    """Measures ``part`` of a picture of file ``path`` against the reference of file ``other``."""
+    """Measures ``part`` of a picture from file ``path`` against the reference from file ``other``."""
     try:
         entry.metrics, maps = judge(metrics, entry.image[part], reference[part])
     except NgptError as error:

@@ -15,9 +15,9 @@ STREAM = "-"
 
 @contextmanager
 def standard_input(names: Sequence[str]) -> Iterator[list[str]]:
-    """The names, with a file in the place of ``-`` that holds standard input; messages call it "standard input".
+    """The names, where a file with the contents of standard input replaces ``-``; messages call it "standard input".
 
-    Raises WrongUse for two of them.
+    Raises WrongUse if ``-`` occurs twice.
     """
     if STREAM not in names:
         yield list(names)
@@ -34,9 +34,9 @@ def standard_input(names: Sequence[str]) -> Iterator[list[str]]:
 
 @contextmanager
 def as_files(stacks: list[str], output: str | None) -> Iterator[tuple[list[str], str | None]]:
-    """The names of inputs and output, with files in the place of ``-``. Standard input has been read when the block
-    begins. The file that the block has written goes to standard output when it ends. OpenEXR needs random access, so
-    both need a file.
+    """The names of inputs and output, where files replace ``-``. Standard input has been read when the block begins.
+    The file that the block has written goes to standard output when it ends. OpenEXR needs random access, so both need
+    a file.
 
     Raises NgptError for ``-`` beside other inputs, without an output, and for images that would go to a terminal.
     """
@@ -60,7 +60,7 @@ def as_files(stacks: list[str], output: str | None) -> Iterator[tuple[list[str],
                 with called(str(target), "standard output"):
                     yield inputs, str(target)
             finally:
-                # Also after a render that failed: it has written the samples done before.
+                # Also after a failed render, which has written the samples that it finished.
                 if target.exists():
                     with target.open("rb") as file:
                         shutil.copyfileobj(file, sys.stdout.buffer)

@@ -53,7 +53,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if not args.out:
         raise WrongUse("--out is missing: the folder for checkpoint, weights and log")
     for folder in _on_disk(settings):
-        open_crops(folder)  # its errors are raised before anything is made
+        open_crops(folder)  # so that its errors are raised before any file is made
     out = make_folder(args.out)
     say = (lambda text: None) if console.quiet else show
     processes = Processes()

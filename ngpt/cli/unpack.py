@@ -1,4 +1,4 @@
-"""``ngpt unpack``: a stack as raw files, for programs that read no OpenEXR."""
+"""``ngpt unpack``: writes a stack as raw files, for programs that cannot read OpenEXR."""
 
 import argparse
 from pathlib import Path

@@ -4,15 +4,16 @@ Such light is rare and bright: most pixels hold none of it, and a few hold what 
 is spread by a diffusion [Perona and Malik 1990, "Scale-space and edge detection using anisotropic diffusion"] over
 distances of 1, 2, 4, ... pixels [Dammertz et al. 2010, "Edge-avoiding à-trous wavelet transform for fast global
 illumination filtering"]: ``ngpt.denoisers.diffusion``. One pixel gets exactly what another gives: no light is lost.
-Pixels exchange less light the more their surfaces differ, and the more they differ themselves beyond their noise
-[variances travel along as in Schied et al. 2017, "Spatiotemporal variance-guided filtering"].
+Two pixels exchange less light the more their surfaces differ, and the more their light differs beyond its noise. The
+variances are filtered along with the light [Schied et al. 2017, "Spatiotemporal variance-guided filtering"].
 
-Photons are the same case: neighbouring pixels gather the same ones, and OIDN takes their blotches for detail, but the
-variance reveals them. So method `oidn` leaves them to the diffusion (``ngpt.layers.GATHERED``). They are divided by the
-albedo of the surface that they were gathered at, and multiplied again, so that its texture stays sharp.
+The light of photons needs the same: neighbouring pixels gather the same photons, and OIDN takes their blotches for
+detail, but the variance reveals them. So method `oidn` leaves this light to the diffusion (``ngpt.layers.GATHERED``).
+It is divided by the albedo of the surface at which the photons were gathered, and multiplied by it again afterwards, so
+that textures stay sharp.
 
-Methods from gradients that call OIDN anyway take its image of this light (``ngpt.network.inputs.Oidn``): what OIDN
-takes for noise is given back by one factor for the whole image (docs/lab/log).
+Methods that read gradients and call OIDN anyway take OIDN's image of this light (``ngpt.network.inputs.Oidn``). OIDN
+removes some of the light as noise; one factor for the whole image gives it back (docs/lab/log).
 """
 
 from dataclasses import replace
@@ -22,16 +23,16 @@ import numpy as np
 from ngpt.denoisers.diffusion import diffused
 from ngpt.repair import Repaired
 
-# OIDN's image becomes brighter by at most this factor, to hold the light that there was. A larger one would make
-# blotches of the little that OIDN has not taken for outliers.
+# OIDN's image becomes brighter by at most this factor, to keep the sum of the light. A larger one would turn the little
+# light that OIDN has left into blotches.
 MOST = 4.0
-LOUDEST = 1e30  # variances of light of at most 1 are less, or as good as that
-FARTHEST = 1e-6  # depths below this share of the largest one are alike
-DARKEST = 0.05  # is added to the albedo that photons are divided by: gloss reflects light where nothing else does
+LOUDEST = 1e30  # larger variances are cut to this one; light is at most 1 here, so the result is the same
+FARTHEST = 1e-6  # depths below this share of the largest depth count as equal
+DARKEST = 0.05  # added to the albedo before the division: a glossy surface of albedo 0 reflects light, too
 
 
 def denoised(data: Repaired) -> np.ndarray:
-    """What is added to a reconstruction of ``data.image``: ``data.caustic``, (H, W, 3) float32, with less noise."""
+    """``data.caustic`` with less noise, (H, W, 3) float32, to be added to a reconstruction of ``data.image``."""
     assert data.caustic is not None
     scale = float(np.abs(data.caustic).max())
     light = _planes(data.caustic) / np.float32(scale)
@@ -46,7 +47,7 @@ def denoised(data: Repaired) -> np.ndarray:
 
 
 def of_photons(data: Repaired) -> np.ndarray:
-    """As ``denoised()``, of light that photons have brought; the texture of the surfaces stays."""
+    """Like ``denoised()``, but for light that photons have brought: the texture of the surfaces stays sharp."""
     assert data.caustic is not None
     if "albedo" not in data.features:
         return denoised(data)
@@ -57,15 +58,15 @@ def of_photons(data: Repaired) -> np.ndarray:
 
 
 def given_back(found: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """The denoised ``light``, scaled so that its sum is kept, see ``MOST``; both are (H, W, 3)."""
-    # OIDN may go below zero where no light does.
+    """``found``, a denoised image of ``light``, scaled to the sum of ``light``, see ``MOST``; both are (H, W, 3)."""
+    # OIDN may return values below zero, even if no light is negative.
     found = np.maximum(found, min(float(light.min()), 0))
     before, after = light.sum(dtype=np.float64), found.sum(dtype=np.float64)
     return found * np.float32(min(before / after, MOST)) if before > 0 and after > 0 else found
 
 
 def _surfaces(features: dict[str, np.ndarray], size: tuple[int, int]) -> np.ndarray:
-    """(N, H, W): albedo, normals and the logarithm of the depth, those there are."""
+    """(N, H, W): albedo, normal and the logarithm of the depth, as far as the features have them."""
     planes = [_planes(features[name]) for name in ("albedo", "normal") if name in features]
     if "depth" in features and features["depth"].max() > 0:
         depth = _planes(features["depth"])

@@ -14,13 +14,13 @@ import numpy as np
 
 from ngpt.classical.arrays import map_silent
 
-# Distances in pixels, one after the other; the last two even out what the grids of the others leave.
+# The distances in pixels, one pass each. The last two smooth the grids that the larger distances leave.
 DISTANCES = (1, 2, 4, 8, 16, 32, 1, 2)
-# Two pixels exchange 1/e of their light if they differ, beyond their noise, by this number of its standard deviations.
+# Two pixels exchange only 1/e as much light if they differ, beyond their noise, by this number of standard deviations.
 SIGNIFICANT = 3.0
 # The neighbours of one half plane at distance 1, and their weights in the binomial filter of 3x3 pixels.
 NEIGHBOURS = ((0, 1, 1 / 8), (1, 0, 1 / 8), (1, 1, 1 / 16), (1, -1, 1 / 16))
-# Pixels that are worked on at a time: fewer make more calls, more leave the cache.
+# Pixels that are processed at a time: fewer make more calls, more do not fit into the cache.
 _PIXELS = 16384
 # The value of surfaces in gaps.
 _FAR = float(np.finfo(np.float32).max)
@@ -30,9 +30,10 @@ _LEAST = np.exp(np.full(1, -SMALLEST))
 
 
 def diffused(light: np.ndarray, variance: np.ndarray, surfaces: np.ndarray) -> np.ndarray:
-    """``light`` (C, H, W), spread; its sum stays. ``variance`` (H, W) is its own, ``surfaces`` (N, H, W) of any unit.
+    """``light`` (C, H, W), spread by the diffusion, with the same sum.
 
-    All are float32 and finite. Two pixels whose ``surfaces`` are 1 apart exchange 1/e of what they would otherwise.
+    ``variance`` (H, W) is the variance of ``light``; ``surfaces`` (N, H, W) are features of any unit. All arrays are
+    float32 and finite. Two pixels whose ``surfaces`` are 1 apart exchange 1/e of what they would otherwise.
     """
     floor = np.float32(1e-12 * np.mean(light**2) + 1e-37)
     layout = _Layout(*variance.shape)
@@ -45,7 +46,7 @@ def diffused(light: np.ndarray, variance: np.ndarray, surfaces: np.ndarray) -> n
         around = [layout.around(layer, distance) for layer in (*now, surface)]
         inner = [layer[:, layout.margin :] for layer in after]
         for down, right, _ in NEIGHBOURS:
-            # What an earlier, smaller distance wrote there.
+            # A smaller distance has written here, where this one writes nothing.
             shares[1 - down, 1 - right, : layout.offset(down, right, distance)] = 0
 
         def share(first: int, distance: int = distance, around: list = around) -> None:
@@ -87,14 +88,17 @@ class _Layout:
         return rows.reshape(len(flat), self.height, self.pitch)[..., : self.width]
 
     def around(self, flat: np.ndarray, distance: int) -> np.ndarray:
-        """(3, 3, C, size): of each pixel the nine at that distance, itself in the middle."""
+        """(3, 3, C, size): each pixel, in the middle, and its eight neighbours at that distance."""
         corner = flat[:, self.margin - self.offset(1, 1, distance) :]
         down, right = (flat.itemsize * self.offset(*step, distance) for step in ((1, 0), (0, 1)))
         return np.lib.stride_tricks.as_strided(corner, (3, 3, len(flat), self.size), (down, right, *flat.strides))
 
 
 def _shares(light: np.ndarray, variance: np.ndarray, surface: np.ndarray, floor: np.float32):
-    """For each of ``NEIGHBOURS``, the share (pixels) that is exchanged with it; arrays (3, 3, ..., pixels)."""
+    """For each of ``NEIGHBOURS``, the share of light that each pixel exchanges with it, (pixels).
+
+    The arrays are (3, 3, ..., pixels), as ``_Layout.around`` makes them.
+    """
     steps = np.empty(surface.shape[2:], np.float32)
     change = np.empty(light.shape[2:], np.float32)
     apart, noise = np.empty((2, light.shape[-1]), np.float32)
@@ -122,7 +126,11 @@ def _shares(light: np.ndarray, variance: np.ndarray, surface: np.ndarray, floor:
 def _exchange(
     shares: np.ndarray, light: np.ndarray, variance: np.ndarray, next_light: np.ndarray, next_variance: np.ndarray
 ) -> None:
-    """Fills the last two, (C, pixels), by sums of the others, (3, 3, ..., pixels); ``shares`` are overwritten."""
+    """Writes the sums of light and variance over 3x3 pixels, weighted by ``shares``, into the last two arguments.
+
+    Sums are (C, pixels), the other arrays (3, 3, ..., pixels). ``shares`` are overwritten by their squares, which weigh
+    the variance.
+    """
     shares[1, 1] = 0
     np.subtract(1, np.add.reduce(shares, axis=(0, 1)), out=shares[1, 1])
     _sum(shares, light, next_light)
@@ -131,7 +139,8 @@ def _exchange(
 
 
 def _sum(weights: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
-    # Column by column: at distance 1 einsum would take their axis, which is as dense as the pixels', for the inner one.
+    # Column by column: at distance 1 the axis of columns has the same stride as the axis of pixels, and einsum would
+    # choose these three values for its inner loop.
     left, middle, right = (np.einsum("ip,icp->cp", weights[:, i], values[:, i]) for i in range(3))
     np.add(left, middle, out=out)
     out += right

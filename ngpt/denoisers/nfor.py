@@ -5,11 +5,13 @@ For each pixel p, the light of its neighbourhood is fitted by a linear function 
     min over F_p, G_p of  Σ_q  w_pq |F_p + G_pᵀ (f_q - f_p) - I_q|²
 
 [survey, equation 24; Bitterli et al. 2016, "Nonlinearly weighted first-order regression for denoising Monte Carlo
-renderings", section 4], with weights w of non-local means on the colours. The values that a fit gives for all pixels of
-its neighbourhood are averaged with the same weights (their collaborative filtering). Bitterli et al. have two half
-buffers, for these weights and to choose a bandwidth. A stack holds one image, so the patch distance subtracts what its
-variance explains instead [Rousselle et al. 2012, "Adaptive rendering with non-local means filtering", equation 4], and
-each pixel takes a mixture of two bandwidths by Stein's unbiased estimate of their errors.
+renderings", section 4]. The weights w are those of non-local means on the colours. Each fit gives values for all pixels
+of its neighbourhood; these are averaged with the same weights ("collaborative filtering" in the paper).
+
+The paper computes the weights, and chooses a bandwidth, by two half buffers. A stack holds one image. So the patch
+distance subtracts the part that the image's variance explains [Rousselle et al. 2012, "Adaptive rendering with
+non-local means filtering", equation 4], and each pixel mixes two bandwidths by Stein's unbiased estimate of their
+errors.
 """
 
 import math
@@ -24,15 +26,15 @@ from ngpt.system.late import ndimage
 RADIUS = 9  # of the neighbourhood, 19x19 pixels
 PATCH = 3  # radius of the patches that are compared
 BANDWIDTHS = (0.5, 1.0)
-# A feature is believed as far as its spread in the neighbourhood exceeds this share of its range in the image.
+# The ridge of the regression: a feature hardly counts if its variance in the neighbourhood, relative to its squared
+# range in the image, is below this.
 RIDGE = 1e-3
-# Variance, over the median of the neighbourhood, at which a pixel counts half.
+# A pixel counts half if its variance is this many times the median of its neighbourhood.
 OUTLIER = 1000.0
-# In units of the light of the brightest hundredth: brighter light is cut at FAR, and counts no more than FLOOR in the
-# noise that is negligible beside the image. One pixel of 1e30 would leave the range of single precision, and blur all
-# others.
+# In units of the 99th percentile of the light: light is cut at FAR, and at FLOOR in the estimate of negligible noise
+# (``_floor``). One pixel of 1e30 would leave the range of single precision, and blur all others.
 FAR, FLOOR = 1e6, 1e3
-_TILE = 48  # pixels of a tile's side: what is summed for it stays in the processor's cache
+_TILE = 48  # side of a tile in pixels: its sums stay in the processor's cache
 
 
 def nfor(image: np.ndarray, variance: np.ndarray, features: list[np.ndarray]) -> np.ndarray:
@@ -41,13 +43,13 @@ def nfor(image: np.ndarray, variance: np.ndarray, features: list[np.ndarray]) ->
     ``image`` is (H, W, 3), finite. ``variance`` is the variance of its pixels as means, NaN where it is not known.
     ``features`` is a list of (H, W, C). Memory is about 100 floats a pixel.
     """
-    # As they are: averaged with their neighbours', which is safer elsewhere, they blur (docs/lab/log).
+    # Variances are not averaged over neighbours. That is safer in other methods, but blurs here (docs/lab/log).
     variance = np.where(np.isfinite(variance), np.maximum(variance, 0), 0).astype(np.float32)
     power = _power(image)
     image = np.clip(np.ldexp(image, -power), -FAR, FAR)
     variance = np.minimum(np.ldexp(variance, -2 * power), np.float32(FAR**2))
     design = _design(features, image.shape[:2])
-    # Squares of extreme fireflies would be infinite, and their exact light makes patches no more alike.
+    # Squares of extreme fireflies would be infinite. Patches are compared as well with such light cut at ``most``.
     most = bound(image)
     seen = image if most == np.inf else np.clip(image, -most, most)
     variance = np.minimum(variance, np.float32(most) ** 2)
@@ -66,16 +68,20 @@ def nfor(image: np.ndarray, variance: np.ndarray, features: list[np.ndarray]) ->
 
 
 def _power(image: np.ndarray) -> int:
-    """The power of two by which the brightest hundredth of an image begins at 1 to 2; of its light, if that is less."""
+    """The p such that the 99th percentile of |image| is in [2^p, 2^(p + 1)).
+
+    If the percentile is 0, the median of the values that are not 0 takes its place.
+    """
     light = np.abs(image)
     level = np.percentile(light, 99) or np.median(light[light > 0] if light.any() else 1.0)
     return math.floor(math.log2(level))
 
 
 def estimated_variance(image: np.ndarray) -> np.ndarray:
-    """The variance of an image (H, W, 3) that comes without, by what sets pixels apart from the median of 3 x 3.
+    """An estimate (H, W, 3) for an image whose variance is not known: its squared distances from a 3 x 3 median.
 
-    What is finer than that counts as noise (docs/lab/log/2026-W48.md).
+    The squares are averaged twice over 3 x 3 pixels. Detail finer than the median counts as noise
+    (docs/lab/log/2026-W48.md).
     """
     squares = (image.astype(np.float64) - ndimage.median_filter(image, (3, 3, 1), mode="nearest")) ** 2
     for _ in range(2):
@@ -86,8 +92,8 @@ def estimated_variance(image: np.ndarray) -> np.ndarray:
 def _trust(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """(H, W, 1) in (0, 1]: near 1 except for pixels whose variance is far above their neighbourhood's.
 
-    A spot of light in the dark differs from the dark by little more than its own noise, and the patches around it are
-    alike: without this it is smeared over them.
+    A spot of light in the dark differs from the dark by little more than its own noise, and the patches around it look
+    like it. Without this weight, the spot would be smeared over them.
     """
     total = variance.mean(axis=-1)
     usual = OUTLIER * ndimage.median_filter(total, 2 * RADIUS + 1) + _floor(image)
@@ -95,12 +101,15 @@ def _trust(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 
 def _floor(image: np.ndarray) -> float:
-    """A variance that is nothing beside the image."""
+    """A variance that is negligible beside the image."""
     return 1e-6 * float(np.mean(np.clip(image, -FLOOR, FLOOR).astype(np.float64) ** 2)) + 1e-30
 
 
 def _design(features: list[np.ndarray], size: tuple[int, int]) -> np.ndarray:
-    """(H, W, 1 + features) float32: the constant, and the features less their means over their ranges."""
+    """(H, W, 1 + channels) float32: 1, and the channels of the features that vary, scaled to [-0.5, 0.5].
+
+    The range of a channel is from its 1st to its 99th percentile; values beyond are clipped.
+    """
     columns = [np.ones((*size, 1), np.float32)]
     for feature in features:
         for channel in np.moveaxis(feature, -1, 0):
@@ -114,9 +123,9 @@ def _design(features: list[np.ndarray], size: tuple[int, int]) -> np.ndarray:
 def _filtered(
     image: np.ndarray, seen: np.ndarray, variance: np.ndarray, trust: np.ndarray, design: np.ndarray, bandwidth: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The collaborative fits at one bandwidth, and how much of itself each pixel keeps, about dF/dI.
+    """The result F (H, W, 3) at one bandwidth, and the weight (H, W) of each pixel in its own fit, about dF/dI.
 
-    ``seen`` is the image by which patches are compared.
+    ``image`` is averaged; ``seen`` is the image in which patches are compared.
     """
     n = design.shape[-1]
     rows, columns = np.triu_indices(n)
@@ -126,7 +135,8 @@ def _filtered(
     sums = _gathered(moments * trust, seen, variance, bandwidth)
     gram = np.empty((*image.shape[:2], n, n))
     gram[..., rows, columns] = gram[..., columns, rows] = sums[..., : len(rows)]
-    # Ridge on the slopes only, in proportion to the weights' sum, so that flat features cannot make the fit unstable.
+    # The ridge is only on the slopes, in proportion to the sum of the weights, so that flat features do not make the
+    # fit unstable.
     weight = gram[..., 0, 0].copy()
     index = np.arange(1, n)
     gram[..., index, index] += RIDGE * weight[..., None]
@@ -157,7 +167,7 @@ def _gathered(values: np.ndarray, image: np.ndarray, variance: np.ndarray, bandw
 
 
 def _weights(image: np.ndarray, variance: np.ndarray, bandwidth: float) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Offsets (dy, dx) and the weights (H, W) of the pixels there, 0 where those are outside the image."""
+    """Each offset (dy, dx) with the weights (H, W) of the pixels there; 0 where that is outside the image."""
     height, width = image.shape[:2]
     floor = _floor(image)
     reach = [range(-min(RADIUS, n - 1), min(RADIUS, n - 1) + 1) for n in (height, width)]

@@ -1,13 +1,13 @@
-"""Intel Open Image Denoise as a method: it needs the primal and features, no gradients. Imported when first called."""
+"""Intel Open Image Denoise as a method: it reads the primal and features, no gradients."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
 from ngpt.coverage import mirrored
-from ngpt.denoisers.clean import features_are_clean
 from ngpt.denoisers.oidn_filters import filtered
 from ngpt.errors import NgptError
 from ngpt.options import Option
@@ -17,7 +17,7 @@ from ngpt.system.install import package_command
 
 AUXILIARY = ("prefiltered", "clean", "noisy", "none")
 QUALITIES = {"high": "High", "balanced": "Balanced", "fast": "Fast"}
-# What OIDN's filter and its settings are.
+# The values of ``filter``: OIDN's own filter and its settings.
 FILTERS: dict[str, dict[str, Any]] = {
     "image": {"hdr": True},
     "lightmap": {"kind": "RTLightmap"},
@@ -27,13 +27,13 @@ FILTERS: dict[str, dict[str, Any]] = {
 OPTIONS = {
     "auxiliary": Option(
         "auto",
-        "what OIDN is told of albedo and normal; auto: clean for subpixels, else prefiltered",
+        "how albedo and normal are used; auto: prefiltered, and with subpixels the mean of that and of noisy subpixels",
         choices=("auto", *AUXILIARY),
     ),
     "filter": Option(
-        "image", "OIDN's for images, or for lightmaps of light or of coefficients in [-1, 1]", choices=tuple(FILTERS)
+        "image", "for images, for lightmaps, or for lightmaps of coefficients in [-1, 1]", choices=tuple(FILTERS)
     ),
-    "quality": Option("high", "of its network: less is quicker", choices=tuple(QUALITIES)),
+    "quality": Option("high", "quality of OIDN's network: a lower one is faster", choices=tuple(QUALITIES)),
 }
 
 
@@ -42,34 +42,33 @@ def missing() -> str:
 
 
 def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") -> np.ndarray:
-    """Intel Open Image Denoise, its filter "RT" for HDR images, with albedo, or albedo and normal, where there are any.
+    """The image that OIDN makes of the primal, albedo and normal: (H, W, 3) float32 without direct emission.
 
-    OIDN takes no normals without albedo: they are left out then.
+    OIDN takes no normals without albedo, so they are left out if there is no albedo. If the stack has subpixels
+    (``ngpt.subpixels``), they are denoised, and their means are the image; "auto" makes ``of_both``.
 
-    Where there are subpixels (``ngpt.subpixels``), these are denoised, and the image is their means. With "auto" they
-    are only where features are clean: noisy ones, as behind a lens, would have to be prefiltered, which takes four
-    times as long, and without that subpixels have more error than pixels (docs/lab/log).
-
-    ``auxiliary``  how OIDN uses the features: "prefiltered" denoises them with its own models first and then marks
-                   them as clean, which its documentation recommends for the best quality; "clean" marks them as clean
-                   as they are; "noisy" does not; "none" leaves them out; "auto" is "clean" for
-                   subpixels, and else "prefiltered"
-    ``quality``    "high", "balanced" or "fast", for the image and for features that are denoised first
+    ``auxiliary``  how OIDN uses the features: "prefiltered" denoises them with its own models first and then
+                   marks them as clean, which its documentation recommends for the best quality;
+                   "clean" marks them as clean without denoising them; "noisy" does neither; "none" leaves them out;
+                   "auto" is "prefiltered" without subpixels
+    ``quality``    "high", "balanced" or "fast": the quality for the image, and for features that are denoised first
     ``filter``     one of ``FILTERS``: "lightmap" and "directional" are OIDN's for lightmaps, which take no features
 
-    Without features, empty pixels become what the covered ones beside them would be in a mirror: OIDN would darken the
-    borders of the islands of a lightmap, and let their light leak from one to the other.
+    Without features, OIDN reads mirror images of the covered pixels in place of empty ones. Otherwise it would darken
+    the borders of the islands of a lightmap, and light would leak from one island to another. Empty pixels of the
+    result are those of the primal.
     """
     require_oidn()
     features = {}
-    # With the light sources seen, as a renderer hands it over and OIDN was trained.
+    # With light sources that are seen directly: OIDN was trained on such images.
     image, layers = data.image + data.direct, data.features
     k = subpixels(data.fine, image.shape[1]) if filter == "image" else 1
     if filter != "image":
         auxiliary = "none"
+    elif auxiliary == "auto" and k > 1:
+        return of_both(with_clean_features(data), quality)
     elif auxiliary == "auto":
-        auxiliary = "clean" if k > 1 and (not data.features or features_are_clean(data)) else "prefiltered"
-        k = k if auxiliary == "clean" else 1
+        auxiliary = "prefiltered"
     if k > 1:
         image, layers = data.fine["primal"], data.fine
     image = np.ascontiguousarray(image, np.float32)
@@ -89,12 +88,38 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
     return (means(image, k) if k > 1 else image) - data.direct
 
 
-def prefiltered(features: Mapping[str, np.ndarray], quality: str) -> dict[str, np.ndarray]:
-    """Albedo and normal (H, W, 3) denoised by OIDN's own models for them, whether they are noisy or not.
+def of_both(data: Repaired, quality: str) -> np.ndarray:
+    """The mean of OIDN's image of the pixels and its images at K, K / 2 ... times the size; (H, W, 3) float32.
 
-    With ``quality`` "high" this takes longer than the image itself, with "balanced" less than half of that, and images
-    denoised with their help are as good (docs/lab/log).
+    Without subpixels, it is the image of the pixels. The features of pixels are marked as clean, those of subpixels as
+    noisy. Marked as clean, they would leave noise behind a lens, and prefiltering them would take four times as long
+    (docs/lab/log).
+
+    Small pixels keep edges, and large ones keep smooth areas. The errors of these images differ so much that their mean
+    has less error than each of them in nearly every scene.
     """
+    images = [oidn(replace(data, fine={}), "clean", quality)]
+    k, fine = subpixels(data.fine, data.image.shape[1]), data.fine
+    while k > 1:
+        images.append(oidn(replace(data, fine=fine), "noisy", quality))
+        k, odd = divmod(k, 2)
+        if odd:
+            break
+        fine = {name: means(layer, 2) for name, layer in fine.items()}
+    return np.asarray(np.mean(images, axis=0, dtype=np.float32))
+
+
+def with_clean_features(data: Repaired) -> Repaired:
+    """The data with albedo and normal of pixels prefiltered, for images that something else corrects.
+
+    The quality is "balanced": "high" takes more than twice as long, and neither means of two sizes nor networks gain by
+    it (docs/lab/log).
+    """
+    return replace(data, features=data.features | prefiltered(data.features, "balanced"))
+
+
+def prefiltered(features: Mapping[str, np.ndarray], quality: str) -> dict[str, np.ndarray]:
+    """Albedo and normal (H, W, 3) denoised by OIDN's own models for them, whether they are noisy or not."""
     require_oidn()
     return {name: _prefiltered(name, layer, quality) for name, layer in _in_range(features).items()}
 

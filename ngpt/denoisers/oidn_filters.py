@@ -1,7 +1,7 @@
 """OIDN's devices and filters, which all threads of a process share: one thread uses them at a time.
 
-Two threads that set images of one filter would get each other's pixels. They lose no time by waiting, since OIDN works
-on all cores, or as many as ``ngpt.limit_threads`` allows. To make a filter takes longer than to run it on a small
+Two threads that set the images of one filter would get each other's pixels. Waiting costs them no time, since OIDN
+uses all cores, or as many as ``ngpt.limit_threads`` allows. Making a filter takes longer than running it on a small
 image, so filters are kept.
 """
 
@@ -16,15 +16,15 @@ from ngpt.io.primaries import BEYOND, TO_WIDE, converted, negative_share
 from ngpt.system.forks import hold_while_forking
 from ngpt.system.limits import limited, processors
 
-# By the names of OIDN's devices in Python.
+# Our name of a device -> its name in OIDN's Python package
 DEVICES = {"auto": "Default", "cpu": "CPU", "cuda": "CUDA", "hip": "HIP", "metal": "Metal", "sycl": "SYCL"}
 # Negative light below this share of all light is rounding, and not worth a second run.
 _ROUNDING = 1e-6
-# Filters that are kept: an image and its features, with two qualities, take five.
+# The number of filters that are kept. An image and its features, with two qualities, take five.
 _MOST = 8
 
 _lock = Lock()
-# By name and threads.
+# (name, threads) -> device
 _devices: dict[tuple[str, int], Any] = {}
 _filters: dict[tuple, Any] = {}
 
@@ -38,15 +38,16 @@ def filtered(
 ) -> np.ndarray:
     """The result of OIDN's filter "RT", or of another ``kind``, (H, W, 3) float32.
 
-    OIDN takes negative light for 0. So an image with many colours beyond its primaries is denoised in wider ones, which
-    leaves less error than the other way: negative light is denoised by itself and then subtracted.
+    OIDN reads negative light as 0. So an image with many colours beyond its primaries is denoised in wider primaries,
+    which leaves less error. Other negative light is denoised by itself and then subtracted.
 
-    ``images``    "color", "albedo" and "normal", those there are: (H, W, 3) float32, C-contiguous, of one size
+    ``images``    "color", "albedo" and "normal", or some of them: (H, W, 3) float32, C-contiguous, of one size
     ``device``    one of ``DEVICES``
-    ``weights``   in the place of OIDN's own, as a .tza file holds them
-    ``settings``  of the filter, by their names in ``mitsuba_oidn``; a quality by its name in ``mitsuba_oidn.Quality``
+    ``weights``   the contents of a .tza file, used in place of OIDN's own weights
+    ``settings``  settings of the filter, by their names in ``mitsuba_oidn``; a quality by its name in
+                  ``mitsuba_oidn.Quality``
 
-    Raises NgptError with what OIDN says where it cannot.
+    Raises NgptError with OIDN's message if the filter fails.
     """
 
     def run(colour: np.ndarray | None) -> np.ndarray:
@@ -77,15 +78,15 @@ def _filtered(
     import mitsuba_oidn
 
     result = np.empty_like(next(iter(images.values())))
-    # 0: those that it shares with Dr.Jit.
+    # 0 threads: OIDN uses the pool of threads that it shares with Dr.Jit.
     where = device, processors() if limited() else 0
     key = (where, weights, kind, tuple(images), result.shape, tuple(settings.items()))
     try:
         with _lock:
-            # Out of those that are kept until it has worked: one that failed is not used again.
+            # A filter is taken out until it has worked, so that one that failed is not used again.
             made = _filters.pop(key, None) or _made(where, weights, kind, settings)
             _run(_devices[where], made, images, result)
-            # Networks of the user's own are many, and as large as an image.
+            # Filters with weights of the user are not kept: there are many, and each is as large as an image.
             if weights is None:
                 _filters[key] = made
             while len(_filters) > _MOST:
@@ -96,7 +97,7 @@ def _filtered(
 
 
 def _made(where: tuple[str, int], weights: bytes | None, kind: str, settings: Mapping[str, Any]) -> Any:
-    """A filter on the device of that name. A processor gets this number of threads of its own."""
+    """A new filter on the device ``where``: (name, threads). With 0 threads, a CPU device has OIDN's own number."""
     import mitsuba_oidn
 
     if where not in _devices:
@@ -114,7 +115,10 @@ def _made(where: tuple[str, int], weights: bytes | None, kind: str, settings: Ma
 
 
 def _run(device: Any, made: Any, images: Mapping[str, np.ndarray], result: np.ndarray) -> None:
-    """The device reads arrays in place if it can, and through buffers otherwise. The filter keeps none of them."""
+    """Runs the filter ``made`` on ``images`` and writes ``result``; the filter keeps none of the arrays.
+
+    The device reads arrays in place if it can, and otherwise through buffers.
+    """
     height, width = result.shape[:2]
     buffers = {}
     for name, image in {**images, "output": result}.items():

@@ -18,26 +18,27 @@ from ngpt.io.exr import write
 from ngpt.measure.metrics import METRICS, scores
 from ngpt.methods import METHODS, check_request, reconstruct, unknown_method
 from ngpt.stack import GradientStack
+from ngpt.subpixels import subpixels
 from ngpt.system.files import make_folder
 from ngpt.system.machine import versions
 from ngpt.system.writing import write_json
 
-# Packages that numbers depend on, or whose absence makes rows absent.
+# Packages whose versions change results. Some rows are absent where a package is.
 PACKAGES = ("numpy", "scipy", "mitsuba", "torch", "mitsuba-oidn", "scikit-image", "flip-evaluator")
 
-# The format of a cell in the cache: its time by both clocks
+# The version of the format of cached cells. 2: times by both clocks
 _FORMAT = 2
 
 
 class Scorer:
-    """Runs methods warm and measures what they give."""
+    """Runs methods after a warm-up, and measures their results and times."""
 
     def __init__(self, config: Config, cache: Path):
         self.config, self.cache = config, cache
         make_folder(self.cache)
         self._warm: set[tuple] = set()
         self._code = [_FORMAT, library_hash(), versions(*PACKAGES)]
-        # Options of metrics that have some.
+        # The options of metrics that take any
         self.options = {"E-LPIPS": config.elpips}
         found = {name: METRICS[name].missing for name in config.metrics}
         lacks = {name: missing(**self.options.get(name, {})) for name, missing in found.items() if missing}
@@ -48,9 +49,11 @@ class Scorer:
     def cell(
         self, column: Column, stack: Callable[[], GradientStack], reference: Reference, key: list, image: Path | None
     ) -> dict[str, Any]:
-        """``metrics``, seconds to ``reconstruct`` by clock, or why it is ``absent``; its picture goes to ``image``.
+        """The entries of a cell: ``metrics``, the seconds of ``reconstruct`` by clock, and ``absent``, None.
 
-        ``key`` is what the stack depends on; ``stack`` is called only when the cell is not in the cache.
+        If the method fails, ``absent`` is the reason and the only entry. The result is written to the file ``image``,
+        if that is not None. ``key`` identifies the stack in the cache; ``stack`` is called only if the cell is not
+        cached.
         """
         parts = [key, column.method, column.options, file_hash(column.options.get("weights", ""))]
         parts += filter(None, [code_of(METHODS[column.method].run)])
@@ -59,9 +62,9 @@ class Scorer:
             return json.loads(path.read_text())
         try:
             data = stack()
-            warm = (column.family, data.height, data.width)
+            warm = (column.family, data.height, data.width, subpixels(data.fine, data.width))
             if warm not in self._warm:
-                # Files of weights, just-in-time compilation, filters that are made once.
+                # The first run also reads weights, compiles kernels and makes filters, so it is not timed.
                 reconstruct(data, column.method, **column.options)
                 self._warm.add(warm)
             begins = time.process_time()
@@ -69,7 +72,7 @@ class Scorer:
             seconds = {"wall": result.seconds, "processor": time.process_time() - begins}
             values = self._scores(self.metrics, result.image, *reference.images)
         except NgptError as error:
-            # Not kept: what is missing may be there the next time.
+            # Not cached: a missing package or file may be there the next time.
             return {"absent": str(error)}
         if image is not None:
             image.parent.mkdir(parents=True, exist_ok=True)
@@ -79,7 +82,10 @@ class Scorer:
         return cell
 
     def floors(self, reference: Reference) -> dict[str, float | None]:
-        """Between the two halves of a reference, the metrics whose noise they do not take off; none of one image."""
+        """The metrics between the two halves of a reference, which show its noise; {} for a reference of one image.
+
+        Squared metrics are left out: with two halves, they are free of this noise.
+        """
         if len(reference.images) == 1:
             return {}
         path = self._path(["floors"], reference)
@@ -89,18 +95,18 @@ class Scorer:
         return json.loads(path.read_text())
 
     def _scores(self, names: list[str], image: np.ndarray, *halves: np.ndarray) -> dict[str, float | None]:
-        """None for what is infinite, as the PSNR of equal images is."""
+        """The metrics ``names`` of an image; None where one is not finite, like the PSNR of equal images."""
         values = scores(names, image, *halves, options=self.options)
         return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
     def _path(self, parts: list, reference: Reference) -> Path:
-        """The file of what depends on ``parts``, the reference, the metrics and the code."""
+        """The cache file of a result that depends on ``parts``, the reference, the metrics and the code."""
         parts = [*parts, reference.key, self.config.metrics, self.options, *self._code]
         return self.cache / f"{hashlib.sha256(json.dumps(parts, default=str).encode()).hexdigest()[:32]}.json"
 
 
 def absence(column: Column) -> str:
-    """Why a column cannot be computed at all here, "" if it can."""
+    """Why a column cannot be computed on this machine, "" if it can."""
     if column.method not in METHODS:
         return str(unknown_method(column.method))
     weights = column.options.get("weights", "")

@@ -14,22 +14,22 @@ from ngpt.options import settings
 from ngpt.system.parts import find_renderer
 from ngpt.system.records import check, from_table, read_toml
 
-# The seeds whose pictures are kept.
+# The values of ``images``: the seeds whose pictures are kept.
 IMAGES = ("first", "all", "none")
-# What equal time is: of the wall, or of all processors, which other work on the machine does not change.
+# The values of ``time``: the clock of equal time. Other work on the machine hardly changes processor time.
 CLOCKS = ("wall", "processor")
 
 
 @dataclass(frozen=True)
 class Column:
-    """A method as the tables have it: one of the registry's, with options, on a kind of stack by a sampler.
+    """A column of the tables: a method with its options, on the stacks of one sampler.
 
-    ``name``     in tables: the family, and the sampler in brackets where several are compared
-    ``family``   what the configuration calls it: a method or a variant
-    ``method``   in ``ngpt.methods.METHODS``; another name makes a row that says so
-    ``sampler``  what the configuration calls the one of ``render``
-    ``render``   what it is given
-    ``options``  of the method
+    ``name``     the name in tables: the family, and the sampler in brackets where several are compared
+    ``family``   the name in the configuration: a method or a variant
+    ``method``   the name in ``ngpt.methods.METHODS``; an unknown name makes rows that say so
+    ``sampler``  the name of the sampler in the configuration; ``render`` has the renderer's own name
+    ``render``   the stacks that the method reads
+    ``options``  the method's options that differ from its defaults
     """
 
     name: str
@@ -42,29 +42,33 @@ class Column:
 
 @dataclass(frozen=True)
 class Config:
-    """An evaluation. configs/eval-tiny.toml shows entries at work; ``ngpt evaluate --init FILE`` writes all of them.
+    """The settings of an evaluation. configs/eval-tiny.toml explains them by example.
 
-    ``title``     of the report
+    ``ngpt evaluate --init FILE`` writes all of them to a file.
+
+    ``title``     the title of the report
     ``scenes``    built-in scenes, scene files, patterns, or folders of stacks: KIND-SPP-SEED.exr and reference.exr
     ``size``      width and height in pixels
-    ``spp``       samples per pixel of the stacks by ``clock``; other stacks have as many as take that time
-    ``rival_spp``  the same for the columns of ``against``, if it is not empty: their curves should reach as far as what
-              takes longer to reconstruct
-    ``seeds``     renders of each stack
-    ``methods``   of `ngpt info`, or variants: tables [variants.NAME] with method, options, stack and sampler
-    ``samplers``, ``rivals``  samplers of stacks with gradients, and without; tables [samplers.NAME] give them options
+    ``spp``       samples per pixel of the stacks by ``clock``; other stacks get the number that takes the same time
+    ``rival_spp``  the same for the columns of ``against``; empty: as ``spp``. Larger numbers let the curves of rivals
+              reach the whole time of methods that take longer to reconstruct
+    ``seeds``     the number of renders of each stack, each with its own seed
+    ``methods``   methods of `ngpt info`, or variants: tables [variants.NAME] with method, options, stack and sampler
+    ``samplers``, ``rivals``  samplers of stacks with gradients, and without; tables [samplers.NAME] give them options,
+              and ``subpixels`` as for ``ngpt render``; without, there are none
     ``clock``     the sampler whose samples ``spp`` counts
-    ``time``      "wall", or "processor": all cores together, which other work on the machine does not change
-    ``metrics``   the first is measured always; E-LPIPS needs a table [elpips] with backbone and weights
+    ``time``      "wall", or "processor": all cores together, which other work on the machine hardly changes
+    ``metrics``   the metrics to measure; E-LPIPS needs a table [elpips] with backbone and weights
     ``primary``   the metric of tables and plots
-    ``reference_spp``, ``reference_seconds``  samples per pixel of a reference, or if that is 0 seconds of rendering
-    ``reference_sampler``  one that finds all the light of the scenes
-    ``timing_spp``, ``timing_repeats``  renders that measure what a sample costs
+    ``reference_spp``, ``reference_seconds``  samples per pixel of a reference; if that is 0, seconds of rendering
+    ``reference_sampler``  the sampler of references: one that finds all the light of the scenes
+    ``timing_spp``, ``timing_repeats``  samples per pixel, and number, of the renders that measure the cost of a sample
     ``images``    pictures to keep: of the "first" seed, of "all", or "none"
     ``elpips``    files of E-LPIPS: backbone and weights
     ``references``  references from elsewhere, NAME = "FILE" or NAME = ["FILE", "FILE"] for two halves
-    ``groups``    of scenes, NAME = ["SCENE", ...]: rows of means in the tables
-    ``against``   rivals at equal whole time, NAME = ["COLUMN", ...]: settings; the best one counts at each time
+    ``groups``    groups of scenes, NAME = ["SCENE", ...]: each gets rows of means in the tables
+    ``against``   rivals at equal whole time, NAME = ["COLUMN", ...]: the columns are settings of one rival, and at each
+              time the best of them counts
     ``variants``  methods with options of their own, by name
     """
 
@@ -92,7 +96,7 @@ class Config:
     groups: dict[str, Any] = field(default_factory=dict)
     against: dict[str, Any] = field(default_factory=dict)
     variants: dict[str, dict[str, Any]] = field(default_factory=dict)
-    # What tables in the place of ``samplers`` hold: files have no entry of this name.
+    # The options in tables [samplers.NAME]. Files have no entry of this name.
     sampler_options: dict[str, dict[str, Any]] = field(default_factory=dict, metadata={"internal": True})
 
     def __post_init__(self) -> None:
@@ -116,7 +120,7 @@ class Config:
             if table.get("stack", "path") not in KINDS:
                 raise NgptError(f"evaluation: variants.{name}: stack must be one of {', '.join(KINDS)}")
             if "method" not in table:
-                raise NgptError(f"evaluation: variants.{name}: method is missing: which one it is a variant of")
+                raise NgptError(f"evaluation: variants.{name}: method is missing; name the method that it varies")
             if table["method"] in METHODS:
                 options = {key: value for key, value in table.items() if key not in ("method", "stack", "sampler")}
                 try:
@@ -127,7 +131,7 @@ class Config:
             self.sampler(name)
         for name, files in self.references.items():
             if not isinstance(files, str) and (not isinstance(files, list) or [type(f) for f in files] != [str, str]):
-                raise NgptError(f"evaluation: references.{name} = {files!r}: must be a file, or a list of two halves")
+                raise NgptError(f"evaluation: references.{name} = {files!r}: must be a file, or a list of two files")
         columns = [column.name for column in self.columns()]
         for entry, what in (("groups", "scenes"), ("against", "columns")):
             for name, listed in getattr(self, entry).items():
@@ -142,10 +146,10 @@ class Config:
                 )
         parts = [file_part(column) for column in columns]
         if repeated := next((part for i, part in enumerate(parts) if part in parts[:i]), ""):
-            raise NgptError(f"evaluation: two columns would be called '{repeated}'; name the variant otherwise")
+            raise NgptError(f"evaluation: two columns would be called '{repeated}'; rename the variant")
 
     def places(self) -> list[tuple[int, int, list[Column]]]:
-        """Nominal samples per pixel, seed, and the columns that are measured there, in the order of the tables."""
+        """Tuples (samples per pixel by ``clock``, seed, columns measured there), in the order of the tables."""
         settings = {column for listed in self.against.values() for column in listed} if self.rival_spp else set()
         pairs = [(column, self.rival_spp if column.name in settings else self.spp) for column in self.columns()]
         return [
@@ -155,11 +159,14 @@ class Config:
         ]
 
     def columns(self) -> list[Column]:
-        """Methods and samplers in the order of the tables."""
+        """All columns, in the order of the tables."""
         return [column for name in self.methods for column in self._columns(name)]
 
     def _columns(self, name: str) -> list[Column]:
-        """A method or variant with each of the samplers that are listed for its kind of stack, or with its own."""
+        """The columns of a method or variant: one for its own sampler if it names one.
+
+        Otherwise one for each sampler that is listed for its kind of stack.
+        """
         table = dict(self.variants.get(name, {}))
         method, kind, sampler = table.pop("method", name), table.pop("stack", ""), table.pop("sampler", "")
         layers = (*METHODS[method].needs, *METHODS[method].uses) if method in METHODS else ()
@@ -169,15 +176,21 @@ class Config:
         return [Column(n, name, method, s, self.render(kind, s), table) for n, s in zip(names, samplers, strict=True)]
 
     def render(self, kind: str, sampler: str) -> Render:
-        """A kind of stack by one of the samplers; only the default sampler of plain images leaves the features out.
+        """The stacks of this ``kind`` by the sampler that the configuration calls ``sampler``.
 
-        Raises NgptError for a sampler's options that it does not take.
+        Only the default sampler of plain images can leave features out: with another one, kind "path" becomes
+        "features". Raises NgptError for options that the sampler does not take.
         """
         name, given = self.sampler(sampler)
         return Render("features" if kind == "path" and name != KINDS["path"] else kind, name, given)
 
     def sampler(self, name: str) -> tuple[str, str]:
-        """What the renderer calls the sampler that is called ``name`` here, and its options that are not defaults."""
+        """The renderer's name of the sampler that the configuration calls ``name``, and its options, as text.
+
+        The text has only options that differ from their defaults. Subpixels count as one, whose default is 1, and not
+        "auto" as in `ngpt render`: so a configuration keeps its meaning, and stored tables stay what they were. Raises
+        NgptError for options that it does not take.
+        """
         table = dict(self.sampler_options.get(name, {}))
         if not table:
             return name, ""
@@ -188,7 +201,10 @@ class Config:
             raise NgptError(f"evaluation: samplers.{name}: {error}") from None
 
     def scene_files(self) -> dict[str, str]:
-        """Name -> built-in scene, scene file or folder of stacks; patterns are resolved. Raises NgptError for none."""
+        """Name -> built-in scene, scene file or folder of stacks, with patterns resolved.
+
+        Raises NgptError if there are no scenes, if a pattern matches none, or if two have the same name.
+        """
         if not self.scenes:
             raise NgptError("evaluation: no scenes: name built-in ones, scene files, patterns or folders with --scenes")
         result: dict[str, str] = {}
@@ -208,12 +224,15 @@ class Config:
 
 
 def file_part(column: str) -> str:
-    """What file names call a column: "wcv (gpt-basic)" is wcv-gpt-basic."""
+    """The name of a column in file names: "wcv (gpt-basic)" becomes wcv-gpt-basic."""
     return column.replace(" (", "-").removesuffix(")")
 
 
 def scene_name(scene: str) -> str:
-    """What tables call a scene: the folder of a scene file and what its name adds to "scene"."""
+    """The name of a scene in tables.
+
+    For a scene file, this is the name of its folder and the part of the file's name after "scene".
+    """
     path = Path(scene)
     return f"{path.parent.name}{path.stem.removeprefix('scene')}" if path.suffix == ".xml" else path.name
 
@@ -222,8 +241,8 @@ def read_config(path: str | Path) -> Config:
     """Reads a TOML file; raises NgptError for entries that do not exist or have the wrong type.
 
     ``base`` names another file, relative to the folder of this one: entries that this file lacks are taken from there.
-    ``samplers`` may be tables of options. Samplers with gradients are compared, others are for ``rivals``, and samplers
-    that a variant names are only for this variant.
+    ``samplers`` may be tables of options. Then the samplers with gradients are compared, except for those that a
+    variant names. ``rivals``, ``clock`` and others may name samplers without gradients.
     """
     values = _with_base(Path(path))
     if isinstance(tables := values.get("samplers"), dict):
@@ -236,7 +255,7 @@ def read_config(path: str | Path) -> Config:
 
 
 def _with_base(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """The entries of a file and of its base; ``above`` are the files whose base it is."""
+    """The entries of a file and of its base; ``above`` are the files that are built on this one."""
     values = read_toml(path)
     base = values.pop("base", None)
     if base is None:
@@ -248,7 +267,7 @@ def _with_base(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
 
 
 def _merged(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """Tables entry by entry; all else that both have is of ``values``."""
+    """``base`` updated with ``values``. Tables that both have are merged entry by entry."""
     tables = {
         name: _merged(base[name], value)
         for name, value in values.items()

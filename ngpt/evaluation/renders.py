@@ -12,7 +12,7 @@ KINDS = {"gradients": "auto", "features": "primal", "path": "primal"}
 
 @dataclass(frozen=True)
 class Render:
-    """A kind of stack by a sampler, with options of it that are not its defaults: "radius=1, photons=2".
+    """A kind of stack by a sampler, with options of it that are not its defaults: "radius=1, photons=2, subpixels=2".
 
     ``name`` is what files, costs and results call it.
     """

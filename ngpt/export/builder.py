@@ -5,8 +5,9 @@
     graph.output("y", op.Max(x, 0.0) * 2.0, ("n", 3))
     model = graph.model({"method": "double"})
 
-``op.NAME`` is ONNX's operator of that name, with its inputs in order and its attributes by name. Python floats, ints,
-lists of ints, and arrays among the inputs become constants: of float32, int64, int64, and as they are.
+``op.NAME`` is ONNX's operator of that name, with its inputs in order and its attributes by name. Among the inputs,
+Python floats become constants of float32, ints and lists of ints become constants of int64, and arrays become constants
+of their own type.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -74,7 +75,7 @@ op = Operators()
 
 
 class Graph:
-    """A graph that grows by one node with each operator that its values are given to."""
+    """A graph that grows by one node with each operator that is applied to its values."""
 
     def __init__(self, name: str):
         self.name = name
@@ -82,12 +83,12 @@ class Graph:
         self._outputs: list[onnx.ValueInfoProto] = []
         self._initializers: dict[str, onnx.TensorProto] = {}
         self._constants: dict[tuple, Value] = {}
-        # Nodes of the graph, and of the bodies inside each other that are being made.
+        # The nodes of the graph, then those of each nested body that is being made.
         self._bodies: list[list[onnx.NodeProto]] = [[]]
         self._names = 0
 
     def input(self, name: str, shape: Shape, default: np.ndarray | None = None) -> Value:
-        """A float32 input; one with a ``default`` may be left out by those who run the model."""
+        """A float32 input. Whoever runs the model may omit an input with a ``default``."""
         self._inputs.append(helper.make_tensor_value_info(name, FLOAT, shape))
         if default is not None:
             self._initializers[name] = numpy_helper.from_array(default.astype(np.float32), name)
@@ -102,7 +103,7 @@ class Graph:
         """The value, or tuple of values, that a new node makes of ``inputs``; None leaves an optional one out."""
         names = ["" if value is None else self._value(value).name for value in inputs]
         results = tuple(self._new(kind) for _ in range(outputs))
-        # Nodes need names: an optimizer of ONNX Runtime 1.21 reuses them for nodes that it makes, and refuses
+        # Nodes need names: an optimizer of ONNX Runtime 1.21 reuses the names for nodes that it makes, and refuses
         # duplicates.
         outputs_of = [result.name for result in results]
         self._bodies[-1].append(helper.make_node(kind, names, outputs_of, f"node of {outputs_of[0]}", **attributes))
@@ -137,9 +138,9 @@ class Graph:
         )
 
     def model(self, metadata: Mapping[str, str]) -> onnx.ModelProto:
-        """The model, checked, with who made it, and ``metadata`` under names ``ngpt.*``.
+        """The checked model, with its producer, and ``metadata`` under names ``ngpt.*``.
 
-        Nodes and constants that no output depends on are left out.
+        It has no nodes and constants that no output depends on.
         """
         (nodes,) = self._bodies
         graph = helper.make_graph(nodes, self.name, self._inputs, self._outputs)
@@ -157,7 +158,7 @@ class Graph:
         return Value(self, f"{kind}_{self._names}")
 
     def _value(self, value: Any) -> Value:
-        """The value itself, or a constant; equal constants are one."""
+        """The value itself, or a constant; equal constants are stored once."""
         if isinstance(value, Value):
             return value
         array = np.asarray(value, np.float32 if isinstance(value, float) else None)
@@ -175,13 +176,13 @@ def channels(x: Value, first: int, last: int) -> Value:
 
 
 def choose(condition: Value, then: Callable[[], Value], otherwise: Callable[[], Value], shape: Shape) -> Value:
-    """The result of ``then`` if ``condition``, a scalar, holds, else that of ``otherwise``; float32."""
+    """The float32 result of ``then`` if the scalar ``condition`` is true, else the result of ``otherwise``."""
     branches = [condition.graph.body(lambda make=make: [make()], {}, [(FLOAT, shape)]) for make in (then, otherwise)]
     return op.If(condition, then_branch=branches[0], else_branch=branches[1])
 
 
 def repeat(most: int, step: Callable[[Value, Value], tuple[Value, Value | bool]], state: Value, shape: Shape) -> Value:
-    """``state``, float32, after at most this number of steps. ``step`` takes the number of the step, from 0, and the
+    """The float32 ``state`` after at most this number of steps. ``step`` takes the number of the step, from 0, and the
     state. It returns the next state, and whether to go on.
     """
     graph = state.graph
@@ -195,7 +196,7 @@ def repeat(most: int, step: Callable[[Value, Value], tuple[Value, Value | bool]]
 
 
 def _drop_unused(graph: onnx.GraphProto) -> set[str]:
-    """Removes nodes whose results nothing reads; returns all names that the rest reads."""
+    """Removes nodes whose results are not read; returns all names that the remaining nodes read."""
     read = {output.name for output in graph.output}
     kept = []
     for node in reversed(graph.node):

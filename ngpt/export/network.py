@@ -1,4 +1,7 @@
-"""A network of ours as ONNX: raw buffers of a renderer in, the image out. CONTRACT.md is for those who run it."""
+"""One of our networks as ONNX: it reads the raw buffers of a renderer and returns the image.
+
+CONTRACT.md is for those who run it.
+"""
 
 import json
 import logging
@@ -24,12 +27,12 @@ from ngpt.version import __version__
 
 
 def network_model(weights: str | Path, name: str, precision: str = "float32") -> onnx.ModelProto:
-    """The graph of the weights in that file; ``name`` is what its metadata call it.
+    """The graph of the weights in that file; ``name`` is its name in the metadata.
 
     ``precision`` is the precision of all convolutions but the last; everything else is always float32. float16 is for
     GPUs: ONNX Runtime's CPU provider computes it in float32, with conversions, which hides overflows and takes longer.
 
-    Raises NgptError for weights that cannot be read, and for those that start from a base that has no graph.
+    Raises NgptError for weights that cannot be read, and for networks whose base has no graph.
     """
     model, header = _load(weights)
     tell = metadata(model, name, precision) | {"training": json.dumps(header.get("training", {}))}
@@ -37,14 +40,14 @@ def network_model(weights: str | Path, name: str, precision: str = "float32") ->
 
 
 def statistics_model(weights: str | Path, name: str) -> onnx.ModelProto:
-    """The graph that computes what the tiles of an image share, for the model of these weights."""
+    """The graph that computes the statistics that tiles of an image share, for the model of these weights."""
     model, _ = _load(weights)
     tell = {"version": __version__, "method": name, "statistics": ", ".join(STATISTICS)}
     return statistics(model.config).model(tell)
 
 
 def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
-    """What a host may want to know, by key; CONTRACT.md explains them."""
+    """Facts that a host may need, by key; CONTRACT.md explains them."""
     seen, light = reach(model), REACH if "caustic_var" in layers(model.config) else 0
 
     def overlap(*pixels: int) -> str:
@@ -75,13 +78,13 @@ def _base_reach(model: Reconstructor) -> int:
 
 
 def bytes_per_pixel(model: Reconstructor) -> int:
-    """The most memory that a run takes for each pixel, beside the image's layers; measured in
+    """The most memory in bytes that a run takes for each pixel, besides the image's layers; measured in
     tests/network/test_run_onnx.py.
 
-    The last convolution reads the longest list of tensors; it exists as the list, as one tensor, and about once more.
-    The channels exist six times, from raw to one tensor; then the head has the prediction, in three forms. The arena of
-    ONNX Runtime gets more than that, most where sizes are halved and doubled without weights. ngpt-combine took 0.6 of
-    its bound at 1280x720.
+    The last convolution reads the longest list of tensors. They are in memory as the list, as one tensor, and about
+    once more. The channels are in memory six times, from raw layers to one tensor. The head holds the prediction in
+    three forms. The arena of ONNX Runtime allocates more than that, most where sizes are halved and doubled without
+    weights. ngpt-combine took 0.6 of its bound at 1280x720.
     """
     listed = next(model.network.head.parameters()).shape[1]
     body = 3 * listed + 6 * features.channels(model.config.inputs)
@@ -106,7 +109,7 @@ def _load(weights: str | Path) -> tuple[Reconstructor, dict]:
 
 
 class _Half(torch.nn.Module):
-    """The network in float16, except its head, which predicts logarithms."""
+    """The network in float16; its head, which predicts logarithms, stays in float32."""
 
     def __init__(self, network: torch.nn.Module):
         super().__init__()
@@ -118,7 +121,7 @@ class _Half(torch.nn.Module):
 
 
 def network_body(model: Reconstructor, precision: str = "float32") -> onnx.ModelProto:
-    """The network proper, ``channels`` to ``prediction``, (N, C, H, W) of any aligned size."""
+    """The network itself, from ``channels`` to ``prediction``, (N, C, H, W) of any aligned size."""
     inputs = features.channels(model.config.inputs)
     return convolutions(model.network, inputs, model.alignment, "channels", "prediction", precision)
 
@@ -131,15 +134,15 @@ def convolutions(
     """
     for module in network.modules():
         if isinstance(module, Convolution):
-            # Normalised once and for all, rather than in each run of the graph.
+            # Normalised here once, rather than in each run of the graph.
             weight = module.weight().detach()
             if precision == "float16" and module is not network.head.convolution:  # type: ignore[union-attr]
                 weight = weight.half()
             module.weight = partial(_same, weight)  # type: ignore[method-assign]
-    # Sizes that are not special: the exporter takes 0 and 1 for constants.
+    # Sizes other than 0 and 1, which the exporter takes for constants.
     example = torch.zeros(2, inputs, 5 * alignment, 7 * alignment)
     tiles, rows, columns = (torch.export.Dim(name, min=2, max=1 << 16) for name in ("tiles", "r", "c"))
-    # It would report that torchvision is not installed, which is not needed.
+    # The exporter would report that torchvision, which is not needed, is not installed.
     logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -1,8 +1,8 @@
 """The least-squares screened Poisson reconstruction (``ngpt.classical.poisson.l2``) as one ONNX graph.
 
 The cosine transforms are matrix products with matrices made inside the graph from the size of its input, so one file
-serves every size. That costs O(H W (H + W)) instead of the O(H W log(H W)) of a fast transform, but matrix products run
-so near the peak of a machine that up to 1920x1080 the two are equally fast on two CPU cores (docs/lab/log).
+serves every size. That costs O(H W (H + W)) instead of the O(H W log(H W)) of a fast transform. Matrix products run
+near the peak speed of a machine: up to 1920x1080 both are equally fast on two CPU cores (docs/lab/log).
 """
 
 import math
@@ -46,7 +46,7 @@ def _correction(primal: Value, dx: Value, dy: Value, alpha: float) -> Value:
 
 
 def _divergence(primal: Value, gradient: Value, axis: int) -> Value:
-    """∂ᵀ(G - ∂P) along one axis. The last column of dx and the last row of dy stand for no difference."""
+    """∂ᵀ(G - ∂P) along one axis. The last column of dx and the last row of dy hold no difference."""
     slope = op.Slice(primal, [1], [END], [axis]) - op.Slice(primal, [0], [-1], [axis])
     residual = op.Slice(gradient, [0], [-1], [axis]) - slope
     return op.Pad(residual, [1, 0], None, [axis]) - op.Pad(residual, [0, 1], None, [axis])

@@ -1,9 +1,9 @@
 """How far around a pixel a network has to see: the overlap of its tiles.
 
-``Reconstructor.radius`` is how far it can see. Networks with kernels or sweeps at several resolutions can see twice as
-far as makes any difference: light from the far end passes through every convolution, every coarse pixel and every
-sweep, each time with a small weight. Tiles that overlap by the whole radius take four times the memory. So the distance
-that matters is measured, on noise that is worse than in images.
+``Reconstructor.radius`` is how far it can see. For networks with kernels or sweeps at several resolutions, that can be
+twice the distance that makes any difference: light from the far end passes through every convolution, every coarse
+pixel and every sweep, each time with a small weight. Tiles that overlap by the whole radius take four times the memory.
+So the distance that matters is measured, on noise stronger than in images.
 """
 
 import numpy as np
@@ -13,16 +13,17 @@ from torch import Tensor
 from ngpt.network import features, padding
 from ngpt.network.model import Reconstructor
 
-# Pixels farther away change an image by less than this share of its value: ten times less than tiles may.
+# Pixels farther away change an image by less than this share of its value, a tenth of the tolerance for tiles.
 TOLERANCE = 1e-6
-# How many examples are tried, and the side of the middle of each that is compared.
+# The number of examples, and the side of the square in the middle of each that is compared.
 EXAMPLES, MIDDLE = 3, 64
-# Pixels added to what the examples need, because images differ; smaller distances are not measured.
+# Pixels added to the distance that the examples need, because images differ; and the distance up to which it is not
+# measured.
 BESIDE, NEAR = 24, 48
 
 
 def reach(model: Reconstructor) -> int:
-    """Pixels, a multiple of the alignment: ``radius`` rounded up, or less where more makes no difference.
+    """The overlap in multiples of the alignment, in pixels: ``radius`` rounded up, or less if more makes no difference.
 
     The result is the least distance that keeps every pixel of all examples within ``TOLERANCE``, plus ``BESIDE``.
     """
@@ -36,7 +37,7 @@ def reach(model: Reconstructor) -> int:
 
 @torch.inference_mode()
 def _least(model: Reconstructor, whole: int, seed: int) -> int:
-    """The multiples of the alignment that one example needs."""
+    """The overlap that one example needs, as a number of alignments."""
     step = model.alignment
     middle = -(-MIDDLE // step) * step
     scaled, _ = features.normalised(_example(model, middle + 2 * whole * step, seed))
@@ -62,7 +63,7 @@ def _least(model: Reconstructor, whole: int, seed: int) -> int:
 
 
 def _example(model: Reconstructor, side: int, seed: int) -> dict[str, Tensor]:
-    """Layers (1, C, side, side): rectangles of all brightnesses under noise; 1 % of it is a hundred times as strong."""
+    """Layers (1, C, side, side): rectangles of all brightnesses under noise, 1 % of it a hundred times stronger."""
     rng = np.random.default_rng(seed)
     image = np.ones((3, side, side))
     for _ in range(side):

@@ -1,4 +1,4 @@
-"""The network that blends frames as ONNX: ``inputs`` as of ``ngpt.sequence.network``, (1, C, H, W) of aligned sizes."""
+"""The network that blends frames as ONNX: ``inputs`` as in ``ngpt.sequence.network``, (1, C, H, W) of aligned sizes."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from ngpt.version import __version__
 
 
 def temporal_model(weights: str | Path) -> onnx.ModelProto:
-    """The graph of weights of such a network; raises NgptError for others."""
+    """The graph for the weights of such a network; raises NgptError for other weights."""
     model, header = load(weights)
     proto = convolutions(model, len(INPUTS), model.alignment, "inputs", "corrections")
     proto.producer_name, proto.producer_version = "ngpt", __version__

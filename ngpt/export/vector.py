@@ -13,7 +13,7 @@ SIZE = 29, 23  # width and height: odd, and no multiple of any alignment
 
 
 def write_vector(model: onnx.ModelProto, folder: Path, overwrite: bool = False) -> None:
-    """Writes the inputs of a model into a folder, and its result as ``image``; see ``ngpt.io.rawlayers``."""
+    """Writes the inputs of a model, and its result as ``image``, into a folder; see ``ngpt.io.rawlayers``."""
     names = {item.key: item.value for item in model.metadata_props}["ngpt.inputs"].split(", ")
     arrays = {name: layer for name, layer in example_layers().items() if name in names}
     session = runtime().InferenceSession(model.SerializeToString(), quiet(), providers=["CPUExecutionProvider"])

@@ -1,4 +1,4 @@
-"""Weights in 16 bits: as the repository keeps them, with the curve of their training, and as OIDN reads them."""
+"""Weights in 16 bits: the repository's files, with their training curve, and the files that OIDN reads."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,7 +39,8 @@ def mean(files: Sequence[str | Path]) -> tuple[dict[str, Tensor], dict[str, Any]
 
     The mean of a network before and after tuning forgets less than the tuned network does [Wortsman et al. 2022,
     "Robust fine-tuning of zero-shot models"]. The header is the first file's, with the training of each file. Raises
-    NgptError for files that hold no weights of a network for single images, or another network than the first one.
+    NgptError if a file does not hold weights of a network for single images, or holds another network than the first
+    file.
     """
     models, headers = zip(*map(load_weights, files), strict=True)
     for file, model in zip(files, models, strict=True):
@@ -56,7 +57,7 @@ def mean(files: Sequence[str | Path]) -> tuple[dict[str, Tensor], dict[str, Any]
 
 
 def curve(entries: list[dict[str, float]], last: int) -> dict[str, list[Any]]:
-    """Losses until step ``last``, each the mean of those since the one before."""
+    """Losses until step ``last``, each the mean over the steps since the previous entry."""
     logged = [(entry["step"], entry["loss"]) for entry in entries if "loss" in entry and entry["step"] <= last]
     parts = [part for part in np.array_split(np.array(logged).reshape(-1, 2), POINTS) if len(part)]
     return {
@@ -66,9 +67,9 @@ def curve(entries: list[dict[str, float]], last: int) -> dict[str, list[Any]]:
 
 
 def oidn_weights(weights: str | Path) -> bytes:
-    """The .tza file of weights as `ngpt train` writes them.
+    """The .tza file of weights that `ngpt train` wrote.
 
-    Raises NgptError for networks of another shape, and for numbers that the 16 bits of OIDN cannot hold.
+    Raises NgptError for networks of a shape other than OIDN's, and for numbers beyond 16-bit floats.
     """
     model, _ = load_weights(weights)
     if model.config.network != "oidn":

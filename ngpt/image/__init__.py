@@ -1,1 +1,1 @@
-"""Images to look at: exposure and colour, looks, PNG, JPEG and videos, and stacks in notebooks."""
+"""Images to look at: exposure, colour, view transforms, PNG, JPEG, videos, and stacks in notebooks."""

@@ -1,7 +1,7 @@
 """From scene-linear numbers to 8-bit colours for looking at.
 
-Nothing here is for measuring: display clamps and rounds. Every function takes scene-linear floats and returns
-(H, W, 3) uint8 in sRGB. A NaN is magenta wherever it turns up, so that it cannot be mistaken for a colour.
+Never measure on these colours: they are clamped and rounded. Every function takes scene-linear floats and returns (H,
+W, 3) uint8 in sRGB. A NaN is always magenta, so that it cannot be mistaken for a colour.
 """
 
 import math
@@ -12,15 +12,16 @@ import numpy as np
 from ngpt.errors import NgptError
 
 MAGENTA = (255, 0, 255)
-MIDDLE_GREY = 0.18  # what a photographer's light meter makes of the average scene
+MIDDLE_GREY = 0.18  # the display value that a light meter gives the average scene
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
 
-ERROR_EPSILON = 1e-2  # keeps the relative error of black pixels finite; of an image at automatic exposure
+ERROR_EPSILON = 1e-2  # keeps the relative error of black pixels finite, at automatic exposure
 ERROR_RANGE = (1e-4, 1.0)  # relative squared error at the two ends of the heat table: 1 % and 100 %
 
 MOST_ASPECT = 16.0  # of pixels: larger values in a header make no sense
 
-# "inferno" of Smith and van der Walt at nine even steps: lightness grows evenly, and it survives colour blindness.
+# "inferno" of Smith and van der Walt at nine even steps: its lightness grows evenly, so colour-blind readers can use
+# it.
 _INFERNO = ("000004", "210c4a", "57106e", "8a226a", "bc3754", "e45a31", "f98e09", "f9cb35", "fcffa4")
 _DIVERGING = ("9ecbff", "2f7fd6", "777777", "d9772b", "ffd09a")  # negative blue, zero grey, positive orange
 
@@ -40,7 +41,7 @@ def encoded_srgb(light: np.ndarray) -> np.ndarray:
 
 
 def to_display8(image: np.ndarray, transform: Callable[[np.ndarray], np.ndarray], stops: float) -> np.ndarray:
-    """As :func:`to_srgb8`, by a transform of its own: (H, W, 3) of light from 0 on -> display values."""
+    """As :func:`to_srgb8`, with another transform: (H, W, 3) of light >= 0 -> display values."""
     image = _rgb(image)
     # Clamped before and after the gain: before, so that Inf and the largest floats cannot overflow into a NaN.
     light = np.clip(np.nan_to_num(image, nan=0.0, posinf=1e30, neginf=0.0), 0.0, 1e30)
@@ -52,9 +53,9 @@ def to_display8(image: np.ndarray, transform: Callable[[np.ndarray], np.ndarray]
 
 
 def squared(image: np.ndarray, aspect: float) -> np.ndarray:
-    """An image (H, W, C) with square pixels, of pixels whose width is ``aspect`` times their height.
+    """An image (H, W, C) with square pixels, made from pixels whose width is ``aspect`` times their height.
 
-    They are repeated, so that a picture only becomes larger.
+    Pixels are repeated, so a picture only becomes larger.
     """
     if not (1 / MOST_ASPECT <= aspect <= MOST_ASPECT) or aspect == 1:
         return image
@@ -66,8 +67,8 @@ def squared(image: np.ndarray, aspect: float) -> np.ndarray:
 def auto_exposure(reference: np.ndarray) -> float:
     """The exposure, in stops, that brings the log-average luminance of (H, W, 3) to middle grey, 0.18.
 
-    Only finite pixels count. Pixels 13 stops or more under the bright end are background, not subject, and are left
-    out; fireflies count as the 99th percentile of the lit pixels. An all-black image gives 0.
+    Only finite pixels count. Pixels 13 stops or more below the bright end count as background, and are left out.
+    Fireflies are clamped to the 99th percentile of the lit pixels. An all-black image gives 0.
     """
     with np.errstate(invalid="ignore"):  # Inf - Inf, left out below
         luminance = (_rgb(reference) @ LUMINANCE).ravel()
@@ -83,21 +84,21 @@ def auto_exposure(reference: np.ndarray) -> float:
 def signed_map(gradient: np.ndarray) -> np.ndarray:
     """A gradient layer, (H, W, 3) of either sign: zero is grey, negative is blue, positive is orange.
 
-    What shows is the mean over RGB, linear up to the 99th percentile of its own magnitude.
+    It shows the mean over RGB, linear up to the 99th percentile of its magnitude.
     """
     value = _rgb(gradient).mean(axis=2)
     magnitude = np.abs(value[np.isfinite(value)])
     scale = np.percentile(magnitude, 99.0) if magnitude.size else 0.0
-    if scale == 0.0:  # a layer that is zero nearly everywhere still has its peak
+    if scale == 0.0:  # for a layer that is zero nearly everywhere
         scale = magnitude.max(initial=0.0) or 1.0
     return coloured(0.5 + 0.5 * value / scale, sign_table())
 
 
 def layer_view(name: str, layer: np.ndarray) -> np.ndarray:
-    """A layer of a stack, (H, W), (H, W, 1) or (H, W, 3), as (H, W, 3) uint8: each kind in a way of its own.
+    """A layer of a stack, (H, W), (H, W, 1) or (H, W, 3), as (H, W, 3) uint8: each kind in its own way.
 
-    Gradients as :func:`signed_map`, normals as colours, depth up to its 99th percentile, light and variances at
-    automatic exposure, all else as it is.
+    Gradients are shown as in :func:`signed_map`, normals as colours, depth up to its 99th percentile, light and
+    variances at automatic exposure, and other layers unchanged.
     """
     layer = np.atleast_3d(np.asarray(layer, dtype=np.float64))
     layer = np.broadcast_to(layer, (*layer.shape[:2], 3))
@@ -129,7 +130,7 @@ def heat_table() -> np.ndarray:
 
 
 def sign_table() -> np.ndarray:
-    """(255, 3) uint8 sRGB from blue over grey to orange; odd, so that zero has an entry of its own."""
+    """(255, 3) uint8 sRGB from blue over grey to orange; the odd size gives zero an entry of its own."""
     return colour_table(_DIVERGING, 255)
 
 

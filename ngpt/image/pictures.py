@@ -1,4 +1,4 @@
-"""Pictures and films of 8-bit sRGB: PNG by ourselves, JPEG and WebP by Pillow, MP4 by FFmpeg.
+"""Pictures and films of 8-bit sRGB: PNG by ``ngpt.image.png``, JPEG and WebP by Pillow, MP4 by FFmpeg.
 
 A shot is a lossless animated WebP, or an MP4 (H.264 where FFmpeg has it). FFmpeg is the program of that name, or the
 one in the package imageio-ffmpeg.
@@ -24,11 +24,11 @@ PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 SHOTS = (".webp", ".mp4")
 # The longest side of a picture in pixels, where the format has a limit
 _LONGEST = {".jpg": 65500, ".jpeg": 65500, ".webp": 16383}
-_QUALITY = 95  # of JPEG; no colour is stored at half the size
+_QUALITY = 95  # of JPEG; colour is stored at full resolution
 
 
 def check_kind(path: Path, kinds: tuple[str, ...]) -> None:
-    """Raises NgptError for files that are not of these kinds, or that cannot be made on this machine."""
+    """Raises NgptError for a file of another kind, or of a kind that cannot be written on this machine."""
     kind = path.suffix.lower()
     if kind not in kinds:
         raise NgptError(
@@ -109,7 +109,7 @@ def _write_mp4(path: Path, temporary: Path, frames: Iterable[np.ndarray], size: 
     # Players need even sides, and tags that name the colour space.
     command += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2,scale=out_color_matrix=bt709:out_range=tv", "-pix_fmt", "yuv420p"]
     command += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "iec61966-2-1", "-f", "mp4"]
-    # As it would be without: a name that begins with a dash, or like a protocol, is a file's all the same.
+    # With "file:", a name that begins with a dash, or looks like a protocol, still names a file.
     command += ["-q:v", "2", "-movflags", "+faststart", f"file:{os.path.abspath(temporary)}"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None and process.stderr is not None
@@ -118,7 +118,7 @@ def _write_mp4(path: Path, temporary: Path, frames: Iterable[np.ndarray], size: 
                 process.stdin.write(np.ascontiguousarray(frame).tobytes())
             process.stdin.close()
         except BrokenPipeError:
-            pass  # What it says of that follows.
+            pass  # FFmpeg's own message is read below.
         except BaseException:
             process.kill()
             raise

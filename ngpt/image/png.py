@@ -1,4 +1,4 @@
-"""A PNG encoder for 8-bit RGB and palettes: the one image format a report needs, and no dependency for it."""
+"""A PNG encoder for 8-bit RGB and palettes: reports need no other format, and so no image library."""
 
 import struct
 import zlib
@@ -11,7 +11,7 @@ from ngpt.errors import NgptError
 def encode_png(image: np.ndarray, level: int = 9) -> bytes:
     """Encodes (H, W, 3) uint8, row 0 on top, as an sRGB PNG. The same pixels give the same bytes.
 
-    ``level`` is zlib's compression level: 9 makes the smallest file, 1 takes a tenth of the time.
+    ``level`` is zlib's compression level: 9 makes the smallest file, and 1 takes a tenth of the time.
     """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
         raise NgptError(f"PNG: needs a non-empty (H, W, 3) uint8 image, got {image.shape} {image.dtype}")
@@ -19,7 +19,7 @@ def encode_png(image: np.ndarray, level: int = 9) -> bytes:
 
 
 def encode_palette_png(places: np.ndarray, table: np.ndarray, level: int = 6) -> bytes:
-    """Encodes (H, W) uint8 places in a ``table`` of at most 256 colours, (N, 3) uint8: a third of what RGB takes."""
+    """Encodes (H, W) uint8 indices into a ``table`` of at most 256 colours, (N, 3) uint8: a third of RGB's size."""
     if places.dtype != np.uint8 or places.ndim != 2 or places.size == 0 or places.max() >= len(table):
         raise NgptError(f"PNG: needs non-empty (H, W) uint8 places in a table, got {places.shape} {places.dtype}")
     # Rows without a filter, as the standard advises for palettes.

@@ -1,6 +1,6 @@
 """View transforms: from scene-linear light of Rec. 709 to 8-bit sRGB, for pictures that people look at.
 
-standard  the sRGB curve (IEC 61966-2-1); what is above 1 is white
+standard  the sRGB curve (IEC 61966-2-1); values above 1 are white
 filmic    AgX: highlights roll off and lose their colour, as on film
 aces      ACES 1.3, "ACES 1.0 - SDR Video", by OpenColorIO's built-in configuration; needs its package
 """
@@ -31,14 +31,14 @@ _CONFIGURATION = "ocio://cg-config-v2.1.0_aces-v1.3_ocio-v2.3"
 
 
 def filmic(light: np.ndarray) -> np.ndarray:
-    """(H, W, 3) from 0 on -> display values of sRGB, by AgX."""
+    """(H, W, 3) >= 0 -> display values of sRGB, by AgX."""
     stops = np.log2(np.maximum(light @ _INSET.T, 2.0**_DARKEST))
     place = np.clip((stops - _DARKEST) / (_BRIGHTEST - _DARKEST), 0.0, 1.0)
     return np.polyval(_CURVE, place) @ np.linalg.inv(_INSET).T
 
 
 def aces(light: np.ndarray) -> np.ndarray:
-    """(H, W, 3) from 0 on -> display values of sRGB, by OpenColorIO."""
+    """(H, W, 3) >= 0 -> display values of sRGB, by OpenColorIO."""
     image = np.ascontiguousarray(light, np.float32)
     _aces().applyRGB(image)
     return image
@@ -72,7 +72,7 @@ TRANSFORMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"standard": encoded
 def shown(image: np.ndarray, transform: str = "standard", stops: float = 0.0) -> np.ndarray:
     """(H, W, 3) scene-linear of Rec. 709 -> uint8 sRGB, after multiplication by 2**stops.
 
-    Negative values show as 0, a pixel with +Inf as white, a pixel with NaN as magenta. Raises NgptError where the
+    Negative values show as 0, a pixel with +Inf as white, a pixel with NaN as magenta. Raises NgptError if the
     transform needs a package that is not installed.
     """
     return to_display8(image, TRANSFORMS[transform], stops)

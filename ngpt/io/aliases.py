@@ -9,9 +9,9 @@ from ngpt.layers import LAYERS
 class Alias(NamedTuple):
     """A name under which ``producer`` stores ``layer``; ``""`` is the root.
 
-    ``only``     demands these channel suffixes, the layer's own first
-    ``factors``  of the channels, where a renderer has another sign or unit
-    ``writer`` demands a file by this program, according to ``writer_of``
+    ``only``     the required channel suffixes; those of the layer come first
+    ``factors``  the factors of the channels, if a renderer uses another sign or unit
+    ``writer``   the alias holds only in files by this program, according to ``writer_of``
     """
 
     layer: str
@@ -32,9 +32,9 @@ OWN: dict[str, set[str]] = {
     "shared": {"primal_var"},
 }
 
-# The first name that a file holds wins, so order is preference. Absent on purpose: pbrt-v4's `Variance` and Mitsuba's
-# moments are variances of a sample, not of the pixel mean, half of what other renderers call `diffuse` is light, and
-# V-Ray's VRayZDepth is a shade of grey between two distances.
+# The first name that a file holds wins, so order is preference. Some names are absent on purpose. pbrt-v4's `Variance`
+# and Mitsuba's moments are variances of a sample, not of the pixel mean. In half of the other renderers, `diffuse` is
+# light. V-Ray's VRayZDepth is a shade of grey between two distances.
 ALIASES: tuple[Alias, ...] = (
     *(Alias(name, "ngpt", name) for name in LAYERS if name not in (*OWN, "error")),
     Alias("direct", "ngpt", "direct", "in files of ngpt, or beside dx or dy: elsewhere `direct` is direct lighting"),
@@ -84,8 +84,8 @@ ALIASES: tuple[Alias, ...] = (
     Alias("alpha", "RenderMan", "a"),
 )
 
-# Parts of names, in small letters without blanks and underscores, that make a layer look like one of the contract. Only
-# the user knows the direction and unit of most motion vectors.
+# If a layer's name contains one of these parts (lower case, no blanks or underscores), it may be a layer of the
+# contract. Only the user knows the direction and unit of most motion vectors.
 LOOKS = {
     "albedo": ("albedo", "diffusefilter", "diffusecol", "basecol", "diffcol", "reflectance"),
     "normal": ("normal",),
@@ -94,25 +94,25 @@ LOOKS = {
     "dy": ("gradienty", "grady"),
     "motion": ("motionvec", "velocity", "vector"),
 }
-# Parts of names that are none of these layers: V-Ray's depth is a shade of grey between two distances.
+# Parts of names that rule these layers out: V-Ray's depth is a shade of grey between two distances.
 NOT_LOOKS = {"depth": ("zdepth",)}
-# Parts of names of layers that are not light, whatever their channels.
+# Parts of names that show that a layer is not light, whatever its channels.
 NO_LIGHT = ("crypto", "position", "matte", "mask", "noise", "samples")
-# How names of variances and errors end.
+# The ends of names of variances and errors.
 NOISE = ("var", "variance", "mse", "error")
 
-# Attributes that begin so show who wrote a file.
+# Attributes with these prefixes show who wrote a file.
 _WRITERS = {"ngpt:sampler": "ngpt", "vrayInfo": "V-Ray", "generatedBy": "Mitsuba"}
 
 
 def is_image(name: str) -> bool:
-    """Whether a layer of that name is what a renderer calls its image, and not the noisy one."""
+    """Whether renderers give this name to their final image, and not to the noisy one."""
     known = {alias.name for alias in ALIASES if alias.layer == "primal"} - {"", "primal", "Noisy Image"}
     return name.rpartition(".")[2] in known
 
 
 def plain(name: str) -> str:
-    """A name in small letters without blanks and underscores."""
+    """A name in lower case without blanks and underscores."""
     return name.lower().replace(" ", "").replace("_", "")
 
 

@@ -1,9 +1,9 @@
 """Gradient stacks and results in OpenEXR files: `read` and `write`.
 
-Images of other formats are read as well (``ngpt.io.foreign``), each as an OpenEXR file with the same light would be.
+Images of other formats (``ngpt.io.foreign``) are read like an OpenEXR file with the same light.
 
-Layers are found by their names, in the contract or in other renderers (``ngpt.io.aliases``). Everything else in a file,
-including layers that the toolkit does not know, passes through as ``ngpt.io.openexr`` describes.
+Layers are found by their names, those of the contract or of other renderers (``ngpt.io.aliases``). Everything else in a
+file, including layers that the toolkit does not know, passes through as ``ngpt.io.openexr`` describes.
 """
 
 import logging
@@ -45,7 +45,7 @@ def read(
     files: Mapping[str, str | os.PathLike] | None = None,
     view: str | None = None,
 ) -> GradientStack:
-    """Reads a gradient stack, or any render with an image in it.
+    """Reads a gradient stack, or any render that contains an image.
 
     Layers are found by their names in the contract or in other renderers (``ngpt.io.aliases``). ``layers`` maps names
     of the contract to names in the file, ``{"albedo": "ViewLayer.Denoising Albedo"}``, or to channels with signs and
@@ -53,22 +53,23 @@ def read(
     toolkit does not know stay in ``stack.source`` and come back on writing. In a result file primal is the kept input,
     so that reconstructing a result gives the result again.
 
-    ``view`` is one of a stereo file (``ngpt.io.views``): by default the first.
+    ``view`` names a view of a stereo file (``ngpt.io.views``); by default, it is the first.
 
-    ``files`` maps names of the contract to files of their own, ``{"albedo": "albedo.exr"}``, which win over layers of
-    that name in ``path``. If such a file has several layers, the one with a known name counts, else the root.
+    ``files`` maps names of the contract to separate files, ``{"albedo": "albedo.exr"}``. These win over layers of that
+    name in ``path``. If such a file has several layers, the one with a known name is read, else the root.
 
-    ``isolated`` decodes the file in a process of its own, so that one made to crash the decoder is an NgptError too:
-    for files of strangers (``ngpt.io.isolated``).
+    ``isolated`` decodes the file in a separate process: a file from a stranger that crashes the decoder then raises
+    NgptError (``ngpt.io.isolated``).
 
     Colours stay in the primaries of the file, which its header names (``ngpt.io.primaries``).
 
     Light that is encoded for displays, as in PNG, is made scene-linear (``ngpt.io.foreign.files``).
 
-    A layer in a part with a data window of its own gets the pixels of the primal, with 0 where it has none.
+    A layer whose data window differs from the primal's is put onto the pixels of the primal. Pixels outside its own
+    window are 0.
 
-    Raises NgptError if the file cannot be read, holds no primal, or holds layers without a pixel in common with it; and
-    for a file of a layer of another size or place.
+    Raises NgptError if the file cannot be read, holds no primal, or holds layers without a pixel in common with the
+    primal; and if the size or place of a layer in ``files`` is not that of the primal.
     """
     image, subpixels = _opened(path, isolated)
     stack = _stack(image, _one_view(image, view, str(path)), layers, isolated, files, str(path))
@@ -82,7 +83,7 @@ def read_views(
     files: Mapping[str, str | os.PathLike] | None = None,
     view: str | None = None,
 ) -> list[GradientStack]:
-    """As ``read``, a stack for each view of the file, or for the one that is named; one for a file without views."""
+    """Like ``read``, but returns a stack for each view, or for the named view; one stack for a file without views."""
     image, subpixels = _opened(path, isolated)
     found = choose_views(file_views(image), view, str(path))
     if len(found) == 1:
@@ -91,7 +92,7 @@ def read_views(
 
 
 def _opened(path: str | os.PathLike, isolated: bool) -> tuple[ExrImage, ExrPart | None]:
-    """The contents of a file except its subpixels, and the part that has these."""
+    """The contents of a file except its subpixels, and the part with the subpixels."""
     return fine.apart(read_exr_isolated(path) if isolated else read_file(path))
 
 
@@ -100,7 +101,7 @@ def _with_fine(stack: GradientStack, part: ExrPart | None) -> GradientStack:
 
 
 def _one_view(image: ExrImage, wanted: str | None, path: str) -> View:
-    """The view of that name, or the first; a warning says so where there are others."""
+    """The view of that name, or the first; logs a warning if the file has others."""
     found = choose_views(file_views(image), wanted, path)
     if len(found) > 1:
         _LOG.warning("%s: of the views %s, %s is taken", path, ", ".join(view.name for view in found), found[0].name)
@@ -113,7 +114,7 @@ def _resolved(
     """The places of the layers of a view; ``attributes`` are the headers of the parts."""
     headers, wanted = list(attributes), {name: view.without(text) for name, text in (layers or {}).items()}
     origin = next((str(header["ngpt:pass"]) for header in headers if "ngpt:pass" in header), "")
-    # In a result, the input has been moved.
+    # In a result file, the input is no longer at its first place.
     if origin and f".{origin}".endswith(f".{wanted.get('primal')}"):
         del wanted["primal"]
     writer = writer_of(name for header in headers for name in header)
@@ -132,7 +133,7 @@ def _stack(
     resolution = _resolved(view, layers, (part.header for part in image.parts), path)
     main = image.parts[resolution["primal"].part]
     if channels_like(resolution["primal"]) == XYZ:
-        main.header.setdefault("colorInteropID", "lin_ciexyzd65_scene")  # Mitsuba's are relative to D65
+        main.header.setdefault("colorInteropID", "lin_ciexyzd65_scene")  # Mitsuba's X Y Z are relative to D65
     here = data_window(main)
     for name, found in resolution.items():
         there = data_window(image.parts[found.part])
@@ -149,20 +150,21 @@ def _stack(
 
 
 def layers_in(path: str | os.PathLike, layers: Mapping[str, str] | None = None) -> frozenset[str]:
-    """The names of the layers that ``read`` would find, by the file's header; raises NgptError as it does for that."""
+    """The names of the layers that ``read`` would find, from the file's header. Raises the errors of ``read`` about
+    layers."""
     views, texts = _views_in(path)
     return frozenset(_resolved(views[0], layers, texts, str(path)))
 
 
 def views_in(path: str | os.PathLike) -> list[View]:
-    """The views of a file, and the names of their layers, by its header; raises NgptError for a file that is not an
+    """The views of a file, and the names of their layers, from its header; raises NgptError for a file that is not an
     image.
     """
     return _views_in(path)[0]
 
 
 def _views_in(path: str | os.PathLike) -> tuple[list[View], list[dict[str, str]]]:
-    """The views of a file, and the attributes of its parts that are texts."""
+    """The views of a file, and the text attributes of its parts."""
     with regular_file(Path(path)) as file:
         headers = file_headers(file, str(path))
     headers = [part for i, part in enumerate(headers) if not (i and fine.is_fine(part.name, part.attributes))]
@@ -171,7 +173,8 @@ def _views_in(path: str | os.PathLike) -> tuple[list[View], list[dict[str, str]]
 
 
 def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: ExrPart, isolated: bool) -> np.ndarray:
-    """Layer ``name`` (H, W, C) of a file of its own, of the size and place of ``main``, the part that holds primal."""
+    """Layer ``name`` (H, W, C) from a separate file. It must have the size and place of ``main``, the part with the
+    primal."""
     if name not in LAYERS or name == "primal":
         raise NgptError(f"{file}: layer '{name}' cannot be read from a separate file")
     parts = (read_exr_isolated(file) if isolated else read_file(file)).parts
@@ -194,30 +197,31 @@ def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: 
 
 
 class Picture(NamedTuple):
-    """What a viewer shows of a file, (H, W, 3) float32, and where it lies."""
+    """The picture that a viewer shows for a file, (H, W, 3) float32, and where it lies."""
 
     pixels: np.ndarray
     place: Place
 
 
 def read_image(path: str | os.PathLike, isolated: bool = False, view: str | None = None) -> np.ndarray:
-    """Reads what a viewer would show of a file, (H, W, 3) float32: the pixels of ``read_picture``."""
+    """Reads the picture that a viewer would show for a file, (H, W, 3) float32: the pixels of ``read_picture``."""
     return read_picture(path, isolated, view).pixels
 
 
 def read_picture(path: str | os.PathLike, isolated: bool = False, view: str | None = None) -> Picture:
     """Reads the picture that a viewer would show: the root R G B of the first part.
 
-    That is the reconstruction in a result file and the primal in a stack; in a file without a root image, it is what
-    ``read`` takes for the primal. ``view`` is one of a stereo file, by default the first. Unlike there, light of other
-    primaries is converted to linear Rec. 709 (``ngpt.io.primaries``): pictures are looked at and compared.
+    That is the reconstruction in a result file and the primal in a stack; in a file without a root image, it is the
+    layer that ``read`` takes as the primal. ``view`` names a view of a stereo file; by default, it is the first. Unlike
+    ``read``, it converts light of other primaries to linear Rec. 709 (``ngpt.io.primaries``), because pictures are
+    looked at and compared.
     """
     image, _ = _opened(path, isolated)
     part, chosen = image.parts[0], _one_view(image, view, str(path))
     if view is None and all(name in part.channels for name in RGB):
         return Picture(converted(gather(part, RGB), to_rec709(part.header)), place_of(part))
     stack = _stack(image, chosen, None, isolated, None, str(path))
-    # The picture of a result is beside its input.
+    # The picture of a result lies in the file beside its input.
     for place in (stack.source.resolution["primal"].part, chosen.first):
         like = channels_like(stack.source.resolution["primal"])
         part, root = image.parts[place], tuple(chosen.channel(place, name) for name in like)
@@ -238,26 +242,27 @@ def write(
 ) -> Path:
     """Writes a stack, a result or an image, and returns its path.
 
-    Subpixels, where there are any, are one more part, ``fine``, of a stack and of a result (``ngpt.io.fine``).
+    The subpixels of a stack or a result become one more part, ``fine`` (``ngpt.io.fine``).
 
-    A stack is written as the file it was read from with its layers and attributes brought up to date (they are never
-    removed), or else as one scanline part at its ``place``, compressed with ZIP, primal in the root R G B.
+    A stack that was read from a file is written as that file, with its layers and attributes brought up to date; none
+    are removed. Any other stack is written as one scanline part at its ``place``, compressed with ZIP, with primal in
+    the root R G B.
 
-    A result, ``image`` (H, W, 3) with ``like`` the stack it was made of, is that file with ``image`` in the root R G B
-    of its first part, which is what viewers show, and the input in primal.R/G/B. If the first part is not the one that
-    holds primal, or shows something else in its root, it stays as it is and a new part goes in front. Alpha is copied
-    into the root if the file has it elsewhere. ``image`` also replaces the layer that the input was read from
-    (``ViewLayer.Combined``), which the attribute ``ngpt:pass`` then names; a ``Noisy Image`` stays. ``into`` names
-    another layer to replace, or "root" for none.
+    A result is an ``image`` (H, W, 3), with the stack that it was made from as ``like``. It is written as the file of
+    that stack, with ``image`` in the root R G B of its first part, which viewers show, and the input in primal.R/G/B.
+    If the first part does not hold primal, or shows another layer in its root, it stays as it is, and a new part goes
+    in front. Alpha is copied into the root if the file has it elsewhere. ``image`` also replaces the layer that the
+    input was read from (``ViewLayer.Combined``), which the attribute ``ngpt:pass`` then names; a ``Noisy Image`` stays.
+    ``into`` names another layer to replace, or "root" for none.
 
-    Results of the views of one file go together: lists of them, and of their stacks (``read_views``). Each is then the
-    root of its view.
+    Results of the views of one file are written together, as a list of images and a list of their stacks
+    (``read_views``). Each image is then the root of its view.
 
     Channels keep their type, half or float, and become float where half cannot hold the values (above 65504, or all
     below 6.1e-5). Gradients, variances and depth are written as float. An ``image`` without ``like`` is written as
     float R G B.
 
-    With ``reduce`` K, a result is written with K x K pixels as one (``ngpt.io.reduced`` has the rules).
+    With ``reduce`` K, each K x K pixels of a result become one (``ngpt.io.reduced`` has the rules).
 
     ``attributes`` go into the header beside the attributes of the stack; ``Result.attributes`` say what made a result.
     If the stack is itself a result, the attributes on how it was made (``MADE_BY``) are left out of the new result, and
@@ -278,7 +283,7 @@ def write(
         attributes = {**(attributes or {}), REDUCED: reduce}
     pairs: list[tuple[Any, GradientStack]] = [(image, like)] if isinstance(like, GradientStack) else []
     pairs = pairs or list(zip(image, like, strict=True))  # type: ignore[arg-type]
-    # The first view may get a part in front of all others, which then have other numbers.
+    # The first view may get a part in front of all others, which changes their numbers.
     pairs.sort(key=lambda pair: pair[1].source is None or pair[1].source.view.first == 0)
     if reduce != 1:
         pairs = [(one, replace(stack, fine={})) for one, stack in pairs]
@@ -298,7 +303,8 @@ def write(
 
 
 def layers_of_result(stack: GradientStack, into: str | None = None) -> tuple[list[str], list[str]]:
-    """What ``write`` replaces by a result, the root first, and the layers that are named like images and stay noisy."""
+    """The layers that ``write`` replaces by a result, the root first; and other layers named like images, which stay
+    noisy."""
     if stack.source is None:
         return ["root"], []
     origin, source = str(stack.attributes.get("ngpt:pass", "")), stack.source
@@ -329,10 +335,10 @@ def _result(
 
 
 def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> GradientStack:
-    """Returns a stack that was made, not read, with further channels, (H, W) each, to be written beside its layers.
+    """Returns ``stack`` with further channels, (H, W) each, which ``write`` writes beside its layers.
 
-    They go by names outside the contract, ``diagnostics.discarded`` for one, and are carried along as such channels of
-    a file are. ``pass_through`` reads them.
+    ``stack`` must not come from a file. The names of channels are outside the contract, for example
+    ``diagnostics.discarded``. They are kept like the unknown channels of a file, and ``pass_through`` returns them.
     """
     stack.require("primal", why="carrying further channels")
     part, found = ExrPart("", new_header(stack), {}), {}
@@ -346,7 +352,7 @@ def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> G
 
 
 def pass_through(stack: GradientStack) -> dict[str, np.ndarray]:
-    """The channels that a stack carries along beside the layers of the contract: name -> (H, W), as in the file."""
+    """The channels that a stack keeps besides the layers of the contract: name -> (H, W), as in the file."""
     if stack.source is None:
         return {}
     known = {(found.part, channel) for found in stack.source.resolution.values() for channel in found.channels}
@@ -359,13 +365,13 @@ def pass_through(stack: GradientStack) -> dict[str, np.ndarray]:
 
 
 def channels_alone(stack: GradientStack) -> dict[str, np.ndarray]:
-    """The channels of ``pass_through`` that are in none of the ``layers_of_light``."""
+    """The channels of ``pass_through`` that belong to no layer of ``layers_of_light``."""
     light = {id(part.channels[name]) for part, names in _light(stack).values() for name in names}
     return {name: channel for name, channel in pass_through(stack).items() if id(channel) not in light}
 
 
 def layers_of_light(stack: GradientStack) -> dict[str, np.ndarray]:
-    """The layers of colour that a stack holds beside the layers of the contract: name -> (H, W, 3) float32."""
+    """The layers of colour that a stack holds besides the layers of the contract: name -> (H, W, 3) float32."""
     return {
         name: put(gather(part, names), data_window(part), stack.place.data)
         for name, (part, names) in _light(stack).items()
@@ -373,7 +379,7 @@ def layers_of_light(stack: GradientStack) -> dict[str, np.ndarray]:
 
 
 def replace_layers_of_light(stack: GradientStack, layers: Mapping[str, np.ndarray]) -> GradientStack:
-    """The stack with others in place of some of its ``layers_of_light``, (H, W, 3), of the type they have there."""
+    """The stack with some of its ``layers_of_light`` replaced by ``layers``, (H, W, 3); half stays half if possible."""
     image = ExrImage([replace(part, channels=dict(part.channels)) for part in stack.source.image.parts])
     changed = replace(stack, source=replace(stack.source, image=image))
     places = _light(changed)
@@ -384,7 +390,7 @@ def replace_layers_of_light(stack: GradientStack, layers: Mapping[str, np.ndarra
 
 
 def _light(stack: GradientStack) -> dict[str, tuple[ExrPart, tuple[str, ...]]]:
-    """Where they are."""
+    """Where the file of a stack holds its layers of light."""
     if stack.source is None:
         return {}
     parts = stack.source.image.parts

@@ -1,7 +1,8 @@
-"""Subpixels in files: one more part, ``fine``, which readers that do not know it may ignore.
+"""Subpixels in files: one more part, ``fine``, which other readers may ignore.
 
-It holds R G B, ``albedo.R/G/B`` and ``normal.X/Y/Z`` in K times the data window of the pixels, K in ``ngpt:subpixels``.
-The display window is the one of the pixels: OpenEXR wants it to be the same in all parts of a file.
+It holds R G B, ``albedo.R/G/B`` and ``normal.X/Y/Z``. Its data window is K times the data window of the pixels; the
+attribute ``ngpt:subpixels`` holds K. Its display window is that of the pixels: OpenEXR requires the same one in all
+parts of a file.
 """
 
 import logging
@@ -21,9 +22,9 @@ from ngpt.windows import Window
 _LOG = logging.getLogger(__name__)
 
 PART = "fine"
-# The name of the part of the pixels, if it has none: in files with several parts, each needs a name.
+# The name that the part with the pixels gets if it has none: in files with several parts, each needs a name.
 _PIXELS = "stack"
-# Attributes that OpenEXR wants to be the same in all parts of a file
+# Attributes that OpenEXR requires to be the same in all parts of a file
 _COMMON = ("displayWindow", "pixelAspectRatio", "timeCode", "chromaticities")
 
 
@@ -33,7 +34,7 @@ def is_fine(name: str, attributes: Mapping) -> bool:
 
 
 def apart(image: ExrImage) -> tuple[ExrImage, ExrPart | None]:
-    """A file without its subpixels, and their part."""
+    """A file without the part with its subpixels, and that part; None if there is none."""
     fine = next((part for part in image.parts[1:] if is_fine(part.name, part.header)), None)
     if fine is None:
         return image, None
@@ -41,7 +42,8 @@ def apart(image: ExrImage) -> tuple[ExrImage, ExrPart | None]:
 
 
 def subpixels_of(part: ExrPart, stack: GradientStack) -> dict[str, np.ndarray]:
-    """The subpixels in a part, of the pixels of a stack; none, with a warning, where they are of other pixels."""
+    """The subpixels in a part, by layer. If they do not match the pixels of the stack, logs a warning and returns
+    none."""
     data, window = stack.place.data, data_window(part)
     k = part.header[SUBPIXELS]
     if not isinstance(k, int) or k < 2 or window != _window(data, k):

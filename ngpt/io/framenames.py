@@ -1,7 +1,7 @@
 """Names of a shot's frames as studios write them: ``shot.%04d.exr``, ``shot.####.exr``, ``shot.$F4.exr``, ``<frame>``.
 
-``{frame:04d}``, which ``ngpt render`` takes, is one of them. The number after % and $F, and how many # there are, is
-the least number of digits. A file of that very name wins, as with other patterns.
+``{frame:04d}``, the form of ``ngpt render``, is accepted too. The number after % or $F, or the count of #, is the least
+number of digits. If a file has exactly such a name, the name means that file, as with other patterns.
 """
 
 import glob
@@ -14,17 +14,17 @@ from ngpt.errors import NgptError, WrongUse
 _FIELD = re.compile(r"%(?:0(\d))?d|(##+)|\$F(\d?)|<frame>|\{frame(?::0(\d)d)?\}")
 
 
-# A number in a name. A minus belongs to it after a dot, an underscore or nothing: "f.-2", but not "f-2".
+# A number in a name. A minus belongs to it after a dot, an underscore or at the start: "f.-2", but not "f-2".
 NUMBER = re.compile(r"((?:(?<![^._/\\])-)?[0-9]+)")
 
 
 def varies(name: str) -> bool:
-    """Whether a name is one for each frame."""
+    """Whether a name contains a field for the number of the frame."""
     return bool(_FIELD.search(name)) and not os.path.exists(name)
 
 
 def frames_named(name: str) -> dict[int, Path]:
-    """The files there are of a name that varies: number -> file, in order. Raises NgptError where there are none."""
+    """The existing files of a name that varies: number -> file, in order. Raises NgptError if there are none."""
     pieces, form, end = [], "", 0
     for field in _FIELD.finditer(name):
         pieces.append(name[end : field.start()])
@@ -37,7 +37,7 @@ def frames_named(name: str) -> dict[int, Path]:
     found = {}
     for path in glob.glob("*".join(map(glob.escape, pieces))):
         match = re.fullmatch(form, path)
-        # All numbers in a name are the same one.
+        # A frame's name holds the same number in all fields.
         if match and len(numbers := set(map(int, match.groups()))) == 1:
             found[numbers.pop()] = Path(path)
     if not found:
@@ -46,19 +46,19 @@ def frames_named(name: str) -> dict[int, Path]:
 
 
 def named(name: str, frame: int) -> str:
-    """A name that varies, for one frame."""
+    """The name of one frame, from a name that varies."""
     return _FIELD.sub(lambda field: f"{frame:0{_digits(field)}d}" if _digits(field) else str(frame), name)
 
 
 def number_of(path: Path, wanted: str) -> int:
-    """The frame that a file is by the last number in its name. Raises WrongUse where there is none for ``wanted``."""
+    """A file's frame: the last number in its name. Raises WrongUse, naming ``wanted``, if there is none."""
     numbers = NUMBER.findall(path.stem)
     if not numbers:
-        raise WrongUse(f"{path}: has no number, which {wanted} asks for; name the output without")
+        raise WrongUse(f"{path}: has no number, which {wanted} asks for; give an output name without a frame number")
     return int(numbers[-1])
 
 
 def _digits(field: re.Match) -> int:
-    """The least number of digits, 0 where none is given."""
+    """The least number of digits, 0 if none is given."""
     printf, hashes, houdini, ours = field.groups()
     return len(hashes) if hashes else int(printf or houdini or ours or 0)

@@ -1,4 +1,4 @@
-"""Files of frames in a folder or by a pattern, in the order of their numbers, for all that read or show shots."""
+"""Files of frames in a folder or by a pattern, in the order of their numbers."""
 
 import glob
 import os
@@ -12,7 +12,7 @@ from ngpt.io.framenames import NUMBER, frames_named, varies
 from ngpt.io.header import read_headers
 from ngpt.system.reading import regular_file
 
-# What `ngpt denoise` appends to the name of its input. Files of such names are results, and no frames to denoise.
+# The suffix that `ngpt denoise` appends to the name of its input. Files with it are results, not frames to denoise.
 RESULT_SUFFIX = "_denoised"
 
 
@@ -39,15 +39,15 @@ def is_shot(name: str) -> bool:
 def shot_files(name: str) -> list[Path]:
     """The frames of a folder (its .exr files) or a pattern, in order, without hidden files such as macOS's ``._*``.
 
-    Patterns are shell patterns or names of frames (``ngpt.io.framenames``). Folders and files of that very name win,
-    also within a pattern: ``dir[1]/*.exr``. Results in the folder of their inputs (``*_denoised``) are left out. Raises
-    NgptError where there are none.
+    Patterns are shell patterns or names of frames (``ngpt.io.framenames``). Folders and files with exactly that name
+    win, also within a pattern: ``dir[1]/*.exr``. Results in the folder of their inputs (``*_denoised``) are left out.
+    Raises NgptError where there are none.
     """
     return in_order(without_results(_files(name)) or _none(name, "no .exr files there"))
 
 
 def input_files(name: str) -> list[Path]:
-    """As ``shot_files``, without any results of ``ngpt denoise``: what there is to denoise."""
+    """The files to denoise: ``shot_files`` without any results of ``ngpt denoise``."""
     found = [path for path in _files(name) if not path.stem.endswith(RESULT_SUFFIX)]
     return in_order(
         found or _none(name, "no .exr files to denoise there; other formats by their names, such as '*.pfm'")
@@ -62,12 +62,13 @@ def without_results(files: Sequence[Path]) -> list[Path]:
 
 
 def frame_name(path: Path) -> str:
-    """What the files of one frame have in common: the name without its ending and without a result's suffix."""
+    """The name that the files of one frame share: without the ending and without a result's suffix."""
     return path.stem.removesuffix(RESULT_SUFFIX)
 
 
 def in_order(files: Iterable[Path]) -> list[Path]:
-    """Files by their frames: by the attribute ``ngpt:frame`` where all have one of their own, else by their names.
+    """Files in the order of their frames: by the attribute ``ngpt:frame`` if all have different ones, else by their
+    names.
 
     Frames of several series, whose names differ in more than one number, come one series after the other.
     """
@@ -107,9 +108,9 @@ def series(files: Iterable[Path]) -> list[Series]:
 
 
 def remarks(name: str, files: Sequence[Path], results: bool = True) -> list[str]:
-    """Lines about the frames of a shot, before they are shown or blended; none if all is well.
+    """Warnings about the frames of a shot, one line each, before they are shown or blended; none if all is well.
 
-    ``results`` whether to say how many results were left out
+    ``results``  whether to say how many results were left out
     """
     said = []
     if left := len(set(_files(name)) - set(files)) if results else 0:
@@ -142,7 +143,7 @@ def _files(name: str) -> list[Path]:
 
 
 def _with_literals(path: Path) -> str:
-    """A pattern in which folders that exist by the very names it begins with are no patterns: ``dir[1]/*.exr``."""
+    """A pattern whose leading folders are taken literally where they exist: ``dir[1]/*.exr``."""
     known, parts = Path(), []
     for part in path.parts:
         if not (known / part).exists():
@@ -157,7 +158,8 @@ def _none(name: str, what: str) -> list[Path]:
 
 
 def _frame(path: Path) -> float | None:
-    """The attribute ``ngpt:frame`` of a file; None where it has none, or cannot be read: its reader complains."""
+    """The attribute ``ngpt:frame`` of a file; None if it has none or cannot be read: the code that reads the file later
+    reports that."""
     try:
         with regular_file(path) as file:
             numbers = [part.number("ngpt:frame") for part in read_headers(file, str(path))]

@@ -1,4 +1,4 @@
-"""Headers of OpenEXR files, read without OpenEXR: how much a file wants decoded is known, and limited, before it is.
+"""Headers of OpenEXR files, read without OpenEXR, to limit the size of a file before it is decoded.
 
 A header of some hundred bytes can ask for a terabyte, or for a hundred thousand channels. Limits here are far above
 what renderers write. Layout of the format: https://openexr.com/en/latest/OpenEXRFileLayout.html
@@ -16,14 +16,15 @@ from ngpt.system.limits import memory
 MAX_HEADER = 2**24  # bytes of all headers of a file
 MAX_ATTRIBUTES = 10_000
 MAX_CHANNELS = 4096
-MAX_PIXELS = 2**28  # of one part: 16384 x 16384
+MAX_PIXELS = 2**28  # in one part: 16384 x 16384
 MAX_TILE = 2**20  # pixels of a tile that is larger than its image
 
 MAGIC = b"\x76\x2f\x31\x01"
 _DEEP, _MULTIPART = 0x800, 0x1000
 _TYPES = {0: 4, 1: 2, 2: 4}  # uint, half, float: bytes
-# By number: lines in a chunk, and the most that a byte of a file can stand for. Deflate ends at 1032 bytes, run lengths
-# at 64; the bounds of others, where blocks without detail take next to nothing, are generous.
+# Number of the compression -> lines in a chunk, and the most bytes that a byte of a file can stand for. The bound is
+# 1032 for deflate and 64 for run lengths. Other compressions store blocks without detail in very few bytes, so their
+# bounds are generous.
 _COMPRESSIONS = {
     **{0: (1, 1), 1: (1, 64), 2: (1, 1032), 3: (16, 1032), 4: (32, 2**12), 5: (16, 2**11), 6: (32, 12), 7: (32, 12)},
     **{8: (32, 2**16), 9: (256, 2**16), 10: (256, 2**16), 11: (32, 2**16)},
@@ -33,7 +34,7 @@ _COMPRESSIONS = {
 
 @dataclass(frozen=True)
 class PartHeader:
-    """The entries of a part's header that say how large it is.
+    """The entries of a part's header that determine its size.
 
     ``name``      "" if it has none
     ``label``     "part 0 'left'", for messages
@@ -41,7 +42,7 @@ class PartHeader:
     ``channels``  name -> (bytes of a value, x and y step of its subsampling)
     ``deep``      whether pixels hold lists of samples
     ``chunks``    pieces that its full-size image is stored in
-    ``table``     number of entries in the table of where pieces begin, with those for smaller levels if known
+    ``table``     number of entries in the table of offsets of pieces, including those of smaller levels if known
     ``tiled``     whether pieces are tiles
     ``ratio``     the most bytes of image that one byte of the file can stand for
     ``attributes``  name -> type and data, as they are in the file
@@ -59,18 +60,18 @@ class PartHeader:
     attributes: dict[str, tuple[str, bytes]]
 
     def number(self, attribute: str) -> float | None:
-        """An attribute that is a number; None where there is none."""
+        """An attribute that is a number; None if it is absent."""
         kind, data = self.attributes.get(attribute, ("", b""))
         code = {"int": "<i", "float": "<f", "double": "<d"}.get(kind)
         return struct.unpack(code, data)[0] if code and len(data) == struct.calcsize(code) else None
 
     def text(self, attribute: str) -> str:
-        """An attribute that is a string; "" where there is none."""
+        """An attribute that is a string; "" if it is absent."""
         kind, data = self.attributes.get(attribute, ("", b""))
         return data.decode(errors="replace") if kind == "string" else ""
 
     def texts(self, attribute: str) -> list[str]:
-        """An attribute that is a list of strings, as far as it is whole; none where there is none."""
+        """The complete strings of an attribute that is a list of strings; none if it is absent."""
         kind, data = self.attributes.get(attribute, ("", b""))
         found = []
         while kind == "stringvector" and len(data) >= 4:
@@ -86,10 +87,10 @@ class PartHeader:
 
 
 def read_headers(file: BinaryIO, path: str) -> list[PartHeader]:
-    """The headers of an open file's parts, checked: what follows may be decoded as far as its size is concerned.
+    """The headers of an open file's parts, after checks that the file is small enough to be decoded.
 
-    Raises NgptError for files that are no OpenEXR, for headers that are damaged, contradict themselves, the file's
-    length or the limits above, and for more pixels than half of the memory holds.
+    Raises NgptError if the file is not OpenEXR, if a header is damaged or contradicts itself or the file's length, if
+    it exceeds a limit above, and if the pixels need more than half of the memory.
     """
     magic = file.read(4)
     if not magic:
@@ -119,11 +120,11 @@ def read_headers(file: BinaryIO, path: str) -> list[PartHeader]:
 
 
 class _Damage(Exception):
-    """What is wrong with a header."""
+    """The damage of a header, in a few words."""
 
 
 class _Excess(Exception):
-    """What exceeds which limit."""
+    """The size that exceeds a limit, in a few words."""
 
 
 def _headers(file: BinaryIO, flags: int) -> Iterator[dict[bytes, tuple[bytes, bytes]]]:
@@ -154,7 +155,7 @@ def _headers(file: BinaryIO, flags: int) -> Iterator[dict[bytes, tuple[bytes, by
 
 
 def _string(file: BinaryIO) -> bytes:
-    """Up to the next zero; names and types have 255 characters at most."""
+    """The bytes up to the next zero; names and types have 255 characters at most."""
     text = bytearray()
     while (byte := file.read(1)) != b"\0":
         if not byte or len(text) == 255:
@@ -221,7 +222,7 @@ def _channels(data: bytes, label: str) -> Iterator[tuple[str, tuple[int, tuple[i
 
 
 def check_size(parts: list[PartHeader], length: int, path: str) -> None:
-    """Raises NgptError for parts that a file of ``length`` bytes cannot hold, and for those beyond the limits above."""
+    """Raises NgptError for parts that a file of ``length`` bytes cannot hold, and for parts beyond the limits above."""
     if not parts:
         raise NgptError(f"{path}: damaged or incomplete (it has no parts); render or copy it again")
     for part in parts:
@@ -239,7 +240,8 @@ def check_size(parts: list[PartHeader], length: int, path: str) -> None:
         )
     if any(part.deep for part in parts):
         return
-    # Each chunk has an entry in a table, a size before its data, and at most as many bytes as its pixels can take.
+    # The least length of the file: 16 bytes for each chunk (its entry in a table, and its size and place), and the data
+    # of all pixels, compressed as far as possible.
     least = sum(16 * part.chunks + (part.bytes // part.ratio) for part in parts)
     wanted = sum(part.bytes for part in parts)
     if least > length:

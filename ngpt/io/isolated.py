@@ -1,7 +1,8 @@
-"""Images from strangers, decoded in a process of their own: what crashes or stalls the decoder stays there.
+"""Decodes images from strangers in a separate process, so that a file that crashes or stalls the decoder does no harm
+here.
 
-The other process reads the file and writes it anew, without compression, to a folder that only this user can look into;
-here that copy is read. It has a limit on memory (on Linux) and on time, and its death is an NgptError.
+The other process reads the file and writes an uncompressed copy to a folder that only this user can read; this process
+reads the copy. The memory (on Linux) and the time of the other process are limited. If it dies, NgptError is raised.
 
     python -P -m ngpt.io.isolated FILE COPY BYTES         the other process
 """
@@ -22,23 +23,23 @@ from ngpt.io.openexr import ExrImage, read_exr, write_exr
 from ngpt.system.limits import limit_address_space
 from ngpt.system.reading import regular_file
 
-# Beside what its pixels take, twice over: Python, NumPy and the stacks of OpenEXR's threads.
+# Bytes added to three times the size of the pixels, for Python, NumPy and the stacks of OpenEXR's threads.
 _BASE = 2**31
-_SECONDS = 30.0  # and as long as 10 MB/s take
+_SECONDS = 30.0  # plus the time to read the file at 10 MB/s
 _REFUSED = 3
 
 
 def read_exr_isolated(path: str | os.PathLike) -> ExrImage:
-    """What ``read_file`` returns, except that headers of mipmaps become headers of tiles with one level.
+    """Returns the same as ``read_file``, except that headers of mipmaps become headers of tiles with one level.
 
-    Raises NgptError where ``read_file`` does, and where the decoder crashes, runs out of memory or takes too long.
+    Raises NgptError where ``read_file`` does, and if the decoder crashes, runs out of memory or takes too long.
     """
     path = Path(path)
     with regular_file(path) as file:
         size = sum(header.bytes for header in file_headers(file, str(path)))
     with tempfile.TemporaryDirectory(prefix="ngpt-") as folder:
         copy = Path(folder) / "copy.exr"
-        # -P: a folder of strangers' files may hold a numpy.py, and might be the current one.
+        # -P keeps the current folder out of the module path: a folder of strangers' files may hold a numpy.py.
         command = [sys.executable, "-P", "-m", "ngpt.io.isolated", str(path), str(copy), str(_BASE + 3 * size)]
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in map(os.path.abspath, sys.path) if p)}
         seconds = _SECONDS + size / 10e6

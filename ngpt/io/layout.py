@@ -1,4 +1,4 @@
-"""Layers in a file: where a stack's are, how they become arrays, and how arrays become channels."""
+"""Layers in a file: where the layers of a stack are, how they become arrays, and how arrays become channels."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,12 @@ from ngpt.windows import Place, Window, put
 
 _HALF_MAX = 65504.0
 _HALF_NORMAL_MIN = 2.0**-14
-_ROWS = 16  # that are gathered at a time
+_ROWS = 16  # gathered at a time
 
 
 @dataclass(frozen=True)
 class StackSource:
-    """The file a stack was read from, where the layers are in it, and the view, which names its layers."""
+    """The file that a stack was read from, the places of the layers in it, and the view that the stack shows."""
 
     image: ExrImage
     resolution: Resolution
@@ -25,7 +25,7 @@ class StackSource:
 
 
 def file_views(image: ExrImage) -> list[View]:
-    """The views of a file, by its headers."""
+    """The views of a file, from its headers."""
     return views_of(
         [
             Part(part.name, list(part.channels), str(part.header.get("view", "")), part.header.get("multiView", ()))
@@ -35,7 +35,7 @@ def file_views(image: ExrImage) -> list[View]:
 
 
 def place_of(part: ExrPart) -> Place:
-    """Where the pixels of a part lie."""
+    """The place of a part: where its pixels lie."""
     display = Window.of_box(part.header["displayWindow"])
     return Place(data_window(part), display, float(part.header.get("pixelAspectRatio", 1.0)))
 
@@ -44,7 +44,8 @@ def gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:
     """Returns the channels ``names`` as one array (H, W, C) float32."""
     channels = [part.channels[name] for name in names]
     layer = np.empty((*channels[0].shape, len(channels)), np.float32)
-    # Some rows at a time: what one channel wrote is then in the cache when the next comes between it.
+    # Some rows at a time: the values of one channel are then still in the cache when the next channel is written
+    # between them.
     for top in range(0, len(layer), _ROWS):
         rows = slice(top, top + _ROWS)
         for index, channel in enumerate(channels):
@@ -53,7 +54,7 @@ def gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:
 
 
 def taken(image: ExrImage, found: Found, main: int) -> np.ndarray:
-    """A layer of a file, (H, W, C) float32, on the pixels of part ``main``: 0 where its own part has none."""
+    """A layer of a file, (H, W, C) float32, on the pixels of part ``main``: 0 where the layer's part has no pixels."""
     layer = gather(image.parts[found.part], found.channels)
     layer = put(layer, data_window(image.parts[found.part]), data_window(image.parts[main]))
     return layer * np.asarray(found.factors, np.float32) if found.factors else layer
@@ -64,12 +65,12 @@ def data_window(part: ExrPart) -> Window:
 
 
 def as_stored(image: ExrImage, found: Found, main: int) -> bool:
-    """Whether the channels of a layer are what ``taken`` makes of them, without factors and on the same pixels."""
+    """Whether ``taken`` leaves the channels of a layer unchanged: they have no factors and lie on the same pixels."""
     return not found.factors and data_window(image.parts[found.part]) == data_window(image.parts[main])
 
 
 def holds(part: ExrPart, names: tuple[str, ...], values: np.ndarray) -> bool:
-    """Whether the channels ``names`` are ``values`` (H, W, C), of those that are float32 bit for bit."""
+    """Whether the channels ``names``, as float32, are bit for bit the float32 ``values`` (H, W, C)."""
     if values.dtype != np.float32:
         return False
     return values.shape[:2] == part.channels[names[0]].shape and all(
@@ -81,7 +82,7 @@ def holds(part: ExrPart, names: tuple[str, ...], values: np.ndarray) -> bool:
 def scatter(part: ExrPart, names: tuple[str, ...], values: np.ndarray, half: bool) -> None:
     """Puts ``values`` (H, W, C) into the channels ``names``: as half if asked to and half can hold them, else float.
 
-    Raises NgptError for colours where one channel stands for all.
+    Raises NgptError for colours if one channel stands for all three.
     """
     grey = np.broadcast_to(values[..., :1], values.shape)
     if len({*names}) < len(names) and not np.array_equal(values, grey, equal_nan=True):
@@ -89,7 +90,8 @@ def scatter(part: ExrPart, names: tuple[str, ...], values: np.ndarray, half: boo
     if half:
         peak = np.abs(values[np.isfinite(values)]).max(initial=0.0)
         half = peak <= _HALF_MAX and not 0.0 < peak < _HALF_NORMAL_MIN
-    # Variances in double precision may be beyond floats: they are infinite in files, which counts as not known.
+    # Variances in double precision may exceed the range of float. They become infinite in files, which counts as
+    # unknown.
     with np.errstate(over="ignore"):
         for index, name in enumerate(names):
             part.channels[name] = np.ascontiguousarray(values[..., index], dtype=np.float16 if half else np.float32)

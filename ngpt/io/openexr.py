@@ -1,13 +1,13 @@
 """OpenEXR files, verbatim.
 
-What a file holds passes through a read and a write unharmed: parts, channels of every type, attributes of every type
-that Python's OpenEXR knows, data and display windows, tiles, line order. The exceptions, in the words of
-docs/use/gradient-stack.md: lossy compression becomes ZIP, only the full-size level of a mipmap is kept; and attributes
-that are empty lists are dropped, and a rational is reduced (48/2 becomes 24/1).
+A read and a write keep the contents of a file: parts, channels of every type, attributes of every type that Python's
+OpenEXR knows, data and display windows, tiles, line order. The exceptions, as docs/use/gradient-stack.md lists them:
+lossy compression becomes ZIP, only the full-size level of a mipmap is kept, attributes that are empty lists are
+dropped, and rationals are reduced (48/2 becomes 24/1).
 
-Deep images and subsampled channels are refused. OpenEXR holds whole files in memory, and hands over the readable parts
-of a damaged file as if there were no others; here a damaged file is an error. While a file is read, what other threads
-print to stdout or stderr is lost, since OpenEXR's own messages have to be kept out of there.
+Deep images and subsampled channels are refused. OpenEXR holds whole files in memory. It returns the readable parts of a
+damaged file as if there were no others; here a damaged file is an error. While a file is read, output of other threads
+to stdout or stderr is lost, because OpenEXR's own messages are suppressed there.
 """
 
 import contextlib
@@ -56,8 +56,8 @@ _ATTRIBUTE_TYPES = (
 )
 # The folder where Linux names open files by their number; opening such a name opens the file again. Only Linux has it.
 _NUMBERS = Path("/proc/self/fd")
-# Two calls would end the threads of each other, and each would restore the other's stdout and stderr instead of the
-# program's. OpenEXR keeps Python's lock anyway.
+# Two calls at once would end each other's threads, and restore each other's stdout and stderr instead of the program's.
+# OpenEXR keeps Python's lock anyway.
 _one_at_a_time = threading.Lock()
 hold_while_forking(_one_at_a_time)
 # MiB of address space that a thread may reserve, for its stack and its share of the heap.
@@ -83,10 +83,10 @@ class ExrImage:
 
 
 def read_exr(path: str | os.PathLike) -> ExrImage:
-    """Reads a file with all that is in it.
+    """Reads the whole contents of a file. Its size is checked before its pixels are decoded (``ngpt.io.header``).
 
-    Its size is checked before its pixels are decoded (``ngpt.io.header``). Raises NgptError if it is not there, no
-    regular file, damaged, too large, deep or subsampled, and if it changes while it is read.
+    Raises NgptError if the file is missing, not a regular file, damaged, too large, deep or subsampled, and if it
+    changes while it is read.
     """
     path = Path(path)
     with regular_file(path) as file:
@@ -106,7 +106,7 @@ def read_exr(path: str | os.PathLike) -> ExrImage:
         try:
             parts = _decode(file, path, headers)
         finally:
-            # Whatever else went wrong is then no wonder.
+            # The change explains any other error.
             if _state(file) != before:
                 raise NgptError(f"{path}: changed while it was read; wait until its writer is done, and read it again")
     return ExrImage(
@@ -136,7 +136,7 @@ def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False)
 
     Channels are float16, float32 or uint32 arrays (H, W) in any memory layout. Attributes are str, int (32 bit), float
     (stored with 32 bit), fractions.Fraction, lists of str or float, tuples and arrays as OpenEXR reads them, and
-    OpenEXR's own types. Raises NgptError for anything the file could not give back.
+    OpenEXR's own types. Raises NgptError for anything that a read could not return unchanged.
     """
     if Path(path).suffix.lower() != ".exr":
         raise NgptError(f"{path}: ngpt writes OpenEXR; let the name end in .exr")
@@ -152,13 +152,16 @@ def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False)
 
 
 def _numbered(file: BinaryIO) -> str:
-    """A name for an open file: its own may belong to another by now, or be one that OpenEXR cannot encode."""
+    """A name for an open file: its own may belong to another file by now, or OpenEXR may be unable to encode it."""
     return str(_NUMBERS / str(file.fileno())) if _NUMBERS.is_dir() else str(file.name)
 
 
 @contextlib.contextmanager
 def _name_to_write(path: Path) -> Iterator[str]:
-    """``_numbered`` for a file to write. With only its own name, it is closed, since it may count as in use."""
+    """``_numbered`` for a file to write.
+
+    Without numbered names, the file stays closed, because an open file may count as in use.
+    """
     if _NUMBERS.is_dir():
         with open(path, "r+b") as file:
             yield _numbered(file)
@@ -185,7 +188,7 @@ def _decode(file: BinaryIO, path: Path, headers: list[PartHeader]) -> list[Any]:
     except Exception as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0].replace(name, path.name)
         raise NgptError(f"{path}: cannot be read ({reason}); it may be damaged: render or copy it again") from error
-    # What the two readers of a header disagree on is what the limits do not hold for.
+    # If the two readers of a header disagree, the limits were checked on other sizes.
     expected = [({*header.channels}, {header.size[::-1]}) for header in headers]
     got = [({*part.channels}, {channel.pixels.shape for channel in part.channels.values()}) for part in parts]
     if got != expected:
@@ -197,7 +200,7 @@ def _decode(file: BinaryIO, path: Path, headers: list[PartHeader]) -> list[Any]:
 
 @contextlib.contextmanager
 def _without_native_stderr() -> Iterator[None]:
-    """Keeps what OpenEXR's C core writes to file descriptor 2 from the user: it comes again as an exception."""
+    """Hides text that OpenEXR's C core writes to file descriptor 2: the same text comes as an exception."""
     try:
         kept = os.dup(2)
     except OSError:  # the process has no stderr
@@ -215,10 +218,10 @@ def _without_native_stderr() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _all_cores() -> Iterator[None]:
-    """OpenEXR decodes and encodes on all cores, which it does not by itself; with threads that end with the call.
+    """Lets OpenEXR decode and encode on all cores, which is not its default, with threads that end with the call.
 
-    Threads that live on would be missing in a forked process, which would wait for them for ever. Where address space
-    is short there are none, and where the caller has set a number it holds.
+    A forked process would lack threads that outlive the call, and would wait for them for ever. If address space is
+    short, no threads are made. If the caller has set a number of threads, it stays.
     """
     short = free_address_space() < processors() * _THREAD
     if short or OpenEXR.global_thread_count():
@@ -232,17 +235,17 @@ def _all_cores() -> Iterator[None]:
 
 
 def _writable(part: ExrPart, path: str) -> tuple[dict[str, Any], dict[str, Any], str]:
-    """Returns header, channels and name of an OpenEXR.Part that is written faithfully."""
+    """Returns header, channels and name for an OpenEXR.Part that is written unchanged."""
     header = {}
     for name, value in part.header.items():
-        # OpenEXR makes `channels` itself, believes a `chunkCount` that no longer holds, and cannot write empty lists.
+        # OpenEXR makes `channels` itself, trusts a `chunkCount` even if it is outdated, and cannot write empty lists.
         if name in ("channels", "chunkCount") or (isinstance(value, list) and not value):
             continue
         header[name] = _attribute(name, value, path)
     if header.get("compression") in _LOSSY:
         header["compression"] = OpenEXR.ZIP_COMPRESSION
     if "tiles" in header:
-        # The writer leaves the smaller levels of a mipmap out, and then nobody can read the file.
+        # The writer would leave the smaller levels of a mipmap out, which makes the file unreadable.
         tiles = OpenEXR.TileDescription()
         tiles.xSize, tiles.ySize = header["tiles"].xSize, header["tiles"].ySize
         header["tiles"] = tiles
@@ -255,13 +258,13 @@ def _writable(part: ExrPart, path: str) -> tuple[dict[str, Any], dict[str, Any],
                 f"{path}: channel '{name}' is {pixels.dtype} {pixels.shape}; "
                 "OpenEXR stores (height, width) arrays of float16, float32 or uint32"
             )
-        # OpenEXR takes no notice of strides and byte order: it would write garbage.
+        # OpenEXR ignores strides and byte order: it would write garbage.
         channels[name] = OpenEXR.Channel(np.ascontiguousarray(pixels, dtype), 1, 1, bool(linear.get(name, False)))
     return header, channels, part.name
 
 
 def _attribute(name: str, value: Any, path: str) -> Any:
-    """Returns ``value`` in a form that OpenEXR stores as it is; others it wraps, drops or transposes in silence."""
+    """Returns ``value`` in a form that OpenEXR stores unchanged; it silently wraps, drops or transposes other forms."""
     value = _plain(value)
     if not _fits(value):
         raise NgptError(

@@ -8,7 +8,7 @@ import OpenEXR
 _TIME = ("hours", "minutes", "seconds", "frame")
 _TIME_CODE = (*_TIME, "dropFrame", "colorFrame", "fieldPhase", "bgf0", "bgf1", "bgf2", "userData")
 
-# What the constructor takes, and what is set afterwards.
+# The arguments of the constructor, and the attributes that are set afterwards.
 _FIELDS: dict[type, tuple[tuple[str, ...], tuple[str, ...]]] = {
     OpenEXR.Bytes: (("data", "type_hint"), ()),
     OpenEXR.Channel: (("name", "xSampling", "ySampling", "pLinear"), ()),  # as in headers, without pixels

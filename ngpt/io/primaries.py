@@ -1,8 +1,9 @@
-"""Which red, green and blue a file means, by its header; and linear Rec. 709, in which it is shown.
+"""The primaries of a file, from its header, and the conversion to linear Rec. 709, in which it is shown.
 
-The attributes, of which the first one present wins: ``acesImageContainerFlag`` (SMPTE ST 2065-4), ``colorInteropID``
-(the names of the Color Interop Forum), ``chromaticities`` and ``oiio:ColorSpace`` (OpenImageIO). By OpenEXR's rule a
-file without them is of Rec. 709: https://openexr.com/en/latest/TechnicalIntroduction.html
+These attributes are read, and the first one present wins: ``acesImageContainerFlag`` (SMPTE ST 2065-4),
+``colorInteropID`` (the names of the Color Interop Forum), ``chromaticities`` and ``oiio:ColorSpace`` (OpenImageIO). By
+OpenEXR's rule a file without them has the primaries of Rec. 709:
+https://openexr.com/en/latest/TechnicalIntroduction.html
 """
 
 import logging
@@ -21,7 +22,7 @@ REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 REC2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
 P3_D65 = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
 ADOBE_RGB = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
-XYZ_D65 = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.3127, 0.3290)  # known by its name: it means CIE's own units
+XYZ_D65 = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.3127, 0.3290)  # the name for CIE X, Y, Z themselves
 ACES_AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
 ACES_AP1 = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
 # Names of linear spaces, in lower-case letters and digits only.
@@ -37,17 +38,17 @@ _NAMES = {
 _SPACES = {name: primaries for primaries, names in _NAMES.items() for name in names.split()}
 # Names that say nothing about primaries.
 _NO_SPACE = ("", "unknown", "data", "raw", "linear", "scenelinear")
-# Cone responses of Bradford, in which a white is adapted to another.
+# Bradford's cone responses, in which one white is adapted to another.
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-BEYOND = 0.01  # the share of pixels beyond its primaries from which on an image is denoised in others
+BEYOND = 0.01  # from this share of pixels outside Rec. 709 on, an image is denoised in wider primaries
 _SAME = 1e-4  # of a coordinate; files hold 32-bit floats, and standards four digits
 
 
 def to_rec709(attributes: Mapping[str, Any]) -> np.ndarray | None:
     """The matrix (3, 3) that takes colours of a file with such header attributes to linear Rec. 709.
 
-    None if the file has Rec. 709 already, if it does not say, and if what it says makes no sense, which the log warns
-    about. White becomes white: where the two differ, by Bradford's adaptation.
+    Returns None if the file is in Rec. 709 already, if its header names no primaries, or if they make no sense, which
+    is logged as a warning. If the two whites differ, Bradford's adaptation maps one to the other.
     """
     found = _primaries(attributes)
     if found is None:
@@ -67,7 +68,7 @@ def to_rec709(attributes: Mapping[str, Any]) -> np.ndarray | None:
 
 
 def _primaries(attributes: Mapping[str, Any]) -> Any:
-    """x, y of the primaries and white in a header, as they are; None where it has none."""
+    """x, y of the primaries and white in a header, unchecked; None if it has none."""
     if attributes.get("acesImageContainerFlag") == 1:
         return ACES_AP0
     for name in ("colorInteropID", "chromaticities", "oiio:ColorSpace"):
@@ -83,9 +84,10 @@ def _primaries(attributes: Mapping[str, Any]) -> Any:
 
 
 def inside_rec709(stack: GradientStack) -> np.ndarray | None:
-    """``to_rec709`` of a stack, where nearly all of its light is within Rec. 709, else None.
+    """``to_rec709`` of a stack if nearly all of its light is within Rec. 709, else None.
 
-    What is beyond has negative components there, which cost OIDN more than other primaries (docs/use/pictures.md).
+    Light outside Rec. 709 has negative components in it. They cost OIDN more accuracy than other primaries do
+    (docs/use/pictures.md).
     """
     matrix = to_rec709(stack.attributes)
     if matrix is None:
@@ -100,7 +102,7 @@ def negative_share(image: np.ndarray) -> float:
 
 
 def converted(image: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
-    """(H, W, 3) by a matrix; the image itself where there is none. Pixels that are not finite spoil no others."""
+    """(H, W, 3) multiplied by a matrix; the image itself if there is no matrix. Non-finite pixels affect no others."""
     if matrix is None:
         return image
     with np.errstate(over="ignore", invalid="ignore"):
@@ -120,7 +122,7 @@ def _conversion(chromaticities: np.ndarray) -> np.ndarray:
 
 
 def _to_xyz(chromaticities: np.ndarray) -> np.ndarray:
-    """Columns: red, green and blue in CIE XYZ, of such brightness that together they are white of Y = 1."""
+    """Columns: red, green and blue in CIE XYZ, scaled so that their sum is white with Y = 1."""
     x, y = chromaticities.reshape(4, 2).T
     if (np.abs(y[3]) < 1e-6) or abs(np.linalg.det(np.stack([x, y, 1 - x - y])[:, :3])) < 1e-6:
         raise ValueError("they span no colours")

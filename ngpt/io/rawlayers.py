@@ -1,4 +1,4 @@
-"""Layers as raw files that any language reads in three lines: what hosts of networks are given and tested on.
+"""Layers as raw files that any language reads in three lines, for programs that run networks, and for their tests.
 
 A folder holds NAME.f32 for each layer, float32, little-endian, (1, C, height, width) in C order, and ``layers.json``,
 which lists their shapes and SHA-256 sums.
@@ -22,7 +22,7 @@ LISTING = "layers.json"
 def write_layers(folder: Path, layers: Mapping[str, np.ndarray], overwrite: bool = False) -> None:
     """Writes layers (1, C, H, W) into a folder, which is made if there is none; the listing comes last.
 
-    Raises NgptError where the folder cannot be made, and where a file exists and may not be overwritten.
+    Raises NgptError if the folder cannot be made, or a file exists and may not be overwritten.
     """
     if folder.exists() and not folder.is_dir():
         raise NgptError(f"{folder}: is a file; give a folder for the layers")

@@ -1,19 +1,19 @@
-"""Files made smaller: each K x K pixels become one, by rules that keep every channel what it is.
+"""Files made smaller: each K x K pixels become one, by rules that keep the meaning of every channel.
 
 | channels | rule |
 |---|---|
 | colours, light, albedo, alpha, masks, mist, all others | mean of the values that are finite |
 | normals | mean, as ours are: not of length 1 on edges |
-| depth | least that is above 0, and 0 where all are 0: no distance lies between two surfaces |
-| positions, texture coordinates | those of the pixel with that depth; without depth in their part, of the first |
-| ids: whole numbers, and ``IndexOB``, ``IndexMA`` and the like | the most frequent, of equal ones the first |
-| Cryptomatte | coverages of an id are added up and divided by K²; the ranks that there are keep the largest |
-| motion vectors | mean over K, for they count pixels |
-| variances of the pixel mean (``*_var``) | mean over K² |
+| depth | least value above 0, or 0 if all are 0: a mean would lie between two surfaces |
+| positions, texture coordinates | those of the pixel with that depth, or the first if their part has no depth |
+| ids: whole numbers, and ``IndexOB``, ``IndexMA`` and the like | the most frequent; of equal ones the first |
+| Cryptomatte | coverages are added up by id and divided by K²; the existing ranks keep the largest |
+| motion vectors | mean divided by K, because their unit is the pixel |
+| variances of the pixel mean (``*_var``) | mean divided by K² |
 | ``samples`` | sum |
 
-Refused are gradients, since differences between large pixels are none between small ones; motion vectors of unknown
-unit; and Cryptomatte of half floats, whose ids are lost.
+Gradients are refused, because differences between small pixels are not differences between large ones. Motion vectors
+of unknown unit are refused too, and so is Cryptomatte in half floats, which has lost its ids.
 """
 
 import re
@@ -33,7 +33,7 @@ from ngpt.windows import Place, Window
 # Header attribute of a result: K
 REDUCED = "ngpt:reduced"
 
-# Ends of the names of layers, in small letters without blanks and underscores
+# Ends of the names of layers, in lower case without blanks and underscores
 _IDS = ("indexob", "indexma", "objectid", "materialid", "objectindex", "materialindex", "id")
 _PLACES = ("position", "uv", "texcoord", "p", "pref", "pworld")
 # Cryptomatte's ranks: NAME00.R is an id, NAME00.G its coverage, NAME00.B the next id.
@@ -42,8 +42,8 @@ _DEEPEST = "Z"
 
 
 def reduced_window(window: Window, k: int) -> Window:
-    """The window of the pixels that are made of K x K pixels of this one; those that are cut at its borders are left
-    out. Raises NgptError where none is whole."""
+    """The window in large pixels, each of K x K pixels of ``window``. Large pixels that its borders cut are left out.
+    Raises NgptError if none is whole."""
     left, top = -(-window.left // k), -(-window.top // k)
     width, height = (window.left + window.width) // k - left, (window.top + window.height) // k - top
     if width < 1 or height < 1:
@@ -56,7 +56,7 @@ def reduced_place(place: Place, k: int) -> Place:
 
 
 def cut_pixels(place: Place, k: int) -> str:
-    """Says which windows are no multiple of K, so that rows or columns at their borders are left out; "" if none is."""
+    """A message about windows that are no multiple of K, where rows or columns at borders are left out; "" if none."""
     told: list[str] = []
     for name, window in (("data", place.data), ("display", place.display)):
         small = reduced_window(window, k)
@@ -67,12 +67,12 @@ def cut_pixels(place: Place, k: int) -> str:
 
 
 def smaller(image: np.ndarray, place: Place, k: int) -> tuple[np.ndarray, Place]:
-    """An image (H, W, 3) at a place with each K x K pixels as one, and where that lies."""
+    """An image (H, W, 3) at a place, with each K x K pixels as one, and the place of the smaller image."""
     return (image, place) if k == 1 else (reduced_layer(image, place.data, k), reduced_place(place, k))
 
 
 def reduced_layer(layer: np.ndarray, window: Window, k: int) -> np.ndarray:
-    """Means of the finite values of a layer (H, W, C) of that window, float32."""
+    """Means over K x K pixels of the finite values of a layer (H, W, C) of that window, float32."""
     return np.stack([_mean(_blocks(layer[..., c], window, k)) for c in range(layer.shape[-1])], axis=-1)
 
 
@@ -92,8 +92,8 @@ def check_reducible(stack: GradientStack, k: int) -> None:
 
 
 def reduced(image: ExrImage, k: int, stacks: Sequence[GradientStack]) -> ExrImage:
-    """The file with each K x K pixels as one, of the ``stacks`` of its views; raises NgptError for channels without a
-    rule.
+    """The file with each K x K pixels as one. ``stacks`` are the stacks of its views. Raises NgptError for channels
+    without a rule.
 
     Tiles keep their size in pixels.
     """
@@ -175,7 +175,7 @@ def _blocks(channel: np.ndarray, window: Window, k: int) -> np.ndarray:
 
 
 def _kind(channel: str, layer: str) -> str:
-    """By which rule a channel is reduced; ``layer`` is its name in the contract, "" if it has none there."""
+    """The rule that reduces a channel; ``layer`` is its layer's name in the contract, "" if it has none."""
     if layer in ("depth", "motion", "samples"):
         return layer
     if layer.endswith("_var"):
@@ -208,7 +208,7 @@ def _mean(blocks: np.ndarray) -> np.ndarray:
 
 def _depth(blocks: np.ndarray) -> np.ndarray:
     values = np.where(np.isfinite(blocks) & (blocks > 0), blocks, np.inf).min(axis=-1)
-    # What is infinitely far stays so, where no pixel says 0.
+    # An infinite depth stays infinite, unless a pixel has depth 0.
     return np.where(np.isfinite(values), values, np.where((blocks == 0).any(axis=-1), 0, blocks[..., 0]))
 
 
@@ -231,7 +231,7 @@ _RULES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 def _cryptomattes(part: ExrPart, listed: list[str]) -> dict[str, list[str]]:
     """Name of each Cryptomatte in a part -> its channels, id and coverage in turn, by rank.
 
-    They are those that headers have ``listed``, and what is called so without.
+    They are the Cryptomattes ``listed`` in headers, and channels whose names contain "crypto".
     """
     found: dict[str, dict[tuple[int, int], str]] = {}
     for channel in part.channels:
@@ -242,14 +242,14 @@ def _cryptomattes(part: ExrPart, listed: list[str]) -> dict[str, list[str]]:
 
 
 def _ranks(names: Sequence[str], blocks: dict[str, Any]) -> dict[str, np.ndarray]:
-    """The ids and coverages of a Cryptomatte: all of a block, added up by id, the largest first.
+    """The ids and coverages of a Cryptomatte: coverages of each block are added up by id; the largest come first.
 
-    Ids are compared and kept as bits. Coverage beyond the ranks that there are is lost, as in any Cryptomatte.
+    Ids are compared and kept as bits. Coverage beyond the existing ranks is lost, as in any Cryptomatte.
     """
     ids = np.concatenate([blocks[name].view(np.uint32) for name in names[::2]], axis=-1)
     coverage = np.concatenate([blocks[name] for name in names[1::2]], axis=-1).astype(np.float64)
     pixels = blocks[names[0]].shape[-1]
-    # The same id is in several places: all of it is added to the first of them.
+    # An id may occur several times in a block. After sorting by id, its coverages are added up at its last place.
     order = np.argsort(ids, axis=-1, kind="stable")
     ids, coverage = (np.take_along_axis(each, order, axis=-1) for each in (ids, coverage))
     starts = np.ones(ids.shape, bool)
@@ -257,7 +257,7 @@ def _ranks(names: Sequence[str], blocks: dict[str, Any]) -> dict[str, np.ndarray
     total = coverage.cumsum(axis=-1)
     ends = np.ones(ids.shape, bool)
     ends[..., :-1] = starts[..., 1:]
-    # The sum of a run, at its end: the running total less the total before the run.
+    # The sum of a run, at its end: the running total minus the total before the run.
     before = np.maximum.accumulate(np.where(starts, total - coverage, -np.inf), axis=-1)
     each = np.where(ends, total - before, 0.0) / pixels
     order = np.argsort(-each, axis=-1, kind="stable")[..., : len(names) // 2]

@@ -13,8 +13,8 @@ from ngpt.errors import NgptError, did_you_mean
 from ngpt.io.aliases import ALIASES, LOOKS, NO_LIGHT, NOISE, NOT_LOOKS, OWN, Alias, plain
 from ngpt.layers import LAYERS, RGB, XY, XYZ, Layer
 
-# The names of the parts of a file, and their channels: by the names that count here, where those in the file are others
-# (``ngpt.io.views``).
+# The name of each part of a file, and its channels. If the names to match differ from those in the file, the channels
+# are a mapping from names to match to names in the file (``ngpt.io.views``).
 Parts = Sequence[tuple[str, Sequence[str] | Mapping[str, str]]]
 
 _COLOUR = (("R", "r", "red"), ("G", "g", "green"), ("B", "b", "blue"))
@@ -34,7 +34,7 @@ _TERM = re.compile(r"\s*([+-]?)(?:([0-9.]+(?:e[+-]?[0-9]+)?)\*)?(.+?)\s*")
 class Found(NamedTuple):
     """Where a file holds a layer: part index, channel names in canonical order, and the layer's name in the file.
 
-    ``factors``: what the channels are multiplied by, one each; none are all 1.
+    ``factors`` multiply the channels, one each; an empty tuple means 1 for all.
     """
 
     part: int
@@ -55,7 +55,7 @@ class _Group(NamedTuple):
 
 
 class _Home(NamedTuple):
-    """Where the primal is: its part, what its name begins with, and how others that are no rivals' may not begin."""
+    """Where the primal is: its part, the prefix of its name, and the prefixes of its rivals."""
 
     part: int | None
     prefix: str = ""
@@ -68,16 +68,16 @@ def resolve(
     """Finds the layers of the contract among the channel names of a file.
 
     ``parts`` lists each part's name and its channel names. ``overrides`` maps names of the contract to the name of a
-    layer in the file, whole or its tail, and wins over the aliases; or to its channels with signs and factors,
-    "-velocity.R,velocity.G". ``path`` is for messages. ``writer`` is who wrote the file, as ``writer_of`` tells: in a
-    file of "ngpt" ``direct`` and ``caustic`` are what the contract says; elsewhere only layers that nobody else writes
-    show it. ``origin`` is the layer that the input of a result was read from.
+    layer in the file (whole or its tail), or to channels with signs and factors, "-velocity.R,velocity.G". It wins over
+    the aliases. ``path`` is for messages. ``writer`` is the program that wrote the file, by ``writer_of``. In a file by
+    "ngpt", ``direct`` and ``caustic`` have the meaning of the contract; in others they do only beside layers that no
+    other program writes. ``origin`` is the layer that the input of a result was read from.
 
-    A channel without a dot belongs to the root, and in a file of several parts to the layer named like its part; there
-    other layers can also be called ``part.layer``. Where a name fits several layers, the one whose name begins like
-    the primal's name wins (``Near.Combined``, ``Near.Depth``), then the one it fits whole, then the one in the part
-    that holds the primal. Layers that begin like another image that could be the primal belong to that one. Where no
-    name is known, the only layer of colour is the primal.
+    A channel without a dot belongs to the root, and in a file of several parts to the layer named like its part. In
+    such a file, other layers can also be called ``part.layer``. If a name fits several layers, the layer whose name
+    begins like the primal's name wins (``Near.Combined``, ``Near.Depth``), then the layer whose whole name it is, then
+    the layer in the primal's part. A layer whose name begins like that of another possible primal belongs to that
+    image. If no name is known, the only layer of colour is the primal.
 
     Raises NgptError if there is no primal, a name fits several layers, a layer lacks channels or has one twice, or an
     override names something that is not there.
@@ -125,9 +125,10 @@ def resolve(
 def resolve_alone(parts: Parts, name: str, path: str) -> Found:
     """Finds layer ``name`` in a file of its own, ``parts`` as for ``resolve``.
 
-    That is the layer of one of its names, else the root of the first part, else the one layer with such channels.
 
-    Raises NgptError where there is none, or several and none of a known name.
+
+    This is the layer in the file under one of the known names of ``name``, else the root of the first part, else the
+    only layer with such channels. Raises NgptError if there is none, or there are several and none has a known name.
     """
     groups, layer = _group(parts), LAYERS[name]
     for alias in (alias for alias in ALIASES if alias.layer == name and not alias.writer):
@@ -148,7 +149,7 @@ def propose(parts: Parts, found: Resolution) -> dict[str, str]:
     """Layers of a file that look like ones of the contract that ``found`` lacks: layer -> its name in the file.
 
     A guess from names, for the user to judge: ``--layer albedo="NAME"`` takes it. Each layer is proposed once. Motion
-    is proposed by its channels, as if it led to the next frame with y up, which most renderers write.
+    is proposed by its channels. The proposal assumes vectors to the next frame with y up, as most renderers write.
     """
     taken = {(layer.part, channel) for layer in found.values() for channel in layer.channels}
     proposed: dict[str, str] = {}
@@ -175,7 +176,7 @@ def propose(parts: Parts, found: Resolution) -> dict[str, str]:
 
 
 def layers_of_light(parts: Parts, found: Resolution) -> dict[str, Found]:
-    """The layers of colour that are none of the contract: name -> where they are."""
+    """The layers of colour that are not in the contract: name -> where they are."""
     taken = {(layer.part, channel) for layer in found.values() for channel in layer.channels}
     light = {}
     for group in _group(parts):
@@ -191,7 +192,7 @@ def holds_colour(parts: Parts) -> bool:
 
 
 def _group(parts: Parts) -> list[_Group]:
-    """Sorts channels into layers; one without a dot also makes a layer of its own, called like the channel."""
+    """Sorts channels into layers; a channel without a dot also becomes a layer with the channel's name."""
     filled = [index for index, (_, channels) in enumerate(parts) if channels]
     several = len(filled) > 1
     groups: dict[tuple[int, str], dict[str, str]] = {}
@@ -202,7 +203,7 @@ def _group(parts: Parts) -> list[_Group]:
             if several and part and layer != part and not layer.startswith(f"{part}."):
                 layer = f"{part}.{layer}" if dot else part
             held = groups.setdefault((index, layer), {})
-            # Where a layer has a channel twice, R and beauty.R in the part beauty, the one that names the layer wins.
+            # If a layer has a channel twice (R and beauty.R in the part beauty), the channel that names the layer wins.
             held[suffix] = own if dot else held.get(suffix, own)
             if not dot:
                 groups.setdefault((index, f"{layer}.{suffix}" if layer else suffix), {})[""] = own
@@ -247,7 +248,7 @@ def _named(group: _Group, alias: Alias) -> bool:
 
 
 def _chosen(layer: Layer, text: str, groups: list[_Group], home: _Home, path: str) -> Found:
-    """The layer that the user named, or whose channels."""
+    """The layer that the user named by its name or by its channels."""
     wide = home._replace(rivals=frozenset())
     if match := _match(Alias(layer.name, "the user", text), layer, groups, wide, path):
         return match
@@ -267,14 +268,14 @@ def _chosen(layer: Layer, text: str, groups: list[_Group], home: _Home, path: st
 
 
 def _places(channel: str, groups: list[_Group]) -> set[tuple[int, str]]:
-    """The parts and names of channels that are called so, whole or by their tail after a dot; whole ones win."""
+    """The parts and names of channels that have this name, whole or as their tail after a dot; whole names win."""
     names = {(g.part, own): f"{g.name}.{suffix}".strip(".") for g in groups for suffix, own in g.channels.items()}
     whole = {place for place, name in names.items() if channel in (name, place[1])}
     return whole or {place for place, name in names.items() if name.endswith(f".{channel}")}
 
 
 def _distinct(layer: Layer, groups: Sequence[_Group]) -> Iterator[Found]:
-    """Each place that has the channels of ``layer``, once."""
+    """The places that have the channels of ``layer``, without repeats."""
     seen = set()
     for group in groups:
         channels = _complete(layer, group)
@@ -284,14 +285,14 @@ def _distinct(layer: Layer, groups: Sequence[_Group]) -> Iterator[Found]:
 
 
 def _features(groups: list[_Group]) -> set[tuple[int, tuple[str, ...]]]:
-    """The places of colours that are known by name as another layer than the primal."""
+    """The places of colours that have the name of a layer other than the primal."""
     others = [alias for alias in ALIASES if alias.layer not in ("primal", "alpha")]
     named = [group for group in groups if any(_named(group, alias) for alias in others)]
     return {found[:2] for found in _distinct(LAYERS["primal"], named)}
 
 
 def _of_other_channels(groups: list[_Group], writer: str) -> Found | None:
-    """The image of a file without R G B: of luminance, one channel Y that stands for all three, or Mitsuba's X Y Z."""
+    """The image of a file without R G B: luminance, one channel Y that stands for all three, or Mitsuba's X Y Z."""
     for name in ("primal", ""):
         for group in (group for group in groups if group.name == name):
             there = group.channels.keys() & {*RGB, *XYZ, "RY", "BY"}
@@ -303,7 +304,7 @@ def _of_other_channels(groups: list[_Group], writer: str) -> Found | None:
 
 
 def channels_like(found: Found) -> tuple[str, ...]:
-    """What the channels of an image like that one are called: R G B, or as in ``_of_other_channels``."""
+    """The channel names of an image like ``found``: R G B, or as in ``_of_other_channels``."""
     suffixes = tuple(channel.rpartition(".")[2] for channel in found.channels)
     return suffixes if suffixes in (("Y", "Y", "Y"), XYZ) else RGB
 
@@ -331,7 +332,7 @@ def _home(groups: list[_Group], primal: Found, origin: str) -> _Home:
 def _channels(layer: Layer, group: _Group, only: tuple[str, ...], path: str) -> tuple[str, ...]:
     """Returns the channels of ``group`` in canonical order, or () if it has none of those that ``layer`` needs.
 
-    With ``only``, it has all of these or is another layer.
+    If ``only`` is given, a group that lacks one of these channels counts as another layer.
     """
     if only:
         there = all(suffix in group.channels for suffix in only)
@@ -358,7 +359,7 @@ def _channels(layer: Layer, group: _Group, only: tuple[str, ...], path: str) -> 
 
 
 def _complete(layer: Layer, group: _Group) -> tuple[str, ...]:
-    """``_channels``, or () where they are incomplete or one is there twice."""
+    """``_channels``, or () if one is missing or there twice."""
     try:
         return _channels(layer, group, (), "")
     except NgptError:

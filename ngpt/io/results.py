@@ -1,4 +1,4 @@
-"""Stacks and results as files: what a stack was read from, with its layers brought up to date, and a result in it."""
+"""Stacks and results as files: the file that a stack was read from, with its layers brought up to date and a result."""
 
 from dataclasses import replace
 from typing import Any
@@ -16,23 +16,23 @@ from ngpt.stack import GradientStack
 from ngpt.system.threads import map_parts
 from ngpt.windows import put
 
-# Attributes that describe how a part is stored, rather than what it shows; a stack's attributes are all others.
+# Attributes that describe how a part is stored, rather than what it shows; all others are attributes of the stack.
 STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"} | {
     "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type"
 }  # fmt: skip
-# Attributes that say what made a result; the stack's own attributes are others, and stay.
+# Attributes that say what made a result; the stack's own attributes stay.
 MADE_BY = (
     *("ngpt:method", "ngpt:weights", "ngpt:options", "ngpt:estimated", "ngpt:reconstructSeconds"),
     *("ngpt:temporal", "ngpt:history", "ngpt:historyWeights", "ngpt:pass", "ngpt:reduced"),
 )
-# A primal with this in its name says itself that it is noisy: nobody takes it for the image.
+# A primal with this in its name is known to be noisy: nobody mistakes it for the final image.
 _NOISY = "noisy"
 
 
 def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> tuple[ExrImage, Resolution, int]:
     """Returns the stack as a file, where the layers are in it, and the index of the part that has the attributes.
 
-    ``base``: the file as it is by now, where other views of it have results already.
+    ``base``: the file with the results that other views have already.
     """
     if stack.source is None:
         stack.require("primal", why=f"writing {path}")
@@ -40,7 +40,7 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
     else:
         own = stack.source.image.parts
         image = ExrImage([replace(part, channels=dict(part.channels)) for part in (base.parts if base else own)])
-        # The file does not yet have other changes to this view, such as changes to its light groups.
+        # ``base`` lacks other changes to this view, such as changes to its light groups.
         for part, source, (_, channels) in zip(image.parts, own, stack.source.view.parts, strict=False):
             part.channels.update({name: source.channels[name] for name in channels.values() if base})
         resolution = dict(stack.source.resolution)
@@ -66,7 +66,7 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
         values, half = stack[name], False
         if unchanged.get(name):
             continue
-        # Channels in another renderer's units, or on other pixels, stay as they are, and ours go beside them.
+        # Channels in another renderer's units, or on other pixels, stay as they are, and ours are added beside them.
         if name in resolution and as_stored(image, resolution[name], main):
             part, names = image.parts[resolution[name].part], resolution[name].channels
             half = is_half(part, names) and not LAYERS[name].float_on_disk
@@ -81,7 +81,7 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
 
 
 def new_header(stack: GradientStack) -> dict[str, Any]:
-    """The header of the part for a stack that comes from no file."""
+    """The header of the part for a stack that was not read from a file."""
     windows = {"dataWindow": stack.place.data.box, "displayWindow": stack.place.display.box}
     aspect = {} if stack.place.aspect == 1 else {"pixelAspectRatio": stack.place.aspect}
     return {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | windows | aspect
@@ -96,10 +96,11 @@ def leave_out_old_error(stack: GradientStack, image: ExrImage) -> None:
 
 
 def replaced_layer(resolution: Resolution, view: View, origin: str, into: str | None, path: str) -> Found | None:
-    """The layer that holds a result beside the root: who loads that layer wants the image too.
+    """The layer that holds a result besides the root: users who load that layer want the result too.
 
     ``into`` names it, whole or by its tail after a dot; "root" is none. By default it is the layer that the input came
-    from, unless its name says that it is noisy; ``origin`` is its name where the input was moved before.
+    from, unless its name says that it is noisy; ``origin`` is the name of that layer if an earlier result moved the
+    input.
 
     Raises NgptError unless ``into`` fits one layer of colour.
     """
@@ -127,8 +128,8 @@ def with_result(
 ) -> tuple[ExrImage, int]:
     """Returns the file with ``pixels`` (H, W, 3) float32 as the root of a view's first part, the input as primal.R/G/B.
 
-    They also replace the layer ``shown``, whose name goes into the header as ``ngpt:pass``. The second value is the
-    index of the part with the result.
+    ``pixels`` also replace the layer ``shown``, whose name goes into the header as ``ngpt:pass``. The second value is
+    the index of the part with the result.
     """
     primal, alpha = resolution["primal"], resolution.get("alpha")
     source, parts, place = image.parts[primal.part], list(image.parts), view.first
@@ -149,7 +150,7 @@ def with_result(
         if view.name:
             header = {key: value for key, value in header.items() if key != "multiView"} | {"view": view.name}
         root, kept = suffixes, tuple(f"primal.{suffix}" for suffix in suffixes)
-        # At the end the numbers of the other views' parts stay what they are.
+        # A part at the end leaves the numbers of the other views' parts unchanged.
         place = 0 if place == 0 else len(parts)
         parts.insert(place, ExrPart(name, header, {}))
     channels = parts[place].channels

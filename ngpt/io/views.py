@@ -4,9 +4,9 @@
 |---|---|---|
 | OpenEXR's, one part | ``right.R``, ``albedo.right.R``; the first may lack its name | the attribute ``multiView`` |
 | OpenEXR's, many parts | ``R`` in a part of its own | that part's attribute ``view`` |
-| others | ``right.albedo.R`` | ``multiView``, or ``left`` and ``right`` in names alike |
+| others | ``right.albedo.R`` | ``multiView``, or ``left`` and ``right`` in names that are otherwise equal |
 
-A view's layers go by names without the view's name, ``albedo.R``, so that all are found in one way.
+The layers of a view are named without the view's name, ``albedo.R``, so that all layouts are searched in one way.
 https://openexr.com/en/latest/MultiViewOpenEXR.html
 """
 
@@ -17,12 +17,13 @@ from typing import NamedTuple
 from ngpt.errors import NgptError
 from ngpt.io.resolution import holds_colour
 
-# Views that need no attribute, where names alike hold both.
+# Views that need no attribute if both have the same channels.
 _EYES = ("left", "right")
 
 
 class Part(NamedTuple):
-    """The names in a part of a file: its own, its channels', its view's, and the views among its channels."""
+    """The names in a part of a file: its own name, its channels, its view, and the views that its channels belong
+    to."""
 
     name: str
     channels: Sequence[str]
@@ -34,7 +35,7 @@ class View(NamedTuple):
     """One view: its name, "" in a file without views, and for each part of the file its name and channels.
 
     Channels map their name without the view's name to their name in the file; parts of other views have none.
-    ``infix`` is what new channels have in their names, "" in the first view and in parts of its own.
+    ``infix`` is put into the names of new channels; it is "" in the first view, and for a view with its own parts.
     """
 
     name: str
@@ -47,12 +48,12 @@ class View(NamedTuple):
         return next(index for index, (_, channels) in enumerate(self.parts) if channels)
 
     def without(self, name: str) -> str:
-        """A layer's name, or names of channels, without the name of this view: "right.albedo" is its "albedo"."""
+        """A layer's name, or names of channels, without the name of this view: "right.albedo" becomes "albedo"."""
         word = re.escape(self.name)
         return re.sub(rf"\b{word}\.|\.{word}\b", "", name) if self.name else name
 
     def channel(self, part: int, name: str) -> str:
-        """What a channel of this view is called in a part of the file, whether it is there or not."""
+        """The name of a channel of this view in a part of the file, whether it exists or not."""
         known = self.parts[part][1] if part < len(self.parts) else {}
         layer, dot, suffix = name.rpartition(".")
         inserted = ".".join([*([layer] if dot else []), self.infix, suffix]) if self.infix else name
@@ -60,7 +61,7 @@ class View(NamedTuple):
 
 
 def views_of(parts: Sequence[Part]) -> list[View]:
-    """The views of a file in order, those that hold colour; one of no name where there are none."""
+    """The views of a file that hold colour, in order; one view without a name if there are none."""
     names = list(dict.fromkeys([*(view for part in parts for view in part.views), *(p.view for p in parts if p.view)]))
     names = names or _eyes(parts)
     plain = View("", [(part.name, {channel: channel for channel in part.channels}) for part in parts])
@@ -71,7 +72,7 @@ def views_of(parts: Sequence[Part]) -> list[View]:
 
 
 def choose_views(views: Sequence[View], wanted: str | None, path: str) -> list[View]:
-    """The view of that name, or all; raises NgptError where there is none."""
+    """The view of that name, or all views; raises NgptError if the file has no such view."""
     if wanted is None:
         return list(views)
     if found := [view for view in views if view.name == wanted]:
@@ -83,7 +84,7 @@ def choose_views(views: Sequence[View], wanted: str | None, path: str) -> list[V
 
 
 def _eyes(parts: Sequence[Part]) -> list[str]:
-    """Left and right, where each has a part or a channel that the other has too."""
+    """Left and right, if each has a part of its own, or a channel that the other has too."""
     left, right = _EYES
     if {left, right} <= {part.name for part in parts}:
         return list(_EYES)
@@ -104,7 +105,7 @@ def _of_view(part: Part, view: str, names: Sequence[str]) -> tuple[str, dict[str
         place = next((i for i in reversed(range(len(words) - 1)) if words[i] in names), None)
         if (words[place] if place is not None else names[0]) == view:
             name = ".".join(word for i, word in enumerate(words) if i != place)
-            # Where two channels get one name, the one that names the view wins.
+            # If two channels get the same name, the one that names the view wins.
             found[name] = channel if place is not None else found.get(name, channel)
     return bare, found
 

@@ -1,4 +1,5 @@
-"""Whether a file is a whole OpenEXR image, without decoding it: what interrupted copies and full disks leave is not.
+"""Whether a file is a complete OpenEXR image, without decoding it: interrupted copies and full disks leave incomplete
+files.
 
 Layout of the format: https://openexr.com/en/latest/OpenEXRFileLayout.html
 """
@@ -16,10 +17,11 @@ _MULTIPART = 0x1000
 
 
 def finished(path: str | os.PathLike) -> bool:
-    """Whether ``path`` is there and whole: its headers make sense, and all chunks in its tables end within it.
+    """Whether ``path`` exists and is complete: its headers make sense, and all chunks in its tables end within the
+    file.
 
-    Some kilobytes are read. Damage within a chunk is not seen. What is there and no file (a folder, a device) counts as
-    finished, for it is not ours to replace.
+    Some kilobytes are read. Damage within a chunk is not seen. A folder or a device counts as finished, because it must
+    not be replaced.
     """
     path = Path(path)
     if not path.is_file():
@@ -32,7 +34,8 @@ def finished(path: str | os.PathLike) -> bool:
 
 
 def _ends(file: BinaryIO, parts: list[PartHeader]) -> int:
-    """Where the last chunk ends, of an open file whose headers have been read; raises struct.error if it ends before.
+    """Where the last chunk ends in an open file whose headers have been read; raises struct.error if the file ends
+    earlier.
 
     Each chunk begins with the number of its part (in files of several), its place, and the size of what follows.
     """
@@ -42,7 +45,7 @@ def _ends(file: BinaryIO, parts: list[PartHeader]) -> int:
     several = struct.unpack("<I", file.read(4))[0] & _MULTIPART
     end = 0
     for part, offsets in zip(parts, tables, strict=True):
-        # A writer fills its table in last; and none of ours is deep.
+        # Writers fill the table in last, so an unfinished file has zeros there. Our files are never deep.
         if min(offsets) < begin or part.deep:
             raise struct.error
         size = max(offsets) + (4 if several else 0) + (16 if part.tiled else 4)

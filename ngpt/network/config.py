@@ -42,12 +42,12 @@ class ModelConfig:
     ``quiet``     the relative standard error of the primal, over 15x15 pixels, below which the result is blended with
                   the base. The blend is linear in the error and in the logarithm: as noise vanishes, the result
                   converges to the base, whatever the network says. Pixels whose variance is 0 or unknown are not
-                  blended. 0: none are
-    ``kernel``    the side, in pixels, of the kernels that average the weighted mean of those images instead, see
+                  blended. 0: no pixels are blended
+    ``kernel``    the side, in pixels, of the kernels that average the weighted mean of the images in ``start``, see
                   ``ngpt.network.heads.Pyramid``; odd. 0: the network weighs and corrects them pixel by pixel
     ``scales``    the number of resolutions that have kernels, each half as fine as the last; 1 without kernels
-    ``demodulate``  whether the kernels average the image divided by the albedo, and multiply by it again; needs the
-                  input albedo, and ``scales``
+    ``demodulate``  whether the kernels average the image divided by the albedo, and the result is multiplied by it
+                  again; needs the input albedo, and ``scales``
     ``sweeps``    the number of steps, at each of several resolutions, that draw the image toward the gradients with
                   predicted weights, see ``ngpt.network.poisson``; needs the inputs dx_noise and dy_noise. 0: none
     ``pooling``   how the network halves and doubles sizes: "convolution", as NGPT does, or by 1x1 convolutions and

@@ -1,4 +1,4 @@
-"""Estimates of variances for stacks with gradients that lack them, from an image with little noise."""
+"""Estimates of the variances that a stack with gradients lacks, from an image with little noise."""
 
 from dataclasses import replace
 

@@ -13,7 +13,8 @@ _BAND = 256
 
 
 def statistics(layers: Mapping[str, np.ndarray]) -> np.ndarray:
-    """(5,) float32: exposure, largest depth, least and largest radiance (0 within), and 0 for the mean variance.
+    """(5,) float32: exposure, largest depth, least (at most 0) and largest (at least 0) radiance, 0 for the mean
+    variance.
 
     ``layers`` (H, W, C): ``primal``, and ``depth`` where there is one; values that are not finite count as 0. The
     exposure is computed as in ``ngpt.network.features.exposure``. The mean variance is needed only if the graph

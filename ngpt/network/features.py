@@ -19,7 +19,7 @@ log. D is the base if "base" is among the inputs, the denoised image otherwise:
     primal_change, base_change, denoised_base_change
                  3   L(20 (L(x) - L(D)))
     dx_base, dy_base, dx_denoised, dy_denoised, dx_denoised_base, dy_denoised_base
-                 3   L(20 (dx - ΔX) / (1 + |D|)), X the image in the name: where it contradicts the gradients
+                 3   L(20 (dx - ΔX) / (1 + |D|)), X is the image in the name; not 0 where X contradicts the gradients
     primal_noise, dx_noise, dy_noise
                  1   ln(1 + 100 standard error / (1 + |D|)), means over RGB
 
@@ -142,8 +142,8 @@ def _encoded(name: str, layer: Tensor) -> Tensor:
 def exposure(primal: Tensor) -> Tensor:
     """The typical radiance of images (N, 3, H, W), over ``KEY``: (N, 1, 1, 1), positive; 1 for black images.
 
-    The median over blocks of 16x16 pixels, those that are not black, of their means: proportional to the image's
-    brightness, the same at any sample count except for noise, and unaffected by a few pixels. Wants finite values.
+    The median of the means of blocks of 16x16 pixels that are not black. It is proportional to the image's brightness,
+    the same at any sample count except for noise, and unaffected by a few pixels. ``primal`` must be finite.
     """
     size = min(BLOCK, primal.shape[-2]), min(BLOCK, primal.shape[-1])
     blocks = avg_pool2d(primal.float().clamp(min=0).mean(1, keepdim=True), size, ceil_mode=True).flatten(1)

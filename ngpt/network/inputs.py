@@ -21,7 +21,7 @@ import numpy as np
 
 from ngpt.classical.bases import BASES, CLASSICAL
 from ngpt.denoisers import caustic, clean
-from ngpt.denoisers.oidn import oidn, prefiltered
+from ngpt.denoisers.oidn import of_both, oidn, with_clean_features
 from ngpt.errors import NgptError
 from ngpt.network.estimates import with_variances
 from ngpt.repair import Repaired
@@ -41,7 +41,7 @@ CLEAN, _DARK = clean.CLEAN, clean.DARK
 # The inputs that are made from the layers of a stack.
 MADE = ("base", *DENOISED)
 
-# Estimated where a stack with gradients lacks them.
+# Variances that are estimated if a stack with gradients lacks them.
 ESTIMATED = ("primal_var", "dx_var", "dy_var")
 
 
@@ -101,8 +101,8 @@ class Oidn:
     OIDN sees all light of the primal, as in its training. Networks get its image minus its image of ``caustic``, which
     is added to their result again. So caustics in the result are as sharp as in OIDN's image.
 
-    The primal is denoised by OIDN's largest network, with which the combination has 8 % less error than with smaller
-    ones, the base by its smallest: larger ones change the combination by less than 1 % in rooms (docs/lab/log).
+    The primal is denoised by OIDN's largest network: the combination then has 8 % less error than with smaller ones.
+    The base is denoised by the smallest: larger ones change the combination by less than 1 % in rooms (docs/lab/log).
     """
 
     def __init__(self, data: Repaired):
@@ -131,19 +131,15 @@ class Oidn:
     @property
     def _of_all_light(self) -> np.ndarray:
         data = self._with_clean_features
-        # OIDN makes a better image of subpixels only where their features are clean (docs/lab/log).
-        data = data if clean.features_are_clean(self._data) else replace(data, fine={})
         if data.caustic is not None:
             data = replace(data, image=data.image + data.caustic)
-        return oidn(data, "clean", "high")
+        return of_both(data, "high")
 
     @cached_property
     def _with_clean_features(self) -> Repaired:
         if clean.features_are_clean(self._data):
             return self._data
-        # "high" takes more than twice as long and makes networks no better.
-        features = prefiltered(self._data.features, "balanced")
-        return replace(self._data, features=self._data.features | features)
+        return with_clean_features(self._data)
 
 
 def denoised(by_oidn: Oidn, base: np.ndarray | None, names: Collection[str]) -> dict[str, np.ndarray]:
@@ -158,7 +154,7 @@ def denoised(by_oidn: Oidn, base: np.ndarray | None, names: Collection[str]) -> 
 
 
 def _layer(name: str) -> str:
-    """The layer of a stack that an input is, or whose root it is."""
+    """The layer of a stack that equals an input, or whose square root the input is."""
     return name.replace("_se", "_var")
 
 

@@ -1,7 +1,8 @@
 """A U-Net of the shape that Open Image Denoise runs, and OIDN's steps before and after it.
 
 Weights that are trained here run in OIDN: on each device that OIDN supports, in its tiles, by its own tools
-(``ngpt.network.tza``). In PyTorch it gives the same pixels as OIDN, so training optimises the later result:
+(``ngpt.network.tza``). In PyTorch the network gives the same pixels as in OIDN, so training optimises the images that
+users get:
 
     exposure of the colour -> perceptual curve -> zeros up to multiples of 16 -> network -> inverse -> exposure
 
@@ -22,8 +23,8 @@ SHAPES: dict[tuple[int, ...], tuple[int, ...]] = {
 # The layers that it reads beside the colour.
 FEATURES = ("albedo", "normal")
 
-# Exposure: the target of the geometric mean of luminances of bins, and the approximate pixels of a bin. Darker ones
-# than the least do not count.
+# Exposure: the target for the geometric mean of the luminances of bins, the approximate side of a bin in pixels, and
+# the luminance up to which bins do not count.
 KEY, BIN, LEAST = 0.18, 16, 1e-8
 LUMINANCE = (0.212671, 0.715160, 0.072169)
 # The curve between radiance y and its code x, in three pieces; the largest half-precision y has the code 1.

@@ -31,8 +31,8 @@ from ngpt.network.transfer import signed_exp, signed_log
 
 # The number of resolutions: the coarsest pixels are 8 wide.
 SCALES = 4
-# Variances over the squared brightness, which the network's weights correct: of the image, and a number that is added
-# to the measured variance of differences.
+# Variances relative to the squared brightness; the network's weights correct them. The first is that of the image. The
+# second is added to the measured variance of differences.
 IMAGE_VARIANCE, LEAST_VARIANCE = 2e-3, 1e-5
 # The network changes the logarithm of a weight by at most RANGE. DAMPING is the length of a step.
 RANGE, DAMPING = 10.0, 0.8

@@ -218,7 +218,7 @@ def floats(session, path: Path) -> tuple[dict[str, type], str]:
     """The type of each input of a network, and the name of its first output.
 
     Files of other programs may have any inputs and outputs. Single, half and double precision are converted; NgptError
-    is raised for whole numbers, texts, sequences, maps and what else ONNX has.
+    is raised for whole numbers, texts, sequences, maps and all other types of ONNX.
     """
     inputs = [*session.get_inputs(), *session.get_overridable_initializers()]
     output = next(iter(session.get_outputs()))
@@ -264,8 +264,8 @@ def _made(path: str, _modified: int, device: str, threads: int):
     # Planning the reuse of buffers takes six times as long as the rest of the start. It saves neither time nor memory:
     # the arena reuses the same buffers anyway.
     options.enable_mem_reuse = False
-    # Spinning threads keep their cores busy while they wait: a fifth of the processor time of ngpt-fast, at the cost of
-    # other work on the machine.
+    # Spinning threads keep their cores busy while they wait. This takes a fifth of the processor time of ngpt-fast,
+    # which other work on the machine could use.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     # Errors come as exceptions; the log would repeat them.
     options.log_severity_level = 4

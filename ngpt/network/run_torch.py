@@ -50,7 +50,7 @@ def layers_of(
 
 @torch.inference_mode()
 def reconstruct(model: Reconstructor, layers: dict[str, Tensor], tile: int = TILE) -> Tensor:
-    """What ``model(layers)`` returns, computed in tiles whose padded side is at most ``tile`` pixels.
+    """The result of ``model(layers)``, computed in tiles whose padded side is at most ``tile`` pixels.
 
     Exposure and bounds are computed from the whole image. Layers may be on another device than the model. A network of
     OIDN's shape is computed in one piece, since OIDN makes its own tiles.

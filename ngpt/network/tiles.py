@@ -20,7 +20,7 @@ def spans(length: int, step: int, margin: int) -> list[tuple[slice, slice]]:
 
 
 def within(inner: slice, outer: slice) -> slice:
-    """The position of the one within the other."""
+    """The position of ``inner`` within ``outer``."""
     return slice(inner.start - outer.start, inner.stop - outer.start)
 
 

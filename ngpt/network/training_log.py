@@ -10,7 +10,7 @@ LOG = "log.jsonl"
 
 
 def entries_of(path: Path) -> list[dict[str, float]]:
-    """The entries of a log. The last line may be incomplete, as while it is being written; it is then left out."""
+    """The entries of a log. A last line that is still being written is left out."""
     lines = read_text(path).splitlines()
     entries = []
     for number, line in enumerate(lines, 1):

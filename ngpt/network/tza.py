@@ -10,7 +10,7 @@
         "f" or "h", u64         32 or 16 bits, and the position of its data
 
 All numbers are little-endian [Intel Open Image Denoise 2.4.1, core/tza.cpp]. OIDN takes only 16 bits.
-It ignores tensors that it has no use for; one of these says which of our images is the colour.
+OIDN ignores tensors that it does not use. The name of one such tensor says which of our images is the colour.
 """
 
 import struct
@@ -48,7 +48,7 @@ def packed(tensors: Mapping[str, np.ndarray], colour: str) -> bytes:
 def read(path: Path) -> tuple[bytes, str]:
     """The file's contents, and the image that is its colour: "primal", or the name of a base.
 
-    Raises NgptError where it is no such file, is damaged, or was not written by ngpt.
+    Raises NgptError if the file is not of this format, is damaged, or was not written by ngpt.
     """
     data = read_bytes(path, MOST_BYTES)
     shapes = _shapes(data, path)

@@ -68,8 +68,8 @@ class Convolution(nn.Module):
 class Resampling(nn.Module):
     """A 1x1 convolution, then half or twice the size by a fixed rule [Kettunen et al. 2019, figure 12].
 
-    ``pooling``  "average": means of 2x2, and each pixel repeated; "maximum": the largest of 2x2, and each repeated;
-                 "bilinear": bilinear at the centres of pixels, which is the mean of 2x2 on the way down
+    ``pooling``  "average": means of 2x2 pixels; "maximum": the largest of 2x2 pixels; both repeat each pixel on the way
+                 up. "bilinear": bilinear at the centres of pixels, which is the mean of 2x2 on the way down
     """
 
     def __init__(self, inputs: int, outputs: int, pooling: str, up: bool):
@@ -145,8 +145,8 @@ class Unit(nn.Module):
 def radius(convolutions: list[int], pooling: str) -> int:
     """How far, in pixels, a pixel's influence reaches, with this number of 3x3 convolutions at each level.
 
-    Each convolution reaches as far as the width of its level's pixels. A coarsest pixel spreads the values of its
-    pixels over its whole area; bilinear interpolation at each level spreads them to the next pixel too.
+    Each convolution reaches as far as a pixel of its level is wide. A pixel of the coarsest level spreads values over
+    its whole area; bilinear interpolation at each level spreads them to the next pixel too.
     """
     spread = (1 << len(convolutions) - 1) - 1
     return sum(n << level for level, n in enumerate(convolutions)) + spread * (2 if pooling == "bilinear" else 1)

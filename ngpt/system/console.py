@@ -279,7 +279,7 @@ def _bar(label: str, unit: str, pace: _Pace) -> Iterator[Callable[[int, int], No
 
 
 def _shortened(text: str, most: int) -> str:
-    """The text, or its end, where names differ, in at most ``most`` letters."""
+    """The text, shortened to at most ``most`` letters by a cut at its start, since names differ at their ends."""
     return text if len(text) <= most else f"…{text[len(text) - most + 1 :]}" if most > 1 else ""
 
 

@@ -17,7 +17,7 @@ from ngpt.system.forks import hold_while_forking
 
 try:
     import fcntl
-except ImportError:  # Windows, where a locked file could not be written by the block that it is locked for
+except ImportError:  # Windows, where a lock would keep its own holder from writing the file
     fcntl = None  # type: ignore[assignment]
 
 # Temporary files have recognisable names, so that those that killed processes leave behind can be found.
@@ -26,9 +26,8 @@ _LEFTOVER = re.compile(r"\.ngpt-[a-z0-9_]{8}(\.[^.]*)?")
 _MOST = 99  # names that are tried for a file that cannot be written under its own
 _one_at_a_time = Lock()
 hold_while_forking(_one_at_a_time)
-_FORGOTTEN = (
-    24 * 3600.0
-)  # seconds since the last change after which temporary files are removed on systems without locks
+# Seconds since the last change after which temporary files are removed on systems without locks
+_FORGOTTEN = 24 * 3600.0
 
 
 def make_folder(folder: str | os.PathLike) -> Path:
@@ -68,7 +67,7 @@ def save(
     "a.exr"; the working directory; the folder for temporary files. Nothing is overwritten there. ``write`` is called
     again for each place; it writes complete files or none, as ``atomic_output`` does.
 
-    ``alike`` is for folders that several processes write, where every file counts. All of them would write the same
+    ``alike`` is for folders that several processes write to, where every file counts. All of them would write the same
     file, so an existing one is accepted, and no other file is put beside it.
     """
     path = Path(path)
@@ -132,7 +131,8 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
 
 
 def _umask() -> int:
-    """The umask of the process. Reading it means setting it: two threads that did so at once would leave it at 0."""
+    """The umask of the process. It can be read only by setting it: two threads that do so at once could leave it at
+    0."""
     with _one_at_a_time:
         umask = os.umask(0)
         os.umask(umask)

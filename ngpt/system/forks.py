@@ -16,7 +16,8 @@ Made = TypeVar("Made")
 
 
 def hold_while_forking(lock: Lock, drop: Callable[[], object] = lambda: None) -> None:
-    """No fork happens while another thread holds ``lock``; ``drop`` is called under it before each fork.
+    """From now on, no fork happens while another thread holds ``lock``. Before each fork, ``drop`` is called with the
+    lock held.
 
     The thread that forks must not hold the lock itself.
     """

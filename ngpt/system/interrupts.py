@@ -12,7 +12,7 @@ _SIGNALS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SI
 
 
 class Interrupt:
-    """The first signal that has arrived, 0 before. A call returns whether one has arrived."""
+    """The number of the first signal that has arrived, 0 before. Calling the object returns whether one has arrived."""
 
     def __init__(self) -> None:
         self.signal = 0
@@ -30,7 +30,8 @@ class Interrupt:
 def raised() -> Iterator[Interrupt]:
     """In the block, both signals are recorded and raise ``Interrupted``, so that everything is cleaned up.
 
-    A signal that other code handles or has switched off is left as it is. Outside of the main thread, both are.
+    A signal that other code handles or has switched off is left as it is. Outside of the main thread, both signals are
+    left as they are.
     """
     found = Interrupt()
 
@@ -48,8 +49,8 @@ def raised() -> Iterator[Interrupt]:
 def noted(told: Callable[[], None] = lambda: None) -> Iterator[Interrupt]:
     """In the block, the first signal is only recorded; any further one has its previous effect.
 
-    ``told`` is called as soon as the signal arrives. A signal that is switched off stays so, and outside of the main
-    thread none arrives.
+    ``told`` is called as soon as the signal arrives. A signal that is switched off stays switched off. Outside of the
+    main thread, no signal arrives.
     """
     found = Interrupt()
 

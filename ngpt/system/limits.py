@@ -128,7 +128,8 @@ def free_address_space() -> int:
 
 
 def limit_address_space(limit: int) -> None:
-    """Limits the bytes that this process may map, where the system can; its crashes write no memory to disk."""
+    """Limits the bytes that this process may map, if the system can. If the process crashes, it writes no memory to
+    disk."""
     if resource is None:
         return
     own = resource.getrlimit(resource.RLIMIT_AS)[1]

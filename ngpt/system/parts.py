@@ -81,8 +81,9 @@ def _only(group: str) -> Any:
 class Registry(dict[str, T]):
     """Entries by name: ours, and those that other packages bring by entry points of a ``group``.
 
-    An entry of another package is imported when it is requested by name. Iteration goes over ours, and over others'
-    that have been imported; call ``load`` first to list all. Finding one of ours does not search for others.
+    An entry of another package is imported when it is requested by name. Iteration covers our entries and the imported
+    entries of other packages; call ``load`` first to cover all. A search for one of ours does not look at other
+    packages.
 
     ``what``   the word for an entry in messages: "method"
     ``kind``   the class of an entry, or ``Callable``

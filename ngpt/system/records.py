@@ -79,8 +79,8 @@ def from_table(kind: type[T], values: Any, where: str) -> T:
     """The dataclass ``kind`` from a table of settings, whose values must have the annotated types.
 
     Lists become tuples, tables become dataclasses, where the annotations say so: ``tuple[int, ...]``,
-    ``tuple[Files, ...]``. A whole number is accepted where a number is expected. What ``kind`` refuses itself, it
-    refuses by NgptError.
+    ``tuple[Files, ...]``. A whole number is accepted where a number is expected. ``kind`` itself must raise NgptError
+    for values that it refuses.
 
     Raises NgptError, which begins with ``where``, for settings that are unknown, missing, or of another type.
     """

@@ -14,7 +14,7 @@ _INVISIBLE = re.compile(
 )
 
 
-# Names in messages for files that stand for something without a file, by path.
+# Names in messages, by path, of temporary files that stand for something else, such as standard input.
 _names: dict[str, str] = {}
 
 

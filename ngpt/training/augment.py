@@ -28,14 +28,15 @@ class Augmentation:
     """The random changes to each example when it is read.
 
     ``geometry``    flips and transposition, each with probability 1/2
-    ``colors``      permutation of RGB, and a factor for each of mean 1, 0..3, uniform on the simplex
+    ``colors``      permutation of RGB, and a factor for each channel: 0..3, of mean 1, uniform on the simplex
     ``brightness``  standard deviation, in the logarithm, of a log-normal factor of mean 1 on radiance
     ``depth``       range of the factor of depth, uniform
-    ``quieter``     range of a factor on noise, log-uniform, one for each crop: adds its best input with that much less
-                    noise (``quieter``). So networks learn to use more samples than training sets have. [] for none
-    ``rarer``       range of k, log-uniform, one for each crop: adds its best input as if one path in k found most of
-                    its light (``rarer``). So networks learn from rooms lit through curtains, bulbs and gaps, which take
-                    too long to render for training. [] for none
+    ``quieter``     range of a factor, log-uniform, one for each crop: adds the crop's best input with its noise
+                    multiplied by the factor (``quieter``). So networks learn to use more samples than training sets
+                    have. [] for none
+    ``rarer``       range of k, log-uniform, one for each crop: adds the crop's best input as if one path in k found
+                    most of its light (``rarer``). So networks learn from rooms lit through curtains, bulbs and gaps,
+                    which take too long to render for training. [] for none
     """
 
     geometry: bool = True
@@ -74,8 +75,8 @@ class Augmentation:
 def quieter(
     stack: GradientStack, reference: np.ndarray, direct: np.ndarray, caustic: np.ndarray, factor: float
 ) -> GradientStack:
-    """The stack with ``factor`` times its noise, as by 1 / factor² times the samples: a weighted mean with the
-    reference.
+    """The stack with its noise multiplied by ``factor``, as if it had 1 / factor² times the samples: a weighted mean
+    with the reference.
 
     ``reference`` (H, W, 3) includes directly visible emission and the light of the layer ``caustic``; ``direct`` and
     ``caustic`` hold these two parts separately. Features stay as they are.
@@ -94,7 +95,8 @@ def quieter(
 
 
 def rarer(stack: GradientStack, k: float, share: float, rng: np.random.Generator) -> GradientStack:
-    """The stack as if ``share`` of the light in each pixel were found by one path in ``k``, then k times as bright.
+    """The stack as if ``share`` of the light in each pixel were found by one path in ``k``, and were then k times as
+    bright.
 
     In each pixel B = 1 with probability 1/k, else 0. Its light is multiplied by w = 1 - share + share k B, with mean 1.
     A gradient comes from the paths of both its pixels, so its factor is the mean of their factors. Expectations stay

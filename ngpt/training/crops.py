@@ -16,7 +16,7 @@ from ngpt.stack import GradientStack
 class Crop(Protocol):
     """One view with a reference and several inputs, from ``ngpt.training.dataset`` or ``stack_folder``.
 
-    A crop without a reference is used only for ``paired``, by its two stacks.
+    A crop without a reference is ``paired``: its two stacks are the targets of each other.
     """
 
     scene: str

@@ -19,7 +19,9 @@ from typing import Any
 import numpy as np
 
 from ngpt.errors import NgptError
+from ngpt.layers import FEATURE_NOISE
 from ngpt.stack import GradientStack
+from ngpt.subpixels import FINE, SUBPIXELS, means, subpixels
 from ngpt.system.records import Shape, check, read_json
 from ngpt.training import shards
 from ngpt.training.shards import Shard, tensor_names
@@ -58,22 +60,47 @@ class Crop:
     def stack(self, k: int) -> GradientStack:
         """Input ``k`` with all layers of its rendered stack; gradients only if its sampler has them. Values are finite.
 
-        Frames of shots also have the layer ``motion``. It is NaN where it is unknown: everywhere in the first frame.
+        If the set has subpixels, so has the stack, and its pixels are their means, to the bit. Frames of shots also
+        have the layer ``motion``. It is NaN where it is unknown: everywhere in the first frame.
         """
         if not 0 <= k < self.inputs:
             raise NgptError(f"{self.shard.path}: there is no input {k}; the crop has inputs 0 .. {self.inputs - 1}")
-        names = [name for name in self.shard.names if name in shards.OF_INPUTS]
-        layers = {name: self.shard.input(name, self.index, k) for name in names}
-        layers["primal"] = layers.pop("indirect") + layers["direct"] + layers.get("caustic", 0)
+        layers, fine = self._pixels(k), self._subpixels(k)
+        width = layers["primal"].shape[1]
+        layers |= {name: means(layer, subpixels(fine, width)) for name, layer in fine.items()}
         for name in [name for name in layers if name.endswith("_se")]:
             layers[name.removesuffix("_se") + "_var"] = np.square(layers.pop(name))
         attributes: dict[str, Any] = {"ngpt:spp": self.spp[k], "ngpt:normalSpace": "camera"}
+        if fine:
+            attributes[SUBPIXELS] = subpixels(fine, width)
+            if (noise := float(self.shard.input(shards.NOISE, self.index, k))) >= 0:
+                attributes[FEATURE_NOISE] = noise
         if shards.MOTION in self.shard.names:
             motion = self.shard.crop(shards.MOTION, self.index)
             layers[shards.MOTION] = np.where(motion < shards.FAR, motion, np.float32(np.nan))
         if self.frame is not None:
             attributes |= {"ngpt:frame": self.frame, "ngpt:previousFrame": self.frame - 1}
-        return GradientStack(layers, attributes, path=f"{self.shard.path}, crop {self.index}, input {k}")
+        return GradientStack(layers, attributes, path=f"{self.shard.path}, crop {self.index}, input {k}", fine=fine)
+
+    def _pixels(self, k: int) -> dict[str, np.ndarray]:
+        """The layers of input ``k`` as tensors of pixels have them, with standard errors."""
+        names = [name for name in self.shard.names if name in shards.OF_INPUTS]
+        layers = {name: self.shard.input(name, self.index, k) for name in names}
+        layers["primal"] = layers.pop("indirect") + layers["direct"] + layers.get("caustic", 0)
+        return layers
+
+    def _subpixels(self, k: int) -> dict[str, np.ndarray]:
+        names = {name: f"fine_{name}" for name in FINE}
+        return {n: self.shard.input(tensor, self.index, k) for n, tensor in names.items() if tensor in self.shard.names}
+
+    def strays(self, k: int) -> bool:
+        """Whether input ``k`` has subpixels whose means differ from its pixels by more than the rounding of tensors."""
+        pixels, fine = self._pixels(k), self._subpixels(k)
+        for name, layer in fine.items():
+            there = means(layer, subpixels(fine, pixels[name].shape[1])).astype(np.float64)
+            if np.abs(there - pixels[name]).sum() > 2 * shards.MAX_LOSS * np.abs(there).sum():
+                return True
+        return False
 
     @property
     def reference(self) -> np.ndarray:
@@ -201,6 +228,10 @@ def problems(folder: Path) -> list[str]:
             bad = int(np.sum(~np.isfinite(shard.tensor(name))))
             if bad:
                 found.append(f"{shard.path}: tensor '{name}' has {bad} values that are not finite")
+        for i, told in enumerate(entry["crops"]):
+            read = Crop(shard, i, entry["scene"], tuple(told["spp"]))
+            for k in filter(read.strays, range(read.inputs)):
+                found.append(f"{shard.path}: the subpixels of crop {i}, input {k} are of another image; make it again")
         if entry["crops"] and shards.REFERENCES[0] not in shard.names:
             one, other = shard.tensor("indirect").swapaxes(0, 1)
             for crop in np.flatnonzero((one == other).all(axis=(1, 2, 3))):
@@ -225,9 +256,11 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
     if not crops:
         return shard
     gradients, caustic = (not tensors.keys().isdisjoint(shard.names) for tensors in (shards.GRADIENTS, shards.CAUSTIC))
+    fine = () if shards.SUBPIXELS.keys().isdisjoint(shard.names) else (*shards.SUBPIXELS, shards.NOISE)
     optional = (shards.REFERENCE_HALVES, shards.MOTION, *shards.SAMPLES, *shards.SPLIT)
     pairs = set(shards.REFERENCES).isdisjoint(shard.names)
-    names = tensor_names(gradients, caustic, [name for name in optional if name in shard.names], pairs=pairs)
+    further = [*(name for name in optional if name in shard.names), *fine]
+    names = tensor_names(gradients, caustic, further, pairs=pairs)
     missing = [name for name in names if name not in shard.names]
     if missing:
         raise NgptError(f"{path}: tensors {', '.join(missing)} are missing")
@@ -239,6 +272,10 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
         raise NgptError(f"{path}: has no references, so its crops must be pairs: 2 inputs with gradients, not {inputs}")
     shapes: dict[str, tuple[int, ...]] = {name: (inputs, height, width, c) for name, c in shards.OF_INPUTS.items()}
     shapes |= {"spp": (inputs,), shards.REFERENCE_HALVES: (2, height, width, 3), shards.MOTION: (height, width, 2)}
+    if fine:
+        wide = shard.shape("fine_primal")
+        k = max(wide[3] // width if len(wide) == 5 else 0, 2)
+        shapes |= {shards.NOISE: (inputs,)} | dict.fromkeys(shards.SUBPIXELS, (inputs, k * height, k * width, 3))
     for name in names:
         expected = (len(crops), *shapes.get(name, (height, width, 3)))
         if shard.shape(name) != expected:
@@ -261,6 +298,7 @@ def summary(folder: Path) -> dict[str, Any]:
         "training set": str(folder),
         **({"shots": len(data.shots)} if data.shots else {}),
         "crops": len(data),
+        **({"subpixels": k} if (k := data.manifest["config"].get("subpixels", 1)) != 1 else {}),
         **({"pairs": len(data)} if data.manifest["config"].get("reference_spp") == 0 else {}),
         "planned": data.manifest["planned"],
         "failed": sum(len(entry["failures"]) for entry in entries),

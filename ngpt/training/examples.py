@@ -28,7 +28,7 @@ JITTER = 7
 class Examples(TorchDataset):
     """Endless training examples. Each is a function of its index and the seed, in any process and order.
 
-    Example ``i`` is a random crop with one of its inputs (or ``Augmentation.quieter``, ``rarer``), normalised,
+    Example ``i`` is a random crop with one of its inputs (or one by ``Augmentation.quieter`` or ``rarer``), normalised,
     augmented and padded: a dict of layers (C, size + 16, size + 16) and the "target" (3, size - 14, size - 14). The
     target covers the middle, which no jitter of the padding reaches [NGPT's code]. Crops larger than ``size`` are cut
     at random. Prepared layers are cached in memory, up to ``cache`` bytes.
@@ -179,7 +179,7 @@ def _tensors(arrays: dict[str, np.ndarray]) -> Layers:
 
 
 def judges_of(crop: Crop, config: ModelConfig) -> tuple[np.ndarray, ...]:
-    """The images (H, W, 3) that errors of such a network are measured against: two independent halves, or one target.
+    """The images (H, W, 3) that a network's errors are measured against: two independent halves, or one target.
 
     The noise of two halves cancels in the product of both errors, see ``ngpt.measure.metrics``.
     """
@@ -198,7 +198,7 @@ def target_of(crop: Crop, config: ModelConfig) -> np.ndarray:
 
 
 def _scaled(layers: Layers, judge: Layers) -> tuple[Layers, Layers]:
-    """Both divided by the exposure of the first."""
+    """``layers`` and ``judge``, divided by the exposure of ``layers``."""
     scaled, exposure = features.normalised({name: layer[None] for name, layer in layers.items()})
     light = features.RADIANCE | {"target"}
     return {name: layer[0] for name, layer in scaled.items()}, {

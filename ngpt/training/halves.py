@@ -16,7 +16,8 @@ The noise of B is independent of A and has mean 0: it adds a constant to the exp
 truth [Lehtinen et al. 2018, "Noise2Noise"]. Gradients have 5 to 24 times less noise than the image, so their term shows
 errors that the noise of the image hides [compare Guo et al. 2019, "GradNet", where input and target are one render].
 
-Weights are computed only from A. Weights from B would be small where B is bright by chance, and results too dark.
+Weights are computed only from A. Weights from B would be small where B is bright by chance, and results would be too
+dark.
 """
 
 import torch

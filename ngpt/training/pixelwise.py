@@ -12,15 +12,15 @@ from ngpt.network.transfer import signed_log, srgb
 
 # The number of resolutions of ``pyramid``, and its exposures.
 _SCALES, _EXPOSURES = 4, (0.25, 1.0, 4.0)
-# For ``flip``: typical radiance over the exposure is 4. The first exposure makes it white; the last one makes radiance
-# that is 32 times as bright white.
+# For ``flip``: typical radiance over the exposure is 4. The first exposure maps it to white. The last one maps 32 times
+# this radiance to white.
 _WHITES = (0.25, 0.0078)
 # The parts of ``pu``.
 _PU_L1, _PU_STRUCTURE = 0.16, 0.84
 
 
 def l1(prediction: Tensor, target: Tensor) -> Tensor:
-    """Mean |R(p) - R(t)|."""
+    """Mean |R(p) - R(t)|, with R the tone mapping ``tone_mapped``."""
     return (tone_mapped(prediction) - tone_mapped(target)).abs().mean()
 
 
@@ -62,7 +62,8 @@ def pyramid(prediction: Tensor, target: Tensor) -> Tensor:
 
     How visible an error is depends on its width: eyes average out fine noise, above all noise of colours, but not an
     offset of a whole patch [Andersson et al. 2020, "FLIP", section 4.1, here with box filters]. The SSIM in the
-    structural distance subtracts the means of patches. Each resolution has half the pixels of the last, rounded up.
+    structural distance does not see such offsets, because it subtracts the means of patches. Each resolution has half
+    the pixels of the last, rounded up.
     """
     total = prediction.new_zeros(())
     for exposure in _EXPOSURES:
@@ -75,7 +76,8 @@ def pyramid(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def flip(prediction: Tensor, target: Tensor) -> Tensor:
-    """Mean HDR-FLIP in [0, 1), the larger at two exposures: the difference that a viewer sees when flipping images.
+    """Mean HDR-FLIP in [0, 1), in each pixel the larger of two exposures: the difference that a viewer sees when
+    flipping images.
 
     It filters by the resolution of the eye and compares in the Lab colour space [Andersson et al. 2020 and 2021].
     """

@@ -27,7 +27,7 @@ def learning_rate(settings: OptimizerSettings, step: int, steps: int) -> float:
 
 
 def warmup_of(settings: OptimizerSettings, steps: int) -> int:
-    """The steps of the warm-up; a tenth of a run that would otherwise end before it reaches its learning rate."""
+    """The steps of the warm-up: ``warmup``, or a tenth of the run if the run would end within ``warmup``."""
     return settings.warmup if settings.warmup < steps else steps // 10
 
 

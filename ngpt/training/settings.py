@@ -48,11 +48,11 @@ class OptimizerSettings:
     ``learning_rate``  the largest learning rate of the schedule
     ``betas``      decays of Adam's two moments
     ``schedule``   "paper" (warm-up, flat, exponential decay) or "cosine" (warm-up, half a cosine to 1 % at the end)
-    ``warmup``     steps until the learning rate is reached; a tenth of the run if the run would end before
+    ``warmup``     steps until the learning rate is reached; a tenth of the run if the run would end before that
     ``flat``       step until which the rate is constant ("paper")
     ``half_life``  steps in which the rate then halves ("paper")
     ``clip``       largest norm of the gradient; 0 does not clip
-    ``ema``        decay per step of the average of the weights that is validated and shipped; 0 keeps none
+    ``ema``        decay per step of the average of the weights that is validated and shipped; 0 keeps no average
     """
 
     learning_rate: float = 5e-4
@@ -73,8 +73,8 @@ class RunSettings:
     ``precision``  precision of the network's body: "float32" or "bfloat16". CPUs without instructions for bfloat16,
                    which would take several times as long, compute in float32
     ``seed``       seed of all random numbers: weights, order, augmentation, transforms of the loss
-    ``minutes``    wall-clock budget of one call; 0 is none. A run that it stops can be resumed
-    ``log``, ``save``, ``validate``  steps between these
+    ``minutes``    wall-clock budget of one call; 0 means no limit. A run that reaches it can be resumed
+    ``log``, ``save``, ``validate``  steps between two log entries, checkpoints or validations
     ``views``      number of inputs in each validation, spread evenly over all
     """
 
@@ -199,7 +199,7 @@ def _check_temporal(settings: Settings, table: TemporalSettings, path: str) -> N
     if settings.loss or settings.augmentation != Augmentation():
         raise NgptError(f"{path}: [loss] and [augmentation] are for networks that make images; leave them out")
     if streams := [folder for folder in settings.data.folders if folder.endswith(".toml")]:
-        raise NgptError(f"{path}: data.folders: {streams[0]}: shots are not rendered meanwhile; make the set before")
+        raise NgptError(f"{path}: data.folders: {streams[0]}: shots are not rendered during training; make a set")
 
 
 def _change(values: dict[str, Any], change: str) -> None:

@@ -13,6 +13,8 @@ Tensors, N crops of K inputs each, (N, K, H, W, C) unless said otherwise, scene-
     reference_halves            (N, 2, H, W, 3), optional: reference_indirect by each half of its samples
     samples                     optional: the number of samples of each pixel, if it varies within inputs
     diffuse, diffuse_se, specular, specular_se    all or none: parts of indirect, where the sampler splits it
+    fine_primal, fine_albedo, fine_normal    (N, K, k H, k W, 3), all or none: k x k subpixels of each pixel; all light
+    feature_noise               (N, K), where there are these: the variance ``ngpt:featureNoise``, -1 if not known
     motion                      (N, H, W, 2), optional: the layer of that name, floats, ``FAR`` where it is not known
     spp                         (N, K) samples per pixel, int32
 
@@ -23,6 +25,8 @@ Pairs have K = 2 independent inputs, and no references.
 Shots are crops too, one for each frame, in their order; the records of crops number the frames.
 
 A tensor is stored in half floats if that changes at most the share ``MAX_LOSS`` of every crop, in floats otherwise.
+Pixels are the means of their subpixels, so where there are some, all light but ``indirect`` is stored in floats: what
+is left of a pixel beside ``direct`` would be lost otherwise, where a lamp outshines it.
 The header's metadata holds the record of the shard as JSON under "ngpt".
 """
 
@@ -37,7 +41,9 @@ from typing import Any
 import numpy as np
 
 from ngpt.errors import NgptError
+from ngpt.layers import FEATURE_NOISE
 from ngpt.stack import GradientStack
+from ngpt.subpixels import FINE
 from ngpt.system import files
 from ngpt.system.install import install_command
 from ngpt.system.records import check, parse_json
@@ -49,6 +55,8 @@ INPUTS = {"indirect": 3, "direct": 3, "albedo": 3, "normal": 3, "depth": 1, "pri
 CAUSTIC = {"caustic": 3, "caustic_se": 3}
 SAMPLES = {"samples": 1}
 SPLIT = {"diffuse": 3, "diffuse_se": 3, "specular": 3, "specular_se": 3}
+SUBPIXELS = {f"fine_{name}": 3 for name in FINE}
+NOISE = "feature_noise"
 OF_INPUTS = INPUTS | GRADIENTS | CAUSTIC | SAMPLES | SPLIT
 REFERENCES = ("reference_indirect", "reference_direct")
 REFERENCE_CAUSTIC = "reference_caustic"
@@ -124,6 +132,10 @@ def _input_tensors(stack: GradientStack) -> dict[str, np.ndarray]:
             tensors[name] = np.sqrt(stack[name.removesuffix("_se") + "_var"])
         elif name != "indirect":
             tensors[name] = stack[name]
+    if stack.fine:
+        tensors |= {f"fine_{name}": layer for name, layer in stack.fine.items()}
+        noise = stack.number(FEATURE_NOISE)
+        tensors[NOISE] = np.float32(-1 if noise is None else noise)
     return tensors
 
 
@@ -142,8 +154,8 @@ def smallest_float(tensor: np.ndarray) -> np.ndarray:
 def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]) -> None:
     """Writes a shard and the record of its rendering. It may hold no crop, if all have failed.
 
-    An existing shard is kept: another worker has made it, it differs only in the times of its record, and its checksum
-    may be in the manifest already.
+    An existing shard is kept: another worker has made it. It differs from this one only in the times of its record, and
+    its checksum may be in the manifest already.
 
     Raises NgptError for a tensor with numbers that are not finite, and if the file cannot be written.
     """
@@ -152,7 +164,8 @@ def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]
     each = [crop.tensors() for crop in crops]
     tensors = {name: np.stack([t[name] for t in each]) for name in each[0]} if each else {}
     # Half floats would change motion by hundredths of a pixel, and cannot hold FAR.
-    tensors = {name: tensor if name == MOTION else smallest_float(tensor) for name, tensor in tensors.items()}
+    whole = {MOTION, NOISE, *(("fine_primal", "direct", "caustic") if "fine_primal" in tensors else ())}
+    tensors = {name: tensor if name in whole else smallest_float(tensor) for name, tensor in tensors.items()}
     for name, tensor in tensors.items():
         if not np.isfinite(tensor).all():
             raise NgptError(f"{path}: tensor '{name}' has {np.sum(~np.isfinite(tensor))} values that are not finite")

@@ -1,4 +1,5 @@
-"""The interface of what a run trains; the trainer (``ngpt.training.trainer``) runs steps, logs, checkpoints, pages."""
+"""The interface of a task, for the trainer (``ngpt.training.trainer``), which makes steps, logs, checkpoints and
+pages."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -45,7 +46,8 @@ class Task(ABC):
 
     @abstractmethod
     def load(self, path: str) -> nn.Module:
-        """The network of such a file, or of ngpt by its name; raises NgptError for a network of another kind."""
+        """The network in a file written by ``save``, or the shipped network of that name. Raises NgptError for a
+        network of another kind."""
 
     def state(self) -> dict[str, Tensor]:
         """The tensors for the checkpoint that the next batches depend on, in addition to the settings and the step."""

@@ -7,11 +7,11 @@ to work with any method. The loss of a frame is
 
     E |y - r|² / E_x + FLICKER E |(y - r) - W (y' - r')|² / F_x
 
-relative to the reference r, where W looks up values along motion and ' marks the frame before. E_x and F_x are the same
-errors of x, so all shots count alike. A further term is the square of the difference between the mean brightness of y
-and of x, over a batch: otherwise the easiest way to remove specks would be to lose their light. The effect of y on
-later frames is left out: among filters that know their own variance, the one with the least error now is also the best
-for later.
+where x is the frame before blending, y the blended frame and r the reference. W looks up values along motion, and a
+prime marks the previous frame. E is a mean of errors relative to r. E_x and F_x are the same errors of x, so all shots
+count alike. A further term is the square of the difference between the mean brightness of y and of x, over a batch:
+otherwise the easiest way to remove specks would be to lose their light. The effect of y on later frames is left out:
+among filters that know their own variance, the one with the least error now is also the best for later.
 """
 
 import copy

@@ -1,28 +1,30 @@
 r"""The gradient-domain path tracer whose pixels share their paths in tiles.
 
-Each pixel of a tile traces a path. Its *suffix*, all from the second vertex on, is connected to the first vertices of
-the other pixels of the tile as well. So each of N pixels has N suffixes for its value, and N for each difference:
+Each pixel of a tile traces a path. The path's *suffix*, its part from the second vertex on, is also connected to the
+first vertices of the other pixels of the tile. So N pixels have N suffixes each, for the value and for each difference:
 
     x_i               first vertex of the path of pixel i of a tile
-    s_j               second vertex of pixel j's path, where its suffix begins; what it emits and reflects
-    J_ij              dω_i / dω_j of the directions from x_i and from x_j to s_j; 1 if that is infinitely far away
-    q_i(s_j)          density with which pixel i makes s_j, p J_ij V: all are in the solid angle at x_j; V: x_i sees s_j
-    C_i(s_j)          contribution of the path x_i, s_j, ... to pixel i, f J_ij V L, in that solid angle too
-    D(s_j)            Σ_k q_k(s_j), over the pixels k of the tile: the balance heuristic
-    I_i               Σ_j C_i(s_j) / D(s_j), the estimate of pixel i; m and a second pair q, C: see below
-    dx, dy            I_k - I_i within a tile: the suffixes and the denominators are the same
+    s_j               second vertex of the path of pixel j, where its suffix begins
+    J_ij              dω_i / dω_j of the directions from x_i and from x_j to s_j; 1 if s_j is infinitely far away
+    V                 1 if x_i sees s_j, else 0
+    q_i(s_j)          p J_ij V, the density with which pixel i samples s_j, in the solid angle at x_j
+    C_i(s_j)          f J_ij V L, the contribution of the path x_i, s_j, ... to pixel i, in the same solid angle
+    D(s_j)            Σ_k q_k(s_j), over the pixels k of the tile: the denominator of the balance heuristic
+    I_i               Σ_j C_i(s_j) / D(s_j), the estimate of pixel i
+    dx, dy            I_k - I_i within a tile, where both pixels have the same suffixes and denominators
 
-What ends at s_j, or at a lamp that was sampled there, needs only s_j (C1, q1, D1). What goes on from there needs also
-the direction that was sampled at s_j, whose density depends on where the path has come from (C2, q2, D2). Each path
-keeps its own MIS weights m: C is the contribution f m of one technique. Emitters are sampled at x_i by the numbers of
-all pixels of the tile, all with one density: D is the number of pixels.
+There are two pairs of q and C. A path that ends at s_j, or at an emitter sampled from s_j, needs only s_j (C1, q1, D1).
+A path that goes on also needs the direction that was sampled at s_j. Its density depends on the direction from which
+the path arrives (C2, q2, D2). Each path keeps its own MIS weights m: C is the contribution f m of one technique. For
+emitter sampling at x_i, pixel i uses the random numbers of all pixels of the tile. All have the same density, so D is
+the number of pixels.
 
-A difference across the border of two tiles has only the suffixes of its two pixels, as in ``gpt``. The grid of tiles
-moves by a pixel from sample to sample, so that each pair of pixels is in one tile in its turn. Both are unbiased,
-wherever the grid is.
+A difference across the border of two tiles uses only the suffixes of its two pixels, as in ``gpt``. The grid of tiles
+moves from sample to sample, so that the two pixels are in one tile in other samples. Both estimates are unbiased for
+any position of the grid.
 
-A suffix is shared where all three vertices are connectable and the event at x_j is smooth. Otherwise only its own pixel
-uses it, in primal and differences alike: the pixels of a pair agree on that, since the rule names neither first.
+A suffix is shared if x_i, x_j and s_j are connectable and the event at x_j is smooth. Otherwise only its own pixel uses
+it, for the primal and for differences. The rule treats the pixels of a pair alike, so they agree on it.
 
 [Bauszat, Petitjean, Eisemann 2017, "Gradient-domain path reusing"; Bekaert, Sbert, Halton 2002, "Accelerating path
 tracing by reusing paths"; Hua et al. 2019, "A Survey on Gradient-Domain Rendering", section 6.1]
@@ -48,17 +50,17 @@ from data_gen.paths.vertex import Materials, evaluate, seen_from
 from data_gen.samplers.common import GradientIntegrator
 from data_gen.samplers.teaching.gpt_simple import base_step, reflected, trace, walk
 
-# Bytes of a lane: its suffix, its camera sample and sums; and what is kept of one connection.
+# Bytes of a lane for its suffix, its camera sample and its sums; bytes of one connection
 _LANE_BYTES, _CONNECTION_BYTES = 272, 32
 
 
 class GPTTiles(GradientIntegrator):
     """Gradient-domain path tracing with path reuse in tiles, for surfaces.
 
-    Plugin ``gpt_tiles``, with ``max_depth`` and ``rr_depth`` (from the third vertex on at the earliest) of Mitsuba's
-    ``path``, ``tile`` and ``roughness_threshold``. The noise of pixels of a tile is correlated, for they share their
-    paths; variances are of each pixel over its samples, and do not say so. Not handled: media (they are not seen),
-    hidden emitters, polarised and spectral variants; for the last three rendering raises NgptError.
+    Plugin ``gpt_tiles``. Parameters: ``max_depth`` and ``rr_depth`` as for Mitsuba's ``path`` (roulette begins at the
+    third vertex at the earliest), ``tile`` and ``roughness_threshold``. The noise within a tile is correlated, since
+    its pixels share paths. Variances do not show that: they are those of each pixel over its samples. Not handled:
+    media, which are not seen; hidden emitters, polarised and spectral variants, for which rendering raises NgptError.
     """
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
@@ -87,7 +89,7 @@ class Tiles:
         for axis, name in enumerate(("dx+", "dy+")):
             across = grid.across(axis)
             beyond = self.shared(camera, paths, [across])
-            # Either end of a pair would say the same: it is put once.
+            # Both pixels of a pair have the same difference, so only one of them puts it.
             next_one = grid.neighbour(*SHIFTS[name])
             crosses = across.active & (across.lane == next_one.lane)
             here, there = dr.select(crosses, beyond, I), (beyond, I)
@@ -99,7 +101,7 @@ class Tiles:
         film.put_all(features(self.scene, camera.sensor, camera.random.clone(), camera.rays()[0]))
 
     def shared(self, camera: CameraSamples, paths: Paths, links: list[Link]) -> mi.Color3f:
-        """I of each pixel, from its own path and from the paths of the pixels that ``links`` lead to."""
+        """The estimate I of each pixel, from its own path and the paths of the pixels that ``links`` lead to."""
         members, direct, count = [(None, paths.own)], paths.direct, dr.select(paths.lives, mi.Float(1), 0)
         for link in links:
             connection, light = self.connect(camera, paths, link)
@@ -110,7 +112,7 @@ class Tiles:
         return balanced(members) + dr.select(count > 0, direct / count, 0)
 
     def trace(self, camera: CameraSamples) -> tuple[mi.Spectrum, Paths]:
-        """The layer ``direct``, and the path of each pixel: its first vertex, its suffix, and its contribution here."""
+        """The emission that is seen directly, and the path of each pixel."""
         scene, materials, random = self.scene, self.materials, camera.random.clone()
         limit = self.integrator.limits.max_depth
         ray, importance, _ = camera.rays()
@@ -126,7 +128,7 @@ class Tiles:
         second = base_step(scene, random, s, mi.Spectrum(1), s.is_valid() & (limit > 2))
         R = walk(scene, self.integrator.limits, random, second.x1)
 
-        # With the densities left in, as other pixels have it: a path of its own is a connection with J = V = 1.
+        # Not divided by densities, like the connections of other pixels: the own path is one with J = V = 1.
         C = first.β1 * first.p
         C1 = C * (first.L_bsdf + second.L_light)
         C2 = C * second.β1 * second.p * (second.L_bsdf + R)
@@ -154,17 +156,17 @@ class Tiles:
             p_light=second.p_light,
             R=R,
         )
-        # One kernel for all of it
+        # All in one kernel
         dr.eval(Le, hit, lives, own, direct, *vars(suffix).values())
         return Le, Paths(hit, lives, suffix, own, direct)
 
     def connect(self, camera: CameraSamples, paths: Paths, link: Link) -> tuple[Connection, mi.Color3f]:
-        """The first vertex of each pixel, connected to the suffix of the pixel that ``link`` leads to.
+        """Connects the first vertex of each pixel to the suffix of the pixel that ``link`` leads to.
 
-        Also what emitter sampling finds there with that pixel's numbers.
+        Also returns the light that emitter sampling finds at the first vertex with that pixel's random numbers.
         """
         scene, materials = self.scene, self.materials
-        # --------------- The vertices, from what is kept of them ---------------
+        # --------------- The vertices, from stored intersections ---------------
         ray, importance, _ = camera.rays()
         ray = mi.Ray3f(ray)
         y = paths.hit.compute_surface_interaction(ray)
@@ -190,7 +192,7 @@ class Tiles:
         light = LightSample(suffix.light_d, suffix.light_p, suffix.light_delta, suffix.light_weight, s.p)
         C1 = C * (Le * mis_weight(p, p_light) + reflected(light, s))
 
-        # ------------- On from s: the direction is the same, its density not ---
+        # ------------- On from s: the same direction, another density ----------
         f, p = evaluate(s.bsdf(), s, suffix.wo)
         goes_on = good & suffix.goes_on & (p > 0)
         q2 = dr.select(goes_on, q1 * p, 0)
@@ -202,20 +204,20 @@ class Tiles:
 class Suffix:
     """A path from its second vertex on, with the data to connect another first vertex to it."""
 
-    shared: mi.Bool  # whether others may
-    u_light: mi.Point2f  # the numbers of emitter sampling at the first vertex
-    o: mi.Point3f  # the ray from there to s
+    shared: mi.Bool  # whether other pixels may use it
+    u_light: mi.Point2f  # the random numbers of emitter sampling at the first vertex
+    o: mi.Point3f  # the ray from the first vertex to s
     d: mi.Vector3f
     s: mi.PreliminaryIntersection3f
     light_d: mi.Vector3f  # the emitter sampled at s: see LightSample
     light_p: mi.Float
     light_delta: mi.Bool
     light_weight: mi.Spectrum
-    goes_on: mi.Bool  # whether others may go on along ``wo``
+    goes_on: mi.Bool  # whether other pixels may go on along ``wo``
     wo: mi.Vector3f
-    Le: mi.Spectrum  # emitted at the third vertex
-    p_light: mi.Float  # density with which emitter sampling at s would have found that
-    R: mi.Spectrum  # all other radiance that comes from there
+    Le: mi.Spectrum  # emission at the third vertex
+    p_light: mi.Float  # density with which emitter sampling at s would have found this emission
+    R: mi.Spectrum  # all other radiance from the third vertex
 
     def at(self, lanes: mi.UInt32, active: mi.Bool) -> Suffix:
         def taken(value: Any) -> Any:
@@ -236,27 +238,27 @@ class Connection:
 
 @dataclass
 class Paths:
-    hit: mi.PreliminaryIntersection3f  # its first vertex
-    lives: mi.Bool  # whether it has one
+    hit: mi.PreliminaryIntersection3f  # the first vertex
+    lives: mi.Bool  # whether there is a first vertex
     suffix: Suffix
-    own: Connection  # of the suffix to its own pixel
-    direct: mi.Color3f  # what emitter sampling found at the first vertex
+    own: Connection  # the connection of the pixel to its own suffix
+    direct: mi.Color3f  # the light that emitter sampling found at the first vertex
 
     def both(self, link: Link) -> mi.Bool:
-        """Whether a pixel and the one that ``link`` leads to have a first vertex."""
+        """Whether both the pixel and the one that ``link`` leads to have a first vertex."""
         return self.lives & dr.gather(mi.Bool, self.lives, link.lane, link.active)
 
 
 @dataclass
 class Link:
-    """A link to the same sample of another pixel, by lanes; where it is ``active``, its own link leads back."""
+    """For each lane, the ``lane`` of another pixel with the same sample; if ``active``, that lane's link leads back."""
 
     lane: mi.UInt32
     active: mi.Bool
 
 
 class Grid:
-    """Which pixels are in a tile together, sample by sample."""
+    """The tiles of pixels, for each sample."""
 
     def __init__(self, camera: CameraSamples, side: int):
         self.camera, self.side = camera, side
@@ -264,15 +266,15 @@ class Grid:
         width, height = camera.size
         self.place = camera.pixel % dr.opaque(mi.UInt32, width), camera.pixel // dr.opaque(mi.UInt32, width)
         self.size = width, height
-        # Tiles consist of pixels that far apart; tests move them.
+        # The distance between neighbours in a tile; tests change it.
         self.stride = SHIFTS["dx+"][0]
         offsets = camera.sample % side, camera.sample // side % side
         #: the place of a pixel in its tile
         self.slot = tuple((p // self.stride + o) % side for p, o in zip(self.place, offsets, strict=True))
 
     def others(self) -> list[Link]:
-        """Links to all other pixels of the tile. Places are paired by an exclusive or, so that links lead back."""
-        # Opaque: all connections are one kernel.
+        """Links to all other pixels of the tile. An exclusive or pairs the places, so that links lead back."""
+        # Opaque, so that all connections are the same kernel
         all_bits = [dr.opaque(mi.UInt32, bits) for bits in range(self.side)]
         pairs = [(x, y) for y in all_bits for x in all_bits][1:]
         return [
@@ -281,7 +283,7 @@ class Grid:
         ]
 
     def across(self, axis: int) -> Link:
-        """The link to the neighbour along ``axis`` that is in another tile, for pixels at such a border."""
+        """The link from a pixel at the border of its tile to the neighbour along ``axis`` in the next tile."""
         slot = self.slot[axis]
         step = dr.select(slot == self.side - 1, mi.Int32(self.stride), 0)
         step = dr.select(slot == 0, -mi.Int32(self.stride), step)
@@ -289,7 +291,7 @@ class Grid:
         return Link(link.lane, link.active & (step != 0))
 
     def neighbour(self, x: mi.Int32 | int, y: mi.Int32 | int) -> Link:
-        """The link to the pixel at (x, y) from here; not active where that is outside the image."""
+        """The link to the pixel at the offset (x, y); not active where that is outside the image."""
         (width, height), (here_x, here_y) = self.size, self.place
         there_x, there_y = mi.Int32(here_x) + x, mi.Int32(here_y) + y
         width, height = (dr.opaque(mi.Int32, n) for n in (width, height))
@@ -300,9 +302,9 @@ class Grid:
 
 
 def keep_in_step(camera: CameraSamples) -> None:
-    """Gives all pixels the place in the pixel, the point on the lens and the time of the first one's sample.
+    """Gives the samples of all pixels the first pixel's place within the pixel, point on the lens and time.
 
-    Within a pixel things look different from place to place, which would be the most of the noise of a difference.
+    Otherwise most of the noise of a difference would come from the different places within the two pixels.
     """
     leader = dr.arange(mi.UInt32, dr.width(camera.pixel)) - camera.pixel * dr.opaque(mi.UInt32, camera.block)
     same = camera.at(leader)
@@ -320,7 +322,8 @@ def balanced(members: list[tuple[Link | None, Connection]]) -> mi.Color3f:
     def of(link: Link | None, values: mi.Float) -> mi.Float:
         return dr.gather(mi.Float, values, link.lane, link.active) if link else values
 
-    # As the maker of a suffix: densities with which the others would have made it, each in the lane of the other.
+    # For the suffix of each lane: the densities with which the pixels of the tile would have sampled it, summed. Each
+    # density is stored in the lane of its pixel.
     D1, D2 = mi.Float(0), mi.Float(0)
     for link, c in members:
         D1, D2 = D1 + of(link, c.q1), D2 + of(link, c.q2)

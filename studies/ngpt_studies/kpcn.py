@@ -5,10 +5,12 @@
     specular, its error, features ─ 5x5 ── ... ── 5x5 ── 1x1 ── kernels of ln(1 + specular) ──────── exp - 1 ────────┘
 
 "Kernel-Predicting Convolutional Networks for Denoising Monte Carlo Renderings", sections 4 and 5. There are three
-differences from the paper. The last convolution is 1x1 and reads normalised features, as before all our softmax heads;
-convolutions are implemented in ``ngpt.network.unet``. Both networks read logarithms, since one path may be a thousand
-times as bright as its pixel, but kernels average the same values as in the paper. The inputs do not include gradients
-and variances of the features.
+differences from the paper:
+
+- The last convolution is 1x1 and reads normalised features, as in all our networks with a softmax head.
+- Both networks read logarithms, since one path may be a thousand times as bright as its pixel. Kernels average the same
+  values as in the paper.
+- The inputs do not include gradients and variances of the features.
 """
 
 from dataclasses import dataclass
@@ -25,24 +27,27 @@ from ngpt.network.heads import Head, averaged
 from ngpt.network.transfer import signed_exp, signed_log
 from ngpt.network.unet import Convolution, LastConvolution
 
-# What is added to albedo before light is divided by it [section 5.1].
+# Added to albedo before light is divided by it [section 5.1].
 EPSILON = 0.00316
-# The inputs that it cannot do without.
+# The inputs that are required
 NEEDED = ("primal", *PARTS, "albedo")
-# The paper's kernels; the pixels that they see beyond the padding repeat its border.
+# The side of the paper's kernels. Where a kernel reaches beyond the padding, the border of the padding is repeated.
 MAX_KERNEL = 21
-# The largest logarithm of light that float32 still holds, over EPSILON.
+# The largest logarithm for which float32 holds the light divided by EPSILON
 LARGEST = 80.0
 
 
 class KPCN(nn.Module):
-    """Both networks: channels (N, C, H, W), as ``ngpt.network.features.encode`` gives them, to the logits of kernels.
+    """Both networks: from channels (N, C, H, W) of ``ngpt.network.features.encode`` to logits (N, outputs, H, W).
 
-    ``inputs``   the layers that these channels are, in order, ``NEEDED`` among them
-    ``width``    the channels of each 5x5 convolution, ``layers`` of them in each network
-    ``outputs``  the number of logits of both networks, diffuse light first. A network reads its own part of the light
-                 and of the errors, and all other inputs but the primal
-    ``zero`` and ``normalise`` are as in ``LastConvolution``; ``radius`` is the radius of the receptive field
+    Each network reads its own part of the light, the standard error of that, and all other inputs except the primal.
+
+    ``inputs``   the layers of these channels, in order; they must include ``NEEDED``
+    ``width``    the number of channels of each 5x5 convolution
+    ``layers``   the number of 5x5 convolutions in each network
+    ``outputs``  the number of logits of both networks, diffuse light first
+    ``zero``, ``normalise``  as in ``LastConvolution``
+    ``radius``   the radius of the receptive field
     """
 
     alignment = 1
@@ -83,7 +88,7 @@ class KPCN(nn.Module):
 
 @dataclass(frozen=True)
 class SplitKernels(Head):
-    """In each pixel weights (softmax) for ``size`` x ``size`` pixels, for each of the two parts of the light."""
+    """Weights (softmax) of ``size`` x ``size`` pixels around each pixel, for each of the two parts of the light."""
 
     start: tuple[str, ...] = PARTS
     normalise: ClassVar[bool] = True
@@ -112,12 +117,15 @@ class SplitKernels(Head):
         return signed_log(light + signed_exp(averaged(of_specular, signed_log(specular), self.size)))
 
     def graph(self, op: Any, prediction: Any, images: list[Any]) -> Any:
-        raise NgptError("kernels of split light have no ONNX graph")
+        raise NgptError("network 'kpcn' cannot be exported, since it has no ONNX graph; run it in PyTorch")
 
 
 class Kpcn(Kind):
-    """Of the fields of a configuration, ``channels`` has the width of its convolutions and ``units`` their number, one
-    each; ``kernel`` is the side of the kernels of both parts of the light."""
+    """The kind of network "kpcn".
+
+    In its configuration, ``channels`` has one entry, the width of the convolutions, and ``units`` has one, their
+    number. ``kernel`` is the side of the kernels of both parts of the light.
+    """
 
     goes_without = ("base", "start", "quiet", "scales", "demodulate", "sweeps", "pooling")
 
@@ -127,7 +135,7 @@ class Kpcn(Kind):
             raise NgptError(f"network 'kpcn' needs the inputs {', '.join(NEEDED)}; lacks {', '.join(missing)}")
         if type(config.kernel) is not int or config.kernel not in range(3, MAX_KERNEL + 1, 2):
             most = MAX_KERNEL
-            raise NgptError(f"kernel = {config.kernel!r}: of 'kpcn' it must be an odd number from 3 to {most}")
+            raise NgptError(f"kernel = {config.kernel!r}: must be an odd number from 3 to {most} for 'kpcn'")
         if len(config.channels) > 1:
             raise NgptError(f"channels {list(config.channels)}: 'kpcn' has one level; give one number")
 

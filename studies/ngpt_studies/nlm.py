@@ -1,4 +1,4 @@
-"""Joint non-local means of scikit-image as a method, which is imported when it is first called."""
+"""Joint non-local means of scikit-image as a method. The first call imports scikit-image."""
 
 from importlib.util import find_spec
 
@@ -9,8 +9,8 @@ from ngpt.methods import Method
 from ngpt.repair import Repaired
 from ngpt.system.install import install_command
 
-# The bandwidth of nlm in standard deviations of the noise, and the weights of features against it: the noisier the
-# image, the more they count. About the best of 20 choices on four scenes at 4, 16 and 64 spp.
+# The bandwidth in standard deviations of the noise, and the weights of features in units of the bandwidth: the noisier
+# the image, the more they count. These are about the best of 20 choices on four scenes at 4, 16 and 64 spp.
 _NLM_BANDWIDTH = 1.7
 _NLM_FEATURES = {"albedo": 16.0, "normal": 8.0}
 
@@ -20,11 +20,12 @@ def missing() -> str:
 
 
 def nlm(data: Repaired) -> np.ndarray:
-    """Joint non-local means of scikit-image: patches compared in log radiance, albedo and normal, radiance averaged.
+    """The image denoised by joint non-local means, (H, W, 3) float32.
 
-    [Buades et al. 2005, "A non-local algorithm for image denoising"; features as in Rousselle et al. 2013, "Robust
-    denoising using feature and color information".] The patches are 5x5 in a window of 19x19 pixels. The
-    logarithm of negative radiance is that of its size, with its sign.
+    Patches are compared in log radiance, albedo and normal; radiance is averaged. The patches are 5x5 in a window of
+    19x19 pixels. The logarithm of negative radiance is minus the logarithm of its absolute value. [Buades et al. 2005,
+    "A non-local algorithm for image denoising"; features as in Rousselle et al. 2013, "Robust denoising using feature
+    and color information"]
     """
     if missing():
         raise NgptError(f"method 'nlm': {missing()}")
@@ -37,8 +38,8 @@ def nlm(data: Repaired) -> np.ndarray:
     assert data.noise is not None
     deviations = np.sqrt(np.maximum(np.nan_to_num(data.noise), 0)) / (scale + size)
     sigma = float(deviations.mean(dtype=np.float64))
-    # The image itself travels along, too small to count in the distance: its means are of radiance, not of logarithms,
-    # which would darken it.
+    # Radiance is averaged in further channels, which are too small to count in the distance. Averages of logarithms
+    # would darken the image.
     tiny = 1e-6 / max(float(size.max()), 1e-30)
     bandwidth = max(_NLM_BANDWIDTH * sigma, 1e-6)
     guides = [bandwidth * weight * data.features[name] for name, weight in _NLM_FEATURES.items()]

@@ -1,4 +1,4 @@
-"""The entries of the samplers. Nothing here imports Mitsuba."""
+"""The registry's entries of the samplers. This module does not import Mitsuba."""
 
 from data_gen.budget import LANE_BYTES
 from data_gen.samplers import Option, Sampler

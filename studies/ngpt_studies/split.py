@@ -1,11 +1,11 @@
-"""A path tracer whose light is in two layers, by the lobe of its first scattering event: diffuse and specular.
+"""A path tracer that splits light into two layers by the lobe of its first scattering event: diffuse and specular.
 
-Kernel-predicting networks denoise the two apart [Bako et al. 2017, "Kernel-Predicting Convolutional Networks for
-Denoising Monte Carlo Renderings", section 5.1]. Light that reaches the camera in several lobes of one vertex is shared
-between the layers in proportion to them, f_diffuse / f (``Lobes``), by whichever technique it was found: that has less
-noise than to go by the lobe which was sampled, and the same mean. The rest, mirrors, glass, gloss, and emission seen
-through holes, is specular, and primal = direct + diffuse + specular. Holes (null events) are no scattering. Paths are
-sampled as by Mitsuba's ``path``, steps taken as in ``gpt_simple``.
+Kernel-predicting networks denoise the two separately [Bako et al. 2017, "Kernel-Predicting Convolutional Networks for
+Denoising Monte Carlo Renderings", section 5.1]. If several lobes of the vertex scatter light to the camera, the layer
+``diffuse`` gets the share f_diffuse / f of it (``Lobes``), for emitter and BSDF sampling alike. A split by the sampled
+lobe would have the same mean, but more noise. All other light is specular: mirrors, glass, gloss, and emission seen
+through holes. So primal = direct + diffuse + specular. Holes (null events) do not count as scattering events. Paths are
+sampled as by Mitsuba's ``path``, with the steps of ``gpt_simple``.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def make(scene: mi.Scene) -> SamplePass:
 
 
 def samples(scene, limits: Limits, lobes: Lobes, camera: CameraSamples) -> dict:
-    """Layers: one path, and a sample of features, for each camera sample."""
+    """The layers of one path and one sample of the features, for each camera sample."""
     ray, importance, _ = camera.rays()
     parts = trace(scene, limits, lobes, camera.random.clone(), ray, importance)
     diffuse, specular = (to_rgb(part, ray.wavelengths) for part in parts)
@@ -51,10 +51,10 @@ def samples(scene, limits: Limits, lobes: Lobes, camera: CameraSamples) -> dict:
 
 @dr.syntax
 def trace(scene, limits: Limits, lobes: Lobes, random, ray, β) -> tuple[mi.Spectrum, mi.Spectrum]:
-    """Diffuse and specular light of paths that begin with ``ray``, of importance ``β``."""
+    """The diffuse and the specular light of paths that begin with ``ray`` and the importance ``β``."""
     diffuse, specular = mi.Spectrum(0), mi.Spectrum(0)
     x = scene.ray_intersect(mi.Ray3f(ray))
-    # The diffuse share of the light that comes to x from beyond, once that is settled
+    # The diffuse share of the light that reaches x; the first scattering event settles it.
     share, settled = mi.Spectrum(0), mi.Bool(False)
     depth = mi.UInt32(1)
     active = x.is_valid() & (depth < limits.max_depth)
@@ -68,7 +68,7 @@ def trace(scene, limits: Limits, lobes: Lobes, random, ray, β) -> tuple[mi.Spec
         diffuse += here * light
         specular += (1 - here) * light
 
-        # BSDF sampling: a Dirac delta is not diffuse, a hole settles nothing
+        # BSDF sampling: a Dirac delta is not diffuse, and a hole does not settle the share
         share = dr.select(settled, share, lobes.diffuse(x, step.wo, asked & step.smooth))
         settled |= ~step.hole
         light = step.β1 * step.L_bsdf
@@ -84,23 +84,23 @@ def trace(scene, limits: Limits, lobes: Lobes, random, ray, β) -> tuple[mi.Spec
     return diffuse, specular
 
 
-# Materials that evaluate all of their lobes whatever ``BSDFContext.type_mask`` says, by the names of their classes.
+# The classes of materials that ignore ``BSDFContext.type_mask``: they always evaluate all of their lobes.
 DEAF = ("Principled", "PrincipledThin")
-# Their parameters that weigh diffuse lobes against all others, as mi.traverse() spells them, at any nesting.
+# The keys in mi.traverse(), at any nesting, of their parameters that weigh diffuse lobes against all others
 _NOT_DIFFUSE = re.compile(r"(?:^|(.*)\.)(metallic|spec_trans)(?:\.value|\.data)?$")
-# Stands for: this material hears the mask.
+# In place of s, for materials that respect the mask
 _HEARS = -1.0
 
 
 class Lobes:
-    """The share of diffuse lobes (``BSDFFlags.Diffuse``, reflection and transmission) in what a material scatters.
+    """The share of diffuse lobes (``BSDFFlags.Diffuse``, reflection and transmission) in the light a material scatters.
 
-    Materials evaluate only some of their lobes if ``BSDFContext.type_mask`` asks for it, and hand the mask on to those
-    inside. Principled materials ignore it. For these, and for materials that hold one, the diffuse part is approximated
-    by Lambert's law, s ρ |cos θ| / π with s = (1 - metallic) (1 - spec_trans) and the reflectance
-    ρ = ``eval_diffuse_reflectance()``; it is clamped to all that the material scatters. Textured parameters count with
-    their mean, and several such materials in one with the mean of their s. Mitsuba does not list materials inside shape
-    groups: all that principled materials scatter there counts as diffuse.
+    Most materials evaluate only the lobes in ``BSDFContext.type_mask``, and pass the mask on to nested materials.
+    Principled materials ignore it. For these, and for materials that contain one, the diffuse part is approximated by
+    Lambert's law, s ρ |cos θ| / π with s = (1 - metallic) (1 - spec_trans) and the reflectance
+    ρ = ``eval_diffuse_reflectance()``; it is at most all the light that the material scatters. Textured parameters
+    count with their mean. If a material contains several principled ones, s is the mean of theirs. Mitsuba does not
+    list materials inside shape groups; all light that principled materials scatter there counts as diffuse.
     """
 
     def __init__(self, scene: mi.Scene):
@@ -111,10 +111,10 @@ class Lobes:
         self.lambert = ByMaterial(mi.Float(table))
 
     def diffuse(self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
-        """The share, in [0, 1] for each wavelength, in the light that goes from ``wo`` (local) into ``si.wi``.
+        """The diffuse share, in [0, 1] for each wavelength, of the light scattered from ``wo`` (local) to ``si.wi``.
 
-        It is 0 where there is no such light. It holds for directions that were sampled or chosen otherwise, but not for
-        Dirac deltas, which are never diffuse.
+        It is 0 where no light is scattered. ``wo`` may come from any technique, except from a Dirac delta, which is
+        never diffuse.
         """
         bsdf = si.bsdf()
         flags = bsdf.flags()
@@ -129,12 +129,12 @@ class Lobes:
         ρ = bsdf.eval_diffuse_reflectance(si, active & deaf & reaches)
         part = dr.select(deaf, dr.select(reaches, s * dr.abs(wo.z) / dr.pi, 0) * ρ, part)
         share = part / f
-        # ``roughplastic`` says NaN below its horizon.
+        # ``roughplastic`` is NaN below its horizon.
         return dr.select(active & (f > 0) & dr.isfinite(share), dr.clip(share, 0, 1), 0)
 
 
 def _lambert(bsdf: mi.BSDF) -> float:
-    """s of a material that is, or holds, one that does not hear the mask; ``_HEARS`` of all others."""
+    """s of a material that ignores the mask, or contains one that does; ``_HEARS`` for all others."""
     params = mi.traverse(bsdf)
     if not any(getattr(node, "class_name", str)() in DEAF for node in params.hierarchy):
         return _HEARS

@@ -3,7 +3,7 @@
     python -m ngpt_studies.stability DIR
 
 DIR is a folder of results with pictures of all seeds (images = "all", configs/eval-stability.toml). A still scene
-rendered with a new seed for each frame should not move; what does move flickers. Writes DIR/stability.json, a table
+rendered with a new seed for each frame should not change; all change is flicker. Writes DIR/stability.json, a table
 DIR/stability.md, and for each scene and method DIR/stability/SCENE-SPP-METHOD.png. In this picture, as with a rolling
 shutter, each band of rows comes from another seed, so flicker shows as steps between bands; bias does not show.
 """
@@ -29,13 +29,15 @@ from ngpt.system.writing import markdown_table, write_bytes, write_json, write_t
 
 
 def flicker_and_bias(images: np.ndarray, *halves: np.ndarray, share: float = 0.001) -> dict[str, float]:
-    """The two parts of relMSE over seeds, of images (N, H, W, 3), without the worst 0.1 % of the pixels of each.
+    """The two parts of the relMSE of ``images`` (N, H, W, 3) over seeds; their sum is the expected relMSE.
 
     ``flicker``  mean of v / (r² + 1e-3), v the sample variance over the N images
-    ``bias``     mean of ((x - r)² - v / N) / (r² + 1e-3), x the mean image; what its own noise adds to the square is
-                 taken off, so it is near 0 (of either sign) for an unbiased method
-    Their sum is the expected relMSE. With the two ``halves`` of a reference the square is (x - a)(x - b), and r their
-    mean. Raises NgptError for fewer than two images, and for another size.
+    ``bias``     mean of ((x - r)² - v / N) / (r² + 1e-3), x the mean image. v / N is what the noise of x adds to the
+                 square, so the bias of an unbiased method is near 0, of either sign
+
+    Both means leave out the ``share`` of pixels with the largest errors. With the two ``halves`` a, b of a reference,
+    the square is (x - a)(x - b), and r is their mean. Raises NgptError for fewer than two images, and for a reference
+    of another size.
     """
     if len(images) < 2:
         raise NgptError(f"stability needs images of at least 2 seeds; there is {len(images)}")
@@ -53,14 +55,17 @@ def flicker_and_bias(images: np.ndarray, *halves: np.ndarray, share: float = 0.0
 
 
 def rolling_shutter(images: np.ndarray) -> np.ndarray:
-    """One image (H, W, 3) of N (N, H, W, 3): rows in N bands from top to bottom, band i of image i."""
+    """One image (H, W, 3) from N images (N, H, W, 3): N bands of rows from top to bottom, band i from image i."""
     height = images.shape[1]
     band = np.arange(height) * len(images) // height
     return images[band, np.arange(height)]
 
 
 def study(out: Path) -> list[dict[str, Any]]:
-    """Writes what the module's description says and returns the rows of stability.json."""
+    """Writes the files that the module's docstring lists, and returns the rows of stability.json.
+
+    Raises NgptError for a picture that is missing.
+    """
     results = read_results(out)
     seeds = range(results["settings"]["seeds"])
     rows = []
@@ -86,7 +91,7 @@ def study(out: Path) -> list[dict[str, Any]]:
 
 
 def table(rows: list[dict[str, Any]], seeds: int) -> str:
-    """Markdown: flicker and bias of each method, the steadiest bold."""
+    """A table in Markdown: flicker and bias of each method; the least flicker is bold."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     rows_of_text = []
     title = [f"Flicker / bias, the two parts of relMSE (trimmed), over {seeds} seeds; the steadiest in bold.", ""]

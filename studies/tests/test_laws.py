@@ -1,13 +1,22 @@
 """Laws of samplers in scenes that are of interest for studies; those of quick scenes are in tests/data_gen/laws."""
 
+import media_scenes
 import pytest
 from data_gen_scenes import fog, hidden_lamp
 from registered import slow
+from test_bits import have_the_same_bits
 from test_energy import have_no_gradients
-from test_refused import is_refused
+from test_frozen import assert_a_scene_goes_with_its_last_render
+from test_plugins import assert_there_whatever_the_variants
+from test_points import assert_claims_are_those_over_seeds
+from test_refused import endless, is_refused
 from test_unbiased import LONG, Case, holds
+from unbiased import load
 
 from data_gen.adaptive import Adaptive
+from data_gen.samplers import find
+from data_gen.scenes.facts import Facts
+from ngpt.errors import NgptError
 
 CASES = [
     *(Case("gpt-tiles", scene, spp=64) for scene in ("diffuse", "glossy", "lens", "courtyard")),
@@ -26,6 +35,8 @@ REFUSED = [
     ("gpt-tiles", fog, {}, "'gpt-tiles' knows only 'path'"),
     ("gpt-tiles", hidden_lamp, {}, "hides emitters; use --sampler gpt"),
     ("gpt-tiles", "diffuse", {"adaptive": Adaptive()}, "'gpt-tiles' depend on each other and cannot be adaptive"),
+    ("gbeams", media_scenes.smoke, {}, r"density varies.* use --sampler gpt, .*bre \(no gradients\), .*gvpm"),
+    ("vpm", endless, {}, "infinitely far away comes through a medium without end"),
     ("split", fog, {}, "'split' knows only 'path'"),
     ("split", hidden_lamp, {}, "hides emitters; use --sampler gpt"),
 ]
@@ -36,6 +47,37 @@ def test_refused(renderer, sampler, scene, options, message):
     is_refused(renderer, sampler, scene, options, message)
 
 
-@pytest.mark.parametrize("name", ["split", "gpt-tiles"])
+def test_plugins_refuse_too(renderer):
+    with pytest.raises(NgptError, match=r"'gbre' .* media whose density varies, .*; use --sampler gpt, .* bre"):
+        renderer.load_dict({"type": "gbre"}).prepare(load(renderer, media_scenes.smoke, (8, 8)))
+
+
+def test_plugins_are_made_anew_for_each_variant(renderer):
+    """Those that share a base class beside the one of all as well."""
+    assert_there_whatever_the_variants("gpm", "vpm", "gvpm", "beams", "gbeams", "planes", "gplanes", "gvcm")
+
+
+def test_where_there_are_no_media_points_on_surfaces_do():
+    with pytest.raises(NgptError, match="there are no media, and 'ppm' has the same image"):
+        find("vpm", Facts("volpath", ()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["vpm", "gvpm", "beams"])
+def test_photons_in_grids_give_the_same_bits_whatever_the_passes(renderer, monkeypatch, name):
+    have_the_same_bits(renderer, monkeypatch, name, media_scenes.wisps, 3, {})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "scene"), [("gpm", "glossy"), ("gbre", fog)])
+def test_claims_are_those_over_seeds(renderer, name, scene):
+    assert_claims_are_those_over_seeds(renderer, name, scene, (32, 24), 9)
+
+
+def test_a_scene_goes_with_its_last_render(renderer):
+    assert_a_scene_goes_with_its_last_render(renderer, "gpm")
+
+
+@pytest.mark.parametrize("name", ["split", "gpt-tiles", "gpm", "gvcm"])
 def test_paths_of_no_edge_and_of_one_have_no_gradients(renderer, name):
     have_no_gradients(renderer, name)

@@ -1,7 +1,6 @@
 """Cameras: every sampler before every one of Mitsuba's, right or refused; and what samplers know of a camera."""
 
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,9 +29,7 @@ from data_gen.frames.motion import motion_vectors, seen, snapshot
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.eye import Eye
 from data_gen.paths.light_ends import LightEnds
-from data_gen.paths.walk import Limits
 from data_gen.render import render_stack
-from data_gen.samplers.photons.gradients.camera import CameraPaths
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.radius import pixel_width
 from data_gen.scenes.facts import Facts
@@ -87,14 +84,6 @@ def test_right_or_refused(renderer, sampler, view):
 def test_fog_ends_at_the_far_plane(renderer, sampler):
     """Nothing scatters beyond it, and what does not scatter before it is gone."""
     check(renderer, sampler, "far plane", batches=10, spp=32, media=True)
-
-
-def test_paths_and_their_copies_to_photons_end_at_the_far_plane(renderer):
-    """The cells of the matrix that show it are slow."""
-    _, ray, _ = eye_of(renderer, camera(fov=40, near_clip=1.6, far_clip=4.0))
-    walk = CameraPaths(SimpleNamespace(limits=Limits(4, 100)), None)
-    assert np.array_equal(np.array(walk.first(ray, 1.0, True).ray.maxt), np.array(ray.maxt))
-    assert np.array(ray.maxt).max() < 4
 
 
 def eye_of(mi, sensor, samples=64):
@@ -217,7 +206,7 @@ def test_lamps_know_their_medium_wherever_the_camera_is(renderer, kind):
     ball = {"type": "sphere", "bsdf": {"type": "null"}, "interior": fog}
     lamp = {"type": "sphere", "radius": 0.1, "center": [0, 0.5, 0], "emitter": {"type": "area"}}
     scene = mi.load_dict({"type": "scene", "meter": meter, "ball": ball, "lamp": lamp})
-    ways = Fog(scene, scene.sensors()[0], LightEnds(scene), "vpm")
+    ways = Fog(scene, scene.sensors()[0], LightEnds(scene), "bre")
     inside, outside = (ways.around(scene, mi.Point3f([0.0], [y], [0.0])) for y in (0.7, 1.3))
     assert (inside != None)[0] and not (outside != None)[0]  # noqa: E711 - arrays of pointers
 

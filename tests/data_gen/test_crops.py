@@ -1,6 +1,6 @@
 """Crops of training sets: shots whose motion is true and scenes that stay, inputs with uneven samples, and repairs."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import pairwise
 
 import numpy as np
@@ -8,10 +8,12 @@ import pytest
 from full_stack import full_stack
 from unbiased import load
 
+from ngpt.errors import NgptError
 from ngpt.merging import merge
 from ngpt.methods import reconstruct
 from ngpt.sequence.warp import warped
 from ngpt.stack import GradientStack
+from ngpt.subpixels import FINE, means, spread, stored
 from ngpt.training.dataset import Dataset, problems
 
 pytest.importorskip("mitsuba")
@@ -66,6 +68,8 @@ def made_set(around, tmp_path, monkeypatch):
     monkeypatch.setattr(cameras, "Surroundings", lambda scene, box: around)
     monkeypatch.setattr(loading, "load_scene", lambda *arguments, merged: None)
     monkeypatch.setattr(crops, "made_scene", lambda *arguments: None)
+    # The room outlives its shards, and so must its kernels: Dr.Jit ends the process where they are gone.
+    monkeypatch.setattr("drjit.flush_kernel_cache", lambda: None)
 
     def make(**changes):
         jobs.generate(config_of(**changes), tmp_path, jobs.Serial())
@@ -163,6 +167,56 @@ def test_a_set_of_both_kinds_by_a_sampler_without_gradients(made_set, monkeypatc
         assert np.all(crop.stack(0)["samples"] == crop.spp[0])
     shard = data[0].shard
     assert shard.shape("primal_se")[1:] == (2, 16, 16, 3) and "dx" not in shard.names
+
+
+@pytest.mark.parametrize("changes", [{}, {"sampler": "gpt"}, {"adaptive": 0.5, **SHARED_OUT}, {"frames": 2}])
+def test_a_set_with_subpixels(made_set, changes, tmp_path):
+    """Those of the same renders, whatever else the set asks for; pixels are their means, to the bit."""
+    data = made_set(crops=1, subpixels=2, **changes)
+    for crop in data:
+        for k in range(crop.inputs):
+            stack = crop.stack(k)
+            assert set(stack.fine) == set(FINE) and stack.number("ngpt:featureNoise") is not None
+            for name in FINE:
+                assert stack.fine[name].shape == (32, 32, 3) and stack.fine[name].std() > 0
+                assert np.array_equal(means(stack.fine[name], 2), stack[name])
+    write_card(tmp_path)
+    assert f"{crop.inputs} inputs each, with 2x2 subpixels;" in (tmp_path / "README.md").read_text()
+
+
+def test_views_and_references_are_those_without_subpixels(around):
+    ((plain, told),) = crops.make_crop(config_of(size=24), around, "x", 0)
+    ((data, told_fine),) = crops.make_crop(config_of(size=24, subpixels=2), around, "x", 0)
+    assert told_fine["view"] == told["view"] and told_fine["seeds"] == told["seeds"]
+    assert np.array_equal(data.reference, plain.reference) and not plain.stacks[0].fine
+    stack = render_stack(around.scene, 2, told["seeds"][0], "primal", unbiased=True, subpixels=2)
+    assert all(np.array_equal(data.stacks[0].fine[name], stack.fine[name]) for name in FINE)
+    assert np.allclose(data.stacks[0]["primal"], plain.stacks[0]["primal"], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"subpixels": 3}, "data configuration: subpixels = 3: 1, 2, 4"),
+        ({"subpixels": 2, "sampler": "bdpt"}, "sampler 'bdpt' puts light on any pixel and has no subpixels"),
+    ],
+)
+def test_subpixels_that_cannot_be_kept_are_refused(changes, message):
+    with pytest.raises(NgptError, match=message):
+        config_of(**changes)
+
+
+def test_repaired_inputs_keep_their_subpixels():
+    stack = full_stack(20, 24)
+    stack = stack.replace(direct=0 * stack["primal"])
+    fine = {name: stored(name, spread(stack[name], 2)) for name in FINE}
+    fine["primal"][7, 9] = fine["albedo"][30, 31] = np.nan
+    given = replace(stack.replace(**{name: means(layer, 2) for name, layer in fine.items()}), fine=fine)
+    made, bad = crops.finite(given)
+    assert bad >= 1
+    for name in FINE:
+        assert np.isfinite(made.fine[name]).all() and np.array_equal(means(made.fine[name], 2), made[name])
+    assert np.array_equal(made.fine["primal"][:6], fine["primal"][:6])
 
 
 def test_sample_counts_are_stratified():

@@ -9,6 +9,8 @@ pytest.importorskip("mitsuba")
 
 import data_gen.film.gradient_film as module
 from data_gen.film import GradientFilm as film
+from data_gen.film.nets import split
+from data_gen.film.statistics import contrast
 
 
 def fill(mi, film, samples, **kwargs):
@@ -195,3 +197,18 @@ def test_what_is_put_and_what_is_splatted_are_one_value(renderer):
 def test_films_of_independent_samples_take_no_splats(renderer):
     with pytest.raises(ValueError, match="make it with batches"):
         film(2, 1).splat("primal", renderer.UInt32([0]), renderer.Color3f(1))
+
+
+@pytest.mark.parametrize("strands", [1, 2, 5])
+def test_contrasts_are_of_the_first_samples_and_those_behind_them(renderer, rng, strands, monkeypatch):
+    """Whichever strands these are in; a strand may have none between two powers of two."""
+    monkeypatch.setattr(module, "_STRANDS", 6 * strands)
+    samples = rng.normal(size=(6, 160, 3)).astype(np.float32)
+    target = film(3, 2, net=16)
+    for n in range(16, 161, 16):
+        fill(renderer, target, samples[:, n - 16 : n])
+        target.end_pass()
+        n1, n2 = split(n), n - split(n)
+        later, earlier = samples[:, n1:n].mean(axis=1), samples[:, :n1].mean(axis=1)
+        found = contrast(target.moments["primal"], strands, np.full(6, n))
+        assert np.allclose(found, (later - earlier) * math.sqrt(n1 * n2) / n, atol=1e-6), n

@@ -19,9 +19,9 @@ MOVES = np.array([[0, 1, 4], [2, 1, 4]], np.float32)
 TURNS = np.array([[0, 0, 0, 1], Rotation.from_euler("y", 60, degrees=True).as_quat()], np.float32)
 
 
-def content(buffer, way="LINEAR", moves=MOVES, turns=TURNS):
+def content(buffer, way="LINEAR", moves=MOVES, turns=TURNS, times=TIMES):
     """A camera that moves and turns, in a node that stands one unit higher; and its bytes."""
-    parts = [TIMES, np.asarray(moves, np.float32), np.asarray(turns, np.float32)]
+    parts = [times, np.asarray(moves, np.float32), np.asarray(turns, np.float32)]
     data, views, accessors = b"", [], []
     for part, kind in zip(parts, ("SCALAR", "VEC3", "VEC4"), strict=True):
         views.append({"buffer": 0, "byteOffset": len(data), "byteLength": part.nbytes})
@@ -92,6 +92,16 @@ def test_steps_and_splines(tmp_path):
     spline = read(tmp_path, content(embedded, "CUBICSPLINE", moves, turns)[0], 10)
     # Without tangents the way eases in and out: 3 t² - 2 t³.
     assert np.isclose(spline.at(2).to_world[0, 3], 2 * (3 * 0.04 - 2 * 0.008))
+
+
+def test_a_spline_of_any_length_has_the_speed_that_its_tangents_say(tmp_path):
+    """A cubic of time, by its values and derivatives at two seconds and at five, is that cubic in between."""
+    times, cubic = np.array([2, 5], np.float32), np.polynomial.Polynomial([1, -2, 0.5, 0.1])
+    keys = [[cubic.deriv()(t), cubic(t), cubic.deriv()(t)] for t in times]
+    moves, turns = np.zeros((6, 3)), np.insert(np.zeros((4, 4)), [1, 3], TURNS, axis=0)
+    moves[:, 0] = np.ravel(keys)
+    path = read(tmp_path, content(embedded, "CUBICSPLINE", moves, turns, times)[0], 10)
+    assert all(np.isclose(path.at(10 * t).to_world[0, 3], cubic(t), atol=1e-5) for t in (2, 2.5, 3.5, 4.8))
 
 
 @pytest.mark.parametrize(

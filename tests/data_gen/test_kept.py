@@ -157,7 +157,7 @@ def test_kept_references_are_met_again_with_new_inputs(monkeypatch, tmp_path):
         assert all(np.all(crop.stack(0)["primal"] == crop.reference + 1) for crop in data)
     assert len(list(tmp_path.rglob("*.safetensors"))) == 3
     # Another configuration has others, one with other inputs the same.
-    places = [home(replace(config, **other), tmp_path) for other in ({}, {"spp": (3, 9)}, {"seed": 1})]
+    places = [home(replace(config, **other), tmp_path) for other in ({}, {"spp": (3, 9), "subpixels": 2}, {"seed": 1})]
     assert places[0] == places[1] != places[2]
 
 

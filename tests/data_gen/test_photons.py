@@ -5,28 +5,24 @@ from functools import partial
 import media_scenes
 import numpy as np
 import pytest
-from bdpt_scenes import SCENES
 from data_gen_scenes import _scale
-from photon_laws import passes, traced, world_of
-from references import REFERENCES, references
+from photon_laws import (
+    assert_lamps_behind_grids_are_seen,
+    assert_recorded_once,
+    passes,
+    traced,
+    world_of,
+)
 from renders import dr, mi
-from unbiased import assert_unbiased, load, render_ours
+from unbiased import load
 
-from data_gen.film import GradientFilm
-from data_gen.passes import recording
-from data_gen.paths.camera import CameraSamples
-from data_gen.paths.frozen import Frozen
 from data_gen.paths.light_ends import LightEnds
-from data_gen.render import render_stack
 from data_gen.samplers import find
 from data_gen.samplers.photons.map import trace
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.radius import ALPHA, shrunk
-from data_gen.samplers.photons.map.vertices import vertex_of
-from data_gen.scenes.builtin import _camera, _diffuse, _rgb, _sphere
 from ngpt.errors import Interrupted
-from ngpt.testing import z_test
 
 # ------------------------- The grid -------------------------
 
@@ -63,7 +59,7 @@ def test_the_grid_finds_what_brute_force_finds(renderer, points, radius):
 @pytest.mark.parametrize("radius", [0.3, 0.05, 0.01])
 def test_the_grid_finds_what_is_beside_a_ray(renderer, points, radius):
     """Each point once, whatever its cell, on and beyond the box too; rays without end are cut at the box."""
-    from data_gen.samplers.photons.media.bre import BALL
+    from data_gen.samplers.photons.bre import BALL
 
     mi, (rng, points, exist, number) = renderer, points
     grid = Grid(mi.Point3f(points.T), mi.Bool(exist), BALL * radius)
@@ -95,83 +91,30 @@ def test_the_grid_finds_what_is_beside_a_ray(renderer, points, radius):
 # ------------------------- Maps -------------------------
 
 
-def entries(photons, *names):
-    """Fields of the vertices of a map, and the rows of their parents among them; other places of the map are empty."""
-    exists = np.array(photons.t) > 0
-    values = [np.array(getattr(photons, name)).T[exists] for name in names]
-    row, parent = np.cumsum(exists) - 1, np.array(photons.parent)[exists]
-    first = np.array(photons.density)[exists] == 0
-    # Parents of those that begin a further map are in the one before.
-    known = np.where(first, 0, np.minimum(parent, len(row) - 1))
-    return *values, np.where(first, parent, row[known]), first
-
-
-def test_vertices_know_their_parents(renderer):
-    """From the parent a vertex lies along its direction; what the ray met there is found again."""
-    world = world_of(load(renderer, SCENES["glass"], (8, 8)))
-    start, (photons,) = traced(world)
-    p, n, d, t, depth, parent, first = entries(photons, "p", "n", "d", "t", "depth")
-    assert 0 < first.sum() <= 4096 and (parent[~first] < np.flatnonzero(~first)).all()
-    origin = np.where(first[:, None], np.array(start.ray.o).T[parent * first], p[parent * ~first])
-    assert np.abs(origin + d * t[:, None] - p).max() < 1e-3
-    known = ~first & (depth > 0) & (depth[parent] > 0)
-    assert known.any() and (depth[known] == depth[parent[known]] + 1).all()
-    assert (depth == 0).mean() > 0.05  # on glass
-    si = vertex_of(photons, renderer.UInt32(np.flatnonzero(np.array(photons.t) > 0)))
-    assert np.abs(np.array(si.p).T - p).max() < 1e-4 and np.array(si.is_valid()).all()
-    assert ((np.array(si.n).T * n).sum(axis=1) > 0.999).mean() > 0.999
-
-
 def test_maps_of_many_vertices_are_cut(renderer, monkeypatch):
-    """Into some, which have the same photons each once, whose parents are with them."""
+    """Into some, which have the same photons each once."""
     world = world_of(load(renderer, "diffuse", (8, 8)))
-    _, (whole,) = traced(world)
+    (whole,) = traced(world)
     monkeypatch.setattr(trace, "VERTICES_PER_PATH", 2)
-    _, parts = traced(world)
+    parts = traced(world)
     assert len(parts) > 2
-
-    def gathered(part, name):
-        value, depth, *_ = entries(part, name, "depth")
-        return value[depth > 0]
-
     for name in ("p", "β", "d"):
         together = np.concatenate([gathered(part, name) for part in parts])
         assert np.allclose(np.sort(together, axis=0), np.sort(gathered(whole, name), axis=0), rtol=1e-3, atol=1e-4)
-    for part in parts:
-        p, d, t, depth, parent, first = entries(part, "p", "d", "t", "depth")
-        some = ~first & (depth > 0)
-        assert np.abs(p[parent[some]] + (d * t[:, None] - p)[some]).max(initial=0) < 1e-3
+
+
+def gathered(photons, name):
+    return np.array(getattr(photons, name)).T[np.array(photons.depth) > 0]
 
 
 def test_kernels_are_recorded_once_and_make_the_same_bits(renderer, monkeypatch, recordings):
-    """As if they were recorded in each pass."""
-    scene = load(renderer, "diffuse", (16, 12))
-
-    def rendered(others=()):
-        take, film = find("gpm").made(scene), GradientFilm(16, 12, batches=True)
-        for i in range(3):
-            with recording():
-                take(CameraSamples(scene.sensors()[0], 3, 1, i), film)
-                film.end_pass(1)
-            others = [load(renderer, other, (4, 4)) for other in others] if i == 0 else []
-        return film.develop()
-
-    layers = rendered()
-    # A function is recorded again where two arrays happen to be of one size, or of size 1.
-    assert len(recordings.of) > 8 and recordings.total() <= len(recordings.of) + 2
-    # Other scenes come and go.
-    with_others = rendered([SCENES["areas"]])
-    monkeypatch.setattr(Frozen, "__call__", lambda self, f, *args: f(*args))
-    anew = rendered()
-    assert layers.keys() == anew.keys()
-    for name in layers:
-        assert np.array_equal(layers[name], anew[name]) and np.array_equal(layers[name], with_others[name]), name
+    assert_recorded_once(renderer, monkeypatch, recordings, "ppm", least=3)
 
 
 @pytest.mark.parametrize("kind", [KeyboardInterrupt, Interrupted])
 def test_an_interrupt_while_a_plugin_is_made_is_one(renderer, monkeypatch, kind):
     """Mitsuba makes a text of what a plugin raises."""
-    from data_gen.samplers.photons.surfaces.ppm import PPM
+    from data_gen.samplers.photons.ppm import PPM
 
     def interrupted(self, props):
         raise kind
@@ -197,7 +140,7 @@ def test_radii_shrink_as_told():
 def test_the_medium_around_a_lamp_is_found(renderer):
     """Behind walls too, and on either side of a boundary."""
     scene = load(mi, media_scenes.nested, (8, 8))
-    ways = Fog(scene, scene.sensors()[0], LightEnds(scene), "vpm")
+    ways = Fog(scene, scene.sensors()[0], LightEnds(scene), "bre")
     # Outside of all, in the cloud, in its core, and behind the wall at the back
     points = np.array([[0.9, 0.9, 0.9], [0.5, -0.5, 0.5], [-0.2, 0.2, 0.1], [0.2, 0.1, -3.0]])
     found = np.array(dr.reinterpret_array(mi.UInt32, ways.around(scene, mi.Point3f(points.T))))
@@ -206,27 +149,9 @@ def test_the_medium_around_a_lamp_is_found(renderer):
 
 
 @pytest.mark.slow
-def test_what_is_lost_along_the_edges_of_grids_falls_like_the_radius(renderer):
-    """So twice the image of half the radius, less the image of the radius, is the image of ``volpath``."""
-    scene = load(renderer, media_scenes.smoke, (16, 16))
-    theirs = [image.mean() for image in references(renderer, media_scenes.smoke, (16, 16))]
-    wide, narrow = (
-        [s["primal"].mean() for s in render_ours(scene, "vpm", 32, 1, seed=seed, photons=128, radius=radius)]
-        for seed, radius in ((0, 0.4), (100, 0.2))
-    )
-    off = 2 * np.mean(narrow) - np.mean(wide) - np.mean(theirs)
-    error = np.sqrt((4 * np.var(narrow) + np.var(wide)) / 31 + np.var(theirs) / (len(theirs) - 1))
-    assert abs(off) < 4 * error and error < 0.03 * np.mean(theirs), (off, error)
-    assert np.mean(theirs) - np.mean(wide) > 2 * error
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["vpm", "bre"])
-def test_lamps_and_skies_behind_grids_are_seen(renderer, name):
+def test_lamps_and_skies_behind_grids_are_seen(renderer):
     """Paths of one edge, before any photon, carry the light that comes through, as ``volpath`` has it."""
-    ours = render_ours(load(renderer, media_scenes.seen_through, (16, 16)), name, batches=8, spp=12)
-    expected = references(renderer, media_scenes.seen_through, (16, 16))
-    assert_unbiased([{"primal": stack["primal"]} for stack in ours], expected)
+    assert_lamps_behind_grids_are_seen(renderer, "bre")
 
 
 def test_boundaries_within_one_medium_change_nothing(renderer):
@@ -244,66 +169,3 @@ def test_boundaries_within_one_medium_change_nothing(renderer):
     whole, cut = (np.mean([stack["primal"] for stack in stacks], axis=0) for stacks in (whole, cut))
     # What lies in front of the same photons; the lamp's rays pass another surface, and end in the last bits elsewhere.
     assert np.abs(whole - cut).mean() < 0.02 * whole.mean()
-
-
-@pytest.mark.slow
-def test_beams_are_cut_the_same_in_windows(renderer, monkeypatch):
-    """All parts at once, or few at a time: the same light."""
-    from data_gen.samplers.photons.media import beams
-
-    scene = load(renderer, media_scenes.haze, (8, 8))
-    whole = render_stack(scene, 2, 0, "beams", photons=4, unbiased=True)["primal"]
-    monkeypatch.setattr(beams, "PARTS", 1)
-    assert np.allclose(render_stack(scene, 2, 0, "beams", photons=4, unbiased=True)["primal"], whole, rtol=1e-4)
-
-
-def black_room(max_depth=6):
-    """A lamp in a medium around a denser one, and a black ball, within black walls.
-
-    What a lamp sends into media is swept by one edge, all else by planes.
-    """
-    mist = {"type": "ref", "id": "air"}
-    core = {"type": "homogeneous", "albedo": _rgb(0.9, 0.7, 0.8), "sigma_t": _rgb(0.6, 0.4, 0.5), "scale": 3.0}
-    air = {"type": "homogeneous", "albedo": _rgb(0.9, 0.8, 0.7), "sigma_t": _rgb(0.3, 0.5, 0.7)}
-    return {
-        "type": "scene",
-        "air": {"id": "air", "phase": {"type": "hg", "g": 0.4}} | air,
-        "integrator": {"type": "volpath", "max_depth": max_depth, "rr_depth": 4},
-        "sensor": _camera([0, 0, 3], [0, 0, 0], 40) | {"medium": mist},
-        "lamp": {"type": "point", "position": [0.5, 0.8, -0.5], "intensity": _rgb(5, 5, 5)},
-        "core": _sphere([-0.3, 0.0, 0.1], 0.5, {"type": "null"}) | {"interior": core, "exterior": mist},
-        "ball": _sphere([0.5, 0.3, 0.2], 0.3, _diffuse(0, 0, 0)),
-        "walls": _sphere([0.0, 0.0, 0.0], 3.5, _diffuse(0, 0, 0)),
-    }
-
-
-@pytest.fixture
-def planes_alone(monkeypatch):
-    from data_gen.samplers.photons.media.beams import BEAMS
-
-    monkeypatch.setattr(BEAMS, "near", lambda *_: iter(()))
-
-
-@pytest.mark.slow
-def test_light_by_planes_has_no_bias(renderer, planes_alone):
-    """Through boundaries, past what is in the way, with extinctions of each colour; some of the light paths swept."""
-    scene = load(renderer, black_room, (16, 16))
-    ours = render_ours(scene, "planes", batches=8, spp=4, photons=2, planes=128)
-    # Of all paths but those of two edges
-    long, short = (
-        render_ours(
-            load(renderer, partial(black_room, depth), (16, 16)), "primal", 16, 128, seed=REFERENCES + 100 * depth
-        )
-        for depth in (6, 2)
-    )
-    expected = np.stack([a["primal"] - b["primal"] for a, b in zip(long, short, strict=True)])
-    assert expected.mean() > 0.03
-    result = z_test(np.stack([stack["primal"] for stack in ours]), expected, block=4)
-    assert result.passed, result
-
-
-def test_paths_of_planes_are_no_longer_than_the_scene_says(renderer, planes_alone):
-    """A plane and the way to the camera are three edges."""
-    scenes = [load(renderer, partial(black_room, depth), (8, 8)) for depth in (2, 3)]
-    light = [render_stack(scene, 1, 0, "planes", unbiased=True)["primal"].sum() for scene in scenes]
-    assert light[0] == 0 < light[1]

@@ -6,7 +6,7 @@ from unbiased import load, same
 
 import ngpt
 from ngpt.errors import NgptError, WrongUse
-from ngpt.subpixels import FINE, means
+from ngpt.subpixels import FEWEST, FINE, means
 
 pytest.importorskip("mitsuba")
 
@@ -144,11 +144,11 @@ def test_subpixels_that_do_not_fit_become_fewer_and_a_line_says_so(renderer, cap
 
 def test_what_auto_keeps(renderer):
     scene = load(renderer, "diffuse", SIZE)
-    many = render_stack(scene, 32, 3, "primal", subpixels="auto")
+    many = render_stack(scene, FEWEST, 3, "primal", subpixels="auto")
     assert many.attributes["ngpt:subpixels"] == 2
-    assert not render_stack(scene, 8, 3, "primal", subpixels="auto").fine
+    assert not render_stack(scene, FEWEST - 1, 3, "primal", subpixels="auto").fine
     early = render_stack(scene, None, 3, "primal", subpixels="auto", seconds=60, stop=lambda: True)
-    if early.attributes["ngpt:spp"] < 32:
+    if early.attributes["ngpt:spp"] < FEWEST:
         assert not early.fine and "ngpt:subpixels" not in early.attributes
     assert not render_stack(scene, 32, 3, "gpt", subpixels="auto").fine
     assert not render_stack(scene, 4, 3, "bdpt", subpixels="auto").fine
@@ -158,7 +158,7 @@ def test_what_cannot_be_kept_is_refused(renderer):
     scene = load(renderer, "diffuse", SIZE)
     with pytest.raises(WrongUse, match=r"sampler 'bdpt' puts light on any pixel.*one of: .*primal"):
         render_stack(scene, 4, 3, "bdpt", subpixels=2)
-    with pytest.raises(WrongUse, match="3 subpixels: choose one of 1, 2, 4, auto"):
+    with pytest.raises(WrongUse, match="'3' subpixels cannot be kept; write 1, 2, 4, or auto"):
         render_stack(scene, 4, 3, "primal", subpixels=3)
     with pytest.raises(WrongUse, match="'restir' reuses earlier frames"):
         next(render_frames("diffuse", [0], sampler="restir", subpixels=2))

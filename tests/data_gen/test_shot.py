@@ -114,6 +114,19 @@ def test_a_scene_is_loaded_again_only_where_its_parameters_change(renderer, tmp_
     assert moving.at(1) is not first
 
 
+def test_a_twin_looks_through_the_same_camera(renderer, tmp_path):
+    """Samplers that remember frames look at the frame before in a twin, if more than the camera changes."""
+    from data_gen.frames.shot import Shot
+
+    path, (first, camera) = tmp_path / "scene.xml", XML.split("<sensor")
+    second, rest = camera.split("</sensor>")
+    sensors = (f"<sensor{which}</sensor>" for which in (second, second.replace("0,1,4", "3,1,0")))
+    path.write_text(first + "".join(sensors) + rest)
+    wanted, other = (Shot(lambda frame: (str(path), {}), sensor=number) for number in (1, 0))
+    films = [each.snapshot(0).film for each in (wanted, wanted.twin(), other)]
+    assert np.array_equal(films[0], films[1]) and not np.array_equal(films[0], films[2])
+
+
 def test_parameters_can_be_set_in_place(renderer, tmp_path):
     def update(params, frame):
         key = next(filter(lambda name: name.endswith(VERTICES), params.keys()))

@@ -10,7 +10,7 @@ import pytest
 
 from data_gen.tails import feeding
 from data_gen.tails.cache import NEAR, Trail
-from data_gen.tails.table import in_table
+from data_gen.tails.table import Place, in_table, key
 
 
 def test_cells_that_share_a_place_find_others(renderer):
@@ -23,6 +23,13 @@ def test_cells_that_share_a_place_find_others(renderer):
     found, there = in_table(keys, h, names, mi.Bool(True))
     assert np.array(there).all() and np.array_equal(found, made)
     assert not np.array(in_table(keys, h, names + 300, mi.Bool(True))[1]).any()
+
+
+def test_cells_of_other_sizes_are_other_cells(renderer):
+    """Cells of two sizes with the same number along each axis lie in different places of the scene."""
+    p, level = np.array([[0.3, 0.6], [0.7, 1.4], [-0.2, -0.4]]), np.array([-3, -2])
+    first, name, _ = key(Place(mi.Point3f(p), mi.UInt32(0), mi.Int32(level)))
+    assert first[0] != first[1] and name[0] != name[1]
 
 
 def vertex(t):
@@ -103,21 +110,22 @@ def test_differences_get_what_offset_paths_would_find(gpt_tails):
 
 
 class Film:
-    """A film of 64x64 with 4 samples per pixel: variances of the mean, and errors that pixels share."""
+    """A film with 4 samples per pixel: variances of the mean, and errors that pixels share."""
 
     moments = ("shared",)
-    samples_each = np.full((64, 64), 4)
 
-    def __init__(self, own, common):
-        self.own, self.common = own, common
+    def __init__(self, own, common, size=(64, 64)):
+        self.own, self.common, self.size = own, common, size
+        self.samples_each = np.full(size, 4)
 
     def known(self, name):
-        image = np.ones((64, 64, 3))
+        image = np.ones((*self.size, 3))
         return (image, self.own * image) if name == "primal" else (self.common * image, None)
 
 
 @pytest.mark.parametrize(("ratio", "paths"), [(1 / 16, 1 / 4), (1 / 4, 1 / 2), (1e-9, 1 / 16), (100, 1)])
-def test_paths_that_feed_are_as_the_root_of_both_variances(ratio, paths):
-    """sqrt(S / V), for what one path of either kind would give; 16x16 pixels are a block."""
+@pytest.mark.parametrize("size", [(64, 64), (20, 68)])
+def test_paths_that_feed_are_as_the_root_of_both_variances(ratio, paths, size):
+    """sqrt(S / V), for what one path of either kind would give; 16x16 pixels are a block, and fewer at borders."""
     fed, own = 2.0, 16**2 / 4
-    assert feeding.share(Film(own, math.sqrt(ratio / fed)), fed) == paths
+    assert feeding.share(Film(own, math.sqrt(ratio / fed), size), fed) == paths

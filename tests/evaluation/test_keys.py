@@ -28,7 +28,7 @@ def key_of(scene: str, folder: Path, sampler: str = "gpt") -> str:
 
 def test_a_sampler_has_the_key_of_the_code_it_runs(tree, tmp_path):
     """What is shared changes all, a sampler's own code that sampler, and those that use it."""
-    names = ("auto", "gpt", "bdpt", "gbdpt", "primal", "ppm", "gpm")
+    names = ("auto", "gpt", "bdpt", "gbdpt", "primal", "ppm", "bre")
     last: dict[str, str] = {}
 
     def changed(file: str = "", text: str = "\nsomething = 1\n") -> set[str]:
@@ -47,7 +47,7 @@ def test_a_sampler_has_the_key_of_the_code_it_runs(tree, tmp_path):
     assert changed("samplers/gpt/about.py") == {"auto", "gpt"}
     # primal walks the base paths of gpt where lamps are chosen by place.
     assert changed("samplers/gpt/offset_path.py") == {"auto", "gpt", "primal"}
-    assert {"ppm", "gpm"} <= changed("samplers/photons/map/trace.py") <= {"ppm", "gpm"}
+    assert changed("samplers/photons/map/trace.py") == {"ppm", "bre"} and changed("samplers/photons/bre.py") == {"bre"}
     assert changed("paths/fresh.py") == set()
     late = "\ndef late():\n    from data_gen.paths import fresh\n"
     assert changed("samplers/primal/sampler.py", late) == changed("paths/fresh.py") == {"primal"}

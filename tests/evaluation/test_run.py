@@ -217,7 +217,7 @@ def test_weights_that_cannot_be_loaded_are_said_before_any_work(room):
         ('samplers = ["gpt", "gpt"]', "a sampler is listed twice"),
         ("rivals = [1]", "must be a list of str"),
         (f'methods = ["l1", "l1-gpt"]\nsamplers = ["gpt", "toy"]\n{TWIN}', "two columns would be called 'l1-gpt'"),
-        ('[references]\nroom = ["a.exr"]', "references.room = ['a.exr']: must be a file, or a list of two halves"),
+        ('[references]\nroom = ["a.exr"]', "references.room = ['a.exr']: must be a file, or a list of two files"),
         ('[against]\noidn = ["oidm"]', "against.oidn: there is no column 'oidm' among: primal, l1, wcv"),
         ("[against]\noidn = []", "against.oidn is empty"),
         ('[against]\noidn = "oidn"', "against.oidn = 'oidn': must be a list of columns' names"),

@@ -3,15 +3,19 @@
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+import numpy as np
 import pytest
 from folders import evaluated, read, write_scene
 
 import ngpt
 from bench.frontier import Point, draw
 from data_gen import service
+from ngpt.denoisers import oidn
 from ngpt.errors import NgptError
+from ngpt.evaluation import cells
 from ngpt.evaluation.config import Config, read_config
 from ngpt.evaluation.stacks import SceneStacks
+from ngpt.methods import reconstruct
 from ngpt.report.evaluation import write_evaluation_report
 
 VARIANTS = {
@@ -79,6 +83,51 @@ def test_tables_of_samplers_are_their_options(tmp_path):
     (tmp_path / "eval.toml").write_text(text.replace('sampler = "gpt"', 'sampler = "gtp"'))
     with pytest.raises(NgptError, match=r"samplers\.gpt-followed: unknown sampler 'gtp'; did you mean 'gpt'"):
         read_config(tmp_path / "eval.toml")
+
+
+SUBPIXELS = """
+methods = ["oidn"]
+rivals = ["primal", "fine", "by-default"]
+[samplers.fine]
+sampler = "primal"
+subpixels = 2
+[samplers.by-default]
+sampler = "primal"
+points = "independent"
+subpixels = "auto"
+"""
+
+
+def test_subpixels_are_part_of_what_a_column_is_given(tmp_path):
+    """And of its name, by which stacks, costs and cells are cached. Without them it is the name that it was."""
+    text = 'scenes = ["diffuse"]' + SUBPIXELS
+    renders = {column.sampler: column.render for column in read(text, tmp_path).columns()}
+    assert [render.name for render in renders.values()] == [
+        "features",
+        "features primal subpixels=2",
+        "features primal points=independent subpixels=auto",
+    ]
+    assert renders["fine"].options == {"sampler": "primal", "subpixels": "2"}
+    one = read(text.replace("= 2", "= 1"), tmp_path).columns()
+    assert one[1].render == renders["primal"] and "subpixels" not in renders["primal"].options
+    for wrong, message in (
+        ("= 3", r"samplers\.fine: '3' subpixels cannot be kept; write 1, 2, 4, or auto"),
+        ("= true", r"samplers\.fine: 'True' subpixels cannot be kept"),
+        ("= 2\nradius = 2", r"samplers\.fine: sampler 'primal' has no option 'radius'"),
+    ):
+        with pytest.raises(NgptError, match=message):
+            read(text.replace("= 2", wrong), tmp_path)
+    with pytest.raises(NgptError, match=r"samplers\.fine: sampler 'bdpt' puts light on any pixel and has no subpixels"):
+        read(text.replace('"primal"\nsub', '"bdpt"\nsub'), tmp_path)
+
+
+def test_kernels_with_and_without_subpixels_are_compiled_before_time_counts(monkeypatch):
+    rendered = []
+    monkeypatch.setattr(service, "render", lambda *given, **seconds: rendered.append(given[1].get("subpixels")))
+    for options in ({"subpixels": "auto"}, {"subpixels": "2"}, {}):
+        service.warm_up(None, {"sampler": "primal"} | options)
+    service.warm_up(None, {"sampler": "gpt", "subpixels": "auto"})
+    assert rendered == ["auto", 2, "2", None, "auto"]
 
 
 def test_folders_of_stacks_have_samplers_without_a_renderer(tmp_path, rng, monkeypatch):
@@ -171,6 +220,43 @@ def test_two_samplers_at_equal_time(renderer, tmp_path, monkeypatch):
     # Another clock: the nominal samples are those of gpt-basic, of which gpt has more.
     slow = evaluated(read(SETTINGS + 'clock = "gpt-basic"\n', tmp_path), out)
     assert next(c["spp used"] for c in slow["cells"] if c["method"] == "wcv") == 16
+
+
+@pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())
+def test_a_column_with_subpixels_is_its_method_on_stacks_with_them(renderer, tmp_path, monkeypatch):
+    monkeypatch.setattr(service, "timed", by_our_clock)
+    calls = []
+
+    def counted(*given, **options):
+        calls.append(given)
+        return reconstruct(*given, **options)
+
+    monkeypatch.setattr(cells, "reconstruct", counted)
+    text = (
+        SETTINGS.replace('methods = ["primal", "wcv"]', "").replace("[8]", "[4, 32]").replace("seeds = 2", "seeds = 1")
+    )
+    text += SUBPIXELS.replace('points = "independent"', "").replace('"oidn"', '"clean"')
+    text += '[variants.clean]\nmethod = "oidn"\nauxiliary = "clean"\n'
+    results = evaluated(read(text, tmp_path), tmp_path)
+    found = {(cell["method"], cell["spp used"]): cell for cell in results["cells"]}
+    scene = service.load("diffuse", (32, 24))
+    for spp in (8, 64):
+        stack = service.render(scene, {"sampler": "primal", "subpixels": 2}, spp, 0, seconds=None)
+        assert stack.fine
+        fine, plain = (ngpt.read(tmp_path / found[f"clean ({name})", spp]["image"]) for name in ("fine", "primal"))
+        assert np.allclose(fine["primal"], reconstruct(stack, "oidn", auxiliary="clean").image, rtol=1e-4, atol=1e-5)
+        assert np.abs(fine["primal"] - plain["primal"]).max() > 0.01
+        # By default `ngpt render` keeps them from FEWEST samples on.
+        same = "fine" if spp == 64 else "primal"
+        assert found["clean (by-default)", spp]["metrics"] == found[f"clean ({same})", spp]["metrics"]
+    # OIDN begins for images of either size, before its time counts.
+    assert len(calls) == 6 + 2
+    names = {path.name for path in tmp_path.glob("cache/diffuse-*/features*")}
+    assert {
+        "features-8-0.exr",
+        "features-primal-subpixels=2-8-0.exr",
+        "features-primal-subpixels=auto-64-0.exr",
+    } < names
 
 
 def test_the_tiny_configuration_has_a_column_for_each_method():

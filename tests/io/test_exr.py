@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import ngpt
 from ngpt.errors import NgptError
-from ngpt.io.exr import read, write
+from ngpt.io.exr import layers_of_light, read, replace_layers_of_light, write
 from ngpt.layers import LAYERS
 from ngpt.stack import GradientStack
 
@@ -338,6 +338,21 @@ def test_parts_with_windows_of_their_own_are_filled_up_with_zeros(tmp_path, rng)
     held = {name: channels for name, _, channels in read_raw(result)}
     assert all(same_bits(held["N"][name], normal[name]) for name in "XYZ") and held["rgb"]["A"].shape == (6, 8)
     assert np.array_equal(read(result)["normal"], -expected)
+
+
+def test_layers_of_light_lie_where_their_windows_say(tmp_path, rng):
+    """Here the layer is as large as the image, but three pixels further to the right and two further down."""
+    image, fog = ({c: rng.random((6, 8)).astype(np.float32) for c in ROOT} for _ in range(2))
+    display = {"displayWindow": window(0, 0, 8, 6)}
+    moved = display | {"dataWindow": window(3, 2, 8, 6)}
+    stack = read(write_raw(tmp_path / "a.exr", (image, display, "rgb"), (fog, moved, "fog")))
+    held, expected = np.stack([fog[c] for c in ROOT], axis=-1), np.zeros((6, 8, 3), np.float32)
+    expected[2:, 3:] = held[:4, :5]
+    assert np.array_equal(layers_of_light(stack)["fog"], expected)
+    again = replace_layers_of_light(stack, {"fog": 2 * expected})
+    assert np.array_equal(layers_of_light(again)["fog"], 2 * expected)
+    ((_, _, after),) = [part for part in read_raw(write(tmp_path / "b.exr", again)) if part[0] == "fog"]
+    assert np.array_equal(after["G"][:4, :5], 2 * fog["G"][:4, :5])
 
 
 # What Mitsuba's films write with the pixel formats `luminance` and `xyz`.

@@ -114,8 +114,8 @@ def test_networks_run_without_variances_and_say_so(name, absent, told):
     ("name", "absent"), [("ngpt-combine", ()), ("ngpt-primal", ()), ("ngpt-combine", VARIANCES)], ids=str
 )
 def test_features_are_filtered_once_for_a_frame_if_they_are_noisy(name, absent, noise, monkeypatch):
-    calls, real = [], inputs.prefiltered
-    monkeypatch.setattr(inputs, "prefiltered", lambda *given: calls.append(1) or real(*given))
+    calls, real = [], inputs.with_clean_features
+    monkeypatch.setattr(inputs, "with_clean_features", lambda *given: calls.append(1) or real(*given))
     stack = without(full_stack(24, 28), *absent)
     if noise is not None:
         stack.attributes[FEATURE_NOISE] = noise

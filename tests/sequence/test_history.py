@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 from shots import SIGMA, SIZE, frame_of, mse, part_of, view, without
 
 from ngpt.measure.flicker import flicker
-from ngpt.sequence.history import LONGEST, Temporal
+from ngpt.sequence.history import FAST, LONGEST, Temporal
 from ngpt.stack import GradientStack
 
 
@@ -87,6 +87,19 @@ def test_what_comes_into_sight_takes_nothing_from_what_hid_it(rng, history, name
     within = np.s_[11:29, 6:24]
     assert np.allclose(temporal.weight[within], 0, atol=1e-4)
     assert np.allclose(result[within], smooth(now)[within], atol=1e-3)
+
+
+@pytest.mark.parametrize("pixels", [0, 1, 3])
+def test_history_counts_for_fewer_frames_of_a_fast_shot(pixels):
+    """By motion in image widths: the light is the same everywhere and in all frames, so nothing else speaks against
+    it."""
+    flat, temporal = np.ones((20, 80, 3)), Temporal(None)
+    moved = GradientStack({"primal": flat, "primal_var": 0.01 * flat, "motion": np.full((20, 80, 2), [pixels, 0.0])})
+    temporal.next(moved, flat)
+    temporal.assume(0)
+    temporal.next(moved, flat)
+    frames = LONGEST / (1 + pixels / 80 / FAST)
+    assert np.allclose(temporal.weight[:, : 80 - pixels], frames / (1 + frames), atol=1e-5)
 
 
 def test_history_of_another_light_is_left_alone(rng, history):

@@ -5,14 +5,16 @@ import json
 
 import numpy as np
 
+from ngpt.layers import FEATURE_NOISE
 from ngpt.stack import GradientStack
+from ngpt.subpixels import FINE, means, spread, stored
 from ngpt.training.dataset import FORMAT, VERSION, Dataset
 from ngpt.training.shards import CropData, write_shard
 
 SIZE = 8
 
 
-def crop_data(rng, caustic=False, halves=False, motion=None):
+def crop_data(rng, caustic=False, halves=False, motion=None, k=1):
     def image(channels=3):
         return rng.random((SIZE, SIZE, channels), np.float32)
 
@@ -22,10 +24,21 @@ def crop_data(rng, caustic=False, halves=False, motion=None):
         made["primal"] += made["direct"] + made.get("caustic", 0)
         return made | {f"{name}_var": image() for name in varying}
 
+    def stack():
+        pixels = layers()
+        if k == 1:
+            return GradientStack(pixels)
+        # About the pixels
+        fine = {
+            name: stored(name, spread(pixels[name], k) + rng.normal(0, 0.1, (k * SIZE, k * SIZE, 3))) for name in FINE
+        }
+        pixels |= {name: means(layer, k) for name, layer in fine.items()}
+        return GradientStack(pixels, {FEATURE_NOISE: 1e-9}, fine=fine)
+
     direct, light = image(), image() if caustic else None
     reference = direct + 1 + (light if caustic else 0)
     apart = tuple(direct + image() for _ in range(2 * halves))
-    return CropData([GradientStack(layers()) for _ in range(2)], [2, 9], reference, direct, light, apart, motion)
+    return CropData([stack() for _ in range(2)], [2, 9], reference, direct, light, apart, motion)
 
 
 def write_set(folder, shards, frames=None, **config):

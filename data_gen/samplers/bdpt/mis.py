@@ -23,7 +23,7 @@ Both ends may also come to one vertex, and merge: η = π r² N times as many su
 radius r as there are pairs that end in a given unit of area. Paths merge at vertices where photons are gathered, and
 there only if light came from a delta event: else a connection finds the path, and blurs nothing. So a light path knows
 at once, its ``vcm`` is 0 there, and ``gathered`` adds η to it as one more summand; a camera path knows when it leaves
-the next vertex, and η is ``waiting`` until then. Where nothing merges, the formulas are those of ``bdpt``.
+the next vertex, and η is ``waiting`` until then. Without merging, the formulas are the same as in ``bdpt``.
 
 ``p`` are densities in solid angle, ``q`` the same with both directions of the vertex swapped; cosines are absolute, to
 the geometric normal. All quotients are taken one by one: squares of densities would leave float32.

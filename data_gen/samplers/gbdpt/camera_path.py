@@ -20,7 +20,7 @@ from data_gen.samplers.gbdpt.pairs import weighted
 
 
 class MergesPairs(Protocol):
-    """What gathers photons at camera paths and their copies, see ``vcm.gvcm``."""
+    """What gathers photons at camera paths and their copies, as the study ``gvcm`` does."""
 
     def differences(self, z: Vertex, bsdf: mi.BSDFPtr, active: mi.Bool, offsets: list[Offset]) -> tuple:
         """The light of the photons near to the vertex ``z``, weighted; and Δ of the ``offsets``, with it."""

@@ -1,4 +1,4 @@
-"""Light paths once more, up to a vertex that the camera has seen: what a shift needs of them.
+"""Traces light paths again, up to a vertex that the camera sees, with the data that a shift needs.
 
 The kernel that finds light paths only marks which vertices are seen. These are few, scattered over lanes and steps, and
 a shift is eight rays: so each seen vertex has a lane of its own in a second kernel, which traces its path anew.
@@ -26,7 +26,7 @@ from data_gen.samplers.gbdpt.pairs import weighted
 
 @dataclass
 class Marker:
-    """Splats what light paths bring to the camera, and marks the vertices that it sees: its state is a bit for each."""
+    """Splats the light of connections to the camera. Its state has a bit for each vertex that the camera sees."""
 
     splats: Splats
     ray: mi.Ray3f
@@ -36,7 +36,7 @@ class Marker:
         return mi.UInt64(0)
 
     def light(self, seen: Seen) -> mi.Color3f:
-        """What it splats."""
+        """The light that is splatted."""
         return to_rgb(weighted(seen.C, seen.others) * self.importance, self.ray.wavelengths)
 
     def sees(self, state: mi.UInt64, seen: Seen) -> mi.UInt64:
@@ -56,7 +56,7 @@ class Unseen:
 
 
 def marked(state: mi.UInt64, longest: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """The lane and the depth of each vertex that is marked, by depth: lanes side by side trace as many edges."""
+    """The lane and the depth of each marked vertex, ordered by depth: neighbouring lanes trace equally many edges."""
     lanes = [dr.compress((state >> mi.UInt64(depth)) & 1 != 0) for depth in range(1, longest)]
     depths = [dr.full(mi.UInt32, depth, dr.width(some)) for depth, some in enumerate(lanes, 1)]
     found = [(some, depth) for some, depth in zip(lanes, depths, strict=True) if dr.width(some)]
@@ -69,23 +69,23 @@ def marked(state: mi.UInt64, longest: int) -> tuple[mi.UInt32, mi.UInt32]:
 class Link:
     """The part of a light path between its last vertex and the last vertex before it with a smooth event."""
 
-    depth: mi.UInt32  # of that one; 0 is the light's end
-    p: mi.Float  # density with which it was left
+    depth: mi.UInt32  # of the vertex with the smooth event; 0 is the emitter
+    p: mi.Float  # density with which the path left that vertex
     survival: mi.Float  # 1 / probability to survive Russian roulette, and to pass the holes, from there on
     events: mi.UInt32  # mirrors and glass between the two, of ``manifold``, the last one first
-    whole: mi.Bool  # there is room for all of them, and no hole beside them
-    holes: mi.UInt32  # how many are between the two
+    whole: mi.Bool  # ``events`` holds all of them, and there are not both events and holes
+    holes: mi.UInt32  # the number of holes between the two
 
 
 def first_link() -> Link:
-    """The link of the vertex that a light's end lights."""
+    """The link of the first vertex after the emitter."""
     return Link(mi.UInt32(0), mi.Float(1), mi.Float(1), mi.UInt32(0), mi.Bool(True), mi.UInt32(0))
 
 
 def next_link(
     link: Link, depth: mi.UInt32, sample: mi.BSDFSample3f, survival: mi.Float, passed: mi.Bool | bool = False
 ) -> Link:
-    """The link of the next vertex, where a sampled event leaves the vertex at ``depth``, or has ``passed`` a hole."""
+    """The link of the next vertex, after the event that was sampled at ``depth``, or that has ``passed`` a hole."""
     if passed is not False:
         whole = link.whole & (link.events == 0)
         survived = link.survival * survival / sample.pdf
@@ -126,7 +126,7 @@ def light_again(plan: Plan, sight: Sight, depth: mi.UInt32) -> Again:
         bsdf = end.y.si.bsdf()
         depth_here = end.y.depth
         here = record(end.ray, end.hit, replace(end.y, end=plan.known(end.y.end, bsdf)), active)
-        # Where the path was joined to the camera
+        # Draws the random numbers that ``light_path`` drew for the connection to the camera
         eye.place_on_lens(random)
         end, active, sample, survival = go_on(plan, random, start, end.y, bsdf, active)
         passed = plan.holes.passed(bsdf, event_kind(sample.sampled_type)) if plan.holes else False

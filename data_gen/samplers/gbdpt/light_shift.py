@@ -67,7 +67,7 @@ def splat_differences(
     y, link = again.end.y, again.link
     bsdf = y.si.bsdf()
     joined = again.there & scatters_smoothly(bsdf)
-    # The first kernel found it visible: nothing but holes can be in between.
+    # The first kernel found the vertex visible, so only holes can be in between.
     T, holes_seen = 1, 0
     if plan.holes:
         T, holes_seen = plan.through_holes_to_camera(y, eye.toward(y.si, again.lens, joined)[0], joined)
@@ -185,7 +185,7 @@ def shifted(plan: Plan, eye: Eye, path: Splatted, uv: mi.Point2f, active, bent: 
     if plan.holes:
         C *= T
     seen = active & (dr.max(C) > 0) & dr.isfinite(dr.sum(C))
-    # Nothing is in the way of what has been followed.
+    # A bent copy was traced through the mirrors and glass, so it needs no shadow ray.
     if not bent and plan.holes:
         T, holes = plan.holes.transmittance(scene, shadow, target, path.holes, seen)
         C *= dr.select(holes == path.holes, T, 0)
@@ -213,11 +213,11 @@ def through_glass(plan: Plan, path: Splatted, x, active) -> tuple:
     # ------------------------- The chain -------------------------
     ω = -path.d
     beside = mi.Vector3f(dr.select(path.first, path.start.end.n, mi.Vector3f(before.si.n)))
-    # Points have no normal: any plane that the light comes through will do.
+    # Points have no normal. Any plane that the light crosses serves.
     target = Target(dr.select(path.first, path.start.end.p, before.si.p), beside, far)
     point = path.first & path.start.delta & ~far
     target.n = dr.select(far, -path.start.ray.d, dr.select(point, path.start.ray.d, target.n))
-    # Light came from the other side, by rays that began elsewhere: not quite to the point that it is walked to.
+    # Light came from the other side, by rays with other origins, so the walk does not end exactly at its point.
     ω, base, active = walk(scene, y.si, ω, path.events, target, active)
     ω1, shot, J, found = follow(scene, y.si, ω, base, x, path.events, target=target, active=active)
     away, away1 = dr.abs(dr.dot(target.n, base.ray.d)), dr.abs(dr.dot(target.n, shot.ray.d))

@@ -2,7 +2,7 @@
 
 An offset path is *apart* while it has vertices of its own, *joined* at the vertex that it shares but has come to from
 elsewhere, and *settled* from there on: it differs from its base path only by β, r and the partial sums of its weights.
-It has ended where β is 0. Symbols as in ``gbdpt``.
+A path with β = 0 has ended. Symbols as in ``gbdpt``.
 """
 
 from __future__ import annotations
@@ -40,9 +40,8 @@ class Offset:
 
 @dataclass
 class Own:
-    """An offset path at its last own vertex, which it comes back to if its base path passes the hole where both meet.
-
-    That vertex is where ``ray`` has led to, at the path's ``hit``; β is 0 where there is nothing to come back to.
+    """An offset path at its last own vertex. It returns there if its base path passes the hole where both meet. ``ray``
+    leads to that vertex, which is the path's ``hit``. β is 0 if there is no such vertex.
     """
 
     ray: mi.Ray3f
@@ -52,7 +51,7 @@ class Own:
 
 
 def start(plan: Plan, eye: Eye, x, shifted: tuple) -> Offset:
-    """An offset path up to its first vertex; none where there is no base path.
+    """Returns an offset path up to its first vertex, with β = 0 where there is no base path.
 
     It begins with the ``shifted`` camera ray, its importance, and whether it is on the film.
     """
@@ -77,13 +76,13 @@ def start(plan: Plan, eye: Eye, x, shifted: tuple) -> Offset:
 
 
 def own_vertex(offset: Offset, x: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
-    """Where an offset path is that is not settled; ``x`` is the base path's vertex."""
+    """Returns the vertex of an offset path that is not settled. ``x`` is the base path's vertex."""
     own = offset.hit.compute_surface_interaction(offset.ray, active=offset.apart)
     return dr.select(offset.apart, own, seen_from(x, offset.ray.d))
 
 
 def brightest(offsets: list[Offset]) -> mi.Float:
-    """The most that any of the offset paths may still contribute to Δ."""
+    """Returns the largest throughput with which any offset path may still contribute to Δ."""
     largest = mi.Float(0)
     for y in offsets:
         largest = dr.fmax(largest, dr.max(y.β) / (1 + y.r))
@@ -103,18 +102,17 @@ def take_step(
     chain: Chain | None = None,
     eye: Eye | None = None,
 ) -> list[Offset]:
-    """Takes all offset paths along a step of their base path; connections to the light path are not in it.
-
-    With a ``chain``, the one behind the step, only bent paths are shifted; ``course`` is the one before the step. Holes
-    in front of the camera are passed as its ``eye`` sees them.
+    """Takes all offset paths along a step of their base path, without connections to the light path. ``chain`` is the
+    one behind the step; with it, only bent paths are shifted. ``course`` is the one before the step. Holes in front of
+    the camera are passed as its ``eye`` sees them.
     """
     busy = mi.Bool(False)
     for offset in offsets:
         busy |= offset.apart | offset.joined
     offsets = [settled(plan, step, offset) for offset in offsets]
 
-    # A loop over the four has one copy of what a step is, which takes long to compile. Each turn takes the first of
-    # them, and puts it behind the others: after four they are in their order again.
+    # A step takes long to compile, so a loop over the four paths holds one copy of it. Each turn takes the first path
+    # and puts it behind the others. After four turns they are in their order again.
     def rotate(i, y, *others):
         own = y.apart | y.joined
         y = dr.if_stmt((y,), own, lambda y: step_own(plan, step, y, course, chain, eye), lambda y: y)
@@ -125,7 +123,7 @@ def take_step(
 
 
 def settled(plan: Plan, step: Step, y: Offset) -> Offset:
-    """A step that both paths take alike; for offset paths that are not settled, nothing."""
+    """A step that both paths take alike. Offset paths that are not settled contribute nothing."""
     here = ~(y.apart | y.joined)
     x = step.z.si
     # ------------------------ To a light -------------------------
@@ -164,7 +162,7 @@ def step_own(
     chain: Chain | None = None,
     eye: Eye | None = None,
 ) -> Offset:
-    """A step from a vertex of the offset path's own, or from the shared one to which it has come from elsewhere."""
+    """A step from the offset path's own vertex, or from the shared vertex that it has just joined."""
     # --------------- The vertex: apart, or just joined ---------------
     si = own_vertex(y, step.z.si)
     bsdf = si.bsdf()
@@ -184,7 +182,7 @@ def step_own(
     none = Offset(y.ray, y.hit, mi.Spectrum(0), y.r, y.end, mi.Bool(False), mi.Bool(False), Δ, nothing)
     state = (none, mi.Spectrum(0), mi.Float(0))
     if chain is not None:
-        # Its own vertex stays where it is until there is something to walk to.
+        # The own vertex stays until the path has a next vertex.
         waits = y.apart & connectable & (chain.open | chain.arrives)
         joins &= y.joined
         replays &= course.ahead
@@ -200,7 +198,7 @@ def step_own(
         before = own_vertex(ahead, step.z.si)
         state = dr.if_stmt(state, back, lambda *_: reconnect(plan, step, ahead, none, before), lambda *old: old)
         state = dr.if_stmt(state, through, lambda *_: go_through(plan, step, y, none, si, eye), lambda *old: old)
-    # Where all is smooth there is nothing to replay.
+    # A scene with only smooth events needs no replay.
     if not plan.materials.all_connectable:
         state = dr.if_stmt(state, replays, lambda *_: replay(plan, step, y, none, si, bsdf), lambda *old: old)
     moved, C, others = state
@@ -211,7 +209,8 @@ def step_own(
 
 
 def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si) -> tuple[Offset, mi.Spectrum, mi.Float]:
-    """From ``si`` straight to the base path's next vertex, or, where that escapes, along with it; and emission there.
+    """Connects ``si`` straight to the base path's next vertex, or follows its direction if it escapes. Includes the
+    emission there.
 
     Where the base path has passed holes on its way there, the copy does so, too.
     """
@@ -225,7 +224,7 @@ def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si) -> tuple[Offs
     f, p, q = evaluate(RADIANCE, si, si.bsdf(), si.to_local(d))
     ray = dr.select(reaches, si.spawn_ray_to(x1.p), si.spawn_ray(d))
     good = (p > 0) & dr.isfinite(J) & (dr.max(f) > 0)
-    # A joined path goes the way of its base path.
+    # A joined path takes the direction of its base path.
     T = mi.Spectrum(1)
     if plan.holes:
         target = dr.select(reaches, x1.p, plan.outside(si.p, d))
@@ -249,7 +248,7 @@ def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si) -> tuple[Offs
     lives = good & reaches & (y.joined | step.x1_connectable)
     joined, own = lives & y.apart, none.own
     if plan.holes:
-        # It may have to come back.
+        # The path may have to return to this vertex.
         waits = y.apart & reaches & plan.holes.known.of(x1.bsdf(), reaches)[1]
         joined, own = joined | waits, Own(y.ray, dr.select(waits, y.β, 0), y.r, y.end)
     ray = mi.Ray3f(si.p, d, si.time, si.wavelengths)
@@ -258,7 +257,7 @@ def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si) -> tuple[Offs
 
 
 def go_through(plan: Plan, step: Step, y: Offset, none: Offset, si, eye: Eye) -> tuple[Offset, mi.Spectrum, mi.Float]:
-    """Through the hole at ``si`` as the base path went through one, both in front of their first smooth event."""
+    """Passes the hole at ``si`` as the base path passed one. Both are in front of their first smooth event."""
     T, d = plan.holes.share(si, mi.Bool(True)), mi.Vector3f(y.ray.d)
     β = y.β * T * (step.survival / step.p)
     good = (dr.max(T) > 0) & dr.isfinite(dr.sum(β))

@@ -25,9 +25,9 @@ import mitsuba as mi
 
 
 def difference(C: mi.Spectrum, others: mi.Float, shifted: mi.Spectrum, r: mi.Float, others_shifted) -> mi.Spectrum:
-    """Δ of b = ``C`` and b' = ``shifted``, which is 0 where there is no copy."""
+    """Returns Δ for b = ``C`` and b' = ``shifted``, which is 0 where there is no copy."""
     W, rW = 1 + others, r * (1 + others_shifted)
-    # Both ends of a pair must come to the same: black is black in all channels.
+    # Both ends of a pair must treat darkness alike: a copy counts as dark only if it is black in all channels.
     whole = (dr.max(shifted) > 0) & dr.isfinite(dr.sum(shifted)) & dr.isfinite(rW)
     Δ = dr.select(whole, (shifted - C) * (2 / (W + rW)), C * (-2 / W))
     return dr.select(dr.max(C) > 0, Δ, 0)

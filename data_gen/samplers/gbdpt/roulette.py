@@ -1,6 +1,6 @@
-r"""Which light paths that end at the camera are shifted: Russian roulette by what their light is worth.
+r"""Russian roulette that chooses which light paths that end at the camera are shifted, by the light that they bring.
 
-A shift is eight rays, and half of the vertices that the camera sees bring little of the light of their pixels. Before
+A shift traces eight rays, and half of the vertices that the camera sees bring little of their pixels' light. Before
 anything of a shift is traced, the light of all paths of the pass is known, and with it
 
     w      the light that the path has splatted
@@ -32,13 +32,13 @@ from data_gen.samplers.gbdpt.light_again import Marker
 SHARE = 2.0
 # Copies may be brighter than their paths.
 LEAST = 0.1
-# Vertices of a light path whose worth is kept, 8 bytes each; all behind them are shifted.
+# For so many vertices of a light path the worth is kept, 8 bytes each. All later ones are shifted.
 RATED = 9
 
 
 @dataclass
 class Worth:
-    """What light each vertex of light paths splats, and on which pixel."""
+    """The light that each vertex of light paths splats, and the pixel."""
 
     light: mi.Float  # by depth, of each depth by lane
     pixel: mi.UInt32
@@ -89,7 +89,7 @@ def thresholds(camera: CameraSamples, light: mi.Color3f, splats: Splats) -> mi.F
 def survivors(
     camera: CameraSamples, worth: Worth, lane: mi.UInt32, depth: mi.UInt32, threshold: mi.Float
 ) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
-    """The vertices at ``depth`` of the light paths of ``lane`` that are shifted, and 1 / p for each."""
+    """Returns which vertices at ``depth`` of the light paths of ``lane`` are shifted, and 1 / p for each."""
     light, pixel, kept = worth.of(lane, depth)
     share = SHARE * light / dr.gather(mi.Float, threshold, pixel)
     p = dr.select(kept & (share < 1), dr.fmax(share, LEAST), 1)

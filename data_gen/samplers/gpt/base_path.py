@@ -109,7 +109,9 @@ class Step:
 
 
 def begin(plan: Plan, x: mi.SurfaceInteraction3f, place, channel, β: mi.Spectrum) -> Path:
-    """A base path at its first vertex; one that finds nothing has no throughput, but may walk on as a ghost."""
+    """Returns a base path at its first vertex. A path that finds no vertex has throughput 0, but may walk on as a
+    ghost.
+    """
     return Path(
         x=x,
         place=place,
@@ -166,7 +168,7 @@ def base_step(
         if place is not None:
             E_light = dr.select(place.scatters, f.x, E_light)
             E_p = dr.select(place.scatters, f_p.x, E_p)
-        # What the cache has answered for already is left out. Where little may be left, few paths follow it.
+        # Light that the cache has already supplied is left out. Where little light may remain, few paths continue.
         f, survival_of_light = rest(f, path.ρ * E_light)
         f_p, survival_of_rest = rest(f_p, path.ρ * E_p)
         followed = u_survival < survival_of_light
@@ -193,7 +195,7 @@ def base_step(
     η = dr.select(found, path.η * sample.eta, path.η)
 
     # ---------------------- Russian roulette ---------------------
-    # What is left of f is as bright as f where it is followed: else it would have to survive twice.
+    # The rest of f, where it is followed, is as bright as f. Otherwise it would have to survive twice.
     whole = f_p * dr.rcp(dr.maximum(survival_of_rest, 1e-20))
     largest = brightest(path.β * whole, whole, offsets)
     if recording:
@@ -213,7 +215,8 @@ def base_step(
     if path.ρ is not None:
         E_p = dr.select(goes_on, E_p * survival, 0)
     if recording:
-        # What follows is light of the record, however dark the surface is; and behind a mirror, of earlier ones only.
+        # All later light belongs to the record, however dark the surface is. Behind a mirror it belongs to earlier
+        # records only.
         β1 = dr.select(recording.here, dr.maximum(β1, E_p * segment.weight), β1)
     # After a mirror emitter sampling could not have found x1: p_light = 0, and m = 1.
     aim, passed, seen_by, sampled, p_x1 = None, None, x, kind == SMOOTH, sample.pdf
@@ -299,7 +302,9 @@ def base_step(
 
 
 def brightest(β1: mi.Spectrum, f_p: mi.Spectrum, offsets: list) -> mi.Float:
-    """The throughput of the brightest of all five paths behind a step, by which they survive: so none is starved."""
+    """Returns the throughput of the brightest of the five paths behind a step. Russian roulette uses it, so no path is
+    starved.
+    """
     largest = dr.max(dr.abs(β1))
     for y in offsets:
         # The most that an offset path may still contribute to Δ / 2: w β' until it is settled, with its β' of before
@@ -310,11 +315,10 @@ def brightest(β1: mi.Spectrum, f_p: mi.Spectrum, offsets: list) -> mi.Float:
 
 
 def matt_too(plan: Plan, path: Path, recording: Recording | None) -> mi.Bool | None:
-    """Where the next direction must be one that a matt surface scatters into, though the material might not sample it;
-    None for nowhere.
-
-    A record is what arrives at a matt surface. And behind a vertex that has been answered for as one, the rest is
-    negative where the material, tilted by a bump or normal map, scatters nothing: all of these directions count.
+    """Returns where all directions into which a matt surface scatters must be sampled, even those that the material
+    does not sample. None stands for nowhere. A record holds the light that arrives at a matt surface. Where the cache
+    has supplied a vertex's matt part, the rest is negative in directions into which a material, tilted by a bump or
+    normal map, scatters nothing. So these directions count, too.
     """
     x, both = path.x, None
     if path.ρ is not None and plan.matt.any_tilted:
@@ -326,8 +330,8 @@ def matt_too(plan: Plan, path: Path, recording: Recording | None) -> mi.Bool | N
 
 
 def rest(f: mi.Spectrum, ended: mi.Spectrum) -> tuple[mi.Spectrum, mi.Float]:
-    """What is left of ``f`` where ``ended`` of it has been answered for, and the probability to follow it: its size
-    relative to f, so that what is followed weighs as much as f."""
+    """Returns the rest of ``f`` after the cache has supplied ``ended``, and the probability to follow it. The
+    probability is the rest's size relative to f, so a path that is followed weighs as much as f."""
     left = f - ended
     size = dr.max(dr.abs(left)) / dr.maximum(dr.max(dr.abs(f)), 1e-20)
     return left, dr.select(dr.max(ended) > 0, dr.minimum(size, 1), 1)
@@ -335,5 +339,5 @@ def rest(f: mi.Spectrum, ended: mi.Spectrum) -> tuple[mi.Spectrum, mi.Float]:
 
 def light_mis(delta: mi.Bool, p_light: mi.Float, p: mi.Float) -> mi.Float:
     """MIS weight of a sampled emitter whose direction BSDF sampling finds with density ``p``."""
-    # No direction that is sampled ever meets a point or a single direction.
+    # A sampled direction never meets a point or a single direction.
     return dr.select(delta, 1, mis_weight(p_light, p))

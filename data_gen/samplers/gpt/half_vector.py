@@ -30,8 +30,8 @@ class Departure:
 
 
 def copy_where_smooth(step: Step, y: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, replayed: Departure) -> Departure:
-    """The departure from ``y`` with the base path's half-vector where the base path has one, else as ``replayed``."""
-    # A Dirac event has no density to be divided by: it is replayed, as its own half-vector would have it.
+    """Returns the departure from ``y`` with the base path's half-vector if it has one, else ``replayed``."""
+    # A Dirac event has no density to divide by. It is replayed, which gives the same direction as its half-vector.
     copies = step.goes_on & (step.kind == SMOOTH)
     same = y.bsdf() == step.x.bsdf()
     wo, J, exists = shift.copy_half_vector(step.x.wi, step.wo, step.η, y.wi, same)
@@ -45,6 +45,6 @@ def copy_where_smooth(step: Step, y: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, 
         # The same half-vector does not take the same numbers (survey, eq. 15): |J| stays, in f |J| / p and in r.
         f_p=dr.select(copies, f * (J / step.p), replayed.f_p),
         r=dr.select(copies, p * J / step.p, replayed.r),
-        # Past the end of its base path an offset path has no half-vectors to copy, nor would the reverse shift.
+        # Past the end of its base path an offset path has no half-vectors to copy. The reverse shift has none either.
         allowed=dr.select(copies, found, (replayed.kind != SMOOTH) | ~step.x.is_valid()),
     )

@@ -23,11 +23,12 @@ four offsets cost about as much as the base path and not four times that.
 
 An offset path is *apart* from its base path, then *joined* to it for one step (it shares the vertex, but arrives there
 from elsewhere), then *settled*: joined for longer, ended, or rejected. A base path that ends while offset paths are
-apart walks on as a ghost. Its offset paths replay numbers that it has no use for, so that what their pixels see serves
-this pixel too, with w = 1/2, as it does in random sequence replay; to reject them would double their variance.
+apart walks on as a ghost. Its offset paths replay random numbers that it does not use. So the light that their pixels
+see counts for this pixel too, with w = 1/2, as in random sequence replay. Rejecting these paths would double their
+variance.
 
-All paths begin in ``trace``; the rules of shifting are in ``data_gen.paths.shift``; ``plan`` decides which of all that
-a scene needs in its kernel. Whether a vertex is in a medium is known to ``data_gen.paths.space``.
+All paths begin in ``trace``; the rules of shifting are in ``data_gen.paths.shift``; ``plan`` decides which code a scene
+needs in its kernel. ``data_gen.paths.space`` knows whether a vertex is in a medium.
 
 Russian roulette looks at all five paths, so that none is starved. It leaves r as it is: the weights of the two
 directions of a difference sum to one whatever paths survive.
@@ -92,7 +93,7 @@ class GPT(GradientIntegrator):
     def parameters(cls, scene: mi.Scene) -> dict[str, Any]:
         return super().parameters(scene) | {"volumes": integrator_name(scene) in VOLUMETRIC}
 
-    # No attribute: it is decided anew for each render of a plugin.
+    # This is no attribute, since each render of a plugin decides it anew.
     @property
     def shared(self) -> bool:
         return self.options["tails"] == "shared"
@@ -125,7 +126,9 @@ class GPT(GradientIntegrator):
         film.put_all(values | dict(zip(SHIFTS, zip(Δ, inside, strict=True), strict=True)))
 
     def samples(self, plan: Plan, known: Known | None, camera: CameraSamples) -> tuple[dict, list, list, Any]:
-        """Layers, Δ in the order of SHIFTS, where it is on the film, and what options need: A of Δ, or a chain."""
+        """Returns the layers, Δ in the order of SHIFTS, where it is on the film, and what some options need: A of Δ, or
+        a chain.
+        """
         # ------------------------- Paths -----------------------------
         scene, (ray, importance, _) = plan.space.scene, camera.rays()
         within = mi.MediumPtr(camera.sensor.get_medium()) if plan.space.media else None
@@ -151,7 +154,8 @@ class GPT(GradientIntegrator):
 
 
 def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f:
-    """L of each sample as the mean over the four pairs with neighbours: what either path of a pair says of this pixel.
+    """Returns L of each sample as the mean over its four pairs with neighbours, where both paths of a pair estimate
+    this pixel.
 
     A pair is sampled from here, with the base path's part ``A``, and from the neighbour, with the offset path's part
     A + Δ of the same sample there. [Kettunen et al. 2015, section 5]

@@ -10,10 +10,10 @@ goes through the same events to the same point x_c of the lamp, by the walks of 
     r           p' P' J / (p P)
     Δ           2 (b' - b) / (1 + r), or -2 b where no walk leads there and back
 
-Up to z_b' the offset path replays the base path's random numbers, with r = 1. A single technique finds this light,
-since no emitter sampling finds a lamp behind glass, and it is a class of paths by itself. So it is shifted apart from
-all other light, and the kernel of ``gpt`` knows nothing of it. That kernel leaves one record for each lane. Such paths
-are rare, so this kernel runs only on the few lanes that have a record, four times as wide, one for each direction.
+Up to z_b' the offset path replays the base path's random numbers, with r = 1. Only BSDF sampling finds this light,
+since emitter sampling finds no lamp behind glass. These paths are a class of their own, so they are shifted apart from
+all other light. The kernel of ``gpt`` only leaves one record for each lane. Such paths are rare, so this kernel runs
+only on the few lanes that have a record, four times as wide, one for each direction.
 
 [Hua et al. 2019, sections 3.4 and 3.5]
 """
@@ -41,7 +41,7 @@ _EVENTS = (1 << _EVENT_BITS) - 1
 
 @dataclass
 class Chain:
-    """What a base path remembers of the way it has come.
+    """What a base path remembers of its earlier vertices.
 
     ``record``    steps before z_b and, in the lowest bits, the events behind it; 0 while nothing is found there
     ``survival``  product of the factors of Russian roulette, up to where it is found
@@ -56,13 +56,13 @@ class Chain:
 
         Only ``late`` light is followed: for a lamp behind panes only, replay is no worse.
         """
-        # A lamp that is a mirror too could be met again further on: a lane has one record.
+        # A lane has one record. A lamp that is also a mirror could be met again later.
         sharp = mi.has_flag(x1.bsdf().flags(), mi.BSDFFlags.Delta) | mi.has_flag(x1.bsdf().flags(), mi.BSDFFlags.Null)
         ends = late & (self.state > _OPEN) & ~(x1.is_valid() & sharp) & (dr.max(Le) > 0)
         events = self.state & _EVENTS
         k = (33 - dr.lzcnt(events)) >> 1
         record = dr.select(ends, ((depth - 1 - k) << _EVENT_BITS) | events, self.record)
-        # Nothing that comes later belongs to the record.
+        # Later light does not belong to the record.
         return Chain(self.state, record, dr.select(self.record == 0, self.survival * survival, self.survival)), ends
 
 

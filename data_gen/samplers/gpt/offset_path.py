@@ -69,16 +69,17 @@ class Move:
 
 
 def start(plan: Plan, base: Path, first: Segment, importance: mi.Spectrum, inside: mi.Bool) -> Offset:
-    """An offset path behind its ``first`` segment, ``inside`` the film or not; it has ended where it finds nothing.
+    """Returns an offset path behind its ``first`` segment, ``inside`` the film or not. It has ended if it finds no
+    vertex.
 
     A base path that has ended there walks on as a ghost if the kernel can replay, else the shift is rejected.
     """
     hit, none = first.hit, dr.zeros(mi.Spectrum, dr.width(first.hit.t))
     lives = inside & hit.is_valid()
     ended = inside & ~hit.is_valid() & base.x.is_valid()
-    # Seen from the neighbour, a base path that has ended there would walk on as a ghost with this one replayed beside
-    # it: both have the same random numbers, hence r = 1 and w = 1/2. Without ghosts nothing shifts back, and w = 1
-    # (survey, section 3.5).
+    # From the neighbour's side, a base path that has ended there would walk on as a ghost, and this path would be
+    # replayed beside it. Both have the same random numbers, hence r = 1 and w = 1/2. Without ghosts nothing shifts
+    # back, and w = 1 (survey, section 3.5).
     w2_ended = 1 if plan.replays else 2
     return Offset(
         ray=mi.Ray3f(first.ray),
@@ -92,7 +93,7 @@ def start(plan: Plan, base: Path, first: Segment, importance: mi.Spectrum, insid
         rough=mi.Bool(False),
         a=dr.select(ended, -base.β * w2_ended, 0),
         Δ=none,
-        # Beyond the border there is no path that could have its part of the weight.
+        # Beyond the border of the film no path could take its part of the weight.
         w2=dr.select(ended, w2_ended, dr.select(inside, mi.Float(0), 2)),
         A=mi.Spectrum(none),
         failed=mi.Bool(False) if plan.replays else ended,
@@ -101,8 +102,8 @@ def start(plan: Plan, base: Path, first: Segment, importance: mi.Spectrum, insid
 
 
 def next_steps(scene, plan: Plan, step: Step, offsets: list[Offset], first: bool = False) -> list[Offset]:
-    """Takes all offset paths along a step, which may be known to be the ``first``: all of them are apart there, and
-    none is joined. Most later steps find all of them settled.
+    """Takes all offset paths along a step. In the ``first`` step all of them are apart, and none is joined. In most
+    later steps all of them are settled.
 
     Loops over the four of them keep the kernel small, and are recorded in a fraction of the time. Their state rotates,
     so that each path stays in registers when its turn comes. Rare branches are real ones, not masks: they cost 2.5
@@ -122,7 +123,7 @@ def next_steps(scene, plan: Plan, step: Step, offsets: list[Offset], first: bool
         return i + 1, *others, y
 
     if not first:
-        # What a step at a shared vertex does not use stays outside: it would be moved for nothing.
+        # State that a step at a shared vertex does not use stays outside the branch, since moving it would cost time.
         some = (replace(y, hit=None, place=None, apart=None, sky=None, rough=None) for y in offsets)
         now = dr.while_loop((mi.UInt32(0), *some), lambda i, *_: joined & (i < count), join, label="joined paths")[1:]
         offsets = [
@@ -145,7 +146,8 @@ def settle(step: Step, offsets: list[Offset]) -> None:
         y.A = y.A + y.w2 * step.β * C
         y.a = y.a * step.f_p
         if y.aim is not None:
-            # But for m, where both have come straight on through holes from where one had arrived from elsewhere.
+            # Only m differs: one had arrived from elsewhere at the vertex from which both came straight on through
+            # holes.
             β1 = y.a + y.w2 * step.β1  # 2 w β'
             m = mis_weight(y.aim.p, step.p_light) - mis_weight(step.aim.p, step.p_light)
             y.Δ = y.Δ + dr.select(step.passed & (dr.max(dr.abs(β1)) > 0), β1 * step.Le * m, 0)
@@ -191,7 +193,7 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
         joined=joined,
         sky=move.sky,
         rough=move.rough,
-        # Rejected or at its end, it has nothing to set against the rest of the base path.
+        # A path that was rejected or has ended contributes nothing to compare with the rest of the base path.
         a=dr.select(apart | joined, 0, -w2 * step.β1),
         Δ=Δ + w2 * (β1 * move.L_bsdf - step.β1 * step.L_bsdf),
         w2=dr.select(apart | joined, 0, w2),
@@ -234,7 +236,7 @@ def no_move(path: Offset) -> Move:
 
 
 def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
-    """Straight to the base path's next vertex, or, where it escapes, along with it."""
+    """Connects straight to the base path's next vertex, or follows its direction if it escapes."""
     # ------------------------ The segment ------------------------
     # An escape is a vertex at infinity: all directions to it are the same one.
     x1, y = step.x1, own.y
@@ -249,8 +251,8 @@ def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
     origin = step.x.spawn_ray_to(x1.p).o
     J = dr.select(reaches, shift.reconnection_jacobian(origin, ray.o, x1.p, x1.n, in_medium), 1)
     f, p = media.evaluate_vertex(own.bsdf, y, own.place, y.to_local(direction))
-    # Rejected if occluded, unlike a shadow ray: nobody samples a path through an obstacle, so none is shifted back.
-    # Where p = 0 that is so already.
+    # Rejected if occluded, unlike a shadow ray: no path through an obstacle is sampled, so none is shifted back. Moves
+    # with p = 0 are rejected already.
     T, T_c, occluded = plan.space.reconnect(y, own.place, ray, x1, step.segment, step.drawn, active=p > 0)
 
     # ---------------------- Emission at x1 -----------------------
@@ -288,7 +290,7 @@ def part(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
 
     # --------------- Next vertex, and Le there -------------------
     sky = move.sky.behind(kind) if plan.hides else move.sky
-    # The same number, which meets other media, has the same density all the same.
+    # The same random number has the same density in other media.
     segment = plan.space.fly(y, own.place, y.spawn_ray(y.to_world(leaves.wo)), step.drawn, found)
     y1 = plan.space.end(y, segment)
     reaches = found & y1.is_valid()
@@ -303,8 +305,8 @@ def part(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
     # Reject what would not be, or the weights of the pair would not sum to 1 (survey, section 3.5).
     y1_connectable = ~reaches | plan.materials.connectable(y1.bsdf()) | media.scatters(segment.place)
     inverts = shift.replay_inverts(kind, own.connectable, y1_connectable, step.x_connectable)
-    # Light of the layer ``caustic`` has no differences. If one of the two paths is late, so is it from the other side.
-    # A base path that is late, or will be, has not come this far.
+    # Light of the layer ``caustic`` has no differences. If one of the two paths is late, the shift back meets a late
+    # path, too. A base path that is late, or will be, has not come this far.
     rough = move.rough
     if plan.caustic:
         rough, late = caustic.classes(rough, mi.Bool(False), found, kind, own.connectable)

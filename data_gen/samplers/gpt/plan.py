@@ -54,7 +54,7 @@ def make_plan(
         raise NgptError(f"gpt: shift '{shift}' does not go through media; use 'replay'")
     space = Filled(scene) if volumes else Space(scene)
     materials = Materials(scene, roughness_threshold, space.passed, media=volumes)
-    # Where all is connectable, a replay would end at a vertex to which the reverse shift reconnects: never allowed.
+    # If all vertices are connectable, the reverse shift would reconnect to the end of a replay, which is never allowed.
     replays = not materials.all_connectable
     return Plan(
         materials,

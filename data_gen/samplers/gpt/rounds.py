@@ -40,7 +40,7 @@ Take = Callable[[Known | None, CameraSamples, GradientFilm], None]
 
 
 def sharing(view, plan: Plan, frozen: Frozen, take: Take) -> SamplePass:
-    """The pass that ``take`` makes: of paths that share a cache where the ``plan`` says so, else of whole paths."""
+    """Returns the pass that ``take`` makes. Its paths share a cache if the ``plan`` says so, else they are whole."""
     return SharedTails(view, plan, frozen, take) if plan.matt else partial(take, None)
 
 
@@ -53,7 +53,7 @@ class SharedTails:
 
     def __init__(self, view, plan: Plan, frozen: Frozen, take: Take):
         self.frozen, self.take = frozen, take
-        # No method of this object, which has ``frozen``: there must be no circle.
+        # This is no method of the object, which holds ``frozen``: a reference back would form a cycle.
         self.plan, self.paths = plan, partial(paths, view, plan)
         self.seed: int | None = None
         self.cache: Cache | None = None
@@ -108,7 +108,7 @@ class SharedTails:
 
     def feed(self, sensor: mi.Sensor, seed: int, n: int) -> float:
         """Lets this number of paths feed the cache. Returns the share of paths that pass a place to end."""
-        # Spread over the image, row by row: rays side by side are quick.
+        # The paths are spread over the image row by row, since neighbouring rays trace faster.
         number = np.arange(n, dtype=np.int64)
         some, first = number * self.pixels // n, self.fed + number % -(-n // self.pixels)
         camera = CameraSamples(sensor, seed ^ _SEED, 1, mi.UInt32(first), 1, mi.UInt32(some))
@@ -118,7 +118,7 @@ class SharedTails:
         lanes = [dr.compress(count > i) for i in range(len(records))]
         there = [(which, record) for which, record in zip(lanes, records, strict=True) if dr.width(which)]
         if there:
-            # One by one, the kernels that add them would take longer to begin than to run.
+            # Kernels that add them one by one would take longer to launch than to run.
             fields = zip(*([dr.gather(type(v), v, which) for v in record] for which, record in there), strict=True)
             x, y, z, code, level, halves, *values = map(joined, fields)
             self.cache.add(Place(mi.Point3f(x, y, z), code, level), halves, values)
@@ -126,7 +126,9 @@ class SharedTails:
 
 
 def paths(view, plan: Plan, known: Known, camera: CameraSamples, half: mi.UInt32) -> tuple[mi.UInt32, list[list]]:
-    """How many records each path has, and these: place, half of the cache, and light of each sort, RGB."""
+    """Returns the number of records of each path, and the records: place, half of the cache, and light of each sort,
+    RGB.
+    """
     ray, importance, _ = camera.rays()
     within = mi.MediumPtr(camera.sensor.get_medium()) if plan.space.media else None
     count, records = feed(view, plan, known, camera.random.clone(), (ray, importance, within), half)
@@ -137,6 +139,8 @@ def paths(view, plan: Plan, known: Known, camera: CameraSamples, half: mi.UInt32
 
 
 def grid(sensor: mi.Sensor, seed: int) -> Grid:
-    """The cells' grid about a camera: another one for each seed, so that no wall lies on a border of cells in all."""
+    """Returns the cells' grid about a camera. It differs for each seed, so that no wall lies on a cell border for every
+    seed.
+    """
     origin = np.array(sensor.world_transform().translation(), np.float64).ravel()
     return Grid.at(origin, np.random.default_rng([seed, _SEED]).random(3))

@@ -8,8 +8,8 @@ behind the vertex, as far as the surface scatters like a matt one (``data_gen.ta
 
 the vertex's reflectance times the mean light of the cell; an offset path adds a ρ C to its difference, with the factor
 ``a`` that it would have had for all that follows (``offset_path.settle``). Where the material has nothing else the path
-is over. Elsewhere it goes on for the rest. Emission at the vertex itself is found by the step before, and weighted as
-ever.
+is over. Elsewhere it goes on for the rest. The step before finds the emission at the vertex itself, with its usual MIS
+weight.
 
 Where there is the layer ``caustic``, the cache keeps the light apart that belongs to it from the vertex on, because it
 has come over a sharp surface behind it (``data_gen.paths.caustic``). It goes into the layer and into no difference.
@@ -42,7 +42,7 @@ _ALL = 16
 
 
 def place(plan: Plan, known: Known, path: Path) -> tuple[Place, mi.Bool]:
-    """Where a path is in the cache, and whether it may end there, or open a record."""
+    """Returns the path's place in the cache, and whether it may end there or open a record."""
     x, trail = path.x, path.trail
     able = path.walks & x.is_valid() & (path.depth < plan.limits.max_depth) & (trail.spread > NEAR * trail.reach)
     able = plan.matt.at(x, path.place, able)
@@ -55,7 +55,8 @@ def place(plan: Plan, known: Known, path: Path) -> tuple[Place, mi.Bool]:
 
 
 def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.Spectrum, mi.Spectrum, mi.Spectrum]:
-    """Ends paths where the cache knows what follows; returns them, and that, in the layer ``caustic`` or not.
+    """Ends paths where the cache knows the light that follows. Returns the paths, and that light, in the layer
+    ``caustic`` or not.
 
     The last value is a sample of the error of all that comes from the cache (``data_gen.tails.cache``). Differences get
     what is theirs, but for what is in that layer.
@@ -63,7 +64,7 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
     where, able = place(plan, known, path)
     lambertian = plan.matt.lambertian(path.x, path.place, able)
     for y in offsets:
-        # A joined path has come from elsewhere, and the rest of what the material does is another one for it.
+        # A joined path has come from elsewhere, so the rest of the material's scattering differs for it.
         able &= ~(y.apart | (y.joined & ~lambertian))
     sorts, errors, ends = known.look(where, LEAST, able)
     ρ = plan.matt.reflectance(path.x, path.place, ends)
@@ -71,7 +72,8 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
     found, caustic_found = caustic.split(path.late, found)
     caustic_found = sum(late, caustic_found)
     for y in offsets:
-        # For a joined path: what it would settle with at this vertex, which scatters alike in all directions
+        # For a joined path: the factor with which it would settle at this vertex, which scatters alike in all
+        # directions
         joined = gradient_weight(y.r, True) * (y.β - path.β)
         y.Δ = y.Δ + dr.select(y.joined, joined, y.a) * found
     path.walks = path.walks & ~(ends & lambertian)
@@ -107,7 +109,7 @@ def feed(view, plan: Plan, known: Known, random, camera_ray: tuple, half: mi.UIn
     blank = Place(dr.zeros(mi.Point3f, lanes), mi.UInt32(0), mi.Int32(0))
     dark = [dr.zeros(mi.Spectrum, lanes) for _ in known.means]
     none = [Record(blank, mi.Spectrum(0), mi.Bool(False), list(dark)) for _ in range(RECORDS)]
-    # What is late is not so from the camera on, but from each record on.
+    # Here light is late counted from each record, and not from the camera.
     whole = replace(plan, caustic=False)
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
         return walk(whole, known, random, path, none, half)
@@ -144,7 +146,7 @@ def walk(plan: Plan, known: Known, random, path: Path, records: list, half: mi.U
             r.place = dr.select(this, where, r.place)
         count = dr.select(fresh, count + 1, count)
         path.trail.spread = dr.select(fresh, 0, path.trail.spread)
-        # Which paths survive, those decide that are to find the light of the newest record.
+        # The throughput since the newest record decides which paths survive.
         path.β = dr.select(fresh, 1, path.β)
         path.ρ = ρ
         path.walks = path.walks & ~(ends & plan.matt.lambertian(path.x, path.place, ends))

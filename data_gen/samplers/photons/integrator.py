@@ -1,4 +1,4 @@
-"""What all photon plugins share: parameters, the world of a scene, and the photon maps of a pass."""
+"""The shared part of all photon plugins: parameters, the world of a scene, and the photon maps of a pass."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import mitsuba as mi
 from data_gen.passes import SamplePass
 from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.light_ends import LightEnds, LightRay, World
+from data_gen.paths.light_ends import LightEnds, World
 from data_gen.paths.lights import visible
 from data_gen.paths.streams import light_streams
 from data_gen.paths.vertex import Materials
@@ -25,16 +25,15 @@ from ngpt.errors import NgptError
 
 # Bytes of a camera sample and its features, beside the maps
 CAMERA_BYTES = 256
-# Bytes of a map in media: two words more for each vertex, and two for each light path
-MEDIA_MAP_BYTES = MAP_BYTES + VERTICES_PER_PATH * 2 * 8 + 2 * 8
-# Further bytes of it with grids: null collisions of each vertex, twice; and Φ / σs
-GRID_BYTES = VERTICES_PER_PATH * (3 + 3 + 3) * 4
+# Bytes of a map in media: a word more for each vertex, and two for each light path
+MEDIA_MAP_BYTES = MAP_BYTES + VERTICES_PER_PATH * 8 + 2 * 8
+# Further bytes of it with grids: Φ / σs of each vertex
+GRID_BYTES = VERTICES_PER_PATH * 3 * 4
 
 
 @dataclass
 class Traced:
     photons: Any  # the record
-    starts: LightRay  # the light's end of each light path
     paths: int  # light paths of the pass
     number: int  # of the pass
     seed: int  # of the render
@@ -49,15 +48,11 @@ class PhotonIntegrator(GradientIntegrator):
     """Derived classes have ``sample_pass(passes, camera, film)``, and say what they need:
 
     ``follows``       "volpath" where they render media, or "path" for surfaces
-    ``edges``         photon maps have the edges of light paths, too
     ``camera_bytes``  that a camera sample takes
-    ``map_bytes``     that a map takes for each light path
-    ``walk``          class of how camera paths go with the neighbours' paths: ``gradients.camera.CameraPaths``
+    ``map_bytes``     that a map takes for each light path; and ``grid_bytes`` more in scenes with grids
     """
 
-    edges = False
-    camera_bytes, map_bytes = CAMERA_BYTES, MAP_BYTES
-    walk: type | None = None
+    camera_bytes, map_bytes, grid_bytes = CAMERA_BYTES, MAP_BYTES, GRID_BYTES
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
@@ -78,11 +73,11 @@ class PhotonIntegrator(GradientIntegrator):
         _refuse_lamps_never_chosen(scene, self.name)
         fog = Fog(scene, sensor, lights, self.name) if self.follows == "volpath" else None
         if fog and fog.media.grids:
-            self.map_bytes = type(self).map_bytes + GRID_BYTES
+            self.map_bytes = type(self).map_bytes + self.grid_bytes
         passed = {"passed": media.index_matched, "media": True} if fog else {}
         materials = Materials(scene, self.options["roughness_threshold"], **passed)
         world = World(scene, lights, materials, fog)
-        return Passes(self, world, pixel_width(scene, sensor), self.walk and self.walk(self, world))
+        return Passes(self, world, pixel_width(scene, sensor))
 
     def maps(self, passes: Passes, camera: CameraSamples) -> Iterator[Traced]:
         """The photon maps of the pass: of ``photons`` light paths for each sample of the ``camera``."""
@@ -91,16 +86,13 @@ class PhotonIntegrator(GradientIntegrator):
             return
         n = dr.width(camera.pixel) * self.photons
         random = light_streams(camera.seed, dr.arange(mi.UInt32, n), camera.first, independent=not camera.net)
-        longest = limits.max_depth - 1
-        starts, maps = trace(world, random, longest, limits.rr_depth, frozen=passes.frozen, edges=self.edges)
-        for photons in maps:
-            yield Traced(photons, starts, n, camera.first, camera.seed, self.options["radius"] * passes.width)
+        for photons in trace(world, random, limits.max_depth - 1, limits.rr_depth, passes.frozen):
+            yield Traced(photons, n, camera.first, camera.seed, self.options["radius"] * passes.width)
 
 
 def _refuse_lamps_never_chosen(scene, sampler: str) -> None:
-    """No photons start at a lamp of weight 0, so that its light would be missing. Mitsuba's paths meet it by chance.
-
-    Points and single directions of weight 0 are met by nothing: they are off, in Mitsuba as well.
+    """No photons start at a lamp of weight 0, so its light would be missing. Mitsuba's paths meet it by chance. No path
+    meets points and single directions of weight 0. They are off in Mitsuba as well.
     """
     for index, emitter in enumerate(scene.emitters()):
         if visible(emitter) and scene.pdf_emitter(mi.UInt32(index))[0] == 0:

@@ -1,4 +1,4 @@
-"""What the passes of one render share, for integrators that gather photons."""
+"""The state that the passes of one render share, for integrators that gather photons."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ class Passes:
     integrator: Any
     world: World
     width: float  # of a pixel
-    walk: Any = None  # how camera paths go with the neighbours' paths: ``photons.gradients.camera.CameraPaths``
     frozen: Frozen = field(init=False)
 
     def __post_init__(self) -> None:

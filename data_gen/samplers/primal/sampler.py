@@ -36,8 +36,8 @@ def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places |
     errs = places or loses_light(scene, integrator) or bent_lamp(scene)
     if not (tails == "shared" or (followed and errs)):
         return recorded(scene, partial(samples, scene, integrator, radiance(scene, integrator), features))
-    # Others choose a lamp alike everywhere, by vertex normals. Behind holes these paths trace a quarter fewer rays than
-    # ``prb``.
+    # Mitsuba's integrators choose lamps with the same probabilities everywhere, and use vertex normals. Behind holes
+    # our paths trace a quarter fewer rays than ``prb``.
     view = SAMPLERS["gpt"].integrator(scene, places=places, caustic=False, tails=tails)
     plan = view.plan(scene)
     frozen = Frozen(scene, plan)

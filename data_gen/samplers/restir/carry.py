@@ -1,4 +1,4 @@
-r"""Records of one frame, carried into the scene of another: where things or lights move, what was found is found anew.
+r"""Carries the records of one frame into the scene of another, and recomputes them where shapes or lights have moved.
 
 A path is the same path in both scenes if its random numbers are, and rc is the same point of the same shape:
 
@@ -9,9 +9,9 @@ A path is the same path in both scenes if its random numbers are, and rc is the 
 | the direction from rc on | the same in the world | 1 |
 | what is behind it | the same random numbers: light, and Russian roulette, are found anew | 1 |
 
-Nothing of that depends on the pixel that a path is in. So a record is carried once, and everything else is E in either
-scene. The way back is the same, and what it cannot undo is never carried: rc on a shape that was not there, or that has
-other triangles. [Lin et al. 2022: shifts between domains of any kind, here between two times]
+None of this depends on the path's pixel. So a record is carried once, and everything else is E in either scene. The way
+back is the same, and what it cannot undo is never carried: rc on a shape that was not there, or that has other
+triangles. [Lin et al. 2022: shifts between domains of any kind, here between two times]
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from data_gen.scenes.geometry import Mesh
 
 
 class Carry:
-    """How the shapes of one scene lie in another: what takes records from ``source`` to ``target``."""
+    """Carries records from ``source`` to ``target``. It knows how the shapes of one scene lie in the other."""
 
     def __init__(self, source: Stage, target: Stage):
         self.target = target
@@ -68,7 +68,7 @@ class Carry:
         self.stretched = mi.Bool(first > 0)
 
     def __call__(self, seed: int, record: Record, active: mi.Bool) -> Record:
-        """The records in the other scene, evaluated; of those that are not ``active`` nothing is known."""
+        """Returns the records in the other scene, evaluated. Records that are not ``active`` have no defined values."""
         target = self.target
         kind, far = record.kind, record.escapes()
         joined = active & (kind != LIGHT) & (kind != REPLAY) & (kind != STUCK)
@@ -84,7 +84,7 @@ class Carry:
         A = mi.Matrix3f([row[:3] for row in rows])
         P = mi.Point3f(A @ mi.Vector3f(record.P) + mi.Vector3f(*(row[3] for row in rows)))
         moved = replace(record, P=P, shape=shape)
-        # Seen from anywhere: no farther off than it was from its predecessor, as rounding goes
+        # Any viewpoint serves. This one is about as far off as the predecessor was, so rounding errors stay alike.
         hit, ray = moved.hit(P + record.w * dr.rsqrt(dr.maximum(record.geometry, 1e-20)))
         x = hit.compute_surface_interaction(ray, active=known)
         face = dr.gather(mi.Bool, self.stretched, at)

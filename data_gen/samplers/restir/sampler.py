@@ -1,4 +1,4 @@
-"""The sampler ``restir``: a film of each frame of a shot."""
+"""The sampler ``restir``: makes a film for each frame of a shot."""
 
 from __future__ import annotations
 
@@ -18,16 +18,19 @@ from data_gen.samplers.restir.stage import Stage
 from data_gen.scenes.geometry import Geometry
 from data_gen.scenes.load import reference_integrator
 
-# What a lane takes: five reservoirs of 100 bytes, five of the frame before, and E of what they ask for.
+# Bytes of a lane: five reservoirs of 100 bytes, five of the frame before, and the evaluations of the requested paths
 LANE_BYTES = 3072
 
 
 class Restir:
-    """Frames one after the other, of ``spp`` chains for each pixel that know nothing of each other.
+    """Renders frames one after the other, with ``spp`` independent chains for each pixel.
 
-    Options: ``history``, the frames that a reservoir can count for; ``gradients``, "pairs": of reservoirs of pairs of
-    pixels, or "after": of the paths that the pixels' reservoirs have kept, the paper's baseline; and
-    ``roughness_threshold``, as for ``gpt``. Raises NgptError for what cannot be rendered.
+    ``history``    the confidence that a reservoir can reach, in frames
+    ``gradients``  "pairs": pairs of pixels have reservoirs of their own; "after": gradients come from the paths that
+                   the pixels' reservoirs have kept, the paper's baseline
+    ``roughness_threshold``  as for ``gpt``
+
+    Raises NgptError for scenes that it cannot render.
     """
 
     def __init__(
@@ -62,10 +65,11 @@ class Restir:
         depth: np.ndarray | None,
         changed: tuple[mi.Scene, Sequence[Geometry]] | None = None,
     ) -> GradientFilm:
-        """Frame number ``index`` of the shot; where it is not the one after the last, history begins anew.
+        """Renders frame number ``index`` of the shot. If that is not the one after the last, history begins anew.
 
-        ``motion`` and ``depth`` are as for ``History.next_frame``. ``changed`` is the scene as it is now, and where its
-        shapes are; None where only the camera has moved. With ``changed``, two frames in turn must be of two scenes.
+        ``motion`` and ``depth`` are as for ``History.next_frame``. ``changed`` is the scene in this frame, and where
+        its shapes are; None if only the camera has moved. The scene in ``changed`` must be another object than the
+        scene of the frame before, which must not have changed since.
         """
         stage = None if changed is None else self._stage(*changed)
         self.stage = stage or self.stage

@@ -1,4 +1,4 @@
-"""The entries of ``vcm`` and ``gvcm``."""
+"""The entry of ``vcm``."""
 
 from data_gen.samplers.registry import Sampler, register
 from data_gen.samplers.shared import BOTH_ENDS, GATHERING, IN_MIRRORS, first_radius, joined_depth, spectra
@@ -8,23 +8,19 @@ from data_gen.samplers.shared import BOTH_ENDS, GATHERING, IN_MIRRORS, first_rad
 _OPTIONS = {"radius": first_radius(2.0), "joined_depth": joined_depth(17), "roughness_threshold": GATHERING}
 _NOTES = {"transport": "found from both ends and by photons; blurred where by photons", "mirrors": IN_MIRRORS}
 
-for _name, _summary in (
-    ("vcm", "paths from both ends, joined and merged with photons, without gradients (hidden lamps and all caustics)"),
-    ("gvcm", "gradients of paths from both ends, joined and merged with photons (hidden lamps and all caustics)"),
-):
-    register(
-        Sampler(
-            _name,
-            _summary,
-            f"data_gen.samplers.vcm.{'integrator' if _name == 'vcm' else _name}",
-            standing="use" if _name == "vcm" else "niche",
-            refusals=(*BOTH_ENDS, spectra),
-            notes=_NOTES,
-            options=_OPTIONS,
-            gradients=_name == "gvcm",
-            gathers=_name == "vcm",
-            finds=("caustics", "hidden lamps"),
-            batch=1,
-            biased=True,
-        )
+register(
+    Sampler(
+        "vcm",
+        "paths from both ends, joined and merged with photons, without gradients (hidden lamps and all caustics)",
+        "data_gen.samplers.vcm.integrator",
+        standing="use",
+        refusals=(*BOTH_ENDS, spectra),
+        notes=_NOTES,
+        options=_OPTIONS,
+        gradients=False,
+        gathers=True,
+        finds=("caustics", "hidden lamps"),
+        batch=1,
+        biased=True,
     )
+)

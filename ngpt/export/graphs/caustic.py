@@ -1,8 +1,8 @@
 """After ``ngpt.denoisers.caustic`` and ``diffusion``: denoises the light that is not in gradients.
 
-Pixels exchange light with four neighbours of one half plane, at one distance after the other. Each exchange is added to
-one pixel and subtracted from the other, so no light is lost. Surfaces beyond the border are so far away that no light
-is exchanged with them.
+Each pixel exchanges light with its four neighbours in one half plane, at one distance after the other. Each exchange is
+added to one pixel and subtracted from the other, so no light is lost. Surfaces beyond the border are so far away that
+no light is exchanged with them.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from ngpt.export.builder import Value, channels, choose, op, repeat
 from ngpt.export.graphs.repair import finite
 
 IMAGE = ("tiles", 3, "height", "width")
-# Pixels that light travels at most.
+# The largest distance that light travels, in pixels.
 REACH = sum(DISTANCES)
 _FAR = 3e38
 
@@ -50,7 +50,7 @@ def _exchanged(state: Value, surfaces: Value, distance: Value, size: Value, floo
     light, noise = channels(state, 0, 3), channels(state, 3, 4)
     around = op.Mul(distance, [0, 1, 1, 1])
     states, far = op.Pad(state, around, 0.0, [2, 3]), op.Pad(surfaces, around, _FAR, [2, 3])
-    # What is added to light, what is given away, and the variance that comes with what is taken.
+    # Channels: light added (3), sum of the shares given away, variance of the light received.
     sums = op.Concat(light, noise, noise, axis=1) * 0.0
     for down, right, weight in NEIGHBOURS:
         there, surface = (_moved(x, op.Mul(distance, [down, 1 + right]), size) for x in (states, far))
@@ -69,12 +69,12 @@ def _exchanged(state: Value, surfaces: Value, distance: Value, size: Value, floo
 
 
 def _moved(padded: Value, start: Value, size: Value) -> Value:
-    """The part of that size that begins at ``start``, (row, column)."""
+    """The part of ``size`` that begins at ``start``; both are (rows, columns)."""
     return op.Slice(padded, start, op.Add(start, size), [2, 3])
 
 
 def _surfaces(layers: Mapping[str, Value], depth: Value) -> Value:
-    """Albedo, normals and the logarithm of the depth, those that the model reads; without any, one that is even."""
+    """Those of albedo, normals and the logarithm of the depth that the model reads; without any, a uniform layer."""
     planes = [layers[name] for name in ("albedo", "normal") if name in layers]
     if "depth" in layers:
         planes.append(op.Log(op.Max(layers["depth"], depth * FARTHEST + 1e-37)))

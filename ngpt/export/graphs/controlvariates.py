@@ -17,9 +17,9 @@ def wcv(
 ) -> Value:
     """The base (N, 3, H, W) of finite layers.
 
-    ``trusted``   (N, 1, H, W) for dx and dy, true where they are
-    ``variance``  of primal, dx and dy, as renderers give them
-    ``mean``      what it is relative to, a scalar: the mean variance of the whole image
+    ``trusted``   (N, 1, H, W) for dx and dy, true where they can be trusted
+    ``variance``  of primal, dx and dy, as the renderer writes them
+    ``mean``      a scalar: the mean variance of the whole image, by which variances are divided
     """
     smooth, inside = variances.smoothed(primal, *variance)
     noisy = op.Greater(mean, 0.0)
@@ -47,12 +47,12 @@ def wcv(
 
 
 def _before(x: Value, axis: int, border: float) -> Value:
-    """The value of the pixel on the left (above); ``border`` where there is none."""
+    """The value of the left (upper) neighbour; ``border`` where there is none."""
     return op.Pad(op.Slice(x, [0], [-1], [axis]), [1, 0], border, [axis])
 
 
 def _slopes(image: Value) -> Value:
-    """(N, 12, H, W): the differences of the pixels right, below, left and above to a pixel, RGB each."""
+    """(N, 12, H, W): the right, lower, left and upper neighbour minus the pixel, RGB each."""
     weights = np.zeros((12, 3, 3, 3), np.float32)
     for direction, (y, x) in enumerate(((1, 2), (2, 1), (1, 0), (0, 1))):
         for colour in range(3):

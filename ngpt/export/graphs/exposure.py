@@ -11,9 +11,9 @@ STATISTICS = ("exposure", "largest depth", "least radiance", "largest radiance",
 
 
 def statistics(clean: Mapping[str, Value], variance_layers: tuple[Value, ...] | None) -> Value:
-    """(5): what ``STATISTICS`` lists, of layers that are finite; 0 for what is absent.
+    """(5): the values that ``STATISTICS`` lists, for finite layers; 0 for absent ones.
 
-    ``variance_layers``, of primal, dx and dy, belong to networks whose base is made in the graph.
+    ``variance_layers`` are the variances of primal, dx and dy; only networks whose base is made in the graph have them.
     """
     primal = clean["primal"]
     absent = op.ReduceMin(primal, keepdims=0) * 0.0

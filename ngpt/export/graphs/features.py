@@ -28,7 +28,7 @@ def normalised(finite: Mapping[str, Value], names: tuple[str, ...], exposure: Va
 
 
 def completed(scaled: Mapping[str, Value], inputs: tuple[str, ...]) -> dict[str, Value]:
-    """The layers, and those ``inputs`` that are computed from them; before any padding."""
+    """The layers before any padding, and the ``inputs`` that are computed from them."""
     return dict(scaled) | {name: _computed(name, scaled, compared(inputs)) for name in inputs if name in SOURCES}
 
 
@@ -45,12 +45,12 @@ def _computed(name: str, layers: Mapping[str, Value], compared_with: str) -> Val
 
 
 def reflectance(albedo: Value) -> Value:
-    """What radiance may be divided by, see ``ngpt.network.features.reflectance``."""
+    """A divisor of radiance; see ``ngpt.network.features.reflectance``."""
     return albedo + GLOSS
 
 
 def encoded(name: str, layer: Value) -> Value:
-    """The channels of one input, from its layer normalised and completed."""
+    """The channels of one input, from its normalised and completed layer."""
     if name in IMAGES:
         return log_for_networks(op.Max(layer, 0.0))
     if name in ("dx", "dy"):

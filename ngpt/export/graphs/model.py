@@ -4,8 +4,9 @@
             -> cropped -> head -> (goes over to the base) -> bounds -> exponential -> exposure -> emission -> caustic
             -> image
 
-All of it is float32, whatever the network is in. Images come and go with the emission that the camera sees directly,
-and with the light that gradients hold nothing of: another denoiser's image of it, or else what a diffusion makes of it.
+All of it is float32, whatever the precision of the network. Input and output include the emission that the camera sees
+directly. They also include the light that gradients do not contain. It is denoised by another denoiser, or else by a
+diffusion.
 """
 
 import numpy as np
@@ -23,14 +24,14 @@ from ngpt.network.inputs import DENOISED, LAYERS
 from ngpt.network.model import DARK, HUGE, WINDOW
 
 _VARIANCES = ("primal_var", "dx_var", "dy_var")
-# Light that may be apart, and its variance.
+# Light that gradients do not contain, and its variance.
 _APART = ("caustic", "caustic_var")
-# Another denoiser's image of that light, which its image of the primal includes.
+# Another denoiser's image of that light, which is also part of that denoiser's image of the primal.
 _FOUND = "denoised_caustic"
 
 
 class _OperatorsOfHeads(Operators):
-    """With the transfer between images and their logarithms; back at once, it takes no nodes."""
+    """Adds the transfer between images and their logarithms. The inverse of a logarithm made here adds no nodes."""
 
     def __init__(self) -> None:
         self._images: dict[str, Value] = {}
@@ -107,7 +108,7 @@ def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto
 
 
 def statistics(config: ModelConfig) -> Graph:
-    """The graph that computes what the tiles of an image share, and the input of another denoiser."""
+    """The graph that computes the statistics that tiles of an image share, and the input of another denoiser."""
     graph = Graph("statistics_of")
     used = {"primal", "direct", "caustic", "depth", *(("dx", "dy", *_VARIANCES) if config.base else ())}
     denoised = [name for name in DENOISED if name in config.layers]
@@ -156,14 +157,14 @@ def _numbers(shared: Value) -> tuple[Value, ...]:
 
 
 def _base(data: Repaired, scale: Value, mean: Value) -> Value:
-    """Control variates, over the exposure, without direct emission."""
+    """The control variates' image, divided by the exposure, without direct emission."""
     primal, dx, dy = (data.layers[name] / scale for name in ("primal", "dx", "dy"))
     variances = tuple(data.layers[name] for name in _VARIANCES)
     return controlvariates.wcv(primal, dx, dy, (data.trusted["dx"], data.trusted["dy"]), variances, mean)
 
 
 def _share(mirror: Mirror, noise: Value, base: Value, quiet: float) -> Value:
-    """``Reconstructor.share``: how much the network's result counts beside the base, (N, 1, rows, columns)."""
+    """``Reconstructor.share``: the weight of the network's result against the base, (N, 1, rows, columns)."""
     noise, light = op.Min(noise, HUGE), op.Min(abs(base), HUGE)
     both = op.Concat(*(op.ReduceMean(x, [1], keepdims=1) for x in (noise * noise, light)), axis=1)
     pads = 4 * [WINDOW // 2]

@@ -8,12 +8,12 @@ from ngpt.network.padding import MARGIN
 
 @dataclass
 class Side:
-    """One side of an image, padded: for each place the pixel that lies there, and its difference to the next.
+    """One padded axis of an image: for each place, the pixel that is copied to it, and its difference to the next.
 
-    ``axis``     its axis in (N, C, H, W)
-    ``size``     pixels of the side, a scalar
+    ``axis``     the axis in (N, C, H, W)
+    ``size``     pixels along the axis, a scalar
     ``here``     which pixel lies at each place
-    ``nearest``  which difference stands between there and the next place
+    ``nearest``  which difference stands between this place and the next
     ``step``     with which sign: 1, -1, or 0 where the image is one pixel wide
     """
 
@@ -45,7 +45,7 @@ class Mirror:
         return layer
 
     def crop(self, image: Value) -> Value:
-        """What was padded, without the padding."""
+        """A padded image without its padding."""
         sizes = op.Concat(op.Reshape(self.rows.size, [1]), op.Reshape(self.columns.size, [1]), axis=0)
         return op.Slice(image, [MARGIN] * 2, sizes + [MARGIN] * 2, [2, 3])
 

@@ -1,4 +1,4 @@
-"""After ``ngpt.repair``: direct emission taken out, non-finite pixels replaced, differences that cannot be trusted."""
+"""After ``ngpt.repair``: subtracts direct emission, replaces non-finite pixels, and marks untrusted differences."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,18 +10,18 @@ from ngpt.repair import BLOCK
 
 _IMAGE = ("tiles", 3, "height", "width")
 _UNKNOWN = np.float32(np.nan)
-# Blocks of 8^5 = 32768 pixels hold any image that files may.
+# Blocks of 8^5 = 32768 pixels cover any image that a file may hold.
 _LEVELS = 5
 
 
 @dataclass(frozen=True)
 class Repaired:
-    """What the rest of a graph works on; (N, C, H, W).
+    """The inputs of the rest of a graph; (N, C, H, W).
 
-    ``layers``   all of them by name: without direct emission, finite, 0 where not trusted; variances NaN where unknown.
-                 "caustic" is no part of "primal" where gradients are read
+    ``layers``   all of them by name: without direct emission, finite, 0 where not trusted; variances are NaN where
+                 unknown. "primal" excludes "caustic" if the network reads gradients
     ``direct``   direct emission, finite, to be added back
-    ``trusted``  of dx and dy, where there are any: (N, 1, H, W), true where they are
+    ``trusted``  of dx and dy, where there are any: (N, 1, H, W), true where they can be trusted
     """
 
     layers: dict[str, Value]
@@ -35,14 +35,14 @@ def finite(x: Value) -> Value:
 
 
 def clean(x: Value) -> Value:
-    """The values, 0 where they are not finite."""
+    """The values, with 0 where they are not finite."""
     return op.Where(finite(x), x, 0.0)
 
 
 def repaired(raw: Mapping[str, Value], gradients: bool) -> Repaired:
     """The layers that a renderer gives, ``primal`` and ``direct`` among them, as ``ngpt.repair`` leaves them.
 
-    ``gradients``  whether they are for a network that reads gradients, which works on light without ``caustic``
+    ``gradients``  whether the network reads gradients: such a network works on light without ``caustic``
     """
     light = raw["primal"] - raw["direct"]
     rest = light - raw["caustic"] if "caustic" in raw else light
@@ -76,7 +76,7 @@ def repaired(raw: Mapping[str, Value], gradients: bool) -> Repaired:
 
 
 def _of_all_light(raw: Mapping[str, Value]) -> Value:
-    """The variance of the primal with ``caustic``, NaN where it is not known."""
+    """The variance of primal plus ``caustic``, NaN where it is not known."""
     if "caustic" not in raw:
         return raw["primal_var"]
     variance, further = raw["primal_var"], raw["caustic_var"]
@@ -91,7 +91,7 @@ def _everywhere(flags: Value, axis: int) -> Value:
 
 
 def _filled(light: Value, good: Value) -> Value:
-    """The image with the pixels replaced that are not ``good``; ``ngpt.repair`` says by what."""
+    """The image with replacements, as in ``ngpt.repair``, for the pixels that are not ``good``."""
     sums = op.Concat(op.Where(good, light, 0.0), op.Cast(good, to=FLOAT), axis=1)
     near = op.AveragePool(sums, kernel_shape=[3, 3], pads=[1, 1, 1, 1], count_include_pad=1)
     levels = [sums, near]

@@ -14,12 +14,12 @@ def signed_log(x: Value) -> Value:
 
 
 def signed_log_for_networks(x: Value) -> Value:
-    """``signed_log`` to 6e-8, in half the nodes; networks do not see the difference."""
+    """``signed_log`` to 6e-8, in half the nodes; networks do not notice the difference."""
     return op.Sign(x) * log_for_networks(abs(x))
 
 
 def log_for_networks(x: Value) -> Value:
-    """ln(1 + x) of values from 0 on, to 6e-8."""
+    """ln(1 + x) for x >= 0, to 6e-8."""
     return op.Log(x + 1.0)
 
 

@@ -1,4 +1,4 @@
-"""After ``ngpt.classical.variances``: variances prepared as weights. Channels: of the primal, of dx, of dy."""
+"""After ``ngpt.classical.variances``: variances prepared as weights. Channels: primal, dx, dy."""
 
 from ngpt.classical.leastsquares import CLIP
 from ngpt.classical.variances import FEW, TYPICAL
@@ -7,10 +7,10 @@ from ngpt.export.graphs.repair import finite
 
 
 def smoothed(primal: Value, primal_var: Value, dx_var: Value, dy_var: Value) -> tuple[Value, Value]:
-    """The mean over 3x3 known values, taken twice; where none is known, the mean of all values; and ``inside``.
+    """The mean over 3x3 known values, taken twice, and ``inside``.
 
-    For differences it is the mean of fourth roots. Values larger than ``TYPICAL`` times its fourth power stay as they
-    are.
+    Where none is known, it is the mean of all values. For differences it is the fourth power of the mean of fourth
+    roots, times ``TYPICAL``; larger values stay as they are.
     """
     there = inside(primal)
     (vp, gp), (vx, gx), (vy, gy) = (_over_colours(layer) for layer in (primal_var, dx_var, dy_var))
@@ -19,7 +19,7 @@ def smoothed(primal: Value, primal_var: Value, dx_var: Value, dy_var: Value) -> 
     sums, counts = (op.ReduceSum(_rows(x), [2], keepdims=1) for x in (values, known))
     typical = sums / op.Max(counts, 1.0)
     averaged = op.Concat(channels(values, 0, 1), op.Sqrt(op.Sqrt(channels(values, 1, 3))), axis=1)
-    # Nothing may pass through the column and the row that do not exist.
+    # Differences have no last column and no last row: these must not contribute to the second mean.
     v, n = (_box(_box(x) * there) for x in (averaged, known))
     mean = v / op.Max(n, FEW)
     roots = channels(mean, 1, 3)
@@ -29,7 +29,7 @@ def smoothed(primal: Value, primal_var: Value, dx_var: Value, dy_var: Value) -> 
 
 
 def inside(primal: Value) -> Value:
-    """(N, 3, H, W) of 0 and 1: where there is a pixel, a difference to the right, a difference downwards."""
+    """(N, 3, H, W) of 0 and 1: 1 where there is a pixel, a difference to the right, a difference downwards."""
     there = channels(primal, 0, 1) * 0.0 + 1.0
     right, below = (op.Pad(op.Slice(there, [0], [-1], [axis]), [0, 1], 0.0, [axis]) for axis in (3, 2))
     return op.Concat(there, right, below, axis=1)
@@ -43,14 +43,15 @@ def robust_mean(values: Value, there: Value) -> Value:
         mean = op.ReduceSum(_rows(op.Min(used, last * float(CLIP))), keepdims=0) / count
         return mean, op.Less(mean, last * 0.5)
 
-    # In place of infinity, the largest number whose CLIP-fold is still finite.
+    # Instead of infinity, the largest number that stays finite when multiplied by CLIP.
     return repeat(64, clipped, count * 0.0 + 3e36, ())
 
 
 def _rows(x: Value) -> Value:
-    """Sums of rows. A sum over an image adds these: the WebAssembly runtime adds one number after another in 32 bits.
+    """Sums of rows, which a sum over an image adds.
 
-    It missed 0.2 % of the sum of 640x360 numbers, and more of larger images.
+    The WebAssembly runtime adds one number after another in 32 bits: without row sums it lost 0.2 % of the sum of
+    640x360 numbers, and more in larger images.
     """
     return op.ReduceSum(x, [3], keepdims=1)
 

@@ -1,1 +1,1 @@
-"""Images of other formats than OpenEXR: PFM, Radiance HDR, PNG, TIFF, JPEG. ``files`` reads them all."""
+"""Images in formats other than OpenEXR: PFM, Radiance HDR, PNG, TIFF, JPEG. ``files`` reads them all."""

@@ -1,7 +1,7 @@
-"""A file of any format that is read, as an OpenEXR file would be: ``read_file`` and ``file_headers``.
+"""Reads a file of any known format as if it were OpenEXR: ``read_file`` and ``file_headers``.
 
-What is encoded for displays (PNG, JPEG, TIFF of whole numbers) becomes scene-linear by the sRGB formula, colours are
-multiplied by alpha, grey becomes R = G = B. The header attribute ``ngpt:from`` says what an image was.
+Values encoded for displays (PNG, JPEG, TIFF of whole numbers) become scene-linear by the sRGB formula, colours are
+multiplied by alpha, grey becomes R = G = B. The header attribute ``ngpt:from`` names the original format.
 """
 
 import logging
@@ -24,9 +24,9 @@ from ngpt.system.reading import regular_file
 
 _LOG = logging.getLogger(__name__)
 
-# A header attribute: what an image was; and how its value ends where it was encoded for displays.
+# The header attribute for the original format, and the end of its value if the image was encoded for displays.
 FROM, ENCODED = "ngpt:from", " of sRGB"
-# What a file begins with, and who reads it.
+# The first bytes of a file, and its reader.
 READERS: dict[bytes, Callable[[BinaryIO], Form]] = {
     b"PF": pfm.describe,
     b"Pf": pfm.describe,
@@ -40,7 +40,7 @@ _BROKEN = (Damage, struct.error, zlib.error, ValueError, TypeError, LookupError,
 
 
 def read_file(path: str | os.PathLike) -> ExrImage:
-    """All that a file holds. Raises NgptError as ``ngpt.io.openexr.read_exr`` does, for each of the formats."""
+    """The whole contents of a file. Raises NgptError as ``ngpt.io.openexr.read_exr`` does, for each of the formats."""
     path = Path(path)
     with regular_file(path) as file:
         reader = _reader(file)
@@ -58,7 +58,7 @@ def file_headers(file: BinaryIO, path: str) -> list[PartHeader]:
 
 
 def first_attributes(path: Path) -> dict[str, Any]:
-    """The attributes of a file's first part, none in other formats than OpenEXR; raises NgptError."""
+    """The attributes of a file's first part; none in formats other than OpenEXR. Raises NgptError."""
     with regular_file(path) as file:
         if _reader(file):
             return {}
@@ -66,7 +66,7 @@ def first_attributes(path: Path) -> dict[str, Any]:
 
 
 def tell_conversion(path: Path) -> None:
-    """Logs, as ``read_file`` does, how the light of a file was converted that another process has read."""
+    """Logs, as ``read_file`` does, how light was converted, for a file that another process has read."""
     with regular_file(path) as file:
         reader = _reader(file)
         if reader is not None:
@@ -132,7 +132,7 @@ def _as_part(path: Path, form: Form) -> ExrPart:
 
 
 def linear_srgb(values: np.ndarray) -> np.ndarray:
-    """Values in [0, 1] as displays take them -> linear light (IEC 61966-2-1)."""
+    """Display values in [0, 1] -> linear light (IEC 61966-2-1)."""
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 

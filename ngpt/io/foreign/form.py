@@ -1,4 +1,4 @@
-"""What the readers of all formats share: the facts about an image before it is decoded, and one error."""
+"""The parts that all readers share: the facts about an image before it is decoded, and their errors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ class Form:
     ``kind``      format and type of numbers, for messages: "PNG, 16 bits"
     ``size``      (width, height)
     ``channels``  1 grey, 2 grey and alpha, 3 colour, 4 colour and alpha
-    ``ratio``     the most bytes of float32, R G B and perhaps alpha, that one byte of the file can stand for
-    ``encoded``   whether numbers are as displays take them: uint8 or uint16 of sRGB; others are scene-linear float32
+    ``ratio``     the most bytes of the decoded float32 image that one byte of the file can stand for
+    ``encoded``   whether numbers are display values: uint8 or uint16 of sRGB; others are scene-linear float32
     ``decode``    () -> (H, W, channels), row 0 on top
     ``straight``  whether colours are not yet multiplied by alpha
     """

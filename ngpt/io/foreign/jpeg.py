@@ -1,4 +1,4 @@
-"""JPEG, by Pillow, turned as its camera says."""
+"""JPEG, by Pillow, rotated by its orientation tag."""
 
 from importlib.util import find_spec
 from typing import BinaryIO
@@ -20,7 +20,7 @@ def describe(file: BinaryIO) -> Form:
     from PIL import ImageOps
     from PIL.JpegImagePlugin import JpegImageFile
 
-    # Its size is limited by us, before it is decoded.
+    # We limit the size ourselves, before decoding.
     image = JpegImageFile(file)
     if image.mode not in ("L", "RGB"):
         raise Unread(f"holds {image.mode} and neither grey nor R G B; save it as R G B")

@@ -1,7 +1,7 @@
 """Portable float maps, the format of Open Image Denoise's own programs: read and written.
 
 A header of text (``PF`` or ``Pf`` for grey, width and height, scale), then float32, the bottom row first. A negative
-scale means little-endian; its size multiplies the numbers, as in oidnDenoise.
+scale means little-endian; its magnitude multiplies the numbers, as in oidnDenoise.
 https://www.pauldebevec.com/Research/HDR/PFM/
 """
 

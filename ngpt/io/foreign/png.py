@@ -1,4 +1,4 @@
-"""PNG: all types of colour and depth, in rows or interlaced. Gamma and profiles are left out of account: it is sRGB.
+"""PNG: all types of colour and depth, in rows or interlaced. Gamma and profiles are ignored: values are taken as sRGB.
 
 https://www.w3.org/TR/png-3/; ``ngpt.image.png`` is the encoder.
 """
@@ -15,7 +15,7 @@ from ngpt.io.foreign.form import Damage, Form, Unread
 MAGIC = b"\x89PNG\r\n\x1a\n"
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
-_LONGEST = 2**16  # pixels of a side: filters go along the diagonals of an image, one after the other
+_LONGEST = 2**16  # pixels of a side: filters take a step for each diagonal of an image
 # x and y of the first pixel of each pass, and the steps to the next ones.
 _ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
 
@@ -30,7 +30,7 @@ def describe(file: BinaryIO) -> Form:
     if depth not in _DEPTHS.get(colour, ()) or compression or filters or interlaced > 1 or not (width and height):
         raise Damage("its header makes no sense")
     if max(width, height) > _LONGEST:
-        raise Unread(f"is {width}x{height} pixels, and {_LONGEST} are the longest side that is read; cut it up")
+        raise Unread(f"is {width}x{height} pixels, but sides longer than {_LONGEST} are not read; cut it up")
     chunks = list(_before_pixels(file))
     palette = next((data for kind, data in chunks if kind == b"PLTE"), b"")
     clear = next((data for kind, data in chunks if kind == b"tRNS"), b"")
@@ -42,7 +42,7 @@ def describe(file: BinaryIO) -> Form:
             return _looked_up(samples[..., 0], palette, clear)
         most = 2**depth - 1
         if clear:
-            # One colour is the clear one.
+            # One colour is transparent.
             wanted = np.frombuffer(clear[: 2 * samples.shape[2]], ">u2")
             if wanted.size < samples.shape[2]:
                 raise Damage("its clear colour breaks off")
@@ -50,13 +50,16 @@ def describe(file: BinaryIO) -> Form:
             samples = np.concatenate([samples, (there * most).astype(samples.dtype)], axis=-1)
         return samples if depth >= 8 else (samples * (255 // most)).astype(np.uint8)
 
-    # A byte is 1032 of deflate's, and a number of a palette is four floats.
+    # One byte inflates to at most 1032, and an index into a palette becomes four floats.
     ratio = 1032 * 8 * 16 // depth
     return Form(f"PNG, {depth} bits", (width, height), planes, ratio, True, decode, straight=True)
 
 
 def _before_pixels(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
-    """The chunks up to the first of pixels, where the file is then; of palettes and the clear colour also the data."""
+    """The chunks before the first one with pixels, with the data of the palette and the transparent colour.
+
+    The file is then at the first chunk with pixels.
+    """
     while True:
         length, kind = _next(file)
         if kind == b"IDAT":
@@ -71,7 +74,7 @@ def _before_pixels(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _next(file: BinaryIO) -> tuple[int, bytes]:
-    """Length and kind of the chunk at which the file is."""
+    """The length and the kind of the chunk at the file's position."""
     header = file.read(8)
     if len(header) < 8:
         raise Damage("it ends before all of its pixels are there")
@@ -79,7 +82,7 @@ def _next(file: BinaryIO) -> tuple[int, bytes]:
 
 
 def _data(file: BinaryIO, length: int, kind: bytes) -> bytes:
-    """What the chunk holds, by its checksum whole."""
+    """The data of the chunk; its checksum is verified."""
     data, checksum = file.read(length), file.read(4)
     if len(checksum) < 4:
         raise Damage("it ends before all of its pixels are there")
@@ -92,7 +95,7 @@ def _samples(file: BinaryIO, size: tuple[int, int], depth: int, channels: int, i
     """(H, W, channels) uint8 or uint16, as they are stored."""
     width, height = size
     passes = _ADAM7 if interlaced else ((0, 0, 1, 1),)
-    # Columns, rows and bytes of a row of each.
+    # Columns and rows of each pass; then its rows and the bytes of a row.
     areas = [(-(-(width - x) // step), -(-(height - y) // rise)) for x, y, step, rise in passes]
     shapes = [(rows, -(-columns * channels * depth // 8)) if columns > 0 else (0, 0) for columns, rows in areas]
     data = _inflated(file, sum(rows * (1 + length) for rows, length in shapes if length))
@@ -116,7 +119,7 @@ def _samples(file: BinaryIO, size: tuple[int, int], depth: int, channels: int, i
 
 
 def _inflated(file: BinaryIO, size: int) -> bytes:
-    """What the chunks of pixels hold, ``size`` bytes; what follows is left out."""
+    """The first ``size`` bytes in the chunks of pixels, inflated; further bytes are ignored."""
     inflate, data = zlib.decompressobj(), bytearray()
     while len(data) < size:
         length, kind = _next(file)
@@ -129,14 +132,14 @@ def _inflated(file: BinaryIO, size: int) -> bytes:
 def _unfiltered(lines: np.ndarray, step: int) -> np.ndarray:
     """Undoes the filters of rows: (rows, 1 + bytes) -> (rows, bytes). The first byte of a row is its filter.
 
-    ``step`` is the number of bytes of a pixel. A pixel needs the ones to its left, above, and above left. So all on a
-    diagonal are done at once.
+    ``step`` is the number of bytes of a pixel. A pixel needs those to its left, above, and above left. So all pixels on
+    a diagonal are computed at once.
     """
     filters, coded = lines[:, 0], lines[:, 1:]
     if filters.max(initial=0) > 4:
-        raise Damage(f"row {int(filters.argmax())} has filter {filters.max()}, which is none")
+        raise Damage(f"row {int(filters.argmax())} has filter {filters.max()}; filters are 0 to 4")
     rows, columns = len(lines), coded.shape[1] // step
-    # A row above and a pixel to the left, of zeros.
+    # One row above and one column to the left are zeros.
     out = np.zeros((rows + 1, columns + 1, step), np.int16)
     out[1:, 1:] = coded.reshape(rows, columns, step)
     if filters.any():
@@ -145,7 +148,7 @@ def _unfiltered(lines: np.ndarray, step: int) -> np.ndarray:
         for diagonal in range(rows + columns - 1):
             top, end = max(0, diagonal - columns + 1), min(rows - 1, diagonal) + 1
             first = (top + 1) * wide + diagonal - top + 1
-            # The next pixel of a diagonal is a row lower and one to the left.
+            # The next pixel of a diagonal is one row lower and one column to the left.
             here, left, above, corner = (
                 flat[first - back : first - back + (end - top - 1) * columns + 1 : columns]
                 for back in (0, 1, wide, wide + 1)
@@ -160,7 +163,7 @@ def _unfiltered(lines: np.ndarray, step: int) -> np.ndarray:
 
 
 def _looked_up(places: np.ndarray, palette: bytes, clear: bytes) -> np.ndarray:
-    """(H, W, 3 or 4) uint8 of places in a palette; ``clear`` is the alpha of its first colours."""
+    """(H, W, 3 or 4) uint8 from indices into a palette; ``clear`` is the alpha of its first colours."""
     table = np.frombuffer(palette[: len(palette) // 3 * 3], np.uint8).reshape(-1, 3)
     if places.max() >= len(table):
         raise Damage(f"its palette has {len(table)} colours, and a pixel is number {places.max()}")

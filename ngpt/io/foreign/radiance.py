@@ -1,7 +1,7 @@
 """Radiance HDR: RGBE pixels, plain or by either of the format's run lengths.
 
-A pixel is R G B in 8 bits and an exponent that they share: value = byte * 2^(e - 136), as most readers have it
-(Radiance itself adds half a step). EXPOSURE and COLORCORR have been multiplied onto the pixels and are divided out.
+A pixel is R G B in 8 bits and an exponent that they share: value = byte * 2^(e - 136), as in most readers (Radiance
+itself adds half a step). EXPOSURE and COLORCORR have been multiplied onto the pixels and are divided out.
 https://radsite.lbl.gov/radiance/refer/filefmts.pdf
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from ngpt.io.foreign.form import Damage, Form, Unread
 
 _MOST = 2**16  # bytes of the header
-_SHORTEST, _LONGEST = 8, 0x7FFF  # lines of a length in between may have the newer run lengths
+_SHORTEST, _LONGEST = 8, 0x7FFF  # image rows of such widths may use the newer run lengths
 
 
 def describe(file: BinaryIO) -> Form:
@@ -23,7 +23,7 @@ def describe(file: BinaryIO) -> Form:
     text, gap, rest = start.partition(b"\n\n")
     line = re.match(rb"([-+])Y +(\d{1,9}) +([-+])X +(\d{1,9})\n", rest)
     if gap and not line and re.match(rb"[-+]X ", rest):
-        raise Unread("has columns for rows; turn it, pfilt or another program does")
+        raise Unread("has columns for rows; turn it with pfilt or another program")
     if not line:
         raise Damage("its header does not end in a size, such as -Y 360 +X 640")
     if (form := re.search(rb"^FORMAT *= *(\S+)", text, re.MULTILINE)) and form[1] != b"32-bit_rle_rgbe":
@@ -41,12 +41,12 @@ def describe(file: BinaryIO) -> Form:
             light = light if (gain == 1.0).all() else (light / gain).astype(np.float32)
         return light[:: 1 if line[1] == b"-" else -1, :: 1 if line[3] == b"+" else -1]
 
-    # A pair of bytes of the newer run lengths stands for 127 values; one old repetition for a whole image.
+    # A pair of bytes of the newer run lengths stands for 127 values; one old repetition may stand for a whole image.
     return Form("Radiance HDR", (width, height), 3, 2**24, False, decode)
 
 
 def _multiplied(header: bytes) -> np.ndarray:
-    """(3,): what the pixels were multiplied by, all lines of it together."""
+    """(3,): the factor of the pixels, the product of all header lines that give one."""
     gain = np.ones(3)
     for name, value in re.findall(rb"^(EXPOSURE|COLORCORR) *= *(.*)$", header, re.MULTILINE):
         try:
@@ -75,7 +75,8 @@ def _pixels(data: bytes, width: int, height: int) -> np.ndarray:
 
 
 def _old_runs(pixels: np.ndarray, repeats: np.ndarray, count: int) -> np.ndarray:
-    """Pixels 1 1 1 n repeat the one before them n times; of several in a row each counts 256 times the one before."""
+    """A pixel 1 1 1 n repeats the pixel before it n times; in a row of such pixels, each n counts 256 times as much as
+    the one before."""
     places = np.arange(len(pixels))
     last = np.maximum.accumulate(np.where(repeats, -1, places))
     if repeats[0]:
@@ -85,13 +86,13 @@ def _old_runs(pixels: np.ndarray, repeats: np.ndarray, count: int) -> np.ndarray
     end = np.cumsum(times)
     if not len(end) or end[-1] < count:
         raise Damage(f"{end[-1] if len(end) else 0} of its {count} pixels are there")
-    # What is beyond the image is nobody's, and may be anything.
+    # Values beyond the image are not used.
     times = np.clip(count - (end - times), 0, times)
     return np.repeat(pixels[last], times, axis=0)
 
 
 def _new_runs(data: bytes, width: int, height: int) -> np.ndarray:
-    """Line by line, of each first all R, then all G, B and exponents; 128 + n and a byte repeat it n times."""
+    """Each row stores all R, then all G, B and exponents. 128 + n and a byte repeat that byte n times."""
     pixels, place, begin = np.empty((height, 4, width), np.uint8), 0, bytes((2, 2, width >> 8, width & 255))
     for y in range(height):
         if data[place : place + 4] != begin:

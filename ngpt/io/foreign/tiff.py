@@ -15,8 +15,8 @@ _LZW, _DEFLATE = 5, (8, 32946)
 _COMPRESSIONS = (1, _LZW, *_DEFLATE, 32773)
 _FLOATING = 3  # predictor
 _GREY, _COLOUR = 1, 2
-_STRAIGHT = 2  # alpha that colours are not multiplied by
-_BURST = 2**24  # bytes that a strip may be unpacked to without a look at how much it is
+_STRAIGHT = 2  # alpha by which colours are not multiplied
+_BURST = 2**24  # the most bytes of a strip that is unpacked without a check of its size
 
 
 def describe(file: BinaryIO) -> Form:
@@ -63,7 +63,7 @@ def describe(file: BinaryIO) -> Form:
 
 
 def _check_strips(page: Any, file: BinaryIO, kind: np.dtype) -> None:
-    """Raises Damage for a strip or tile that unpacks to more than its pixels: zlib would fill the memory with it."""
+    """Raises Damage for a strip or tile that unpacks to more than its pixels: zlib would fill the memory."""
     across, down = (page.tilewidth, page.tilelength) if page.is_tiled else (page.imagewidth, page.rowsperstrip)
     most = max(across * min(down, page.imagelength + down) * page.samplesperpixel * kind.itemsize, _BURST)
     for place, length in zip(page.dataoffsets, page.databytecounts, strict=False):

@@ -1,1 +1,1 @@
-"""Gradient-domain Metropolis light transport: chains of paths of ``gpt``, which stay where light was found."""
+"""Gradient-domain Metropolis light transport: Markov chains of ``gpt``'s paths, which stay where light was found."""

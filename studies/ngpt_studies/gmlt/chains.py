@@ -1,4 +1,4 @@
-"""Markov chains of paths, side by side, which splat what they find; and mutations of a path's random numbers.
+"""Markov chains of paths, run in parallel, which splat the light they find; and mutations of a path's random numbers.
 
 [Kelemen et al. 2002, "A Simple and Robust Mutation Strategy for the Metropolis Light Transport Algorithm"]
 """
@@ -17,28 +17,29 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.gpt.trace import trace
 
-# Small steps are from the one to the other, of the range of a number; their logarithms are uniform.
+# The limits of small steps, for numbers in [0, 1). The logarithms of steps are uniform between them.
 SMALLEST, LARGEST = 1 / 1024, 1 / 64
-# Numbers that a chain remembers: 6 of the camera, then 6 for each vertex. Further numbers are new in each mutation.
+# The random numbers that a chain remembers: 6 of the camera, then 6 for each of 8 vertices. Further numbers are new in
+# each mutation.
 REMEMBERED = 6 + 8 * 6
 
 
 def small_step(x: mi.Float, u: mi.Float) -> mi.Float:
     """``x`` in [0, 1), moved by a small step that the uniform number ``u`` chooses.
 
-    Steps to either side are as likely, and [0, 1) is a circle: densities there and back are the same.
+    Steps to both sides are equally likely, and [0, 1) is a circle, so a step and its reverse have the same density.
     """
     left = u < 0.5
     u = dr.select(left, 2 * u, 2 * u - 1)
     step = LARGEST * dr.exp(u * dr.log(SMALLEST / LARGEST))
     x = x + dr.select(left, -step, step)
     x -= dr.floor(x)
-    # 1 results from a number just below 0, rounded.
+    # A number just below 0 may be rounded to 1.
     return dr.select(x < 1, x, 0)
 
 
 def acceptance(f: mi.Float, proposed: mi.Float) -> mi.Float:
-    """The probability that a chain at a state of value ``f`` goes on to one of the value ``proposed``."""
+    """The probability that a chain moves from a state of value ``f`` to a state of value ``proposed``."""
     return dr.select(proposed < f, proposed / f, dr.select(proposed > 0, mi.Float(1), 0))
 
 
@@ -47,8 +48,8 @@ class Proposal:
     """Draws the numbers of a mutation one after the other, in place of a sampler."""
 
     vector: dr.Local  # the numbers of the chain's state
-    random: mi.PCG32  # one number for each of them
-    large: mi.Bool  # all numbers are new, independent of the state's
+    random: mi.PCG32  # draws one number for each of these
+    large: mi.Bool  # whether all numbers are new, independent of the state
     count: mi.UInt32
 
     def next_1d(self, active=True) -> mi.Float:
@@ -64,7 +65,7 @@ class Proposal:
 
 
 def taken(vector: dr.Local, random: mi.PCG32, large: mi.Bool, accepted: mi.Bool) -> dr.Local:
-    """The ``vector`` after a mutation: the numbers of ``Proposal`` where it is ``accepted``."""
+    """The ``vector`` after a mutation: where that is ``accepted``, the numbers that its ``Proposal`` drew."""
 
     def write(i, proposal):
         x = proposal.next_1d()
@@ -75,16 +76,16 @@ def taken(vector: dr.Local, random: mi.PCG32, large: mi.Bool, accepted: mi.Bool)
     return dr.while_loop(state, lambda i, _: i < REMEMBERED, write, label="mutation")[1].vector
 
 
-# The share of mutations that are independent of the state
+# The share of large steps: mutations to numbers that are independent of the state
 LARGE_STEPS = 0.05
-# What the differences count in the value of a path, beside its light
+# The weight of each difference in the value of a path; its light has weight 1
 GRADIENTS = 0.25
 
 
 def value_of(layers: dict[str, mi.Color3f]) -> mi.Float:
-    """f, the value of a path: the luminance of its light, and of its four differences.
+    """f, the value of a path: the luminance of its light, plus ``GRADIENTS`` times that of its four differences.
 
-    Wherever a path has anything to splat, f is above 0. [Lehtinen et al. 2013, section 4]
+    If a path has anything to splat, f is above 0. [Lehtinen et al. 2013, section 4]
     """
     f = mi.Float(0)
     for name, light in layers.items():
@@ -93,15 +94,15 @@ def value_of(layers: dict[str, mi.Color3f]) -> mi.Float:
 
 
 class Paths:
-    """The paths of ``gpt`` and what they bring, by layers: light not seen directly, and four differences."""
+    """Traces paths of ``gpt``. Their layers are the light that is not seen directly, and four differences."""
 
     def __init__(self, gpt, scene, plan):
         self.gpt, self.scene, self.plan = gpt, scene, plan
-        # Not within the loop of a chain
+        # Made here, and not within the loop of a chain
         self.shifts = {name: mi.Vector2f(*(dr.opaque(mi.Float, s) for s in shift)) for name, shift in SHIFTS.items()}
 
     def trace(self, camera: CameraSamples, random) -> tuple[dict[str, mi.Color3f], mi.Color3f, dict[str, mi.Bool]]:
-        """The layers of paths with these ``random`` numbers; light seen directly; which neighbours are on the film."""
+        """For paths with these ``random`` numbers: layers, light seen directly, which neighbours are on the film."""
         ray, importance, _ = camera.rays(mi.Vector2f(0))
         shifted = {name: camera.rays(shift) for name, shift in self.shifts.items()}
         paths = trace(self.gpt, self.plan, random, (ray, importance), list(shifted.values()))
@@ -116,14 +117,14 @@ class Paths:
 
 @dataclass
 class State:
-    """A chain: its random numbers, the path they give, and the light that this path has yet to splat."""
+    """The state of a chain: its random numbers, its path, and the light of the path that is not splatted yet."""
 
     vector: dr.Local
     pixel: mi.UInt32
     layers: dict
-    f: mi.Float  # its value
-    weight: mi.Float  # how many steps the chain is expected to have been there, since it came
-    accepted: mi.UInt32  # mutations so far
+    f: mi.Float  # the value of the path
+    weight: mi.Float  # the expected number of steps that the chain has spent in this state
+    accepted: mi.UInt32  # the number of accepted mutations so far
 
 
 def run(
@@ -139,10 +140,10 @@ def run(
 ) -> mi.Float:
     """Runs chains for ``steps`` mutations; returns the share of mutations that each chain accepted.
 
-    They begin with the paths of the lanes ``start``, among all paths of the ``camera``, whose ``layers`` and values
-    ``f`` are known. A state of value f counts ``scale(f)`` for each step that a chain is expected to be there: the
-    current state and the proposed one are both splatted, whatever is accepted. [Veach and Guibas 1997, "Metropolis
-    Light Transport", section 5.1]
+    ``layers`` and ``f`` are the layers and values of all paths of ``camera``. Chains begin with the paths in the lanes
+    ``start``. A state of value f counts ``scale(f)`` for each step that a chain is expected to spend there: both the
+    current state and the proposed one are splatted, whichever is accepted. [Veach and Guibas 1997, "Metropolis Light
+    Transport", section 5.1]
     """
     splats = {name: film.splats(name) for name in layers}
 
@@ -161,7 +162,7 @@ def run(
         f = value_of(layers)
         a = acceptance(old.f, f)
         accepted = u < a
-        # One of the two states is left for good: what it has to splat is known.
+        # The chain leaves one of the two states for good, so the weight of that state is final.
         new = State(None, pixel, layers, f, a, old.accepted + 1)
         stays = State(None, old.pixel, old.layers, old.f, old.weight + 1 - a, old.accepted)
         splat(dr.select(accepted, stays, new))
@@ -175,7 +176,7 @@ def run(
     layers = {name: dr.gather(mi.Color3f, light, start) for name, light in layers.items()}
     pixel, f = dr.gather(mi.UInt32, camera.pixel, start), dr.gather(mi.Float, f, start)
     chain = dr.arange(mi.UInt32, dr.width(start))
-    # Several chains may have one start.
+    # Several chains may begin with the same path, so keys also depend on the chain.
     keys = mi.sample_tea_32(there.random.clone().next_key(), chain)
     dr.eval(layers, pixel, f, keys)
     # ------------------------- Steps -----------------------------
@@ -196,7 +197,7 @@ def stream(keys: tuple[mi.UInt32, mi.UInt32], step: mi.UInt32) -> mi.PCG32:
 
 
 def first_numbers(camera: CameraSamples) -> dr.Local:
-    """The numbers that the paths of these camera samples are made of, as ``moved`` and then the path draw them."""
+    """The random numbers of these camera samples and their paths, in the order of ``moved`` and then the path."""
     sensor, position = camera.sensor, camera.position / mi.Vector2f(camera.size)
     open_time = sensor.shutter_open_time()
     time = (camera.time - sensor.shutter_open()) / open_time if open_time > 0 else mi.Float(0)
@@ -215,7 +216,7 @@ def first_numbers(camera: CameraSamples) -> dr.Local:
 
 
 def moved(camera: CameraSamples, random: Proposal) -> tuple[CameraSamples, mi.UInt32]:
-    """Camera samples of other ``random`` numbers, as far as rays go, and their pixels."""
+    """The camera samples with other ``random`` numbers for position, lens, time and wavelength; and their pixels."""
     there = copy(camera)
     there.position = random.next_2d() * mi.Vector2f(camera.size)
     there.lens = random.next_2d()

@@ -1,20 +1,22 @@
 r"""Gradient-domain Metropolis light transport: small mutations of a path of ``gpt`` that has found light.
 
-A pass is a render of its own. It takes one independent path, a candidate, for each camera sample, as ``gpt`` does, and
-then runs Markov chains over the random numbers of such paths, which visit paths in proportion to their value.
+Each pass is an independent render. It traces one independent path, a candidate, for each camera sample, as ``gpt``
+does. Then it runs Markov chains over the random numbers of such paths. Chains visit paths in proportion to their value.
 
-    x        a path with its four offset paths; g(x) what it brings to a layer
-    f(x)     its value: the luminance of its light and of its differences
-    b        mean of f over all paths; b̂: over the candidates of a pass, b0: over some paths of a first look
+    x        a path with its four offset paths; g(x) is its contribution to a layer
+    f(x)     its value, from the luminance of its light and of its differences
+    b        mean of f over all paths; b̂: over the candidates of a pass; b0: over the paths of a first look
     K        mutations for each candidate
 
     layer =  mean over candidates of g b0 / (b0 + K f)  +  sum over mutations, for each candidate, of g b̂ / (b0 + K f)
 
-Either term is weighted by the balance heuristic. A mutation finds x K f(x) / b times as often as a candidate does: what
-is dim comes from candidates, evenly, and what is bright from chains. No path counts for more than g / (f K) b̂: there
-are no fireflies. b0 is the same in all passes, whatever they find, so that both weights of a path sum to one.
+Both terms are weighted by the balance heuristic. Mutations find x K f(x) / b times as often as candidates do. So dim
+light comes mainly from candidates, which are even, and bright light from chains. No path counts for more than
+b̂ g / (f K), so there are no fireflies. b0 is the same in all passes, whatever they find, so that the two weights of a
+path sum to one.
 
-Chains begin at candidates chosen in proportion to f, and count b̂: that is unbiased, however short they are.
+Chains begin at candidates that are chosen in proportion to f, and are scaled by b̂. So they are unbiased, however short
+they are.
 
 [Lehtinen et al. 2013, "Gradient-Domain Metropolis Light Transport"; Kelemen et al. 2002; Veach and Guibas 1997,
 "Metropolis Light Transport", section 5.1; survey, section 6.2]
@@ -35,7 +37,7 @@ from ngpt_studies.gmlt.chains import Paths, run, value_of
 
 # Mutations for each candidate, and candidates for each chain
 MUTATIONS, CANDIDATES = 3, 256
-# Paths of the first look, at least, and the seed of their random numbers, far from those that users take
+# The least number of paths of the first look, and the seed of their random numbers, far from those that users choose
 _LOOK, _LOOK_SEED = 1 << 14, 0x3E7820
 
 
@@ -53,7 +55,7 @@ class GMLT:
             self.b0 = dr.opaque(mi.Float, np.array(f, np.float64).mean())
         layers, Le, inside, f = self.candidates(camera)
         # ------------------------ Chains -----------------------------
-        # Sums of floats in parallel have no fixed order.
+        # By NumPy: sums of floats in parallel have no fixed order, so their bits would differ between runs.
         sums = np.cumsum(np.array(f, np.float64))
         chains = max(1, len(sums) // CANDIDATES)
         steps = -(-MUTATIONS * len(sums) // chains)
@@ -70,7 +72,7 @@ class GMLT:
         film.put_all(features(self.paths.scene, camera.sensor, camera.random.clone(), ray))
 
     def candidates(self, camera: CameraSamples):
-        """Layers, light seen directly, which neighbours are on the film, value: of a path for each camera sample."""
+        """For one path of each camera sample: layers, light seen directly, the neighbours on the film, and value."""
         layers, Le, inside = self.paths.trace(camera, camera.random.clone())
         f = value_of(layers)
         dr.eval(layers, Le, inside, f)
@@ -78,8 +80,11 @@ class GMLT:
 
 
 def chosen(sums: np.ndarray, n: int, camera: CameraSamples) -> np.ndarray:
-    """``n`` lanes in proportion to their values, whose running ``sums`` are given: each as often as it should be, but
-    for one. The random number is one that no path draws."""
+    """``n`` lanes, chosen in proportion to their values, whose running sums are ``sums``.
+
+    Each lane is chosen as often as expected, up to one time more or less. The choice uses a random number that no path
+    draws.
+    """
     key = camera.random.at(mi.UInt32(0)).next_key()
     u = float(mi.sample_tea_float64(key, mi.UInt32(0))[0])
     return np.minimum(np.searchsorted(sums, (np.arange(n) + u) / n * sums[-1], side="right"), len(sums) - 1)

@@ -1,6 +1,6 @@
-"""Clear glass whose index of refraction depends on the wavelength: Mitsuba's ``dielectric`` has one for all.
+"""Clear glass whose index of refraction depends on the wavelength, unlike that of Mitsuba's ``dielectric``.
 
-And a scene that has it: a prism and a ball of flint glass before stripes.
+Also a scene with such glass: a prism and a ball before stripes.
 """
 
 from __future__ import annotations
@@ -13,17 +13,20 @@ import numpy as np
 
 from ngpt.errors import NgptError
 
-# Sellmeier's coefficients B and C (µm²), as the makers of the glasses have them.
+# Sellmeier's coefficients B and C (µm²), from the makers of the glasses
 SELLMEIER = {
     "n-bk7": ((1.03961212, 0.231792344, 1.01046945), (0.00600069867, 0.0200179144, 103.560653)),
     "n-sf11": ((1.73759695, 0.313747346, 1.89878101), (0.013188707, 0.0623068142, 155.23629)),
 }
-# The wavelength of sodium light, in nm: what a single index stands for
+# The wavelength of sodium light in nm: a single index of refraction is given for it.
 SODIUM = 589.3
 
 
 def index(material: str, wavelength):
-    """n(λ), λ in nm: n² = 1 + Σ B λ² / (λ² - C), λ in µm; of a number, a NumPy array or a Float."""
+    """The index of refraction at a ``wavelength`` in nm: a number, a NumPy array or a Float.
+
+    n² = 1 + Σ B λ² / (λ² - C), with λ in µm.
+    """
     square = (wavelength * 1e-3) ** 2
     total = 1 + sum(b * square / (square - c) for b, c in zip(*SELLMEIER[material], strict=True))
     return dr.sqrt(total) if dr.is_jit_v(total) else total**0.5
@@ -36,14 +39,14 @@ def register() -> None:
 
 @cache
 def _glass_class(variant: str) -> type:
-    """The material's class; Mitsuba's own classes, and so those derived from them, belong to a variant."""
+    """The material's class for a variant: each variant has its own ``mi.BSDF``."""
 
     class Dispersive(mi.BSDF):
         """A smooth dielectric in vacuum. ``material``: a name of ``SELLMEIER`` ("n-bk7").
 
-        A ray goes the way of its first wavelength. So images are right where all wavelengths of a ray are one, as
-        ``ngpt_studies.spectral.render`` has them; elsewhere the others lose their way, but no light. In
-        variants without wavelengths the index is for sodium light.
+        A ray is refracted by the index at its first wavelength. So images are correct if all wavelengths of a ray are
+        equal, as in ``ngpt_studies.spectral.render``. Otherwise, the light of the other wavelengths takes a wrong
+        direction, but none is lost. In variants without wavelengths, the index is that for sodium light.
         """
 
         def __init__(self, props):
@@ -69,7 +72,7 @@ def _glass_class(variant: str) -> type:
             bs.sampled_type = dr.select(reflected, *(mi.UInt32(int(kind)) for kind in kinds))
             bs.wo = dr.select(reflected, mi.reflect(si.wi), mi.refract(si.wi, cos_theta_t, eta_ti))
             bs.eta = dr.select(reflected, 1, eta_it)
-            # Radiance is compressed where it goes in.
+            # Refraction scales radiance by the square of the relative index.
             radiance = ctx.mode == mi.TransportMode.Radiance
             weight = dr.select(reflected | (not radiance), mi.Float(1), dr.square(eta_ti))
             return bs, mi.Spectrum(weight) & active
@@ -90,11 +93,11 @@ def _glass_class(variant: str) -> type:
 
 
 def prism(material: str = "n-sf11") -> dict:
-    """A prism, edges of 60°, and a ball before a wall of black and white stripes, under one lamp. Units are metres."""
+    """A prism with angles of 60°, and a ball, before a wall of dark and bright stripes, under one lamp, in metres."""
     grey, glass = _diffuse(0.5), {"type": "dispersive", "material": material}
     stripes = {"type": "checkerboard", "color0": _rgb(0.05), "color1": _rgb(0.8)}
     stripes["to_uv"] = mi.ScalarTransform4f().scale([12, 1, 1])
-    # Corners of the unit cube at -1 and 1: a rhombus, whose faces are 60° and 120° apart.
+    # Turns the cube, whose corners are at -1 and 1, into a prism over a rhombus with angles of 60° and 120°.
     rhombus = np.eye(4)
     rhombus[:3, 0], rhombus[:3, 1] = (0.3, 0, 0.3 * 3**0.5), (0.3, 0, -0.3 * 3**0.5)
     rhombus[:3, 2], rhombus[:3, 3] = (0, 0.7, 0), (-0.75, 0.75, 0.2)

@@ -1,10 +1,10 @@
 """Images by bins of wavelengths, and differences between neighbouring bins.
 
-A base path has one wavelength. Its offset path has the same random numbers and the wavelength one bin further, so both
-differ where glass disperses, and in colours. Their difference estimates the difference of the two bins, without bias:
-the replay of random numbers has no Jacobian. As in ``gpt-basic``, for any integrator of Mitsuba that knows no
-wavelengths of its own. [Petitjean, Bauszat and Eisemann 2018, "Spectral gradient sampling for path tracing"; survey,
-section 7.3. They copy half vectors instead.]
+A base path has one wavelength. Its offset path has the same random numbers and a wavelength one bin further. So the two
+differ where glass disperses, and in the colours of materials. Their difference is an unbiased estimate of the
+difference between the two bins, since the replay of random numbers has no Jacobian. As with ``gpt-basic``, this works
+for any integrator of Mitsuba that chooses no wavelengths itself. [Petitjean, Bauszat and Eisemann 2018, "Spectral
+gradient sampling for path tracing", which copies half vectors instead; survey, section 7.3]
 """
 
 from __future__ import annotations
@@ -22,16 +22,19 @@ from data_gen.samplers.common import radiance
 from data_gen.scenes.load import reference_integrator
 from ngpt.errors import NgptError
 
-# nm; there is next to no colour beyond.
+# The range of wavelengths in nm; beyond it, the eye sees next to nothing.
 LOW, HIGH = 380.0, 730.0
-# Lanes of a pass
+# The number of lanes of a pass
 _LANES = 1 << 20
 
 
 @dataclass(frozen=True)
 class Spectra:
-    """Means over samples, and variances of these, (H, W, bins) float64: of the light of each bin, and of its step:
-    what the next bin has more. The last step is 0; None if none was sampled."""
+    """Means over samples and the variances of these means, (H, W, bins) float64.
+
+    ``light`` is the light of each bin. ``step`` is the light of the next bin minus that, 0 for the last bin, or None if
+    it was not sampled.
+    """
 
     light: np.ndarray
     light_var: np.ndarray
@@ -40,14 +43,15 @@ class Spectra:
 
     @property
     def edges(self) -> np.ndarray:
-        """Wavelengths between which the bins are, in nm."""
+        """The limits of the bins in nm, (bins + 1)."""
         return np.linspace(LOW, HIGH, self.light.shape[-1] + 1)
 
 
 def render_spectra(scene: mi.Scene, bins: int, samples: int, seed: int = 0, steps: bool = True) -> Spectra:
-    """``samples`` base paths for each bin of each pixel, at least 2; with ``steps`` an offset path each.
+    """Renders ``samples`` base paths for each bin of each pixel, and with ``steps`` an offset path for each of them.
 
-    Radiance is from the scene's own integrator, in its spectral units. Raises NgptError without a spectral variant.
+    Radiance is that of the scene's own integrator, in its spectral units. Raises NgptError for a variant that is
+    polarised or not spectral, and for less than 2 bins or samples.
     """
     if not mi.is_spectral or mi.is_polarized:
         raise NgptError(f"variant '{mi.variant()}' has no spectra to render; use 'llvm_ad_spectral'")
@@ -65,7 +69,7 @@ def render_spectra(scene: mi.Scene, bins: int, samples: int, seed: int = 0, step
             camera = CameraSamples(sensor, seed, count, first)
             values = _sampled(estimate, camera, bins, count, steps)
         for name, value in zip(names, values, strict=False):
-            # Lanes go pixel by pixel, and within a pixel by sample, whose number says the bin.
+            # Lanes are in the order of pixels, and within a pixel in the order of samples. Bins take turns.
             lanes = np.array(value, np.float64).reshape(height, width, -1, bins)
             sums[name] += np.stack([lanes.sum(axis=2), np.square(lanes).sum(axis=2)])
     means = {name: total[0] / samples for name, total in sums.items()}
@@ -75,7 +79,7 @@ def render_spectra(scene: mi.Scene, bins: int, samples: int, seed: int = 0, step
 
 
 def _sampled(estimate, camera: CameraSamples, bins: int, count: int, steps: bool) -> list[mi.Float]:
-    """Light of the paths of a pass, and what those one bin further have more."""
+    """The light of the base paths of a pass and, with ``steps``, the light of their offset paths minus that."""
     n, width = dr.opaque(mi.UInt32, bins), dr.opaque(mi.Float, (HIGH - LOW) / bins)
     bin_ = dr.arange(mi.UInt32, camera.pixels * count) % n
 
@@ -88,21 +92,21 @@ def _sampled(estimate, camera: CameraSamples, bins: int, count: int, steps: bool
     wavelength = LOW + (bin_ + camera.wavelength) * width
     values = [light(wavelength, mi.Bool(True))]
     if steps:
-        # Beyond the last bin there is none.
+        # The last bin has no step.
         values.append(dr.select(bin_ + 1 < n, light(wavelength + width, bin_ + 1 < n) - values[0], 0))
     dr.eval(values)
     return values
 
 
-# Pixels over which variances are averaged: they are as noisy as the light.
+# The side, in pixels, of the square over which variances are averaged, since they are as noisy as the light.
 REACH = 5
 
 
 def reconstructed(spectra: Spectra) -> np.ndarray:
-    """The (H, W, bins) that minimises Σ |I - light|² / v + Σ |I_b+1 - I_b - step|² / s, exactly.
+    """The image I (H, W, bins) that minimises Σ |I - light|² / v + Σ |I_b+1 - I_b - step|² / s, exactly.
 
-    v and s are the variances of light and steps, averaged over bins and ``REACH`` pixels, so both are one number for a
-    pixel. The sum over bins equals the light's sum: steps do not determine it.
+    v and s are the variances of light and steps, averaged over all bins and over ``REACH`` x ``REACH`` pixels, so each
+    pixel has one v and one s. Steps do not change the sum over bins.
     """
     if spectra.step is None or spectra.step_var is None:
         return spectra.light
@@ -110,7 +114,7 @@ def reconstructed(spectra: Spectra) -> np.ndarray:
     v, s = (uniform_filter(variance.mean(axis=-1), REACH) for variance in both)
     weight = (v / np.maximum(s, 1e-12 * v + 1e-300))[..., None]
     bins = spectra.light.shape[-1]
-    # Steps that there are, between bins: for all pixels the same eigenvectors, the cosines
+    # The matrix of the steps has the same eigenvectors for all pixels: cosines.
     rows = np.arange(bins)
     basis = np.cos(np.pi * (rows[:, None] + 0.5) * rows / bins) * np.sqrt(2 / bins)
     basis[:, 0] = np.sqrt(1 / bins)
@@ -124,11 +128,11 @@ def reconstructed(spectra: Spectra) -> np.ndarray:
 
 
 def to_rgb(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Linear RGB, (H, W, 3), of spectra (H, W, bins) that are constant between the ``edges`` in nm."""
+    """Linear RGB (H, W, 3) of spectra (H, W, bins) that are constant within each bin; ``edges`` are in nm."""
     fine = 16
     steps = (np.arange(fine) + 0.5) / fine
     wavelengths = (edges[:-1, None] + steps * np.diff(edges)[:, None]).ravel()
-    # A pixel of a film has the mean of light over density, which is 1 / (HIGH - LOW) here.
+    # A film's pixel is the mean of light divided by the density of its wavelength, which is 1 / (HIGH - LOW) here.
     light = mi.Float(np.full(wavelengths.size, edges[-1] - edges[0], np.float32))
     colours = np.array(mi.spectrum_to_srgb(mi.Spectrum(light), mi.Spectrum(mi.Float(wavelengths.astype(np.float32)))))
     return values @ colours.T.reshape(-1, fine, 3).mean(axis=1) / len(values[0, 0])

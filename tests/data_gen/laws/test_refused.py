@@ -46,8 +46,7 @@ TABLE = [
     ),
     ("gpt-simple", fog, {}, "knows only 'path'; use --sampler gpt, or gpt-basic"),
     ("gpt-simple", hidden_lamp, {}, "hides emitters; use --sampler gpt"),
-    ("gbeams", media_scenes.smoke, {}, r"density varies.* use --sampler gpt, .*vpm \(no gradients\), or gvpm"),
-    ("vpm", endless, {}, "infinitely far away comes through a medium without end"),
+    ("bre", endless, {}, "infinitely far away comes through a medium without end"),
     ("gpt", media_scenes.haze, {"shift": "half-vector"}, "gpt: shift 'half-vector' does not go through media"),
     ("gpt", media_scenes.haze, {"shift": "manifold"}, "gpt: shift 'manifold' does not go through media"),
     ("gpt", "diffuse", {"shift": "manifold", "reuse": True}, r"^gpt: shift 'manifold' needs the layer 'caustic'"),
@@ -67,13 +66,13 @@ def is_refused(renderer, sampler, scene, options, message):
 
 
 def test_plugins_refuse_too(renderer):
-    with pytest.raises(NgptError, match=r"'gbre' .* media whose density varies, .*; use --sampler gpt, .* or bre"):
-        renderer.load_dict({"type": "gbre"}).prepare(load(renderer, media_scenes.smoke, (8, 8)))
+    with pytest.raises(NgptError, match=r"media \(interior\), which 'gpt-simple' does not see; use --sampler "):
+        renderer.load_dict({"type": "gpt_simple"}).prepare(load(renderer, media_scenes.smoke, (8, 8)))
 
 
 def test_where_there_are_no_media_points_on_surfaces_do():
     with pytest.raises(NgptError, match="there are no media, and 'ppm' has the same image"):
-        find("vpm", Facts("volpath", ()))
+        find("bre", Facts("volpath", ()))
 
 
 @pytest.mark.parametrize(("sampler", "option", "memory"), [("ppm", "photons", 400), ("vcm", "joined_depth", 50)])

@@ -8,7 +8,7 @@ import numpy as np
 
 from data_gen.paths import segments
 from data_gen.paths.light_ends import LightEnds
-from data_gen.paths.media import Media, extinction, pick, vertex
+from data_gen.paths.media import Media, vertex
 from ngpt.errors import NgptError
 
 
@@ -60,20 +60,6 @@ class Fog:
         numbers = segments.draw(random, self.media)
         segment = segments.fly(self.media, trace, ray, medium, channel, numbers, active=active)
         return segment, vertex(segment.ray, segment.hit, segment.place)
-
-    def ahead(self, trace, ray, medium, channel, random, active):
-        """The vertex at the end of a camera path's segment, its place, and what the path has ``brought`` there."""
-        segment, x = self.fly(trace, ray, medium, channel, random, active)
-        return x, segment.place, self.brought(segment, channel)
-
-    def brought(self, segment: segments.Segment, channel) -> mi.Spectrum:
-        """The integrand of a camera path's segment over its density; without σs, if that is in ``power()``."""
-        if self.media.grids:
-            return segment.weight
-        σ_c = pick(extinction(segment.place.medium, segment.ray), channel)
-        # Where nothing is scattered, of a colour, photons have none of it either.
-        weight = dr.select(segment.albedo > 0, segment.weight / (segment.albedo * σ_c), 0)
-        return mi.Spectrum(dr.select(segment.place.scatters, weight, segment.weight))
 
     def power(self, photons) -> mi.Spectrum:
         """What counts of each photon of a map in media: the power Φ that is scattered there; with grids, Φ / σs.

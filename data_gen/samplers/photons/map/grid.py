@@ -1,8 +1,8 @@
 """The photons of a map by place: a dense uniform grid, whose cells are runs of one sorted list.
 
 A cell's edge is at least the diameter of what is gathered. So a ball touches two cells along each axis at most: four
-rows of two cells, which are neighbours in the list. All is made by counts and stable sorts, and whoever gathers meets
-the photons of a point in the order of the list: sums have the same bits every time.
+rows of two cells, which are neighbours in the list. Counts and stable sorts build the list. The photons of a point are
+gathered in its order, so sums have the same bits every time.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Grid:
     def __init__(self, points: mi.Point3f, exist: mi.Bool, radius: float):
         index = dr.compress(exist)
         if not dr.width(index):
-            # No point in any cell; and one in no cell, since arrays have something in them.
+            # No cell has a point. The arrays hold one point outside all cells, since they must not be empty.
             self.low, self.n = dr.opaque(mi.Point3f, 0), dr.opaque(mi.Vector3u, 3)
             self.edge, self.rate = (dr.opaque(mi.Float, value) for value in (2 * radius, 1 / (2 * radius)))
             self.start, self.index, self.p = dr.zeros(mi.UInt32, 28), dr.zeros(mi.UInt32, 1), dr.zeros(mi.Point3f, 1)
@@ -97,10 +97,11 @@ class Grid:
         The piece is cut into parts so short that two cells along each axis hold what is near to one. Each point is
         beside only one part.
         """
-        # What is near to the part is in the ball about its middle with half an edge for a radius; half of that length:
+        # All points near to the part lie in the ball about its middle, whose radius is half an edge. Half of the part's
+        # length:
         half = dr.sqrt(dr.maximum(0.25 * dr.square(self.edge) - radius2, 0))
         rate = dr.rcp(2 * half)
-        # From where to where the ray is in the grid, and beside points
+        # The interval in which the ray is in the grid, and beside points
         begin, end = mi.Float(0), mi.Float(length)
         for o, d, low, n in zip(ray.o, ray.d, self.low, self.n, strict=True):
             first, last = (low - o) / d, (low + self.edge * n - o) / d

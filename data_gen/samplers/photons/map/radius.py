@@ -1,19 +1,19 @@
-r"""The radius within which photons are gathered: given in pixels, and smaller from pass to pass.
+r"""The radius within which photons are gathered. It is given in pixels, and shrinks from pass to pass.
 
 Pass i gathers within r_i, with r_(i+1)^d = r_i^d (i + α) / (i + 1); d is 2 on surfaces and 3 in media, the dimension of
 what photons are counted in. So r^d falls like i^(α - 1): slowly enough that the noise of the mean over passes goes to
 zero like i^-α, and its bias like r², i^(2 (α - 1) / d). Every pass is on its own, no point keeps statistics (Knaus and
 Zwicker 2011, "Progressive Photon Mapping: A Probabilistic Approach", eq. 15 and 24).
 
-How much of the disk about a point is surface: photons are counted there, and none lie beyond the edge of a surface.
+The share of surface in the disk about a point also matters, since no photons lie beyond the edge of a surface.
 
     A           area of the surfaces within radius r of x that photons are gathered from
     w           of a probe: 1 / cos where a line through the disk, normal to it, meets such a surface; 0 where it does
                 not; its mean is A / (π r²)
 
-Light that is the same everywhere on a surface would be lost along the edges, in proportion to r, were it counted over
-π r². Counted over A nothing of it is lost. π r² / A is the sum of the products (1 - w₁) ... (1 - wₖ) over k from 0 on,
-whose mean is right, and which has one term on a plane: one probe for each point.
+If photons were counted over π r², uniform light on a surface would be too dark along the edges, in proportion to r.
+Counted over A, it is right. π r² / A is the sum of the products (1 - w₁) ... (1 - wₖ) over k from 0 on, whose mean is
+right, and which has one term on a plane: one probe for each point.
 
 The place and the pass determine the probes' random numbers. So π r² / A is a property of x in each pass, by whatever
 path it is reached.
@@ -66,7 +66,7 @@ def pixel_width(scene: mi.Scene, sensor: mi.Sensor) -> float:
 RAYS = 24
 # A term that is less ends the sum.
 LEAST = 0.01
-# In a radius: what lies so near together has the same numbers, whatever has rounded it.
+# In radii: points so near to each other get the same numbers, however they were rounded.
 PLACES = 8
 # Rounds of the hash: with Mitsuba's 4, one probe after another misses.
 ROUNDS = 8

@@ -1,7 +1,7 @@
 """Light paths as a map of vertices: all paths side by side, in one kernel, each with places of its own in the map.
 
 So vertices lie in the map by path, then by bounce: the same seed gives the same map. (Places handed out by a counter
-would come in the order of threads.) Places that a path does not need stay empty, their edges have the length 0.
+would come in the order of threads.) Places that a path does not need stay empty, and have the depth 0.
 
 In media, vertices are also where light scatters. Their normal is 0, and their power is the power scattered there. Its
 sum over a volume is σs times the light that goes through, so a camera path contributes only its transmittance.
@@ -18,19 +18,16 @@ import mitsuba as mi
 
 from data_gen.paths import media
 from data_gen.paths.frozen import call
-from data_gen.paths.light_ends import LightRay, World
+from data_gen.paths.light_ends import World
 from data_gen.paths.segments import next_surface
-from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.paths.walk import UNLIMITED, roulette
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, context, light_sampled
 from data_gen.samplers.photons.map.vertices import at, put, vertices_class
 
-# Vertices of a map, for each light path of it; at least 2. Paths that have more of them go on in another map.
+# Places of a map, for each light path of it; at least 2. Paths that have more vertices go on in another map.
 VERTICES_PER_PATH = 8
-# Bytes of a vertex: 22 words of a record, as much again in the map before, and 9 words of a grid that is made.
-VERTEX_BYTES = (22 + 22 + 9) * 4
-# And bytes of an edge, twice
-EDGE_BYTES = 12 * 4 * 2
+# Bytes of a vertex: 13 words of a record, as much again in the map before, and 9 words of a grid that is made.
+VERTEX_BYTES = (13 + 13 + 9) * 4
 # Bytes of a light path beside that: rays, throughput and random numbers, twice, and its start.
 PATH_BYTES = 512
 # Bytes that a map takes for each light path.
@@ -44,87 +41,59 @@ class Paths:
     ray: mi.Ray3f  # along that edge
     β: mi.Spectrum  # power there, times the number of light paths
     brightest: mi.Float  # one over what they began with
-    density: mi.Float  # with which the ray's direction was sampled; infinite by a mirror or alike; 0 of a first edge
-    survival: mi.Float  # the probability to have survived Russian roulette there
-    parent: mi.UInt32  # the place of the vertex there; of a first edge the number of the light path
     bounce: mi.UInt32  # the number of the edge, from 1
     alive: mi.Bool
     channel: mi.UInt32 | None  # the colour by which distances are sampled; None in scenes without media
     medium: mi.MediumPtr | None  # that the edge begins in
 
 
-def trace(
-    world: World, random: mi.Sampler, max_depth: int, rr_depth: int, *, frozen: Callable = call, edges: bool = False
-) -> tuple[LightRay, Iterator[Any]]:
+def trace(world: World, random: mi.Sampler, max_depth: int, rr_depth: int, frozen: Callable = call) -> Iterator[Any]:
     """One light path for each lane of ``random``, of at most ``max_depth`` edges, as maps of vertices.
 
     Light is gathered at materials that are connectable, and within the media of the world's fog. A map has
-    VERTICES_PER_PATH places for each path. Further maps hold only the paths that go on, and begin with their last
-    vertex, as parent. ``frozen`` calls the functions that make kernels; with ``edges`` maps have those, too. Returns
-    the light's end of all paths, and the maps.
+    VERTICES_PER_PATH places for each path; further maps hold only the paths that go on. ``frozen`` calls the functions
+    that make kernels.
     """
-    start, channel, medium, numbers = frozen(_start, world, random)
+    start, channel, medium, numbers = frozen(begun, world, random)
     dr.eval(start, channel, medium, numbers)
-    n, power = dr.width(start.ray.d), dr.max(start.β)
-    most, rr = dr.opaque(mi.UInt32, min(max(max_depth, 0), UNLIMITED)), dr.opaque(mi.UInt32, rr_depth)
-    bounce = dr.ones(mi.UInt32, n)
-    paths = Paths(
-        ray=mi.Ray3f(start.ray.o, start.ray.d),
-        β=start.β,
-        brightest=dr.rcp(power),
-        density=dr.zeros(mi.Float, n),
-        survival=dr.ones(mi.Float, n),
-        parent=dr.arange(mi.UInt32, n),
-        bounce=bounce,
-        alive=(power > 0) & (bounce <= most),
-        channel=channel,
-        medium=medium,
-    )
-    return start, _maps(world, paths, type(random)(numbers), (most, rr), frozen, edges)
+    power = dr.max(start.β)
+    depths = dr.opaque(mi.UInt32, min(max(max_depth, 0), UNLIMITED)), dr.opaque(mi.UInt32, rr_depth)
+    bounce = dr.ones(mi.UInt32, dr.width(start.ray.d))
+    ray, alive = mi.Ray3f(start.ray.o, start.ray.d), (power > 0) & (bounce <= depths[0])
+    paths, random = Paths(ray, start.β, dr.rcp(power), bounce, alive, channel, medium), type(random)(numbers)
+    kind, used = vertices_class(mi.variant(), world.fog is not None), 0
+    while dr.width(lanes := dr.compress(paths.alive)):
+        paths, random = at(paths, lanes), random.at(lanes)
+        dr.eval(paths)
+        random.schedule_state()
+        photons, place, end = empty_map(kind, dr.width(lanes), VERTICES_PER_PATH)
+        paths, numbers, photons = frozen(_walk, world, paths, random, depths, photons, (place + used, end))
+        dr.eval(paths, numbers, photons)
+        random = type(random)(numbers)
+        # The first place of further maps stays empty, so that sums over photons keep their groups and their last bits.
+        used = 1
+        yield photons
 
 
-def _start(world: World, random) -> tuple:
+def empty_map(kind: type, paths: int, places: int) -> tuple[Any, mi.UInt32, mi.UInt32]:
+    """A map of this kind of vertices with so many places for each light path.
+
+    Returns the map, the first place of each path, and the place behind its last.
+    """
+    n = paths * places
+    photons = kind(*(dr.empty(t, n) for t in get_type_hints(kind).values()))
+    photons.depth = dr.zeros(mi.UInt32, n)
+    place = dr.arange(mi.UInt32, paths) * dr.opaque(mi.UInt32, places)
+    return photons, place, place + dr.opaque(mi.UInt32, places)
+
+
+def begun(world: World, random) -> tuple:
     """Where light paths begin, their colours and media in fog, and their random numbers from then on."""
     random, channel, medium = random.clone(), None, None
     start = world.lights.sample(world.scene, random, mi.Float(0), dr.zeros(mi.Ray3f).wavelengths)
     if world.fog:
         channel, medium = media.choose_channel(random.next_1d()), world.fog.around(world.scene, start.ray.o)
     return start, channel, medium, random.state
-
-
-def _maps(world: World, paths: Paths, random, depths: tuple, frozen: Callable, edges: bool) -> Iterator[Any]:
-    """Map after map, while paths are alive: each of those that are."""
-    kind = _vertices_of(world, edges)
-    map_before = None
-    while dr.width(lanes := dr.compress(paths.alive)):
-        paths, random = at(paths, lanes), random.at(lanes)
-        dr.eval(paths)
-        random.schedule_state()
-        n = dr.width(lanes) * VERTICES_PER_PATH
-        photons = kind(*(dr.empty(t, n) for t in get_type_hints(kind).values()))
-        photons.t, photons.depth = dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n)
-        if edges:
-            photons.bounce = dr.zeros(mi.UInt32, n)
-        place = dr.arange(mi.UInt32, dr.width(lanes)) * dr.opaque(mi.UInt32, VERTICES_PER_PATH)
-        end = place + dr.opaque(mi.UInt32, VERTICES_PER_PATH)
-        if map_before is not None:
-            # What has been gathered of it is not gathered again.
-            vertex = at(map_before, paths.parent)
-            vertex.depth = dr.zeros(mi.UInt32, len(vertex))
-            if edges:
-                vertex.bounce = vertex.depth
-            put(photons, vertex, place, True)
-            paths.parent, place = place, place + 1
-        paths, numbers, photons = frozen(_walk, world, paths, random, depths, photons, (place, end))
-        dr.eval(paths, numbers, photons)
-        random = type(random)(numbers)
-        map_before = photons
-        yield photons
-
-
-def _vertices_of(world: World, edges: bool) -> type:
-    grids = world.fog is not None and world.fog.media.grids
-    return vertices_class(mi.variant(), world.fog is not None, grids, edges)
 
 
 @dr.syntax
@@ -134,78 +103,56 @@ def _walk(world: World, paths: Paths, random, depths: tuple, photons, places: tu
     ``depths``: the most edges of a path, and the edge from which on Russian roulette is played.
     """
     scene, fog, receives = world.scene, world.fog, world.materials.connectable
-    (max_depth, rr_depth), kind = depths, _vertices_of(world, edges=False)
-    keeps_edges, random = hasattr(photons, "bounce"), random.clone()
+    (max_depth, rr_depth), kind, random = depths, type(photons), random.clone()
     place, end = places  # of the vertex to come, and behind the last
     # What ``Paths`` says, of the edge to come
-    ray, β, density, survival = mi.Ray3f(paths.ray), paths.β, paths.density, paths.survival
-    parent, bounce, alive = mi.UInt32(paths.parent), mi.UInt32(paths.bounce), mi.Bool(paths.alive)
-    channel, medium, brightest = paths.channel, paths.medium, paths.brightest
+    ray, β, brightest = mi.Ray3f(paths.ray), paths.β, paths.brightest
+    bounce, alive, channel, medium = mi.UInt32(paths.bounce), mi.Bool(paths.alive), paths.channel, paths.medium
     while dr.hint(alive & (place < end), label="light paths"):
         # ------------------ The edge: what is at its end ------------------
-        if dr.hint(fog is not None and keeps_edges, mode="scalar"):
-            edge = {"o": ray.o, "e": ray.d, "power": β, "begins": medium, "colour": channel, "bounce": bounce}
-            _enter(photons, edge | {"density": density, "survival": survival, "parent": parent}, place, alive)
         if dr.hint(fog is not None, mode="scalar"):
             segment, si = fog.fly(next_surface(scene), ray, medium, channel, random, alive)
-            hit, where, β = segment.hit, segment.place, β * segment.weight
+            where, β = segment.place, β * segment.weight
             exists, scatters = alive & si.is_valid() & (dr.max(β) > 0), where.scatters
-            around, nulls = {"medium": where.medium, "channel": channel}, segment.nulls
-            if dr.hint(nulls is not None, mode="scalar"):
-                around |= {"key": nulls.key, "nulls": nulls.n, "N_c": nulls.N_c}
-            if dr.hint(nulls is not None and keeps_edges, mode="scalar"):
-                # Also for edges that lead to nothing
-                _enter(photons, {"key": nulls.key, "nulls": nulls.n}, place, alive)
+            around = {"medium": where.medium}
         else:
             hit = scene.ray_intersect_preliminary(ray, active=alive)
             si = hit.compute_surface_interaction(ray, active=alive)
-            exists, scatters, around = alive & si.is_valid(), mi.Bool(False), {}
+            where, exists, scatters, around = None, alive & si.is_valid(), mi.Bool(False), {}
 
         # ---------------- The vertex, as it is in the map -----------------
-        bsdf = si.bsdf()
-        vertex = kind(
-            p=si.p,
-            n=si.n,
-            d=ray.d,
-            β=β,
-            density=density,
-            survival=survival,
-            depth=dr.select(receives(bsdf) | scatters, bounce, 0),
-            parent=parent,
-            t=hit.t,
-            prim_uv=hit.prim_uv,
-            prim_index=hit.prim_index,
-            shape=hit.shape,
-            instance=hit.instance,
-            **around,
-        )
-        put(photons, vertex, place, exists)
-        parent, place = dr.select(exists, place, parent), place + 1
+        depth = dr.select(receives(si.bsdf()) | scatters, bounce, 0)
+        put(photons, kind(p=si.p, n=si.n, d=ray.d, β=β, depth=depth, **around), place, exists)
+        place += 1
 
-        # ---------------- The direction of the next edge ------------------
-        u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
-        sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, exists & ~scatters)
-        f_p, _ = light_sampled(si, bsdf, sample, f_p, exists & (sample.pdf > 0))
-        if dr.hint(fog is not None, mode="scalar"):
-            sample, f_p = media.scattered(si, where, u_lobe, u_direction, sample, f_p)
+        # ------------- The next edge, and whether there is one ------------
+        sample, f_p, u_survival = event(si, where, random, exists)
         β = β * f_p
-        density = dr.select(event_kind(sample.sampled_type) == SMOOTH, sample.pdf, dr.inf)
         ray = si.spawn_ray(si.to_world(sample.wo))
         if dr.hint(fog is not None, mode="scalar"):
             medium = where.toward(si, ray.d)
-
-        # ------------------ Whether the path goes on ----------------------
-        # Russian roulette by what is left of the light that the path began with
-        survival = roulette(dr.max(β) * brightest, bounce >= rr_depth)
-        alive = exists & (sample.pdf > 0) & (dr.max(β) > 0) & dr.isfinite(dr.sum(β)) & (u_survival < survival)
+        alive, survival = lives(sample, β, brightest, u_survival, exists, bounce >= rr_depth)
         β = β / survival
         bounce += 1
         alive &= bounce <= max_depth
-    ray = mi.Ray3f(ray.o, ray.d)
-    on = Paths(ray, β, brightest, density, survival, parent, bounce, alive, channel, medium)
-    return on, random.state, photons
+    return Paths(mi.Ray3f(ray.o, ray.d), β, brightest, bounce, alive, channel, medium), random.state, photons
 
 
-def _enter(photons, values: dict, place: mi.UInt32, active) -> None:
-    for name, value in values.items():
-        dr.scatter(getattr(photons, name), value, place, active)
+def event(si: mi.SurfaceInteraction3f, where: media.Place | None, random, exists: mi.Bool) -> tuple:
+    """How light paths are scattered at vertices: the sample, f / p, and a random number for Russian roulette."""
+    u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
+    bsdf, at_surface = si.bsdf(), exists if where is None else exists & ~where.scatters
+    sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, at_surface)
+    f_p, _ = light_sampled(si, bsdf, sample, f_p, exists & (sample.pdf > 0))
+    if where is not None:
+        sample, f_p = media.scattered(si, where, u_lobe, u_direction, sample, f_p)
+    return sample, f_p, u_survival
+
+
+def lives(sample, β: mi.Spectrum, brightest: mi.Float, u: mi.Float, exists: mi.Bool, plays: mi.Bool) -> tuple:
+    """Which light paths survive an event that leaves the power β, and the probability of that.
+
+    Russian roulette is by what is left of the light that the path began with, where it ``plays``.
+    """
+    survival = roulette(dr.max(β) * brightest, plays)
+    return exists & (sample.pdf > 0) & (dr.max(β) > 0) & dr.isfinite(dr.sum(β)) & (u < survival), survival

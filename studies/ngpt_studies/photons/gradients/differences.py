@@ -1,4 +1,4 @@
-"""Gradient samples of gathered photons: of all pairs of a camera path and a thing near it, piece by piece, and sums."""
+"""Gradient samples of gathered photons: computed for all pairs of a camera path and a thing near it, and summed."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.light_ends import World
 from data_gen.paths.mis import gradient_weight
 from data_gen.paths.spectrum import to_rgb
-from data_gen.samplers.photons.gradients.camera import Level
-from data_gen.samplers.photons.gradients.pairs import Near, Pairs, pieces
 from data_gen.samplers.photons.passes import Passes, begun
+from ngpt_studies.photons.gradients.camera import CameraPaths, Level
+from ngpt_studies.photons.gradients.pairs import Near, Pairs, pieces
 
 # Levels are joined until they have this number of paths for each camera sample.
 LEVELS = 3
@@ -27,13 +27,22 @@ PAIR_BYTES = 192
 
 @dataclass
 class Gathered:
-    """What is near to camera paths in a photon map, or in a part of it."""
+    """The things near to camera paths in a photon map, or in a part of it."""
 
     on_surfaces: Any  # ``gpm.OnSurfaces`` or None
     in_media: Near | None = None
 
 
-def gradient_pass(passes: Passes, camera: CameraSamples, film: GradientFilm, near: Callable, pairs: int) -> None:
+@dataclass
+class GradientPasses(Passes):
+    """Passes whose camera paths go side by side with those of the neighbouring pixels."""
+
+    walk: CameraPaths
+
+
+def gradient_pass(
+    passes: GradientPasses, camera: CameraSamples, film: GradientFilm, near: Callable, pairs: int
+) -> None:
     """One photon map, and one camera path and its four shifts for each camera sample; a pixel has one sample.
 
     ``near`` (passes, photon map) yields what is ``Gathered`` of a map; ``pairs`` are in memory together for each camera
@@ -129,7 +138,7 @@ def add_to(sums: list, lanes: mi.UInt32, parts: list) -> None:
 # ------------------------------- Pairs --------------------------------
 
 
-def parts(passes: Passes, near: Gathered, level: Level, longest: mi.UInt32, most: int) -> Iterator[list]:
+def parts(passes: GradientPasses, near: Gathered, level: Level, longest: mi.UInt32, most: int) -> Iterator[list]:
     """The differences from what is ``near`` to a level's paths."""
     at_surfaces = passes.walk.at_surfaces(level, passes.frozen)
     if near.on_surfaces is not None:
@@ -146,7 +155,7 @@ def differences(passes: Passes, near: Near, paths: list, longest: mi.UInt32, mos
     ``longest``: edges that the light path of a photon may have, of each base path.
     """
     frozen, world = passes.frozen, passes.world
-    # Recorded each time, which is soon done: what it returns may hold a whole map, which Dr.Jit cannot make anew.
+    # The kernel is recorded each time, which is quick. Its result may hold a whole map, which Dr.Jit cannot make anew.
     points, receives = near.where(world, paths[0])
     dr.eval(points, receives)
     for pairs in pieces(near, points, receives, most, frozen):
@@ -155,7 +164,7 @@ def differences(passes: Passes, near: Near, paths: list, longest: mi.UInt32, mos
         places = [dr.compress(one) for one in found.apart]
         known = [k for k, some in enumerate(places) if dr.width(some)]
         if known:
-            # All shifts in one kernel: to launch one takes longer than to run it, where images are small.
+            # One kernel holds all shifts, since for small images a launch takes longer than the kernel runs.
             some = dr.concat([places[k] for k in known])
             which = dr.concat([dr.full(mi.UInt32, k, dr.width(places[k])) for k in known])
             copied = frozen(of_copies, near, world, pairs, paths, found.C, (some, which))
@@ -180,7 +189,7 @@ def spread_out(near: Any, world: World, paths: list) -> list:
 
 
 def of_pairs(near: Near, world: World, pairs: Pairs, paths: list, longest: mi.UInt32) -> Found:
-    """What each pair brings without copies of another place."""
+    """Returns the contribution of each pair without copies at another place."""
     A, *others = (near.receiver(world, [path], None, pairs.point) for path in paths)
     thing = near.thing(pairs.place)
     C, met = near.brought(thing, A, thing.depth <= dr.gather(mi.UInt32, longest, pairs.point))
@@ -191,7 +200,7 @@ def of_pairs(near: Near, world: World, pairs: Pairs, paths: list, longest: mi.UI
 
 
 def of_copies(near: Near, world: World, pairs: Pairs, paths: list, C: mi.Spectrum, asked: tuple) -> mi.Spectrum:
-    """Δ of the pairs and the shifts that are ``asked`` for, (some, which): by copies of another place."""
+    """Returns Δ, by copies at another place, of the pairs and shifts that are ``asked`` for: (some, which)."""
     some, which = asked
     point, place = dr.gather(mi.UInt32, pairs.point, some), dr.gather(mi.UInt32, pairs.place, some)
     A, B = near.receiver(world, paths[:1], None, point), near.receiver(world, paths[1:], which, point)
@@ -200,7 +209,7 @@ def of_copies(near: Near, world: World, pairs: Pairs, paths: list, C: mi.Spectru
 
 
 def summed(pairs: Pairs, found: Found) -> list:
-    """For each point, the sums of all values over its pairs; pairs without a copy are counted."""
+    """Returns the sums of all values over the pairs of each point. Pairs without a copy are counted."""
     failures = mi.Float(0)
     for one in found.Δ:
         failures += dr.select((found.shifts > 0) & dr.all(one == -2 * found.C), 1, 0)
@@ -217,12 +226,14 @@ def chosen(fields: Callable, paths: list, which: mi.UInt32 | None, index: mi.UIn
 
 
 def difference(C: mi.Spectrum, C1: mi.Spectrum, r: mi.Float) -> mi.Spectrum:
-    """Δ of a path and its copy. One that carries no light is none: black is black from either end, in all channels."""
+    """Returns Δ of a path and its copy. A copy that carries no light counts as none. It must be black in all channels,
+    so that both directions agree.
+    """
     good = (dr.max(C1) > 0) & dr.isfinite(dr.sum(C1)) & dr.isfinite(r)
     return dr.select(dr.max(C) > 0, gradient_weight(r, good) * (dr.select(good, C1, 0) - C), 0)
 
 
 def differences_behind(behind: list, paths: list) -> list:
-    """What paths have seen behind grids: the light of base paths and its four Δ."""
+    """Returns the light that base paths have seen behind grids, and its four Δ."""
     C, *others = behind
     return [C, *(gradient_weight(mi.Float(1), y.alive) * (C1 - C) for y, C1 in zip(paths[1:], others, strict=True))]

@@ -6,7 +6,7 @@ r"""The beam radiance estimate: photons in media are gathered along whole rays, 
     L           Σ T(t) f(d) Φ / (π r² N),    f: the phase function, N: light paths of the pass
 
 Camera paths go through media up to the next surface. So no distance is sampled, each segment gathers from all of its
-length, and what is blurred is two-dimensional: less noise, and less bias, than with ``vpm``, of the same photons.
+length, and the blur is two-dimensional. The same photons give less noise and less bias than near to points.
 
 In media whose density varies T is not known. Rays go through them by null collisions, and end at the first real one: a
 ray comes so far with the probability T. Photons count as Φ / σs of their place there, times σs beside them on the ray.
@@ -35,7 +35,7 @@ from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.vertices import in_media
 from data_gen.samplers.photons.passes import Passes, Start
-from data_gen.samplers.photons.surfaces.ppm import PPM, Gathering
+from data_gen.samplers.photons.ppm import PPM, Gathering
 
 # Points of the grid within one radius of a ray are gathered in parts 3 radii long, each in a ball of this many radii.
 BALL = np.sqrt(1 + 1.5**2)
@@ -108,16 +108,20 @@ def scattering_along(ray, medium: mi.MediumPtr) -> Callable[[mi.Float, mi.Bool],
 
 @dataclass
 class Along:
-    """What is near to camera paths that go piece by piece."""
+    """The things near to camera paths that go piece by piece."""
 
     on_surfaces: Gathering | None
-    in_media: Any  # photons, beams or planes, with ``light`` (piece of a ray, length, medium, σ, depth, where)
+    in_media: Any  # photons, with ``light`` (piece of a ray, length, medium, σ, depth, where)
 
 
 class BRE(PPM):
     """Progressive photon mapping by the beam radiance estimate in media, and on surfaces; no gradients.
 
-    Plugin ``bre``. Parameters, bias and what is not handled: as for ``vpm``.
+    Plugin ``bre``. Parameters: as for ``ppm``; the ``radius`` of the first pass is also used for photons in media.
+
+    Biased, and consistent: the mean over passes converges to the image of ``volpath``.
+
+    Not handled: light from infinitely far away through a medium without end, and what ``ppm`` does not handle.
     """
 
     follows, map_bytes = "volpath", MEDIA_MAP_BYTES
@@ -177,7 +181,7 @@ def by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, em
         if dr.hint(emission, mode="scalar"):
             met = active & ~first & (found | sky.seen)
             if dr.hint(grids and limits.shows, mode="scalar"):
-                # What comes through a grid is not in Le, nor is the sky: see ``behind_grids()``.
+                # Le contains neither light that comes through a grid nor the sky: see ``behind_grids()``.
                 behind |= stop.passed > 0
                 met |= active & first & (behind | ~found)
             L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)
@@ -188,7 +192,7 @@ def by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, em
         bsdf = si.bsdf()
         receives = active & connectable(bsdf)
         if dr.hint(at_surface is not None, mode="scalar"):
-            L += β * at_surface(si, None, bsdf, depth, receives)
+            L += β * at_surface(si, bsdf, depth, receives)
 
         # ---------------- Where the path goes on ------------------
         u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()

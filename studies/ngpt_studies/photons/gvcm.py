@@ -43,10 +43,10 @@ from data_gen.samplers.gbdpt.light_again import Marker, marked
 from data_gen.samplers.gbdpt.light_shift import splat_differences
 from data_gen.samplers.gbdpt.offset_path import Offset, own_vertex
 from data_gen.samplers.gbdpt.pairs import difference, difference_of_one, weighted
-from data_gen.samplers.photons.map.vertices import is_near
 from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.vcm.integrator import VCM
 from data_gen.samplers.vcm.merging import Merging, Photons, brought
+from ngpt_studies.photons.map.vertices import is_near
 
 
 class ShiftedMerging(Merging):

@@ -23,17 +23,18 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.light_ends import World
-from data_gen.samplers.photons.gradients import shift
-from data_gen.samplers.photons.gradients.camera_in_media import PathsByPieces, Piece
-from data_gen.samplers.photons.gradients.copies import LightPaths, let_through, redirected
-from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, Gathered
-from data_gen.samplers.photons.integrator import Traced
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.vertices import Photon, at
-from data_gen.samplers.photons.media.beams import BEAM_BYTES, PART_BYTES, AlongBeams, nearest, parts_of
-from data_gen.samplers.photons.media.gbre import PATHS_BYTES, Beside, beside_of, inside_of
+from data_gen.samplers.photons.map.vertices import at
 from data_gen.samplers.photons.passes import Passes
-from data_gen.samplers.photons.surfaces.gpm import GPM, OnSurfaces
+from ngpt_studies.photons.gpm import GPM, OnSurfaces
+from ngpt_studies.photons.gradients import shift
+from ngpt_studies.photons.gradients.camera_in_media import PathsByPieces, Piece
+from ngpt_studies.photons.gradients.copies import LightPaths, let_through, redirected
+from ngpt_studies.photons.gradients.differences import PAIR_BYTES, Gathered
+from ngpt_studies.photons.map.vertices import Photon
+from ngpt_studies.photons.map.whole import Traced
+from ngpt_studies.photons.media.beams import BEAM_BYTES, PART_BYTES, AlongBeams, nearest, parts_of
+from ngpt_studies.photons.media.gbre import PATHS_BYTES, Beside, beside_of, inside_of
 
 # Parts of beams, for each light path, and pairs of a ray and a beam, for each camera sample, in memory together
 PARTS = 16
@@ -156,7 +157,7 @@ def turned(world: World, paths: LightPaths, beam: Beam, A: Beside, B: Beside, ra
     J = (other.sin / met.sin) * shift.jacobian_in_medium(way.base_length2, way.length2)
     r = way.ratio * J
     good = other.near & way.leads(target, r)
-    # Past A it would be gathered as it is, not as a copy: the shift back would be another.
+    # The copy must not be near to A: the shift back would then take it as its own copy.
     good &= ~copy.past(A, radius).near
 
     # ------------------- What comes through, and is scattered there -------------------

@@ -6,7 +6,8 @@ import media_scenes
 import numpy as np
 import pytest
 from bdpt_scenes import SCENES
-from photon_laws import assert_copies_are_light_paths, largest, traced, world_of
+from photon_copies import assert_copies_are_light_paths, largest, traced
+from photon_laws import world_of
 from renders import dr
 from scipy.spatial import cKDTree
 from unbiased import load
@@ -16,10 +17,10 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.light_ends import LightEnds, World
 from data_gen.paths.vertex import Materials
 from data_gen.samplers import find
-from data_gen.samplers.photons.gradients import shift as shifts
-from data_gen.samplers.photons.gradients.copies import LightPaths, copy
 from data_gen.samplers.photons.map.fog import Fog
-from data_gen.samplers.photons.map.vertices import is_near, vertex_of
+from ngpt_studies.photons.gradients import shift as shifts
+from ngpt_studies.photons.gradients.copies import LightPaths, copy
+from ngpt_studies.photons.map.vertices import is_near, vertex_of
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +161,7 @@ def test_jacobian_in_media_by_finite_differences(rays):
 
 def balls(mi, eye, p, medium, rng):
     """Camera paths scatter near by, a hundredth of their length apart."""
-    from data_gen.samplers.photons.media.gvpm import InBall
+    from ngpt_studies.photons.media.gvpm import InBall
 
     n, length = p.shape[1], np.linalg.norm(p - eye, axis=0)
     for spread in (0.003, 0.009):
@@ -171,7 +172,7 @@ def balls(mi, eye, p, medium, rng):
 
 def ray(mi, o, d, medium):
     """A long one, through clear air."""
-    from data_gen.samplers.photons.media.gbre import Beside
+    from ngpt_studies.photons.media.gbre import Beside
 
     n, d = d.shape[1], mi.Vector3f(d / np.linalg.norm(d, axis=0))
     zero, everywhere = dr.zeros(mi.Spectrum, n), dr.full(mi.Bool, True, n)
@@ -191,7 +192,7 @@ MEDIA = ["nested", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ha
 @pytest.mark.parametrize("receivers", [balls, camera_rays])
 @pytest.mark.parametrize("name", MEDIA)
 def test_copies_in_media_are_light_paths_and_their_copies_are_the_photons(renderer, receivers, name):
-    from data_gen.samplers.photons.media.gbre import copy_beside
+    from ngpt_studies.photons.media.gbre import copy_beside
 
     mi, scene, rng = renderer, load(renderer, getattr(media_scenes, name), (8, 8)), np.random.default_rng(0)
     lights = LightEnds(scene)
@@ -219,7 +220,7 @@ def test_copies_in_media_are_light_paths_and_their_copies_are_the_photons(render
 @pytest.mark.parametrize("far", [False, True])
 def test_beams_turn_to_and_fro(rays, far):
     """Past the other ray at the same distance along it, on the other side; J by finite differences."""
-    from data_gen.samplers.photons.media.beams import nearest
+    from ngpt_studies.photons.media.beams import nearest
 
     g, dr = rays, rays.dr
     a = g.b - g.Vector(0.3, 2.0, 0.2)
@@ -258,7 +259,7 @@ def test_beams_turn_to_and_fro(rays, far):
 
 def test_planes_turn_to_and_fro(rays):
     """To where the other ray is as far along it, with the same angle between both edges; J by finite differences."""
-    from data_gen.samplers.photons.media.planes import crossing
+    from ngpt_studies.photons.media.planes import crossing
 
     g, dr = rays, rays.dr
     a = g.b - g.Vector(0.5, 1.5, 0.2)
@@ -285,8 +286,8 @@ def test_planes_turn_to_and_fro(rays):
 @pytest.mark.parametrize("name", ["forward", *(pytest.param(n, marks=pytest.mark.slow) for n in ("haze", "nested"))])
 def test_copies_of_planes_are_planes_and_their_copies_are_the_planes(renderer, name):
     """Laws of light paths in a scene: r(T(x)) r(x) = 1, T(T(x)) = x, and Φ'' = Φ."""
-    from data_gen.samplers.photons.media.gplanes import copied
-    from data_gen.samplers.photons.media.planes import crossing, planes_of
+    from ngpt_studies.photons.media.gplanes import copied
+    from ngpt_studies.photons.media.planes import crossing, planes_of
 
     mi, rng, n = renderer, np.random.default_rng(0), 1 << 12
     made = find("gplanes").made(load(mi, getattr(media_scenes, name), (8, 8)), planes=n)

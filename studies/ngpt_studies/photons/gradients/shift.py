@@ -1,8 +1,8 @@
 r"""How a photon moves with the point that gathers it: pure functions.
 
 A photon b is gathered at x, and its copy b' at y, the vertex of the neighbouring pixel's path. The copy's place round y
-mirrors the place of b round x: whatever is nearer to x than the radius, and not to y, goes to what is nearer to y and
-not to x. Surfaces are curved, and photons lie on them, not on a plane; so it is the photon's line that moves.
+mirrors the place of b round x: a place within the radius of x, and not of y, goes to a place within the radius of y,
+and not of x. Surfaces are curved, and photons lie on them, not on a plane; so it is the photon's line that moves.
 
     a, d        the predecessor of the photon on its light path, and the direction from there
     b̂           where that line meets the tangent plane at x
@@ -69,7 +69,7 @@ def past(a, e, x, d, u, far):
     ``e`` is a direction near to the line's; where the line comes from infinitely ``far`` away, ``e`` is its direction.
     """
     target = x
-    # The line's direction turns the place by a little: each step is better by u over the length.
+    # The line's direction changes the place a little. Each step reduces the error by the factor u over the length.
     for _ in range(6):
         target = x + dr.normalize(dr.cross(d, e)) * u
         e = dr.select(far, e, dr.normalize(target - a))

@@ -25,19 +25,20 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.paths.light_ends import World
-from data_gen.samplers.photons.gradients import shift
-from data_gen.samplers.photons.gradients.camera_segments import Flight, PathsBySegments
-from data_gen.samplers.photons.gradients.copies import LightPaths
-from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen
-from data_gen.samplers.photons.gradients.pairs import Points
-from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
+from data_gen.samplers.photons.bre import seen_along
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.vertices import Photon, in_media
-from data_gen.samplers.photons.media.bre import seen_along
-from data_gen.samplers.photons.media.gbre import PATHS_BYTES, InMedia
+from data_gen.samplers.photons.map.vertices import in_media
 from data_gen.samplers.photons.passes import Passes
-from data_gen.samplers.photons.surfaces.gpm import GPM, OnSurfaces
+from ngpt_studies.photons.gpm import GPM, OnSurfaces
+from ngpt_studies.photons.gradients import shift
+from ngpt_studies.photons.gradients.camera_segments import Flight, PathsBySegments
+from ngpt_studies.photons.gradients.copies import LightPaths
+from ngpt_studies.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen
+from ngpt_studies.photons.gradients.pairs import Points
+from ngpt_studies.photons.map.vertices import Photon
+from ngpt_studies.photons.map.whole import MEDIA_MAP_BYTES, Traced
+from ngpt_studies.photons.media.gbre import PATHS_BYTES, InMedia
 
 
 @dataclass

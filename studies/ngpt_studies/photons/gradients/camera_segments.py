@@ -15,7 +15,8 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import media, segments
-from data_gen.samplers.photons.gradients.camera import (
+from data_gen.samplers.photons.passes import Start
+from ngpt_studies.photons.gradients.camera import (
     CameraPaths,
     Level,
     Path,
@@ -24,7 +25,7 @@ from data_gen.samplers.photons.gradients.camera import (
     survive,
     taken,
 )
-from data_gen.samplers.photons.passes import Start
+from ngpt_studies.photons.media.vpm import brought
 
 
 @dataclass
@@ -86,7 +87,7 @@ class PathsBySegments(CameraPaths):
         return self.of_lanes(level, flights, random, lanes)
 
     def flight(self, path: Path, segment: segments.Segment, channel) -> Flight:
-        β, place = path.β * self.world.fog.brought(segment, channel), segment.place
+        β, place = path.β * brought(self.world.fog, segment, channel), segment.place
         return Flight(segment.ray, segment.hit, β, path.alive, path.sky, place.medium, place.scatters)
 
     def direct(self, level: Level, start: Start, frozen: Callable) -> mi.Spectrum:

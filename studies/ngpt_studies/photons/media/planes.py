@@ -8,10 +8,10 @@ ray meets it.
     x, w, u     the only point of the plane that is on a camera ray, the ray's direction, distance along the ray
     L           Σ T(s) T(t) T(u) σs f(e) Φ / (|d · (e × w)| (1 - T_c(S)) N),    f: the phase function, N: light paths
 
-Wherever on its edge light is scattered, and how far it goes from there, is integrated, and so is the distance along the
-ray: of three integrals over a point in space nothing is left to blur. So this part of the light has no bias. Light
-paths that scatter in the medium, as 1 - T_c(S) of them do, stand for all distances at which they might have done so. A
-shadow ray says whether anything is between the edge and x.
+The estimate integrates the place of scattering on the edge, the distance from there, and the distance along the ray.
+These are the three dimensions of space, so nothing is left to blur, and this part of the light has no bias. Light paths
+that scatter in the medium, as 1 - T_c(S) of them do, stand for all distances at which they might have done so. A shadow
+ray says whether anything is between the edge and x.
 
 Only one edge sweeps the light that comes to x straight from a lamp or a surface. This light is gathered as in
 ``beams``, blurred in one dimension. Each path of light is found in one way.
@@ -35,11 +35,11 @@ import mitsuba as mi
 
 from data_gen.paths import media, segments
 from data_gen.paths.light_ends import World
-from data_gen.samplers.photons.integrator import Traced
+from data_gen.samplers.photons.bre import Along, seen_along
 from data_gen.samplers.photons.map.trace import VERTICES_PER_PATH
-from data_gen.samplers.photons.media.beams import BEAMS
-from data_gen.samplers.photons.media.bre import Along, seen_along
 from data_gen.samplers.photons.passes import Passes
+from ngpt_studies.photons.map.whole import Traced
+from ngpt_studies.photons.media.beams import BEAMS
 
 # Bytes of a plane, and of the edge of a map that it may be swept from
 PLANE_BYTES = (18 + 3) * 4
@@ -79,7 +79,7 @@ class Crossing:
 
 
 def crossing(a, d, e, o, w) -> Crossing:
-    """Where the line from ``o`` crosses the plane; no value is finite where the line is parallel to the plane."""
+    """Returns where the line from ``o`` crosses the plane. No value is finite if they are parallel."""
     to, across = o - a, dr.cross(e, w)
     volume = dr.dot(d, across)
     n = dr.cross(d, e)
@@ -149,14 +149,14 @@ def scattered_of(medium: mi.MediumPtr, ray, active) -> mi.Spectrum:
 
 
 def after_scattering(photons) -> mi.Bool:
-    """Which edges of a map begin where light was scattered in a medium."""
+    """Returns which edges of a map begin where light was scattered in a medium."""
     later = photons.bounce > 1
     parent = dr.gather(mi.Normal3f, photons.n, photons.parent, later)
     return later & (dr.squared_norm(parent) == 0)
 
 
 def only_beams(traced: Traced) -> Traced:
-    """The map with only those edges that are the last edge of no plane."""
+    """Returns the map without the edges that are the last edge of a plane."""
     photons = traced.photons
     others = replace(photons, bounce=dr.select(after_scattering(photons), 0, photons.bounce))
     dr.eval(others.bounce)
@@ -164,9 +164,8 @@ def only_beams(traced: Traced) -> Traced:
 
 
 def planes_of(passes: Passes, traced: Traced) -> AcrossPlanes:
-    """The planes of some light paths of a map; if there is none, one that nothing meets.
-
-    Paths are as good as each other, so every k-th stands for k. Further maps are of fewer paths.
+    """Returns the planes of some light paths of a map, or one that no ray meets if there are none. All paths have the
+    same distribution, so every k-th stands for k. Further maps have fewer paths.
     """
     integrator, photons, kind = passes.integrator, traced.photons, planes_class(mi.variant())
     lanes, most = len(photons) // VERTICES_PER_PATH, integrator.options["planes"]

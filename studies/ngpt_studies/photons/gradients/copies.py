@@ -1,13 +1,14 @@
-"""Photons and their copies near the vertex of a neighbouring pixel's path: by ``shift``, what light they bring there.
+"""Copies of photons near the vertex of a neighbouring pixel's path, made by ``shift``, and the light that they bring
+there.
 
     a           the predecessor of photon b: a vertex of its light path, or the point of the lamp where it begins
     Φ, Φ'       power of photon and copy, both with the density of the photon's path
     p, p'       densities of the directions d and d' at a, without Russian roulette: it is on top of a pair of paths
     r           p' J / p
 
-A photon that came from a by a mirror, or through glass, has no copy: light goes there in one direction. Nor
-is there one where anything is in the way, or where the copy lies outside the radius or on a surface that faces another
-way. A copy must meet the same conditions as a photon, so that both directions of a difference reject alike.
+A photon that came from a by a mirror, or through glass, has no copy: light goes there in one direction. There is no
+copy either if anything is in the way, or if the copy lies outside the radius or on a surface that faces another way. A
+copy must meet the same conditions as a photon, so that both directions of a difference reject alike.
 
 In media a may be where light was scattered. Distances have densities, in the colour c of the light path: T' is in Φ',
 and T'_c / T_c in r. Boundaries that do not bend light may be between a and b, or b'. There b' must be in the medium of
@@ -26,8 +27,8 @@ from data_gen.paths import collisions, media, segments
 from data_gen.paths.collisions import Collisions
 from data_gen.paths.light_ends import LightRay, World
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
-from data_gen.samplers.photons.gradients import shift
-from data_gen.samplers.photons.map.vertices import Photon, is_near, vertex_in_media_of, vertex_of
+from ngpt_studies.photons.gradients import shift
+from ngpt_studies.photons.map.vertices import Photon, is_near, vertex_in_media_of, vertex_of
 
 
 @dataclass
@@ -69,7 +70,7 @@ class Through:
 
 @dataclass
 class Passage:
-    """What comes of light on a way through media."""
+    """The light that passes through media on a way."""
 
     T: mi.Spectrum  # T' / T_c
     T_c: mi.Float  # T'_c / T_c
@@ -97,7 +98,7 @@ def copy(
         Φ, r = way.Φ * (J * passage.T), r * passage.T_c
     moved = Photon(hit.p, hit.n, way.ray.d, Φ)
     good &= hit.is_valid() & world.materials.connectable(hit.bsdf())
-    # At x it would be gathered as it is, not as a copy: the shift back would be another.
+    # The copy must not be gathered at x: the shift back would then take it as its own copy.
     return moved, r, good & is_near(moved, y, radius2) & ~is_near(moved, x, radius2)
 
 
@@ -130,7 +131,7 @@ def copy_in_medium(
 
 
 def let_through(world: World, way: Way, active, target: mi.Point3f | None = None) -> Passage:
-    """What comes through on the way, to the ``target`` or up to a surface."""
+    """Returns the light that passes on the way, to the ``target`` or up to a surface."""
     reach = mi.Float(dr.inf) if target is None else dr.norm(target - way.ray.o)
     fog, ray, through = world.fog, media.shortened(way.ray, reach), way.through
     trace = segments.next_surface(world.scene)
@@ -192,7 +193,7 @@ def redirected(world: World, paths: LightPaths, photon: Photon, foot, target, ac
     if world.fog is None:
         through, base_length = None, dr.gather(mi.Float, photons.t, j, active) + dr.dot(foot - photon.p, photon.d)
     else:
-        # The record knows only the last piece.
+        # The record holds only the last piece.
         origin_of_photon = dr.select(first, start.ray.o, origin)
         base_length = dr.dot(foot - origin_of_photon, photon.d)
         through = known_of_media(world, photons, photon, origin_of_photon)

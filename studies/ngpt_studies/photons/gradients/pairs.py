@@ -1,8 +1,8 @@
 """Pairs of a point, or a ray, and a photon near it, in the order of the points: one lane each, however many they are.
 
-Shifts are done for pairs, all lanes at work; within the walk through the grid one lane in five would have a photon. The
-list is cut into pieces of a given length, and the sums over the pairs of a point are added up in their order: the same
-pairs give the same bits.
+Shifts run on the list of pairs, where all lanes work. Within the walk through the grid only one lane in five would have
+a photon. The list is cut into pieces of a given length, and the sums over the pairs of a point are added up in their
+order: the same pairs give the same bits.
 
 A *thing* (a photon, a beam, a plane) is paired with what it is near to on a base path (a vertex, a piece of a ray), the
 *receiver* A. The neighbour's path has the corresponding receiver B. A thing near to both is its own copy. If a thing is
@@ -20,8 +20,8 @@ import mitsuba as mi
 
 from data_gen.paths.frozen import call
 from data_gen.paths.light_ends import World
-from data_gen.samplers.photons.gradients.camera import Path
 from data_gen.samplers.photons.map.grid import Grid
+from ngpt_studies.photons.gradients.camera import Path
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Pairs:
 
 
 class Receivers(Protocol):
-    """What may have things near to it, one in each lane."""
+    """Receivers that may have things near to them, one in each lane."""
 
     def each(self, grid: Grid | None, radius2: mi.Float | None, active: mi.Bool, visit, state: tuple) -> tuple:
         """``state`` after visits to all that may be near: see ``Grid.each``."""
@@ -96,7 +96,7 @@ def pieces(near, points: Receivers, active: mi.Bool, most: int, frozen: Callable
 
 
 def counts(around: tuple, points: Receivers, active) -> mi.UInt32:
-    """How many pairs each point has; ``around``: (grid, squared radius)."""
+    """Returns the number of pairs of each point. ``around`` is (grid, squared radius)."""
 
     def one_more(state, i, near):
         return (state[0] + dr.select(near, mi.UInt32(1), 0),)
@@ -137,19 +137,21 @@ class Near(Protocol):
         """Where base paths receive light, for the grid; and which of them do."""
 
     def receiver(self, world: World, paths: list, which: mi.UInt32 | None, index: mi.UInt32) -> Any:
-        """What receives light of each path ``index``; of the path of number ``which``, if there are some ``paths``."""
+        """Returns the receiver of each path ``index``, for the path of number ``which`` if there are several
+        ``paths``.
+        """
 
     def thing(self, place: mi.UInt32) -> Any:
-        """The thing of that place in the list of the grid. It has ``depth``, the edges of its light path."""
+        """Returns the thing at that place in the list of the grid. It has ``depth``, the edges of its light path."""
 
     def brought(self, thing: Any, A: Any, active: mi.Bool) -> tuple[mi.Spectrum, Any]:
-        """C, what it brings to the camera by A, 0 where it is not near; and where they meet."""
+        """Returns C, the light that it brings to the camera by A (0 if it is not near), and where they meet."""
 
     def shared(self, thing: Any, met: Any, B: Any, lit: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
-        """What it brings by B as its own copy; and whether a copy of another place is to be looked for.
+        """Returns the light that it brings by B as its own copy, and whether to look for a copy at another place.
 
         ``met`` is where thing and A meet, ``lit`` whether it brings anything there.
         """
 
     def copied(self, world: World, thing: Any, A: Any, B: Any) -> tuple[mi.Spectrum, mi.Float]:
-        """What its copy brings by B, 0 where there is none, and r."""
+        """Returns the light that its copy brings by B (0 if there is none), and r."""

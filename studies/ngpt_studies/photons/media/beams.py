@@ -8,11 +8,10 @@ r"""Photon beams: in media, light is gathered from the edges of light paths and 
                 f: the phase function, N: light paths of the pass
 
 A light path leaves one photon where it scatters, and light all along its edges. So a ray meets many more beams than
-photons, and what is blurred is one-dimensional. A beam ends with its edge: that edges come so far has the density
-T_c(s).
+photons, and the blur is one-dimensional. A beam ends with its edge. An edge reaches so far with the probability T_c(s).
 
 In media whose density varies a beam goes by the null collisions of its edge up to where the light path scatters: it
-comes so far with the probability T. There Φ is without σs, which is taken where the ray is nearest.
+comes so far with the probability T. In such media Φ is without σs, which is taken where the ray is nearest.
 
 Beams are cut into parts, which lie in the ``Grid`` by their middles. Only one part contains the point where a beam and
 a ray are nearest to each other.
@@ -32,16 +31,18 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import collisions, media
+from data_gen.paths.camera import CameraSamples
 from data_gen.paths.light_ends import World
-from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
+from data_gen.samplers.photons.bre import BALL, BRE, Along, scattering_along, seen_along
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.trace import EDGE_BYTES, VERTICES_PER_PATH
+from data_gen.samplers.photons.map.trace import VERTICES_PER_PATH
 from data_gen.samplers.photons.map.vertices import put
-from data_gen.samplers.photons.media.bre import BALL, BRE, Along, scattering_along, seen_along
 from data_gen.samplers.photons.passes import Passes
-from data_gen.samplers.photons.surfaces.ppm import Gathering
+from data_gen.samplers.photons.ppm import Gathering
+from ngpt_studies.photons.map.trace import EDGE_BYTES
+from ngpt_studies.photons.map.whole import GRID_BYTES, MEDIA_MAP_BYTES, Traced, whole_maps
 
-# Radii in the length of a part: shorter ones are more to enter, longer ones more that is near to no ray.
+# Length of a part, in radii. Shorter parts are more to enter. Longer parts are more often near to no ray.
 PART = 6
 # Parts that are in memory together, for each light path; and the bytes of one, including the grid's.
 PARTS = 32
@@ -163,7 +164,7 @@ class AlongBeams:
 
     def __init__(self, parts, traced: Traced, max_depth: int, grids: bool = False):
         self.parts, self.grids, radius = parts, grids, traced.radius(1)
-        # What is near to a ray has its middle no further away.
+        # The middle of a part that is near to a ray is no further away.
         reach = radius * (1 + PART / 2)
         self.grid = Grid(parts.p, parts.half > 0, BALL * reach)
         self.radius, self.reach = dr.opaque(mi.Float, radius), dr.opaque(mi.Float, reach)
@@ -233,7 +234,10 @@ class BEAMS(BRE):
     ``radius`` shrinks faster.
     """
 
-    edges, map_bytes = True, BEAM_BYTES + PARTS * PART_BYTES
+    map_bytes, grid_bytes = BEAM_BYTES + PARTS * PART_BYTES, GRID_BYTES
+
+    def maps(self, passes: Passes, camera: CameraSamples) -> Iterator[Traced]:
+        return whole_maps(self, passes, camera, edges=True)
 
     def near(self, passes: Passes, traced: Traced) -> Iterator[Along]:
         max_depth, fog = self.limits.max_depth, passes.world.fog

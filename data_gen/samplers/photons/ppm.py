@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -25,10 +24,8 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.film import GradientFilm
-from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.light_ends import World
-from data_gen.paths.segments import next_surface
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.paths.walk import Sky, roulette
@@ -59,13 +56,14 @@ class Gathering:
         self.K = dr.opaque(mi.Float, 1 / (np.pi * radius**2 * traced.paths))
         self.number, self.max_depth = number_of(traced.seed, traced.number), dr.opaque(mi.UInt32, max_depth)
 
-    def light(self, si, place: None, bsdf: mi.BSDFPtr, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
+    def light(self, si, bsdf: mi.BSDFPtr, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         """L(x) at the vertex ``si``, on a surface, behind ``depth`` edges, of paths that are not too long."""
         longest = self.max_depth - depth
 
         def one(i, near):
-            photon = photon_of(self.photons, dr.gather(mi.UInt32, self.grid.index, i, near), near)
-            return light(photon, si, bsdf, near & faces(photon, si) & (photon.depth <= longest))
+            j = dr.gather(mi.UInt32, self.grid.index, i, near)
+            photon, depth = photon_of(self.photons, j, near), dr.gather(mi.UInt32, self.photons.depth, j, near)
+            return light(photon, si, bsdf, near & faces(photon, si) & (depth <= longest))
 
         zero = dr.zeros(mi.Spectrum, dr.width(depth))
         L = self.grid.gather(si.p, self.radius2, active, one, zero)
@@ -107,12 +105,12 @@ class PPM(PhotonIntegrator):
         film.put_all(values)
 
     def near(self, passes: Passes, traced: Traced) -> Iterator[Any]:
-        """What is gathered of a photon map, one part after another."""
+        """Yields what is gathered from a photon map, one part after another."""
         yield Gathering(passes.world, traced, self.limits.max_depth)
 
     def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """L and Le of camera paths (world, start, near, emission), with what is gathered from ``near``, and with the
-        ``emission`` that they meet or without."""
+        """Returns L and Le of camera paths (world, start, near, emission). L contains the light gathered from ``near``,
+        and the ``emission`` that the paths meet if that is asked for."""
         return by_vertices(self, *path)
 
 
@@ -120,34 +118,25 @@ class PPM(PhotonIntegrator):
 def by_vertices(integrator: PhotonIntegrator, world: World, start: Start, near, emission: bool) -> tuple:
     """L of camera paths from vertex to vertex: what is gathered ``near``, ``emission`` that they meet; and Le.
 
-    ``near.light`` is called with (vertex, its place, its material, depth, where); or there is nothing near.
+    ``near.light`` is called with (vertex, its material, depth, where); or there is nothing near.
     """
-    scene, fog, limits, random = world.scene, world.fog, integrator.limits, start.random.clone()
+    scene, limits, random = world.scene, integrator.limits, start.random.clone()
     ray, importance = mi.Ray3f(start.ray), start.importance
     connectable, gathered = world.materials.connectable, near.light if near is not None else None
     sky = Sky.from_camera(limits.hide_emitters)
     β, η = mi.Spectrum(importance), mi.Float(1)  # throughput, and the relative index of refraction up to the vertex
     depth = mi.UInt32(1)  # edges up to the vertex si
     # ------------------------- The first vertex --------------------------
-    if dr.hint(fog is not None, mode="scalar"):
-        channel, first = media.choose_channel(random.next_1d()), partial(integrator.first_surface, scene, fog.media)
-        segment, si = fog.fly(first, ray, fog.within, channel, random, mi.Bool(True))
-        place, Le = segment.place, importance * integrator.lamps_in_fog(scene, fog.media, ray, fog.within, channel)
-        β *= fog.brought(segment, channel)
-        L_first = β * integrator.behind_grids(scene, fog.media, segment)
-    else:
-        si, place, channel = integrator.first_hit(scene, ray).compute_surface_interaction(ray), None, None
-        Le, L_first = importance * si.emitter(scene).eval(si, mi.Bool(limits.shows)), 0
-    L = dr.zeros(mi.Spectrum, dr.width(ray)) + (L_first if emission else 0)
+    si = integrator.first_hit(scene, ray).compute_surface_interaction(ray)
+    Le = importance * si.emitter(scene).eval(si, mi.Bool(limits.shows))
+    L = dr.zeros(mi.Spectrum, dr.width(ray))
     active = si.is_valid() & (depth < limits.max_depth)
     while dr.hint(active, label="camera path"):
         # ------------------ What is gathered at a vertex ------------------
         bsdf = si.bsdf()
         receives = active & connectable(bsdf)
-        if dr.hint(fog is not None, mode="scalar"):
-            receives |= active & place.scatters
         if dr.hint(gathered is not None, mode="scalar"):
-            L += β * gathered(si, place, bsdf, depth, receives)
+            L += β * gathered(si, bsdf, depth, receives)
 
         # ------- The next direction: what scatters widely is gathered ------
         u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
@@ -163,13 +152,7 @@ def by_vertices(integrator: PhotonIntegrator, world: World, start: Start, near, 
         depth += 1
 
         # ------------------- The next vertex, its emission ----------------
-        onward = si.spawn_ray(si.to_world(sample.wo))
-        if dr.hint(fog is not None, mode="scalar"):
-            medium = place.toward(si, onward.d)
-            si, place, weight = fog.ahead(next_surface(scene), onward, medium, channel, random, active)
-            β *= weight
-        else:
-            si = scene.ray_intersect(onward, active)
+        si = scene.ray_intersect(si.spawn_ray(si.to_world(sample.wo)), active)
         if dr.hint(emission, mode="scalar"):
             met = active & sky.meets(si)
             L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)

@@ -9,8 +9,8 @@ r"""Gradients of photon planes: ``planes``, and each plane that a camera ray mee
     r           p(e') J / p(e)
 
 The plane turns about its edge, up to the point on B. The angle between d and e stays, so phase functions and their
-densities do. Shifting the copy back gives the plane. What 1 / |d · (e × w)| has of noise, where rays graze a plane,
-falls out: C' has it of A.
+densities do. Shifting the copy back gives the plane. The noise of 1 / |d · (e × w)|, where rays graze a plane, cancels:
+C' has the factor of A.
 
 [Gruson et al. 2018, "Gradient-Domain Volumetric Photon Density Estimation", section 5.3; its eq. 18 is in a local frame
 of the plane, and is not J: J is checked by finite differences]
@@ -26,16 +26,17 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.light_ends import World
-from data_gen.samplers.photons.gradients import shift
-from data_gen.samplers.photons.gradients.camera_in_media import Piece
-from data_gen.samplers.photons.gradients.differences import Gathered
-from data_gen.samplers.photons.integrator import Traced
+from data_gen.samplers.photons.bre import seen_along
 from data_gen.samplers.photons.map.trace import VERTICES_PER_PATH
-from data_gen.samplers.photons.map.vertices import Photon
-from data_gen.samplers.photons.media.bre import seen_along
-from data_gen.samplers.photons.media.gbeams import GBEAMS, RaysAmong
-from data_gen.samplers.photons.media.gbre import Beside, beside_of, inside_of
-from data_gen.samplers.photons.media.planes import (
+from data_gen.samplers.photons.passes import Passes
+from ngpt_studies.photons.gradients import shift
+from ngpt_studies.photons.gradients.camera_in_media import Piece
+from ngpt_studies.photons.gradients.differences import Gathered
+from ngpt_studies.photons.map.vertices import Photon
+from ngpt_studies.photons.map.whole import Traced
+from ngpt_studies.photons.media.gbeams import GBEAMS, RaysAmong
+from ngpt_studies.photons.media.gbre import Beside, beside_of, inside_of
+from ngpt_studies.photons.media.planes import (
     PLANE_BYTES,
     AcrossPlanes,
     Crossing,
@@ -44,7 +45,6 @@ from data_gen.samplers.photons.media.planes import (
     planes_of,
     scattered_of,
 )
-from data_gen.samplers.photons.passes import Passes
 
 
 @dataclass

@@ -28,15 +28,25 @@ import numpy as np
 from data_gen.film import GradientFilm
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.light_ends import World
-from data_gen.samplers.photons.gradients.camera import CameraPaths, Path
-from data_gen.samplers.photons.gradients.copies import LightPaths, copy
-from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen, gradient_pass
-from data_gen.samplers.photons.gradients.pairs import Points
-from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
+from data_gen.samplers.photons.integrator import PhotonIntegrator
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.radius import number_of, spread
-from data_gen.samplers.photons.map.vertices import Photon, is_near, light, on_surfaces, photon_of
+from data_gen.samplers.photons.map.vertices import light, on_surfaces
 from data_gen.samplers.photons.passes import Passes
+from ngpt_studies.photons.gradients.camera import CameraPaths, Path
+from ngpt_studies.photons.gradients.copies import LightPaths, copy
+from ngpt_studies.photons.gradients.differences import (
+    PAIR_BYTES,
+    PAIRS,
+    Gathered,
+    GradientPasses,
+    chosen,
+    gradient_pass,
+)
+from ngpt_studies.photons.gradients.pairs import Points
+from ngpt_studies.photons.map.trace import MAP_BYTES
+from ngpt_studies.photons.map.vertices import Photon, is_near, photon_of
+from ngpt_studies.photons.map.whole import GRID_BYTES, Traced, whole_maps
 
 # Bytes of a camera sample beside that: levels of five paths with their rays, hits and throughputs, and as many sums
 PATHS_BYTES = 3072
@@ -118,12 +128,20 @@ class GPM(PhotonIntegrator):
     Not handled: what ``ppm`` does not handle. Photons that come through glass have no copies but themselves.
     """
 
-    walk, pairs = CameraPaths, PAIRS
-    camera_bytes = PATHS_BYTES + PAIRS * PAIR_BYTES
+    # How camera paths go side by side, and how many pairs are in memory together for each camera sample
+    walk, pairs, edges = CameraPaths, PAIRS, False
+    camera_bytes, map_bytes, grid_bytes = PATHS_BYTES + PAIRS * PAIR_BYTES, MAP_BYTES, GRID_BYTES
 
-    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
+    def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> GradientPasses:
+        passes = super().begin(scene, sensor)
+        return GradientPasses(self, passes.world, passes.width, self.walk(self, passes.world))
+
+    def maps(self, passes: Passes, camera: CameraSamples) -> Iterator[Traced]:
+        return whole_maps(self, passes, camera, self.edges)
+
+    def sample_pass(self, passes: GradientPasses, camera: CameraSamples, film: GradientFilm) -> None:
         gradient_pass(passes, camera, film, self.near, self.pairs)
 
     def near(self, passes: Passes, traced: Traced) -> Iterator[Gathered]:
-        """What is near to camera paths in a photon map, one part after another."""
+        """Yields the things near to camera paths in a photon map, one part after another."""
         yield Gathered(OnSurfaces(traced))

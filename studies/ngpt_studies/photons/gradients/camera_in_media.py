@@ -14,7 +14,8 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import media
-from data_gen.samplers.photons.gradients.camera import (
+from data_gen.samplers.photons.passes import Start
+from ngpt_studies.photons.gradients.camera import (
     CameraPaths,
     Level,
     Path,
@@ -24,7 +25,6 @@ from data_gen.samplers.photons.gradients.camera import (
     survive,
     taken,
 )
-from data_gen.samplers.photons.passes import Start
 
 
 @dataclass

@@ -26,17 +26,18 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.paths.light_ends import World
-from data_gen.samplers.photons.gradients import shift
-from data_gen.samplers.photons.gradients.camera_in_media import PathsByPieces, Piece
-from data_gen.samplers.photons.gradients.copies import LightPaths, copy_in_medium
-from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen
-from data_gen.samplers.photons.gradients.pairs import Rays
-from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, Traced
+from data_gen.samplers.photons.bre import BALL, seen_along
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.vertices import Photon, in_media, photon_of
-from data_gen.samplers.photons.media.bre import BALL, seen_along
+from data_gen.samplers.photons.map.vertices import in_media
 from data_gen.samplers.photons.passes import Passes
-from data_gen.samplers.photons.surfaces.gpm import GPM, OnSurfaces
+from ngpt_studies.photons.gpm import GPM, OnSurfaces
+from ngpt_studies.photons.gradients import shift
+from ngpt_studies.photons.gradients.camera_in_media import PathsByPieces, Piece
+from ngpt_studies.photons.gradients.copies import LightPaths, copy_in_medium
+from ngpt_studies.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen
+from ngpt_studies.photons.gradients.pairs import Rays
+from ngpt_studies.photons.map.vertices import Photon, photon_of
+from ngpt_studies.photons.map.whole import MEDIA_MAP_BYTES, Traced
 
 # Bytes of a camera sample beside pairs: levels of five pieces of paths, what they end at, and as many sums
 PATHS_BYTES = 4096
@@ -97,9 +98,8 @@ def inside_of(base: Piece) -> mi.Bool:
 
 @dataclass
 class InMedia:
-    """``Near``, of photons in media where they are gathered near to points or beside rays: what both have in common.
-
-    The receivers ``near()`` know whether a photon is near, and the ``image()`` of its place near to another.
+    """``Near``, the common part for photons in media that are gathered near to points or beside rays. A receiver's
+    ``near()`` says whether a photon is near, and its ``image()`` where the copy lies near to another receiver.
     """
 
     paths: LightPaths
@@ -133,7 +133,7 @@ def copy_beside(world: World, paths: LightPaths, photon: Photon, A, B, radius2: 
     """(copy, t', r, whether it exists) of the ``photon`` that is gathered at A and not at B."""
     target = A.image(photon.p, B)
     t, there = B.near(target, radius2)
-    # At A it would be gathered as it is, not as a copy: the shift back would be another.
+    # The copy must not be near to A: the shift back would then take it as its own copy.
     there &= ~A.near(target, radius2)[1]
     moved, r, good = copy_in_medium(world, paths, photon, target, there)
     return moved, t, r, good & (photon.medium == B.medium)

@@ -1,1 +1,0 @@
-"""Photons gathered in media: at points, along rays, from beams and planes."""

@@ -1,1 +1,0 @@
-"""Photons gathered on surfaces."""
