@@ -55,6 +55,10 @@ class Space:
     def fly(self, x, place: Place | None, ray, drawn: Drawn | None, active) -> Segment:
         return straight(ray, self.scene.ray_intersect_preliminary(ray, active=active))
 
+    def length(self, ray, x) -> mi.Float:
+        """How long the whole segment of the camera's ``ray`` to the vertex ``x`` is; infinite where there is none."""
+        return x.t
+
     def end(self, x, segment: Segment) -> mi.SurfaceInteraction3f:
         return media.vertex(segment.ray, segment.hit, segment.place)
 
@@ -105,6 +109,10 @@ class Filled(Space):
     def fly(self, x, place: Place, ray, drawn: Drawn, active) -> Segment:
         trace, medium = segments.next_surface(self.scene), place.toward(x, ray.d)
         return segments.fly(self.media, trace, ray, medium, drawn.channel, drawn.numbers, active=active)
+
+    def length(self, ray, x) -> mi.Float:
+        # x.t is the length of the last piece.
+        return dr.select(x.is_valid(), dr.norm(x.p - ray.o), x.t)
 
     def end(self, x, segment: Segment) -> mi.SurfaceInteraction3f:
         x1 = super().end(x, segment)

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 # Integrators that render media, of those that samplers of ours follow
 VOLUMETRIC = ("volpath", "volpathmis")
+# Integrators of paths
+PATHS = ("path", *VOLUMETRIC)
 
 
 def polarised(facts: Facts, name: str) -> str:
@@ -39,7 +41,7 @@ def no_media(facts: Facts, name: str) -> str:
 
 
 def unrendered_media(facts: Facts, name: str) -> str:
-    if facts.integrator not in ("path", *VOLUMETRIC):
+    if facts.integrator not in PATHS:
         return f"the integrator is '{facts.integrator}', and '{name}' knows only 'path', 'volpath' and 'volpathmis'"
     unseen = ", ".join(facts.media) if facts.integrator == "path" else ""
     return f"there are media ({unseen}), which the integrator 'path' does not render" if unseen else ""
@@ -87,13 +89,10 @@ TAILS = Option(
 )
 
 
-def why_not_shared(media: bool, settings: Mapping[str, Any], variant: str) -> str:
-    """Why paths of a sampler with the option ``tails`` cannot share their tails under these ``settings``.
-
-    ``media``: the paths go through media. "" where they can share.
+def why_not_shared(settings: Mapping[str, Any], variant: str) -> str:
+    """Why paths of a sampler with the option ``tails`` cannot share their tails under these ``settings``; "" where they
+    can.
     """
-    if media:
-        return "there are media"
     if "rgb" not in variant or "polarized" in variant:
         return f"variant '{variant}' renders other colours than RGB"
     unable = {"reuse": (True, "reuse"), "shift": ("manifold", "shift=manifold")}

@@ -15,7 +15,7 @@ from data_gen.passes import block_of_samples, least_memory
 from data_gen.paths.camera import bytes_of_rays
 from data_gen.paths.streams import first_round
 from data_gen.samplers.registry import Sampler
-from data_gen.samplers.shared import why_not_shared
+from data_gen.samplers.shared import PATHS, why_not_shared
 from data_gen.scenes.facts import Facts
 from data_gen.tails.cache import LEAST_MIB, MIB
 from data_gen.tails.schedule import enough
@@ -37,9 +37,9 @@ def sharing_of(sensor: mi.Sensor, entry: Sampler, facts: Facts, settings: Mappin
 
     What fits into some memory must fit into more: the cache is there only where film and paths fit beside it.
     """
-    never = why_not_shared(bool(facts.media), settings, mi.variant())
-    if facts.integrator != "path":
-        never = f"the integrator is '{facts.integrator}', and only paths of 'path' do"
+    never = why_not_shared(settings, mi.variant())
+    if facts.integrator not in PATHS:
+        never = f"the integrator is '{facts.integrator}', and only paths of {', '.join(map(repr, PATHS))} do"
     net = first_round(settings.get("points", "independent"), budget.spp)
     film = GradientFilm(*(int(n) for n in sensor.film().crop_size()), net=net, gradients=entry.film_of_gradients)
     own = MIB + bytes_of_shared(film.pixels) // 2**20

@@ -30,10 +30,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths import media
 from data_gen.paths.streams import mixed
 from data_gen.tails.schedule import FINENESS
-from data_gen.tails.table import Grid, Place, in_table, key, octahedral
+from data_gen.tails.table import INSIDE, Grid, Place, in_table, key, octahedral
 
 # MiB that the cache takes, and the MiB of a render from which on this is little
 MIB, LEAST_MIB = 320, 640
@@ -50,16 +49,19 @@ class Trail:
     spread: mi.Float
 
     @classmethod
-    def to(cls, x: mi.SurfaceInteraction3f) -> Trail:
-        """The trail of a path at its first vertex."""
-        return cls(mi.Float(x.t), dr.zeros(mi.Float, dr.width(x.t)))
+    def to(cls, first: mi.Float) -> Trail:
+        """The trail of a path at its first vertex, so far from the camera."""
+        return cls(mi.Float(first), dr.zeros(mi.Float, dr.width(first)))
 
     def on(
-        self, x: mi.SurfaceInteraction3f, place: media.Place | None, smooth: mi.Bool, p: mi.Float, active: mi.Bool
+        self, x: mi.SurfaceInteraction3f, inside: mi.Bool, smooth: mi.Bool, p: mi.Float, active: mi.Bool
     ) -> Trail:
-        """At the next vertex ``x``, if there is one, behind an event of density ``p`` that was ``smooth``, or not."""
+        """At the next vertex ``x``, if there is one, behind an event of density ``p`` that was ``smooth``, or not.
+
+        A vertex ``inside`` a medium meets the bundle of paths face to face.
+        """
         there = active & x.is_valid()
-        cosine = dr.select(media.scatters(place), 1, dr.abs(x.wi.z))
+        cosine = dr.select(inside, 1, dr.abs(x.wi.z))
         wider = x.t * dr.rsqrt(dr.maximum(p * cosine, 1e-6))
         further = there & ~smooth & (self.spread == 0)
         return Trail(self.reach + dr.select(further, x.t, 0), self.spread + dr.select(there & smooth, wider, 0))
@@ -105,11 +107,10 @@ class Known:
     def place_of(self, x: mi.SurfaceInteraction3f, inside: mi.Bool, spread: mi.Float, kind: mi.UInt32 | int) -> Place:
         """The place of vertex ``x`` among the cells that are ``fineness`` times smaller than the ``spread``.
 
-        Vertices of different ``kind`` share no light.
+        Vertices ``inside`` media share no light with those on surfaces, nor do vertices of different ``kind``.
         """
         level = mi.Int32(dr.floor(dr.log2(dr.maximum(spread / self.fineness, 1e-20))))
-        # Cells of the volume have a direction of their own.
-        normal = dr.select(inside, mi.UInt32(64), octahedral(mi.Normal3f(dr.mulsign(x.sh_frame.n, x.wi.z))))
+        normal = dr.select(inside, mi.UInt32(INSIDE), octahedral(mi.Normal3f(dr.mulsign(x.sh_frame.n, x.wi.z))))
         return Place(self.grid.place_of(x.p, level), normal + (mi.UInt32(kind) << 16), level)
 
     def look(

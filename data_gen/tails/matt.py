@@ -1,4 +1,4 @@
-"""Which materials let a path end in the cache, and the share of arriving light that they scatter like a matt surface.
+"""Which materials and media let a path end in the cache, and the share of arriving light that they scatter evenly.
 
 The cache knows the light that *arrives* at a surface, weighted by the cosine: its irradiance over π. Every material
 with a diffuse part scatters some of that light as a matt surface of reflectance ρ would,
@@ -8,38 +8,55 @@ with a diffuse part scatters some of that light as a matt surface of reflectance
 The path ends for the first term and goes on for the rest: gloss, metal, mirrors, what goes through, and what bumps and
 Fresnel's law change about the diffuse part. Any ρ gives the right mean, and the closer it comes to the material, the
 less is left to go on for. No light is divided by ρ, which may be 0.
+
+In a medium the cache knows the mean radiance over all directions. A phase function is split in the same way,
+
+    f = ρ / 4π + rest,
+
+where ρ is 4π times its least value, so that the rest is nowhere negative. The throughput already has the albedo. So a
+cell needs neither the extinction nor the albedo: thin and dense parts of a grid, and both sides of an index-matched
+boundary, may share it.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from data_gen.paths import media
-from data_gen.paths.vertex import SMOOTH, ByMaterial, consistent, evaluate, event_kind, materials_of
+from data_gen.paths.media import Place
+from data_gen.paths.vertex import SMOOTH, ByMaterial, event_kind, materials_of
 
 # The tangent of the angle between the normal and the direction that ρ is read off: as far from a mirror direction as
 # from the horizon
 _TILT = 1.0
 # Flags of all other lobes
 _ELSE = ("Delta", "Delta1D", "Null", "Glossy", "DiffuseTransmission")
+# In media whose ρ is smaller, most paths would go on, and the cache would cost more than it gains.
+_LEAST_EVEN = 0.1
 # Materials that disturb the normal of the material inside
 _BUMPS = re.compile("(Bump|Normal)Map")
 
 
 class Matt:
-    """Facts about a scene's materials that the cache needs."""
+    """Facts about a scene's materials that the cache needs, and about the ``fogs`` that paths go through."""
 
-    def __init__(self, scene: mi.Scene):
+    def __init__(self, scene: mi.Scene, fogs: Sequence[mi.Medium] = ()):
         bsdfs = materials_of(scene)
+        evens = {_number(fog): even_part(fog.phase_function()) for fog in fogs}
+        of_media = np.zeros(max(evens, default=0) + 1, np.float32)
+        of_media[list(evens)] = list(evens.values())
+        self.evens = ByMaterial(mi.Float(of_media))
         table = np.zeros(max(bsdfs, default=0) + 1, bool)
         table[[number for number, bsdf in bsdfs.items() if is_lambertian(bsdf)]] = True
         # Materials inside shape groups are not listed.
         groups = any(shape.class_name() == "Instance" for shape in scene.shapes())
-        self.any = groups or any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) for bsdf in bsdfs.values())
+        matt = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) for bsdf in bsdfs.values())
+        self.any = groups or matt or bool(of_media.any())
         self.nothing_else = ByMaterial(mi.Bool(table))
         tilted = np.zeros(len(table), bool)
         tilted[[number for number, bsdf in bsdfs.items() if _BUMPS.search(str(bsdf))]] = True
@@ -48,28 +65,33 @@ class Matt:
         self.tilts = ByMaterial(mi.Bool(tilted))
         self.plain = Plain(bsdfs)
 
-    def at(self, x: mi.SurfaceInteraction3f, place: media.Place | None, active: mi.Bool) -> mi.Bool:
-        """Whether a vertex is in a medium, or its material has a diffuse part."""
-        return active & (media.scatters(place) | mi.has_flag(x.bsdf().flags(), mi.BSDFFlags.DiffuseReflection))
+    def at(self, x: mi.SurfaceInteraction3f, place: Place | None, active: mi.Bool) -> mi.Bool:
+        """Whether the material or the phase function at a vertex has a part that the cache answers for."""
+        matt = mi.has_flag(x.bsdf().flags(), mi.BSDFFlags.DiffuseReflection)
+        return active & (matt if place is None else matt | (self._even(place, active) > 0))
 
-    def lambertian(self, x: mi.SurfaceInteraction3f, place: media.Place | None, active: mi.Bool) -> mi.Bool:
-        """Whether a path that ends at the vertex has no rest to go on for: a material of nothing but a diffuse part, or
-        a medium that scatters alike in all directions."""
+    def lambertian(self, x: mi.SurfaceInteraction3f, place: Place | None, active: mi.Bool) -> mi.Bool:
+        """Whether that part is all: a path that ends there has no rest to go on for."""
         listed, lambertian = self.nothing_else.of(x.bsdf(), active)
-        return (listed & lambertian) | (active & media.scatters(place))
+        all_matt = listed & lambertian
+        return all_matt if place is None else all_matt | (self._even(place, active) == 1)
+
+    def _even(self, place: Place, active: mi.Bool) -> mi.Float:
+        """ρ of the phase function at a vertex, 0 on surfaces."""
+        return self.evens.of(place.medium, active & place.scatters)[1]
 
     def tilted(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
         """Whether its diffuse part may be tilted by a bump or normal map, and so miss directions of a matt surface."""
         listed, tilted = self.tilts.of(x.bsdf(), active)
         return active & (~listed | tilted)
 
-    def reflectance(self, x: mi.SurfaceInteraction3f, place: media.Place | None, active: mi.Bool) -> mi.Color3f:
-        """ρ in [0, 1]: π times the diffuse lobe's f in a direction on the side of ``wi``; 1 in media, whose albedo
-        is in the throughput."""
-        inside = media.scatters(place)
-        known, ρ = self.plain.of(x, active & ~inside)
-        ρ = dr.select(known, ρ, reflectance(x.bsdf(), x, active & ~known & ~inside))
-        return dr.select(active & inside, 1, ρ)
+    def reflectance(self, x: mi.SurfaceInteraction3f, place: Place | None, active: mi.Bool) -> mi.Color3f:
+        """ρ in [0, 1]: π times the diffuse lobe's f in a direction on the side of ``wi``, or ρ of the phase function.
+        """
+        on_surface = active & ~media.scatters(place)
+        known, ρ = self.plain.of(x, on_surface)
+        ρ = dr.select(known, ρ, reflectance(x.bsdf(), x, on_surface & ~known))
+        return ρ if place is None else dr.select(place.scatters, mi.Color3f(self._even(place, active)), ρ)
 
 
 class Plain:
@@ -123,44 +145,61 @@ def is_constant(bsdf: mi.BSDF) -> bool:
     return bool(keys) and all(key.split(".")[-2:] == ["reflectance", "value"] for key in keys)
 
 
-def matt_lobe(x: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.Float:
-    """f cos θ of a matt surface of reflectance 1, on the side that the path has come to."""
-    return dr.maximum(dr.mulsign(wo.z, x.wi.z), 0) * dr.inv_pi
+def even_part(phase: mi.PhaseFunction) -> float:
+    """ρ of a phase function: 4π times its least value. Returns 0 where that is below ``_LEAST_EVEN`` or not known."""
+    name, ρ = phase.class_name(), 0.0
+    if name == "IsotropicPhaseFunction":
+        ρ = 1.0
+    elif name == "RayleighPhaseFunction":
+        ρ = 0.75
+    elif name == "HGPhaseFunction":
+        g = float(np.max(np.abs(np.array(mi.traverse(phase)["g"]))))
+        ρ = (1 - g) / (1 + g) ** 2
+    return ρ if ρ >= _LEAST_EVEN else 0.0
+
+
+def _number(medium: mi.Medium) -> int:
+    return int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(medium))[0])
+
+
+def matt_lobe(x: mi.SurfaceInteraction3f, place: Place | None, wo: mi.Vector3f) -> mi.Float:
+    """f cos θ of a matt surface of reflectance 1, on the side that the path has come to; 1 / 4π in a medium."""
+    cosine = dr.maximum(dr.mulsign(wo.z, x.wi.z), 0) * dr.inv_pi
+    return cosine if place is None else dr.select(place.scatters, dr.inv_four_pi, cosine)
+
+
+def along_lobe(x: mi.SurfaceInteraction3f, place: Place | None, u: mi.Point2f) -> mi.Vector3f:
+    """A direction with the density ``matt_lobe``."""
+    wo = mi.warp.square_to_cosine_hemisphere(u)
+    wo.z *= dr.mulsign(mi.Float(1), x.wi.z)
+    return wo if place is None else dr.select(place.scatters, mi.warp.square_to_uniform_sphere(u), wo)
 
 
 def evaluate_and_sample(
     bsdf: mi.BSDFPtr,
     x: mi.SurfaceInteraction3f,
-    place: media.Place | None,
+    place: Place | None,
     wo: mi.Vector3f,
-    u_lobe: mi.Float,
-    u_direction: mi.Point2f,
+    u: tuple[mi.Float, mi.Point2f],
     both: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum]:
-    """As ``data_gen.paths.media.evaluate_and_sample``, but half of the directions of ``both`` lanes come by the cosine,
-    as at a matt surface. Each density is the mean of both ways."""
-    by_cosine, u_phase = both & (u_lobe < 0.5), mi.Float(u_lobe)
-    u_lobe = dr.select(both, 2 * u_lobe - dr.select(by_cosine, mi.Float(0), 1), u_lobe)
-    f, p, sample, f_p = bsdf.eval_pdf_sample(mi.BSDFContext(), x, wo, u_lobe, u_direction)
-    sample = consistent(bsdf, x, sample, f_p)
-    p = dr.select(both, 0.5 * (p + matt_lobe(x, wo)), p)
+    """As ``data_gen.paths.media.evaluate_and_sample``, but half of the directions of ``both`` lanes come as at a matt
+    surface, or evenly in a medium. Each density is the mean of both ways. ``u`` chooses the lobe and the direction."""
+    u_lobe, u_direction = u
+    by_lobe = both & (u_lobe < 0.5)
+    u_lobe = dr.select(both, 2 * u_lobe - dr.select(by_lobe, mi.Float(0), 1), u_lobe)
+    f, p, sample, f_p = media.evaluate_and_sample(bsdf, x, place, wo, u_lobe, u_direction)
+    p = dr.select(both, 0.5 * (p + matt_lobe(x, place, wo)), p)
 
-    own = mi.warp.square_to_cosine_hemisphere(u_direction)
-    own.z *= dr.mulsign(mi.Float(1), x.wi.z)
-    f_own, p_own = evaluate(bsdf, x, own, by_cosine)
-    sample.wo = dr.select(by_cosine, own, sample.wo)
-    sample.eta = dr.select(by_cosine, 1, sample.eta)
-    sample.sampled_type = dr.select(by_cosine, mi.UInt32(+mi.BSDFFlags.DiffuseReflection), sample.sampled_type)
-    p_material = dr.select(by_cosine, p_own, sample.pdf)
+    own = along_lobe(x, place, u_direction)
+    f_own, p_own = media.evaluate_vertex(bsdf, x, place, own, by_lobe)
+    sample.wo = dr.select(by_lobe, own, sample.wo)
+    sample.eta = dr.select(by_lobe, 1, sample.eta)
+    sample.sampled_type = dr.select(by_lobe, mi.UInt32(+mi.BSDFFlags.DiffuseReflection), sample.sampled_type)
+    p_material = dr.select(by_lobe, p_own, sample.pdf)
     smooth = event_kind(sample.sampled_type) == SMOOTH
-    together = 0.5 * (p_material + dr.select(smooth, matt_lobe(x, sample.wo), 0))
-    scattered = dr.select(by_cosine, f_own, f_p * p_material)
+    together = 0.5 * (p_material + dr.select(smooth, matt_lobe(x, place, sample.wo), 0))
+    scattered = dr.select(by_lobe, f_own, f_p * p_material)
     f_p = dr.select(both, scattered * dr.rcp(dr.maximum(together, 1e-20)), f_p)
     sample.pdf = dr.select(both, together, sample.pdf)
-    if place is None:
-        return f, p, sample, f_p
-    phase = place.medium.phase_function()
-    inside = media.in_medium(x, place)
-    f_phase, p_phase = phase.eval_pdf(mi.PhaseFunctionContext(), inside, wo, place.scatters)
-    f, p = dr.select(place.scatters, f_phase, f), dr.select(place.scatters, p_phase, p)
-    return f, p, *media.scattered(x, place, u_phase, u_direction, sample, f_p)
+    return f, p, sample, f_p

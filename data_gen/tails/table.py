@@ -12,8 +12,9 @@ from data_gen.paths.streams import mixed
 
 # The number of adjacent places in the table in which a cell may be: enough for each cell to find one, in any order
 _PLACES = 512
-# Directions along an axis of the octahedral map
+# Directions along an axis of the octahedral map, and the code of cells that have none: those in media
 _DIRECTIONS = 8
+INSIDE = _DIRECTIONS**2
 
 
 @dataclass

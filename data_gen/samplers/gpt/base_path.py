@@ -160,14 +160,11 @@ def base_step(
     if both is None:
         f, p, sample, f_p = media.evaluate_and_sample(bsdf, x, place, to_light, u_lobe, u_direction)
     else:
-        f, p, sample, f_p = matt.evaluate_and_sample(bsdf, x, place, to_light, u_lobe, u_direction, both)
+        f, p, sample, f_p = matt.evaluate_and_sample(bsdf, x, place, to_light, (u_lobe, u_direction), both)
     survival_of_rest = mi.Float(1)
     if path.ρ is not None:
-        E_light, smooth = matt.matt_lobe(x, to_light), event_kind(sample.sampled_type) == SMOOTH
-        E_p = dr.select(smooth & (sample.pdf > 0), matt.matt_lobe(x, sample.wo) / sample.pdf, 0)
-        if place is not None:
-            E_light = dr.select(place.scatters, f.x, E_light)
-            E_p = dr.select(place.scatters, f_p.x, E_p)
+        E_light, smooth = matt.matt_lobe(x, place, to_light), event_kind(sample.sampled_type) == SMOOTH
+        E_p = dr.select(smooth & (sample.pdf > 0), matt.matt_lobe(x, place, sample.wo) / sample.pdf, 0)
         # Light that the cache has already supplied is left out. Where little light may remain, few paths continue.
         f, survival_of_light = rest(f, path.ρ * E_light)
         f_p, survival_of_rest = rest(f_p, path.ρ * E_p)
@@ -295,7 +292,7 @@ def base_step(
         chain=chain,
         walks=walks,
         aim=aim,
-        trail=path.trail and path.trail.on(x1, segment.place, kind == SMOOTH, sample.pdf, goes_on),
+        trail=path.trail and path.trail.on(x1, media.scatters(segment.place), kind == SMOOTH, sample.pdf, goes_on),
         ρ=None if path.ρ is None else mi.Color3f(0),
     )
     return step, behind
@@ -322,7 +319,7 @@ def matt_too(plan: Plan, path: Path, recording: Recording | None) -> mi.Bool | N
     """
     x, both = path.x, None
     if path.ρ is not None and plan.matt.any_tilted:
-        both = plan.matt.tilted(x, dr.max(path.ρ) > 0)
+        both = plan.matt.tilted(x, (dr.max(path.ρ) > 0) & ~media.scatters(path.place))
     if recording:
         here = recording.here & ~plan.matt.lambertian(x, path.place, recording.here)
         both = here if both is None else here | both

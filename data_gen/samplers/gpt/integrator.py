@@ -110,7 +110,7 @@ class GPT(GradientIntegrator):
     def plan(self, scene) -> Plan:
         """What the kernel contains for a scene. Raises NgptError where its paths cannot share their tails."""
         volumes = self.volumes and bool(media_of(scene))
-        if self.shared and (reason := why_not_shared(volumes, self.options, mi.variant())):
+        if self.shared and (reason := why_not_shared(self.options, mi.variant())):
             raise NgptError(f"gpt: tails=shared is not possible: {reason}; use tails=paths")
         more = {"caustic": self.caustic, "volumes": volumes, "places": self.places, "shared": self.shared}
         return make_plan(scene, self.limits, self.roughness_threshold, self.shift, **more)

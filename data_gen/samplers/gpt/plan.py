@@ -10,6 +10,7 @@ from data_gen.paths.lights import Lights
 from data_gen.paths.space import Filled, Space
 from data_gen.paths.vertex import Materials
 from data_gen.paths.walk import Limits
+from data_gen.scenes.facts import media_of
 from data_gen.scenes.lamps import Places
 from data_gen.tails.matt import Matt
 from ngpt.errors import NgptError
@@ -65,5 +66,5 @@ def make_plan(
         half_vectors=replays and shift == "half-vector",
         caustic=caustic and replays,
         manifold=caustic and replays and shift == "manifold",
-        matt=Matt(scene) if shared else None,
+        matt=Matt(scene, media_of(scene) if volumes else ()) if shared else None,
     )

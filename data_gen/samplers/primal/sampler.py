@@ -18,7 +18,7 @@ from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.gpt.rounds import sharing
 from data_gen.samplers.gpt.trace import trace
 from data_gen.samplers.registry import SAMPLERS
-from data_gen.samplers.shared import VOLUMETRIC
+from data_gen.samplers.shared import PATHS
 from data_gen.scenes.facts import integrator_name
 from data_gen.scenes.lamps import Places
 from data_gen.scenes.load import reference_integrator
@@ -32,7 +32,7 @@ def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places |
     With ``tails`` "shared" the tails of paths are found in a cache, see ``data_gen.tails``.
     """
     integrator = reference_integrator(scene)
-    followed = integrator_name(scene) in ("path", *VOLUMETRIC) and not mi.is_polarized
+    followed = integrator_name(scene) in PATHS and not mi.is_polarized
     errs = places or loses_light(scene, integrator) or bent_lamp(scene)
     if not (tails == "shared" or (followed and errs)):
         return recorded(scene, partial(samples, scene, integrator, radiance(scene, integrator), features))
