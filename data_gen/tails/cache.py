@@ -53,9 +53,7 @@ class Trail:
         """The trail of a path at its first vertex, so far from the camera."""
         return cls(mi.Float(first), dr.zeros(mi.Float, dr.width(first)))
 
-    def on(
-        self, x: mi.SurfaceInteraction3f, inside: mi.Bool, smooth: mi.Bool, p: mi.Float, active: mi.Bool
-    ) -> Trail:
+    def on(self, x: mi.SurfaceInteraction3f, inside: mi.Bool, smooth: mi.Bool, p: mi.Float, active: mi.Bool) -> Trail:
         """At the next vertex ``x``, if there is one, behind an event of density ``p`` that was ``smooth``, or not.
 
         A vertex ``inside`` a medium meets the bundle of paths face to face.

@@ -132,6 +132,33 @@ def slit():
     )
 
 
+def foggy(scene, sigma_t=0.4):
+    """The scene filled with fog that scatters evenly."""
+    fog = {"type": "homogeneous", "id": "fog", "albedo": 0.95, "sigma_t": sigma_t}
+    inside = {"medium": {"type": "ref", "id": "fog"}}
+    integrator = scene["integrator"] | {"type": "volpath"}
+    return {"type": "scene", "fog": fog} | scene | {"integrator": integrator, "sensor": scene["sensor"] | inside}
+
+
+def foggy_sheet():
+    """The sheet without thickness between bright fog and dark fog."""
+    return foggy(thin_wall())
+
+
+def foggy_slit():
+    """The lamp behind a slit, in fog: a bright sheet of light in the air."""
+    return foggy(slit())
+
+
+def half_fog():
+    """The same room with fog in its left half, behind a boundary that bends nothing, and clear air in the right one."""
+    scene = door()
+    fog = {"type": "homogeneous", "albedo": 0.95, "sigma_t": 1.0}
+    block = {"type": "cube", "bsdf": {"type": "null"}, "interior": fog}
+    block["to_world"] = mi.ScalarTransform4f().translate([-0.75, 1.2, 0]).scale([0.7, 1.1, 1.4])
+    return scene | {"integrator": scene["integrator"] | {"type": "volpath"}, "block": block}
+
+
 def bulb():
     """A room whose only lamp is inside a ball of glass: all of its light comes over rough surfaces and then glass."""
     lamp = _sphere([0, 1.2, 0], 0.5, _diffuse(0, 0, 0)) | {"emitter": {"type": "area", "radiance": 3.0}}

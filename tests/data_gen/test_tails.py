@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from media_scenes import milk, nested
 from tails_scenes import bulb, mirrors, slit
 from unbiased import light_of_gradients, load
 
@@ -301,7 +302,7 @@ def renders(renderer):
     return rendered
 
 
-@pytest.mark.parametrize("scene", ["diffuse", "glossy", bulb, mirrors])
+@pytest.mark.parametrize("scene", ["diffuse", "glossy", bulb, mirrors, nested])
 def test_differences_are_those_of_the_image(renders, scene):
     """In the mean over blocks, within four standard errors and a little for places where but one of two paths ends."""
     stacks = renders(scene, "gpt", "shared")
@@ -315,7 +316,7 @@ def test_differences_are_those_of_the_image(renders, scene):
         assert (np.abs(each.mean(axis=0)) < 4 * doubt + 2e-3 * lights.mean()).all(), layer
 
 
-@pytest.mark.parametrize("scene", ["glossy", bulb, mirrors])
+@pytest.mark.parametrize("scene", ["glossy", bulb, mirrors, milk])
 @pytest.mark.parametrize("sampler", ["primal", "gpt"])
 def test_no_light_is_lost_or_counted_twice(renders, sampler, scene):
     """Also not light that comes through glass or off a mirror, which ``gpt`` keeps in a layer of its own."""
@@ -432,7 +433,6 @@ def test_claims_hold_for_pixels_blocks_and_images(renderer):
 @pytest.mark.parametrize(
     ("scene", "options", "reason"),
     [
-        ("haze", {}, "the integrator is 'volpath'"),
         ("diffuse", {"reuse": True}, "reuse needs whole paths"),
         ("diffuse", {"shift": "manifold"}, "shift=manifold needs whole paths"),
     ],

@@ -12,6 +12,9 @@ from tails_scenes import (
     corner_box,
     door,
     first_sunset,
+    foggy_sheet,
+    foggy_slit,
+    half_fog,
     shade,
     sheet,
     shelf,
@@ -89,10 +92,18 @@ MOST = {
     sheet: (0.006, 0.004),  # 0.002, 0.0002
     contact: (0.006, 0.006),  # 0.0023, -0.0028
     slit: (0.150, 0.150),  # 0.075, -0.073
+    foggy_sheet: (0.020, 0.008),  # -, 0.0012
+    foggy_slit: (0.100, 0.080),  # 0.033, 0.027
+    half_fog: (0.020, 0.014),  # -, 0.003
 }
 
 
-@pytest.mark.parametrize("description", MOST)
+SLOW = (foggy_slit, half_fog)
+
+
+@pytest.mark.parametrize(
+    "description", [pytest.param(scene, marks=pytest.mark.slow if scene in SLOW else ()) for scene in MOST]
+)
 def test_little_light_leaks(renderer, description):
     scene, (most, most_total) = load(renderer, description, SIZE), MOST[description]
     shared, paths = images(scene, "shared", 64, range(8)), whole(description)

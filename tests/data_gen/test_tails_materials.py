@@ -3,10 +3,10 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from kept_light import keeps_its_light
 from tails_scenes import SIZE, of_material
-from unbiased import REFERENCES, load
+from unbiased import load
 
-from data_gen.render import render_stack
 from data_gen.tails import schedule
 
 
@@ -62,20 +62,5 @@ SLOW = ("principled glass", "plastic and grey", "two-sided", "bumps", "red and w
     "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in MATERIALS]
 )
 def test_each_material_keeps_its_light(renderer, monkeypatch, name):
-    """In the mean and in blocks of 4x4 pixels, of 256 samples and four seeds."""
     monkeypatch.setattr(schedule, "BEGIN", 1)
-    scene = load(renderer, of_material(MATERIALS[name]()), SIZE)
-    found = {}
-    for tails, first in (("shared", 0), ("paths", REFERENCES)):
-        how = {"tails": tails, "with_features": False}
-        stacks = [render_stack(scene, 256, first + seed, "primal", unbiased=True, **how) for seed in range(4)]
-        found[tails] = np.array([stack["primal"] for stack in stacks], np.float64)
-    assert stacks[0].attributes.get("ngpt:tails") is None
-    shared, whole = (image.reshape(4, 6, 4, 8, 4, 3).mean(axis=(2, 4)) for image in found.values())
-    doubt = [np.sqrt(each.mean(axis=(1, 2)).var(axis=0, ddof=1) / 4) for each in (shared, whole)]
-    error = shared.mean(axis=(0, 1, 2)) - whole.mean(axis=(0, 1, 2))
-    assert (np.abs(error) < 4 * np.hypot(*doubt) + 2e-3 * whole.mean()).all()
-    # Products of independent differences have no noise in their mean.
-    halves = [shared[i::2].mean(axis=0) - whole[i::2].mean(axis=0) for i in range(2)]
-    unit = whole.mean(axis=0) + 0.02 * whole.mean()
-    assert (halves[0] * halves[1] / unit**2).mean() < 0.01**2
+    keeps_its_light(load(renderer, of_material(MATERIALS[name]()), SIZE))

@@ -45,15 +45,15 @@ def vertex(t):
 
 def test_smooth_events_widen_a_path_and_sharp_ones_lengthen_it(renderer):
     """A step of length t behind a smooth event of density p adds t / sqrt(p cos θ) to the spread."""
-    trail, there = Trail.to(vertex(2.0)), mi.Bool(True)
-    sharp = trail.on(vertex(3.0), mi.Bool(False), mi.Float(1.0), there)
+    trail, there, outside = Trail.to(mi.Float(2)), mi.Bool(True), mi.Bool(False)
+    sharp = trail.on(vertex(3.0), outside, mi.Bool(False), mi.Float(1.0), there)
     assert (sharp.reach[0], sharp.spread[0]) == (5, 0)
-    once = sharp.on(vertex(4.0), mi.Bool(True), mi.Float(0.5), there)
+    once = sharp.on(vertex(4.0), outside, mi.Bool(True), mi.Float(0.5), there)
     assert (once.reach[0], once.spread[0]) == (5, pytest.approx(8))
     # What is sharp behind a rough surface neither widens nor lengthens it.
-    again = once.on(vertex(7.0), mi.Bool(False), mi.Float(1.0), there)
+    again = once.on(vertex(7.0), outside, mi.Bool(False), mi.Float(1.0), there)
     assert (again.reach[0], again.spread[0]) == (5, pytest.approx(8))
-    assert again.on(vertex(1.0), mi.Bool(True), mi.Float(2.0), there).spread[0] == pytest.approx(9)
+    assert again.on(vertex(1.0), outside, mi.Bool(True), mi.Float(2.0), there).spread[0] == pytest.approx(9)
 
 
 @pytest.fixture
@@ -67,9 +67,9 @@ PLAN = SimpleNamespace(
     limits=SimpleNamespace(max_depth=10),
     replays=False,
     matt=SimpleNamespace(
-        at=lambda x, active: active,
-        lambertian=lambda x, active: active,
-        reflectance=lambda x, active: mi.Color3f(0.5),
+        at=lambda x, place, active: active,
+        lambertian=lambda x, place, active: active,
+        reflectance=lambda x, place, active: mi.Color3f(0.5),
     ),
 )
 
@@ -77,7 +77,7 @@ PLAN = SimpleNamespace(
 class Light:
     """Knows 3 everywhere."""
 
-    def place_of(self, x, spread, late):
+    def place_of(self, x, inside, spread, late):
         return None
 
     def look(self, where, least, active):
@@ -86,7 +86,7 @@ class Light:
 
 def path_at(spread, reach=8.0):
     values = {"x": vertex(1.0), "depth": mi.UInt32(2), "trail": Trail(mi.Float(reach), mi.Float(spread))}
-    return SimpleNamespace(walks=mi.Bool(True), late=mi.Bool(False), β=mi.Color3f(0.25), **values)
+    return SimpleNamespace(place=None, walks=mi.Bool(True), late=mi.Bool(False), β=mi.Color3f(0.25), **values)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.99, 1.01, 4])
