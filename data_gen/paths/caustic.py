@@ -38,7 +38,7 @@ def lit_late(rough: mi.Bool, late: mi.Bool, connectable: mi.Bool) -> mi.Bool:
 def ends_late(smooth: mi.Bool, connectable: mi.Bool, sharp_next: mi.Bool) -> mi.Bool:
     """Whether all light from behind the next vertex belongs to the layer.
 
-    It does if the vertex has no hole and scatters nothing widely: then the path is late after any event there. A
+    It does if that vertex has no hole and does not scatter widely: then the path is late after any event there. A
     shifted copy would be of no use, so it is rejected one step before a path is late, again from both sides.
     """
     return smooth & connectable & sharp_next
