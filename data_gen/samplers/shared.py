@@ -1,4 +1,4 @@
-"""What entries of several families share: why they refuse a scene (``registry.Rule``), and options and notes."""
+"""Parts of entries that several families share: rules to refuse a scene (``registry.Rule``), options and notes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from data_gen.samplers.registry import Option
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
 
-# Integrators that render media, of those that samplers of ours follow
+# Integrators with media that our samplers can follow
 VOLUMETRIC = ("volpath", "volpathmis")
 
 
@@ -20,7 +20,7 @@ def polarised(facts: Facts, name: str) -> str:
 
 
 def spectra(facts: Facts, name: str) -> str:
-    """Paths that share light with others must have the same wavelengths."""
+    """Paths that share light must have the same wavelengths."""
     reason = f"in variant '{facts.spectral}' each path has wavelengths of its own, and '{name}' lets paths share light"
     return f"{reason}, as variant 'llvm_ad_rgb' allows" if facts.spectral else ""
 
@@ -54,19 +54,19 @@ def mirrors(facts: Facts, name: str) -> str:
 
 
 def unreachable_camera(facts: Facts, name: str) -> str:
-    """Light paths must be able to end there."""
+    """Light paths must be able to end at the camera."""
     reached = facts.camera in ("perspective", "thinlens")
     return "" if reached else f"light paths cannot reach a camera '{facts.camera}', but 'perspective' and 'thinlens'"
 
 
 def no_pixels(facts: Facts, name: str) -> str:
-    """The radius of photons is in pixels: meters have one for all that they see, or none side by side."""
+    """The radius of photons is in pixels. Meters have a single pixel, or pixels that are not side by side."""
     meter = facts.camera in ("radiancemeter", "irradiancemeter", "distant")
     return f"photons are gathered over pixels, which a camera '{facts.camera}' has not side by side" if meter else ""
 
 
 def hair(facts: Facts, name: str) -> str:
-    """Mitsuba's hair scatters differently from the light to the eye than back, and does not provide its adjoint."""
+    """Mitsuba's hair is not reciprocal, and does not provide its adjoint."""
     return "light paths lose light at the material 'hair', which is not the same in both directions" * facts.hair
 
 
@@ -88,9 +88,9 @@ TAILS = Option(
 
 
 def why_not_shared(media: bool, settings: Mapping[str, Any], variant: str) -> str:
-    """Why paths of a sampler with the option ``tails`` cannot share their tails under these ``settings``.
+    """Why paths of a sampler with the option ``tails`` cannot share their tails under these ``settings``, or "".
 
-    ``media``: the paths go through media. "" where they can share.
+    ``media``: whether the paths go through media.
     """
     if media:
         return "there are media"
