@@ -1,5 +1,4 @@
-r"""Camera paths that go through mirrors or glass directly after the first vertex at which copies differ, and their
-copies.
+r"""Camera paths that go through mirrors or glass directly after the vertex x1 below, and their copies.
 
     x1, x1'   the first vertex of each path that it leaves by a smooth event, at a connectable material
     ω, ω'     the directions there; k = 1 .. 6 specular events later both paths meet

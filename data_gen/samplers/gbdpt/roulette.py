@@ -8,9 +8,9 @@ of all paths of a pass is known before shifts are traced:
     I0     the light of the image: (mean of √I)²
     p      = min(1, 2 w / √(I I0)), and at least 0.1
 
-How visible noise is lies between w / I (relative to the pixel) and w / I0. A path is shifted with probability p, and
-its Δ counts 1 / p times, so the expected value is Δ for any p. The roulette uses its own random numbers. It may have
-another p for a path than for its copy, since Δ itself (``pairs``) does not depend on p.
+The visibility of noise lies between w / I (relative to the pixel) and w / I0 (relative to the image). A path is shifted
+with probability p, and its Δ counts 1 / p times, so the expected value is Δ for any p. The roulette uses its own random
+numbers. It may have another p for a path than for its copy, since Δ itself (``pairs``) does not depend on p.
 
 [Arvo and Kirk 1990, "Particle Transport and Image Synthesis", section 4]
 """
