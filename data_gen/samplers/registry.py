@@ -38,12 +38,12 @@ def integrator_of(module: str) -> Any:
 COMMON = {
     "points": Option(
         "sobol",
-        "of random numbers: Sobol's, in rounds where --spp does not say how many, or independent ones (more noise)",
+        "random numbers: Sobol points in a single round of --spp samples, in rounds from 16 on, or independent ones",
         choices=("sobol", "rounds", "independent"),
     ),
     "lamps": Option(
         "power",
-        "how often each is chosen, where the scene leaves that open: by what it brings, or all alike",
+        "how often each lamp is chosen, if the scene does not say: by the light it brings, or all equally",
         choices=("power", "uniform"),
     ),
 }

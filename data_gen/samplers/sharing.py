@@ -39,7 +39,7 @@ def sharing_of(sensor: mi.Sensor, entry: Sampler, facts: Facts, settings: Mappin
     """
     never = why_not_shared(bool(facts.media), settings, mi.variant())
     if facts.integrator != "path":
-        never = f"the integrator is '{facts.integrator}', and only paths of 'path' do"
+        never = f"the integrator is '{facts.integrator}', and only paths of 'path' can"
     net = first_round(settings.get("points", "independent"), budget.spp)
     film = GradientFilm(*(int(n) for n in sensor.film().crop_size()), net=net, gradients=entry.film_of_gradients)
     own = MIB + bytes_of_shared(film.pixels) // 2**20

@@ -20,7 +20,7 @@ register(
         refusals=BOTH_ENDS,
         notes={
             "transport": "found from both ends and shifted as a whole",
-            "mirrors": "shifted in front of the camera, and where light comes through them to what it sees",
+            "mirrors": "shifted in front of the camera, and between a light and the surface that the camera sees",
         },
         options={"joined_depth": joined_depth(10), "roughness_threshold": CONNECTABLE},
         tried=True,

@@ -97,6 +97,6 @@ def _refuse_lamps_never_chosen(scene, sampler: str) -> None:
     for index, emitter in enumerate(scene.emitters()):
         if visible(emitter) and scene.pdf_emitter(mi.UInt32(index))[0] == 0:
             raise NgptError(
-                f"sampler '{sampler}' cannot render this scene: its photons start at lamps that are chosen, and "
-                f"emitter '{emitter.id()}' has sampling_weight 0; give it a positive one, or use --sampler gpt"
+                f"sampler '{sampler}' cannot render this scene: no photons would start at emitter "
+                f"'{emitter.id()}', which has sampling_weight 0; give it a positive one, or use --sampler gpt"
             )

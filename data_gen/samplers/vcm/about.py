@@ -6,7 +6,7 @@ from data_gen.samplers.shared import BOTH_ENDS, GATHERING, IN_MIRRORS, first_rad
 # Light that goes through glass and back has long paths, which camera paths find rarely, as bright dots. So up to 16
 # vertices of a light path are kept.
 _OPTIONS = {"radius": first_radius(2.0), "joined_depth": joined_depth(17), "roughness_threshold": GATHERING}
-_NOTES = {"transport": "found from both ends and by photons; blurred where by photons", "mirrors": IN_MIRRORS}
+_NOTES = {"transport": "found from both ends and by photons, which blur", "mirrors": IN_MIRRORS}
 
 register(
     Sampler(
