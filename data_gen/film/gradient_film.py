@@ -150,8 +150,7 @@ class GradientFilm:
         return self._splats[name]
 
     def end_pass(self, block: int | None = None, some: np.ndarray | None = None) -> None:
-        """Adds the values of the pass to the statistics. Nothing is added before, so an interrupted pass leaves no
-        trace.
+        """Adds the values of the pass to the statistics, all at once: an interrupted pass leaves no trace.
 
         ``block`` is the ``block`` of ``CameraSamples``: the number of samples of a pixel that are side by side. In a
         film with ``batches`` it is the number of samples per pixel in the pass, and must be given if there are only
@@ -416,8 +415,7 @@ class GradientFilm:
 
     @property
     def _net_of_numbers(self) -> int:
-        """The number of values in the first round of points, a power of two. If values are batches, each is a block of
-        points."""
+        """The number of values in the first round, a power of two. A batch is a block of points."""
         net = self.net // self.batch if self.batches else self.net
         return 1 << max(net.bit_length() - 1, 0)
 

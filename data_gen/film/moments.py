@@ -85,8 +85,7 @@ def _one_later(earlier: Earlier, old: Moments, number: mi.UInt32) -> Earlier:
 
 @dataclass
 class Strands:
-    """Which lanes each strand takes: ``block`` lanes from ``first`` on, and again each ``stride`` later, all before
-    ``end``.
+    """The lanes of each strand: ``block`` lanes from ``first`` on, and again each ``stride`` later, up to ``end``.
 
     ``number`` is the number of the first sample in its pixel. It grows by ``further`` from one block to the next.
     """

@@ -94,8 +94,7 @@ class BentLamps:
     def sample(
         self, x: mi.Interaction3f, chosen: Chosen, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum, mi.Normal3f]:
-        """As ``scene.sample_emitter_direction()``, for the ``chosen`` lamp, bent or not. The third value is
-        ``Point.front``."""
+        """As ``scene.sample_emitter_direction()``, for the ``chosen`` lamp, bent or not; and ``Point.front``."""
         emitter = dr.gather(mi.EmitterPtr, self.emitters, chosen.lamp, active)
         bent = active & self.has(chosen.lamp, active)
         light, weight = emitter.sample_direction(x, chosen.u, active & ~bent)

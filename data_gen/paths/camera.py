@@ -74,8 +74,7 @@ class CameraSamples:
 
     @classmethod
     def replayed(cls, sensor: mi.Sensor, seed: int, pixel: mi.UInt32, sample: mi.UInt32, place: mi.Point2f) -> Self:
-        """Sample ``sample`` of each ``pixel``, at another ``place`` on the film. It is drawn in the kernel that uses
-        it."""
+        """Sample ``sample`` of each ``pixel``, at another ``place`` on the film, drawn in the kernel that uses it."""
         camera = cls.__new__(cls)
         camera.pixel = pixel
         camera._see(sensor)
@@ -169,8 +168,7 @@ def bytes_of_rays(sensor: mi.Sensor) -> int:
 
 
 def in_packets(lanes: np.ndarray, camera: CameraSamples) -> tuple[np.ndarray, np.ndarray]:
-    """The ``lanes`` with gaps between blocks of samples, and which of them exist. With these gaps no two blocks share a
-    packet of rays.
+    """The ``lanes`` with gaps between blocks of samples, so that no two blocks share a packet; and which of them exist.
 
     The last bits of a ray's result depend on the rays traced with it, and a block must not depend on its pass.
     """

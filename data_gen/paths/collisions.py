@@ -137,8 +137,7 @@ def fly_on(passes, trace, ray, medium, *, channel, u, key, active):
 
 @dr.syntax
 def cross(passes, trace, ray, medium, reach, *, channel, key, scale, most, target, active):
-    """As ``segments.cross()``, for scenes with grids. There are at most ``most`` collisions, whose steps are multiplied
-    by ``scale``.
+    """As ``segments.cross()``, for scenes with grids: at most ``most`` collisions, with steps multiplied by ``scale``.
 
     Returns the same, where τ is the optical depth of homogeneous media only, then M and ∏ σn / μ_c.
     """

@@ -59,8 +59,7 @@ def axes(sensor) -> list[mi.Vector3f]:
 
 
 def before_near_plane(sensor, ray) -> mi.Float:
-    """The distance along ``ray`` from the camera, or from the plane of an orthographic camera, to the near plane, where
-    the ray begins."""
+    """The distance along ``ray`` from the camera (orthographic: its plane) to the near plane, where the ray begins."""
     if not isinstance(sensor, mi.ProjectiveCamera):
         return mi.Float(0)
     # near_clip of an orthographic camera is in units of to_world, which may be scaled.

@@ -97,8 +97,7 @@ class Holes:
     def behind(
         self, si: mi.SurfaceInteraction3f, T: mi.Spectrum, left: mi.UInt32, going: mi.Bool
     ) -> tuple[mi.Spectrum, mi.UInt32, mi.Bool]:
-        """T, the number of holes that may be ``left``, and which rays are still ``going``, behind the surface at
-        ``si``."""
+        """``T``, the number of holes ``left`` and which rays are still ``going``, behind the surface at ``si``."""
         T = dr.select(going, mi.Spectrum(T * dr.select(left > 0, self.share(si, going), 0)), T)
         going = going & (dr.max(T) > 0)
         return T, dr.select(going, left - 1, left), going

@@ -255,8 +255,7 @@ def _kind(emitter: mi.Emitter) -> int | None:
 
 
 def _table(scene: mi.Scene, number: int, emitter: mi.Emitter, kind: int) -> list[float]:
-    """Position, axis and cosine of the cutoff of a point or spot; last, for a sphere, its density of starting
-    points."""
+    """Position, axis and cosine of the cutoff of a point or spot; last, the density of starts on a sphere."""
     if kind == _AREA:
         shape = emitter.get_shape()
         ball = shape.class_name() == "Sphere"
@@ -274,8 +273,7 @@ def _table(scene: mi.Scene, number: int, emitter: mi.Emitter, kind: int) -> list
 
 
 def _cone_density(cutoff: mi.Float) -> mi.Float:
-    """The density of uniform directions in a cone. ``cutoff`` is the cosine of its half angle, -1 for all
-    directions."""
+    """The density of uniform directions in a cone. ``cutoff`` is the cosine of its half angle; -1 is a sphere."""
     return dr.rcp(dr.two_pi * (1 - cutoff))
 
 

@@ -22,8 +22,7 @@ _EMISSION = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
 
 
 class Lights:
-    """The emitters of a scene, and whether the same random numbers sample the same point, or direction, from
-    everywhere.
+    """The emitters of a scene, and whether equal random numbers sample the same point or direction from everywhere.
 
     They do for emitters that are infinitely far away, and for area lights on shapes that are sampled uniformly.
     Replaying the sample at another vertex changes only the solid angle, so such emitters need not be sampled again.
@@ -101,8 +100,7 @@ def shadowed(scene: mi.Scene, si: mi.SurfaceInteraction3f, light: LightSample, f
 def replay_light(
     scene, lights: Lights, base, base_weight, u, y: mi.SurfaceInteraction3f, *, lit: mi.Bool
 ) -> LightSample:
-    """``sample_light(scene, y, u, lit, lights)``, computed from the sample ``base`` that ``u`` gave at another
-    vertex."""
+    """``sample_light(scene, y, u, lit, lights)``, from the sample ``base`` that ``u`` gave at another vertex."""
     return _replayed(lights, base, base_weight, y, lit, lambda anew: sample_light(scene, y, u, anew, lights))
 
 

@@ -185,8 +185,7 @@ def on_surface(si: mi.SurfaceInteraction3f, d: mi.Vector3f, dp: mi.Vector3f) -> 
 
 
 def turn(code, η, n, d, dn: tuple, dd: tuple) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]:
-    """The direction ``d`` after an event, and its differentials (Igehy 1999, eq. 14-18); ``η`` is n_t / n_i along the
-    ray."""
+    """The direction ``d`` after an event, and its differentials (Igehy 1999, eq. 14-18); ``η`` is n_t / n_i."""
     back = dr.dot(d, n) > 0
     N = mi.Vector3f(dr.select(back, -n, n))
     cos = dr.dot(d, N)

@@ -61,8 +61,7 @@ class Materials:
         self.rough = ByMaterial(mi.Bool(table))
 
     def connectable(self, bsdf: mi.BSDFPtr) -> mi.Bool:
-        """Whether a vertex with this material is connectable. False if there is no material, as for a path that
-        escaped."""
+        """Whether a vertex with this material is connectable. False without a material, as for escaped paths."""
         listed, rough = self.rough.of(bsdf)
         return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (~listed | rough)
 

@@ -48,8 +48,7 @@ def loses_light(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> bool:
 
 
 def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[..., mi.Spectrum]:
-    """(sampler, ray, medium, active) -> radiance, as the integrator estimates it, or ``prb`` if that
-    ``loses_light``."""
+    """(sampler, ray, medium, active) -> radiance, by the integrator, or by ``prb`` if that ``loses_light``."""
     if loses_light(scene, integrator):
         integrator = mi.load_dict({"type": "prb", **path_depths(integrator)})
     return own_estimate(scene, integrator)
@@ -99,8 +98,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
 
     @classmethod
     def like_path(cls, scene: mi.Scene, plugin: str, places: Places | None = None, **options) -> Self:
-        """Makes an integrator ``plugin``, of this class, with the parameters of the scene's ``path`` and the
-        ``options``.
+        """An integrator ``plugin`` of this class, with the parameters of the scene's ``path`` and the ``options``.
 
         Lamps are chosen by ``places``. Raises NgptError where the parameters cannot be read.
         """

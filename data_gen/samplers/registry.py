@@ -165,8 +165,7 @@ class Sampler(Entry):
         return bool(self.batch) or self.together
 
     def subpixels(self, asked: int | str, spp: int | None) -> int:
-        """K of the K x K subpixels that a render keeps: ``asked``, where "auto" stands for the best K for ``spp``
-        samples.
+        """K of the K x K subpixels that a render keeps: ``asked``, or for "auto" the best K for ``spp`` samples.
 
         Raises WrongUse if the sampler cannot keep subpixels.
         """
@@ -185,8 +184,7 @@ class Sampler(Entry):
 
 @dataclass(frozen=True)
 class FrameSampler(Entry):
-    """A sampler that renders the frames of a shot in order, since it reuses earlier frames. It renders no single
-    images.
+    """A sampler of shots: it renders frames in order, since it reuses earlier frames, and no single images.
 
     Its ``make`` (scene, seed, samples per pixel, memory in MiB, options) returns an object whose ``film(index, motion,
     depth)`` is the film of a frame, numbered in the shot.
@@ -269,8 +267,7 @@ def choose(facts: Facts) -> tuple[str, str]:
 
 
 def check_options(name: str, given: Mapping[str, Any]) -> None:
-    """Raises WrongUse for options that the sampler called ``name`` does not have. "auto" has those that all its
-    samplers share."""
+    """Raises WrongUse for options that the sampler does not have. "auto" has those that all its samplers share."""
     if name != "auto":
         (FRAME_SAMPLERS[name] if name in FRAME_SAMPLERS else find(name)).settings(given)
         return

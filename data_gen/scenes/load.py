@@ -96,8 +96,7 @@ def complaint(error: Exception) -> str:
 
 @contextmanager
 def _enough_threads() -> Iterator[None]:
-    """A context with at least two threads in Dr.Jit. With one, some scene files never finish loading (Mitsuba
-    3.9.1)."""
+    """A context with at least two threads. With one, some scene files never finish loading (Mitsuba 3.9.1)."""
     before = dr.thread_count()
     if before >= _LOADING:
         yield

@@ -78,8 +78,7 @@ def _register(variant: str) -> None:
 
 
 def _candidates(state: mi.parser.ParserState) -> Iterator[tuple[str, int | None, int, np.ndarray]]:
-    """Meshes that shine in one colour: name, node of the material (None: Mitsuba's default), node of the mesh,
-    radiance."""
+    """Meshes that shine in one colour: name, material node (None: Mitsuba's default), mesh node, radiance."""
     for name, number in parts_of(state.root.props):
         shape = state.nodes[number].props
         nodes = [part for _, part in parts_of(shape)]

@@ -84,8 +84,7 @@ def _bytes_of(mesh: mi.Properties) -> int:
 
 
 def _in_pairs(state: mi.parser.ParserState, meshes: list) -> mi.Properties.ResolvedReference:
-    """Merges meshes in pairs, so each is copied log2(n) times. One after the other, the first would be copied n
-    times."""
+    """Merges n meshes in pairs, so each is copied log2(n) times. One by one, the first would be copied n times."""
     if len(meshes) == 1:
         return meshes[0]
     props, middle = mi.Properties("merge"), len(meshes) // 2

@@ -63,7 +63,7 @@ class LightPath:
 
 
 def begin(plan: Plan, random, camera_ray: mi.Ray3f) -> tuple[LightRay, End, mi.Bool]:
-    """The start and first vertex of a path from a light, and whether it exists; ``camera_ray`` has time and
+    """The start and first vertex of a light path, and whether it exists; ``camera_ray`` has its time and
     wavelengths."""
     scene, lights = plan.scene, plan.lights
     start = lights.sample(scene, random, camera_ray.time, camera_ray.wavelengths)
@@ -81,8 +81,7 @@ def lit(plan: Plan, start: LightRay, si: mi.SurfaceInteraction3f) -> mis.Partial
 
 
 def go_on(plan: Plan, random, start: LightRay, y: Vertex, bsdf, active) -> tuple:
-    """The next vertex after ``y``, whether it exists, the event that leads there, and 1 / the probability to
-    survive."""
+    """The next vertex after ``y``, whether it exists, the event that leads there, and 1 / survival probability."""
     u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
     sample, f_p = bsdf.sample(context(IMPORTANCE), y.si, u_lobe, u_direction, active)
     known = replace(y, end=plan.known(y.end, bsdf))

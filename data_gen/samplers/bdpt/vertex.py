@@ -95,8 +95,7 @@ def scatters_smoothly(bsdf: mi.BSDFPtr) -> mi.Bool:
 
 
 def evaluate(mode, si, bsdf, wo: mi.Vector3f, active=True) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
-    """f cos for a path that goes on along ``wo`` (local), the density of ``wo``, and that with both directions
-    swapped."""
+    """f cos for a path that goes on along ``wo`` (local), the density p of ``wo``, and q with directions swapped."""
     if mode == IMPORTANCE:
         f, q = light_scattered(si, bsdf, wo, active)
         p = bsdf.pdf(context(RADIANCE), si, wo, active)

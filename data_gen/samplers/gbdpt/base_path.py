@@ -52,8 +52,7 @@ class Way:
     holes: mi.UInt32  # the number of holes on the way
 
     def behind(self, passed: mi.Bool, new: Way) -> Way:
-        """The way behind an event: the ``new`` one, or this one if the event ``passed`` a hole, with probability
-        ``new.p``."""
+        """The ``new`` way behind an event, or this way if the event ``passed`` a hole, with probability ``new.p``."""
         weight, holes = self.weight * new.weight / new.p, self.holes + 1
         return dr.select(passed, Way(self.o, self.p, weight, self.η, holes), new)
 

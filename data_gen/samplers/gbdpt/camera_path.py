@@ -23,8 +23,7 @@ class MergesPairs(Protocol):
     """Gathers photons at camera paths and their copies, as the study ``gvcm`` does."""
 
     def differences(self, z: Vertex, bsdf: mi.BSDFPtr, active: mi.Bool, offsets: list[Offset]) -> tuple:
-        """The weighted light of the photons near the vertex ``z``, and Δ of each of the ``offsets`` with this light
-        added."""
+        """The weighted light of photons near the vertex ``z``, and Δ of the ``offsets`` with this light added."""
 
 
 @dr.syntax

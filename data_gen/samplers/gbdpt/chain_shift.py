@@ -124,8 +124,7 @@ def no_chain(lanes: int) -> Chain:
 
 
 def ends(plan: Plan, y: mi.SurfaceInteraction3f) -> mi.Bool:
-    """Whether a chain ends at ``y``, whatever is sampled there. A copy that comes to such a vertex must end there,
-    too."""
+    """Whether a chain ends at ``y``, whatever is sampled there. A copy must also end at such a vertex."""
     return ~y.is_valid() | plan.materials.connectable(y.bsdf()) | (y.emitter(plan.scene) != None)  # noqa: E711 - pointers
 
 

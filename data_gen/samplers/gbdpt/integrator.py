@@ -182,8 +182,7 @@ def shift_splats(
 def splatted_differences(
     plan: Plan, camera: CameraSamples, depths: mi.UInt32, times: mi.Float, bent: bool, sums: dict[str, tuple]
 ) -> tuple[dict[str, tuple], mi.Bool]:
-    """Adds the differences of light paths to ``sums``; also returns which lanes have bent paths, see
-    ``light_shift``."""
+    """Adds the differences of light paths to ``sums``. Also returns which are bent, see ``light_shift``."""
     sight = Sight.of(camera)
     splats = {name: Splats.on(sight.eye.pixels, 3, one) for name, one in sums.items()}
     return sums, splat_differences(plan, sight, depths, splats, bent, times)

@@ -56,8 +56,7 @@ class Unseen:
 
 
 def marked(state: mi.UInt64, longest: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """The lane and depth of each marked vertex, ordered by depth, so that neighbouring lanes trace equally many
-    edges."""
+    """The lane and depth of each marked vertex, ordered by depth, so that neighbours trace equally many edges."""
     lanes = [dr.compress((state >> mi.UInt64(depth)) & 1 != 0) for depth in range(1, longest)]
     depths = [dr.full(mi.UInt32, depth, dr.width(some)) for depth, some in enumerate(lanes, 1)]
     found = [(some, depth) for some, depth in zip(lanes, depths, strict=True) if dr.width(some)]

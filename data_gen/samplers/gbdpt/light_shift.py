@@ -56,8 +56,7 @@ def splat_differences(
     bent: bool = False,
     times: mi.Float | float = 1.0,
 ) -> mi.Bool:
-    """Splats the differences of light paths that end at a vertex that the camera sees, one path for each of its
-    samples.
+    """Splats the differences of light paths that end at a vertex that the camera sees, one for each lane.
 
     This vertex is ``depth`` edges from the light, and the path counts ``times`` times. A path is bent if mirrors or
     glass lie before its last vertex. With ``bent`` only the differences of bent paths are splatted, otherwise only all
@@ -131,8 +130,7 @@ def differences(
 
 
 def shifted(plan: Plan, eye: Eye, path: Splatted, uv: mi.Point2f, active, bent: bool = False) -> tuple:
-    """f J / p, r and ``others`` of the shifted path that the camera sees at ``uv`` on the film; f is 0 if it does not
-    exist."""
+    """f J / p, r and ``others`` of the copy that the camera sees at ``uv`` on the film; f is 0 if there is none."""
     # --------------------- The last vertex -----------------------
     scene, y = plan.scene, path.y
     ray = eye.ray(uv, path.lens)

@@ -257,8 +257,7 @@ def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si) -> tuple[Offs
 
 
 def go_through(plan: Plan, step: Step, y: Offset, none: Offset, si, eye: Eye) -> tuple[Offset, mi.Spectrum, mi.Float]:
-    """Passes the hole at ``si``, as the base path has passed one. Both are before the first smooth event of their
-    path."""
+    """Passes the hole at ``si``, as the base path has passed one. Both are before the first smooth event."""
     T, d = plan.holes.share(si, mi.Bool(True)), mi.Vector3f(y.ray.d)
     β = y.β * T * (step.survival / step.p)
     good = (dr.max(T) > 0) & dr.isfinite(dr.sum(β))

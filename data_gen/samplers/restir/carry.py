@@ -128,8 +128,8 @@ def _areas(mesh: Mesh) -> np.ndarray:
 def _behind(
     scene: mi.Scene, plan: Plan, random, x: mi.SurfaceInteraction3f, record: Record, active: mi.Bool
 ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float, mi.Bool]:
-    """Recomputes the path behind rc, ``x``: ``w``, ``L`` and ``p_light`` of a record, and whether the lamp sampled at
-    rc has a Dirac delta."""
+    """Recomputes ``w``, ``L`` and ``p_light`` of a record behind rc, ``x``; and whether the lamp sampled at rc is a
+    Dirac delta."""
     light, Le_p, lit = _sampled(scene, plan, x, draw(random), active & record.sampled & (record.behind == 0))
     w = dr.select(lit, light.d, record.w)
     L = dr.select(lit, Le_p, 0)

@@ -163,8 +163,7 @@ class History:
     # ------------------------------ E, where it is needed ------------------------------
 
     def _partners(self, record: Record, W: mi.Float) -> Requests:
-        """E of each lane's path in the right, left, lower and upper neighbour; request k n + i is neighbour k of lane
-        i."""
+        """E of each lane's path in the right, left, lower and upper neighbour (k = 0 to 3): request k n + lane."""
 
         def place(lane: mi.UInt32) -> tuple[mi.UInt32, mi.Point2f]:
             i, pair = lane % self.at.n, lane // self.at.n
@@ -177,8 +176,7 @@ class History:
         return self._of(self.stage, record, 4 * self.at.lanes, 1, active, request)
 
     def _of_kept(self, stage: Stage, kept: Reservoir, elsewhere: bool) -> Requests:
-        """E of each kept path at its place in this frame. Each reservoir has 4 requests, one for each corner of its
-        area.
+        """E of each kept path at its place in this frame: 4 requests for each reservoir, for the corners of its area.
 
         With ``elsewhere``: E in the frame before, at the other place where the path could have been.
         """

@@ -1,5 +1,4 @@
-"""Each reservoir keeps one of the paths that it is offered. Without reservoirs for pairs, kept paths give
-differences."""
+"""Each reservoir keeps one of the paths that it is offered. Also: differences of the paths kept by pixels."""
 
 from __future__ import annotations
 
@@ -27,8 +26,7 @@ class Evaluated:
 
 @dataclass
 class _Offer:
-    """A path for a reservoir: its value there, resampling weight and side; the lane of its record; its new place and
-    geometry."""
+    """A path for a reservoir: value, resampling weight and side; the lane of its record; its new place and geometry."""
 
     value: mi.Spectrum
     weight: mi.Float
@@ -137,7 +135,6 @@ def _pair(own: mi.Spectrum, other: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
 
 
 def _value(r: mi.UInt32, own: mi.Spectrum, other: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
-    """The value of reservoir ``r``, light or one sign of a difference, for f of a path in its pixel and in the
-    other."""
+    """The value for reservoir ``r``: light, or one sign of a difference. ``own``, ``other``: f in both pixels."""
     sign = dr.select(r % 2 == 1, mi.Float(1), -1)
     return dr.select(r == 0, own, part(_pair(own, other, side), sign))

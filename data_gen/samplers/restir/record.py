@@ -95,8 +95,7 @@ class Record:
         return self.shape == None  # noqa: E711 - a comparison of arrays of pointers
 
     def moved(self, place: mi.Point2f, geometry: mi.Float) -> Record:
-        """The record with its path at another ``place`` on the film, for which ``evaluate`` has found its
-        ``geometry``."""
+        """The record with its path at another ``place`` on the film, where ``evaluate`` has given ``geometry``."""
         return replace(self, place=place, geometry=geometry)
 
 

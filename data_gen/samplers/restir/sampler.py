@@ -65,8 +65,7 @@ class Restir:
         depth: np.ndarray | None,
         changed: tuple[mi.Scene, Sequence[Geometry]] | None = None,
     ) -> GradientFilm:
-        """Renders frame number ``index`` of the shot. If it does not follow the last rendered frame, history starts
-        again.
+        """Renders frame number ``index`` of the shot. If it does not follow the last one, history starts again.
 
         ``motion`` and ``depth`` are as for ``History.next_frame``. ``changed`` is the scene of this frame with the
         geometry of its shapes, or None if only the camera has moved. This scene must be another object than the scene

@@ -71,8 +71,7 @@ class Grid:
         return x + self.n.x * (y + self.n.y * z)
 
     def row(self, p: mi.Point3f, k: mi.UInt32, active) -> tuple[mi.UInt32, mi.UInt32]:
-        """The start and end in the list of row ``k`` (0 to 3) of the cells near ``p``; an empty range far off the
-        grid."""
+        """The start and end in the list of row ``k`` (0 to 3) of the cells near ``p``; empty far off the grid."""
         near = [(q - o) * self.rate - 0.5 for q, o in zip(p, self.low, strict=True)]
         for f, n in zip(near, self.n, strict=True):
             active = active & (f >= 0) & (f < n - 1)
