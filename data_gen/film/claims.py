@@ -23,9 +23,9 @@ import numpy as np
 from data_gen.film.nets import USUAL, law
 from ngpt.shared import box_means
 
-# Groups of pixels of about the same noise: the most groups, and the least pixels of a group
+# The most groups of pixels of similar noise, and the least pixels of a group
 _GROUPS, _LEAST = 64, 64
-# Side of the square of pixels around a pixel that its noise is estimated from
+# Side of the square of pixels from which the noise of its middle pixel is estimated
 _AROUND = 5
 
 

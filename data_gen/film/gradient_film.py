@@ -38,8 +38,8 @@ _SPLIT = ("diffuse", "specular")
 # Features whose noise is summarised by one number, see ``GradientFilm.feature_noise``
 _FEATURES = ("albedo", "normal")
 _WITH_VARIANCE = frozenset({"primal", "caustic", *_SPLIT, *SHIFTS, *_FEATURES})
-# Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 21; and the moments of
-# one name once more.
+# Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 21; and a second copy
+# of the moments of one name, while they are updated.
 _STRAND_BYTES = 10 * 8 + (26 + 21) * 8 + (8 + 6 * 8)
 # Without gradients: 5 names, 13 channels, 9 sums of squares. This leaves memory for more subpixels.
 _STRAND_BYTES_WITHOUT = 5 * 8 + (13 + 9) * 8 + (8 + 6 * 8)
@@ -197,7 +197,7 @@ class GradientFilm:
         self.blocks += spp // block
 
     def forget_pass(self) -> None:
-        """Drops what was put since the last pass ended, because the pass was aborted."""
+        """Drops the values of the current pass, because it was aborted."""
         self._pass, self._splats, self._cell = {}, {}, None
 
     def _add_some(self, values: dict, block: int | None, some: np.ndarray, cell: mi.UInt32 | None) -> None:

@@ -28,10 +28,10 @@ import numpy as np
 _MIXED = np.linspace(1.0, 0.0, 21)
 SHARES = np.concatenate([np.zeros(10), _MIXED, np.zeros(10), _MIXED[1:]])
 RATES = np.concatenate([np.linspace(0.5, 0.95, 10), np.full(21, 1.5), np.linspace(1.55, 2.0, 10), np.full(20, 2.0)])
-ODD = np.concatenate([np.ones(41), np.full(20, 1.5)])  # times as much at odd powers of two
-# The prior of each law. Independent samples have the largest, the smallest and the largest rates have the smallest. The
-# priors were chosen on renders of five scenes by seven samplers, at 2 to 40 samples, and revised for smooth integrands
-# on ``gpt`` at 8 to 128 samples.
+ODD = np.concatenate([np.ones(41), np.full(20, 1.5)])  # factor at odd powers of two
+# The prior of each law: largest for independent samples, smallest at both ends of the rates. The priors were chosen on
+# renders of five scenes by seven samplers, at 2 to 40 samples, and revised for smooth integrands on ``gpt`` at 8 to 128
+# samples.
 USUAL = np.concatenate([np.full(10, 0.6), [40.0], np.ones(20), np.full(10, 0.5), np.ones(20)])
 USUAL /= USUAL.sum()
 

@@ -36,7 +36,7 @@ class Splats:
 
     @classmethod
     def on(cls, pixels: int, channels: int, sums: tuple) -> Self:
-        """Splats that continue ``sums``, the pair ``sums`` and ``lost`` of other splats, and change them in place."""
+        """Splats on the arrays (``sums``, ``lost``) of other splats, which are changed in place."""
         splats = cls.__new__(cls)
         splats.pixels, splats.channels, (splats.sums, splats.lost) = pixels, channels, sums
         return splats

@@ -110,7 +110,7 @@ def fly_on(passes, trace, ray, medium, *, channel, u, key, active):
         collision = dr.select(μ_c > 0, t + dr.select(grid, ahead, left) / μ_c, dr.inf)
         collides = collision < end
         stop = dr.select(collides, collision, end)
-        # Infinitely long only where there is nothing
+        # A piece is infinite only where μ is 0
         τ += mi.Spectrum(dr.select(grid | (μ <= 0), 0, μ * (stop - t)))
         passed = dr.select(μ_c > 0, μ_c * dr.maximum(stop - t, 0), 0)
         M += dr.select(grid, passed, 0)

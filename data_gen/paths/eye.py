@@ -69,8 +69,8 @@ class Eye:
     lens: mi.Point2f  # place on the lens, in [0, 1]²
     time: mi.Float | float
     wavelength: mi.Float  # a random number
-    near: mi.Float  # the distance along its axis from which it sees things,
-    far: mi.Float  # and up to which
+    near: mi.Float  # its near plane, as a distance along its axis
+    far: mi.Float  # its far plane
     area: mi.Float  # of the film, at distance 1
     thin: ThinLens | None = None  # for a thin lens; None if the sensor can be called
 
@@ -93,7 +93,7 @@ class Eye:
         return int(dr.prod(self.size))
 
     def place_on_lens(self, random: Any) -> mi.Point2f:
-        """A point on the lens for a path that comes from elsewhere, drawn from ``random`` if there is a lens."""
+        """A point on the lens for a path that starts at a light, drawn from ``random`` if there is a lens."""
         return random.next_2d() if self.sensor.needs_aperture_sample() else mi.Point2f(0.5)
 
     def ray(self, uv: mi.Point2f, lens: mi.Point2f) -> mi.Ray3f:

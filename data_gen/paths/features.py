@@ -21,8 +21,8 @@ _TURNS_NORMALS = ("BumpMap", "NormalMap")
 def features(scene, sensor, sampler, ray: mi.RayDifferential3f) -> dict[str, mi.Color3f | mi.Float]:
     """One sample of every feature layer along a camera ray, in the conventions of the gradient stack.
 
-    ``albedo``  reflectance in [0, 1], tinted by the mirrors and the glass it is seen through; media dim it, and add
-                their own albedo by as much as they dim
+    ``albedo``  reflectance in [0, 1], tinted by the mirrors and glass on the way; media dim it, and add their own
+                albedo in proportion to the light that they remove
     ``normal``  unit shading normal in camera space, +x right, +y up, +z toward the viewer, on the side seen
     ``depth``   path length from the camera, not from its near plane, in world units
     All are zero where the path escapes, except the albedo of media. Normal and depth describe the surface behind media.

@@ -101,7 +101,7 @@ def _of_each_kind() -> list:
     return [dr.zeros(getattr(mi, name)) for name in dir(mi) if name.endswith("Ptr")]
 
 
-# Functions that a warning has been given for
+# Functions for which a warning was given
 _SAID: set[str] = set()
 
 

@@ -292,4 +292,4 @@ class World:
     lights: LightEnds
     materials: Materials | None = None  # None for samplers that do not use them
     fog: Any = None  # ``photons.map.fog.Fog``: the media, for samplers that gather photons in them
-    holes: Holes | None = None  # that are no vertices; None if there are none, or if they are vertices
+    holes: Holes | None = None  # the holes, if they are no vertices; else None

@@ -5,8 +5,8 @@ same events may lead to the same x_c along another direction ω'. To arrive at x
 of ω'. Newton's method solves them. [Hanika et al. 2015, "Manifold next event estimation"; Hua et al. 2019, "A Survey on
 Gradient-Domain Rendering", section 3.4]
 
-    B     dx_c/dω, a 2x2 matrix, by ray differentials [Igehy 1999, "Tracing ray differentials"]; x_c moves on the plane
-          through itself, or, at infinity, on the plane that its direction is normal to
+    B     dx_c/dω, a 2x2 matrix, by ray differentials [Igehy 1999, "Tracing ray differentials"]; x_c moves on the
+          tangent plane of its surface or, at infinity, on a plane normal to its direction
     J     dω'/dω at a fixed x_c, |det B| / |det B'|
 
 There may be several solutions, and a walk may end at another one, or at none. The shift from z to z' is an involution
@@ -157,7 +157,7 @@ def _shoot(scene, z, ω, events, target: Target, *, active, ends: Ends) -> Shot:
 
 
 def arrive(target: Target, shot: Shot, dp: tuple, dd: tuple) -> Shot:
-    """Continues ``shot`` from its last event, up to which ``reach`` is its length, to the plane of the target."""
+    """Continues ``shot`` from its last event, where its ``reach`` ends, to the plane of the target."""
     ray, good = shot.ray, shot.good
     plane = mi.Frame3f(target.n)
     cos = dr.dot(ray.d, target.n)

@@ -24,7 +24,7 @@ _MOST = 0.95
 
 @dataclass
 class Limits:
-    """The parameters that our integrators have from Mitsuba's ``path``."""
+    """The parameters that our integrators share with Mitsuba's ``path``."""
 
     max_depth: int = UNLIMITED  # most edges of a path; 1: only emission that the camera sees
     rr_depth: int = 5  # number of the first vertex with Russian roulette

@@ -13,8 +13,8 @@ path there. For each path that ends at y or goes on from there:
     r         p'(ω') P' J / (p(ω) P)
 
 Only one strategy traces the edges from x1 to y from the light's end: the one that joins x1 to the camera. It
-contributes ``vc`` of ``mis`` there, and shifts such paths by its own walk (``light_shift``). The two strategies use
-separate weights for pairs, so they need not agree on which walks succeed.
+contributes ``vc`` of ``mis`` there, and shifts such paths by its own walk (``light_shift``). Each strategy has separate
+weights for pairs, so strategies need not agree on which walks succeed.
 
 Paths that have both holes and mirrors or glass between x1 and y are rejected.
 
