@@ -45,7 +45,7 @@ class Config:
     ``reference_spp``  samples per pixel of references, in two halves; 0 makes pairs, without references
     ``reference_method``  method that reconstructs the references
     ``scenes``     number of procedural scenes
-    ``varied``     whether some of them have further sights
+    ``varied``     whether some of them have sights
     ``sights``     share of the varied scenes that have each sight: names of data_gen.scenes.procedural.variety.SHARES
     ``adaptive``   share of the inputs from 32 samples on whose samples are uneven, docs/use/adaptive.md
     ``crops``      number of crops of each procedural scene

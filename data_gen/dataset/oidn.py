@@ -4,7 +4,7 @@
                         crop0003_0016spp.alb.exr    albedo, 0 to 1,
                         crop0003_0016spp.nrm.exr    normal, -1 to 1
                         crop0003_ref.hdr.exr        and the same for the reference
-    FOLDER/valid/...                                scenes kept apart, whole
+    FOLDER/valid/...                                the same for the scenes that are kept for validation
 
 Source of the layout: "Datasets" in the README of Open Image Denoise 2.4, and training/dataset.py there.
 """
