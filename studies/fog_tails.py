@@ -21,6 +21,7 @@ from data_gen.scenes import builtin  # noqa: E402
 
 SIZE = (192, 108)
 
+
 def described(name):
     name, _, g = name.partition(":")
     g = float(g or 0)
@@ -56,7 +57,13 @@ def relmse(image, a, b):
 def main(name, seeds="8", reference_spp="2048"):
     scene = described(name)
     cache = f"/tmp/m/fog-{name}-{reference_spp}-{SIZE[0]}.npy"
-    halves = list(np.load(cache)) if os.path.exists(cache) else [render(scene, int(reference_spp), 1000 + i, "paths", "primal")[0]["primal"].astype(float) for i in range(2)]
+    halves = (
+        list(np.load(cache))
+        if os.path.exists(cache)
+        else [
+            render(scene, int(reference_spp), 1000 + i, "paths", "primal")[0]["primal"].astype(float) for i in range(2)
+        ]
+    )
     np.save(cache, halves)
     truth = (halves[0] + halves[1]) / 2
     print(
