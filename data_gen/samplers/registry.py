@@ -243,13 +243,13 @@ SIMPLE = ("primal", "oidn")
 def described(facts: Facts, gradients: bool = False) -> tuple[str, str, str]:
     """What "auto" stands for in `ngpt render`, judged by the scene's description only: sampler, method, and why.
 
-    Returns ``SIMPLE``, except in three cases: there are media, for which gradients are worth their cost; gradients were
-    asked for; or OIDN is missing, without which gradients give better images. Then the method is "": the layers decide.
+    Returns ``SIMPLE``, except in two cases: gradients were asked for, or OIDN is missing, without which gradients give
+    better images. Then the method is "": the layers decide.
     """
     sampler, reason = choose(facts)
-    if gradients or facts.media or METHODS[SIMPLE[1]].missing():
+    if gradients or METHODS[SIMPLE[1]].missing():
         return sampler, "", reason
-    return *SIMPLE, "there are no media, so more samples pay more than gradients; --sampler gpt renders gradients"
+    return *SIMPLE, "more samples pay more than gradients; --sampler gpt renders gradients"
 
 
 def choose(facts: Facts) -> tuple[str, str]:
