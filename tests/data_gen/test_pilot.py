@@ -92,12 +92,12 @@ def test_a_choice_needs_a_margin(renderer):
 
 
 def test_candidates_are_those_of_the_registry(renderer):
-    """Without media the simple way comes first, and then what finds light that it hardly finds."""
+    """The simple way comes first, and then what finds light that it hardly finds."""
     scene = load(renderer, "diffuse", (48, 32))
     assert candidates(scene) == ["primal", "bdpt", "gbdpt"] and candidates(scene, gradients=True) == ["gpt", "gbdpt"]
     assert candidates(scene, biased=True) == ["primal", "bdpt", "gbdpt", "ppm"]
     assert candidates(load(renderer, "diffuse", (16, 12))) == ["primal"]
-    assert candidates(load(renderer, "haze", (48, 32))) == ["gpt", "primal"]
+    assert candidates(load(renderer, "haze", (48, 32))) == ["primal"]
 
 
 def test_short_renders_are_not_measured(renderer, monkeypatch):
@@ -108,7 +108,7 @@ def test_short_renders_are_not_measured(renderer, monkeypatch):
         assert choice.sampler == "primal" and "too short" in choice.reason and choice.render == seconds
 
 
-def test_scenes_without_media_are_rendered_the_simple_way(renderer, monkeypatch):
+def test_scenes_are_rendered_the_simple_way(renderer, monkeypatch):
     """Whatever ends the render, unless gradients are asked for, or OIDN is not there."""
     oidn = plans.METHODS["oidn"]
     monkeypatch.setitem(plans.METHODS, "oidn", replace(oidn, missing=lambda: ""))
@@ -118,15 +118,13 @@ def test_scenes_without_media_are_rendered_the_simple_way(renderer, monkeypatch)
         return plan.sampler, plan.method
 
     assert (simple("primal"), simple("ppm"), simple("gbdpt")) == ("oidn", "primal", "wcv")
-    for scene in ("glossy", "diffuse", "environment", "lens"):
+    for scene in ("glossy", "diffuse", "environment", "lens", "haze"):
         assert chosen(scene) == chosen(scene, 1) == ("primal", "oidn")
         assert chosen(scene, gradients=True) == ("gpt", "")
-    assert chosen("haze") == ("gpt", "")
     glossy = load(renderer, "glossy", (64, 32))
     plan = plans.plan(glossy, 40.0)
     assert (plan.sampler, plan.method) == ("primal", "oidn") and 35 < plan.render < 40 and "no time" in plan.reason
     assert plans.plan(glossy, 5.0, "wcv").sampler == "gpt"
-    assert plans.plan(load(renderer, "haze", (64, 32)), 5.0).sampler == "gpt"
     monkeypatch.setitem(plans.METHODS, "oidn", replace(oidn, missing=lambda: "no OIDN"))
     assert chosen("glossy") == ("gpt", "")
 
