@@ -28,7 +28,7 @@ import numpy as np
 
 import ngpt
 from bench.common import measure, metadata, save
-from bench.reconstruction import synthetic
+from ngpt.classical.gradients import forward_differences
 from ngpt.methods import METHODS, reconstruct
 from ngpt.network.run_onnx import Network, planes
 from ngpt.network.shipped import WEIGHTS
@@ -59,6 +59,21 @@ def main() -> None:
         result["peak MiB"] = {size: peak(size) for size in args.sizes}
         result["bytes"] = {"float32": FAST.stat().st_size, "float16": half.stat().st_size if half else None}
     save(args.output, result)
+
+
+def synthetic(width: int, height: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """(primal, dx, dy) and their variances: shading with edges, noise that varies tenfold, fireflies, all seeded."""
+    random = np.random.default_rng(0)
+    y, x = (np.mgrid[:height, :width] / height).astype(np.float32)
+    boxes = sum(((x - a) % 0.31 < 0.13) * ((y - b) % 0.23 < 0.1) for a, b in ((0, 0), (0.1, 0.05), (0.2, 0.15)))
+    truth = np.stack([0.1 + 0.3 * y + 0.2 * boxes * (1 + 0.3 * np.sin(7 * x + c)) for c in range(3)], -1)
+    layers, variances = [], []
+    for image, share in ((truth, 0.7), *((d, 0.1) for d in forward_differences(truth))):
+        deviation = share * truth.mean(-1, keepdims=True) * random.gamma(1, 1, (height, width, 1))
+        deviation *= 1 + 20 * (random.random((height, width, 1)) < 0.003)
+        layers.append((image + deviation * random.standard_normal(image.shape)).astype(np.float32))
+        variances.append((deviation**2 * random.gamma(4, 0.25, image.shape)).astype(np.float32))
+    return layers, variances
 
 
 def stack_of(width: int, height: int) -> GradientStack:
