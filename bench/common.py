@@ -1,7 +1,8 @@
 """Functions of all benchmarks: times, versions of packages, and cached renders."""
 
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,18 @@ def write_page(page: Path, text: str, marks: tuple[str, str]) -> None:
     before, _, rest = page.read_text().partition(marks[0])
     _, _, after = rest.partition(marks[1])
     page.write_text(f"{before}{marks[0]}\n\n{text}\n\n{marks[1]}{after}")
+
+
+def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> None:
+    """Prints a table in Markdown."""
+    for line in (head, ["---"] * len(head), *lines):
+        print(f"| {' | '.join(line)} |", flush=True)
+
+
+def digits(value: float | None) -> str:
+    if value is None or math.isnan(value):
+        return "-"
+    return f"{value:.4g}" if value < 100 else f"{value:.0f}"
 
 
 def blocks(image: np.ndarray, side: int = 8) -> np.ndarray:

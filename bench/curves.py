@@ -13,6 +13,8 @@ import math
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
+from ngpt.measure.averages import geometric_mean
+
 REACH = 4.0  # how far a slope is trusted past the measured points
 # Squared errors fall as 1/samples. Two short renders may take nearly the same time; then the slope is mostly noise.
 STEEPEST = -1.0
@@ -70,6 +72,19 @@ def joined(marks: Iterable[str]) -> str:
     found = set(marks) - {""}
     bounds = found & {"<", ">"}
     return bounds.pop() if len(bounds) == 1 else "~" if found else ""
+
+
+def marked(value: tuple[float, str] | None) -> str:
+    """A ratio with its mark as text."""
+    return f"{value[1]}{value[0]:.2f}" if value else "-"
+
+
+def over(values: Sequence[tuple[float, str] | None]) -> str:
+    """The geometric mean of the values as text, with its mark, if none is missing."""
+    known = [value for value in values if value]
+    if len(known) < len(values):
+        return "-"
+    return marked((geometric_mean(value for value, _ in known), joined(mark for _, mark in known)))
 
 
 def _curve(points: Points) -> tuple[list[tuple[float, float]], list[_Segment]]:

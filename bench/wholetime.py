@@ -135,36 +135,27 @@ def envelope(results: dict[str, Any], rival: str, scenes: list[str]) -> list[tup
 def against_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
     """Title -> rows of text, the header first: means of groups, then each scene; columns of rivals are left out."""
     tables: dict[str, list[list[str]]] = {}
-    rivals = list(results["settings"]["against"])
-    settings = {column for columns in results["settings"]["against"].values() for column in columns}
+    rivals = results["settings"]["against"]
+    settings = {column for columns in rivals.values() for column in columns}
     ratios = against_rivals(results)
-    means, by_scene = ([row for row in ratios[key] if row["method"] not in settings] for key in ("means", "rows"))
-    heads = [text for rival in rivals for text in (f"error over {rival}", f"FLIP over {rival}")]
-    heads += [text for rival in rivals for text in (f"less error than {rival}", f"less FLIP than {rival}")]
-    if means:
-        rows = [["scenes", "spp", "method", "seconds", *heads]]
-        for (group, spp, method), by_rival in _by_place(means, "group").items():
-            one = next(iter(by_rival.values()))
-            found = [by_rival.get(rival) for rival in rivals]
-            counts = [text for row in found for text in (_count(row, ""), _count(row, " FLIP"))]
-            first = [f"{group} ({one['scenes']})", str(spp), method, f"{one['seconds']:.3g}"]
-            rows.append([*first, *_ratios(found), *counts])
-        tables["Errors over those of rivals at equal whole time, geometric means"] = rows
-    if by_scene:
-        rows = [["scene", "spp", "method", "seconds", *heads[: 2 * len(rivals)]]]
-        for (scene, spp, method), by_rival in _by_place(by_scene, "scene").items():
-            one = next(iter(by_rival.values()))
-            first = [scene, str(spp), method, f"{one['seconds']:.3g}"]
-            rows.append([*first, *_ratios([by_rival.get(rival) for rival in rivals])])
-        tables["Errors over those of rivals at equal whole time, scene by scene"] = rows
+    for kind, first, how in (("means", "group", "geometric means"), ("rows", "scene", "scene by scene")):
+        by_place: dict[tuple, dict[str, dict[str, Any]]] = {}
+        for row in ratios[kind]:
+            if row["method"] not in settings:
+                by_place.setdefault((row[first], row["spp"], row["method"]), {})[row["rival"]] = row
+        heads = ["scenes" if kind == "means" else "scene", "spp", "method", "seconds"]
+        heads += [f"{value} over {rival}" for rival in rivals for value in ("error", FLIP)]
+        heads += [f"less {value} than {r}" for r in rivals for value in ("error", FLIP) if kind == "means"]
+        lines = [heads]
+        for (name, spp, method), by_rival in by_place.items():
+            one, found = next(iter(by_rival.values())), [by_rival.get(rival) for rival in rivals]
+            name = f"{name} ({one['scenes']})" if kind == "means" else name
+            counts = [_count(row, key) for row in found for key in ("", " FLIP") if kind == "means"]
+            cells = [ratio(row, key) for row in found for key in ("error", FLIP)]
+            lines.append([name, str(spp), method, f"{one['seconds']:.3g}", *cells, *counts])
+        if len(lines) > 1:
+            tables[f"Errors over those of rivals at equal whole time, {how}"] = lines
     return tables
-
-
-def _by_place(rows: list[dict[str, Any]], first: str) -> dict[tuple, dict[str, dict[str, Any]]]:
-    found: dict[tuple, dict[str, dict[str, Any]]] = {}
-    for row in rows:
-        found.setdefault((row[first], row["spp"], row["method"]), {})[row["rival"]] = row
-    return found
 
 
 def ratio(row: dict[str, Any] | None, key: str) -> str:
@@ -172,10 +163,6 @@ def ratio(row: dict[str, Any] | None, key: str) -> str:
     if row is None or row[key] is None:
         return ""
     return f"{row['mark' if key == 'error' else 'FLIP mark']}{row[key]:.2f}"
-
-
-def _ratios(rows: list[dict[str, Any] | None]) -> list[str]:
-    return [ratio(row, key) for row in rows for key in ("error", FLIP)]
 
 
 def _count(row: dict[str, Any] | None, key: str) -> str:
