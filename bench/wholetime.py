@@ -7,7 +7,8 @@ counts from the time of its quickest cell on, unless no setting was measured in 
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from itertools import product
 from typing import Any
 
 from bench.curves import Points, error_at, joined
@@ -37,7 +38,8 @@ def against_rivals(results: dict[str, Any]) -> dict[str, Any]:
                     if found:
                         place = {name: row[name] for name in ("scene", "spp", "method")}
                         rows.append(place | {"seconds": row["seconds"]["total"], "rival": rival} | found)
-    return {"rows": rows, "means": _means(results, rows)}
+    keys = {"spp": results["settings"]["spp"], "method": results["methods"], "rival": results["settings"]["against"]}
+    return {"rows": rows, "means": [entry | _mean(here) for entry, here in grouped(results, rows, **keys)]}
 
 
 def _timed(results: dict[str, Any], scene: str) -> list[dict[str, Any]]:
@@ -79,20 +81,6 @@ def _over(row: dict[str, Any], primary: str, curves: dict[str, dict[str, Points]
     entry = {"setting": setting, "error": row["error"] / error, "mark": mark, "FLIP": None, "FLIP mark": ""}
     flip, mine = _least(row["seconds"]["total"], curves.get(FLIP, {})), _value(row, FLIP)
     return entry | ({"FLIP": mine / flip[0], "FLIP mark": flip[1]} if flip and mine else {})
-
-
-def _means(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    means = []
-    for group, members in groups_of(results, [row["scene"] for row in rows]).items():
-        for spp in results["settings"]["spp"]:
-            for method in results["methods"]:
-                for rival in results["settings"]["against"]:
-                    key = (spp, method, rival)
-                    here = [r for r in rows if r["scene"] in members and (r["spp"], r["method"], r["rival"]) == key]
-                    if here:
-                        entry = {"group": group, "spp": spp, "method": method, "rival": rival}
-                        means.append(entry | _mean(here))
-    return means
 
 
 def _mean(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -167,6 +155,17 @@ def ratio(row: dict[str, Any] | None, key: str) -> str:
 
 def _count(row: dict[str, Any] | None, key: str) -> str:
     return f"{row[f'less{key}']} of {row[f'scenes{key}']}" if row else ""
+
+
+def grouped(
+    results: dict[str, Any], rows: list[dict[str, Any]], **keys: Iterable
+) -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
+    """The rows of each group of scenes with each combination of ``keys``, where there are any."""
+    for group, members in groups_of(results, [row["scene"] for row in rows]).items():
+        for values in product(*keys.values()):
+            place = dict(zip(keys, values, strict=True))
+            if here := [row for row in rows if row["scene"] in members and place.items() <= row.items()]:
+                yield {"group": group} | place, here
 
 
 def groups_of(results: dict[str, Any], scenes: Iterable[str]) -> dict[str, list[str]]:
