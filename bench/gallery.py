@@ -12,7 +12,6 @@ the result.
 
 import argparse
 import json
-import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +20,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import ngpt
 from bench.common import kept, metadata, save, write_page
+from bench.judging import timed
 from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.stack import GradientStack
@@ -87,9 +87,7 @@ def main() -> None:
             continue
         shown, rows[name] = images(args, row)
         exposure = auto_exposure(shown[-1])
-        tiles = dict(
-            zip(("Noisy", "Denoised", "Reference"), (to_srgb8(image, exposure) for image in shown), strict=True)
-        )
+        tiles = dict(zip(HEADINGS, (to_srgb8(image, exposure) for image in shown), strict=True))
         written(ROOT / "docs" / "images" / "gallery" / f"{name}.webp", [beside(tiles)], quality=88)
     found = {"benchmark": "gallery", "size": list(args.size), "rows": rows}
     save(RESULT, found | {"metadata": metadata("mitsuba", "mitsuba-oidn")})
@@ -108,16 +106,14 @@ def images(args: argparse.Namespace, row: Shown) -> tuple[list[np.ndarray], dict
     """Noisy image, result and reference, (H, W, 3) scene-linear, and their values in the table."""
     stack = rendered(args, row, row.sampler, row.spp, 0, unbiased=False)
     ngpt.reconstruct(stack)  # loads what the method needs
-    start = time.process_time()
-    result = ngpt.reconstruct(stack)
-    seconds = float(stack.attributes["gallery:seconds"]) + time.process_time() - start
+    result, seconds = timed(lambda: ngpt.reconstruct(stack))
     reference = (args, row, row.reference, row.reference_spp)
     halves = [rendered(*reference, REFERENCE_SEED + i, unbiased=True)["primal"] for i in (0, 1)]
     facts = {
         "options": options(row),
         "sampler": stack.attributes["ngpt:sampler"],
         "method": result.method,
-        "CPU seconds": seconds,
+        "CPU seconds": float(stack.attributes["gallery:seconds"]) + seconds,
         "noisy": relmse_trimmed(stack["primal"], *halves),
         "result": relmse_trimmed(result.image, *halves),
         "oidn": relmse_trimmed(ngpt.denoise(stack, "oidn"), *halves),
@@ -134,10 +130,10 @@ def rendered(args: argparse.Namespace, row: Shown, sampler: str, spp: int, seed:
         import data_gen
 
         path = args.folder / row.scene if (args.folder / row.scene).exists() else row.scene
-        start = time.process_time()
-        stack, _ = data_gen.render_scene(path, spp, seed, sampler, size=tuple(args.size), unbiased=unbiased)
-        stack.attributes["gallery:seconds"] = time.process_time() - start
-        return stack
+        how = {"size": tuple(args.size), "unbiased": unbiased}
+        made, seconds = timed(lambda: data_gen.render_scene(path, spp, seed, sampler, **how))
+        made.stack.attributes["gallery:seconds"] = seconds
+        return made.stack
 
     return kept(file, make)
 

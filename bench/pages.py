@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.common import save, write_page
-from bench.curves import error_at
+from bench.curves import over_least
 from bench.frontier import draw, points_against
 from bench.tables import RIVALS
 from bench.wholetime import against_rivals, groups_of, ratio
@@ -259,8 +259,8 @@ def over_primal(sizes: list[Size]) -> str:
     for (scene, n, method), mine in known.items():
         curve = [cell for (s, _, m), cell in known.items() if (s, m) == (scene, "ngpt-primal")]
         points = [(cell["seconds"]["total"], cell["error"]) for cell in curve]
-        if method == "ngpt-combine" and (theirs := error_at(mine["seconds"]["total"], points)):
-            ratios[scene, n] = mine["error"] / theirs[0]
+        if method == "ngpt-combine" and (found := over_least(mine["error"], mine["seconds"]["total"], [points])):
+            ratios[scene, n] = found[0]
     rows = []
     for group in size.groups:
         scenes = size.members(group)

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import ngpt
 from bench import verdict
 from bench.common import metadata, renderer, save, write_page
-from bench.curves import error_at, marked, over
+from bench.curves import Ratio, marked, over, over_least
 from bench.judging import RIVAL, WARM_SPP, Judge, opened, processor_seconds, timed
 from ngpt.errors import NgptError
 from ngpt.measure.averages import geometric_mean
@@ -220,20 +220,18 @@ def mean_of(cell: dict[str, Any], value: str) -> float:
     return geometric_mean(cell[value].values())
 
 
-def over_best(of: dict[verdict.Key, dict[str, Any]], scene: str, spp: int, equal: str) -> list[tuple[float, str]]:
+def over_best(of: dict[verdict.Key, dict[str, Any]], scene: str, spp: int, equal: str) -> list[Ratio | None]:
     """Error and FLIP of the default over the least of ``OURS``, at as many samples or after as many seconds; with the
     marks of ``bench.curves``."""
-    default = of[scene, str(spp), DEFAULT]
-    found = []
+    default, found = of[scene, str(spp), DEFAULT], []
     for value in verdict.LIMITS:
+        error = mean_of(default, value)
         if equal == "samples":
-            least = min((mean_of(of[scene, str(spp), each], value), "") for each in OURS)
+            found.append((error / min(mean_of(of[scene, str(spp), each], value) for each in OURS), ""))
         else:
             curves = ([of[scene, str(n), each] for n in SPP] for each in OURS)
             points = ([(mean_of(cell, "seconds"), mean_of(cell, value)) for cell in curve] for curve in curves)
-            read = (error_at(mean_of(default, "seconds"), each) for each in points)
-            least = min(each for each in read if each)
-        found.append((mean_of(default, value) / least[0], least[1]))
+            found.append(over_least(error, mean_of(default, "seconds"), points))
     return found
 
 

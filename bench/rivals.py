@@ -32,7 +32,7 @@ import numpy as np
 
 import ngpt
 from bench.common import renderer, table
-from bench.curves import error_at, marked
+from bench.curves import marked, over_least
 from bench.judging import WARM_SPP, Cells, Judge, command, opened, parsed, timed
 from ngpt.measure.averages import geometric_mean
 from ngpt.stack import GradientStack
@@ -234,10 +234,7 @@ def over(mine: list[dict], cells: list[dict], renders: tuple[str, ...], ways: tu
     seconds, found = geometric_mean([each["seconds"] for each in mine]), []
     for value in VALUES:
         curves = [points(cells, render, way, value) for render in renders for way in ways]
-        answers = [answer for curve in curves if (answer := error_at(seconds, curve))]
-        least = min(answers, default=None)
-        own = geometric_mean([each[value] for each in mine])
-        found.append((own / least[0], least[1]) if least else None)
+        found.append(over_least(geometric_mean([each[value] for each in mine]), seconds, curves))
     return found
 
 

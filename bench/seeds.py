@@ -31,7 +31,7 @@ import numpy as np
 
 import ngpt
 from bench.common import blocks, digits, renderer, table
-from bench.curves import error_at, marked
+from bench.curves import marked, over_least
 from bench.judging import WARM_SPP, Cells, Judge, command, opened, parsed, timed
 from bench.tails import TAILS
 from ngpt.measure.averages import geometric_mean
@@ -135,11 +135,9 @@ def rows(cells: list[dict[str, Any]]) -> list[list[str]]:
     lines = []
     for cell in sorted(cells, key=lambda cell: tuple(cell[name] for name in CELL)):
         paths = [c for c in cells if (c["scene"], c["size"], c["tails"]) == (cell["scene"], cell["size"], "paths")]
-        answer = error_at(
-            cell["seconds"], [(c["seconds"], c["error"]["mean"]) for c in paths if c["error"]["mean"] > 0]
-        )
-        ratio = (cell["error"]["mean"] / answer[0], answer[1]) if answer and cell["tails"] != "paths" else None
         light, error = cell["light"], cell["error"]
+        curve = [(c["seconds"], c["error"]["mean"]) for c in paths if c["error"]["mean"] > 0]
+        ratio = None if cell["tails"] == "paths" else over_least(error["mean"], cell["seconds"], [curve])
         line = [f"{cell['scene']} {cell['size']}", str(cell["spp"]), cell["tails"]]
         line += [f"{light['mean']:.4f}", f"{light['least']:.3f} .. {light['most']:.3f}", digits(cell["deviation"])]
         line += [f"{digits(by.get('sum'))}, {digits(by.get('median'))}" for by in cell["blocks"].values()]

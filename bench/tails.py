@@ -31,7 +31,7 @@ import pandas as pd
 
 import ngpt
 from bench.common import blocks, digits, renderer, table
-from bench.curves import error_at, joined, marked, over
+from bench.curves import Ratio, error_at, joined, marked, over, over_least
 from bench.judging import RIVAL, WARM_SPP, Cells, Judge, command, parsed, timed
 from bench.worth import worth_tables
 from ngpt.evaluation.config import scene_name
@@ -152,7 +152,7 @@ def points(here: pd.DataFrame, value: str) -> list[tuple[float, float]]:
     return list(zip(known["whole"], known[value], strict=True))
 
 
-def ratios(here: pd.DataFrame, spp: int) -> dict[str, tuple[float, str]]:
+def ratios(here: pd.DataFrame, spp: int) -> dict[str, Ratio]:
     """Shared over paths, with marks: ``seconds``, and errors at equal samples and at equal whole time."""
     if any((spp, tails) not in here.index for tails in TAILS):
         return {}
@@ -161,13 +161,13 @@ def ratios(here: pd.DataFrame, spp: int) -> dict[str, tuple[float, str]]:
     for name in ERRORS:
         if shared[name] > 0 and paths[name] > 0:
             found[f"{name}, samples"] = shared[name] / paths[name], ""
-            if answer := error_at(shared["whole"], points(with_tails(here, "paths"), name)):
-                found[f"{name}, time"] = shared[name] / answer[0], answer[1]
+            if time := over_least(shared[name], shared["whole"], [points(with_tails(here, "paths"), name)]):
+                found[f"{name}, time"] = time
     return found
 
 
 def show(cells: list[dict], groups: dict[str, list[str]]) -> None:
-    found: dict[tuple, dict[str, dict[str, tuple[float, str]]]] = {}
+    found: dict[tuple, dict[str, dict[str, Ratio]]] = {}
     lines = []
     for (scene, size, sampler, method), here in medians(cells).items():
         for spp in here.index.unique("spp"):
@@ -219,7 +219,7 @@ def groups_of(curves: dict[str, Any], groups: dict[str, list[str]]) -> list[tupl
     return [*((scene, [scene]) for scene in curves), *((name, members) for name, members in known if members)]
 
 
-def both(scenes: list[str], ratio: Callable[[str, str], tuple[float, str] | None]) -> str:
+def both(scenes: list[str], ratio: Callable[[str, str], Ratio | None]) -> str:
     """Means of a ratio of error and of FLIP, a function of scene and value."""
     return ", ".join(over([ratio(scene, value) for scene in scenes]) for value in ("error", "FLIP"))
 
@@ -228,7 +228,7 @@ def against_oidn(cells: list[dict], tails: str, groups: dict[str, list[str]]) ->
     """A row for each scene and group, and each of ``SECONDS``: error and FLIP of all ``PIPELINES`` and of Mitsuba."""
     curves = curves_of(cells, tails)
 
-    def ratio(name: str, seconds: float, scene: str, value: str) -> tuple[float, str] | None:
+    def ratio(name: str, seconds: float, scene: str, value: str) -> Ratio | None:
         here = [curves[scene].get(each) for each in (name, "primal+oidn")]
         a, b = (None if each is None else error_at(seconds, points(each, value)) for each in here)
         return (a[0] / b[0], joined((a[1], b[1]))) if a and b else None
@@ -245,7 +245,7 @@ def default_over_best(cells: list[dict], tails: str, groups: dict[str, list[str]
     curves = curves_of(cells, tails)
     taken = {cell["scene"]: f"{cell['sampler']}+{cell['auto']}" for cell in cells if "auto" in cell}
 
-    def ratio(seconds: float, scene: str, value: str) -> tuple[float, str] | None:
+    def ratio(seconds: float, scene: str, value: str) -> Ratio | None:
         ours = {name: error_at(seconds, points(here, value)) for name, here in curves[scene].items() if name != MITSUBA}
         known = {name: found for name, found in ours.items() if found}
         if taken.get(scene) not in known:
