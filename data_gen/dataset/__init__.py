@@ -1,1 +1,1 @@
-"""Training sets: scenes made in code, cameras found by ray casting, crops rendered by jobs that may be killed."""
+"""Training sets: scenes made in code, cameras found by ray casting, and crops rendered by jobs that may be killed."""

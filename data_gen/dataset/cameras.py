@@ -1,9 +1,9 @@
 """Cameras in the free space of any scene, found by casting rays.
 
-The scene's own camera stands in free space. From there a walk goes along random rays, each time part of the way to what
-they hit, so it never enters an object and stays where one can get to. Views that see nothing are rejected. Where hardly
-any view sees something, as around an object in empty space, cameras stand between the scene's own and what that sees,
-and look at something else it sees.
+The scene's own camera stands in free space. From there a walk goes along random rays, each time a part of the way to
+the hit. So it never enters an object and stays in reachable space. Views that see nothing are rejected. If hardly any
+view sees something, as around an object in empty space, a camera stands between the scene's own camera and a point that
+this camera sees, and looks at another such point.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ VIRTUAL_SIZE = (1280, 720)
 MAX_ZOOM = 4.0  # the crop is 1 to 1 / 4 of the virtual image's height
 STEPS = 4  # of the walk to a new position
 ATTEMPTS = 64
-CHOICES = 5  # views that one is chosen from
-GRID = 24  # rays across a view that is judged
+CHOICES = 5  # views from which one is chosen
+GRID = 24  # rays along each side of a view, to judge it
 FEWEST_EDGES = 0.04
-MOST_BOUNDARIES = 8  # of media that one ray is followed through
+MOST_BOUNDARIES = 8  # boundaries of media through which a ray is followed
 
 
 @dataclass(frozen=True)
 class View:
-    """A camera and the window of its virtual image that is rendered: all of it reproducible from these numbers."""
+    """A camera and the window of its virtual image that is rendered. These numbers reproduce the view."""
 
     origin: tuple[float, float, float]
     target: tuple[float, float, float]
@@ -39,21 +39,21 @@ class View:
     aperture: float
     focus: float
     film: tuple[int, int]  # the virtual image, pixels
-    window: tuple[int, int]  # its upper left corner there
+    window: tuple[int, int]  # upper left corner of the window in the virtual image
     size: int
 
     def apply(self, scene: mi.Scene) -> None:
         params = mi.traverse(scene.sensors()[0])
         params["to_world"] = mi.ScalarTransform4f().look_at(list(self.origin), list(self.target), list(self.up))
         params["x_fov"] = self.fov
-        # A new size of the film makes the window the whole film, so the window comes after it.
+        # A new film size resets the window to the whole film, so the window is set afterwards.
         params["film.crop_offset"] = [0, 0]
         params["film.size"] = list(self.film)
         params.update()
         params["film.crop_size"] = [self.size, self.size]
         params["film.crop_offset"] = list(self.window)
         if "aperture_radius" in params:
-            # Opaque: as literals they would be compiled into the kernel, a new one for every view.
+            # Opaque: as literals they would be compiled into the kernel, so each view would need a new one.
             params["aperture_radius"] = dr.opaque(mi.Float, self.aperture)
             params["focus_distance"] = dr.opaque(mi.Float, self.focus)
         params.update()
@@ -65,7 +65,7 @@ class View:
 
 
 class Surroundings:
-    """What rays find in a scene, how large its inhabited part is, and the samplers that are ``made`` for it."""
+    """Ray casting in a scene, the ``scale`` of the scene around its camera, and the samplers ``made`` for it."""
 
     def __init__(self, scene: mi.Scene, box: list | tuple | None = None):
         self.scene, self.box, self.made = scene, box, Made()
@@ -79,12 +79,12 @@ class Surroundings:
         hits = distance[np.isfinite(distance)]
         if not len(hits):
             raise NgptError("the scene's camera sees nothing in any direction; move it among the objects")
-        # Not the bounding box, which a ground plane can make arbitrarily large.
+        # Not from the bounding box, which a ground plane can make arbitrarily large
         self.scale = float(np.median(hits))
         self.seen = self.points(scene.sensors()[0])
 
     def points(self, sensor: mi.Sensor) -> np.ndarray:
-        """(n, 3) where rays through a grid of the sensor's film end, or meet a medium; n is 0 where none do."""
+        """The points (n, 3) where rays through a grid of the sensor's film hit a surface or a boundary of a medium."""
         origins, towards = grid_rays(sensor)
         distance = self.cast(origins, towards, boundaries=True)[0]
         hit = np.isfinite(distance)
@@ -93,16 +93,16 @@ class Surroundings:
     def cast(
         self, origins: np.ndarray, towards: np.ndarray, boundaries: bool = False
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distances (n,), Inf where nothing is hit; normals (n, 3); identities of what is hit (n,), 0 for nothing.
+        """Distances (n,), Inf if nothing is hit; normals (n, 3); identities of the shapes (n,), 0 if nothing is hit.
 
-        ``boundaries`` of media, which nobody sees, count only where asked for.
+        Boundaries of media are invisible and count only with ``boundaries``.
         """
         ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(towards.T))
         si = self.scene.ray_intersect(ray)
         passed = mi.Float(0)
         for _ in range(MOST_BOUNDARIES if self.boundaries and not boundaries else 0):
             behind = si.is_valid() & is_boundary(si.bsdf())
-            # Computed each time: all steps are one small kernel.
+            # Evaluated in each step, so that all steps share one small kernel
             if not dr.any(behind):
                 break
             passed += dr.select(behind, si.t, 0)
@@ -113,7 +113,7 @@ class Surroundings:
         return np.array(si.t + passed), np.array(si.n).T, np.array(identity)
 
     def position(self, rng: np.random.Generator) -> np.ndarray:
-        """A point of free space: uniform in the hand-made box where there is one, else at the end of a walk."""
+        """A point in free space: uniform in the given box if there is one, else the end of a walk."""
         if self.box is not None:
             low, high = self.box
             return rng.uniform(low, high)
@@ -121,7 +121,7 @@ class Surroundings:
         for towards in directions(rng, STEPS):
             towards = towards - 0.5 * (towards @ self.up) * self.up
             towards /= np.linalg.norm(towards)
-            # Neither into a medium nor out of one: the camera's medium is stated once, for all views.
+            # The walk does not cross boundaries, since the scene states the camera's medium once for all views.
             distance = float(self.cast(point[None], towards[None], boundaries=True)[0][0])
             point = point + rng.uniform(0.05, 0.8) * min(distance, 1.5 * self.scale) * towards
         return point
@@ -148,11 +148,11 @@ def grid_rays(sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float) -> View:
-    """A random view that shows something; views that show more are more likely.
+    """A random view that shows something. Views that show more edges are more likely.
 
-    ``size``: the crop's, in pixels; ``roll``: the largest angle about the view direction, degrees; ``lens``: standard
-    deviation of the aperture's radius, relative to the distance in focus (0.005 in the paper). Raises NgptError when no
-    view can be found.
+    ``size`` is the size of the crop in pixels, ``roll`` the largest angle about the view direction in degrees, and
+    ``lens`` the standard deviation of the aperture's radius, relative to the focus distance (0.005 in the paper).
+    Raises NgptError if no view is found.
     """
     views: list[View] = []
     details: list[float] = []
@@ -177,7 +177,7 @@ def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: f
 def random_view(
     around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float, aimed: bool = False
 ) -> View:
-    """Any view, or one ``aimed`` at what the scene's own camera sees."""
+    """Any view, or a view ``aimed`` at points that the scene's own camera sees."""
     if aimed:
         before, target = around.seen[rng.integers(len(around.seen), size=2)]
         origin = around.start + rng.uniform(0, 0.6) * (before - around.start)
@@ -207,14 +207,14 @@ def floats(vector: np.ndarray) -> tuple[float, float, float]:
 
 
 def with_one_kernel(around: Surroundings, view: View) -> View:
-    """The view, or one that hardly differs, for which all views of a scene share their kernels.
+    """The view, or a nearly equal one, with which all views of a scene share their kernels.
 
-    Pixels are square, so two factors of the camera's projection are equal but for rounding. Where they are equal to the
-    last bit, Dr.Jit takes them for one variable, and compiles all kernels, for many seconds, once more.
+    Pixels are square, so two factors of the camera's projection are equal except for rounding. If they are equal to the
+    last bit, Dr.Jit treats them as one variable, and compiles all kernels again, which takes many seconds.
     """
     params = mi.traverse(around.scene.sensors()[0])
     crop, corner = mi.ScalarVector2i(view.size, view.size), mi.ScalarVector2i(*view.window)
-    # Some sizes have equal factors whatever the field of view: all sizes that are as high as the crop.
+    # Some sizes have equal factors for any field of view: all sizes with the height of the crop.
     for larger in range(16):
         width, height = view.film[0] + larger, view.film[1] + larger
         for steps in range(8):
@@ -229,15 +229,14 @@ def with_one_kernel(around: Surroundings, view: View) -> View:
 
 
 def what_shows(around: Surroundings, view: View) -> float:
-    """The share of edges in a view; 0 if it is not worth rendering: mostly empty, a wall at the lens, the inside of a
-    small object, or one flat surface."""
+    """The share of edges in a view, or 0 if it is mostly empty, very close to something, or one flat surface."""
     view.apply(around.scene)
     n = GRID
     distance, normal, shape = around.cast(*grid_rays(around.scene.sensors()[0]))
     hit = np.isfinite(distance)
     if hit.mean() < 0.35 or np.quantile(distance[hit], 0.1) < 0.06 * around.scale:
         return 0.0
-    # Edges: neighbours that differ in what they show, or in which way it faces.
+    # Edges: neighbours that differ in their shape or their normal
     shape, normal = shape.reshape(n, n), np.where(hit[:, None], normal, 0).reshape(n, n, 3)
     other = [(np.diff(shape, axis=a) != 0) | (np.linalg.norm(np.diff(normal, axis=a), axis=-1) > 0.2) for a in (0, 1)]
     edges = float(np.mean([edge.mean() for edge in other]))

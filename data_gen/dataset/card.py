@@ -1,4 +1,4 @@
-"""README.md and a contact sheet, which a person looks at first, written from the training set itself."""
+"""Writes README.md and a contact sheet of a training set, from the set itself."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ngpt.system.console import Console
 from ngpt.system.files import atomic_output
 from ngpt.training.dataset import Crop, Dataset, summary
 
-CELLS = 24  # crops on the contact sheet, evenly chosen
+CELLS = 24  # crops on the contact sheet, evenly spaced in the set
 COLUMNS = 4  # each shows its noisiest input and its reference
 
 
@@ -31,7 +31,7 @@ def write_card(folder: Path) -> None:
 
 
 def contact_sheet(data: Dataset) -> np.ndarray:
-    """(H, W, 3) uint8: what is ``shown`` of some crops, at the automatic exposure of the second."""
+    """(H, W, 3) uint8: the ``shown`` images of some crops, with the automatic exposure of the second image."""
     pairs = []
     for index in np.unique(np.linspace(0, len(data) - 1, min(CELLS, len(data))).astype(int)):
         images = shown(data[int(index)])
@@ -44,7 +44,7 @@ def contact_sheet(data: Dataset) -> np.ndarray:
 
 
 def shown(crop: Crop) -> tuple[np.ndarray, np.ndarray]:
-    """The noisiest input and the reference, (H, W, 3) each; the two halves of a pair."""
+    """The noisiest input and the reference, or the two halves of a pair, (H, W, 3) each."""
     return crop.stack(0)["primal"], crop.stack(1)["primal"] if crop.paired else crop.reference
 
 

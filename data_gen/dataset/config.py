@@ -1,4 +1,4 @@
-"""The configuration of a training set: a TOML file, checked before any work starts."""
+"""The configuration of a training set: a TOML file that is checked before any work starts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from ngpt.system.records import from_table, read_toml
 
 @dataclass(frozen=True)
 class Files:
-    """Scene files as a source: all that match ``pattern``; ``boxes``: scene -> [low, high] corners for cameras."""
+    """Scene files that match ``pattern``, with ``crops`` crops each. ``boxes``: scene -> [low, high] for its
+    cameras."""
 
     pattern: str
     crops: int
@@ -28,27 +29,27 @@ class Files:
 
 @dataclass(frozen=True)
 class Config:
-    """A training set. ``ngpt dataset --init FILE`` writes all entries with their meanings.
+    """The entries of a training set. ``ngpt dataset --init FILE`` writes them all with their meanings.
 
     ``seed``       of scenes, cameras and samples
     ``size``       pixels of a crop's side
-    ``inputs``     stacks of each crop, their sample counts log-uniform and stratified within ``spp``
-    ``frames``     of a shot: 1 makes single crops, more make each crop a shot whose frames are crops of the set
+    ``inputs``     stacks of each crop; their sample counts are log-uniform and stratified within ``spp``
+    ``frames``     of a shot: 1 makes single crops; with more, each crop is a shot, and its frames are crops of the set
     ``spp``        least and greatest samples per pixel of the inputs
     ``sampler``    of the inputs and references: a name of `ngpt info`, or "auto", chosen for each scene
     ``samplers``   options of that sampler, a table [samplers.NAME]
     ``subpixels``  2 or 4: inputs keep 2x2 or 4x4 subpixels of each pixel (docs/use/subpixels.md); 1: none
     ``roll``       the camera's largest roll, degrees
-    ``lens``       standard deviation of the aperture's radius, relative to the distance in focus
-    ``crops_per_shard``  what one job makes, and what is lost when it is killed; all of a scene compile kernels once
-    ``reference_spp``  samples per pixel of references, in two halves; 0 makes pairs, which have none
-    ``reference_method``  that reconstructs the references
-    ``scenes``     procedural scenes
-    ``varied``     whether some of them have further sights
+    ``lens``       standard deviation of the aperture's radius, relative to the focus distance
+    ``crops_per_shard``  crops of one job, which are lost if it is killed; they share the kernels of their scene
+    ``reference_spp``  samples per pixel of references, in two halves; 0 makes pairs, without references
+    ``reference_method``  method that reconstructs the references
+    ``scenes``     number of procedural scenes
+    ``varied``     whether some of them have sights
     ``sights``     share of the varied scenes that have each sight: names of data_gen.scenes.procedural.variety.SHARES
     ``adaptive``   share of the inputs from 32 samples on whose samples are uneven, docs/use/adaptive.md
-    ``crops``      of each procedural scene
-    ``files``      scene files, a table [[files]] each: pattern and crops, and if you like parameters and boxes
+    ``crops``      number of crops of each procedural scene
+    ``files``      scene files, a table [[files]] each: pattern and crops, optionally parameters and boxes
     """
 
     seed: int = 0
@@ -93,7 +94,7 @@ class Config:
                 raise NgptError(f"data configuration: samplers.{name}: this set is rendered by '{self.sampler}'")
             check_options(name, options)
         if self.sampler != "auto":
-            find(self.sampler).subpixels(self.subpixels, None)  # raises WrongUse where it cannot keep them
+            find(self.sampler).subpixels(self.subpixels, None)  # raises WrongUse if it cannot keep them
         if self.adaptive:
             self._check_adaptive()
         flat = self.sampler != "auto" and not find(self.sampler).gradients
@@ -123,12 +124,12 @@ class Config:
 
     @property
     def unbiased_options(self) -> dict[str, Any]:
-        """The sampler's options for references: without ``tails``, because references are unbiased."""
+        """The sampler's options for references: without ``tails``, since references must be unbiased."""
         return {name: value for name, value in self.options.items() if name != "tails"}
 
     @property
     def pairs(self) -> bool:
-        """Whether its crops have no reference, and two inputs of equally many samples that judge each other."""
+        """Whether crops have no reference, but two inputs with equally many samples that judge each other."""
         return self.reference_spp == 0
 
     def _check_adaptive(self) -> None:
@@ -147,9 +148,9 @@ class Config:
         )
 
     def plan(self, turn: int = 0) -> list[Job]:
-        """The shards to make. It depends only on the configuration, so that n machines agree on who makes which.
+        """The jobs, one for each shard. They depend only on the configuration, so several machines can divide them.
 
-        ``turn``  number of the turn for endless use: from 1 on, further procedural scenes and views of scene files
+        ``turn``  number of the turn, for endless use: from 1 on, more procedural scenes and more views of scene files
         """
         sources: list[tuple] = [(made_name(turn * self.scenes + i), self.crops) for i in range(self.scenes)]
         for source in self.files:
@@ -168,7 +169,7 @@ class Config:
         self, turn: int, name: str, crops: int, path: str = "", parameters: dict | None = None, box: list | None = None
     ) -> list[Job]:
         starts = range(0, crops, self.crops_per_shard)
-        # Procedural scenes are others in each turn, and have all their crops in one.
+        # Each turn has new procedural scenes, with all their crops.
         turn = turn if path else 0
         jobs = []
         for i, start in enumerate(starts, turn * len(starts)):
@@ -184,7 +185,7 @@ def _refuse(*cases: tuple[bool, str]) -> None:
 
 
 def made_name(number: int) -> str:
-    """The name of a procedural scene, which its seed comes from."""
+    """The name of a procedural scene, from which its seed is computed."""
     return f"made-{number:05d}"
 
 

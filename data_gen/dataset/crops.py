@@ -1,4 +1,4 @@
-"""One shard: opens or makes its scene, finds views, renders inputs and references, and writes the file."""
+"""Makes one shard: opens or makes its scene, finds views, renders inputs and references, and writes the file."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from ngpt.subpixels import means, subpixels
 from ngpt.training.shards import CropData, write_shard
 from ngpt.version import __version__
 
-# Views that turn out to be black are replaced this often.
+# The most views to try for a crop, since views may turn out black
 ATTEMPTS = 6
-# The number of independent parts of a reference: what two parts have in common is not noise.
+# The number of independent parts of a reference. They have the same signal but different noise.
 HALVES = 2
 LIT = 0.1  # the share of pixels of the first input that must have seen any light
 
@@ -34,10 +34,10 @@ LIT = 0.1  # the share of pixels of the first input that must have seen any ligh
 def make_shard(config: Config, job: Job, folder: str, variant: str, again: Again | None = None) -> str:
     """Renders the crops of ``job`` and writes its shard into ``folder``; returns its name there.
 
-    Runs in any process. The same config and job give the same bits. A crop that fails is recorded and left out. Where
-    there are references (``again``), only inputs are rendered, with new noise.
+    It can run in any process. The same config and job give the same bits. A crop that fails is recorded and left out.
+    With ``again`` the references exist already, and only inputs are rendered, with new noise.
     """
-    if (Path(folder) / job.file).exists():  # made by a worker that was lost before it said so
+    if (Path(folder) / job.file).exists():  # made by a worker that died before it reported this
         return job.file
     use_variant(variant)
     import mitsuba as mi
@@ -76,7 +76,7 @@ def make_shard(config: Config, job: Job, folder: str, variant: str, again: Again
                 crops += [data for data, _ in made]
                 record["crops"] += [told for _, told in made]
     write_shard(Path(folder) / job.file, crops, record)
-    # Kernels belong to the scene: a process that makes thousands of scenes would keep them all.
+    # Kernels belong to a scene, and a process that makes thousands of scenes would keep them all.
     import drjit as dr
 
     dr.flush_kernel_cache()
@@ -95,7 +95,7 @@ def made_scene(config: Config, name: str, folder: Path) -> Path:
 
 
 def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:
-    """K samples per pixel, log-uniform between the bounds, stratified, smallest first; counts of a pair are equal."""
+    """Samples per pixel of the inputs: log-uniform, stratified, smallest first. Those of a pair are equal."""
     low, high = np.log(config.spp[0]), np.log(config.spp[1] + 1)
     if config.pairs:
         return 2 * [int(np.exp(low + rng.random() * (high - low)))]
@@ -104,8 +104,7 @@ def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:
 
 
 def uneven_inputs(config: Config, name: str, crop: int, counts: list[int]) -> list[bool]:
-    """Chooses the inputs of a crop that get adaptive samples: the share ``config.adaptive`` of inputs with enough
-    samples.
+    """Which inputs of a crop get adaptive samples: the share ``config.adaptive`` of those with enough samples.
 
     It uses separate random numbers, so that views, seeds and references are the same as with even samples.
     """
@@ -118,7 +117,7 @@ def uneven_inputs(config: Config, name: str, crop: int, counts: list[int]) -> li
 
 
 def render_input(config: Config, scene, spp: int, seed: int, uneven: bool, made: Any = None) -> GradientStack:
-    """One input. All inputs of a set that has uneven ones have the layer ``samples``."""
+    """One input. If the set has uneven inputs, all its inputs have the layer ``samples``."""
     from data_gen.render import render_stack
 
     options = {"made": made, "unbiased": True, "gradients": True, "subpixels": config.subpixels, **config.options}
@@ -129,7 +128,7 @@ def render_input(config: Config, scene, spp: int, seed: int, uneven: bool, made:
 
 
 def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropData, dict]]:
-    """One crop and its record, or one for each frame of a shot; ``around`` are the ``Surroundings`` of its scene."""
+    """One crop and its record, or one for each frame of a shot. ``around`` is the ``Surroundings`` of its scene."""
     from data_gen.dataset.cameras import find_view
     from data_gen.dataset.movement import Movement, random_movement
     from data_gen.frames.motion import motion_vectors, snapshot
@@ -179,7 +178,7 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
 
 
 def make_inputs(config: Config, scene, made: Any, kept: Kept, place: int, seed: int) -> list[tuple[CropData, dict]]:
-    """The crop at that place of kept references and its record: the view of then, with new inputs, whose noise is by
+    """The crop at ``place`` of kept references, and its record: the same view with new inputs, whose noise depends on
     ``seed``.
     """
     from data_gen.dataset.cameras import View
@@ -213,7 +212,7 @@ def _crop(
     clock: float,
     made: Any,
 ) -> tuple[CropData, dict]:
-    """The crop whose first input is ``first``, and its record; it was begun at ``clock``."""
+    """The crop whose first input is ``first``, and its record. ``clock`` is the time at which ``first`` was begun."""
     from data_gen.render import render_stack
 
     further = zip(counts[1:], seeds[1:-HALVES], uneven[1:], strict=True)
@@ -240,7 +239,7 @@ def _crop(
 
 
 def references(converged: GradientStack, method: str) -> tuple[np.ndarray, np.ndarray | None]:
-    """The clean image without the light of the layer ``caustic``, and that light; None without such a layer."""
+    """The clean image without the light of the layer ``caustic``, and that light, or None without such a layer."""
     image = reconstruct(converged, method=method).image
     if "caustic" not in converged:
         return image, None
@@ -251,7 +250,7 @@ def references(converged: GradientStack, method: str) -> tuple[np.ndarray, np.nd
 
 
 def finite(stack: GradientStack) -> tuple[GradientStack, int]:
-    """The stack without values that are not finite, and how many pixels or differences had some.
+    """The stack with all values made finite, and the number of pixels and differences that were not.
 
     Pixels are filled from their neighbours, and gradients become 0. An unknown variance becomes the square of the
     value, as if the value were only noise. Pixels stay the means of their subpixels.

@@ -1,4 +1,4 @@
-"""Makes a training set with any executor; a finished shard is a finished job, so being killed loses one at most."""
+"""Makes a training set with any executor. Each job writes one shard, so a killed worker loses at most one."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class Serial(Executor):
 
 
 class Pool(ProcessPoolExecutor):
-    """``count`` worker processes that end with this one, however it ends, and at once when it is interrupted.
+    """``count`` worker processes that end with this process, however it ends.
 
-    ``interruptible`` whether Ctrl-C ends them at once; otherwise the caller decides when to ``end`` them
+    ``interruptible``: whether Ctrl-C ends them at once. Otherwise the caller decides when to ``end`` them.
     """
 
     def __init__(self, count: int, interruptible: bool = True):
@@ -49,7 +49,7 @@ class Pool(ProcessPoolExecutor):
 
     def __exit__(self, kind, *rest):
         if kind is not None and issubclass(kind, KeyboardInterrupt):
-            # The crops that they are working on are made again; waiting for them would take minutes.
+            # Waiting for their current crops would take minutes; these crops are made again later.
             for process in active_children():
                 process.terminate()
         return super().__exit__(kind, *rest)
@@ -68,11 +68,11 @@ def generate(
     variant: str = "llvm_ad_rgb",
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Makes the shards that are missing in ``folder``, of jobs i, i + n, i + 2n ... where ``shard`` is (i, n).
+    """Makes the missing shards in ``folder``, for jobs i, i + n, i + 2n, ... where ``shard`` is (i, n).
 
-    ``executor`` is any of concurrent.futures. The same configuration gives the same bits with any of them, in any
-    order. ``progress`` gets the crops done and all crops of this part. Raises NgptError when a file cannot be written
-    or a worker dies; what is finished by then is kept, and the same call continues.
+    ``executor`` is any executor of concurrent.futures. The same configuration gives the same bits with each of them, in
+    any order of jobs. ``progress`` gets the number of crops done and of all crops of this part. Raises NgptError if a
+    file cannot be written or a worker dies. Finished shards are kept, and the same call continues from there.
     """
     plan = config.plan()
     start(config, folder, config.frames * sum(len(job.crops) for job in plan))
@@ -94,7 +94,7 @@ def generate(
 
 
 def finished(executor: Executor, make: Callable[[Job], str], jobs: list[Job], ahead: int = 64) -> Iterator[Job]:
-    """Yields jobs as they are finished, with at most ``ahead`` of them handed out; drops the others on an error."""
+    """Yields jobs as they finish. At most ``ahead`` are submitted at a time. An error cancels the others."""
     waiting = iter(jobs)
     running: dict[Any, Job] = {}
     try:
@@ -113,13 +113,13 @@ def finished(executor: Executor, make: Callable[[Job], str], jobs: list[Job], ah
 
 
 def start(config: Config, folder: Path, planned: int) -> None:
-    """Makes ``folder`` the home of this configuration's training set; raises NgptError if it belongs to another."""
+    """Prepares ``folder`` for the training set of this configuration. Raises NgptError if it belongs to another one."""
     (folder / "shards").mkdir(parents=True, exist_ok=True)
     with exclusive(folder, wait=True):
         if not (folder / MANIFEST).exists():
             empty = {"format": FORMAT, "version": VERSION, "config": as_json(config), "planned": planned, "shards": []}
             write_json(folder / MANIFEST, empty)
-        # An entry that was not there yet when the set was begun has its default.
+        # An entry that did not exist when the set was begun has its default.
         theirs = as_json(Config(scenes=1)) | read_manifest(folder)["config"]
     ours = json.loads(json.dumps(as_json(config)))
     different = [key for key in ours if theirs.get(key) != ours[key]]
@@ -130,7 +130,7 @@ def start(config: Config, folder: Path, planned: int) -> None:
 
 
 def update_manifest(folder: Path) -> None:
-    """Lists the shards that are on disk. Jobs on other machines may do the same: the folder is locked meanwhile."""
+    """Lists the shards on disk in the manifest. The folder is locked, since other machines may do the same."""
     with exclusive(folder, wait=True):
         manifest = read_manifest(folder)
         known = {entry["file"]: entry for entry in manifest["shards"]}

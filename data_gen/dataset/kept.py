@@ -1,8 +1,8 @@
-"""Compressed references without inputs: inputs are rendered again, with new noise, each time a reference is used.
+"""Compressed references without inputs. Each time a reference is used, its inputs are rendered again, with new noise.
 
-A file of references has the name and the record of the shard that they were made in (scene, views, seeds, versions),
-and for each crop its images as bytes of lzma. A number x is stored as its sign and the nearest step log2 |x| = n / 64,
-with an error of at most 0.54 %. The numbers n of green, and the differences of red and of blue from green, are stored
+A file of references has the name and the record (scene, views, seeds, versions) of the shard in which they were made,
+and the images of each crop, compressed by lzma. A number x is stored as its sign and the integer n nearest to 64 log2
+|x|, with an error of at most 0.54 %. The numbers n of green, and the differences of red and blue from green, are stored
 as differences from pixel to pixel, with high and low bytes separated.
 """
 
@@ -25,7 +25,7 @@ STEPS = 64
 # log2 of the least number that is kept; smaller ones become 0.
 LEAST = -126
 IMAGES = (*REFERENCES, REFERENCE_CAUSTIC)
-# The entries of a configuration that references do not depend on
+# The entries of a configuration on which references do not depend
 _OF_INPUTS = ("inputs", "spp", "adaptive", "subpixels")
 
 
@@ -38,13 +38,13 @@ class Again:
 
 
 def home(config: Config, folder: Path) -> Path:
-    """Where the references of ``config`` lie in ``folder``; configurations that differ only in inputs share them."""
+    """The subfolder of ``folder`` for references of ``config``. Configurations that differ only in inputs share it."""
     told = {name: value for name, value in as_json(config).items() if name not in _OF_INPUTS}
     return folder / f"{zlib.crc32(json.dumps(told, sort_keys=True).encode()):08x}"
 
 
 def keep(shard: Shard, path: Path) -> None:
-    """Writes the references of a shard to ``path``, where they replace others."""
+    """Writes the references of a shard to ``path``, and replaces an existing file."""
     from safetensors.numpy import save
 
     crops = range(len(shard.record["crops"]))
@@ -56,7 +56,7 @@ def keep(shard: Shard, path: Path) -> None:
 
 
 class Kept:
-    """A file of kept references; raises NgptError for one that is missing or damaged."""
+    """A file of kept references. Raises NgptError if it is missing or damaged."""
 
     def __init__(self, path: Path):
         self._shard = Shard(path)
@@ -76,7 +76,7 @@ class Kept:
 
 
 def packed(image: np.ndarray) -> np.ndarray:
-    """(n,) uint8 of finite float32 (H, W, 3)."""
+    """Compresses finite float32 (H, W, 3) to (n,) uint8."""
     size = np.abs(image)
     with np.errstate(divide="ignore"):
         steps = np.round((np.log2(size, dtype=np.float32) - LEAST) * STEPS)
@@ -88,7 +88,7 @@ def packed(image: np.ndarray) -> np.ndarray:
 
 
 def unpacked(data: np.ndarray, size: tuple[int, int], where: str = "kept reference") -> np.ndarray:
-    """The image (H, W, 3) float32 of what ``packed`` made, ``size`` is (H, W); raises NgptError for other bytes."""
+    """Undoes ``packed``: (H, W, 3) float32, where ``size`` is (H, W). Raises NgptError for damaged bytes."""
     try:
         planes = np.frombuffer(lzma.decompress(data.tobytes()), np.uint8).reshape(2, -1)
         change = np.ascontiguousarray(planes.T).view("<i2").reshape(3, *size)

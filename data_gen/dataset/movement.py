@@ -1,6 +1,6 @@
-"""How a shot of a training set moves: its camera, one thing in it, its light. All of it comes from random numbers.
+"""Random movements of a shot of a training set: of its camera, of one thing in it, and of its light.
 
-Each of the three moves or rests independently, at a constant speed that is log-uniform from shot to shot.
+Each of the three moves or rests independently. Its speed is constant in a shot, and log-uniform over shots.
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ from data_gen.dataset.cameras import Surroundings, View, floats
 from data_gen.frames.motion import seen
 from data_gen.scenes.geometry import VERTICES, put_vertices, vertices
 
-# Shares of the shots in which the camera moves, a thing moves, and the light changes; and the share of these in which a
-# lamp moves, if there is one, instead of changing its radiance.
+# Shares of the shots in which the camera moves, a thing moves, and the light changes. LAMP is the share of the last in
+# which a lamp moves, if there is one, instead of changing its radiance.
 CAMERA, THING, LIGHT, LAMP = 0.8, 0.35, 0.35, 0.5
 # Movement per frame at the median distance, as a share of the image's width: 0.1 to 9.6 of 96 pixels.
 SPEEDS = 0.001, 0.1
-# A thing that is moved fills this share of the pixels: smaller ones are not seen, larger ones are walls.
+# A moving thing must fill this share of the pixels: smaller things are hardly seen, larger ones are walls.
 SIZES = 0.01, 0.3
 # Changes per frame: of the lamp's position, relative to the median distance, and of the logarithm of its radiance
 LAMP_WAYS, GAINS = (0.005, 0.08), (0.01, 0.3)
-# The share of the way to the next obstacle that a camera may go, in all frames together
+# The most that a camera moves over all frames, as a share of the distance to the next obstacle
 CLEAR = 0.6
 RADIANCE = (".radiance.value", ".intensity.value", ".irradiance.value")
 
 
 @dataclass
 class Movement:
-    """What changes from frame to frame; without anything but a view, nothing does."""
+    """The changes from frame to frame. With only a ``view`` nothing changes."""
 
     view: View
-    way: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the camera, world units a frame
-    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of its target beside it
+    way: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the camera, in world units per frame
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of its target, in addition to ``way``
     shape: str = ""  # the parameter that places a shape,
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # and its way a frame
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # and its movement per frame
     light: str = ""  # the parameter of a light,
-    gain: float = 1.0  # and its factor a frame
+    gain: float = 1.0  # and its factor per frame
     _start: dict = field(default_factory=dict, repr=False)
 
     def view_at(self, frame: int) -> View:
@@ -48,7 +48,7 @@ class Movement:
         return replace(self.view, origin=floats(origin), target=floats(target))
 
     def apply(self, scene: mi.Scene, frame: int) -> None:
-        """Brings ``scene`` into the state of a frame; frame 0 is the original scene, seen by the view."""
+        """Sets ``scene`` to the state of a frame. Frame 0 is the original scene, seen by the view."""
         self.view_at(frame).apply(scene)
         if not self.shape and not self.light:
             return
@@ -72,7 +72,7 @@ class Movement:
 
 
 def random_movement(around: Surroundings, view: View, rng: np.random.Generator, frames: int) -> Movement:
-    """How a shot of ``frames`` frames goes on from ``view``, which is applied to the scene."""
+    """A random movement for a shot of ``frames`` frames that starts at ``view``. It applies the view to the scene."""
     scene = around.scene
     view.apply(scene)
     what = seen(scene)
@@ -84,7 +84,7 @@ def random_movement(around: Surroundings, view: View, rng: np.random.Generator, 
     right = np.cross(forward, view.up)
     right /= max(np.linalg.norm(right), 1e-9)
     axes = np.stack([right, np.cross(right, forward), forward])
-    # The width of what is seen at that distance.
+    # The width of the visible part of the scene at that distance
     width = 2 * distance * np.tan(np.radians(view.fov) / 2) * view.size / view.film[0]
 
     def speed(low: float, high: float) -> float:
@@ -92,7 +92,7 @@ def random_movement(around: Surroundings, view: View, rng: np.random.Generator, 
 
     made = Movement(view)
     if rng.random() < CAMERA:
-        # Forward and back changes the image less than sideways.
+        # Movement along the view direction changes the image less than sideways movement.
         way = rng.normal(size=3) * (1, 0.5, 2) @ axes
         way *= speed(*SPEEDS) * width / np.linalg.norm(way)
         free = float(around.cast(eye[None], (way / np.linalg.norm(way))[None])[0][0])
@@ -123,10 +123,10 @@ def random_movement(around: Surroundings, view: View, rng: np.random.Generator, 
 
 
 def _movable(scene: mi.Scene) -> dict[int, str]:
-    """The shapes that can be placed, by their numbers: the parameter that places each of them."""
+    """Number of a shape that can be moved -> the parameter that places it."""
     places: dict[int, str] = {}
     numbers = {shape: number for number, shape in enumerate(scene.shapes())}
-    # Not by the names of shapes, which may be missing.
+    # By nodes and not by names, since shapes may have no name
     for name, (_, _, node, _) in mi.traverse(scene).properties.items():
         kind = name.rpartition(".")[2]
         if node in numbers and (kind == "to_world" or (kind in VERTICES and numbers[node] not in places)):

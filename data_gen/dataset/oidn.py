@@ -1,10 +1,10 @@
-"""A training set as Open Image Denoise's own training reads it: a file of OpenEXR for each feature of each image.
+"""Writes a training set in the layout of Open Image Denoise's own training: an OpenEXR file for each image and feature.
 
     FOLDER/train/SCENE/crop0003_0016spp.hdr.exr     an input of 16 samples per pixel: light,
                         crop0003_0016spp.alb.exr    albedo, 0 to 1,
                         crop0003_0016spp.nrm.exr    normal, -1 to 1
-                        crop0003_ref.hdr.exr        and the same of the reference
-    FOLDER/valid/...                                scenes kept apart, whole
+                        crop0003_ref.hdr.exr        and the same for the reference
+    FOLDER/valid/...                                the same for the scenes that are kept for validation
 
 Source of the layout: "Datasets" in the README of Open Image Denoise 2.4, and training/dataset.py there.
 """
@@ -20,7 +20,7 @@ from ngpt.errors import NgptError
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
 from ngpt.training.dataset import Crop, Dataset
 
-# One scene in this many is for validation, and at least one if there are two scenes.
+# One of this number of scenes is for validation, and at least one if there are two scenes.
 VALIDATION = 10
 
 
@@ -29,7 +29,7 @@ def write_layout(data: Dataset, folder: Path, progress: Callable[[int, int], Non
 
     An input is left out if another input of its crop has as many samples, since both would have the same name.
 
-    Raises NgptError for sets of shots or without references, and where a file cannot be written.
+    Raises NgptError for sets of shots or without references, and if a file cannot be written.
     """
     if data.shots:
         raise NgptError(f"{data.folder}: is a set of shots, and Open Image Denoise trains on single images")
@@ -59,8 +59,8 @@ def _named(data: Dataset) -> Iterator[tuple[str, Crop]]:
 
 
 def _images(crop: Crop, digits: int) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-    """The inputs and the reference by what their names end in. The features of the reference are means over all inputs,
-    weighted by their samples."""
+    """(end of the name, images) of each input and of the reference. The features of the reference are means over all
+    inputs, weighted by their samples."""
     if "reference_indirect" not in crop.shard.names:
         raise NgptError(f"{crop.shard.path}: has no references, without which Open Image Denoise does not train")
     stacks = [crop.stack(k) for k in range(crop.inputs)]

@@ -1,10 +1,10 @@
-"""Crops while they are rendered: a replay buffer that a training loop reads like a ``Dataset``, with no set on disk.
+"""Renders crops during training: a replay buffer that a training loop reads like a ``Dataset``, with no set on disk.
 
     with Stream(config, executor) as data:
         for step in ...:
             crop = data[rng.integers(len(data))]
-After the scenes of the configuration come others of their kind, and further views of scene files. With ``kept``, a
-folder, its references are made once and stored there in compressed form, and used repeatedly with new inputs.
+After the scenes of the configuration follow more scenes of the same kind, and more views of scene files. With a folder
+``kept``, references are made once, stored there in compressed form, and used repeatedly with new inputs.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from ngpt.training.shards import Shard
 
 
 class Stream:
-    """The last ``capacity`` crops, at least one, replaced by new ones as they are finished.
+    """The last ``capacity`` crops, at least one. New crops replace them as they finish.
 
-    ``executor`` should have workers of its own (processes, a cluster); ``ahead`` shards are rendered at a time. A crop
-    in hand stays readable after its shard has left the buffer. Entering waits for the first crops; what goes wrong in a
-    worker is raised as NgptError there and by every later access. Raises NgptError where shots or pairs are to be
-    ``kept``, a folder for references.
+    ``executor`` should have separate workers (processes, a cluster). ``ahead`` shards are rendered at a time. A crop
+    stays readable after its shard has left the buffer. Entering the context waits for the first crops. An error in a
+    worker is raised as NgptError on entering, and by every later access. ``kept`` is a folder for references; with
+    shots it raises NgptError, and with pairs, which have no references, it is ignored.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Stream:
             raise NgptError(f"the stream of crops has stopped: {self._error}") from self._error
 
     def _jobs(self) -> Iterator[tuple[Job, Again | None]]:
-        """What to render next, for ever: all scenes in turn, in an order that differs from run to run."""
+        """The jobs, without end: all scenes in each turn. With kept references the order differs from run to run."""
         rng = np.random.default_rng()
         for turn in count():
             plan = self.config.plan(0 if self.kept else turn)
@@ -112,7 +112,7 @@ class Stream:
             while not self._stop.is_set():
                 while len(running) < ahead:
                     job, again = next(jobs)
-                    # Two of one name would be one file.
+                    # Two jobs of the same name would write the same file.
                     if job.file not in running.values():
                         given = (self.config, job, self._temporary.name, self.variant, again)
                         running[self.executor.submit(make_shard, *given)] = job.file
@@ -137,17 +137,18 @@ class Stream:
         with self._changed:
             self._crops.extend(Crop(shard, i, told["scene"], tuple(c["spp"]), c.get("frame")) for i, c in crops)
             self._changed.notify_all()
-        # Kept open, it lives on for as long as one of its crops does.
+        # The shard is open, so its data stay until its last crop is gone.
         path.unlink()
 
 
 @contextmanager
 def stream(config: Path, kept: str = "") -> Iterator[Stream]:
-    """Crops of a configuration, rendered in another process while they are trained on: see ``ngpt.renderer.Crops``."""
-    # Training that is interrupted finishes its step, and may still ask for crops.
+    """A context with crops of a configuration, rendered in another process during training: see
+    ``ngpt.renderer.Crops``."""
+    # Interrupted training finishes its step, and may still need crops.
     with Pool(1, interruptible=False) as worker, Stream(read_config(config), worker, kept=kept) as data:
         try:
             yield data
         finally:
-            # Its current job would take minutes, and nobody would use the result.
+            # The current job would take minutes, and its result is not needed.
             worker.end()

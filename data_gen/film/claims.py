@@ -1,18 +1,19 @@
 """The variance of pixels whose samples are points of nets, and so not independent.
 
-Samples of a pixel that are points of one net (``data_gen.paths.streams``) keep apart from each other: the sample
-variance, which takes them for independent, overstates the noise of their mean. The render itself shows by how much. The
-samples of a pixel are split into two parts of similar size (``data_gen.film.nets.split``), n1 and n2 of n samples with
-means a and b, and compared by their *contrast*
+Samples of a pixel that are points of one net (``data_gen.paths.streams``) keep apart from each other. The sample
+variance assumes that they are independent, so it overstates the noise of their mean. The render itself shows by how
+much. The n samples of a pixel are split into two parts of similar size (``data_gen.film.nets.split``): n1 samples with
+mean a and n2 samples with mean b. The parts are compared by their *contrast*
 
     (b - a) sqrt(n1 n2) / n,
 
-whose expected square is the variance of the pixel's mean where samples are independent. ``data_gen.film.nets.law``
-gives, for each way in which noise may fall, what that square and the variance of the mean are where samples are points
-of nets. One square says little about a pixel, but pixels of about the same noise together show which law holds. Points
-help much where little light is found by chance, and not at all where all of it is. If most of the noise is in few
-pixels, they show less. So the factor is a mean over all laws, weighted by how likely they are; a geometric one, since
-factors are wrong by ratios. All laws expect the same contrast of two samples. There, only the prior of each law counts.
+whose expected square is the variance of the pixel's mean if samples are independent. Points of nets help much where
+little light is found by chance, and not at all where all of it is found by chance. So there is a family of laws by
+which the noise may fall, and ``data_gen.film.nets.law`` gives the expected square and the variance of the mean for each
+law. One square says little about a pixel, but pixels of about the same noise together show which law holds. They show
+less if most of the noise is in few pixels. So the factor is a mean over all laws, weighted by their probabilities. It
+is a geometric mean, since factors are wrong by ratios. All laws expect the same contrast of two samples; there, only
+the prior of each law counts.
 """
 
 from __future__ import annotations
@@ -22,21 +23,21 @@ import numpy as np
 from data_gen.film.nets import USUAL, law
 from ngpt.shared import box_means
 
-# Groups of pixels of about the same noise: the most groups, and the least pixels of a group
+# The most groups of pixels of similar noise, and the least pixels of a group
 _GROUPS, _LEAST = 64, 64
-# Side of the square of pixels around a pixel that its noise is estimated from
+# Side of the square of pixels from which the noise of its middle pixel is estimated
 _AROUND = 5
 
 
 def factors(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net: int) -> np.ndarray:
-    """The factor (H, W, 1) that corrects the sample ``variance`` of the mean.
+    """The factor (H, W, 1) by which the sample ``variance`` of the mean must be multiplied.
 
     ``contrast``, as defined above, and ``variance`` are (H, W, C). Pixels where one of them is NaN are not used.
     ``samples`` (H, W) is the number of samples of each pixel, and ``net`` the number of points in the first round.
     """
     squares, variances = np.square(contrast).sum(axis=-1), variance.sum(axis=-1)
     good = np.isfinite(squares) & np.isfinite(variances)
-    # Without the pixel itself: its own variance is large where it has a rare sample, and rare samples are the
+    # The pixel itself is left out: its own variance is large where it has a rare sample, and rare samples are the
     # independent ones. Groups by a pixel's own variance would put all of these into one group.
     filled = np.where(good, variances, 0)
     sums = _AROUND**2 * box_means(filled, _AROUND)
@@ -57,8 +58,8 @@ def factor(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net:
 def _found(
     squares: np.ndarray, variances: np.ndarray, samples: np.ndarray, net: int, order: np.ndarray, groups: int
 ) -> np.ndarray:
-    """The factors of pixels, which are put into at most ``groups`` groups in this ``order``, all (N). Pixels that are
-    not in ``order`` have the factor 1."""
+    """The factors (N) of pixels. ``order`` is the list of pixels that is cut into at most ``groups`` groups. Pixels
+    that are not in ``order`` have the factor 1."""
     found = np.ones(len(squares))
     if not len(order):
         return found
@@ -76,11 +77,12 @@ def _found(
 
 
 def _likely(ratio: float, expected: np.ndarray, contrasts: float, pixels: float) -> np.ndarray:
-    """The probability of each law, (laws), by the ``ratio`` of squared contrasts to variances and those ``expected``.
+    """The probability of each law, (laws), given the observed ``ratio`` of squared contrasts to variances; ``expected``
+    are the ratios that the laws predict.
 
-    A sample variance is a mean over this number of orthogonal ``contrasts``. The observed contrast is compared with all
-    others: divided by what a law expects, their ratio has an F distribution. Its degrees of freedom are one and the
-    number of the others, for each of the ``pixels`` of equal noise.
+    A sample variance is a mean over ``contrasts`` orthogonal contrasts, and the observed contrast is one of them. The
+    ratio of its square to the mean square of the others, divided by what a law expects, has an F distribution. Its
+    degrees of freedom are one and the number of the others, for each of the ``pixels`` of equal noise.
     """
     others = contrasts - 1
     if others < 1e-6:

@@ -20,35 +20,36 @@ from ngpt.stack import GradientStack
 from ngpt.subpixels import SUBPIXELS, means
 from ngpt.windows import Place
 
-# The shifts of samplers, (x, y) in pixels, y down: each difference of the contract, and back. The film keeps the
-# differences "neighbour - base" at the base pixel and combines both directions when it develops.
+# The shifts of samplers, (x, y) in pixels, y down: forward ("+") and backward ("-") for each difference of the
+# contract. The film keeps the differences "neighbour - base" at the base pixel and combines both directions when it
+# develops.
 SHIFTS = {
     f"{layer}{sign}": (factor * x, factor * y)
     for layer, (x, y, _) in DIFFERENCES.items()
     for sign, factor in (("+", 1), ("-", -1))
 }
 
-# What is put under these names becomes a diagnostic image, not a layer of the stack: name -> name of the image.
+# Values put under these names become diagnostic images, not layers of the stack: name -> name of the image.
 DIAGNOSTICS = {"shift_failures": "diagnostics.shiftFailures"}
 DISCARDED = "diagnostics.discarded"
 
 # Parts of the primal, by the lobe of the first scattering event
 _SPLIT = ("diffuse", "specular")
-# Features whose noise is given as one number, see ``GradientFilm.feature_noise``
+# Features whose noise is summarised by one number, see ``GradientFilm.feature_noise``
 _FEATURES = ("albedo", "normal")
 _WITH_VARIANCE = frozenset({"primal", "caustic", *_SPLIT, *SHIFTS, *_FEATURES})
-# Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 21; and the moments of
-# one name once more.
+# Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 21; and a second copy
+# of the moments of one name, while they are updated.
 _STRAND_BYTES = 10 * 8 + (26 + 21) * 8 + (8 + 6 * 8)
-# Without gradients: 5 names, 13 channels, 9 sums of squares. They are fewer, and the more subpixels fit.
+# Without gradients: 5 names, 13 channels, 9 sums of squares. This leaves memory for more subpixels.
 _STRAND_BYTES_WITHOUT = 5 * 8 + (13 + 9) * 8 + (8 + 6 * 8)
-# Per strand, of the layer ``shared``, which few films have: two counts, double means
+# Per strand, for the layer ``shared``, which few films have: two counts, double means
 _SHARED_BYTES = 8 + 3 * 8
-# Per strand, of two sets of earlier samples: single means of 21 channels, and counts of the seven names they belong to,
-# with the number of bits
+# Per strand, for the two sets of ``moments.Earlier``: float32 means of 21 channels; and for each of their seven names
+# two counts and the number of bits
 _HALVES_BYTES = 2 * 21 * 4 + 7 * 3 * 4
 _HALVES_BYTES_WITHOUT = 2 * 9 * 4 + 3 * 3 * 4
-# Per pixel, of a pass that is one batch: the mean over the batch, splats and their sums, of one name.
+# Per pixel, for one name, in a pass that is one batch: the mean over the batch, the splats and their sums.
 _BATCH_BYTES = 3 * 8 + 3 * SPLAT_BYTES + 4 + 3 * 8
 # Enough pixels to estimate the mean noise of features
 _ENOUGH = 1 << 13
@@ -59,22 +60,24 @@ _STRANDS = 1 << 15
 class GradientFilm:
     """Collects samples, in the order of ``CameraSamples``, and develops them into the layers of a gradient stack.
 
-    Samples that are not finite get zero weight: they are left out of the mean and counted. The number of a
-    sample determines which sum it is added to, and in what order: the same samples give the same bits in any passes.
+    Samples that are not finite get zero weight: they are left out of the mean and counted. The number of a sample
+    determines which sum it is added to, and in what order. So the same samples give the same bits, however they are
+    divided into passes.
 
-    A pass may hold samples of only ``some`` pixels. Then the number of samples differs between pixels, also between the
-    two ends of a pair of pixels. Each direction of a difference is a mean over the base paths of its own end.
+    A pass may hold samples of only ``some`` pixels. Then pixels differ in their number of samples, and so may the two
+    pixels of a difference. Each direction of a difference is a mean over the base paths of its own pixel.
 
-    Variances are computed over samples, as if these were independent. If samples are points of rounds, and the first
-    round is a ``net`` with this number of points per pixel, the variances are scaled to the noise that is observed, see
-    ``data_gen.film.claims``. If samples of a pass share photons, reservoirs or the state of a chain, or lanes splat
-    onto other pixels, the film is made with ``batches``: each pass is one batch, a pixel's value is its mean over the
-    batch, and variances are computed over batches. Batches are weighted by their samples: the last one may have fewer.
+    Variances are computed over samples, as if these were independent. A ``net`` above 0 says that samples are points of
+    rounds, and that the first round has ``net`` points per pixel. Then the variances are scaled to the observed noise,
+    see ``data_gen.film.claims``. If samples of a pass share photons, reservoirs or the state of a chain, or lanes splat
+    onto other pixels, the film is made with ``batches``. Then each pass is one batch, a pixel's value is its mean over
+    the batch, and variances are computed over batches. Batches are weighted by their number of samples, since the last
+    one may have fewer.
 
-    With ``subpixels`` K > 1 the film also keeps what denoisers read by K x K subpixels of each pixel
-    (``ngpt.subpixels``). Each pass is then announced by ``begin_pass``. Batches have no subpixels.
+    With ``subpixels`` K > 1 the film also keeps the inputs of denoisers for the K x K subpixels of each pixel
+    (``ngpt.subpixels``). Then ``begin_pass`` must be called before each pass. Batches have no subpixels.
 
-    ``bytes`` is the most memory that the film takes; it takes less without ``gradients``.
+    ``bytes`` is the most memory that the film takes. It is less without ``gradients``.
     """
 
     def __init__(
@@ -116,7 +119,7 @@ class GradientFilm:
         """Adds the samples of one pass.
 
         ``value`` is a Float or Color3f with ``width * height * spp`` lanes, and ``active`` says which of them exist (an
-        offset outside the image does not). What is put under one name again belongs to the next pass.
+        offset outside the image does not). A second value under the same name begins the next pass.
         """
         if name in self._pass:
             self.end_pass()
@@ -128,19 +131,20 @@ class GradientFilm:
             self.put(name, *(value if isinstance(value, tuple) else (value,)))
 
     def splat(self, name: str, pixel: mi.UInt32, value, active: bool | mi.Bool = True) -> None:
-        """Adds values to any pixel: the ``pixel`` of each lane, numbered row by row. Only films with ``batches`` can.
+        """Adds each lane's value to any ``pixel``, numbered row by row. Only films with ``batches`` allow it.
 
-        Over a pass with n samples per pixel, a pixel's value is the mean of what was put for it, plus the sum of its
-        splats over n. So a lane's splat counts like its put: one light path per camera sample, each worth the
-        contribution to its pixel over its density, fills the image. Several splats of a name in a pass add up.
+        In a pass with n samples per pixel, a pixel's value is the mean of the values put for it, plus the sum of its
+        splats divided by n. So a lane's splat has the same weight as the value that the lane puts. With one light path
+        per camera sample, a splat is the light path's contribution to the pixel divided by its density. Several splats
+        of a name in a pass add up.
         """
         components = _components(value)
         self.splats(name, len(components)).add(pixel, components, mi.Bool(active))
 
     def splats(self, name: str, channels: int = 3) -> Splats:
-        """The splats of a name in this pass; ``add`` of it may be called within symbolic loops."""
+        """The splats of a name in this pass. Their ``add`` may be called within symbolic loops."""
         if not self.batches:
-            raise ValueError("this film takes samples for independent, which splats are not: make it with batches")
+            raise ValueError("splats are not independent samples: make the film with batches")
         if name not in self._splats:
             self._splats[name] = Splats(self.pixels, channels)
         return self._splats[name]
@@ -149,9 +153,9 @@ class GradientFilm:
         """Adds the values of the pass to the statistics, all at once: an interrupted pass leaves no trace.
 
         ``block`` is the ``block`` of ``CameraSamples``: the number of samples of a pixel that are side by side. In a
-        film with ``batches`` it is the number of all samples of the pass, and must be given if there are only splats.
-        ``some`` is the pixel of each block, ascending, if the pass does not treat all pixels alike; all later passes
-        must then give it too.
+        film with ``batches`` it is the number of samples per pixel in the pass, and must be given if there are only
+        splats. If the pass does not treat all pixels alike, ``some`` is the pixel of each block, ascending. All later
+        passes must then give ``some`` too.
         """
         if not self._pass and not self._splats:
             return
@@ -159,14 +163,14 @@ class GradientFilm:
         splats, self._splats = self._splats, {}
         cell, self._cell = self._cell, None
         if self._fine and cell is None:
-            raise ValueError("a film with subpixels is told of each pass by begin_pass()")
+            raise ValueError("a film with subpixels needs begin_pass() before each pass")
         # Reading single lanes evaluates an array: without this, each read would trace the paths again.
         dr.eval(values, cell)
         if some is not None:
             self._add_some(values, block, some, cell)
             return
         if self.counts is not None:
-            raise ValueError("pixels have samples in different numbers: say which pixels the blocks are of")
+            raise ValueError("pixels differ in their number of samples: give the pixel of each block in `some`")
         lanes = dr.width(values) if values else self.pixels * (block or 0)
         spp = lanes // self.pixels
         block = block or spp
@@ -193,13 +197,13 @@ class GradientFilm:
         self.blocks += spp // block
 
     def forget_pass(self) -> None:
-        """Drops what was put since the last pass ended, because the pass was aborted."""
+        """Drops the values of the current pass, because it was aborted."""
         self._pass, self._splats, self._cell = {}, {}, None
 
     def _add_some(self, values: dict, block: int | None, some: np.ndarray, cell: mi.UInt32 | None) -> None:
         """Adds the samples of a pass whose blocks belong to ``some`` pixels."""
         if self.batches or not block:
-            raise ValueError("passes of some pixels have blocks of independent samples")
+            raise ValueError("a pass of some pixels needs blocks of independent samples: no batches, and a block size")
         if self.counts is None:
             self.counts = np.full(self.pixels, self.samples, np.int64)
             self._blocks_each = np.full(self.pixels, self.blocks, np.int64)
@@ -244,7 +248,8 @@ class GradientFilm:
             if name in splats:
                 sums, lost_splats = splats[name].totals(), splats[name].lost
                 share = dr.opaque(dr.float64_array_t(mi.Float), 1 / spp)
-                # Where nothing was put, the value is the splats. Where all that was put is lost, the pixel is unknown.
+                # Where nothing was put, the value is the splats. Where all values that were put are lost, the pixel is
+                # unknown.
                 mean = [(m if mean else 0) + s * share for m, s in zip(mean or sums, sums, strict=True)]
                 lost = lost + lost_splats
             number = opaque(self.blocks) + dr.zeros(mi.UInt32, self.pixels)
@@ -259,7 +264,7 @@ class GradientFilm:
         return np.full(self.pixels, self.samples, np.int64) if self.counts is None else self.counts.copy()
 
     def _moments(self, name: str, channels: int) -> Moments:
-        """The statistics so far of what is put under a name."""
+        """The statistics so far of the values put under a name."""
         width = self.pixels * self.strands
         variance = name in _WITH_VARIANCE
         return self.moments.get(name) or no_moments(width, channels, variance, variance and self.net > 0)
@@ -271,10 +276,10 @@ class GradientFilm:
         return sum(int(np.array(moments.lost, np.int64).sum()) for moments in self.moments.values())
 
     def develop(self) -> dict[str, np.ndarray]:
-        """The layers, (H, W, C) float32: means of all that was put, dx, dy of the shifts, and their variances.
+        """The layers, (H, W, C) float32: the means of all values put, dx and dy from the shifts, and their variances.
 
-        Variances are of the pixel mean and left out while no pixel has more than one sample. A pixel that lost all its
-        samples is NaN. The layer ``samples`` is there where pixels differ in them.
+        Variances are variances of the pixel mean. They are left out while no pixel has more than one sample. A pixel
+        that lost all its samples is NaN. There is a layer ``samples`` if pixels differ in their number of samples.
         """
         self.end_pass()
         layers = {}
@@ -284,7 +289,7 @@ class GradientFilm:
         count = self._statistics("primal")[0]
         variances = {"primal_var": self._claimed("primal")}
         if "caustic" in layers:
-            # Samplers put it beside a primal without it, whose variance belongs to dx and dy.
+            # Samplers put ``caustic`` beside a primal that lacks it. The variance of that primal goes with dx and dy.
             layers["primal"] = layers["primal"] + layers["caustic"]
             variances["caustic_var"] = self._claimed("caustic")
         if "shared" in layers:
@@ -319,9 +324,9 @@ class GradientFilm:
 
     @property
     def feature_noise(self) -> float | None:
-        """The variance of the pixel mean of ``albedo`` or of ``normal``, whichever is larger: each the mean over pixels
-        and channels, of images with many pixels over some of them. None where it is not known: there are no features,
-        or no pixel has more than one sample.
+        """The variance of the pixel mean of ``albedo`` or ``normal``, whichever is larger. Each is a mean over channels
+        and pixels; large images use a subset of their pixels. None if there are no features, or no pixel has more than
+        one sample.
         """
         self.end_pass()
         some = np.arange(0, self.pixels, -(-self.pixels // _ENOUGH))
@@ -340,8 +345,8 @@ class GradientFilm:
         return max(found, default=None)
 
     def diagnose(self) -> dict[str, np.ndarray]:
-        """Diagnostic images, (H, W) float32 in [0, 1]: the mean of what was put under the names of ``DIAGNOSTICS``, and
-        which share of a pixel's values was left out because it was not finite."""
+        """Diagnostic images, (H, W) float32 in [0, 1]: the means of the values put under the names of ``DIAGNOSTICS``,
+        and the share of a pixel's values that were left out because they were not finite."""
         self.end_pass()
         images = {image: self._statistics(name)[1] for name, image in DIAGNOSTICS.items() if name in self.moments}
         lost, count = (
@@ -356,7 +361,7 @@ class GradientFilm:
         }
 
     def known(self, name: str) -> tuple[np.ndarray, np.ndarray | None]:
-        """The mean and, where there is one, the sample variance of the mean, (H, W, C), of what is put under a name."""
+        """The mean of the values put under a name, and the sample variance of that mean or None, each (H, W, C)."""
         _, mean, variance = self._statistics(name)
         return self._image(mean), None if variance is None else self._image(variance)
 
@@ -369,10 +374,10 @@ class GradientFilm:
     def _gradient(self, layer: str) -> tuple[np.ndarray, np.ndarray]:
         """Both directions of one difference, each with weight 1/2 (survey, Algorithm 1), and its variance.
 
-        The difference between pixel p and its successor is sampled from p by the forward shift and, independently,
-        from the successor by the backward shift. Each direction estimates a part of the difference, not all of it. So
-        where one end has more samples, its part has less variance, but not more weight. If only the forward shift has
-        values, these are the whole difference.
+        The difference between pixel p and its successor is sampled from p by the forward shift and, independently, from
+        the successor by the backward shift. Each direction estimates its own part of the difference. So if one pixel
+        has more samples, its part has less variance, but not more weight. If only the forward shift has values, these
+        are the whole difference.
         """
         x, y = SHIFTS[f"{layer}+"]
         behind, ahead = np.s_[: self.height - y, : self.width - x], np.s_[y:, x:]
@@ -388,12 +393,12 @@ class GradientFilm:
         return gradient, self._as_seen(variance, [(f"{layer}+", behind, 0.5), (f"{layer}-", ahead, -0.5)])
 
     def _claimed(self, name: str) -> np.ndarray:
-        """The variance of the pixel mean of what is put under a name."""
+        """The variance of the pixel mean of the values put under a name."""
         return self._as_seen(self._image(self._statistics(name)[2]), [(name, np.s_[:, :], 1.0)])
 
     def _as_seen(self, variance: np.ndarray, terms: list[tuple[str, tuple, float]]) -> np.ndarray:
-        """A sample ``variance`` (H, W, 3), scaled to the observed noise where samples are points of nets. It is the
-        variance of the sum of ``terms``: name, which pixels, factor."""
+        """Scales a sample ``variance`` (H, W, 3) to the observed noise, if samples are points of nets. It is the
+        variance of a sum of ``terms``: (name, which pixels, factor)."""
         if not self.net:
             return variance
         seen = sum(factor * self._image(self._contrast(name))[pixels] for name, pixels, factor in terms)
@@ -410,7 +415,7 @@ class GradientFilm:
 
     @property
     def _net_of_numbers(self) -> int:
-        """How many of these values the first round of points has, a power of two: a batch is a block of points."""
+        """The number of values in the first round, a power of two. A batch is a block of points."""
         net = self.net // self.batch if self.batches else self.net
         return 1 << max(net.bit_length() - 1, 0)
 
@@ -429,5 +434,5 @@ def _components(value) -> list:
 
 
 def opaque(n: int) -> mi.UInt32:
-    """A number that is not compiled into kernels, as a new variable for each call."""
+    """A new variable that holds ``n``, so that the number is not compiled into kernels."""
     return dr.opaque(mi.UInt32, n)

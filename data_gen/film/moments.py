@@ -1,7 +1,7 @@
 """Running mean and variance of many lanes at once.
 
-Welford 1962, "Note on a method for calculating corrected sums of squares and products", in double precision: sums of
-squares would lose all digits where the variance is small beside the mean.
+Welford 1962, "Note on a method for calculating corrected sums of squares and products", in double precision. Plain sums
+of squares would lose all digits where the variance is small compared with the mean.
 """
 
 from __future__ import annotations
@@ -15,22 +15,24 @@ import mitsuba as mi
 
 @dataclass
 class Moments:
-    """Running statistics of one value, for all strands: counts UInt32, a Float64 for each channel of the others."""
+    """Running statistics of one value, for all strands. Counts are UInt32; lists hold a Float64 for each channel."""
 
-    count: mi.UInt32  # samples that count, the weights added up
+    count: mi.UInt32  # sum of the weights of the samples
     lost: mi.UInt32  # samples left out because they were not finite
     mean: list
-    m2: list  # weighted sum of squared deviations from the mean; empty where nobody asks for a variance
-    # A list of one ``Earlier``; empty where nobody asks for it
+    m2: list  # weighted sum of squared deviations from the mean; empty if no variance is wanted
+    # A list of one ``Earlier``; empty if it is not wanted
     earlier: list
 
 
 @dataclass
 class Earlier:
-    """The samples of a strand before the last one whose number is a power of two, and those before half that number.
+    """Two sets of earlier samples of a strand: those before the last sample whose number is a power of two, and those
+    before half that number.
 
-    For each set: how many samples count, UInt32, and their means, a Float32 for each channel, whose rounding is far
-    below the noise. ``bits`` is the number of bits in the number of the last sample.
+    ``counts`` and ``means`` have one entry for each set: the number of samples, UInt32, and a list of a Float32 for
+    each channel, whose rounding is far below the noise. ``bits`` is the number of bits in the number of the last
+    sample.
     """
 
     bits: mi.UInt32
@@ -39,7 +41,7 @@ class Earlier:
 
 
 def no_moments(width: int, channels: int, variance: bool, halves: bool = False) -> Moments:
-    """The statistics of no sample, for ``width`` strands; with ``halves``, also of ``Earlier`` ones."""
+    """Empty statistics for ``width`` strands; with ``halves``, they include ``Earlier`` samples."""
     Float64, Float32 = dr.float64_array_t(mi.Float), dr.float32_array_t(mi.Float)
     mean, m2 = ([dr.zeros(Float64, width) for _ in range(channels)] for _ in range(2))
     count, lost, bits, *counts = (dr.zeros(mi.UInt32, width) for _ in range(5))
@@ -48,8 +50,9 @@ def no_moments(width: int, channels: int, variance: bool, halves: bool = False) 
 
 
 def one_more(old: Moments, x: list, exists, number: mi.UInt32, weight: mi.UInt32 | int = 1) -> Moments:
-    """The statistics with one more sample ``x``, which has this ``number``, for each strand where it ``exists``.
-    A sample that is not finite counts as lost. ``weight`` is the number of samples that ``x`` is the mean of."""
+    """The statistics after one more sample ``x`` of each strand, where it ``exists``. ``number`` is the number of that
+    sample in its pixel. A sample that is not finite counts as lost. ``weight`` is the number of samples that ``x`` is
+    the mean of."""
     Float64 = dr.float64_array_t(mi.Float)
     finite = dr.all([dr.isfinite(component) for component in x])
     good = exists & finite
@@ -64,11 +67,11 @@ def one_more(old: Moments, x: list, exists, number: mi.UInt32, weight: mi.UInt32
 
 
 def _one_later(earlier: Earlier, old: Moments, number: mi.UInt32) -> Earlier:
-    """The samples before the one with this ``number``, for which the statistics were the ``old`` ones."""
+    """Updates ``earlier`` for the sample ``number``; ``old`` are the statistics of the samples before it."""
     Float32 = dr.float32_array_t(mi.Float)
     bits = 32 - dr.lzcnt(number)
     begins = bits != earlier.bits
-    # A strand without a sample between the two numbers has all of its samples before half the number, too.
+    # If a strand has no sample between the two numbers, all its samples are before the smaller number, too.
     follows = bits == earlier.bits + 1
     last, half = earlier.counts
     counts = [dr.select(begins, old.count, last), dr.select(begins, dr.select(follows, last, old.count), half)]
@@ -82,9 +85,9 @@ def _one_later(earlier: Earlier, old: Moments, number: mi.UInt32) -> Earlier:
 
 @dataclass
 class Strands:
-    """Which samples each strand takes: ``block`` from ``first`` on, again ``stride`` later, all before ``end``.
+    """The lanes of each strand: ``block`` lanes from ``first`` on, and again each ``stride`` later, up to ``end``.
 
-    The first has a ``number`` in its pixel, and the first of its next block one that is ``further`` on.
+    ``number`` is the number of the first sample in its pixel. It grows by ``further`` from one block to the next.
     """
 
     first: mi.UInt32

@@ -1,4 +1,4 @@
-"""How the noise of a pixel's mean falls with its samples, where these are points of scrambled nets.
+"""How the noise of a pixel's mean falls with the number of its samples, if these are points of scrambled nets.
 
 Let V(m) be the variance of the mean of an aligned block of m = 2^j points of one net, with V(1) = 1. Scrambling is
 nested [Owen 1995, "Randomly permuted (t,m,s)-nets and (t,s)-sequences"], so any two points whose smallest common block
@@ -18,37 +18,38 @@ from typing import NamedTuple
 
 import numpy as np
 
-# The family: V(m) = share / m + (1 - share) fall(m), from independent samples alone (share 1) to none. Most light is in
-# between: steps or smooth light, mixed with light that is found by chance. - Steps of the integrand: fall(m) = m^-3/2.
-# Those along an axis, as at edges of lamps, up to m^-2. But a row of pixels that such an edge cuts at the same place
-# looks as smooth, where this number of samples happens to suit that place. - Smooth integrands: fall(m) = m^-2, and 3/2
-# times as much where m is an odd power of two. Points are nets in pairs of dimensions. 4^k points are one in each of as
-# many squares. Twice as many cut these squares along one axis alone. - Worse than independent samples, as a few pixels
-# may seem to be by chance: fall(m) = m^-rate with rates below 1.
+# The family: V(m) = share / m + (1 - share) fall(m). With share 1, the noise falls as for independent samples. Most
+# light is between 1 and 0: steps or smooth light, mixed with light that is found by chance.
+# - Steps of the integrand: fall(m) = m^-3/2, and up to m^-2 for steps along an axis, as at edges of lamps. Such a step
+#   may also look smooth, if it cuts a row of pixels at the same place and the number of samples suits that place.
+# - Smooth integrands: fall(m) = m^-2, and 3/2 times that if m is an odd power of two. Points are nets in pairs of
+#   dimensions: 4^k points lie one in each of 4^k squares, while 2 4^k points halve these squares along one axis only.
+# - Worse than independent samples, as a few pixels may seem to be by chance: fall(m) = m^-rate with rates below 1.
 _MIXED = np.linspace(1.0, 0.0, 21)
 SHARES = np.concatenate([np.zeros(10), _MIXED, np.zeros(10), _MIXED[1:]])
 RATES = np.concatenate([np.linspace(0.5, 0.95, 10), np.full(21, 1.5), np.linspace(1.55, 2.0, 10), np.full(20, 2.0)])
-ODD = np.concatenate([np.ones(41), np.full(20, 1.5)])  # times as much at odd powers of two
-# The prior of each law: independent samples have the largest, both ends of the rates the smallest. Chosen on renders of
-# seven samplers and five scenes, over 2 to 40 samples; anew with smooth integrands, on ``gpt`` at 8 to 128 samples.
+ODD = np.concatenate([np.ones(41), np.full(20, 1.5)])  # factor at odd powers of two
+# The prior of each law: largest for independent samples, smallest at both ends of the rates. The priors were chosen on
+# renders of five scenes by seven samplers, at 2 to 40 samples, and revised for smooth integrands on ``gpt`` at 8 to 128
+# samples.
 USUAL = np.concatenate([np.full(10, 0.6), [40.0], np.ones(20), np.full(10, 0.5), np.ones(20)])
 USUAL /= USUAL.sum()
 
 
 class Law(NamedTuple):
-    """What ``n`` samples of a pixel show, and the variance of their mean, for each law of the family; both (laws).
+    """The contrast that a pixel shows, and the true variance of its mean, for each law of the family; both (laws).
 
-    Both are divided by the variance that follows from the spread of independent samples.
+    Both are divided by the sample variance of the mean, which assumes that samples are independent.
     """
 
-    seen: np.ndarray  # the expected square of the contrast of data_gen.film.claims
+    seen: np.ndarray  # the expected square of the contrast that data_gen.film.claims defines
     truth: np.ndarray
 
 
 def split(n: int) -> int:
-    """How many of ``n`` > 1 samples are compared with those after them: either part has a third or more.
+    """The number of the first of ``n`` > 1 samples that are compared with the rest; either part has a third or more.
 
-    It is the last power of two before n, or half of that.
+    It is the largest power of two below n, or half of it.
     """
     last = 1 << ((n - 1).bit_length() - 1)
     return last if 2 * (n - last) >= last else last // 2
@@ -80,7 +81,7 @@ def _covariances(begin: int, end: int, net: int) -> np.ndarray:
 
 
 def _in_block(begin: int, end: int, start: int, size: int) -> np.ndarray:
-    """Sums the covariances of those pairs that lie in the aligned block of ``size`` samples from ``start`` on."""
+    """The sum of the covariances of those pairs that lie in the aligned block of ``size`` samples from ``start`` on."""
     begin, end = max(begin, start), min(end, start + size)
     if begin >= end:
         return np.zeros(len(RATES))

@@ -1,7 +1,7 @@
-"""Sums of values that lanes put onto any pixel of the image: light tracing, connections to the camera, Markov chains.
+"""Sums of values that lanes add to any pixel: for light tracing, connections to the camera and Markov chains.
 
-Lanes meet at a pixel in no fixed order, and floating-point sums depend on the order. So the values are added as
-integers, whose sums do not: the same values give the same bits, whatever the threads.
+Lanes reach a pixel in no fixed order, and floating-point sums depend on the order. Sums of integers do not, so the
+values are added as integers: the same values give the same bits, whatever the threads.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import Self
 import drjit as dr
 import mitsuba as mi
 
-# A pixel has one integer for each range of 16 binary exponents, from 2^-48 up to 2^64. A float32 of a range has at most
-# 24 + 16 bits in its units, which leaves room for 2^23 of the largest.
+# A pixel has one integer for each range of 16 binary exponents, from 2^-48 up to 2^64. In the unit of its range, a
+# float32 has at most 24 + 16 bits. So an integer has room for 2^23 of the largest values.
 BINS = 7
 _LOWEST, _BITS = -48, 16
 # Bytes of one pixel and channel.
@@ -29,31 +29,31 @@ class Splats:
     def __init__(self, pixels: int, channels: int):
         self.pixels = pixels
         self.channels = channels
-        # Ordered by pixel, then by range from the smallest up, then by channel. So the channels of a pixel are adjacent
-        # in memory: most of the time of a splat is memory access.
+        # Ordered by pixel, then by range from the smallest up, then by channel. So the channels of a range are adjacent
+        # in memory, where a splat spends most of its time.
         self.sums = dr.zeros(dr.int64_array_t(mi.Float), pixels * BINS * channels)
         self.lost = dr.zeros(mi.UInt32, pixels)
 
     @classmethod
     def on(cls, pixels: int, channels: int, sums: tuple) -> Self:
-        """Splats that continue ``sums``, the pair ``sums`` and ``lost`` of other splats, and change them in place."""
+        """Splats on the arrays (``sums``, ``lost``) of other splats, which are changed in place."""
         splats = cls.__new__(cls)
         splats.pixels, splats.channels, (splats.sums, splats.lost) = pixels, channels, sums
         return splats
 
     def zeros(self) -> tuple:
-        """Sums of nothing, for ``on``."""
+        """Sums that are zero, for ``on``."""
         sums = dr.zeros(type(self.sums), dr.width(self.sums)), dr.zeros(mi.UInt32, self.pixels)
         dr.make_opaque(sums)
         return sums
 
     def take(self, sums: tuple) -> None:
-        """Adds all that others hold."""
+        """Adds the ``sums`` of other splats."""
         self.sums, self.lost = self.sums + sums[0], self.lost + sums[1]
         dr.eval(self.sums, self.lost)
 
     def add(self, pixel: mi.UInt32, components: list, active) -> None:
-        """Adds a value of a Float for each channel to the ``pixel`` of each lane that is ``active``."""
+        """Adds the value of each ``active`` lane to its ``pixel``; ``components`` has a Float for each channel."""
         Int64, Float64 = dr.int64_array_t(mi.Float), dr.float64_array_t(mi.Float)
         good = dr.all([dr.abs(component) < 2.0**64 for component in components])
         dr.scatter_add(self.lost, mi.UInt32(1), pixel, active & ~good)
@@ -66,7 +66,7 @@ class Splats:
             dr.scatter_add(self.sums, digits, place, active & good, mode=dr.ReduceMode.Direct)
 
     def totals(self) -> list:
-        """The sums as Float64, (pixels) a channel."""
+        """The sums: for each channel a Float64 (pixels)."""
         Int64, Float64 = dr.int64_array_t(mi.Float), dr.float64_array_t(mi.Float)
         pixel = dr.arange(mi.UInt32, self.pixels) * BINS
         totals = []

@@ -12,11 +12,11 @@ from data_gen.film.nets import split
 
 
 def statistics(moments: Moments, strands: int, batch: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """How many values (pixels, 1), mean and variance of the mean (pixels, C), of all strands of a pixel together.
+    """The number of values (pixels, 1), their mean and the variance of the mean (pixels, C) or None, over all strands.
 
-    Values are samples, or batches of ``batch`` samples. Unknown must not look like zero: the mean of no sample is NaN,
-    and so is the variance of fewer than two. Chan, Golub, LeVeque 1983, "Algorithms for computing the sample variance",
-    eq. 2.1.
+    Values are samples, or batches of ``batch`` samples. The mean of no value is NaN, and so is the variance of fewer
+    than two: unknown must not look like zero. Chan, Golub, LeVeque 1983, "Algorithms for computing the sample
+    variance", eq. 2.1.
     """
     counts = np.array(moments.count, np.float64).reshape(strands, -1)
     count = counts.sum(axis=0)
@@ -38,7 +38,7 @@ def statistics(moments: Moments, strands: int, batch: int = 0) -> tuple[np.ndarr
 
 
 def contrast(moments: Moments, strands: int, values: np.ndarray) -> np.ndarray:
-    """The contrast (pixels, C) of the later samples of each pixel with the earlier ones, see ``data_gen.film.claims``.
+    """The contrast (pixels, C) between the later and the earlier samples of each pixel, see ``data_gen.film.claims``.
 
     ``values`` is the number of values of each pixel.
     """
@@ -47,7 +47,7 @@ def contrast(moments: Moments, strands: int, values: np.ndarray) -> np.ndarray:
     bits = np.array(earlier.bits, np.int64).reshape(strands, -1)
     numbers, kind = np.unique(values, return_inverse=True)
     splits = np.array([split(max(int(n), 2)) for n in numbers])[kind]
-    # The samples of a strand with numbers below ``splits``: one of the two sets of ``earlier``, or all samples.
+    # Which samples of a strand have numbers below ``splits``: one of the two sets of ``earlier``, or all samples.
     which = np.clip(np.log2(splits).astype(np.int64) + 2 - bits, 0, 2)
     before, n = np.choose(which, counts), counts[-1].sum(axis=0)
     n1 = before.sum(axis=0)

@@ -1,8 +1,7 @@
 """Sums of the inputs of denoisers over the K x K subpixels of each pixel.
 
-The position of a sample in its pixel determines its subpixel. Points are spread evenly over a pixel, so that each
-subpixel has the same number of them where the number of samples is a multiple of K², and the points are the default
-ones.
+The position of a sample in its pixel determines its subpixel. The default points are spread evenly over a pixel: each
+subpixel gets the same number of samples if the number of samples per pixel is a multiple of K².
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ import numpy as np
 from data_gen.film.moments import Strands
 from ngpt.subpixels import FINE, stored
 
-# Per strand and subpixel: a count and double sums of 3 channels, for each of ``FINE``; and for light in ``caustic``
+# Per strand and subpixel: a count and double sums of 3 channels, for each of ``FINE``, and for ``caustic``
 BYTES = 3 * (4 + 3 * 8)
 BYTES_OF_CAUSTIC = 4 + 3 * 8
-# What is put under these names is summed. ``caustic`` is light that is not in what is put as ``primal``.
+# Values put under these names are summed. The light put as ``caustic`` is not in the values put as ``primal``.
 SUMMED = (*FINE, "caustic")
 
 
@@ -47,7 +46,7 @@ class Subpixels:
     def add(self, values: dict, cell: mi.UInt32, strands: Strands, place: mi.UInt32) -> None:
         """Adds the samples of a pass, in the order of their strands; ``cell`` is the subpixel of each sample.
 
-        ``place`` is the number of the strand that each of the ``strands`` is. Samples that are not finite are left out.
+        ``place`` is the number of each of the ``strands`` in the film. Samples that are not finite are left out.
         """
         for name in SUMMED:
             if name in values:
@@ -69,7 +68,8 @@ class Subpixels:
             if active is not True:
                 good &= dr.gather(mi.Bool, active, i)
             to = first + dr.gather(mi.UInt32, cell, i)
-            # A strand has its subpixels to itself, and takes its samples one by one: the order of sums is fixed.
+            # No two strands share a subpixel, and a strand takes its samples one by one: the order of additions is
+            # fixed.
             how = {"active": good, "mode": dr.ReduceMode.NoConflicts}
             for target, component in zip(sums, x, strict=True):
                 dr.scatter_add(target, Float64(component), to, **how)
@@ -81,9 +81,10 @@ class Subpixels:
         dr.eval(dr.while_loop(state, lambda i, n: i < strands.end, one, label="subpixels"), sums, counts)
 
     def develop(self, width: int, height: int) -> dict[str, np.ndarray]:
-        """The layers of ``FINE`` that were put, (K H, K W, 3) float32.
+        """Those layers of ``FINE`` that have values, (K H, K W, 3) float32.
 
-        A subpixel without a sample has the mean of the others; the subpixels of a pixel without a sample are NaN.
+        A subpixel without a sample gets the mean of the pixel's other subpixels. If a pixel has no sample, its
+        subpixels are NaN.
         """
         found = {name: self._means(name) for name in self.sums}
         if "caustic" in found:
@@ -96,7 +97,7 @@ class Subpixels:
         return layers
 
     def _means(self, name: str) -> np.ndarray:
-        """(pixels, K², 3) double precision."""
+        """The means of the subpixels, (pixels, K², 3) in double precision."""
         shape = self.strands, self.pixels, self.k * self.k
         count = np.array(self.counts[name], np.int64).reshape(shape).sum(axis=0)
         sums = [np.array(channel).reshape(shape).sum(axis=0) for channel in self.sums[name]]

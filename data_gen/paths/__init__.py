@@ -1,1 +1,1 @@
-"""What paths are made of: camera samples, random streams, vertices, lights, shifts, features."""
+"""The parts of paths: camera samples, random streams, vertices, lights, shifts, features."""

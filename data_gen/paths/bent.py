@@ -1,9 +1,9 @@
-"""Sampling of mesh lamps whose vertex normals differ from the normals of their faces, with the right density.
+"""Sampling of "bent" lamps with the right density: mesh lamps whose vertex normals differ from the face normals.
 
-Mitsuba turns the density of a point on a mesh into one of directions by the vertex normals, where it samples the point
-and where it is asked for the density (its issue 1952). The solid angle of a face depends on the normal of the face.
-Here such lamps are sampled by the normals of their faces. Where they shine stays as Mitsuba has it: in front of their
-vertex normals. Places in front of only one of the two normals are not sampled.
+Mitsuba uses the vertex normals to convert the density of a point on a mesh into a density of directions, both when it
+samples the point and when it evaluates the density (its issue 1952). But the solid angle of a face depends on the
+normal of the face. Here such lamps are sampled by their face normals. As in Mitsuba, they shine in front of their
+vertex normals. A point is not sampled from places that are in front of only one of its two normals.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from data_gen.scenes.lost import is_bent
 
 @dataclass
 class Point:
-    """A point on a lamp: its place, the ``n`` of its face, the vertex normals there (``front``), and its uv."""
+    """A point on a lamp: its place, the face normal ``n``, the interpolated vertex normal ``front``, and its uv."""
 
     p: mi.Point3f
     n: mi.Normal3f
@@ -44,7 +44,8 @@ class BentLamps:
         count = len(scene.emitters())
         faces = {number: _Faces(mesh) for number, mesh in bent.items()}
         first = np.cumsum([0, *(len(each.upto) for each in faces.values())])
-        # First face, number of faces, 1 / area, and -1 for flipped normals; no faces where an emitter is not bent
+        # Rows: first face, number of faces (0 for an emitter that is not bent), 1 / area, and the side (-1: flipped
+        # normals)
         table = np.zeros((4, count + 1))
         rows = [(1 / each.area, each.side) for each in faces.values()]
         table[:, list(bent)] = [first[:-1], np.diff(first), *zip(*rows, strict=True)]
@@ -61,11 +62,11 @@ class BentLamps:
         return dr.gather(mi.UInt32, self.faces, lamp, active) > 0
 
     def number(self, emitter: mi.EmitterPtr, active: mi.Bool = True) -> mi.UInt32:
-        """The number of that emitter, or one more than the last number if it is none."""
+        """The number of an emitter in the scene, or the number of emitters if ``emitter`` is none."""
         return dr.gather(mi.UInt32, self.indices, dr.reinterpret_array(mi.UInt32, emitter), active)
 
     def point(self, lamp: mi.UInt32, u: mi.Point2f, active: mi.Bool) -> Point:
-        """A point of that bent ``lamp``, uniform by area."""
+        """A point on the bent lamp with number ``lamp``, distributed uniformly by area."""
         first, count = (dr.gather(mi.UInt32, table, lamp, active) for table in (self.first, self.faces))
         last = dr.select(count > 0, first + count - 1, first)
 
@@ -93,7 +94,7 @@ class BentLamps:
     def sample(
         self, x: mi.Interaction3f, chosen: Chosen, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum, mi.Normal3f]:
-        """As ``scene.sample_emitter_direction()``, at the lamp that is ``chosen``, bent or not; and its ``front``."""
+        """As ``scene.sample_emitter_direction()``, for the ``chosen`` lamp, bent or not; and ``Point.front``."""
         emitter = dr.gather(mi.EmitterPtr, self.emitters, chosen.lamp, active)
         bent = active & self.has(chosen.lamp, active)
         light, weight = emitter.sample_direction(x, chosen.u, active & ~bent)
@@ -114,14 +115,14 @@ class BentLamps:
         return light, weight / chosen.p, here.front
 
     def density(self, lamp: mi.UInt32, n: mi.Normal3f, d: mi.Vector3f, dist: mi.Float) -> mi.Float:
-        """The density per solid angle of sampling a bent lamp in direction ``d``, at a point of normal ``n``."""
+        """The density per solid angle of sampling a bent lamp in direction ``d``, at a point with face normal ``n``."""
         cos = -dr.dot(n, d)
         return dr.select(cos > 0, dr.gather(mi.Float, self.per_area, lamp) * dr.square(dist) / cos, 0)
 
     def corrected(self, p: mi.Float, light: mi.DirectionSample3f, si: mi.SurfaceInteraction3f, choice, active):
-        """Density ``p`` of sampling the emitter that was met at ``si``, and the normal there; right for bent lamps too.
+        """The density of sampling the emitter that was met at ``si``, and the normal there, also right for bent lamps.
 
-        ``choice`` (lamp, active) returns the probability of choosing a lamp.
+        ``p`` is Mitsuba's density. ``choice`` (lamp, active) returns the probability of choosing a lamp.
         """
         lamp = self.number(light.emitter, active)
         bent = active & self.has(lamp, active)
@@ -129,7 +130,7 @@ class BentLamps:
         return dr.select(bent, ours, p), mi.Normal3f(dr.select(bent, si.n, light.n))
 
     def emitted(self, emitter: mi.EmitterPtr, here: Point, w: mi.Vector3f, at, active: mi.Bool) -> mi.Spectrum:
-        """Le from a point into direction ``w``, at the time and wavelengths of ``at``."""
+        """Le from a point in direction ``w``, at the time and wavelengths of ``at``."""
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(here.p))
         si.p, si.n, si.uv, si.sh_frame = here.p, here.n, here.uv, mi.Frame3f(here.front)
         si.wi, si.time, si.wavelengths = si.to_local(w), at.time, at.wavelengths
@@ -137,16 +138,16 @@ class BentLamps:
 
 
 def sample_emitter(scene: mi.Scene, bent: BentLamps | None, x: mi.Interaction3f, u: mi.Point2f, active) -> tuple:
-    """``scene.sample_emitter_direction(x, u, False, active)``, also right for ``bent`` lamps; and their ``front``,
-    None in scenes without bent lamps."""
+    """``scene.sample_emitter_direction(x, u, False, active)``, also right for ``bent`` lamps. The third value is
+    ``Point.front``, or None in scenes without bent lamps."""
     if not bent:
         return *scene.sample_emitter_direction(x, u, False, active), None
     return bent.sample(x, Chosen.of_scene(scene, u, active), active)
 
 
 class _Faces:
-    """The triangles of a mesh, (F, 3, ...): ``corners``, vertex normals (``fronts``), ``uvs``; ``upto``, the share of
-    the ``area`` in all faces up to one; ``side``: -1 if normals are flipped."""
+    """The triangles of a mesh: ``corners``, vertex normals (``fronts``) and ``uvs``, each (F, 3, ...); the total
+    ``area``; ``upto`` (F), each face's cumulative share of the area; ``side``, -1 if normals are flipped, else 1."""
 
     def __init__(self, mesh: mi.Mesh):
         params = mi.traverse(mesh)
@@ -162,5 +163,5 @@ class _Faces:
         areas = np.linalg.norm(across, axis=-1) / 2
         self.area = areas.sum()
         self.upto = np.cumsum(areas) / self.area
-        # More than any random number, whatever rounding makes of the sum
+        # Above any random number, even if the sum was rounded down
         self.upto[-1] = 1

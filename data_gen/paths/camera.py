@@ -12,33 +12,33 @@ import numpy as np
 from data_gen.paths.streams import sample_streams
 from data_gen.scenes.cameras import camera_name
 
-# Shifts by half a pixel: with its own place, a sample then has one in each quarter of its pixel.
+# Shifts by half a pixel. A sample and its three shifted copies have one place in each quarter of the pixel.
 QUARTERS = ("x", "y", "xy")
-# As in ``data_gen.passes``: rays of lanes side by side are traced together.
+# Neighbouring lanes whose rays are traced together, as in ``data_gen.passes``
 _PACKET = 16
 # Origin, direction and length of eight rays
 _SEEN_BYTES = 8 * 7 * 4
 
 
 class CameraSamples:
-    """``spp`` camera samples for every pixel of a sensor, from number ``first`` on; or for some pixels.
+    """``spp`` camera samples for each pixel of a sensor, or for some pixels, from sample number ``first`` on.
 
-    Lanes are ordered by blocks of ``block`` samples (default: one block of them all), within a block pixel by pixel,
-    within a pixel by sample; ``spp`` is a multiple of ``block``. Sample i of a pixel is the same for a given seed,
+    Lanes are ordered by blocks of ``block`` samples (default: all samples are one block), within a block by pixel, and
+    within a pixel by sample. ``spp`` is a multiple of ``block``. Sample i of a pixel is the same for a given seed,
     whatever else is rendered with it. ``pixel`` is the number of each lane's pixel, row by row, and ``sample`` the
-    number of its sample. ``random`` holds the random numbers of the paths to come. Cloning it replays them: this
+    number of its sample. ``random`` holds the random numbers for the paths. A clone of it gives the same numbers, which
     correlates a path with its shifted copies.
 
-    ``net`` is the size of the first round of points (``data_gen.paths.streams``), or 0: independent samples. ``some``,
-    UInt32, are the pixels to sample, which may repeat; ``first`` is then a UInt32 with a number for each. Functions
-    that are recorded once (``data_gen.paths.frozen``) may use only the fields of ``DRJIT_STRUCT`` of an argument.
+    ``net`` is the size of the first round of points (``data_gen.paths.streams``), or 0 for independent samples.
+    ``some``, UInt32, lists the pixels to sample, which may repeat; then ``first`` is a UInt32 with a number for each.
+    Functions that are recorded once (``data_gen.paths.frozen``) may use only those fields that ``DRJIT_STRUCT`` names.
     """
 
     DRJIT_STRUCT = dict.fromkeys(
         ("sensor", "pixel", "random", "position", "lens", "time", "wavelength", "seen", "columns", "ends", "steps"),
         object,
     )
-    # (ray, importance) by shift; None where the camera can be asked
+    # shift -> (ray, importance), computed by ``look``; None if the sensor can be called instead
     seen: dict | None = None
 
     def __init__(
@@ -56,7 +56,7 @@ class CameraSamples:
         self._see(sensor)
         self.pixels = int(dr.prod(self.size)) if some is None else dr.width(some)
         lane = dr.arange(mi.UInt32, self.pixels * spp)
-        # Opaque, here and below: a literal would be compiled into the kernel, a new one for every value.
+        # Opaque, here and below: a literal would be compiled into the kernel, so each value would need a new kernel.
         self.block = block or spp
         in_pixel, in_block = (dr.opaque(mi.UInt32, n * self.block) for n in (1, self.pixels))
         pixel = lane % in_block // in_pixel
@@ -74,7 +74,7 @@ class CameraSamples:
 
     @classmethod
     def replayed(cls, sensor: mi.Sensor, seed: int, pixel: mi.UInt32, sample: mi.UInt32, place: mi.Point2f) -> Self:
-        """Sample ``sample`` of each ``pixel``, at another ``place`` on the film; drawn in the kernel that needs it."""
+        """Sample ``sample`` of each ``pixel``, at another ``place`` on the film, drawn in the kernel that uses it."""
         camera = cls.__new__(cls)
         camera.pixel = pixel
         camera._see(sensor)
@@ -103,8 +103,8 @@ class CameraSamples:
     def cells(self, k: int) -> mi.UInt32:
         """Which of the K x K subpixels of its pixel each sample is in, counted row by row.
 
-        It depends on the place in the pixel as it was drawn: ``position`` has fewer digits, since it includes the
-        column.
+        This uses the place in the pixel as it was drawn, because ``position`` includes the column and so has fewer
+        digits.
         """
         place = sample_streams(self.seed, self.pixel, self.sample, int(self.size.x), self.net).next_2d()
         size = dr.opaque(mi.UInt32, k)
@@ -112,7 +112,7 @@ class CameraSamples:
         return y * size + x
 
     def at(self, lanes: mi.UInt32) -> CameraSamples:
-        """The samples of only these ``lanes``, with their rays and random numbers and no other fields."""
+        """The samples of only these ``lanes``. Only the fields for rays and random numbers are valid."""
 
         def gather(value):
             return dr.gather(type(value), value, lanes) if dr.width(value) > 1 else value
@@ -127,9 +127,9 @@ class CameraSamples:
         return some
 
     def rays(self, shift=(0, 0)) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Bool]:
-        """Camera rays displaced by ``shift`` = (x, y) pixels, their importance, and whether they are on the film.
+        """Camera rays displaced by ``shift`` pixels, their importance, and whether they are on the film.
 
-        The ``shift`` is a pair of numbers, one of ``QUARTERS``, or a Vector2f with one for each lane.
+        The ``shift`` is a pair (x, y), one of ``QUARTERS``, or a Vector2f with one shift for each lane.
         """
         p = self.position + self._shift(shift)
         inside = (p.x >= 0) & (p.y >= 0) & (p.x < self.ends.x) & (p.y < self.ends.y)
@@ -150,9 +150,10 @@ class CameraSamples:
         return mi.Vector2f(*(dr.opaque(mi.Float, s) for s in shift))
 
     def look(self, *shifts: tuple[int, int] | str) -> Self:
-        """These samples, for a function that is recorded once and asks for their rays by these ``shifts``.
+        """Prepares these samples for a function that is recorded once and uses their rays displaced by ``shifts``.
 
-        The function cannot ask most cameras, since Dr.Jit 1.5 does not find their arrays. So they are evaluated before.
+        Such a function cannot call most cameras, since Dr.Jit 1.5 does not find their arrays. So the rays are evaluated
+        before.
         """
         if bytes_of_rays(self.sensor):
             rays = [self.rays(shift) for shift in shifts]
@@ -162,15 +163,14 @@ class CameraSamples:
 
 
 def bytes_of_rays(sensor: mi.Sensor) -> int:
-    """The bytes that a lane may take for camera rays that are kept: see ``look``."""
+    """The most bytes that a lane takes for the rays that ``look`` keeps."""
     return 0 if camera_name(sensor) == "perspective" else _SEEN_BYTES
 
 
 def in_packets(lanes: np.ndarray, camera: CameraSamples) -> tuple[np.ndarray, np.ndarray]:
-    """The ``lanes`` with gaps between blocks, and which of them exist: no two blocks of samples then share a packet of
-    rays.
+    """The ``lanes`` with gaps between blocks of samples, so that no two blocks share a packet; and which of them exist.
 
-    The results of a ray depend, in the last bits, on those traced with it; blocks must not depend on their pass.
+    The last bits of a ray's result depend on the rays traced with it, and a block must not depend on its pass.
     """
     _, counts = np.unique(lanes // (camera.pixels * camera.block), return_counts=True)
     padded = -(-counts // _PACKET) * _PACKET

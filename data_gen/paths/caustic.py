@@ -1,4 +1,4 @@
-"""The layer ``caustic`` has the light of paths that leave a widely scattering surface and later a sharp one.
+"""The layer ``caustic``: the light of paths that leave a widely scattering surface and later a sharp one.
 
 Such paths are rare and bright, and cannot be shifted well: a shifted copy meets another point of the glass, and from
 there it misses the lamp. So their light goes into a separate layer, for methods that need no differences.
@@ -6,9 +6,9 @@ there it misses the lamp. So their light goes into a separate layer, for methods
     rough   the path has scattered smoothly at a connectable vertex
     late    and has later left a vertex by a mirror, glass or sharp gloss: its light belongs to the layer
 
-Both are properties of the path, not of its shift. So primal - caustic is the image of a subset of the paths, and the
-differences belong to this image: a path of the layer counts 0 in them, whether it is a base path or a shifted copy.
-Where either path of a pair is late, the shift is rejected from both sides, so this is exact.
+Both are properties of a path, not of its shift. So primal - caustic is the image of a subset of the paths, and the
+differences are those of this image: a path of the layer counts 0 in them, whether it is a base path or a shifted copy.
+This is exact, because the shift is rejected from both sides where either path of a pair is late.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from data_gen.paths.vertex import DELTA, SMOOTH
 
 
 def classes(rough: mi.Bool, late: mi.Bool, found: mi.Bool, kind: mi.UInt32, connectable: mi.Bool) -> tuple:
-    """``rough`` and ``late`` behind a vertex that is ``connectable`` or not, left by an event of that ``kind``.
+    """``rough`` and ``late`` after a vertex; ``kind`` is the kind of event by which the path left it.
 
-    Where no direction was ``found``, the path ends, and nothing changes for its copies.
+    Where no direction was ``found`` the path ends, and both stay as they are.
     """
     smooth = found & (kind == SMOOTH)
     sharp = (found & (kind == DELTA)) | (smooth & ~connectable)
@@ -31,15 +31,15 @@ def classes(rough: mi.Bool, late: mi.Bool, found: mi.Bool, kind: mi.UInt32, conn
 
 def lit_late(rough: mi.Bool, late: mi.Bool, connectable: mi.Bool) -> mi.Bool:
     """Whether light from a sampled emitter, scattered at this vertex, belongs to the layer."""
-    # As if its direction had been sampled by a smooth event: both techniques divide the light alike.
+    # The same as if a smooth event had sampled the direction: both techniques must split the light alike.
     return late | (rough & ~connectable)
 
 
 def ends_late(smooth: mi.Bool, connectable: mi.Bool, sharp_next: mi.Bool) -> mi.Bool:
-    """Whether all light from behind the next vertex belongs to the layer: it has no hole, and nothing that scatters
-    widely, and is left late whatever is sampled there.
+    """Whether all light from behind the next vertex belongs to the layer.
 
-    So there is no use in a shifted copy: it is rejected a step before one of the two is late, again from both sides.
+    It does if that vertex has no hole and does not scatter widely: then the path is late after any event there. A
+    shifted copy would be of no use, so it is rejected one step before a path is late, again from both sides.
     """
     return smooth & connectable & sharp_next
 

@@ -1,13 +1,14 @@
-"""Segments through media whose density varies: null collisions, and how a shift maps their list.
+"""Segments through media whose density varies (grids): null collisions, and how a shift maps them.
 
-In a grid the transmittance can only be estimated. So a path holds not only its vertices, but also the null collisions
-on its way, which happen at the density of the majorant μ and change nothing. In this larger path space all densities
-are known. A list of n null collisions with a vertex at the end has the density exp(-M) ∏ σn(x_i) / μ · σ, M the
-majorant's optical depth of the segment, only in grids and the integrand has σs in place of σ, and has colours.
-Collisions are exponential steps along the optical depth m of the majorant, which uses the same units in all grids and
-gaps that the segment crosses. A replay takes the same steps and random numbers: r = 1. A reconnection takes the list of
-the base path, m_i' = m_i M' / M, with the Jacobian (M' / M)^n; its steps are generated again from the base path's key,
-so only n has to be kept. Homogeneous media use one exponential number for each segment, and no list.
+In a grid the transmittance can only be estimated. So a path consists not only of its vertices, but also of the null
+collisions on its way. They occur at the rate of the majorant μ and change nothing. In this larger path space all
+densities are known. Let M be the majorant's optical depth of the segment, in its grids only. Then n null collisions
+with a vertex at the end have the density exp(-M) ∏ σn(x_i) / μ · σ. The integrand has σs in place of σ, and one value
+for each colour. The distances between collisions, in optical depths m of the majorant, are exponentially distributed; m
+continues through all grids and gaps that the segment crosses. A replay takes the same steps and random numbers: r = 1.
+A reconnection moves the collisions of the base path, m_i' = m_i M' / M, with the Jacobian (M' / M)^n. The steps are
+generated again from the base path's key, so only n has to be kept. Homogeneous media use one exponential number for
+each segment, and no null collisions.
 
 [Miller et al. 2019, "A null-scattering path integral formulation of light transport"; docs/samplers/media.md]
 """
@@ -24,7 +25,7 @@ from data_gen.paths.media import beyond, end_of, onward, pick
 
 @dataclass
 class Collisions:
-    key: mi.UInt32  # of the random numbers that place them
+    key: mi.UInt32  # of the random numbers that determine their places
     n: mi.UInt32
     M: mi.Float
     N_c: mi.Float  # the product of σn / μ in colour c
@@ -36,7 +37,7 @@ def number(key: mi.UInt32, i: mi.UInt32) -> mi.Float:
 
 
 def step(key: mi.UInt32, i: mi.UInt32) -> mi.Float:
-    """The optical depth between its collision ``i`` and the one before."""
+    """The majorant's optical depth between collision ``i`` of a segment and the one before."""
     return -dr.log(1 - number(key, 2 * i))
 
 
@@ -45,7 +46,7 @@ def is_real(key: mi.UInt32, i: mi.UInt32, probability: mi.Float) -> mi.Bool:
 
 
 def extent(medium: mi.MediumPtr, ray: mi.Ray3f) -> tuple[mi.Spectrum, mi.Bool, mi.Float, mi.Float]:
-    """μ of ``medium``, whether it is a grid, and from where to where it fills a ray."""
+    """μ of ``medium``, whether it is a grid, and the distances at which the ray enters and leaves it."""
     exists = medium != None  # noqa: E711 - a comparison of arrays of pointers
     where = dr.zeros(mi.MediumInteraction3f, dr.width(ray.o))
     where.p, where.wavelengths = ray.o, ray.wavelengths
@@ -58,13 +59,13 @@ def extent(medium: mi.MediumPtr, ray: mi.Ray3f) -> tuple[mi.Spectrum, mi.Bool, m
 
 @dataclass
 class Stop:
-    """How far a path goes in a piece of a ray, up to a collision of the majorant in a grid or to the end."""
+    """Where a path stops on a piece of a ray: at a collision of the majorant in a grid, or at the end of the piece."""
 
     t: mi.Float
     grid: mi.Bool  # whether the medium is one
     collides: mi.Bool
-    passed: mi.Float  # the majorant's optical depth up to there, in grids
-    null: mi.Spectrum  # σn / σn_c of a collision that is null
+    passed: mi.Float  # the majorant's optical depth up to ``t``, in grids
+    null: mi.Spectrum  # σn / σn_c at ``t``, if the collision is null
     real: mi.Spectrum  # the probability that it is real
 
 
@@ -91,7 +92,7 @@ def null_and_real(medium, ray, t, μ_c, active) -> tuple[mi.Spectrum, mi.Spectru
 
 @dr.syntax
 def fly_on(passes, trace, ray, medium, *, channel, u, key, active):
-    """As ``segments.fly_on()``, where there are grids; returns the same, its null collisions, and ∏ σn / σn_c."""
+    """As ``segments.fly_on()``, for scenes with grids. Returns the same, then the null collisions, and ∏ σn / σn_c."""
     lanes = dr.width(ray.o)
     ray, medium = mi.Ray3f(ray), mi.MediumPtr(medium)
     left, ahead, n = -dr.log(1 - u), step(key, mi.UInt32(0)), mi.UInt32(0)
@@ -109,7 +110,7 @@ def fly_on(passes, trace, ray, medium, *, channel, u, key, active):
         collision = dr.select(μ_c > 0, t + dr.select(grid, ahead, left) / μ_c, dr.inf)
         collides = collision < end
         stop = dr.select(collides, collision, end)
-        # Infinitely long only where there is nothing
+        # A piece is infinite only where μ is 0
         τ += mi.Spectrum(dr.select(grid | (μ <= 0), 0, μ * (stop - t)))
         passed = dr.select(μ_c > 0, μ_c * dr.maximum(stop - t, 0), 0)
         M += dr.select(grid, passed, 0)
@@ -136,9 +137,9 @@ def fly_on(passes, trace, ray, medium, *, channel, u, key, active):
 
 @dr.syntax
 def cross(passes, trace, ray, medium, reach, *, channel, key, scale, most, target, active):
-    """As ``segments.cross()``, where there are grids, with ``most`` collisions at most, their steps ``scale`` long.
+    """As ``segments.cross()``, for scenes with grids: at most ``most`` collisions, with steps multiplied by ``scale``.
 
-    Returns the same, where τ is the optical depth of homogeneous media, and also M and ∏ σn / μ_c.
+    Returns the same, where τ is the optical depth of homogeneous media only, then M and ∏ σn / μ_c.
     """
     lanes = dr.width(ray.o)
     ray, medium, reach = mi.Ray3f(ray), mi.MediumPtr(medium), mi.Float(reach)
@@ -166,7 +167,7 @@ def cross(passes, trace, ray, medium, reach, *, channel, key, scale, most, targe
         ahead = dr.select(collides, scale * step(key, n), ahead)
         fresh = ~collides & hit.is_valid() & passes(hit.shape)
         crossing &= collides | fresh
-        # Nothing comes through what is opaque to the majorant.
+        # Where N is 0 the transmittance is 0.
         crossing &= dr.max(N) > 0
         if crossing & fresh:
             ray, medium, reach = onward(ray, hit, medium, reach, target)
@@ -176,10 +177,12 @@ def cross(passes, trace, ray, medium, reach, *, channel, key, scale, most, targe
 def rescale(
     passes, trace, ray, medium, reach, base: Collisions, *, channel, active, target=None, to_surface: bool = False
 ) -> tuple:
-    """Maps the null collisions of a ``base`` segment to another one, to its end or ``to_surface``: m_i' = m_i M' / M.
+    """Maps the null collisions of a ``base`` segment to another segment: m_i' = m_i M' / M.
 
-    Returns τ of homogeneous media, the hit, the last piece of the ray, the medium there, and the integrand of the list
-    times the Jacobian, over the density of the base path's list. Its colour c, the ratio of the densities, comes last.
+    Unless ``to_surface`` is set, a segment that ends at a surface is blocked, and nothing is mapped. Returns τ of
+    homogeneous media, the hit, the last piece of the ray, the medium there, and the integrand of the mapped collisions
+    times the Jacobian, divided by the density of the base collisions. The last value is colour c of this quotient,
+    which is the ratio of the densities.
     """
     way = {"channel": channel, "key": base.key, "target": target}
     # First without collisions, for M'

@@ -15,8 +15,8 @@ from data_gen.scenes.cameras import camera_name
 
 @dataclass
 class ThinLens:
-    """Mitsuba's camera ``thinlens`` in our terms: Dr.Jit 1.5 does not find its arrays, and cannot freeze a function
-    that calls it."""
+    """Computes what Mitsuba's camera ``thinlens`` does. Dr.Jit 1.5 does not find the arrays of that camera, and cannot
+    freeze a function that calls it."""
 
     radius: mi.Float
     focus: mi.Float
@@ -35,12 +35,12 @@ class ThinLens:
         return cls(radius, focus, mi.Vector2f(sx, sy), mi.Vector2f(x, y))
 
     def on_lens(self, lens: mi.Point2f) -> mi.Point3f:
-        """The place ``lens`` in the camera's space."""
+        """The point in the camera's space of ``lens``, a place in [0, 1]²."""
         disk = mi.warp.square_to_uniform_disk_concentric(lens) * self.radius
         return mi.Point3f(disk.x, disk.y, 0)
 
     def toward(self, to_world, si: mi.Interaction3f, lens: mi.Point2f, size: mi.Vector2f) -> mi.DirectionSample3f:
-        """``sample_direction`` of the camera, as far as ``Eye`` uses it."""
+        """The fields of the camera's ``sample_direction`` that ``Eye`` uses."""
         place = self.on_lens(lens)
         d = mi.Vector3f(to_world.inverse() @ si.p - place)
         focused = place + d * (self.focus / d.z)
@@ -69,14 +69,14 @@ class Eye:
     lens: mi.Point2f  # place on the lens, in [0, 1]²
     time: mi.Float | float
     wavelength: mi.Float  # a random number
-    near: mi.Float  # along its axis, where what it sees begins,
-    far: mi.Float  # and ends
+    near: mi.Float  # its near plane, as a distance along its axis
+    far: mi.Float  # its far plane
     area: mi.Float  # of the film, at distance 1
-    thin: ThinLens | None = None  # for such a camera; None where it can be asked
+    thin: ThinLens | None = None  # for a thin lens; None if the sensor can be called
 
     @classmethod
     def of(cls, camera: CameraSamples) -> Eye:
-        """The eye of these camera samples, for a perspective camera or a thin lens."""
+        """The eye for these camera samples. The camera is perspective or a thin lens."""
         sensor = camera.sensor
         numbers = (sensor.near_clip(), sensor.far_clip(), film_area(sensor))
         planes_and_area = (dr.opaque(mi.Float, number) for number in numbers)
@@ -93,23 +93,24 @@ class Eye:
         return int(dr.prod(self.size))
 
     def place_on_lens(self, random: Any) -> mi.Point2f:
-        """A point on the lens for a path that comes from elsewhere, drawn from ``random`` if there is a lens."""
+        """A point on the lens for a path that starts at a light, drawn from ``random`` if there is a lens."""
         return random.next_2d() if self.sensor.needs_aperture_sample() else mi.Point2f(0.5)
 
     def ray(self, uv: mi.Point2f, lens: mi.Point2f) -> mi.Ray3f:
-        """Through the place ``uv`` on the film, in pixels, and the place ``lens`` on the lens."""
+        """The camera ray through the place ``uv`` on the film, in pixels, and the place ``lens`` on the lens."""
         if self.thin:
             where, planes = uv / mi.Vector2f(self.size), {"near": self.near, "far": self.far}
             return self.thin.ray(self.sensor.world_transform(), where, lens, **planes, time=self.time)
         return self.sensor.sample_ray(self.time, self.wavelength, uv / mi.Vector2f(self.size), lens)[0]
 
     def toward(self, si: mi.Interaction3f, lens: mi.Point2f, active: mi.Bool | bool = True) -> tuple:
-        """From ``si`` to the place ``lens`` on the lens: a DirectionSample3f, and the camera's W / distance².
+        """Connects ``si`` to the place ``lens`` on the lens: a DirectionSample3f, and the camera's W / distance².
 
-        Its ``uv`` is the place on the film, in pixels. Its ``p`` is the point on the near plane where the camera ray
-        begins. Its ``pdf`` is 1 if ``si`` is in the camera's view, else 0; occlusion does not count.
-        W = 1 / (A cos³), with A the film's area at distance 1. Mitsuba 3.9's own importance is 0 in the part of the
-        film that an offset of the principal point adds, and its thin lens sees things before the near plane.
+        ``uv`` of the sample is the place on the film, in pixels. ``p`` is the point on the near plane where the camera
+        ray begins. ``pdf`` is 1 if ``si`` is in the camera's view, else 0; occlusion is ignored. W = 1 / (A cos³), with
+        A the film's area at distance 1. Mitsuba's own values are not used: in version 3.9 the importance is 0 in the
+        part of the film that an offset of the principal point adds, and the thin lens sees things before the near
+        plane.
         """
         if self.thin:
             to = self.thin.toward(self.sensor.world_transform(), si, lens, mi.Vector2f(self.size))

@@ -8,7 +8,7 @@ import mitsuba as mi
 from data_gen.paths.spectrum import reflectance_to_rgb
 from data_gen.scenes.facts import media_of, shapes_of
 
-# A longer chain of mirrors is cut: the features of what it shows are unknown then, as for a path that escapes.
+# A longer chain of mirrors is cut: its features are zero, as for a path that escapes.
 MAX_SPECULAR_VERTICES = 32
 
 # Steps of a ray through a medium whose density varies
@@ -21,13 +21,13 @@ _TURNS_NORMALS = ("BumpMap", "NormalMap")
 def features(scene, sensor, sampler, ray: mi.RayDifferential3f) -> dict[str, mi.Color3f | mi.Float]:
     """One sample of every feature layer along a camera ray, in the conventions of the gradient stack.
 
-    ``albedo``  reflectance in [0, 1], tinted by the mirrors and the glass it is seen through; media dim it, and add
-                their own albedo by as much as they dim
+    ``albedo``  reflectance in [0, 1], tinted by the mirrors and glass on the way; media dim it, and add their own
+                albedo in proportion to the light that they remove
     ``normal``  unit shading normal in camera space, +x right, +y up, +z toward the viewer, on the side seen
     ``depth``   path length from the camera, not from its near plane, in world units
     All are zero where the path escapes, except the albedo of media. Normal and depth describe the surface behind media.
-    Bump and normal maps count if they are a shape's outermost material; Mitsuba does not expose maps inside other
-    materials (``twosided``, ``mask``).
+    Bump and normal maps change the normal if they are a shape's outermost material. Mitsuba does not expose maps inside
+    other materials (``twosided``, ``mask``).
     """
     si, last, depth, reflectance, scattered = first_nonspecular_vertex(
         scene, sampler, ray, *in_media(scene, sensor.get_medium())
@@ -37,7 +37,7 @@ def features(scene, sensor, sampler, ray: mi.RayDifferential3f) -> dict[str, mi.
     if any(shape.bsdf() is not None and shape.bsdf().class_name() in _TURNS_NORMALS for shape in shapes_of(scene)):
         aov = mi.load_dict({"type": "aov", "aovs": "normal:sh_normal"})
         normal = mi.Normal3f(aov.sample(scene, sampler.clone(), mi.RayDifferential3f(last), active=found)[2])
-    # The shading frame has no side; the layer has the normal on the side of the incoming ray.
+    # The shading normal may point to either side; the layer has the one on the side of the incoming ray.
     normal = dr.mulsign(normal, si.wi.z)
     # A Mitsuba camera looks along its +z with +x to the left of the image.
     right, up, back = (sign * axis for sign, axis in zip((-1, 1, -1), axes(sensor), strict=True))
@@ -59,16 +59,16 @@ def axes(sensor) -> list[mi.Vector3f]:
 
 
 def before_near_plane(sensor, ray) -> mi.Float:
-    """How far from a camera, or from the plane of an orthographic one, its ``ray`` begins: on its near plane."""
+    """The distance along ``ray`` from the camera (orthographic: its plane) to the near plane, where the ray begins."""
     if not isinstance(sensor, mi.ProjectiveCamera):
         return mi.Float(0)
-    # For an orthographic camera near_clip counts in units of to_world, which may be scaled.
+    # near_clip of an orthographic camera is in units of to_world, which may be scaled.
     along = dr.norm(sensor.world_transform() @ mi.Vector3f(0, 0, 1))
     return sensor.near_clip() * along / dr.dot(ray.d, axes(sensor)[2])
 
 
 def in_media(scene, medium) -> tuple[mi.MediumPtr | None, int]:
-    """The ``medium`` that the camera is in, and the steps to take in media: 0 where the scene has none."""
+    """The ``medium`` of the camera, and the number of steps through a medium: None and 0 if the scene has no media."""
     media = media_of(scene)
     if not media:
         return None, 0
@@ -78,14 +78,14 @@ def in_media(scene, medium) -> tuple[mi.MediumPtr | None, int]:
 
 @dr.syntax
 def through_medium(medium, ray, length, sampler, steps: int):
-    """The transmittance of a ``medium`` (none: 1) along ``ray`` up to ``length``, and the albedo it scatters there.
+    """The transmittance of a ``medium`` (none: 1) along ``ray`` up to ``length``, and the albedo that the medium adds.
 
-    The albedo is the single-scattering albedo, weighted by the light that the medium takes on each of the ``steps``.
+    That albedo is the single-scattering albedo, weighted by the share of light that the medium removes in each step.
     """
     transmittance = mi.unpolarized_spectrum(mi.Spectrum(1))
     albedo = mi.unpolarized_spectrum(mi.Spectrum(0))
     spectrum = type(albedo)
-    # Where the density of a grid is not 0; all of a ray in a medium without bounds.
+    # From ``first`` to ``end`` the ray is in the box of a grid; a medium without a box fills the whole ray.
     inside = medium != None  # noqa: E711 - a comparison of arrays of pointers
     hit, first, end = medium.intersect_aabb(ray)
     first, end = dr.maximum(first, 0), dr.minimum(end, length)
@@ -132,16 +132,16 @@ def first_nonspecular_vertex(scene, sampler, ray, medium=None, steps=0):
         si = scene.ray_intersect(ray, mi.RayFlags.All, vertices == 0)
         depth += si.t
         if dr.hint(steps > 0, mode="scalar"):
-            # Escaped paths are far away, but at a distance that float32 can hold.
+            # For a path that escapes: far away, but a distance that float32 can hold.
             length = dr.minimum(dr.minimum(si.t, ray.maxt), 1e9)
             passed, albedo = through_medium(medium, ray, length, sampler, steps)
             scattered = type(scattered)(scattered + tint * albedo)
             tint *= passed
         bsdf = si.bsdf(mi.RayDifferential3f(ray))
         flags = bsdf.flags()
-        # eval_diffuse_reflectance() is free of noise, but means nothing without a diffuse component. The weight of a
-        # sampled direction has the directional albedo as its mean, for any material; η² takes out that radiance, not
-        # power, changes where it is refracted.
+        # eval_diffuse_reflectance() is free of noise, but means nothing without a diffuse component. For any material
+        # the mean weight of a sampled direction is the directional albedo. The factor η² undoes the change of radiance
+        # at a refraction, which is no loss of power.
         diffuse = mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection)
         sampled = si.is_valid() & (~diffuse | mi.has_flag(flags, mi.BSDFFlags.Null))
         context = mi.BSDFContext()

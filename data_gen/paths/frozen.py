@@ -1,8 +1,8 @@
-"""Functions whose kernels are recorded once in a render, and launched again from then on.
+"""Functions whose kernels are recorded once in a render, and only launched in later calls.
 
 Python and Dr.Jit take a second to record the kernel of ``gpt``, however few its samples are, and a pass of photons has
-few camera samples and many kernels. A function is recorded again where it meets arrays of other types, where two of its
-arrays happen to be of one width, or of width 1, and where scenes come into the process or leave it.
+few camera samples and many kernels. A function is recorded again if its arrays have other types, if the widths of two
+arrays become equal or a width becomes 1, and if a scene is loaded or freed in the process.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ _LOG = logging.getLogger(f"ngpt.{__name__}")
 
 
 class Frozen:
-    """Calls functions: ``frozen(f, *args)`` is ``f(*args)``, whose kernels are recorded when the types are new.
+    """Calls functions: ``frozen(f, *args)`` returns ``f(*args)``, and records the kernels of f if the types are new.
 
-    All arrays that f uses are among its arguments, or belong to the ``scene``, or to attributes of the ``owners``. All
-    else that f uses does not change while this object lives. Within f no width is a number. Where f cannot be recorded
-    it is called as it is, and a warning says so; in spectral variants it always is.
+    All arrays that f uses must be among its arguments, or belong to the ``scene`` or to attributes of the ``owners``.
+    All else that f uses must not change while this object lives. f must not use the width of an array as a number. If f
+    cannot be recorded, it is called without recording, and a warning says so. In spectral variants it is never
+    recorded.
     """
 
     def __init__(self, scene: mi.Scene, *owners: Any):
@@ -35,22 +36,23 @@ class Frozen:
         self.settle = _Recorded(_nothing, self.state)
 
     def __call__(self, f: Callable, *args: Any, sums: Callable | None = None) -> Any:
-        """``sums`` makes the last argument, which f adds to.
+        """``sums``, if given, makes the last argument of f, to which f adds.
 
-        A call that fails may have added already: the next try has others.
+        A call that fails may have added already, so each try gets new sums.
         """
 
         def tried(f: Callable) -> Any:
             return f(*args, *([sums()] if sums else []))
 
         if mi.is_spectral:
-            # Dr.Jit does not find Mitsuba's tables of colours, and would be asked three times in vain.
+            # Dr.Jit does not find Mitsuba's tables of colours, so all three tries would fail.
             return tried(evaluated(f))
         try:
             if f not in self.functions:
                 self.functions[f] = _Recorded(as_wide_as_arguments(f), self.state)
-                # Dr.Jit makes an array of each number that it meets, and one that belongs to several objects becomes
-                # several arrays, which are one again from the next call on. What does nothing is recorded for that.
+                # Dr.Jit turns each number that it finds into an array. A number that belongs to several objects becomes
+                # several arrays in the first call and a single one in the next, which would have f recorded again. So a
+                # function that does nothing is called first.
                 tried(self.settle)
             return tried(self.functions[f])
         except RuntimeError as error:
@@ -69,17 +71,17 @@ class Frozen:
 
 
 class _Recorded:
-    """A function that ``dr.freeze`` records, with arrays that it uses beside its arguments.
+    """A function that ``dr.freeze`` records. ``state`` holds the arrays that it uses besides its arguments.
 
-    ``dr.freeze`` makes a class, which only Python's collector of reference cycles frees. Until then everything that the
-    class refers to would live. Scenes of earlier renders make kernels larger, and freeing them has functions recorded
-    again.
+    ``dr.freeze`` makes a class, which only Python's collector of reference cycles frees. It would keep alive everything
+    it refers to until then, so it has only a weak reference to this object. Scenes of earlier renders make kernels
+    larger, and freeing them has functions recorded again.
     """
 
     def __init__(self, f: Callable, state: list):
         self.f, self.state, this = f, state, weakref.ref(self)
-        # Maps with as many vertices as the image has pixels, and similar cases, are recorded once more: no reason to
-        # warn.
+        # Some functions are recorded a few times, for example for a map with exactly as many vertices as the image has
+        # pixels. This is no reason to warn.
         options = {"warn_after": 1 << 30, "auto_opaque": False, "state_fn": lambda *_: this().state}
         self.launch = dr.freeze(lambda *args: this().f(*args), **options)
 
@@ -92,13 +94,14 @@ def _nothing(*args: Any) -> None:
 
 
 def _of_each_kind() -> list:
-    """A pointer of each type: a call goes through all objects of its kind in the process, and Dr.Jit looks at them only
-    if the function is given such a pointer. A material that no shape has would keep the function from being recorded.
+    """A pointer of each type. A virtual call goes through all objects of its type in the process, but Dr.Jit finds them
+    only if the function has such a pointer. Otherwise a material that no shape uses would keep the function from being
+    recorded.
     """
     return [dr.zeros(getattr(mi, name)) for name in dir(mi) if name.endswith("Ptr")]
 
 
-# Functions that a warning has been given for
+# Functions for which a warning was given
 _SAID: set[str] = set()
 
 
@@ -106,19 +109,20 @@ def _say(f: Callable, reason: str) -> None:
     name = getattr(getattr(f, "func", f), "__qualname__", repr(f))
     if name not in _SAID:
         _SAID.add(name)
-        _LOG.warning("%s is recorded anew in each pass, which may take a second of each: %s", name, reason)
+        _LOG.warning("%s is recorded again in each pass, which may take a second each time: %s", name, reason)
 
 
 def _wake_lamps(scene: mi.Scene) -> None:
-    """Makes all lamps in the process build the tables that they are sampled by, such as the distribution of a texture.
-    Lamps build them on first use, and a call uses all lamps. Dr.Jit cannot record a function in which that happens.
+    """Makes all lamps in the process build the tables by which they are sampled, such as the distribution of a texture.
+    Lamps build them on first use, a virtual call uses all lamps, and Dr.Jit cannot record a function in which tables
+    are built.
     """
     if scene.emitters():
         scene.emitters_dr().sample_direction(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5), True)
 
 
 def as_wide_as_arguments(f: Callable) -> Callable:
-    """f, with constants among its results that depend on an argument: else Dr.Jit 1.5 keeps the width of the first."""
+    """f with constant results made to depend on an argument. Dr.Jit 1.5 would keep their width from the first call."""
 
     def widened(*args: Any) -> Any:
         by_width = {dr.width(leaf): leaf for leaf in leaves(args)}
@@ -128,7 +132,7 @@ def as_wide_as_arguments(f: Callable) -> Callable:
             if leaf.state != dr.VarState.Literal or width == 1:
                 return leaf
             if width not in by_width:
-                raise RuntimeError(f"a constant among the results, {width} wide as no argument is")
+                raise RuntimeError(f"a constant among the results has width {width}, and no argument has that width")
             return dr.select(_always(by_width[width]), leaf, dr.zeros(type(leaf)))
 
         return mapped(depending, f(*args))
@@ -137,13 +141,13 @@ def as_wide_as_arguments(f: Callable) -> Callable:
 
 
 def _always(leaf: Any) -> Any:
-    """True, but Dr.Jit does not know that it is constant."""
+    """True in each lane, in a form that Dr.Jit does not recognise as a constant."""
     mask = leaf if dr.is_mask_v(leaf) else leaf == 0
     return (dr.select(mask, dr.uint32_array_t(mask)(1), 2)) > 0
 
 
 def mapped(f: Callable, value: Any) -> Any:
-    """A tree whose flat arrays are what f makes of them; objects in it are changed in place."""
+    """A copy of a tree with f applied to its flat arrays. Objects in the tree are changed in place."""
     if isinstance(value, list | tuple):
         return type(value)(mapped(f, part) for part in value)
     if isinstance(value, dict):
@@ -184,12 +188,12 @@ def fields(value: Any) -> Iterable[str]:
 
 
 def call(f: Callable, *args: Any) -> Any:
-    """Calls ``f``, which is recorded each time."""
+    """Calls ``f`` without ``Frozen``: it is recorded each time."""
     return f(*args)
 
 
 def evaluated(f: Callable) -> Callable:
-    """f, with its results evaluated at once, as frozen functions do it: each use of lazy ones would trace all paths."""
+    """f with its results evaluated at once, as ``Frozen`` does. Each use of a lazy result would trace all paths."""
 
     def computed(*args: Any) -> Any:
         result = f(*args)
@@ -200,10 +204,10 @@ def evaluated(f: Callable) -> Callable:
 
 
 def arrays(owner: Any) -> list:
-    """The arrays in the attributes of an object, and of objects there, which become copies.
+    """Replaces the arrays in the attributes of an object, and of objects there, by copies, and returns the copies.
 
-    Kernels depend on how the memory of arrays is aligned, which varies for arrays of NumPy: kernels would be compiled
-    again.
+    Kernels depend on the alignment of their arrays, which varies for arrays of NumPy. Without copies kernels would be
+    compiled again.
     """
     found: list = []
     for name, value in list(vars(owner).items()) if hasattr(owner, "__dict__") else ():

@@ -1,9 +1,9 @@
-"""Holes: surfaces that let a part of the light go straight on, as masks and thin panes do.
+"""Holes: surfaces that let a part of the light pass straight through, such as masks and thin panes.
 
 A path that meets a hole passes it by chance, at a vertex of its own (``vertex.NULL``). A ray toward an emitter goes
-straight on and is weakened by T, as in Mitsuba's ``volpath``. Both techniques find the same light, so holes leave the
-density unchanged with which the direction through them was sampled. Each hole counts in ``max_depth``, as in ``path``,
-whichever technique passes it.
+straight on and is weakened by T, as in Mitsuba's ``volpath``. Both techniques find the same light, so the density of a
+direction is the same behind a hole as before it. Each hole counts in ``max_depth``, as in ``path``, whichever technique
+passes it.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from data_gen.paths.vertex import NULL, SMOOTH, ByMaterial, dr_number
 from data_gen.scenes.facts import shapes_of
 from data_gen.scenes.integrators import objects_in
 
-# Materials that return the share of light that goes straight through, if the materials within them do
+# Materials that give the share of light that goes straight through, if the materials within them do
 _KNOWN = ("MaskBSDF", "Null", "ThinDielectric", "BlendBSDF")
 
 
 @dataclass
 class _Straight:
-    """Where a path was before the holes that it has passed."""
+    """The point ``o`` from which a path went straight on, through any holes."""
 
     o: mi.Point3f
 
     def seen_by(self, x: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
-        """``x`` moved to where the path was, for densities of sampling emitters."""
+        """``x`` moved to ``o``, to evaluate the density of sampling an emitter from there."""
         there = mi.SurfaceInteraction3f(x)
         there.p = mi.Point3f(self.o)
         return there
@@ -37,8 +37,8 @@ class _Straight:
 
 @dataclass
 class Aim(_Straight):
-    """The point from which a path has come straight on, and the density ``p`` of its direction there. ``p`` is infinite
-    where emitters cannot be sampled: from the camera, and behind mirrors.
+    """Adds the density ``p`` with which the direction from ``o`` was sampled. ``p`` is infinite where emitters cannot
+    be sampled: at the camera and at mirrors.
     """
 
     p: mi.Float
@@ -48,7 +48,7 @@ class Aim(_Straight):
         return cls(mi.Point3f(o), dr.full(mi.Float, dr.inf, dr.width(o)))
 
     def behind(self, passed: mi.Bool, x: mi.SurfaceInteraction3f, kind: mi.UInt32, p: mi.Float) -> Aim:
-        """Behind vertex ``x``, left by an event of that ``kind`` and density, which may have ``passed`` a hole."""
+        """The aim behind vertex ``x``. The event there had this ``kind`` and density ``p``, or ``passed`` a hole."""
         return Aim(
             dr.select(passed, self.o, x.p), dr.select(passed, self.p, dr.select(kind == SMOOTH, p, mi.Float(dr.inf)))
         )
@@ -56,12 +56,12 @@ class Aim(_Straight):
 
 @dataclass
 class Edge(_Straight):
-    """An edge of a path from either end, which may lead through several holes."""
+    """An edge of a path from the camera or from a lamp. It may lead through several holes."""
 
-    first: mi.Bool  # it begins at the camera or at a lamp
+    first: mi.Bool  # whether it begins at the camera or at a lamp
 
     def behind(self, passed: mi.Bool, x: mi.SurfaceInteraction3f) -> Edge:
-        """Behind vertex ``x``, where the path may have ``passed`` a hole."""
+        """The edge behind vertex ``x``. ``passed``: the path has passed a hole there."""
         return Edge(dr.select(passed, self.o, x.p), self.first & passed)
 
     def length2(self, x: mi.SurfaceInteraction3f) -> mi.Float:
@@ -77,7 +77,7 @@ class Holes:
         self.known = ByMaterial(mi.Bool(table))
 
     def passed(self, bsdf: mi.BSDFPtr, kind: mi.UInt32) -> mi.Bool:
-        """Whether an event of that ``kind`` goes straight through a hole, like rays toward emitters."""
+        """Whether an event of this ``kind`` goes straight through a hole, as rays toward emitters do."""
         return (kind == NULL) & self.known.of(bsdf)[1]
 
     def share(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
@@ -89,7 +89,7 @@ class Holes:
 
     @classmethod
     def of(cls, scene: mi.Scene, passed: Callable[[mi.Shape], bool] = lambda shape: False) -> Holes | None:
-        """The holes of a scene, except in shapes that are ``passed``; None if it has no holes."""
+        """The holes of a scene, or None if it has none. Shapes for which ``passed`` is true are left out."""
         bsdfs = (shape.bsdf() for shape in shapes_of(scene) if not passed(shape))
         some = [bsdf for bsdf in bsdfs if bsdf is not None and has_holes(bsdf) and knows(bsdf)]
         return cls(some) if some else None
@@ -97,7 +97,7 @@ class Holes:
     def behind(
         self, si: mi.SurfaceInteraction3f, T: mi.Spectrum, left: mi.UInt32, going: mi.Bool
     ) -> tuple[mi.Spectrum, mi.UInt32, mi.Bool]:
-        """T behind the surface at ``si``, how many holes may be ``left`` there, and which rays are still ``going``."""
+        """``T``, the number of holes ``left`` and which rays are still ``going``, behind the surface at ``si``."""
         T = dr.select(going, mi.Spectrum(T * dr.select(left > 0, self.share(si, going), 0)), T)
         going = going & (dr.max(T) > 0)
         return T, dr.select(going, left - 1, left), going
@@ -106,7 +106,7 @@ class Holes:
     def transmittance(
         self, scene, ray: mi.Ray3f, target: mi.Point3f, most, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.UInt32]:
-        """T along ``ray`` to the ``target``, and the number of holes; T is 0 behind more than ``most`` of them."""
+        """T along ``ray`` to the ``target``, and the number of holes on it. T is 0 if there are more than ``most``."""
         ray, left, going = mi.Ray3f(ray), mi.UInt32(most), mi.Bool(active)
         T = dr.select(active, mi.Spectrum(1), 0)
         while dr.hint(going, label="holes"):
@@ -121,9 +121,11 @@ class Holes:
     def toward_camera(
         self, scene, si: mi.SurfaceInteraction3f, target: mi.Point3f, most, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.UInt32]:
-        """As ``transmittance()`` from ``si``, where lamps hide from the camera, but not from what is behind holes."""
+        """As ``transmittance()`` from ``si`` to a camera from which lamps are hidden.
+
+        There a lamp blocks light only if a hole is between the lamp and the camera."""
         ray, left, going = si.spawn_ray_to(target), mi.UInt32(most), mi.Bool(active)
-        # As a surface sees it, and as the camera does
+        # T as a surface sees it, and T as the camera sees it
         T, seen = dr.select(active, mi.Spectrum(1), 0), dr.select(active & ~_on_lamp(si, scene), mi.Spectrum(1), 0)
         left_there = mi.UInt32(left)
         while dr.hint(going, label="holes"):
@@ -141,9 +143,9 @@ class Holes:
     def through(
         self, scene, x: mi.SurfaceInteraction3f, d: mi.Vector3f, number, active: mi.Bool
     ) -> tuple[mi.SurfaceInteraction3f, mi.Spectrum]:
-        """The vertex behind that ``number`` of holes along ``d``, and the transmittance T of these holes.
+        """The vertex behind ``number`` holes along ``d``, and the transmittance T of these holes.
 
-        ``x`` is at the first hole. T is 0 where there are fewer holes.
+        ``x`` is at the first hole. T is 0 if there are fewer holes.
         """
         x, T, left, active = mi.SurfaceInteraction3f(x), mi.Spectrum(1), mi.UInt32(number), mi.Bool(active)
         going = active & (left > 0)
@@ -163,5 +165,5 @@ def has_holes(bsdf: mi.BSDF) -> bool:
 
 
 def knows(bsdf: mi.BSDF) -> bool:
-    """Whether the share that goes straight through is known: bump and normal maps around a mask say that it is 0."""
+    """Whether the share that goes straight through is known. Bump and normal maps around a mask wrongly report 0."""
     return not has_holes(bsdf) or (bsdf.class_name() in _KNOWN and all(map(knows, objects_in(bsdf, mi.BSDF))))

@@ -1,4 +1,4 @@
-"""The light's end of paths: where light starts, and with what densities."""
+"""The light's end of paths: where light starts, and with which density."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ class LightRay:
     β: mi.Spectrum  # Le cos / p
     emitter: mi.EmitterPtr
     index: mi.UInt32
-    end: mi.DirectionSample3f  # position, normal and uv of the emitter's point, and its pdf
+    end: mi.DirectionSample3f  # position, normal, uv and pdf of the point on the emitter
     delta: mi.Bool
-    front: mi.Normal3f | None = None  # the vertex normal there; None in scenes without bent lamps
+    front: mi.Normal3f | None = None  # the vertex normal at that point; None in scenes without bent lamps
 
 
 class LightEnds:
-    """The emitters of a scene as the beginnings of light paths.
+    """The emitters of a scene as starts of light paths.
 
-    Points on areas are sampled as Mitsuba's emitters do, with a cosine distribution of directions; the directions of
-    what is infinitely far away as well, on a disk that covers the scene; points light all around, spots their cone.
-    ``BentLamps`` samples points on bent lamps.
+    On area lights, Mitsuba samples the point (``BentLamps`` on bent lamps), and directions have a cosine distribution.
+    For emitters that are infinitely far away, Mitsuba samples the direction, and the ray starts on a disk that covers
+    the scene. Directions from a point light are uniform on the sphere, directions from a spot are uniform in its cone.
 
-    Raises NgptError, in the name of the ``sampler``, for a scene with emitters that Mitsuba does not tell enough of.
+    Raises NgptError, with the name of the ``sampler``, for other emitters, of which Mitsuba does not expose enough.
     """
 
     def __init__(self, scene: mi.Scene, sampler: str = "bdpt"):
@@ -64,7 +64,7 @@ class LightEnds:
         tables = [_table(scene, number, *each) for number, each in enumerate(both)] or [[0] * 8]
         x, y, z, u, v, w, self.cutoff, of_ball = map(mi.Float, np.array(tables, np.float32).T)
         self.position, self.axis = mi.Point3f(x, y, z), mi.Vector3f(u, v, w)
-        # Density of emission per area for spheres, where connections find only the visible part; else 0
+        # The density of starting points per area for spheres, where a connection samples only the visible part; else 0
         self.of_ball = of_ball
         self.balls = bool(np.any(np.array(of_ball) > 0))
         self.indices = emitter_numbers(scene)
@@ -77,9 +77,9 @@ class LightEnds:
         return dr.gather(mi.UInt32, self.kind, index) == _FAR
 
     def emission(self, index: mi.UInt32, p: mi.Float, cos: mi.Float, distance2: mi.Float) -> mi.Float:
-        """``e`` of ``mis``, of the emitter with that number.
+        """``e`` of ``mis`` for the emitter with number ``index``.
 
-        ``p``          density of connecting to this point of the emitter from the other end of the edge, not of deltas
+        ``p``          density of connecting to this point of the emitter from the other end of the edge; not for deltas
         ``cos``        absolute cosine at the emitter
         ``distance2``  squared length of the edge
         """
@@ -96,7 +96,7 @@ class LightEnds:
         return e
 
     def connect(self, scene, si: mi.SurfaceInteraction3f, u: mi.Point2f, active) -> tuple:
-        """As ``scene.sample_emitter_direction(si, u, False, active)``, and the ``front`` of a light ray there."""
+        """As ``scene.sample_emitter_direction(si, u, False, active)``; the third value is ``LightRay.front``."""
         return sample_emitter(scene, self.bent, si, u, active)
 
     def met(self, scene, si: mi.SurfaceInteraction3f, ref, active) -> tuple[mi.DirectionSample3f, mi.Float]:
@@ -136,7 +136,7 @@ class LightEnds:
             frame = mi.Frame3f(dr.gather(mi.Vector3f, self.axis, index))
             position = dr.gather(mi.Point3f, self.position, index)
             along = frame.to_world(mi.warp.square_to_uniform_cone(u_direction, cutoff))
-            # The intensity is what arrives at distance 1.
+            # The intensity is the irradiance at distance 1.
             beside = _somewhere(position + along, time, wavelengths)
             _, intensity = emitter.sample_direction(beside, mi.Point2f(0.5), here)
             β = dr.select(here, intensity * (weight / _cone_density(cutoff)), β)
@@ -157,7 +157,7 @@ class LightEnds:
         return LightRay(mi.Ray3f(origin, d, time, wavelengths), β, emitter, index, end, delta, front)
 
     def _place_bent(self, place: mi.PositionSample3f, lamp: mi.UInt32, u: mi.Point2f, active) -> mi.Normal3f:
-        """Moves the ``place`` to where a bent lamp is sampled; returns the ``front`` there, of all lamps."""
+        """Changes ``place`` to a point that ``BentLamps`` samples, on bent lamps. Returns ``front``, for all lamps."""
         bent = active & self.bent.has(lamp, active)
         ours, front = self.bent.point(lamp, u, bent), mi.Normal3f(place.n)
         pdf = dr.gather(mi.Float, self.bent.per_area, lamp, bent)
@@ -179,10 +179,10 @@ class LightEnds:
         return self.emission(start.index, p, cos, distance2), p
 
     def redirected(self, scene, start: LightRay, y: mi.SurfaceInteraction3f) -> tuple[LightRay, mi.Float, mi.Float]:
-        """``start`` shifted: the same end, but the edge to vertex ``y``.
+        """``start`` shifted: the same point of the emitter, but the edge leads to vertex ``y``.
 
-        Its β is Le cos / p with the p of ``start``. With it come p' / p, and dω / dA cos, of the cosine at y: the
-        inverse of the squared distance, or 1 if it is infinite.
+        Returns the shifted ray, whose β is Le cos / p with the p of ``start``; p' / p; and dω / (cos dA) with the
+        cosine at y, which is 1 / distance², or 1 if the distance is infinite.
         """
         kind = dr.gather(mi.UInt32, self.kind, start.index)
         far = kind == _FAR
@@ -191,7 +191,7 @@ class LightEnds:
         d = dr.select(far, start.ray.d, dr.normalize(to))
         β, ratio = mi.Spectrum(start.β), mi.Float(1)
         if _AREA in self.kinds:
-            # The ratio for a cosine distribution; behind the emitter there is no light.
+            # p' / p of a cosine distribution. No light leaves the back of the emitter.
             cosines = dr.dot(start.end.n, d) / dr.dot(start.end.n, start.ray.d)
             shines = cosines > 0
             if start.front is not None:
@@ -210,10 +210,10 @@ class LightEnds:
     def seen_from_elsewhere(
         self, scene, light: mi.DirectionSample3f, weight: mi.Spectrum, si: mi.SurfaceInteraction3f, active, *, front
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum, mi.Float]:
-        """A sampled ``light`` of ``weight`` Le / p shifted: the same point of the emitter, of the ``front`` that
-        ``connect()`` gives, seen from ``si``.
+        """A sampled ``light`` of ``weight`` Le / p shifted: the same point of the emitter, seen from ``si``.
 
-        The weight that is returned is Le J / p with the p of ``light``. With it comes p' J / p; J = dω' / dω.
+        ``front`` is the third value of ``connect()``. Returns the shifted light, the weight Le J / p with the p of
+        ``light``, and p' J / p, where J = dω' / dω.
         """
         index = self.index_of(light.emitter, active)
         kind = dr.gather(mi.UInt32, self.kind, index, active)
@@ -246,7 +246,7 @@ class LightEnds:
 
 
 def _kind(emitter: mi.Emitter) -> int | None:
-    """The kind of an emitter; None for one that light paths cannot begin at."""
+    """The kind of an emitter; None if light paths cannot start there."""
     if mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
         return _FAR
     if is_area(emitter):
@@ -255,7 +255,7 @@ def _kind(emitter: mi.Emitter) -> int | None:
 
 
 def _table(scene: mi.Scene, number: int, emitter: mi.Emitter, kind: int) -> list[float]:
-    """Position, axis and cosine of the cutoff of points, and of spheres the density of emission per area."""
+    """Position, axis and cosine of the cutoff of a point or spot; last, the density of starts on a sphere."""
     if kind == _AREA:
         shape = emitter.get_shape()
         ball = shape.class_name() == "Sphere"
@@ -273,7 +273,7 @@ def _table(scene: mi.Scene, number: int, emitter: mi.Emitter, kind: int) -> list
 
 
 def _cone_density(cutoff: mi.Float) -> mi.Float:
-    """Density of directions within a cone; the cosine -1 of its angle gives the whole sphere."""
+    """The density of uniform directions in a cone. ``cutoff`` is the cosine of its half angle; -1 is a sphere."""
     return dr.rcp(dr.two_pi * (1 - cutoff))
 
 
@@ -286,10 +286,10 @@ def _somewhere(position: mi.Point3f, time, wavelengths) -> mi.Interaction3f:
 
 @dataclass
 class World:
-    """It does not change in a render. Functions that are ``frozen`` take it as one argument."""
+    """A scene and its tables, which a render does not change. Functions that are ``frozen`` take it as one argument."""
 
     scene: mi.Scene
     lights: LightEnds
-    materials: Materials | None = None  # for samplers that ask nothing of them
-    fog: Any = None  # ``photons.map.fog.Fog``: the media, for samplers that gather photons there
-    holes: Holes | None = None  # which are no vertices; None where there are none, or where they are
+    materials: Materials | None = None  # None for samplers that do not use them
+    fog: Any = None  # ``photons.map.fog.Fog``: the media, for samplers that gather photons in them
+    holes: Holes | None = None  # the holes, if they are no vertices; else None

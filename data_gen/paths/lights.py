@@ -1,4 +1,4 @@
-"""Emitters seen from the vertices of shifted paths, and what of that they may take over from their base path."""
+"""Emitters seen from path vertices, and how a shifted path reuses the emitter samples of its base path."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from data_gen.scenes.load import path_depths
 
 # Shapes that Mitsuba samples uniformly by area, besides meshes; for spheres it samples the visible part.
 _UNIFORM_SHAPES = ("Rectangle", "Disk", "Cylinder")
-# What emission depends on, where it is met: of thousands of shapes, all else takes twice the time to record.
+# What emission depends on. With thousands of shapes, all fields would take twice as long to record.
 _EMISSION = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
 
 
 class Lights:
-    """Whether the emitters of a scene answer the same random numbers with the same point, or direction, everywhere.
+    """The emitters of a scene, and whether equal random numbers sample the same point or direction from everywhere.
 
-    This holds for all emitters that are infinitely far away, and for area lights on shapes that are sampled uniformly.
-    Replaying their sampling at another vertex changes only the solid angle, so they need not be sampled again: they are
-    ``shared``, if there are no others in the scene. ``near``, ``far``: whether there are emitters of finite and of
-    infinite distance; ``places``: how often each is chosen, by place; None: as often as the scene says, everywhere.
-    ``bent``: lamps that Mitsuba samples with a wrong density; None if there are none. Where these shine depends on the
-    vertex that sees them, so that they are not shared.
+    They do for emitters that are infinitely far away, and for area lights on shapes that are sampled uniformly.
+    Replaying the sample at another vertex changes only the solid angle, so such emitters need not be sampled again.
+    ``shared`` is True if all emitters of the scene are of these kinds. ``near`` and ``far`` say whether there are
+    emitters at finite and at infinite distance. ``places`` chooses lamps by place; None means that the scene's own
+    probabilities hold everywhere. ``bent`` are the lamps that Mitsuba samples with a wrong density, or None. A bent
+    lamp does not shine to all vertices in front of its faces, so scenes with bent lamps are not shared.
     """
 
     def __init__(self, scene: mi.Scene, places: Places | None = None):
@@ -44,9 +44,9 @@ class Lights:
         self.places = places
 
     def sample(self, scene, x: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool) -> tuple:
-        """The direction sample of ``scene.sample_emitter_direction(x, u, False, active)``, its Le / p, and the lamp.
+        """A direction sample, its Le / p, and the chosen lamp, which is None if lamps are not chosen by place.
 
-        That is None where it is not chosen by place.
+        The first two are as from ``scene.sample_emitter_direction(x, u, False, active)``.
         """
         if not self.places:
             return *self.anywhere(scene, x, u, active), None
@@ -54,7 +54,7 @@ class Lights:
         return *self.at(x, chosen, active), chosen
 
     def anywhere(self, scene, x: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool) -> tuple:
-        """The direction sample and Le / p, where lamps are chosen with the scene's own probabilities."""
+        """A direction sample and Le / p. Lamps are chosen with the scene's own probabilities."""
         return sample_emitter(scene, self.bent, x, u, active)[:2]
 
     def seen(self, scene, x: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool) -> tuple:
@@ -65,7 +65,7 @@ class Lights:
         return light, dr.select(scene.ray_test(x.spawn_ray_to(light.p), active & (light.pdf > 0)), 0, weight)
 
     def at(self, x: mi.SurfaceInteraction3f, chosen: Chosen, active: mi.Bool) -> tuple:
-        """The direction sample and Le / p of the lamp that is ``chosen`` by place."""
+        """A direction sample and Le / p for the lamp that was ``chosen`` by place."""
         return self.bent.sample(x, chosen, active)[:2] if self.bent else self.places.sample(x, chosen, active)
 
 
@@ -83,7 +83,7 @@ class LightSample:
 def sample_light(
     scene: mi.Scene, si: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool, lights: Lights | None = None
 ) -> LightSample:
-    """Emitter sampling at a vertex, in view of what is in the way; with ``lights`` with no regard for occlusion."""
+    """Emitter sampling at a vertex. The weight is Le V / p, or Le / p without occlusion if ``lights`` are given."""
     if lights:
         light, weight = lights.anywhere(scene, si, u, active)
     else:
@@ -92,7 +92,7 @@ def sample_light(
 
 
 def shadowed(scene: mi.Scene, si: mi.SurfaceInteraction3f, light: LightSample, f: mi.Spectrum) -> mi.Spectrum:
-    """f Le V / p of a sample without V: the shadow ray is traced where there is something to be shadowed."""
+    """f Le V / p of a ``light`` sample whose weight is Le / p. Only where that is above 0, a shadow ray is traced."""
     lit = f * light.weight
     return dr.select(scene.ray_test(si.spawn_ray_to(light.target), dr.max(lit) > 0), 0, lit)
 
@@ -100,17 +100,17 @@ def shadowed(scene: mi.Scene, si: mi.SurfaceInteraction3f, light: LightSample, f
 def replay_light(
     scene, lights: Lights, base, base_weight, u, y: mi.SurfaceInteraction3f, *, lit: mi.Bool
 ) -> LightSample:
-    """``sample_light(scene, y, u, lit, lights)``, by the direction sample ``base``, of Le / p, at another vertex."""
+    """``sample_light(scene, y, u, lit, lights)``, from the sample ``base`` that ``u`` gave at another vertex."""
     return _replayed(lights, base, base_weight, y, lit, lambda anew: sample_light(scene, y, u, anew, lights))
 
 
 def replay_lamp(
     lights: Lights, base, base_weight, chosen: Chosen, x, y: mi.SurfaceInteraction3f, *, lit: mi.Bool
 ) -> tuple[LightSample, mi.Float]:
-    """Replays a lamp sample ``chosen`` by place at vertex ``x``: the same point on the same lamp, seen from ``y``.
+    """Replays at ``y`` the sample of a lamp that vertex ``x`` has ``chosen`` by place: the same point of that lamp.
 
-    Its ``p`` includes the probability P of choosing the lamp at ``y``, its ``weight`` the probability at ``x``. The
-    ratio P(y) / P(x), a factor of r, is returned as well.
+    P is the probability of choosing the lamp. ``p`` of the result includes P(y), its ``weight`` includes P(x). The
+    second value is the ratio P(y) / P(x), a factor of r.
     """
     places = lights.places
 
@@ -120,12 +120,12 @@ def replay_lamp(
 
     sample = _replayed(lights, base, base_weight, y, lit, anew)
     ratio = places.probability(y, chosen.lamp) / chosen.p
-    # A base path that has ended is nowhere: seen from the other side it takes no part, and the weight is 1/2.
+    # A base path that has ended has no vertex x and takes no part in the reverse shift: the MIS weight is 1/2.
     return replace(sample, p=sample.p * ratio), dr.select(x.is_valid(), ratio, 1)
 
 
 def _replayed(lights: Lights, base, base_weight, y: mi.SurfaceInteraction3f, lit: mi.Bool, sample) -> LightSample:
-    """The direction sample ``base`` as seen from ``y``, taken by ``sample`` (active) where it cannot be taken over."""
+    """The direction sample ``base`` seen from ``y``. Where it cannot be reused, ``sample`` (active) samples again."""
     if not lights.shared:
         return sample(lit)
     far = mi.Bool(lights.far)
@@ -137,7 +137,7 @@ def _replayed(lights: Lights, base, base_weight, y: mi.SurfaceInteraction3f, lit
     ratio = dr.dot(base.n, d) / dr.dot(base.n, base.d)
     # dω'/dω from either vertex to the point on the emitter
     J = dr.select(far, 1, dr.abs(ratio) * dr.square(base.dist) / distance2)
-    # Seen from the other side, an emitter is another one.
+    # The other side of an emitter may emit differently.
     shared = (base.pdf > 0) & (far | (ratio > 0)) & dr.isfinite(J) & (J > 0)
     anew, shared = lit & ~shared, lit & shared
     p, weight = dr.select(shared, base.pdf / J, 0), dr.select(shared, base_weight * J, mi.Spectrum(0))
@@ -148,8 +148,8 @@ def _replayed(lights: Lights, base, base_weight, y: mi.SurfaceInteraction3f, lit
 def emission(
     scene, si: mi.SurfaceInteraction3f, ref: mi.SurfaceInteraction3f, active, sampled, lights: Lights | None = None
 ) -> tuple:
-    """Le at ``si`` toward ``ref`` where ``active``, and the density with which emitter sampling finds it where
-    ``sampled``: that of Mitsuba, or that of ``lights``."""
+    """Le at ``si`` toward ``ref`` where ``active``, and the density of emitter sampling where ``sampled``. The density
+    is Mitsuba's, or that of ``lights`` if they are given."""
     light, places = mi.DirectionSample3f(scene, si, ref), lights and lights.places
     p = places.density(ref, light, sampled) if places else scene.pdf_emitter_direction(ref, light, sampled)
     if lights and lights.bent:
@@ -159,7 +159,7 @@ def emission(
 
 
 def shared_emission(scene, lights: Lights, x1, Le, p, *, x, y, y1, J) -> tuple[mi.Spectrum, mi.Float]:
-    """``emission(scene, y1, y, True, True, lights)`` by ``Le`` and ``p`` of the same vertex ``x1``, as seen from ``x``.
+    """``emission(scene, y1, y, True, True, lights)``, computed from ``Le`` and ``p`` of ``x1`` as seen from ``x``.
 
     ``y1`` is ``x1`` with another incident direction; ``J`` is the ratio d'²/d² of the squared distances.
     """
@@ -178,9 +178,10 @@ def shared_emission(scene, lights: Lights, x1, Le, p, *, x, y, y1, J) -> tuple[m
 
 
 def emission_seen(scene, integrator, medium, ray: mi.RayDifferential3f, active) -> mi.Spectrum:
-    """What a camera ray meets of emitters before anything else: the layer ``direct``.
+    """The emission at the first surface that a camera ray meets: the layer ``direct``.
 
-    Zero where ``integrator`` hides it or follows no edge, and where the camera is in a ``medium``, which would dim it.
+    Zero if ``integrator`` hides emitters or has ``max_depth`` 0, and if the camera is in a ``medium``, which would dim
+    it.
     """
     if not _shows(integrator) or medium is not None:
         return dr.zeros(mi.Spectrum, dr.width(ray))
@@ -194,9 +195,9 @@ def emission_seen(scene, integrator, medium, ray: mi.RayDifferential3f, active) 
 
 
 def _shows(integrator) -> bool:
-    """Whether emission that the camera sees directly is in the image; ``max_depth`` 0 means that nothing is."""
+    """Whether the image includes emission that the camera sees directly. With ``max_depth`` 0 the image is empty."""
     depth = getattr(integrator, "max_depth", None)
-    if depth is None:  # Mitsuba's own, which only print it
+    if depth is None:  # Mitsuba's own integrators only print it
         depth = path_depths(integrator).get("max_depth")
     return not integrator.hide_emitters and depth != 0
 
@@ -204,11 +205,11 @@ def _shows(integrator) -> bool:
 def emission_in_pixel(
     scene: mi.Scene, camera: CameraSamples, Le: mi.Spectrum, emission: Callable[[mi.Ray3f], mi.Spectrum]
 ) -> mi.Spectrum:
-    """The layer ``direct`` of camera samples that meet ``Le``: the mean over four rays, one in each quarter of a pixel.
+    """The layer ``direct``: the mean over four rays, one in each quarter of a pixel. The first of them meets ``Le``.
 
-    Lamps differ most from what is beside them: where a pixel's few samples see too much of a frame it is a black dot,
-    which no reconstruction fills, for this light is in no gradient. ``Le`` is weighted by the camera's importance;
-    ``emission``, which tells what a ray meets, is not.
+    Lamps are much brighter than their surroundings. A pixel whose few samples happen to miss the lamp is a black dot,
+    which no reconstruction fills, since this light is in no gradient. ``Le`` is weighted by the camera's importance.
+    ``emission`` gives the emission that a ray meets, without that weight.
     """
     if not any(visible(emitter) for emitter in scene.emitters()):
         return Le
@@ -217,7 +218,8 @@ def emission_in_pixel(
 
 
 def _sum_of(seen: list[tuple[mi.Ray3f, mi.Spectrum]], Le: mi.Spectrum, emission: Callable) -> mi.Spectrum:
-    """Le, and what rays of some importance meet. In a loop, ``emission`` is recorded once: it asks all shapes."""
+    """The sum of Le and the weighted emission that the rays in ``seen`` meet. In a loop ``emission``, a call to all
+    shapes, is recorded only once."""
     kind = type(Le)
 
     def add(i: mi.UInt32, Le: mi.Spectrum) -> tuple[mi.UInt32, mi.Spectrum]:
@@ -226,10 +228,11 @@ def _sum_of(seen: list[tuple[mi.Ray3f, mi.Spectrum]], Le: mi.Spectrum, emission:
             ray, importance = dr.select(i == number, other, ray), dr.select(i == number, weight, importance)
         return i + 1, kind(Le + importance * emission(ray))
 
-    # Without dr.syntax, whose state would hold the rays: what no round changes has Dr.Jit record the loop again.
+    # Without dr.syntax, which would put the rays into the loop's state. State that no round changes makes Dr.Jit record
+    # the loop again.
     return dr.while_loop((mi.UInt32(0), Le), lambda i, Le: i < len(seen), add)[1]
 
 
 def visible(emitter: mi.Emitter) -> bool:
-    """Whether a camera may see it: points and single directions are met by no ray."""
+    """Whether a camera ray can meet the emitter: none meets a point or a single direction."""
     return not mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)

@@ -1,18 +1,18 @@
-"""Walks on the manifold of specular paths: they lead a copy of a path through the same mirrors and glass to one point.
+"""Walks on the manifold of specular paths, which lead a copy of a path through the same mirrors and glass to one point.
 
 A path leaves a rough vertex z in direction ω, meets k specular events, and arrives at x_c. From another vertex z' the
-same events may lead to the same x_c along another direction ω'. These are two equations for two unknowns; Newton's
-method solves them from ω on. [Hanika et al. 2015, "Manifold next event estimation"; Hua et al. 2019, "A Survey on
+same events may lead to the same x_c along another direction ω'. To arrive at x_c is two equations for the two unknowns
+of ω'. Newton's method solves them. [Hanika et al. 2015, "Manifold next event estimation"; Hua et al. 2019, "A Survey on
 Gradient-Domain Rendering", section 3.4]
 
-    B     dx_c/dω, a 2x2 matrix, by ray differentials [Igehy 1999, "Tracing ray differentials"]; x_c moves on the plane
-          through itself, or, at infinity, on the plane that its direction is normal to
+    B     dx_c/dω, a 2x2 matrix, by ray differentials [Igehy 1999, "Tracing ray differentials"]; x_c moves on the
+          tangent plane of its surface or, at infinity, on a plane normal to its direction
     J     dω'/dω at a fixed x_c, |det B| / |det B'|
 
-A walk may end at another of several solutions, or at none. The shift from z to z' is an involution only if a walk back
-from ω' arrives at ω: ``follow()`` rejects all others. Everything here is a pure function of wide lanes.
+There may be several solutions, and a walk may end at another one, or at none. The shift from z to z' is an involution
+only if a walk back from z' to z arrives at ω: ``follow()`` rejects all others. All functions here are pure.
 
-Not followed: bump and normal maps, whose derivatives Mitsuba keeps to itself.
+Chains over bump and normal maps are rejected, since Mitsuba does not expose the derivatives of these maps.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ REFLECT, REFRACT, PASS = 1, 2, 3
 MAX_EVENTS = 6
 # Measured: 95 % of the walks that arrive at all need at most 6 to 10 steps (meshes, spheres, waves).
 MAX_STEPS = 12
-# How far from x_c a walk may end, of the length of the chain (or as an angle, at infinity).
+# The largest distance from x_c at which a walk may end, as a share of the chain's length (at infinity: an angle).
 TOLERANCE = 1e-4
-# How far from ω the walk back may end.
+# The largest distance from ω at which the walk back may end.
 RETURNS = 1e-3
 
 
-# Called at each event but the first: would a chain have ended here, whatever the event?
+# Called at each event but the first: would a chain have ended here, whichever event is sampled?
 Ends = Callable[["mi.SurfaceInteraction3f"], "mi.Bool"]
 
 
@@ -54,19 +54,19 @@ class Target:
 
 @dataclass
 class Shot:
-    """A chain from a vertex z in some direction, up to the plane of the target."""
+    """A chain of events from a vertex z in some direction, up to the plane of the target."""
 
-    good: mi.Bool  # it has met all its events, and arrives from before the plane
-    miss: mi.Vector2f  # from the target to the point of arrival, on the plane
-    reach: mi.Float  # the length that ``miss`` compares with
-    B0: mi.Vector2f  # columns of B, for two orthogonal turns of ω
+    good: mi.Bool  # whether it has met all its events and arrives from the front of the plane
+    miss: mi.Vector2f  # the vector on the plane from the target to the point of arrival
+    reach: mi.Float  # the length that ``miss`` is compared with
+    B0: mi.Vector2f  # columns of B, for two orthogonal changes of ω
     B1: mi.Vector2f
     first: mi.Point3f  # point of the first event
-    weight: mi.Spectrum  # product of the events' f / P,
-    P: mi.Float  # and of the probabilities with which sampling takes such events
+    weight: mi.Spectrum  # product of f / P over the events
+    P: mi.Float  # product of the probabilities with which the events are sampled
     η: mi.Float  # product of the events' relative indices of refraction
-    turns: mi.Float  # product of the quotients of cosines, behind over before an event, to the geometric normals
-    ray: mi.Ray3f  # from the last event on
+    turns: mi.Float  # product over the events of |cos| after / |cos| before, to the geometric normal
+    ray: mi.Ray3f  # from the last event
 
     @property
     def det(self) -> mi.Float:
@@ -74,14 +74,14 @@ class Shot:
 
 
 def event(sampled_type: mi.UInt32) -> mi.UInt32:
-    """REFLECT, REFRACT or PASS of the ``sampled_type`` of a BSDF sample; 0 if it is not specular."""
+    """REFLECT, REFRACT or PASS, given the ``sampled_type`` of a BSDF sample; 0 if it is not specular."""
     code = dr.select(mi.has_flag(sampled_type, mi.BSDFFlags.DeltaReflection), mi.UInt32(REFLECT), 0)
     code = dr.select(mi.has_flag(sampled_type, mi.BSDFFlags.DeltaTransmission), REFRACT, code)
     return dr.select(mi.has_flag(sampled_type, mi.BSDFFlags.Null), PASS, code)
 
 
 def prepend_event(events: mi.UInt32, code: mi.UInt32) -> tuple[mi.UInt32, mi.Bool]:
-    """The chain with one more event in front of all others, and whether it has room for it."""
+    """The chain with one more event in front, and whether there is room for it."""
     return (events << 2) | code, has_room(events)
 
 
@@ -90,7 +90,7 @@ def has_room(events: mi.UInt32) -> mi.Bool:
 
 
 def add_event(events: mi.UInt32, code: mi.UInt32) -> tuple[mi.UInt32, mi.Bool]:
-    """The chain with one more event, and whether it has room for it."""
+    """The chain with one more event at its end, and whether there is room for it."""
     fits = has_room(events)
     # The place behind the highest event
     place = (34 - dr.lzcnt(events) - 1) & ~mi.UInt32(1)
@@ -107,7 +107,7 @@ def shoot(
     *,
     ends: Ends = nowhere,
 ) -> Shot:
-    """Follows the ``events`` from ``z`` in direction ``ω`` (world space), and its differentials with them."""
+    """Follows the ``events``, and the ray differentials, from ``z`` in direction ``ω`` (world space)."""
     return _shoot(scene, z, ω, events, target, active=active, ends=ends)
 
 
@@ -131,7 +131,8 @@ def _shoot(scene, z, ω, events, target: Target, *, active, ends: Ends) -> Shot:
         # ------------------------ Event --------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV, False, good)
         code = left & 3
-        # The ends of the range of random numbers: reflections come first in all of Mitsuba's materials, holes last.
+        # The smallest random number samples a reflection in all of Mitsuba's materials, the largest one a hole or
+        # refraction.
         u = dr.select(code == REFLECT, mi.Float(0), 1 - dr.epsilon(mi.Float))
         sample, f_P = si.bsdf().sample(mi.BSDFContext(), si, u, mi.Point2f(0.5), good)
         good &= si.is_valid() & (sample.pdf > 0) & (event(sample.sampled_type) == code)
@@ -141,7 +142,7 @@ def _shoot(scene, z, ω, events, target: Target, *, active, ends: Ends) -> Shot:
         dp1, dn1 = on_surface(si, ray.d, dp1 + dd1 * si.t)
         d, dd0, dd1 = turn(code, sample.eta, si.sh_frame.n, ray.d, (dn0, dn1), (dd0, dd1))
         wo = si.to_world(sample.wo)
-        # A bumpy surface turns rays elsewhere than its shape would.
+        # A surface with a bump or normal map turns rays in a direction that the shape does not explain.
         good &= dr.squared_norm(wo - d) < 1e-6
         first = dr.select(left == events, si.p, first)
         weight *= f_P
@@ -156,7 +157,7 @@ def _shoot(scene, z, ω, events, target: Target, *, active, ends: Ends) -> Shot:
 
 
 def arrive(target: Target, shot: Shot, dp: tuple, dd: tuple) -> Shot:
-    """The ``shot`` from its last event to the plane of the target; its ``reach`` was the length up to there."""
+    """Continues ``shot`` from its last event, where its ``reach`` ends, to the plane of the target."""
     ray, good = shot.ray, shot.good
     plane = mi.Frame3f(target.n)
     cos = dr.dot(ray.d, target.n)
@@ -165,7 +166,7 @@ def arrive(target: Target, shot: Shot, dp: tuple, dd: tuple) -> Shot:
     miss = dr.select(target.far, ray.d - target.n, mi.Vector3f(ray.o + ray.d * t - target.p))
     columns = []
     for p, d in zip(dp, dd, strict=True):
-        # Where a differential leaves the plane, it goes on along the ray until it is back.
+        # Moves the differential along the ray until it is on the plane.
         move = p + d * t
         columns.append(dr.select(target.far, d, move - ray.d * (dr.dot(move, target.n) / cos)))
     B0, B1, miss = (mi.Vector2f(dr.dot(v, plane.s), dr.dot(v, plane.t)) for v in (*columns, miss))
@@ -174,7 +175,7 @@ def arrive(target: Target, shot: Shot, dp: tuple, dd: tuple) -> Shot:
 
 
 def on_surface(si: mi.SurfaceInteraction3f, d: mi.Vector3f, dp: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """The differentials of a ray's point as it moves on the surface, and of the shading normal there."""
+    """The differentials of the point where a ray meets the surface, and of the shading normal there."""
     dp = dp - d * (dr.dot(dp, si.n) / dr.dot(d, si.n))
     # Its coordinates (u, v), by the normal equations
     uu, uv, vv = dr.squared_norm(si.dp_du), dr.dot(si.dp_du, si.dp_dv), dr.squared_norm(si.dp_dv)
@@ -184,7 +185,7 @@ def on_surface(si: mi.SurfaceInteraction3f, d: mi.Vector3f, dp: mi.Vector3f) -> 
 
 
 def turn(code, η, n, d, dn: tuple, dd: tuple) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]:
-    """A direction after an event, and its differentials (Igehy 1999, eq. 14-18); ``η`` is n_t / n_i along it."""
+    """The direction ``d`` after an event, and its differentials (Igehy 1999, eq. 14-18); ``η`` is n_t / n_i."""
     back = dr.dot(d, n) > 0
     N = mi.Vector3f(dr.select(back, -n, n))
     cos = dr.dot(d, N)
@@ -206,9 +207,9 @@ def turn(code, η, n, d, dn: tuple, dd: tuple) -> tuple[mi.Vector3f, mi.Vector3f
 def walk(
     scene, z, ω: mi.Vector3f, events: mi.UInt32, target: Target, active=True, *, ends: Ends = nowhere
 ) -> tuple[mi.Vector3f, Shot, mi.Bool]:
-    """Newton's method from ``ω`` on: the direction from ``z`` to the target, its shot, and whether it was found.
+    """Newton's method, started at ``ω``: the direction from ``z`` to the target, its shot, and whether it was found.
 
-    A step that breaks the chain, or comes no nearer, is halved.
+    A step that breaks the chain, or does not come nearer, is halved.
     """
     return _walk(scene, z, ω, events, target, active=active, ends=ends)
 
@@ -241,12 +242,13 @@ def _walk(scene, z, ω, events, target: Target, *, active, ends: Ends) -> tuple[
 def follow(
     scene, z, ω, base: Shot, z1, events, *, target: Target, active=True, ends: Ends = nowhere
 ) -> tuple[mi.Vector3f, Shot, mi.Float, mi.Bool]:
-    """The copy, from vertex ``z1``, of the chain that the ``base`` shot took from ``z`` in direction ``ω``.
+    """Copies to vertex ``z1`` the chain that the ``base`` shot took from ``z`` in direction ``ω``.
 
-    Returns its direction ω', its shot, J = dω'/dω, and whether it exists: the walk has arrived, the walk back has
-    returned, and nothing is between the last event and the target.
+    Returns the direction ω' of the copy, its shot, J = dω'/dω, and whether it exists. It exists if the walk arrives,
+    the walk back returns to ω, and nothing is between the last event and the target.
     """
-    # Walks begin toward the other chain's first event: along its direction they would miss what is small or near.
+    # A walk starts toward the first event of the other chain. With that chain's direction it would miss small or near
+    # objects.
     ω1, shot, found = walk(scene, z1, dr.normalize(base.first - z1.p), events, target, active & base.good, ends=ends)
     J = dr.abs(base.det / shot.det)
     found &= dr.isfinite(J) & (J > 0)

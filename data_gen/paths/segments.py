@@ -1,6 +1,6 @@
-"""Segments of a path through media: how far they go, how much light they transmit, and how they are shifted.
+"""Segments of a path through media: where they end, how much light they transmit, and how they are shifted.
 
-A *segment* leads from vertex to vertex. It goes straight through index-matched boundaries, which are no vertices: they
+A *segment* leads from vertex to vertex. It goes straight through index-matched boundaries. These are no vertices: they
 do not count in the length of a path, and emitters are sampled and found through them.
 
     σ, σs       extinction and scattering coefficients, one for each colour
@@ -8,8 +8,8 @@ do not count in the length of a path, and emitters are sampled and found through
     τ           optical depth of the homogeneous media of a segment
     T           exp(-τ)
 
-An optical depth in colour c is sampled, not a distance: one number decides where a path scatters, through whatever
-homogeneous media it goes. The density of a vertex in a medium is T_c σ_c, and T_c on a surface. A shifted copy that
+An optical depth in colour c is sampled, not a distance, so one random number decides where a path scatters, through any
+number of homogeneous media. The density of a vertex is T_c σ_c in a medium, and T_c on a surface. A shifted copy that
 reconnects to the vertex has T_c' instead of T_c. A copy that replays the number has r = 1. For media whose density
 varies see ``data_gen.paths.collisions``. [Hua et al. 2019, section 7.1; docs/samplers/media.md]
 """
@@ -30,15 +30,15 @@ from data_gen.paths.media import Media, Place, beyond, depth, end_of, extinction
 @dataclass
 class Numbers:
     u: mi.Float
-    key: mi.UInt32 | None  # of as many as there are null collisions; None without grids
+    key: mi.UInt32 | None  # of the random numbers for null collisions; None without grids
 
 
 @dataclass
 class Segment:
-    """What is met along a ray: a vertex in a medium, one on a surface, or nothing."""
+    """A segment, which ends at a vertex in a medium, at a vertex on a surface, or nowhere."""
 
-    ray: mi.Ray3f  # its last piece, behind the last boundary
-    hit: mi.PreliminaryIntersection3f  # of this piece; its distance is the distance to the vertex, also in a medium
+    ray: mi.Ray3f  # the last piece of the segment, behind the last boundary
+    hit: mi.PreliminaryIntersection3f  # at the end of this piece; its distance leads to the vertex, also in a medium
     place: Place
     weight: mi.Spectrum  # integrand over density in colour c: T / T_c, times σs / σ_c in a medium
     albedo: mi.Spectrum  # σs / σ_c in a medium, else 1
@@ -56,7 +56,7 @@ def next_surface(scene):
 
 
 def fly(media: Media, trace, ray, medium, channel, numbers: Numbers, *, active) -> Segment:
-    """The segment along ``ray``, from within ``medium``, that these ``numbers`` make.
+    """Samples the segment along ``ray``, which starts in ``medium``, from ``numbers``.
 
     ``trace`` (ray, medium, active) finds the next surface, as ``next_surface()`` does.
     """
@@ -78,7 +78,7 @@ def fly(media: Media, trace, ray, medium, channel, numbers: Numbers, *, active) 
 
 @dr.syntax
 def fly_on(passes, trace, ray, medium, channel, u, *, active):
-    """The last piece of a segment, its surface, its medium, whether the path scatters there, and τ up to there."""
+    """Samples a segment: its last piece, the hit, the medium there, whether the path scatters in it, and τ."""
     ray, medium = mi.Ray3f(ray), mi.MediumPtr(medium)
     left = -dr.log(1 - u)
     τ = dr.zeros(mi.Spectrum, dr.width(ray.o))
@@ -104,8 +104,8 @@ def fly_on(passes, trace, ray, medium, channel, u, *, active):
 def cross(passes, trace, ray, medium, reach, *, active, target):
     """Straight along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary.
 
-    With a ``target``, where that is finite, each piece aims at it anew: see ``media.onward()``. Returns τ, the surface,
-    the last piece of the ray, and the medium there.
+    Each piece aims at the ``target`` again, if there is one and it is finite: see ``media.onward()``. Returns τ, the
+    hit, the last piece of the ray, and the medium there.
     """
     ray, medium, reach = mi.Ray3f(ray), mi.MediumPtr(medium), mi.Float(reach)
     τ = dr.zeros(mi.Spectrum, dr.width(ray.o))
@@ -122,9 +122,9 @@ def cross(passes, trace, ray, medium, reach, *, active, target):
 
 
 def see(media: Media, trace, ray, medium, reach, *, channel, key, active) -> tuple:
-    """T along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary: in grids an estimate.
+    """T along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary; an estimate in grids.
 
-    Returns T, that surface, the last piece of the ray, and the medium there.
+    Returns T, the hit, the last piece of the ray, and the medium there.
     """
     if not media.grids:
         τ, hit, ray, medium = cross(media.passes, trace, ray, medium, reach, active=active, target=None)
@@ -136,9 +136,9 @@ def see(media: Media, trace, ray, medium, reach, *, channel, key, active) -> tup
 
 
 def clear_view(media: Media, trace, ray, medium, channel, active) -> tuple:
-    """exp(-τ) along ``ray`` up to the first surface that is no boundary, 0 where a grid is on the way.
+    """exp(-τ) along ``ray`` up to the first surface that is no boundary, or 0 if a grid is on the way.
 
-    Returns that, the surface, and the last piece of the ray.
+    Returns that number, the hit, and the last piece of the ray.
     """
     reach = end_of(ray)
     if not media.grids:
@@ -152,7 +152,7 @@ def clear_view(media: Media, trace, ray, medium, channel, active) -> tuple:
 def transmittance(
     scene, media: Media, x, place: Place, target: mi.Point3f, *, channel, key, active: mi.Bool
 ) -> mi.Spectrum:
-    """T of the way from vertex ``x`` to the point ``target`` of an emitter; 0 where it is blocked."""
+    """T from vertex ``x`` to the point ``target`` of an emitter; 0 if it is blocked."""
     ray = x.spawn_ray_to(target)
     medium, reach = place.toward(x, ray.d), dr.norm(target - ray.o)
     if not media.boundaries and not media.grids:
@@ -165,7 +165,7 @@ def transmittance(
 def through_holes(
     scene, media: Media, x, place: Place, target: mi.Point3f, *, holes: Holes, most, channel, key, active: mi.Bool
 ) -> mi.Spectrum:
-    """``transmittance()`` where there may be ``most`` holes on the way."""
+    """``transmittance()`` through at most ``most`` holes."""
     trace, ray = next_surface(scene), x.spawn_ray_to(target)
     medium, left, going = mi.MediumPtr(place.toward(x, ray.d)), mi.UInt32(most), mi.Bool(active)
     T = dr.select(active, mi.Spectrum(1), 0)
@@ -179,16 +179,16 @@ def through_holes(
         ray = si.spawn_ray_to(target)
         medium = dr.select(si.is_medium_transition(), si.target_medium(ray.d), there)
         if dr.hint(key is not None, mode="scalar"):
-            # Another piece has other collisions.
+            # Each piece needs its own random numbers for collisions.
             key = mi.sample_tea_32(key, mi.UInt32(left))[0]
     return T
 
 
 def reconnect(scene, media: Media, y, place: Place, ray, *, x1, base: Segment, channel, active) -> tuple:
-    """``ray`` from the offset path's vertex ``y`` to ``x1``, where the segment ``base`` ends.
+    """Shifts the segment ``base`` by reconnection: ``ray`` leads from the offset path's vertex ``y`` to its end ``x1``.
 
-    Returns its integrand over the density of the base path; the ratio of the two densities, of colour c; and whether it
-    is blocked. The Jacobian of x1 itself is not in them.
+    Returns the integrand divided by the density of ``base``, the ratio of the two densities (colour c), and whether the
+    segment is blocked. The Jacobian of x1 is left out of both.
     """
     reach, medium = dr.select(x1.is_valid(), dr.norm(x1.p - ray.o), dr.inf), place.toward(y, ray.d)
     trace, target = next_surface(scene), dr.select(x1.is_valid(), x1.p, dr.inf)
@@ -199,7 +199,7 @@ def reconnect(scene, media: Media, y, place: Place, ray, *, x1, base: Segment, c
     else:
         τ, hit, _, medium = cross(media.passes, trace, ray, medium, reach, active=active, target=target)
         N, N_c = 1, 1
-    # Both paths must arrive through the same medium: a boundary may have holes.
+    # Both paths must arrive through the same medium. This is checked, since a boundary may have holes.
     blocked = hit.is_valid() | (medium != base.place.medium)
     τ_c = pick(τ, channel)
     return dr.exp(base.τ_c - τ) * base.albedo * N, dr.exp(base.τ_c - τ_c) * N_c, blocked

@@ -1,16 +1,16 @@
-"""Shift mappings of gradient-domain path tracing, one vertex at a time, as pure functions.
+"""Shift mappings of gradient-domain path tracing: pure functions, each for one vertex.
 
-A shift takes a base path through one pixel to an offset path through its neighbour. Vertex by vertex it does one of
-four things (survey, sections 3.1 to 3.3):
+A shift maps a base path through one pixel to an offset path through its neighbour. At each vertex it does one of four
+things (survey, sections 3.1 to 3.3):
 
     reconnect   go straight to the next vertex of the base path, which both paths share from then on
     replay      sample the next direction from the same random numbers
     copy        take the direction that has the same half-vector, in the shading frame
     reject      give up: no offset path corresponds to this base path
 
-Gradients are unbiased if the shift is an involution, T(T(x)) = x: shifting the offset path back must give the base
-path, with the inverse Jacobian, or be rejected from either side. So each rule below is symmetric, or comes with the
-test of what the reverse shift would have done.
+Gradients are unbiased if the shift is an involution, T(T(x)) = x. Shifting the offset path back must give the base
+path, with the inverse Jacobian; otherwise the shift must be rejected from both sides. So each rule below is symmetric,
+or has a test of what the reverse shift would do.
 """
 
 from __future__ import annotations
@@ -24,28 +24,30 @@ from data_gen.paths.vertex import SMOOTH
 def reconnects(kind: mi.UInt32, base: mi.Bool, base_next: mi.Bool, offset: mi.Bool) -> mi.Bool:
     """Whether the offset path goes to the base path's next vertex.
 
-    ``kind`` is the kind of event by which the base path left its vertex; the others say which vertices are connectable,
-    an escape to the environment being so (Kettunen et al. 2015, section 5.2).
+    ``kind`` is the kind of event by which the base path left its vertex. The other arguments say whether these vertices
+    are connectable: the base path's, its next one, and the offset path's. An escape to the environment is connectable
+    (Kettunen et al. 2015, section 5.2).
     """
-    # All three vertices, so that the rule is its own mirror image: base and offset may change places.
+    # All three vertices count, so the rule stays the same if base and offset change places.
     return (kind == SMOOTH) & base & base_next & offset
 
 
 def replay_inverts(offset_kind: mi.UInt32, offset: mi.Bool, offset_next: mi.Bool, base: mi.Bool) -> mi.Bool:
-    """Whether the replay of an event would be undone by the reverse shift.
+    """Whether the reverse shift would undo the replay of an event.
 
-    It would not if that reconnects the path found, whose event is of ``offset_kind``, to the base path's vertex. Else
-    it replays, whatever the kinds of the two events: the same random numbers have the same density (survey, eq. 6).
+    It would not if it reconnected the base path's vertex to the next vertex of the offset path, whose event is of
+    ``offset_kind``. Otherwise it replays, whatever the kinds of the two events: the same random numbers have the same
+    density (survey, eq. 6).
     """
-    # The rule above with the two paths changed, as the reverse shift would ask it
+    # The rule above with the two paths exchanged, as the reverse shift applies it
     return ~reconnects(offset_kind, offset, offset_next, base)
 
 
 def keeps_joined(kind: mi.UInt32) -> mi.Bool:
-    """Whether a path that has come to the shared vertex from elsewhere may leave it as its companion does.
+    """Whether a path that has come to the shared vertex from another direction may leave it as its companion does.
 
-    It may after a smooth event. A mirror or a hole gives each incoming direction its own outgoing one. Then the shift
-    is rejected from both sides, since neither path can sample the direction of the other.
+    It may if the event there is smooth. A mirror or a hole gives each incoming direction its own outgoing one, so
+    neither path can sample the other's direction, and the shift is rejected from both sides.
     """
     return kind == SMOOTH
 
@@ -55,12 +57,12 @@ def reconnection_jacobian(
 ) -> mi.Float:
     """dω'/dω, for directions from ``base`` and from ``offset`` to the same ``target`` with geometric ``normal``.
 
-    (cos θ' / cos θ) (d² / d'²), with angles at the target (survey, section 3.3). In a medium, where distances have a
-    density of their own, it is d² / d'² (survey, section 7.1).
+    It is (cos θ' / cos θ) (d² / d'²), with angles at the target (survey, section 3.3). In a medium, where the distance
+    has its own density, it is d² / d'² (survey, section 7.1).
     """
     to_base, to_offset = base - target, offset - target
     near, far = dr.squared_norm(to_base), dr.squared_norm(to_offset)
-    # One factor is a ratio of cosines, the other of squared distances: r³ would leave float32 before they do.
+    # A ratio of cosines times a ratio of squared distances. The cubes of distances could leave the range of float32.
     cosines = dr.abs(dr.dot(normal, to_offset) / dr.dot(normal, to_base)) * dr.sqrt(near / far)
     if in_medium is not None:
         cosines = dr.select(in_medium, 1, cosines)
@@ -70,12 +72,12 @@ def reconnection_jacobian(
 def copy_half_vector(
     wi: mi.Vector3f, wo: mi.Vector3f, η: mi.Float, wi_offset: mi.Vector3f, same: mi.Bool
 ) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
-    """The direction that has, with ``wi_offset``, the half-vector of ``wi`` and ``wo``; dω'/dω; whether it exists.
+    """The direction that has with ``wi_offset`` the same half-vector as ``wi`` and ``wo``; dω'/dω; whether it exists.
 
-    Directions are local to the shading frame of either vertex and lead away from it; ``η`` is the relative index of
-    refraction along ``wo``. A refraction is copied only to the ``same`` material from the same side, since the reverse
-    shift must know η; one without bending (thin sheets) is copied as a mirrored reflection. The base vertex must not be
-    left by a Dirac delta. [Kettunen et al. 2015, supplement; Walter et al. 2007, eq. 13-17, 40]
+    Directions are in the shading frame of their vertex and lead away from it. ``η`` is the relative index of refraction
+    along ``wo``. A refraction is copied only to the ``same`` material from the same side, since the reverse shift must
+    know η. A transmission without bending (thin sheets) is copied as a mirrored reflection. The event at the base
+    vertex must not be a Dirac delta. [Kettunen et al. 2015, supplement; Walter et al. 2007, eq. 13-17, 40]
     """
     refracts = wi.z * wo.z < 0
     thin = refracts & (η == 1)
@@ -88,7 +90,7 @@ def copy_half_vector(
     length2 = dr.squared_norm(h)
     h = h * dr.rsqrt(length2)
 
-    # Reflection about h; either sign of h will do
+    # Reflection about h; the sign of h does not matter
     c = dr.dot(wi_offset, h)
     mirrored = 2 * c * h - wi_offset
     # Refraction: wi' + η wo' is to be parallel to h (Walter et al., eq. 40).
@@ -102,6 +104,6 @@ def copy_half_vector(
     J = dr.select(bends, length2_offset / length2 / cosines, cosines)
     wo_offset.z = dr.select(thin, -wo_offset.z, wo_offset.z)
     exists = ((wi_offset.z * wo_offset.z < 0) == refracts) & (~refracts | (same & (wi.z * wi_offset.z > 0)))
-    # A pair of directions that is no refraction about h has no inverse.
+    # If wi and wo are no refraction about h, the copy has no inverse.
     exists &= (~bends | ((cos2 > 0) & (dr.dot(wi, h) * dr.dot(wo, h) < 0))) & dr.isfinite(J) & (J > 0)
     return dr.select(exists, wo_offset, mi.Vector3f(0, 0, 1)), dr.select(exists, J, 0), exists

@@ -1,7 +1,7 @@
 """The space between the surfaces of a scene: empty, or filled with media. Only the paths of ``gpt`` use it.
 
-The kernel of a scene without media contains no code for them. There a vertex has no ``Place``, a path draws no numbers
-for its segments, and a segment is the ray to the next surface.
+The kernel of a scene without media contains no code for media. In such a scene a vertex has no ``Place``, a path draws
+no random numbers for its segments, and a segment is the ray to the next surface.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from data_gen.paths.segments import Numbers, Segment
 class Drawn:
     """Random numbers of a path for one step through media."""
 
-    channel: mi.UInt32  # the colour by which it samples its distances, the same in all steps
+    channel: mi.UInt32  # the colour by which the path samples its distances, the same in all steps
     numbers: Numbers  # of the segment
-    light: mi.UInt32 | None  # key of the numbers on the way to the emitter; None without grids
+    light: mi.UInt32 | None  # key of the numbers for the way to the emitter; None without grids
 
 
 class Space:
@@ -45,11 +45,11 @@ class Space:
         return None
 
     def draw(self, random, channel: mi.UInt32 | None) -> Drawn | None:
-        """Random numbers of one more step of a path that samples distances by that ``channel``."""
+        """Random numbers for one more step of a path that samples distances by colour ``channel``."""
         return None
 
     def first(self, view, ray, within, drawn: Drawn | None) -> Segment:
-        """From a camera ``within`` a medium; ``view`` is the integrator, which knows what hides from the camera."""
+        """The segment from a camera ``within`` a medium. ``view`` is the integrator, which may hide lamps."""
         return straight(ray, view.first_hit(self.scene, ray))
 
     def fly(self, x, place: Place | None, ray, drawn: Drawn | None, active) -> Segment:
@@ -61,9 +61,9 @@ class Space:
     def sees(
         self, x, place: Place | None, target: mi.Point3f, drawn: Drawn | None, active, *, most: Any
     ) -> tuple[Any, mi.Bool]:
-        """Transmittance from vertex ``x`` to the point ``target`` of an emitter, and whether anything comes through.
+        """Transmittance from vertex ``x`` to the point ``target`` of an emitter, and whether it is above 0.
 
-        There may be ``most`` holes on the way.
+        There may be at most ``most`` holes on the way.
         """
         if self.holes is None:
             return 1, ~self.scene.ray_test(x.spawn_ray_to(target), active)
@@ -73,7 +73,7 @@ class Space:
     def reconnect(
         self, y, place: Place | None, ray, x1, base: Segment, drawn: Drawn | None, *, active
     ) -> tuple[Any, Any, mi.Bool]:
-        """Along ``ray`` from vertex ``y`` to ``x1``, where the segment ``base`` ends: see ``segments.reconnect``."""
+        """Reconnects the segment ``base`` along ``ray``, from ``y`` to ``x1``: see ``segments.reconnect``."""
         return 1, 1, self.scene.ray_test(ray, active)
 
 
@@ -82,7 +82,7 @@ def straight(ray, hit: mi.PreliminaryIntersection3f) -> Segment:
 
 
 class Filled(Space):
-    """Filled with media: vertices may be in them, and light is dimmed on its way."""
+    """Filled with media: vertices may be in them, and they absorb and scatter light on its way."""
 
     def __init__(self, scene: mi.Scene):
         super().__init__(scene)

@@ -1,4 +1,4 @@
-"""Radiance in whatever colours the Mitsuba variant works with, as scene-linear RGB."""
+"""Converts radiance from the colours of any Mitsuba variant to scene-linear RGB."""
 
 from __future__ import annotations
 

@@ -1,16 +1,16 @@
-"""Random numbers that belong to a sample of a pixel, or to a light path, whatever pass renders it.
+"""Random numbers that belong to a sample of a pixel, or to a light path, and do not depend on the passes of a render.
 
 There are two kinds of ``points``. "independent" points come from a random number generator for each sample. "sobol"
 points, the default, come from Owen-scrambled Sobol sequences, with a new pair of dimensions for each pair of numbers.
 
 - A pair of dimensions is the first two of Sobol's sequence, with a new scrambling of the order of the points and of
   both coordinates. [Burley 2020, "Practical Hash-based Owen Scrambling"]
-- Pixels are numbered in Z order, within tiles of 64x64 that are independent of each other, and a pixel's points are
-  side by side. [Ahmed and Wonka 2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error via hierarchical
-  ordering of pixels"]
-- Samples come in *rounds*, independent of each other: the first has the requested number of samples, or 16 if this is
-  not known, and each further one as many as all before it.
-- Light paths that are no pixel's own are numbered as they come in a pass; passes are independent of each other.
+- Pixels are numbered in Z order within tiles of 64x64, and the points of a pixel follow each other. Tiles are
+  independent of each other. [Ahmed and Wonka 2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error via
+  hierarchical ordering of pixels"]
+- Samples come in *rounds* that are independent of each other. The first round has the requested number of samples, or
+  16 if that is not known. Each further round has as many samples as all rounds before it.
+- Light paths that belong to no pixel are numbered in the order of their pass. Passes are independent of each other.
 """
 
 from __future__ import annotations
@@ -21,18 +21,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# Samples of a pixel in the first round, where it is not known how many there will be
+# Samples of a pixel in the first round, if their total number is not known
 ROUND = 16
-# The largest number of samples per pixel in a round, as a power of two: with the pixels of a tile, 32 bits number them.
+# Largest number of samples per pixel in a round, as a power of two: 32 bits number all samples of a tile's pixels.
 _LARGEST = 20
 # Side of a tile of pixels, as a power of two
 _TILE = 6
 
 
 def first_round(points: str, samples: int | None) -> int:
-    """Samples of a pixel in the first round, a power of two, or 0 where they are independent.
+    """Samples of a pixel in the first round, a power of two, or 0 for independent samples.
 
-    ``points`` "sobol" has as many as are asked for (None: not known), "rounds" always 16, "independent" none.
+    ``points`` is "sobol" (the first round has all ``samples``, or 16 if that is None), "rounds" (always 16) or
+    "independent".
     """
     if points == "independent":
         return 0
@@ -44,15 +45,15 @@ def first_round(points: str, samples: int | None) -> int:
 def sample_streams(seed: int, pixel: mi.UInt32, sample: mi.UInt32, width: int = 0, net: int = 0) -> mi.Sampler:
     """A sampler whose lanes are the streams of sample ``sample`` of pixel ``pixel``.
 
-    ``seed`` is any integer from 0. With a ``net`` they are points in an image of that ``width``, the first round of
-    which has ``net`` samples of each pixel, a power of two; without, they are independent. Mitsuba's own sampler
-    numbers the lanes of a pass instead, so its numbers change with the size of passes, and with them the image.
+    ``seed`` is an integer from 0. With a ``net`` above 0, the numbers are points in an image of this ``width``, and the
+    first round has ``net`` samples of each pixel, a power of two. With ``net`` 0 they are independent. Mitsuba's own
+    sampler depends on the number of the lane in its pass, so there the image would change with the size of passes.
     """
     if not net:
         return _independent(seed, pixel, sample)
     width, net = (dr.opaque(mi.UInt32, n) for n in (width, net))
     bits = dr.minimum(31 - dr.lzcnt(dr.maximum(sample, net)), _LARGEST)
-    # A number of the first round has as many bits as the last of the round, or fewer.
+    # All samples of the first round use the bits of the largest number in it.
     bits = dr.select(sample < net, 31 - dr.lzcnt(net), bits)
     first = dr.select(sample < net, 0, sample >> bits << bits)
     x, y = pixel % width, pixel // width
@@ -64,7 +65,7 @@ def sample_streams(seed: int, pixel: mi.UInt32, sample: mi.UInt32, width: int = 
 
 
 def light_streams(seed: int, number: mi.UInt32, turn: int, independent: bool = False) -> mi.Sampler:
-    """The streams of the light paths ``number`` of pass number ``turn``; none coincides with a stream of a pixel."""
+    """The streams of the light paths ``number`` in pass number ``turn``. They differ from all streams of pixels."""
     turn = dr.opaque(mi.UInt32, turn)
     if independent:
         return _independent(seed, number, turn, of_lights=True)
@@ -73,7 +74,7 @@ def light_streams(seed: int, number: mi.UInt32, turn: int, independent: bool = F
 
 
 def _independent(seed: int, a: mi.UInt32, b: mi.UInt32, of_lights: bool = False) -> mi.Sampler:
-    """Generators for each (a, b)."""
+    """Independent generators, one for each (a, b)."""
     entropy = [seed, 2] if of_lights else seed
     keys = (int(key) for key in np.random.SeedSequence(entropy).generate_state(2))
     # Encrypted twice, so that the streams of two seeds do not differ only by a shift of some pixels or samples.
@@ -85,13 +86,13 @@ def _independent(seed: int, a: mi.UInt32, b: mi.UInt32, of_lights: bool = False)
 
 
 def _key(seed: int, what: int) -> mi.UInt32:
-    """32 bits of a seed, others for each kind of streams."""
+    """32 bits made of the seed, which differ for each kind of stream (``what``)."""
     return dr.opaque(mi.UInt32, int(np.random.SeedSequence([seed, 1, what]).generate_state(1)[0]))
 
 
 @cache
 def _stream_class(variant: str) -> type:
-    """The sampler's class; Mitsuba's own classes, and so those derived from them, belong to a variant."""
+    """The class of samplers with independent numbers. Its base is a class of Mitsuba, and so belongs to a variant."""
 
     class Stream(mi.Sampler):
         """Independent random numbers. Cloning replays them. A stream can be recreated from ``state``."""
@@ -112,7 +113,7 @@ def _stream_class(variant: str) -> type:
             return mi.Point2f(x, self.random.next_float32(active))
 
         def next_key(self):
-            """Any 32 bits, from which more random numbers are made than would be drawn whether used or not."""
+            """32 random bits, from which a variable number of random numbers can be made."""
             return self.random.next_uint32()
 
         def skip(self, count):
@@ -139,8 +140,8 @@ def _sobol_class(variant: str) -> type:
     class Points(mi.Sampler):
         """Point ``index`` of each dimension from ``dimension`` on, scrambled by ``key``. Cloning replays them.
 
-        A pair of numbers takes two dimensions, and the second is skipped, so that pairs and single numbers can be
-        counted alike. Lanes that draw while others do not are ahead of them.
+        A pair of numbers advances by two dimensions, so that ``skip`` can count pairs and single numbers alike. Lanes
+        that draw while others are inactive get ahead of them.
         """
 
         def __init__(self, state):
@@ -189,19 +190,19 @@ def _sobol_class(variant: str) -> type:
 
 
 def mixed(x: mi.UInt32) -> mi.UInt32:
-    """Other bits for other numbers. [Wellons 2018, "Prospecting for hash functions", lowbias32]"""
+    """A hash of 32 bits. [Wellons 2018, "Prospecting for hash functions", lowbias32]"""
     x = (x ^ (x >> 16)) * mi.UInt32(0x7FEB352D)
     x = (x ^ (x >> 15)) * mi.UInt32(0x846CA68B)
     return x ^ (x >> 16)
 
 
 def _reversed_owen(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
-    """Nested uniform scrambling of the binary digits of ``x``; its first digit is the lowest bit; bits in usual order.
+    """Nested uniform scrambling of ``x``, given with reversed bits; the result has the usual order of bits.
 
-    The bits below a bit decide whether it is flipped. [Laine and Karras 2011, "Stratified sampling for stochastic
+    The lower bits of ``x`` decide whether a bit is flipped. [Laine and Karras 2011, "Stratified sampling for stochastic
     transparency"; constants of Vegdahl 2021, "Building a better LK hash"]
     """
-    # Not in place: that would change what the caller has.
+    # Not in place, which would change the caller's array
     x = x ^ (x * 0x3D20ADEA)
     x = (x + seed) * ((seed >> 16) | 1)
     x = x ^ (x * 0x05526C56)
@@ -210,12 +211,12 @@ def _reversed_owen(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
 
 
 def _owen(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
-    """Nested uniform scrambling of ``x``: blocks of 2^n whole numbers from a multiple of 2^n on stay together."""
+    """Nested uniform scrambling of the integer ``x``. It maps each aligned block of 2^n integers to such a block."""
     return _reversed_owen(dr.brev(x), seed)
 
 
 def _pascal(x: mi.UInt32) -> mi.UInt32:
-    """Sobol's second dimension, its first digit the lowest bit: Pascal's triangle modulo 2, times the bits of ``x``."""
+    """Sobol's second dimension, with reversed bits: Pascal's triangle modulo 2, times the bits of ``x``."""
     for shift, kept in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF)):
         x = x ^ ((x >> shift) & kept)
     return x
@@ -229,5 +230,5 @@ def _apart(x: mi.UInt32) -> mi.UInt32:
 
 
 def _unit(bits: mi.UInt32) -> mi.Float:
-    """In [0, 1)."""
+    """``bits`` as a number in [0, 1)."""
     return mi.Float(bits >> 8) * 2.0**-24

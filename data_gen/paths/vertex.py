@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# Kinds of scattering events: only after a smooth one can another path have gone the same way. An event that found no
-# direction at all counts as DELTA.
+# Kinds of scattering events. Only after a smooth event could another path have taken the same direction. An event that
+# found no direction counts as DELTA.
 SMOOTH, DELTA, NULL = 0, 1, 2
 
 # Parameters that hold a microfacet roughness, as mi.traverse() spells them: constants and textures, at any nesting.
@@ -18,19 +18,19 @@ _ROUGHNESS = re.compile(r"(?:^|\.)(alpha|alpha_u|alpha_v|roughness)(?:\.value|\.
 
 
 class Materials:
-    """Which materials of a scene scatter so widely that any two directions may be joined at them.
+    """Which materials of a scene scatter so widely that paths may be connected at them.
 
     A vertex is *connectable* if its material has a component without a Dirac delta, and the smallest roughness of all
     such components exceeds ``threshold``. This includes materials that also have a mirror component (``plastic``),
     although the shift is rejected when the mirror is sampled at the shared vertex. Connectability depends only on the
-    material, so that a path and its shifted copy agree on it, which keeps the shift invertible. Textured roughness
-    counts with its smallest texel; materials with no parameter for it (``diffuse``, ``measured``) count as rough.
+    material, so a path and its shifted copy agree on it, which keeps the shift invertible. Of a textured roughness the
+    smallest texel counts. Materials without a roughness parameter (``diffuse``, ``measured``) count as rough.
 
-    Shapes that are ``passed`` have no vertices, and do not count. With ``media`` in the scene rough glass is not
-    connectable, however rough: light that leaves a medium by it is found by few paths, see docs/samplers/media.md.
+    Shapes for which ``passed`` is true have no vertices and are ignored. With ``media`` in the scene, rough glass is
+    never connectable, because few paths find light that leaves a medium through it, see docs/samplers/media.md.
 
     ``unconnectable`` lists the materials, as "shape.material (class)", at which a vertex is not connectable or an event
-    may be other than smooth; ``all_connectable`` is True where there are none.
+    may not be smooth. ``all_connectable`` is True if there are none.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Materials:
         media: bool = False,
     ):
         shapes = [shape for shape in scene.shapes() if not passed(shape)]
-        # By Dr.Jit's number of each material, one of the shapes that are made of it
+        # Dr.Jit's number of each material -> one of its shapes
         users = {dr_number(shape.bsdf()): shape for shape in shapes if shape.bsdf() is not None}
         table = np.ones(max(users, default=0) + 1, bool)
         self.unconnectable: list[str] = []
@@ -53,7 +53,7 @@ class Materials:
             if sharp or not (table[number] and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)):
                 name = ".".join(filter(None, (shape.id(), bsdf.id())))
                 self.unconnectable.append(f"{name} ({bsdf.class_name()})".strip())
-        # Materials inside shape groups are not listed: they count as rough, but what else they do is unknown.
+        # Materials inside shape groups cannot be listed. They count as rough, but they may also have sharp components.
         if any(shape.class_name() == "Instance" for shape in shapes):
             self.unconnectable.append("those inside shape groups")
         self.unconnectable.sort()
@@ -61,7 +61,7 @@ class Materials:
         self.rough = ByMaterial(mi.Bool(table))
 
     def connectable(self, bsdf: mi.BSDFPtr) -> mi.Bool:
-        """The classification of a vertex with this material; False where there is none, as for a path that escaped."""
+        """Whether a vertex with this material is connectable. False without a material, as for escaped paths."""
         listed, rough = self.rough.of(bsdf)
         return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (~listed | rough)
 
@@ -73,18 +73,18 @@ class Materials:
 
 
 class ByMaterial:
-    """Values by Dr.Jit's number of a material.
+    """A table of values for materials, indexed by Dr.Jit's number of a material.
 
     Mitsuba does not list the materials inside shape groups, so they have no value.
     """
 
     def __init__(self, values: mi.Bool | mi.Float):
-        # Opaque: the numbers may be others in each process, and the kernel is to be the same.
+        # Opaque: the numbers may differ between processes, and the kernel should not.
         self.size, self.values = dr.opaque(mi.UInt32, dr.width(values)), values
         dr.eval(self.values)
 
     def of(self, bsdf: mi.BSDFPtr, active: mi.Bool | bool = True) -> tuple[mi.Bool, mi.Bool | mi.Float]:
-        """Whether each of the ``active`` materials has a value, and the value, else 0."""
+        """Whether each material is ``active`` and has a value, and the value, or 0."""
         number = dr.reinterpret_array(mi.UInt32, bsdf)
         listed = active & (number < self.size)
         return listed, dr.gather(type(self.values), self.values, number, listed)
@@ -96,7 +96,7 @@ def materials_of(scene: mi.Scene) -> dict[int, mi.BSDF]:
 
 
 def dr_number(bsdf: mi.BSDF) -> int:
-    """The number by which Dr.Jit's arrays of pointers know a material."""
+    """The number of a material in Dr.Jit's arrays of pointers."""
     return int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])
 
 
@@ -108,20 +108,20 @@ def smallest_roughness(bsdf: mi.BSDF) -> float:
         match = _ROUGHNESS.search(key)
         if match:
             value = float(np.min(np.array(params[key])))
-            # The principled materials' parameter is perceptual: α is its square.
+            # ``roughness`` of the principled materials is perceptual: α is its square.
             roughness = min(roughness, value**2 if match[1] == "roughness" else value)
     return roughness
 
 
 def event_kind(sampled_type: mi.UInt32) -> mi.UInt32:
-    """SMOOTH, DELTA or NULL, of the ``sampled_type`` of a BSDF sample."""
+    """SMOOTH, DELTA or NULL, given the ``sampled_type`` of a BSDF sample."""
     null = mi.has_flag(sampled_type, mi.BSDFFlags.Null)
     delta = mi.has_flag(sampled_type, mi.BSDFFlags.Delta)
     return dr.select(null, mi.UInt32(NULL), dr.select(delta, mi.UInt32(DELTA), mi.UInt32(SMOOTH)))
 
 
 def seen_from(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.SurfaceInteraction3f:
-    """Vertex ``si``, but reached along ``direction`` (world space). Escaped paths keep their direction."""
+    """Vertex ``si`` as if it had been reached along ``direction`` (world space). Escaped paths keep their direction."""
     other = mi.SurfaceInteraction3f(si)
     other.wi = dr.select(si.is_valid(), si.to_local(-direction), si.wi)
     return other
@@ -134,11 +134,11 @@ def consistent(
     f_p: mi.Spectrum,
     active: bool | mi.Bool = True,
 ) -> mi.BSDFSample3f:
-    """A BSDF sample, with density 0 where the material evaluates the density of the sampled direction to 0.
+    """The BSDF ``sample``, with density 0 where ``evaluate`` gives density 0 for the sampled direction.
 
     Diffuse materials seen from behind, and rough metal below its horizon, sample directions with a density above 0 and
-    f / p = 0, while ``evaluate`` gives the density 0. A shift would use this 0 for the path it leads to, and the
-    density of the sample for the path it comes from: the weights of the pair would add up to more than 1.
+    f / p = 0, while ``evaluate`` gives the density 0. A shift would use the 0 for the offset path and the sampled
+    density for the base path, so the weights of the pair would add up to more than 1.
     """
     asked = active & (event_kind(sample.sampled_type) == SMOOTH) & (sample.pdf > 0) & (dr.max(f_p) == 0)
     _, p = evaluate(bsdf, si, sample.wo, asked)
@@ -149,9 +149,10 @@ def consistent(
 def evaluate(
     bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: bool | mi.Bool = True
 ) -> tuple[mi.Spectrum, mi.Float]:
-    """f cos θ of a material and the density of sampling ``wo``, for directions that were not sampled there.
+    """f cos θ of a material and the density of sampling ``wo``, also for directions that its sampling cannot return.
 
-    Such directions may lie below the horizon, where some materials (``roughplastic``) return NaN. Then the value is 0.
+    Such directions may lie below the horizon, where some materials (``roughplastic``) return NaN. Both values are 0
+    then.
     """
     f, p = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
     good = dr.isfinite(p) & dr.isfinite(dr.sum(f))

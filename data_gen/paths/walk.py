@@ -1,6 +1,6 @@
-"""Rules of all random walks: the largest depth, Russian roulette, and the environment that an escaping path sees.
+"""Rules of all random walks: the largest depth, Russian roulette, and whether an escaping path sees the environment.
 
-Each rule is written once, because samplers must agree: different ends of paths would give different images.
+Each rule is written once, because samplers must agree: if their paths ended differently, their images would differ.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ _MOST = 0.95
 
 @dataclass
 class Limits:
-    """The parameters that our integrators have from Mitsuba's ``path``."""
+    """The parameters that our integrators share with Mitsuba's ``path``."""
 
     max_depth: int = UNLIMITED  # most edges of a path; 1: only emission that the camera sees
-    rr_depth: int = 5  # vertices from the first that Russian roulette looks at on
-    hide_emitters: bool = False  # from the camera
+    rr_depth: int = 5  # number of the first vertex with Russian roulette
+    hide_emitters: bool = False  # whether emitters are hidden from the camera
 
     @classmethod
     def read(cls, props: mi.Properties) -> Limits:
@@ -65,11 +65,11 @@ class Limits:
 
 
 def roulette(throughput: mi.Float, plays: mi.Bool | bool, η: mi.Float | None = None) -> mi.Float:
-    """Russian roulette: the probability to survive, which survivors are divided by; 1 where a path does not ``plays``.
+    """Russian roulette: the probability to survive, by which survivors must be divided; 1 where ``plays`` is false.
 
-    For a path from the camera, ``throughput`` is the largest channel of its weight behind the step, and ``η`` the
-    product of the relative indices of refraction up to there: η² undoes what refraction does to radiance, as in
-    Mitsuba's ``path``. For a path from a light it is relative to the weight that the path began with.
+    For a path from the camera, ``throughput`` is the largest channel of its weight after the step, and ``η`` the
+    product of the relative indices of refraction so far. η² undoes the change of radiance by refraction, as in
+    Mitsuba's ``path``. For a path from a light, ``throughput`` is relative to the initial weight of the path.
     """
     if η is not None:
         throughput = throughput * dr.square(η)
@@ -77,7 +77,7 @@ def roulette(throughput: mi.Float, plays: mi.Bool | bool, η: mi.Float | None = 
 
 
 def brightest(paths: Iterable[Any]) -> mi.Float:
-    """The largest throughput ``β`` of those paths that are ``alive``."""
+    """The largest channel of the throughputs ``β`` of those paths that are ``alive``."""
     largest = mi.Float(0)
     for path in paths:
         largest = dr.fmax(largest, dr.select(path.alive, dr.max(path.β), 0))
@@ -88,20 +88,21 @@ def brightest(paths: Iterable[Any]) -> mi.Float:
 class Sky:
     """Whether a path that escapes sees the environment.
 
-    One that hides from the camera hides as well behind holes, where nothing has been scattered yet.
+    An environment that is hidden from the camera is hidden behind holes, too, since nothing has been scattered there
+    yet.
     """
 
     seen: mi.Bool
 
     @classmethod
     def from_camera(cls, hides: bool, lanes: int = 1) -> Sky:
-        """At the first vertex; ``hides``: emitters hide from the camera."""
+        """For the first edge of a path; ``hides``: emitters are hidden from the camera."""
         return cls(dr.full(mi.Bool, not hides, lanes))
 
     def behind(self, kind: mi.UInt32, found: mi.Bool | bool = True) -> Sky:
-        """Behind an event of this ``kind`` (``vertex.event_kind``), where one was ``found``."""
+        """For the edge after an event of this ``kind`` (``vertex.event_kind``), where one was ``found``."""
         return Sky(self.seen | (found & (kind != NULL)))
 
     def meets(self, x: mi.SurfaceInteraction3f) -> mi.Bool:
-        """Whether there is something that may emit light at the next vertex ``x``: a surface, or the environment."""
+        """Whether the next vertex ``x`` may emit light: it is on a surface, or the path sees the environment."""
         return x.is_valid() | self.seen

@@ -1,8 +1,8 @@
 """The samplers: one registry, one way to call them.
 
-A new sampler is a class and one entry, in the ``about`` of its family, which a line here imports. The command line,
-``ngpt info``, the choice of "auto", the refusals, the configurations, the evaluation, the docs and the tests find it
-there. Nothing of that imports Mitsuba.
+A new sampler is a class and one entry. The entry is in the ``about`` of the sampler's family, which a line here
+imports. The command line, ``ngpt info``, the choice of "auto", the refusals, the configurations, the evaluation, the
+docs and the tests read the entries. Reading them does not import Mitsuba.
 """
 # ruff: noqa: F401 - what is imported registers itself
 

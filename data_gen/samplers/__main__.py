@@ -4,12 +4,12 @@ from data_gen.samplers import SAMPLERS, by_standing
 from data_gen.samplers.registry import own
 from ngpt.options import written
 
-# Standing -> what the table calls it
+# Standing -> its heading in the table
 GROUPS = {"use": "", "niche": "for some scenes"}
 
 
 def table() -> str:
-    """All samplers but studies in Markdown, by standing, with their options and defaults."""
+    """A table in Markdown of all samplers except studies, by standing, with their options and defaults."""
     lines, others = ["| sampler | what it is | options |", "|---|---|---|"], SAMPLERS.load()
     for standing, title in GROUPS.items():
         lines += [f"| | *{title}* | |"] if title else []

@@ -1,4 +1,4 @@
-"""What our samplers share: Mitsuba's own estimates, and what makes an integrator a plugin."""
+"""Code that several samplers share: the estimates of Mitsuba's integrators, and the base class of our plugins."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ from ngpt.options import written
 def loses_light(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> bool:
     """Whether the integrator is ``path`` in a scene where that is biased.
 
-    ``path`` returns 0 for a path that escapes after passing only holes, even if emitter sampling has lit it where the
-    material of a mask is partly there; scenes with an environment are not affected. It also never finds the light that
-    lamps without size send through holes.
+    ``path`` returns 0 for a path that escapes after passing only holes, and drops the light that emitter sampling found
+    at partly opaque masks. Scenes with an environment are not affected. ``path`` also never finds light that lamps
+    without size send through holes.
     """
     if integrator.class_name() != "PathIntegrator":
         return False
@@ -48,7 +48,7 @@ def loses_light(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> bool:
 
 
 def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[..., mi.Spectrum]:
-    """(sampler, ray, medium, active) -> what the integrator estimates: itself, or ``prb`` where it ``loses_light``."""
+    """(sampler, ray, medium, active) -> radiance, by the integrator, or by ``prb`` if that ``loses_light``."""
     if loses_light(scene, integrator):
         integrator = mi.load_dict({"type": "prb", **path_depths(integrator)})
     return own_estimate(scene, integrator)
@@ -57,9 +57,9 @@ def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[...
 def recorded(
     scene: mi.Scene, samples: Callable[[CameraSamples], dict], *owners: object, shifts: Iterable = QUARTERS
 ) -> SamplePass:
-    """A pass that puts the results of ``samples`` on the film, recorded once: see ``Frozen``, also for ``owners``.
+    """A pass that puts the results of ``samples`` on the film. ``samples`` is recorded once: see ``Frozen``.
 
-    It also asks the camera for rays displaced by the ``shifts``.
+    Besides the camera rays, ``samples`` may use rays displaced by the ``shifts``.
     """
     frozen = Frozen(scene, *owners)
     return lambda camera, film: film.put_all(frozen(samples, camera.look((0, 0), *shifts)))
@@ -74,31 +74,31 @@ class GradientIntegrator(mi.SamplingIntegrator):
     """
 
     follows = "path"  # Mitsuba's integrator whose image is rendered
-    nested = False  # whether another integrator traces the paths, so that there are no ``limits``
+    nested = False  # whether another integrator traces the paths; then there are no ``limits``
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
-        # Of the sampler, whose ``entry`` in the registry says which options there are, and what it refuses
+        # The name of the sampler. Its ``entry`` in the registry has the options and the refusals
         self.name = by_plugin(props.plugin_name()).name
         self.options = self.entry.settings({name: props[name] for name in self.entry.options if name in props})
-        # Whether the user decides on them: what the option says is else decided anew for each render
+        # Whether the user has set this option. If not, ``share_tails`` sets it for each render
         self.given_tails = "tails" in self.entry.options and "tails" in props
         # Whether the film counts failed shifts, where the sampler ``diagnoses`` them
         self.diagnostics = props.get("diagnostics", False)
         if not self.nested:
             self.limits = Limits.read(props)
         self.channels: list[str] = []
-        # By which lamps are chosen, where the sampler does so by place and there are many
+        # Chooses lamps, if the sampler can choose them by place and the scene has many
         self.places: Places | None = None
 
-    # No attribute: Dr.Jit looks at all of these where an integrator is among the variables of a loop.
+    # A property: Dr.Jit traverses all attributes if an integrator is among the variables of a loop.
     @property
     def entry(self) -> Sampler:
         return SAMPLERS[self.name]
 
     @classmethod
     def like_path(cls, scene: mi.Scene, plugin: str, places: Places | None = None, **options) -> Self:
-        """The integrator ``plugin``, of this class, with the parameters of the scene's own ``path``, and ``options``.
+        """An integrator ``plugin`` of this class, with the parameters of the scene's ``path`` and the ``options``.
 
         Lamps are chosen by ``places``. Raises NgptError where the parameters cannot be read.
         """
@@ -131,11 +131,11 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return self.begin(scene, sensor)
 
     def begin(self, scene: mi.Scene, sensor: mi.Sensor) -> SamplePass:
-        """``prepare()`` of a scene that the sampler does not refuse."""
+        """As ``prepare()``, for a scene that the sampler does not refuse."""
         raise NotImplementedError
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        """Only the primal estimate, by the ``reference()``."""
+        """Only the primal estimate, as the ``reference()`` computes it."""
         return self.reference().sample(scene, sampler, ray, medium, active)
 
     def render_film(self, scene, sensor, seed: int, spp: int) -> GradientFilm:
@@ -151,7 +151,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
             return render_passes(self.prepare(scene, sensor), sensor, seed, budget, **limits)
 
     def share_tails(self, scene: mi.Scene, sensor: mi.Sensor, budget: Budget) -> Budget:
-        """Decides whether paths share their tails, if the plugin leaves it open; returns the remaining budget."""
+        """Decides whether paths share their tails, if the user has not; returns the remaining budget."""
         if "tails" not in self.options:
             return budget
         found = sharing_of(sensor, self.entry, self.facts(scene, sensor), self.options, budget)
@@ -168,7 +168,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return mi.TensorXf(np.concatenate(list(layers.values()), axis=-1))
 
     def aov_names(self):
-        """The channels of the last render; `ngpt.GradientStack.from_aovs` makes a stack of its tensor by them."""
+        """The channels of the last render. `ngpt.GradientStack.from_aovs` needs them to make a stack of its tensor."""
         return self.channels
 
     def to_string(self):
@@ -177,7 +177,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return f"{type(self).__name__}[\n{lines}]"
 
     def first_hit(self, scene, ray, active=True, *, coherent=True) -> mi.PreliminaryIntersection3f:
-        """Where a camera ray leads, through lamps that hide from the camera."""
+        """The first hit of a camera ray. If emitters are hidden, the ray passes through lamps."""
         ray = mi.Ray3f(ray)
         hit = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
         if self.hide_emitters:
@@ -187,9 +187,9 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return hit
 
     def first_surface(self, scene, media: Media, ray, medium, active) -> mi.PreliminaryIntersection3f:
-        """``first_hit()`` for a piece of such a ray; as in ``volpath``, lamps in a medium are dark there, but seen."""
-        # Where a boundary coincides with a surface, coherent rays meet the boundary half as often as other rays. Rays
-        # of ``volpath`` are never coherent.
+        """``first_hit()`` of a piece of a camera ray. As in ``volpath``, hidden lamps block rays inside a medium."""
+        # Where a boundary coincides with a surface, coherent rays meet the boundary half as often as other rays do.
+        # Rays of ``volpath`` are never coherent.
         coherent = not media.boundaries
         hit = self.first_hit(scene, ray, active, coherent=coherent)
         if self.hide_emitters:
@@ -198,7 +198,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return hit
 
     def emission_in_pixel(self, scene, camera: CameraSamples, Le, media: Media | None = None, within=None):
-        """``lights.emission_in_pixel`` of what this integrator shows, through ``media`` around a camera ``within``."""
+        """``lights.emission_in_pixel`` for this integrator; the camera may be ``within`` one of the ``media``."""
         if not self.limits.shows:
             return Le
         if media:
@@ -208,7 +208,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return emission_in_pixel(scene, camera, Le, emission)
 
     def lamps_in_fog(self, scene, media: Media, ray, within, channel) -> mi.Spectrum:
-        """The layer ``direct``: lamps and the environment as seen through homogeneous media, the expectation."""
+        """The layer ``direct``: the expected emission of lamps and the environment, seen through homogeneous media."""
         if not self.limits.shows:
             return mi.Spectrum(0)
         trace = partial(self.first_surface, scene, media)
@@ -217,11 +217,11 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return T * si.emitter(scene).eval(si, hit.is_valid() if media.grids else mi.Bool(True))
 
     def behind_grids(self, scene, media: Media, segment: segments.Segment) -> mi.Spectrum:
-        """Le where the first ``segment`` of a path has come through grids, or to the environment of a scene with grids.
+        """Le at the end of the first ``segment`` of a path, if it crosses grids, or escapes in a scene with grids.
 
-        It is light like any other, not in ``direct``: it has noise, and less so together with the light that was
-        scattered on the way, since a path finds one or the other. The environment is here in all pixels. Else the box
-        around a cloud would stand out from the sky.
+        This light is not in ``direct``, since it has noise. The noise is less in the sum with light that was scattered
+        on the way, since a path finds one or the other. The environment is included here in all pixels; otherwise the
+        box around a cloud would stand out from the sky.
         """
         if not self.limits.shows or not media.grids:
             return mi.Spectrum(0)

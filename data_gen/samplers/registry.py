@@ -21,7 +21,7 @@ from ngpt.system.parts import Registry
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
 
-# Why a scene of these facts cannot be rendered by the sampler of a name; "" where it can
+# (facts of a scene, name of a sampler) -> why that sampler cannot render the scene, or "" if it can
 Rule = Callable[["Facts", str], str]
 
 
@@ -34,16 +34,16 @@ def integrator_of(module: str) -> Any:
     return None if hasattr(found, "make") else next(value for value in own if hasattr(value, "like_path"))
 
 
-# What every sampler of single images takes beside its own options; ``data_gen.render`` sees to it, and not ``make``.
+# Options of every sampler of single images, besides its own. ``data_gen.render`` handles them; ``make`` does not.
 COMMON = {
     "points": Option(
         "sobol",
-        "of random numbers: Sobol's, in rounds where --spp does not say how many, or independent ones (more noise)",
+        "random numbers: Sobol points in a single round of --spp samples, in rounds from 16 on, or independent ones",
         choices=("sobol", "rounds", "independent"),
     ),
     "lamps": Option(
         "power",
-        "how often each is chosen, where the scene leaves that open: by what it brings, or all alike",
+        "how often each lamp is chosen, if the scene does not say: by the light it brings, or all equally",
         choices=("power", "uniform"),
     ),
 }
@@ -51,20 +51,20 @@ COMMON = {
 
 @dataclass(frozen=True)
 class Entry:
-    name: str  # as users call it
+    name: str  # the name that users give
     summary: str  # one line for the user
-    # Where its Mitsuba integrator is, a ``data_gen.samplers.common.GradientIntegrator``, or a function ``make``. It is
-    # imported when the sampler is made, since its classes belong to a variant of Mitsuba. Or the function itself
+    # The module with its Mitsuba integrator, a ``data_gen.samplers.common.GradientIntegrator``, or with a function
+    # ``make``. It is imported when the sampler is made, since its classes belong to a variant of Mitsuba. Instead of a
+    # module, the function itself may be given
     module: str | Callable[..., Any]
-    standing: str = field(default="niche", kw_only=True)  # of ``STANDINGS``: what help shows first, and what is tested
+    standing: str = field(default="niche", kw_only=True)  # one of ``STANDINGS``: order in the help, tests
     # All of them are given to ``make``, except the options in ``COMMON``.
     options: Mapping[str, Option] = field(default_factory=dict, kw_only=True)
-    refusals: tuple[Rule, ...] = field(default=(), kw_only=True)  # the first that gives a reason counts
-    # What the user should know about rendering, by subject: "transport" and "noise"; "mirrors" and "media" where a
-    # scene has them
+    refusals: tuple[Rule, ...] = field(default=(), kw_only=True)  # the first one with a reason counts
+    # Notes for the user by subject: "transport" and "noise"; "mirrors" and "media", shown if a scene has them
     notes: Mapping[str, str] = field(default_factory=dict, kw_only=True)
-    loses: str = field(default="", kw_only=True)  # which light of lamps without size it loses at holes; "": none
-    # Whether it leaves the densities of lamps to Mitsuba, which errs where these have vertex normals (``BentLamps``)
+    loses: str = field(default="", kw_only=True)  # which light of lamps without size is lost at holes; "": none
+    # Whether it uses Mitsuba's densities for lamps, which are wrong for bent lamps (``BentLamps``)
     leaves_lamps: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -72,7 +72,7 @@ class Entry:
             raise NgptError(f"sampler '{self.name}': standing '{self.standing}' is none of {', '.join(STANDINGS)}")
 
     def make(self, *args: Any, **options: Any) -> Any:
-        """What the module makes; raises NgptError for a scene that cannot be rendered."""
+        """Returns what the module makes. Raises NgptError for a scene that cannot be rendered."""
         make = self.module if callable(self.module) else import_module(self.module).make
         return make(*args, **options)
 
@@ -94,7 +94,7 @@ class Entry:
         return settings(f"sampler '{self.name}'", self.options, given)
 
     def unusual(self, settings: Mapping[str, Any]) -> str:
-        """The ``settings`` that are not defaults, as ``-O`` takes them, separated by commas."""
+        """Returns the ``settings`` that are not defaults, in the form of ``-O``, separated by commas."""
         return as_text(unusual(self.options, settings))
 
     def made(self, *args: Any, **options: Any) -> Any:
@@ -112,30 +112,29 @@ def own(settings: Mapping[str, Any]) -> dict[str, Any]:
 class Sampler(Entry):
     """A sampler that renders the layers of a gradient stack. It has its own options, and the options in ``COMMON``.
 
-    Its ``make`` (scene, options) returns what takes the samples of a pass (``data_gen.passes.SamplePass``).
+    Its ``make`` (scene, options) returns a function that takes the samples of a pass (``data_gen.passes.SamplePass``).
     """
 
     _: KW_ONLY
     gradients: bool = True  # whether it renders dx and dy
     rank: int = 0  # "auto" takes the sampler of least rank that can render the scene; 0: never
-    # Whether the pilot of "auto" compares it with others, where it can render the scene: True for samplers that were
-    # seen to be chosen where they are best (``data_gen.choosing.plans``)
+    # Whether the pilot of "auto" compares it with others in scenes that it can render. True for samplers of which
+    # measurements have shown that the pilot chooses them where they are best (``data_gen.choosing.plans``)
     tried: bool = False
-    compiles: float = 2.0  # seconds that a core takes to compile its kernels, given where it is ``tried``
-    # Light that it finds and paths from the camera hardly find: "caustics" (seen in mirrors or glass after glass has
-    # focussed it on something rough), "hidden lamps" (hidden from what they light), "grids" (light in media of varying
-    # density, by photons)
+    compiles: float = 2.0  # seconds that a core takes to compile its kernels; used if ``tried``
+    # Light that it finds and paths from the camera hardly find: "caustics" (that are seen in mirrors or through glass),
+    # "hidden lamps" (that the surfaces they light do not see), "grids" (light in media of varying density, by photons)
     finds: tuple[str, ...] = ()
     diagnoses: bool = False  # whether it counts failed shifts (--diagnostics): ``make`` takes ``diagnostics=True``
-    # 0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass has this
-    # number, and variances are over passes
+    # 0 if all samples are independent. Otherwise samples of a pass depend on each other or splat: this is the number of
+    # samples per pixel in a pass, and variances are computed over passes
     batch: int = 0
-    together: bool = False  # whether pixels share paths, so that a pass has all of them, with as many samples each
-    lane_bytes: int = LANE_BYTES  # memory that a lane, one sample of one pixel, takes in a pass
+    together: bool = False  # whether pixels share paths: a pass needs all pixels, with equally many samples
+    lane_bytes: int = LANE_BYTES  # memory of a lane, which is one sample of one pixel, in a pass
     by_place: bool = False  # whether it can choose lamps by place: ``make`` takes ``places``
-    gathers: bool = False  # whether its layer ``caustic`` is what photons brought (``ngpt.layers.GATHERED``)
-    biased: bool = False  # whether its mean approaches Mitsuba's only as the number of samples grows
-    counts: bool = False  # whether it replays numbers one by one, which must be independent: it takes no ``points``
+    gathers: bool = False  # whether its layer ``caustic`` is light of photons (``ngpt.layers.GATHERED``)
+    biased: bool = False  # whether its expected image approaches Mitsuba's only as the number of samples grows
+    counts: bool = False  # whether it replays numbers one by one, which must be independent: it has no ``points``
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -147,9 +146,7 @@ class Sampler(Entry):
         return plugin_of(self.name)
 
     def integrator(self, scene: Any, **options: Any) -> Any:
-        """Returns its integrator with the parameters of the scene's own ``path`` and the ``options``, which are
-        checked.
-        """
+        """Returns its integrator, with the parameters of the scene's own ``path`` and checked ``options``."""
         return integrator_of(self.module).like_path(scene, self.plugin, **options)
 
     def make(self, scene: Any, **options: Any) -> Any:
@@ -159,22 +156,22 @@ class Sampler(Entry):
 
     @property
     def film_of_gradients(self) -> bool:
-        """Whether its film may need room for more than colour and features: studies put what they like."""
+        """Whether its film may need room for more than colour and features. Studies may put any layer."""
         return self.gradients or bool(self.batch) or self.standing == "study"
 
     @property
     def even(self) -> bool:
-        """Whether all pixels must have as many samples."""
+        """Whether all pixels must have the same number of samples."""
         return bool(self.batch) or self.together
 
     def subpixels(self, asked: int | str, spp: int | None) -> int:
-        """K of the K x K subpixels that a render keeps: the number ``asked``, or for "auto" what suits ``spp`` samples.
+        """K of the K x K subpixels that a render keeps: ``asked``, or for "auto" the best K for ``spp`` samples.
 
-        Raises WrongUse if it cannot keep the requested ones.
+        Raises WrongUse if the sampler cannot keep subpixels.
         """
         k = choice(asked)
         if not self.batch:
-            # With gradients, networks combine images that they were trained to find without subpixels.
+            # Networks for gradients were trained without subpixels.
             return int(k) if k != "auto" else 1 if self.gradients else best(spp)
         if k in ("auto", 1):
             return 1
@@ -187,8 +184,7 @@ class Sampler(Entry):
 
 @dataclass(frozen=True)
 class FrameSampler(Entry):
-    """A sampler that renders the frames of a shot in order, since it reuses earlier frames. It renders no single
-    images.
+    """A sampler of shots: it renders frames in order, since it reuses earlier frames, and no single images.
 
     Its ``make`` (scene, seed, samples per pixel, memory in MiB, options) returns an object whose ``film(index, motion,
     depth)`` is the film of a frame, numbered in the shot.
@@ -196,12 +192,12 @@ class FrameSampler(Entry):
 
     _: KW_ONLY
     spp: int  # samples per pixel of a frame, where the user gives none
-    warm_up: int  # frames before, that are rendered where a shot is gone on with: its history
-    alone: str  # why it renders no single images
+    warm_up: int  # earlier frames to render again, as its history, when a shot is continued
+    alone: str  # the reason, in a message, why it renders no single images
 
 
 FRAME_SAMPLERS: dict[str, FrameSampler] = {}
-# Other packages add theirs by entry points.
+# Other packages add samplers by entry points.
 SAMPLERS: Registry[Sampler] = Registry("ngpt.samplers", "sampler", Sampler, {}, FRAME_SAMPLERS)
 
 
@@ -215,7 +211,7 @@ def by_plugin(plugin: str) -> Sampler:
 
 
 def register(entry: Sampler | FrameSampler) -> None:
-    """Adds a sampler behind the existing ones. Raises NgptError if its name is taken."""
+    """Adds a sampler after the existing ones. Raises NgptError if its name is taken."""
     if entry.name in ("auto", *SAMPLERS, *FRAME_SAMPLERS):
         raise NgptError(f"there is a sampler '{entry.name}' already")
     if isinstance(entry, FrameSampler):
@@ -225,7 +221,7 @@ def register(entry: Sampler | FrameSampler) -> None:
 
 
 def find(name: str, facts: Facts | None = None) -> Sampler:
-    """The sampler of that name. Raises NgptError if there is none, or if it refuses a scene of these ``facts``."""
+    """The sampler called ``name``. Raises NgptError if there is none, or if it refuses a scene of these ``facts``."""
     if name in FRAME_SAMPLERS:
         raise WrongUse(f"sampler '{name}' is for shots (--frames): {FRAME_SAMPLERS[name].alone}; use --sampler gpt")
     if name not in SAMPLERS:
@@ -239,16 +235,16 @@ def find(name: str, facts: Facts | None = None) -> Sampler:
     return sampler
 
 
-# The default is samples without gradients, and OIDN. Anything that takes longer to compile, to render or to explain
-# replaces it only if it was measured to be better.
+# The default: samples without gradients, and OIDN. A way that takes longer to compile, to render or to explain replaces
+# it only where measurements show that it is better.
 SIMPLE = ("primal", "oidn")
 
 
 def described(facts: Facts, gradients: bool = False) -> tuple[str, str, str]:
-    """The sampler of "auto" in `ngpt render`, from the description only, the method for its stacks, and why.
+    """What "auto" stands for in `ngpt render`, judged by the scene's description only: sampler, method, and why.
 
-    The method is "" where the layers decide. It is the simple way unless there are media, where gradients pay, unless
-    they are asked for, and unless OIDN is missing, without which gradients clean better.
+    Returns ``SIMPLE``, except in three cases: there are media, for which gradients are worth their cost; gradients were
+    asked for; or OIDN is missing, without which gradients give better images. Then the method is "": the layers decide.
     """
     sampler, reason = choose(facts)
     if gradients or facts.media or METHODS[SIMPLE[1]].missing():
@@ -257,7 +253,7 @@ def described(facts: Facts, gradients: bool = False) -> tuple[str, str, str]:
 
 
 def choose(facts: Facts) -> tuple[str, str]:
-    """The sampler with gradients that "auto" stands for, from the description only, and why."""
+    """The sampler with gradients for "auto", judged by the scene's description only, and why."""
     reasons: list[str] = []
     for sampler in sorted(SAMPLERS.values(), key=lambda sampler: sampler.rank):
         if not sampler.rank:
@@ -271,7 +267,7 @@ def choose(facts: Facts) -> tuple[str, str]:
 
 
 def check_options(name: str, given: Mapping[str, Any]) -> None:
-    """Raises WrongUse for options that the sampler of that name does not take, or not all that "auto" may stand for."""
+    """Raises WrongUse for options that the sampler does not have. "auto" has those that all its samplers share."""
     if name != "auto":
         (FRAME_SAMPLERS[name] if name in FRAME_SAMPLERS else find(name)).settings(given)
         return

@@ -1,6 +1,6 @@
-"""Samplers that renders of one scene share: their kernels are recorded once for all of them.
+"""Samplers that several renders of one scene share, so that their kernels are recorded only once.
 
-Small images, such as crops of a training set, take less time to render than to record.
+Small images, such as crops of a training set, take less time to render than their kernels take to record.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ngpt.errors import stop_if_interrupted
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
-# Numbers of a film that the arrays of a camera hold, and no kernel
+# Numbers of a film that are in arrays of the camera, not in kernels
 _IN_ARRAYS = ("film.size", "film.crop_offset")
 
 
@@ -28,7 +28,7 @@ class Made:
         self._kept: dict[str, tuple[Any, SamplePass]] = {}
 
     def sampler(self, entry: Sampler, scene: mi.Scene, options: dict[str, Any]) -> SamplePass:
-        """What ``entry.make`` makes, or has made. ``options`` are the sampler's own."""
+        """The kept sampler if it still fits, or else what ``entry.make`` makes. ``options`` are the sampler's own."""
         if entry.name in self._kept:
             key, sample = self._kept[entry.name]
             if key == _key(scene, options):
@@ -36,9 +36,10 @@ class Made:
         return entry.make(scene, **options)
 
     def keep(self, entry: Sampler, scene: mi.Scene, options: dict[str, Any], sample: SamplePass) -> None:
-        """To be called after a render. Samplers that know the view, or remember passes, are not kept.
+        """Keeps a sampler after a render. Samplers that depend on the view, or remember passes, are not kept.
 
-        Whatever fails here does not fail the render, which has all its samples: the next one makes its own sampler.
+        A failure here only gives a warning, since the render has all its samples. The next render makes its own
+        sampler.
         """
         if entry.even or "places" in options:
             return
@@ -61,7 +62,7 @@ def _key(scene: mi.Scene, options: dict[str, Any]) -> tuple:
 def _values(thing: mi.Object) -> dict[str, Any]:
     """The parameters of a scene or a camera by name.
 
-    ``mi.SceneParameters`` fails where one is None, as is ``sigma_a`` of hair with a colour from melanin.
+    ``mi.SceneParameters`` fails if a parameter is None, such as ``sigma_a`` of hair whose colour comes from melanin.
     """
     found = mi.traverse(thing).properties.items()
     return {
@@ -70,9 +71,9 @@ def _values(thing: mi.Object) -> dict[str, Any]:
 
 
 class _Same:
-    """The value of a parameter, to be compared.
+    """The value of a parameter, for comparisons.
 
-    It holds the arrays, since Dr.Jit gives their indices to others once they are gone.
+    It keeps the arrays alive, since Dr.Jit gives the index of a freed array to another array.
     """
 
     def __init__(self, value: Any):

@@ -1,4 +1,4 @@
-"""What entries of several families share: why they refuse a scene (``registry.Rule``), and options and notes."""
+"""Parts of entries that several families share: rules to refuse a scene (``registry.Rule``), options and notes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from data_gen.samplers.registry import Option
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
 
-# Integrators that render media, of those that samplers of ours follow
+# Integrators with media that our samplers can follow
 VOLUMETRIC = ("volpath", "volpathmis")
 
 
@@ -20,7 +20,7 @@ def polarised(facts: Facts, name: str) -> str:
 
 
 def spectra(facts: Facts, name: str) -> str:
-    """Paths that share light with others must have the same wavelengths."""
+    """Paths that share light must have the same wavelengths."""
     reason = f"in variant '{facts.spectral}' each path has wavelengths of its own, and '{name}' lets paths share light"
     return f"{reason}, as variant 'llvm_ad_rgb' allows" if facts.spectral else ""
 
@@ -54,20 +54,20 @@ def mirrors(facts: Facts, name: str) -> str:
 
 
 def unreachable_camera(facts: Facts, name: str) -> str:
-    """Light paths must be able to end there."""
+    """Light paths must be able to end at the camera."""
     reached = facts.camera in ("perspective", "thinlens")
-    return "" if reached else f"light paths cannot reach a camera '{facts.camera}', but 'perspective' and 'thinlens'"
+    return "" if reached else f"light paths cannot reach a camera '{facts.camera}', only 'perspective' and 'thinlens'"
 
 
 def no_pixels(facts: Facts, name: str) -> str:
-    """The radius of photons is in pixels: meters have one for all that they see, or none side by side."""
+    """The radius of photons is in pixels. Meters have a single pixel, or pixels that are not side by side."""
     meter = facts.camera in ("radiancemeter", "irradiancemeter", "distant")
-    return f"photons are gathered over pixels, which a camera '{facts.camera}' has not side by side" if meter else ""
+    return f"photons need pixels side by side, which a camera '{facts.camera}' does not have" if meter else ""
 
 
 def hair(facts: Facts, name: str) -> str:
-    """Mitsuba's hair scatters differently from the light to the eye than back, and does not provide its adjoint."""
-    return "light paths lose light at the material 'hair', which is not the same in both directions" * facts.hair
+    """Mitsuba's hair is not reciprocal, and does not provide its adjoint."""
+    return "light paths lose light at the material 'hair', which is not reciprocal" * facts.hair
 
 
 SURFACES = (polarised, unseen_media)
@@ -82,15 +82,15 @@ GATHERING = Option(0.05, "the microfacet roughness above which photons are gathe
 
 TAILS = Option(
     "paths",
-    "how a path finds light behind its first steps: by itself, or in a cache of what others have found (biased)",
+    "where a path finds light behind its first steps: by itself, or in a cache shared with other paths (biased)",
     choices=("paths", "shared"),
 )
 
 
 def why_not_shared(media: bool, settings: Mapping[str, Any], variant: str) -> str:
-    """Why paths of a sampler with the option ``tails`` cannot share their tails under these ``settings``.
+    """Why paths of a sampler with the option ``tails`` cannot share their tails under these ``settings``, or "".
 
-    ``media``: the paths go through media. "" where they can share.
+    ``media``: whether the paths go through media.
     """
     if media:
         return "there are media"
@@ -102,16 +102,16 @@ def why_not_shared(media: bool, settings: Mapping[str, Any], variant: str) -> st
 
 
 def joined_depth(default: int) -> Option:
-    meaning = "edges of a path, up to which it is found from both ends; longer ones from the camera"
+    meaning = "paths of up to this number of edges are found from both ends, longer ones only from the camera"
     return Option(default, meaning, range=(1, 64))
 
 
 def first_radius(default: float) -> Option:
-    meaning = "how far photons are gathered from in the first pass, in pixels where most is seen"
+    meaning = "the radius of gathering in the first pass, in pixels (their median width at the surfaces seen)"
     return Option(default, meaning, range=(1e-6, 1e6))
 
 
 # Which light of lamps without size a sampler loses
 THROUGH_HOLES = "that comes through masks and thin panes"
 
-IN_MIRRORS = "followed from the camera and from the lights, caustics seen in them too"
+IN_MIRRORS = "followed from the camera and from the lights; caustics that are seen in them are found, too"

@@ -1,4 +1,4 @@
-"""Whether the paths of a render share a cache of their tails: one rule, for ``render_stack`` and for our plugins."""
+"""Whether the paths of a render share a cache of their tails: one rule for ``render_stack`` and our plugins."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from data_gen.tails.schedule import enough
 class Sharing(NamedTuple):
     """``never``  why no paths with these options can share their tails in this scene, "" if they can
     ``not_now``  why the paths of this render should not or cannot share them, "" if they should
-    ``rest``     the budget without what the cache takes
+    ``rest``     the budget without the memory of the cache
     """
 
     never: str
@@ -33,13 +33,13 @@ class Sharing(NamedTuple):
 
 
 def sharing_of(sensor: mi.Sensor, entry: Sampler, facts: Facts, settings: Mapping[str, Any], budget: Budget) -> Sharing:
-    """Whether the paths of a render may share their tails; the sampler has the option ``tails``.
+    """Whether the paths of a render may share their tails. The sampler must have the option ``tails``.
 
-    What fits into some memory must fit into more: the cache is there only where film and paths fit beside it.
+    More memory must never make a render fail: paths share only if film and paths fit into memory beside the cache.
     """
     never = why_not_shared(bool(facts.media), settings, mi.variant())
     if facts.integrator != "path":
-        never = f"the integrator is '{facts.integrator}', and only paths of 'path' do"
+        never = f"the integrator is '{facts.integrator}', and only paths of 'path' can"
     net = first_round(settings.get("points", "independent"), budget.spp)
     film = GradientFilm(*(int(n) for n in sensor.film().crop_size()), net=net, gradients=entry.film_of_gradients)
     own = MIB + bytes_of_shared(film.pixels) // 2**20

@@ -1,8 +1,8 @@
-"""Bounding boxes of meshes that Mitsuba has merged: it leaves out rectangles.
+"""Corrects the bounding boxes of meshes that Mitsuba has merged, which leave out rectangles.
 
-``mi.load_file`` and ``mi.load_dict`` merge meshes of one material (``optimize=True``), and ``load_scene`` does. The box
-of the result then lacks each rectangle among them (Mitsuba 3.9), and so does the box of the scene. Light from far away
-starts on a sphere around that box: where the sphere is too small, sun and sky pass through walls.
+``mi.load_file`` and ``mi.load_dict`` merge meshes of one material (``optimize=True``), and so does ``load_scene``. In
+Mitsuba 3.9 the box of a merged mesh leaves out all rectangles in it, and so does the box of the scene. Light from far
+away starts on a sphere around that box. If the sphere is too small, sun and sky pass through walls.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ def mend_bounds(scene: mi.Scene) -> None:
             )
     scene.parameters_changed()
     for end in (*scene.emitters(), *scene.sensors()):
-        end.set_scene(scene)  # which keeps a sphere around the scene
+        end.set_scene(scene)  # updates its sphere around the scene
 
 
 def bounded(shape: mi.Shape) -> bool:
-    """Whether the box of a mesh contains all its vertices; numbers that are NaN do not count."""
+    """Whether the box of a mesh contains all its vertices, ignoring NaN coordinates."""
     params, box = mi.traverse(shape), shape.bbox()
     corners = np.array(params[vertices_name(params)]).reshape(-1, 3)
     return not ((corners < np.array(box.min)).any() or (corners > np.array(box.max)).any())

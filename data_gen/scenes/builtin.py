@@ -1,6 +1,6 @@
-"""The scenes that come with ngpt: small, made in code, one for each kind of transport the demo shows.
+"""The scenes that come with ngpt: small, made in code, one for each kind of transport that the demo shows.
 
-Each function returns a Mitsuba scene dictionary, without its film size: units are metres, +y is up.
+Each function returns a Mitsuba scene dictionary. Units are metres, and +y is up.
 """
 
 from __future__ import annotations
@@ -202,7 +202,7 @@ def haze() -> dict:
         "stand": _box([0.45, 0.24, 0.1], [0.4, 0.48, 0.4], 12, _diffuse(0.6, 0.58, 0.55)),
         "block": _box([-0.75, 0.4, 0.6], [0.5, 0.8, 0.5], 25, _diffuse(0.65, 0.55, 0.25)),
     }
-    # The wall around a window from 0.9 m to 0.15 m behind the middle of the room, 1.5 m to 2.2 m above the floor.
+    # The wall around a window that spans z from -0.9 m to 0.15 m, and y from 1.5 m to 2.2 m.
     red = _diffuse(0.62, 0.2, 0.13)
     del scene["left"]
     for name, (low, high, front, back) in {
@@ -219,7 +219,7 @@ def haze() -> dict:
 
 
 def smoke() -> dict:
-    """Smoke that rises from a bowl before coloured walls: thin and dense parts, and a shadow of its own."""
+    """Smoke that rises from a bowl in front of coloured walls, with thin and dense parts, and shadows within it."""
     box = ([-0.6, 0.42, -0.6], [0.6, 2.2, 0.6])
     grid = grids.plume(np.random.default_rng(0))
     albedo = _rgb(0.75, 0.8, 0.86)
@@ -239,7 +239,7 @@ def smoke() -> dict:
 
 
 def cloud() -> dict:
-    """A small cloud over a ball and a block in the open: light that scatters many times, before nothing but sky."""
+    """A small cloud over a ball and a block in the open: light that scatters many times, in front of a plain sky."""
     box = ([-1.3, 1.2, -0.8], [1.3, 2.7, 0.8])
     grid = grids.cloud(np.random.default_rng(2))
     scene = environment()
@@ -269,7 +269,7 @@ SCENES = SURFACES | MEDIA
 
 
 def no_scene(name: str, others: Iterable[str] = ()) -> NgptError:
-    """The error for what is neither a file nor a built-in scene; ``others`` are names that may have been meant too."""
+    """The error for a name that is neither a file nor a built-in scene. ``others`` may have been meant, too."""
     if os.path.isdir(name):
         files = sorted(glob.glob(os.path.join(glob.escape(name), "*.xml")))
         such = f", such as {files[0]}" if files else ""

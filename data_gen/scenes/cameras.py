@@ -1,4 +1,4 @@
-"""Cameras of Mitsuba: their names, the part of a picture that they show, and cameras that no sampler renders."""
+"""Mitsuba's cameras: their names, the part of a picture that they show, and refusals."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from ngpt.errors import NgptError, WrongUse
 from ngpt.windows import Place, Window
 
-# By the names of their classes, since a loaded camera does not know its plugin
+# Class name -> plugin name, since a loaded camera does not know its plugin
 _PLUGINS = {
     "PerspectiveCamera": "perspective",
     "ThinLensCamera": "thinlens",
@@ -21,7 +21,7 @@ _PLUGINS = {
     "DistantSensorImpl": "distant",
     "BatchSensor": "batch",
 }
-# As in Mitsuba's own perspective camera: rounding of a rotation in float32 stays below it
+# The tolerance of Mitsuba's own perspective camera, which is above the rounding of a rotation in float32
 _SCALE = 1e-3
 
 
@@ -32,7 +32,7 @@ def camera_name(sensor: mi.Sensor) -> str:
 
 
 def place_of(sensor: mi.Sensor) -> Place:
-    """The crop window of a sensor's film, in the whole film."""
+    """The place of the crop window of a sensor's film in the whole film."""
     film = sensor.film()
     (left, top), size, whole = ([int(n) for n in pair] for pair in (film.crop_offset(), film.crop_size(), film.size()))
     return Place(Window(left, top, *size), Window(0, 0, *whole))
@@ -41,8 +41,9 @@ def place_of(sensor: mi.Sensor) -> Place:
 def check_camera(sensor: mi.Sensor) -> None:
     """Raises NgptError for a camera that no sampler renders.
 
-    Cameras in one film have neither normals in the space of one camera nor differences across their borders. The rays
-    of a scaled meter are no unit vectors in Mitsuba 3.9, by which materials and distances would be wrong.
+    Several cameras in one film have no common camera space for normals, and differences across their borders mean
+    nothing. In Mitsuba 3.9 the ray directions of a scaled meter are no unit vectors, so materials and distances would
+    be wrong.
     """
     name = camera_name(sensor)
     if name == "batch":
@@ -57,9 +58,9 @@ def check_camera(sensor: mi.Sensor) -> None:
 
 
 def sensor_number(wanted: int | str | None, ids: Sequence[str], scene: str) -> int:
-    """The index of the sensor that is ``wanted``, by id or number, among a scene's sensors, whose ``ids`` may be "".
+    """The index of the ``wanted`` sensor, given by id or number, among a scene's sensors, whose ``ids`` may be "".
 
-    None: the first. Raises WrongUse for one that is not there.
+    None stands for the first. Raises WrongUse if there is no such sensor.
     """
     if wanted is None:
         return 0

@@ -1,4 +1,4 @@
-"""A warning in one line that explains a black image."""
+"""Warnings that explain a black image."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ _LOG = logging.getLogger(f"ngpt.{__name__}")
 
 _RAYS = 1 << 10
 _NO_LAMPS = 'the scene has no lamps, so its image is black; add one, such as <emitter type="constant"/>'
-# Integrators whose light comes from emitters alone
+# Integrators whose light comes only from emitters
 _OF_EMITTERS = ("path", "direct", "volpath", "volpathmis")
 
 
 def warn_without_lamps(scene: mi.Scene) -> None:
-    """Before a render."""
+    """Warns before a render if the scene has no lamps."""
     if not scene.emitters() and integrator_name(scene) in _OF_EMITTERS:
         _LOG.warning(_NO_LAMPS)
 
 
 def warn_if_black(scene: mi.Scene, image: np.ndarray) -> None:
-    """After a render whose ``image`` is (H, W, 3). A scene without lamps was named before."""
+    """Warns after a render if its ``image`` (H, W, 3) is black. ``warn_without_lamps`` covers scenes without lamps."""
     if scene.emitters() and not image.any():
         _LOG.warning("the image is black: %s", why_black(scene))
 
 
 def why_black(scene: mi.Scene) -> str:
-    """Why the first sensor of a scene with lamps sees black, by the hits of its rays; "" if they do not explain it."""
+    """Why the first sensor of a scene with lamps sees black, judged by the hits of its rays."""
     random, sensor = mi.PCG32(_RAYS, 0x1A3B), scene.sensors()[0]
     film, lens = (mi.Point2f(random.next_float32(), random.next_float32()) for _ in range(2))
     ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), random.next_float32(), film, lens)

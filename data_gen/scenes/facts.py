@@ -14,22 +14,22 @@ from data_gen.scenes.integrators import check_integrator, followed, objects_in, 
 class Facts:
     """Facts about a scene, known without rendering it."""
 
-    # The plugin name of the integrator whose image is rendered, or the name of its class; "path" if the scene has none:
-    # see ``data_gen.scenes.integrators.followed``
+    # The plugin name (or class name) of the integrator whose image is rendered, see
+    # ``data_gen.scenes.integrators.followed``; "path" if the scene has no integrator
     integrator: str
     media: tuple[str, ...]  # the names of its media, sorted
     polarised: str = ""  # the name of a variant that renders polarised light, or ""
-    mirrors: bool = False  # whether there are mirrors or clear glass; known of scene files that were inspected
+    mirrors: bool = False  # whether there are mirrors or clear glass; set only when a scene file is inspected
     grids: bool = False  # whether there are media whose density varies
-    camera: str = "perspective"  # the plugin name of its first camera, or the name of its class
-    hair: bool = False  # whether there is Mitsuba's material ``hair``, which is not the same in both directions
+    camera: str = "perspective"  # the plugin name (or class name) of its first camera
+    hair: bool = False  # whether there is Mitsuba's material ``hair``, which is not reciprocal
     spectral: str = ""  # the name of a variant whose paths have wavelengths, or ""
-    hides: bool = False  # whether emitters hide from the camera
+    hides: bool = False  # whether emitters are hidden from the camera
 
 
 def scene_facts(scene: mi.Scene, sensor: mi.Sensor | None = None, integrator: mi.Integrator | None = None) -> Facts:
-    """The facts about a scene that is loaded, as seen by a ``sensor`` and by an ``integrator``: by its own ones, where
-    they are not given. Raises NgptError for a camera or integrator that no sampler renders."""
+    """The facts about a loaded scene with this ``sensor`` and ``integrator`` (default: the scene's own). Raises
+    NgptError for a camera or integrator that no sampler renders."""
     camera, integrator = sensor or scene.sensors()[0], integrator or scene.integrator()
     check_camera(camera)
     if integrator is not None:
@@ -52,25 +52,25 @@ def scene_facts(scene: mi.Scene, sensor: mi.Sensor | None = None, integrator: mi
 
 
 def shapes_of(scene: mi.Scene) -> list[mi.Shape]:
-    """All shapes of a scene. Mitsuba does not list those that only instances show; they are here too."""
+    """All shapes of a scene, including those in shape groups, which Mitsuba does not list."""
     groups = (shape for shape in objects_in(scene, mi.Shape) if shape.class_name() == "ShapeGroupPlugin")
     return [*scene.shapes(), *(shape for group in groups for shape in objects_in(group, mi.Shape))]
 
 
 def _has_hair(bsdf: mi.BSDF | None) -> bool:
-    """Whether a material is hair, or one within it: of a mask, a blend, a two-sided one."""
+    """Whether a material is hair or contains hair, as a mask, a blend or a two-sided material may."""
     if bsdf is None:
         return False
     return bsdf.class_name() == "Hair" or any(map(_has_hair, objects_in(bsdf, mi.BSDF)))
 
 
 def integrator_name(scene: mi.Scene) -> str:
-    """The plugin name of the integrator whose image is rendered, or the name of its class."""
+    """The plugin name (or class name) of the integrator whose image is rendered."""
     return "path" if scene.integrator() is None else plugin_name(followed(scene.integrator()))
 
 
 def media_of(scene: mi.Scene) -> list[mi.Medium]:
-    """All media of a scene, the camera's included."""
+    """All media of a scene, including the camera's."""
     found = [scene.sensors()[0].get_medium()]
     for shape in shapes_of(scene):
         if shape.is_medium_transition():

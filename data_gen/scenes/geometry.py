@@ -1,4 +1,4 @@
-"""Where the shapes of a scene are: matrices and meshes, as NumPy arrays that outlive the scene."""
+"""The geometry of a scene's shapes: matrices and meshes, as NumPy arrays that outlive the scene."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class Mesh:
     faces: np.ndarray
 
 
-# Parameters of a mesh that hold its vertices: rows of three numbers since Mitsuba 3.10, and one row of all before
+# Names of the parameter with a mesh's vertices: rows of three numbers since Mitsuba 3.10, a flat array before
 VERTICES = ("positions", "vertex_positions")
 
-# A matrix (4, 4) to the world, or a mesh; None for shapes that show neither.
+# A matrix (4, 4) to world space, or a mesh; None for shapes that expose neither.
 Geometry = np.ndarray | Mesh | None
 
 
@@ -38,13 +38,13 @@ def geometry_of(params: Mapping[str, Any]) -> Geometry:
 
 
 def vertices_name(params: Mapping[str, Any], shape: str = "") -> str:
-    """The parameter that holds the vertices of a mesh, which a scene calls ``shape``; "" if there is none."""
+    """The name of the parameter with the vertices of a mesh, or ""; ``shape`` is the mesh's name in the scene."""
     names = (f"{shape}.{name}" if shape else name for name in VERTICES)
     return next((name for name in names if name in params), "")
 
 
 def vertices(params: Mapping[str, Any], name: str) -> np.ndarray:
-    """The vertices (V, 3) that a parameter holds: a copy, for a scene that is updated keeps its buffers."""
+    """A copy of the vertices (V, 3) that a parameter holds. An updated scene overwrites its buffers."""
     return np.array(params[name], np.float64).reshape(-1, 3)
 
 

@@ -1,6 +1,6 @@
-"""Grids of density made from noise: smoke and clouds, and a writer of Mitsuba's files of volumes.
+"""Grids of density made from noise, for smoke and clouds, and a writer of Mitsuba's volume files.
 
-A grid is a (Z, Y, X) float32 array in [0, 1], +y is up. It is 0 on its border, so the box around it does not show.
+A grid is a (Z, Y, X) float32 array in [0, 1]; +y is up. It is 0 on its border, so its box cannot be seen.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 
 def noise(rng: np.random.Generator, shape: tuple[int, int, int], slope: float) -> np.ndarray:
-    """Noise of mean 0 and deviation 1 that tiles; its spectrum falls with frequency to the power of ``slope``."""
+    """Noise that tiles, of mean 0 and deviation 1. The amplitude of its spectrum is frequency^-``slope``."""
     axes = [np.fft.fftfreq(n) for n in shape[:2]] + [np.fft.rfftfreq(shape[2])]
     frequency = np.sqrt(sum(axis**2 for axis in np.meshgrid(*axes, indexing="ij")))
     frequency[0, 0, 0] = np.inf
@@ -33,7 +33,7 @@ def plume(rng: np.random.Generator, shape: tuple[int, int, int] = (32, 48, 32)) 
 
 
 def cloud(rng: np.random.Generator, shape: tuple[int, int, int] = (32, 32, 48)) -> np.ndarray:
-    """A cloud of some round heaps on a flat base."""
+    """A cloud: some round heaps on a flat base."""
     z, y, x = _coordinates(shape)
     field = np.full(shape, -1.0)
     for _ in range(rng.integers(6, 11)):
@@ -52,14 +52,14 @@ def _coordinates(shape: tuple[int, int, int]) -> tuple[np.ndarray, ...]:
 
 
 def _finished(density: np.ndarray) -> np.ndarray:
-    """The largest density is 1, and that on the border 0."""
+    """Scales the largest density to 1, and sets the border to 0."""
     inner = np.zeros_like(density)
     inner[1:-1, 1:-1, 1:-1] = density[1:-1, 1:-1, 1:-1]
     return (inner / max(inner.max(), 1e-6)).astype(np.float32)
 
 
 def write_vol(path: Path, grid: np.ndarray) -> None:
-    """Mitsuba's binary file of a ``gridvolume`` in the unit cube, one channel of float32."""
+    """Writes Mitsuba's binary file of a ``gridvolume`` in the unit cube, with one float32 channel."""
     depth, height, width = grid.shape
     header = b"VOL\x03" + struct.pack("<iiiii6f", 1, width, height, depth, 1, 0, 0, 0, 1, 1, 1)
     path.write_bytes(header + np.ascontiguousarray(grid, "<f4").tobytes())

@@ -1,4 +1,4 @@
-"""Mitsuba's integrators: their names, and which one our samplers follow in place of another with the same image."""
+"""Mitsuba's integrators: their names, and which one our samplers follow instead of another with the same image."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from ngpt.errors import NgptError, stop_if_interrupted
 
-# By the names of their classes, since a loaded integrator does not know its plugin
+# Class name -> plugin name, since a loaded integrator does not know its plugin
 _PLUGINS = {
     "PathIntegrator": "path",
     "VolumetricPathIntegrator": "volpath",
@@ -29,8 +29,8 @@ _PLUGINS = {
     "PRBVolpathIntegrator": "prbvolpath",
     "BasicVolumetricPrimitiveRadianceFieldIntegrator": "volprim_rf_basic",
 }
-# Integrators that render the same image. The second is for emitters that hide from the camera, which Mitsuba's
-# projective integrators treat differently.
+# Plugin -> the integrator with the same image, and the one with the same image if emitters are hidden from the camera.
+# "" if there is none: Mitsuba's projective integrators treat hidden emitters differently.
 _SAME = {
     "prb": ("path", "path"),
     "prb_basic": ("path", "path"),
@@ -45,7 +45,7 @@ AROUND = ("aov", "moment", "stokes")
 
 
 def plugin_name(integrator: mi.Integrator) -> str:
-    """The plugin name of an integrator, or the name of its class where it is not one of Mitsuba's."""
+    """The plugin name of an integrator, or its class name if it is not one of Mitsuba's."""
     name = integrator.class_name()
     if name not in _PLUGINS:  # An integrator in Python gives the name of its base class in Mitsuba.
         name = type(integrator).__name__
@@ -53,16 +53,16 @@ def plugin_name(integrator: mi.Integrator) -> str:
 
 
 def same_image(plugin: str, hides: bool) -> str:
-    """The plugin that renders the image of ``plugin`` and is one to follow, or ``plugin`` itself.
+    """The plugin that our samplers follow instead of ``plugin``, with the same image, or ``plugin`` itself.
 
-    ``hides``: emitters hide from the camera.
+    ``hides``: emitters are hidden from the camera.
     """
     return _SAME.get(plugin, ("", ""))[hides] or plugin
 
 
 def followed(integrator: mi.Integrator) -> mi.Integrator:
-    """The integrator whose image is rendered in place of this one: one of the same image with the same depths, the one
-    within an ``aov``, ``moment`` or ``stokes``, or itself."""
+    """The integrator whose image is rendered instead of this one: the one inside an ``aov``, ``moment`` or ``stokes``,
+    one with the same image and depths, or this one itself."""
     name = plugin_name(integrator)
     if name in AROUND and len(nested := objects_in(integrator, mi.Integrator)) == 1:
         return followed(nested[0])
@@ -76,9 +76,10 @@ def followed(integrator: mi.Integrator) -> mi.Integrator:
 
 
 def objects_in(thing: mi.Object, kind: type) -> list:
-    """The direct children of an object that are of a ``kind``: integrators of an integrator, materials of a mask."""
+    """The direct children of an object that are of a ``kind``, such as the materials of a mask."""
 
-    # The class must refer only to its arguments: reference cycles would keep other objects, and their scene, alive.
+    # The class must refer only to its arguments, since its reference cycles would keep other objects and their scene
+    # alive.
     class Inside(mi.TraversalCallback):
         def __init__(self, kind: type):
             super().__init__()
@@ -95,9 +96,9 @@ def objects_in(thing: mi.Object, kind: type) -> list:
 
 
 def lack(plugin: str, nested: int, from_camera: bool = True) -> str:
-    """Why an integrator around this number of others renders no image for a stack; "" if it does.
+    """Why an integrator cannot render an image for a stack, or "". It has ``nested`` other integrators in it.
 
-    ``from_camera``: it traces paths from the camera, unless its name says otherwise.
+    ``from_camera``: whether it seems to trace paths from the camera. Integrators in ``_FROM_LAMPS`` do not.
     """
     if not from_camera or plugin in _FROM_LAMPS:
         return (
@@ -123,7 +124,7 @@ def own_estimate(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable
     """
     call: Callable[..., Any] = partial(integrator.sample, scene)
     if isinstance(integrator, mi.CppADIntegrator):
-        # As ``mi.ad.integrators.common.ADIntegrator.render`` calls them
+        # The arguments of the call in ``mi.ad.integrators.common.ADIntegrator.render``
         constant = {"mode": dr.ADMode.Primal, "scene": scene, "δL": None, "δaovs": None, "state_in": None}
 
         def call_as_render_does(sampler, ray, medium, active):

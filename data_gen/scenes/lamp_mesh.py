@@ -1,4 +1,4 @@
-"""One emitter for many lamps that share a mesh; ``many_lamps`` makes it."""
+"""One emitter for many lamps that share a mesh, for ``many_lamps``."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 
 @dataclass
 class Table:
-    """Lamps of one mesh: ``corners`` (F, 3, 3) of all faces, the number of the ``lamp`` of each, (F,), and the
-    ``radiance`` (L, 3) of lamps."""
+    """The lamps of one mesh: the ``corners`` (F, 3, 3) of all faces, the number of each face's ``lamp`` (F,), and the
+    ``radiance`` (L, 3) of each lamp."""
 
     corners: np.ndarray
     lamp: np.ndarray
@@ -21,7 +21,7 @@ class Table:
 
     @property
     def smallest(self) -> float:
-        """The least diagonal of the lamps' bounding boxes."""
+        """The smallest diagonal of the lamps' bounding boxes."""
         each = (self.corners[self.lamp == i] for i in range(len(self.radiance)))
         return min(float(np.linalg.norm(np.ptp(corners, axis=(0, 1)))) for corners in each)
 
@@ -32,18 +32,18 @@ def lamps(table: Table) -> mi.Emitter:
 
 
 def table_of(emitter: mi.Emitter) -> Table | None:
-    """The lamps of an emitter that has many; None for all others."""
+    """The table of an emitter with many lamps; None for all others."""
     table = getattr(emitter, "table", None)
     return table if isinstance(table, Table) else None
 
 
 def is_area(emitter: mi.Emitter) -> bool:
-    """Whether it is a surface that shines to its front, one lamp or many."""
+    """Whether an emitter is a surface that shines to its front; it may be one lamp or many."""
     return table_of(emitter) is not None or emitter.class_name() == "AreaLight"
 
 
 def mesh_of(props: mi.Properties) -> mi.Mesh:
-    """The mesh of a part of the lamps, with faces of its own vertices."""
+    """The mesh of the lamps in ``props["emitter"]``. No two of its faces share a vertex."""
     table = props["emitter"].table
     count = 3 * len(table.lamp)
     mesh = mi.Mesh(props.id(), count, len(table.lamp), props, has_vertex_texcoords=True)
@@ -58,12 +58,12 @@ def mesh_of(props: mi.Properties) -> mi.Mesh:
 
 @cache
 def _emitter(variant: str) -> type:
-    """The class for that variant, which must be the current one: each variant has its own base classes."""
+    """The class for a variant, which must be the current one, since each variant has its own base classes."""
 
     class Lamps(mi.Emitter):
-        """Many area lamps of one mesh, each with its radiance, on the side that its faces turn to.
+        """Many area lamps of one mesh, each with its own radiance. They shine on the side to which their faces turn.
 
-        A face is sampled in proportion to area times mean radiance, and points on it uniformly.
+        A face is sampled in proportion to its area times its mean radiance, and points on it uniformly.
         """
 
         def __init__(self, table: Table):
@@ -73,11 +73,11 @@ def _emitter(variant: str) -> type:
             across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             areas = np.linalg.norm(across, axis=-1) / 2
             strength = np.abs(radiance).mean(axis=-1)
-            # Lamps that are all dark are met all the same.
+            # If all lamps are dark, they must still have a distribution.
             strength = strength if strength.any() else np.ones(len(strength))
             share = areas * strength[lamp]
             upto = np.cumsum(share / share.sum())
-            # More than any random number, from the last face on that may be sampled
+            # Above any random number, from the last face that may be sampled
             upto[np.flatnonzero(share)[-1] :] = 2
             self.faces, self.upto = len(areas), mi.Float(upto.astype(np.float32))
             self.corners, self.lamp = mi.Float(corners.astype(np.float32).ravel()), mi.UInt32(lamp.astype(np.uint32))

@@ -1,12 +1,12 @@
-"""How often each lamp of a scene is chosen, by what it brings to what the camera sees.
+"""How often each lamp of a scene is chosen: by the light that it brings to the surfaces that the camera sees.
 
-The best weights are in proportion to the root of the mean square of what a lamp brings to a vertex, which a short pilot
-measures: at the first vertices of camera paths, each lamp is sampled in turn, whatever kind of lamp it is.
+The best weight of a lamp is proportional to the root mean square of the light that it brings to a vertex. A short pilot
+measures this: at the first vertices of camera paths it samples the lamps in turn, whatever their kind.
 
-With many lamps, most light up little of the scene, which is cut into cells: in each, lamps are chosen by the mean
-square of their light at vertices there. The mean of each cell includes some virtual samples with the mean of its
-parent. Any probabilities give correct images, as long as none is 0 where a lamp has light. A shifted path keeps its
-lamp, and knows the probability of choosing it both where the path comes from and where it goes to.
+If there are many lamps, most of them light only a part of the scene. So the scene is cut into cells, and in each cell
+lamps are chosen by the mean square of their light at the vertices in it. This mean includes some virtual samples with
+the mean of the parent cell. Any probabilities give correct images, as long as none is 0 where a lamp has light. A
+shifted path keeps its lamp, and knows the probability of choosing it at both vertices.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# Camera paths of the pilot, and vertices of each that lamps are sampled at
+# Camera paths of the pilot, and vertices of each path at which lamps are sampled
 _PATHS, _VERTICES = 1 << 14, 3
-# Paths of a pilot that weighs lamps by place, and the number of lamps from which on there is one
+# Paths of a pilot that weights lamps by place, and the least number of lamps for such a pilot
 _PATHS_BY_PLACE, MANY = 1 << 17, 8
-# Lamps are chosen by place if this is expected to lower the variance of direct light to less than this share. In matt
-# scenes the expectation holds; glossy materials, which the pilot does not consider, were seen to cost a factor of two.
+# Lamps are chosen by place if this is expected to lower the variance of direct light to less than this share. The
+# expectation holds in matt scenes. With glossy materials, which the pilot ignores, it was wrong by a factor of two.
 PROMISE = 0.45
-# The share given to all lamps alike, and in a cell as in the whole scene: lamps that the pilot did not see may light
-# other places and start light paths.
+# The share of the choice that is uniform over lamps. In a cell this share follows the weights of the whole scene. Lamps
+# that the pilot did not see may light other places and start light paths.
 _FLOOR = 0.2
 # Mean squares leave out this share of a lamp's largest values, so that a single vertex close to it does not decide.
 _TRIM = 0.002
@@ -35,10 +35,11 @@ _TRIM = 0.002
 
 @contextmanager
 def weighed(scene: mi.Scene, lamps: str, by_place: bool = False) -> Iterator[Places | None]:
-    """The ``scene`` with its lamps chosen by "power", where it leaves their weights equal; "uniform": as it is.
+    """A context in which the ``scene`` has lamp weights from a pilot. With ``lamps`` "uniform", or weights that already
+    differ, the scene stays as it is.
 
-    Yields how they are to be chosen by place, if the sampler can (``by_place``) and there are many. Afterwards the
-    scene is as it was before.
+    Yields the choice of lamps by place if the sampler can use it (``by_place``) and there are many lamps, else None.
+    The weights are restored afterwards.
     """
     emitters = scene.emitters()
     before = [emitter.sampling_weight() for emitter in emitters]
@@ -61,14 +62,14 @@ def _set(scene: mi.Scene, weights) -> None:
         params = mi.traverse(emitter)
         params["sampling_weight"] = float(weight)
         params.update()
-    # Else the old distribution stays.
+    # Without this the scene would keep its old distribution.
     scene.parameters_changed()
 
 
 def lamp_weights(scene: mi.Scene, found: Found | None = None) -> np.ndarray:
-    """The share of each lamp in the choice, in the order of ``scene.emitters()``; they sum to 1.
+    """The probability of each lamp, in the order of ``scene.emitters()``; they sum to 1.
 
-    The same for the same scene and camera. ``found`` is what a pilot has found, by at least ``_PATHS`` paths.
+    It depends only on the scene and the camera. ``found`` are the samples of a pilot with at least ``_PATHS`` paths.
     """
     n = len(scene.emitters())
     found = (found or _pilot(scene, _PATHS)).first(_PATHS)
@@ -83,16 +84,16 @@ def lamp_weights(scene: mi.Scene, found: Found | None = None) -> np.ndarray:
 
 
 def lamp_places(scene: mi.Scene, weights: np.ndarray, found: Found) -> Places | None:
-    """How often each lamp is chosen by place, beside ``weights`` of the whole scene; None where that does not pay."""
+    """The choice of lamps by place, given the ``weights`` of the whole scene; None if it is not worth its cost."""
     share, table = promised(found, weights)
     return Places(scene, table) if table and share < PROMISE else None
 
 
 def promised(found: Found, weights: np.ndarray) -> tuple[float, Table | None]:
-    """What choosing by place promises to leave of the variance of direct light, and by what table.
+    """The expected share of the variance of direct light that is left with a choice by place, and the table for it.
 
-    One half of a pilot's samples determines how often each lamp is chosen. The other half measures how much better that
-    is. Where the pilot meets nothing there is no table.
+    One half of the pilot's samples gives a table, and the other half measures its gain. If the pilot meets nothing,
+    there is no table.
     """
     lamp, squares, at = found.lamp, np.square(found.L), found.at
     half = np.random.default_rng(0).random(len(lamp)) < 0.5
@@ -105,8 +106,8 @@ def promised(found: Found, weights: np.ndarray) -> tuple[float, Table | None]:
 
 @dataclass
 class Found:
-    """Samples of lamps at the first vertices of a pilot's paths, (N) each: the number of the ``lamp``, what it brings
-    (``L``), the vertex ``at``, (N, 3), and the number of the ``path``."""
+    """Samples of lamps at the first vertices of a pilot's paths, (N) each: the number of the ``lamp``, its light ``L``,
+    the vertex ``at`` (N, 3), and the number of the ``path``."""
 
     lamp: np.ndarray
     L: np.ndarray
@@ -114,15 +115,15 @@ class Found:
     path: np.ndarray
 
     def first(self, paths: int) -> Found:
-        """What a pilot of only the first ``paths`` paths would have found."""
+        """The samples of the first ``paths`` paths only."""
         some = self.path < paths
         return Found(self.lamp[some], self.L[some], self.at[some], self.path[some])
 
 
 def _pilot(scene: mi.Scene, paths: int) -> Found:
-    """Samples of lamps by this number of paths.
+    """Runs the pilot with ``paths`` paths.
 
-    What a lamp brings counts by its weight beside BSDF sampling: lamps that are large, or close, count for less.
+    The light of a lamp includes its MIS weight against BSDF sampling, so large or close lamps count for less.
     """
     random, sensor = mi.PCG32(paths, 0x1A3B), scene.sensors()[0]
     wavelength, film, lens = random.next_float32(), _pair(random), _pair(random)
@@ -141,7 +142,7 @@ def _pilot(scene: mi.Scene, paths: int) -> Found:
 
 
 def _walk(scene: mi.Scene, ray: mi.Ray3f, random: mi.PCG32, lamps: mi.UInt32, paths: int) -> tuple:
-    """Lamp, light, place and existence of the vertices of ``paths``, one vertex of all after the other.
+    """Lamp, light, place and existence of the vertices of ``paths`` paths: first vertices, then second ones, and so on.
 
     A loop is recorded twice, however many vertices there are. With many lamps each recording takes seconds.
     """
@@ -150,17 +151,17 @@ def _walk(scene: mi.Scene, ray: mi.Ray3f, random: mi.PCG32, lamps: mi.UInt32, pa
     of_place = dr.zeros(mi.Float, 3 * n)
 
     def step(ray: mi.Ray3f, random: mi.PCG32, vertex: mi.UInt32, active: mi.Bool) -> tuple:
-        # Place and normal are all that is used: of thousands of shapes, all else takes twice the time to record.
+        # Only place and normal are used. With thousands of shapes, recording all fields would take twice as long.
         si = scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
         active = active & si.is_valid()
-        # As if all were grey and matt: so no material is compiled for the pilot, which would take longer than the rest.
+        # All surfaces count as grey and matt, since compiling materials would take longer than the rest of the pilot.
         side = mi.Frame3f(dr.mulsign(si.n, dr.dot(si.n, -ray.d)))
-        # Each lamp as often as the others, at vertices all over the image
+        # Each lamp is sampled equally often, at vertices all over the image
         index = (lane + vertex * 0x9E37) % lamps
         emitter = dr.gather(mi.EmitterPtr, emitters, index, active)
         light, radiance = emitter.sample_direction(si, _pair(random), active)
         cos = dr.maximum(dr.dot(side.n, light.d), 0)
-        # Over all colours: a red lamp has as much noise in one channel as a white lamp has in each.
+        # The mean over colours: a red lamp has as much noise in one channel as a white lamp has in each.
         L = dr.sqrt(dr.mean(dr.square(mi.unpolarized_spectrum(radiance)))) * cos
         L *= dr.select(light.delta, 1, dr.rcp(1 + dr.square(cos * dr.inv_pi * mi.Float(lamps) / light.pdf)))
         lit = active & (light.pdf > 0) & (L > 0)
@@ -184,24 +185,24 @@ def _pair(random: mi.PCG32) -> mi.Point2f:
 
 
 def emitter_numbers(scene: mi.Scene, none: int = 0) -> mi.UInt32:
-    """By what Dr.Jit calls an emitter: its number in ``scene.emitters()``. What is no emitter of it has ``none``."""
+    """Dr.Jit's number of an emitter -> its number in ``scene.emitters()``, or ``none`` for numbers of other objects."""
     pointers = np.array(dr.reinterpret_array(mi.UInt32, scene.emitters_dr())) if scene.emitters() else np.zeros(0, int)
     index = np.full(pointers.max(initial=0) + 1, none, np.uint32)
     index[pointers] = np.arange(len(pointers))
     return mi.UInt32(index)
 
 
-# Cells along each axis of the finest grid, and of the coarser ones that it goes by, down to the whole scene
+# Cells along each axis of the finest grid. Coarser grids halve it, down to one cell
 _SIDE = 16
-# Samples that the mean of the larger cell stands for
+# The number of virtual samples with the mean of the parent cell
 _OF_PARENT = 16
-# Numbers in a table: with more lamps, cells are larger.
+# The most numbers in a table. With more lamps, cells are larger.
 _LARGEST = 1 << 21
 
 
 @dataclass
 class Chosen:
-    """A lamp of the scene, by its number, the probability to choose it, and the random numbers that are left."""
+    """The number of a chosen lamp, the probability to choose it, and the random numbers that are left."""
 
     lamp: mi.UInt32
     p: mi.Float
@@ -209,17 +210,17 @@ class Chosen:
 
     @classmethod
     def of_scene(cls, scene: mi.Scene, u: mi.Point2f, active: mi.Bool) -> Chosen:
-        """As the scene chooses it, everywhere alike."""
+        """The choice with the scene's own probabilities, which are the same everywhere."""
         lamp, per_p, left = scene.sample_emitter(u.x, active)
         return cls(lamp, dr.rcp(per_p), mi.Point2f(left, u.y))
 
 
 @dataclass
 class Table:
-    """The probability of each lamp in each cell: ``p``, (cells + 1, lamps), of rows that sum to 1.
+    """The probability ``p`` of each lamp in each cell, (cells + 1, lamps). Its rows sum to 1.
 
-    The last row is for what is nowhere: paths that have ended. ``low`` is the first corner of all cells, ``size`` that
-    of one, (3,); there are ``side`` along each axis.
+    The last row is for paths that have ended. ``low`` is the first corner of the grid and ``size`` the size of a cell,
+    (3,); there are ``side`` cells along each axis.
     """
 
     p: np.ndarray
@@ -234,19 +235,19 @@ class Table:
 
 
 def cell_of(at: np.ndarray, low: np.ndarray, size: np.ndarray, side: int) -> np.ndarray:
-    """The numbers of cells along each axis, (N, 3); what is beyond them belongs to the nearest."""
+    """The number of the cell along each axis, (N, 3). Places beyond the grid belong to the nearest cell."""
     return np.clip((at - low) / size, 0, side - 1).astype(int)
 
 
 class Places:
-    """A table on the device, and the emitters of the scene that it is of."""
+    """A table as Dr.Jit arrays, and the emitters of its scene."""
 
     def __init__(self, scene: mi.Scene, table: Table):
         self.emitters, self.lamps, self.side = scene.emitters_dr(), table.p.shape[1], table.side
         self.low, self.per_size = mi.Point3f(*table.low.tolist()), mi.Vector3f(*(1 / table.size).tolist())
         self.p = mi.Float(table.p.ravel().astype(np.float32))
         upto = np.cumsum(table.p, axis=1).astype(np.float32)
-        # More than any random number, so that rounding leaves none beyond
+        # Above any random number, even if the sum was rounded down
         upto[:, -1] = 2
         self.upto = mi.Float(upto.ravel())
         self.indices = emitter_numbers(scene)
@@ -254,14 +255,14 @@ class Places:
         dr.make_opaque(self.low, self.per_size, self.p, self.upto, self.indices)
 
     def row(self, x: mi.SurfaceInteraction3f) -> mi.UInt32:
-        """Where the cell of vertex ``x`` begins in the table."""
+        """The index in the table at which the cell of vertex ``x`` begins."""
         place = (x.p - self.low) * self.per_size
         i, j, k = (mi.UInt32(dr.clip(each, 0, self.side - 1)) for each in place)
         cell = (i * self.side + j) * self.side + k
         return dr.select(x.is_valid(), cell, self.side**3) * self.lamps
 
     def choose(self, x: mi.SurfaceInteraction3f, u: mi.Point2f) -> Chosen:
-        """The lamp that the first of the numbers ``u`` leads to at vertex ``x``."""
+        """Chooses a lamp at vertex ``x`` by the first of the random numbers ``u``."""
         row = self.row(x)
         lamp = dr.binary_search(0, self.lamps - 1, lambda i: dr.gather(mi.Float, self.upto, row + i) <= u.x)
         p = dr.gather(mi.Float, self.p, row + lamp)
@@ -270,13 +271,13 @@ class Places:
         return Chosen(lamp, p, mi.Point2f(left, u.y))
 
     def probability(self, x: mi.SurfaceInteraction3f, lamp: mi.UInt32, active: mi.Bool = True) -> mi.Float:
-        """With which this lamp is chosen at vertex ``x``."""
+        """The probability of choosing this lamp at vertex ``x``."""
         return dr.gather(mi.Float, self.p, self.row(x) + lamp, active)
 
     def sample(self, x: mi.SurfaceInteraction3f, chosen: Chosen, active: mi.Bool) -> tuple:
-        """As ``scene.sample_emitter_direction(x, u, False, active)``: a point of the lamp that is ``chosen``.
+        """As ``scene.sample_emitter_direction(x, u, False, active)``, for the ``chosen`` lamp.
 
-        Its density, and Le over it, count the choice with the probability that ``chosen`` says.
+        The density and the weight include the probability ``chosen.p``.
         """
         lamp = dr.gather(mi.EmitterPtr, self.emitters, chosen.lamp, active)
         light, weight = lamp.sample_direction(x, chosen.u, active)
@@ -293,16 +294,16 @@ class Places:
 
 
 def learn(lamp: np.ndarray, squares: np.ndarray, at: np.ndarray, whole: np.ndarray) -> Table:
-    """From samples of a pilot: the number of its ``lamp``, the square of what that brings, and its vertex, (N, 3).
+    """Makes a table from samples of a pilot: the number of the ``lamp``, its squared light, and the vertex, (N, 3).
 
-    ``whole``: weights of lamps in the whole scene, (lamps,), none 0.
+    ``whole`` (lamps,) are the weights of lamps in the whole scene, all above 0.
     """
     lamps, side = len(whole), _SIDE
     while side > 1 and side**3 * lamps > _LARGEST:
         side //= 2
-    # The extent of all but a few vertices: a single distant vertex would leave only one cell for the others. Uneven
-    # margins make sure that no wall lies exactly between two cells: rounding would then decide which cell it is in, and
-    # a path and its shifted copy might disagree.
+    # The extent of all but a few vertices, since a single distant vertex would leave only one cell for all others. The
+    # margins are not round numbers, so that no wall lies exactly between two cells. Rounding would decide to which cell
+    # such a wall belongs, and a path and its shifted copy might disagree.
     low, high = np.quantile(at, 0.005, axis=0), np.quantile(at, 0.995, axis=0)
     extent = np.maximum(high - low, 1e-3 * (high - low).max() + 1e-30)
     low, size = low - 0.0137 * extent, 1.0411 * extent / side

@@ -1,4 +1,4 @@
-"""Scenes: loaded from a Mitsuba file or built in, with errors that say what is wrong."""
+"""Loads scenes, from Mitsuba files or built in, with errors that say what is wrong."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from data_gen.scenes.merge import merge
 from data_gen.scenes.nodes import parts_of
 from ngpt.errors import NgptError, stop_if_interrupted
 
-# Threads that it takes to load any scene
+# The number of threads that is enough to load any scene
 _LOADING = 2
 
 
@@ -34,10 +34,10 @@ def load_scene(
 ) -> mi.Scene:
     """Loads a Mitsuba 3 scene file, or the built-in scene of that name.
 
-    ``size`` is (width, height) in pixels and replaces the scene's film size; a crop window stays the same part of
-    it. ``parameters`` sets the file's ``<default>`` values. ``merged`` joins the meshes of each material into one,
-    which renders the same and starts much sooner; it must be off if meshes move or are looked up by name.
-    ``sensor``, a number or an id, is the only one that the scene then has. Raises NgptError with Mitsuba's complaint.
+    ``size`` is (width, height) in pixels and replaces the scene's film size; a crop window stays the same part of the
+    film. ``parameters`` sets the file's ``<default>`` values. ``merged`` joins the meshes of each material into one.
+    The image is the same, and the render starts much sooner. It must be off if meshes move or are looked up by name. If
+    ``sensor``, a number or an id, is given, the scene has only this sensor. Raises NgptError with Mitsuba's message.
     """
     parameters = parameters or {}
     try:
@@ -87,7 +87,7 @@ def check_scene(scene: object) -> mi.Scene:
 
 
 def complaint(error: Exception) -> str:
-    """Mitsuba's error about a scene in one line, rewritten where it does not help."""
+    """Mitsuba's error about a scene, in one line. An unclear one is replaced."""
     text = " ".join(str(error).split())
     if "<animation>" in text:
         return f"animated transforms (motion blur) are not known to Mitsuba {mi.__version__}; remove <animation>"
@@ -96,7 +96,7 @@ def complaint(error: Exception) -> str:
 
 @contextmanager
 def _enough_threads() -> Iterator[None]:
-    """Sees that Dr.Jit has two threads: with one, some scene files load for ever (Mitsuba 3.9.1)."""
+    """A context with at least two threads. With one, some scene files never finish loading (Mitsuba 3.9.1)."""
     before = dr.thread_count()
     if before >= _LOADING:
         yield
@@ -111,14 +111,14 @@ def _enough_threads() -> Iterator[None]:
 def set_film_size(scene: mi.Scene, size: tuple[int, int]) -> None:
     """Sets the film of the scene's first sensor to ``size`` = (width, height) pixels.
 
-    A crop window stays the same part of it: its edges are rounded to pixels, so that parts which meet still do.
+    A crop window stays the same part of the film. Its edges are rounded to pixels, so adjacent windows stay adjacent.
     """
     sensor = scene.sensors()[0]
     film = sensor.film()
     crop = [_scaled(*each) for each in zip(film.crop_offset(), film.crop_size(), film.size(), size, strict=True)]
     params = mi.traverse(sensor)
     params["film.size"] = list(size)
-    # A new size makes the whole film the window, so the window comes after it.
+    # A new size resets the window to the whole film, so the window is set afterwards.
     params.update()
     if crop != [(0, length) for length in size]:
         params["film.crop_offset"], params["film.crop_size"] = ([*each] for each in zip(*crop, strict=True))
@@ -129,7 +129,7 @@ def set_film_size(scene: mi.Scene, size: tuple[int, int]) -> None:
 def at_most(scene: mi.Scene, pixels: int):
     """Shrinks the scene's film to at most ``pixels`` within the block; yields the factor by which it shrinks.
 
-    A cropped film keeps its size, since its window could not be set again.
+    A cropped film keeps its size, since its window could not be restored.
     """
     film = scene.sensors()[0].film()
     (width, height), window = (tuple(int(n) for n in numbers) for numbers in (film.size(), film.crop_size()))
@@ -146,15 +146,15 @@ def at_most(scene: mi.Scene, pixels: int):
 
 
 def _scaled(begin: int, length: int, whole: int, new: int) -> tuple[int, int]:
-    """Scales the part ``begin``, ``length`` of a ``whole`` to ``new`` pixels; it keeps at least one pixel."""
+    """Scales a part of a film of ``whole`` pixels to a film of ``new`` pixels. It keeps at least one pixel."""
     first, end = ((2 * int(edge) * new + int(whole)) // (2 * int(whole)) for edge in (begin, begin + length))
     first = min(first, new - 1)
     return first, max(end - first, 1)
 
 
 def path_depths(path: mi.SamplingIntegrator) -> dict[str, int]:
-    """``max_depth`` (-1: no limit) and ``rr_depth`` of an integrator like ``path``; {} where they cannot be read."""
-    # Mitsuba exposes neither depth as a parameter, only in print.
+    """``max_depth`` (-1: no limit) and ``rr_depth`` of an integrator like ``path``; {} if they cannot be read."""
+    # Mitsuba does not expose the depths as parameters, but prints them.
     depths = {key: int(value) for key, value in re.findall(r"(\w+_depth) = (\d+)", str(path))}
     if depths.keys() != {"max_depth", "rr_depth"}:
         return {}
@@ -162,15 +162,15 @@ def path_depths(path: mi.SamplingIntegrator) -> dict[str, int]:
 
 
 def reference_integrator(scene: mi.Scene) -> mi.SamplingIntegrator:
-    """The integrator that defines the rendered transport: the scene's own, or the one followed in its place, or
-    Mitsuba's ``path`` if the scene has none. Raises NgptError for an integrator without camera rays."""
+    """The integrator that defines the rendered transport: the scene's own, the one followed instead of it, or Mitsuba's
+    ``path`` if the scene has none. Raises NgptError for an integrator without camera rays."""
     integrator = scene.integrator() or mi.load_dict({"type": "path"})
     check_integrator(integrator)
     return followed(integrator)
 
 
 def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int | str | None) -> object:
-    """The result of ``mi.load_file``, with only the given ``sensor`` (a number or an id) unless that is None.
+    """Loads what ``mi.load_file`` loads. If ``sensor`` (a number or an id) is given, the scene has only this sensor.
 
     ``merged`` merges meshes by ``data_gen.scenes.merge``. Mitsuba's own merging (``optimize=True``) changes the order
     of shapes and emitters from call to call, and with it the bits of the image.
@@ -186,11 +186,11 @@ def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int |
 
 
 def parsed(path: str, parameters: Mapping[str, str] = MappingProxyType({})) -> tuple:
-    """Mitsuba's configuration and state of a scene file that was parsed but not instantiated."""
+    """Mitsuba's configuration and state of a scene file that is parsed but not instantiated."""
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
-    # In parallel objects are numbered as they come, which differs from process to process, and with it the kernel: it
-    # would be compiled again.
+    # With parallel loading the numbers of objects differ from process to process, and so do kernels, which would be
+    # compiled again.
     config.parallel = False
     state = mi.parser.parse_file(config, path, **parameters)
     mi.parser.transform_all(config, state)
@@ -198,7 +198,7 @@ def parsed(path: str, parameters: Mapping[str, str] = MappingProxyType({})) -> t
 
 
 def _keep(state: mi.parser.ParserState, sensor: int | str, path: str) -> None:
-    """Leaves out all sensors of the scene but that one. Raises WrongUse where it is not there."""
+    """Removes all sensors of the scene except one. Raises WrongUse if there is no such sensor."""
     scene, nodes = state.root.props, state.nodes
     sensors = [(name, nodes[number]) for name, number in parts_of(scene) if nodes[number].type == mi.ObjectType.Sensor]
     found = {name: node.props.id() for name, node in sensors}
@@ -211,7 +211,7 @@ def _keep(state: mi.parser.ParserState, sensor: int | str, path: str) -> None:
 
 @contextmanager
 def found_beside(path: str):
-    """Within the block, Mitsuba looks for the files of a scene in the scene's folder first."""
+    """A context in which Mitsuba looks for files in the scene's folder first."""
     resolver = mi.file_resolver()
     before = list(resolver)
     resolver.prepend(str(Path(path).resolve().parent))

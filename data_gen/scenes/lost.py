@@ -1,4 +1,4 @@
-"""Lamps whose light is hard to find or wrong, and the causes in a scene."""
+"""Lamps whose light is hard to find, or wrong in Mitsuba, and properties of a scene that cause it."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _SHARP = ("SmoothConductor", "SmoothDielectric")
 _TINY = 1 / 500
 # Part of the class name of all emitters with a sun, whose disk fills 7e-5 of a hemisphere.
 _SUN = "Sunsky"
-# Below this mean cosine, that of 2.6 degrees, vertex normals are not those of the faces.
+# Below this mean cosine (2.6 degrees) vertex normals count as different from face normals.
 _BENT = 0.999
 
 
 def behind_sharp(scene: mi.Scene) -> str:
-    """Which lamps hardly a path from the camera meets behind the scene's glass or mirrors; "" if there are none."""
+    """The kind of lamps that camera paths hardly meet behind the scene's glass or mirrors; "" if there are none."""
     if not any(_is_sharp(shape.bsdf()) for shape in shapes_of(scene)):
         return ""
     if without_size(scene):
@@ -32,7 +32,7 @@ def without_size(scene: mi.Scene) -> bool:
 
 
 def hard_to_meet(scene: mi.Scene, emitter: mi.Emitter) -> bool:
-    """Whether hardly a path meets that emitter of the scene: it has no size, or is tiny."""
+    """Whether paths hardly meet this emitter of the scene, because it has no size or is tiny."""
     return _has_no_size(emitter) or _is_tiny(emitter, float(np.linalg.norm(np.array(scene.bbox().extents()))))
 
 
@@ -41,15 +41,15 @@ def _has_no_size(emitter: mi.Emitter) -> bool:
 
 
 def has_holes(scene: mi.Scene) -> bool:
-    """Whether light goes straight through a surface of the scene; media do not count."""
+    """Whether light goes straight through a surface of the scene; boundaries of media do not count."""
     bsdfs = (shape.bsdf() for shape in shapes_of(scene) if not shape.is_medium_transition())
     return any(bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
 
 
 def bent_lamp(scene: mi.Scene) -> mi.Shape | None:
-    """The first lamp that has other vertex normals than its faces, or None.
+    """The first lamp whose vertex normals differ from its face normals, or None.
 
-    Mitsuba samples it by one normal and weighs it by another: its issue 1952.
+    Mitsuba computes a wrong density for such lamps: its issue 1952.
     """
     return next(filter(is_bent, (shape for shape in scene.shapes() if shape.is_emitter())), None)
 
@@ -64,7 +64,7 @@ def _is_tiny(emitter: mi.Emitter, whole: float) -> bool:
 
 
 def is_bent(shape: mi.Shape) -> bool:
-    """Whether it is a mesh whose vertex normals are not those of its faces."""
+    """Whether a shape is a mesh whose vertex normals differ from its face normals."""
     # A rectangle is a mesh too, but has no table of faces.
     if not shape.is_mesh() or not shape.has_vertex_normals() or shape.class_name() == "Rectangle":
         return False

@@ -1,11 +1,11 @@
-"""Many lamps as few: hundreds of small meshes that shine become 64 meshes, each with one emitter for all of its lamps.
+"""Merges lamps: hundreds of small meshes that shine become 64 meshes, each with one emitter for all of its lamps.
 
-Dr.Jit records every call of a kernel for each shape and each emitter of a scene before the first sample. With 2,000
-lamps that takes seconds in all. Lamps that are close together share a mesh here, so samplers still choose lamps by
-place. Within a mesh, points are sampled in proportion to the radiance.
+Before the first sample, Dr.Jit records every virtual call of a kernel for each shape and each emitter of a scene. With
+2,000 lamps this takes seconds. Lamps that are close together share a mesh, so samplers can still choose lamps by place.
+Within a mesh, points are sampled in proportion to the radiance.
 
-A lamp keeps its radiance and its material. It loses its name, and its texture coordinates: their first number says
-which lamp of the mesh it is, as a texture would.
+A lamp keeps its radiance and its material. It loses its name and its texture coordinates: u now holds the number of the
+lamp in its mesh, from which the radiance is looked up.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from data_gen.scenes.lamp_mesh import Table, lamps, mesh_of
 from data_gen.scenes.lost import is_bent
 from data_gen.scenes.nodes import MESHES, added, is_part, parts_of
 
-# The number of lamps of one material from which on they are merged
+# The least number of lamps of one material that are merged
 MANY = 256
-# How often they are halved: they become 64 meshes
+# The number of times the lamps are split into halves, which gives 64 meshes
 _HALVINGS = 6
 # The corners of Mitsuba's rectangle, and its faces
 _RECTANGLE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
@@ -33,15 +33,15 @@ _PLUGIN = "ngpt_lamps"
 
 @dataclass
 class Lamp:
-    """A mesh that shines: ``corners`` (F, 3, 3) of its faces, counterclockwise as seen from where they shine, and the
-    ``radiance`` (3,)."""
+    """A mesh that shines: the ``corners`` (F, 3, 3) of its faces, counterclockwise as seen from the side that shines,
+    and the ``radiance`` (3,)."""
 
     corners: np.ndarray
     radiance: np.ndarray
 
 
 def merge_lamps(state: mi.parser.ParserState) -> None:
-    """Changes the nodes of a scene file that is parsed. Spectral and polarised variants keep their lamps."""
+    """Merges the lamps in the nodes of a parsed scene file. In spectral and polarised variants it changes nothing."""
     if not mi.is_rgb or mi.is_polarized:
         return
     groups: dict[int | None, dict[str, tuple[int, np.ndarray]]] = {}
@@ -57,7 +57,7 @@ def merge_lamps(state: mi.parser.ParserState) -> None:
 
 
 def _merge(state: mi.parser.ParserState, material: int | None, known: dict[str, Lamp]) -> None:
-    """Puts meshes in the place of lamps of one material, each in the place of its first lamp."""
+    """Replaces the lamps of one material by meshes. Each mesh takes the place of its first lamp."""
     _register(mi.variant())
     names = list(known)
     middles = np.array([lamp.corners.reshape(-1, 3).mean(axis=0) for lamp in known.values()])
@@ -73,13 +73,12 @@ def _merge(state: mi.parser.ParserState, material: int | None, known: dict[str, 
 
 @cache
 def _register(variant: str) -> None:
-    """Registers the plugin with that variant, which must be the current one."""
+    """Registers the plugin with a variant, which must be the current one."""
     mi.register_shape(_PLUGIN, mesh_of)
 
 
 def _candidates(state: mi.parser.ParserState) -> Iterator[tuple[str, int | None, int, np.ndarray]]:
-    """Meshes that shine in one colour: the name, the node of the material (None: Mitsuba's own), the node of the mesh,
-    and the radiance."""
+    """Meshes that shine in one colour: name, material node (None: Mitsuba's default), mesh node, radiance."""
     for name, number in parts_of(state.root.props):
         shape = state.nodes[number].props
         nodes = [part for _, part in parts_of(shape)]
@@ -106,14 +105,14 @@ def _has_texture(state: mi.parser.ParserState, number: int) -> bool:
 
 
 def _lamp(shape: mi.Properties, radiance: np.ndarray) -> Lamp | None:
-    """The lamp of a mesh's node; None if its vertex normals are not those of its faces."""
+    """The lamp of a mesh's node; None if its vertex normals differ from its face normals."""
     flipped = bool(shape.get("flip_normals", False))
     normals = None
     if shape.plugin_name() == "rectangle":
         # A rectangle has no table of faces.
         to_world = np.array(shape["to_world"].matrix, float) if "to_world" in shape else np.eye(4)
         corners = (_RECTANGLE @ to_world[:3, :3].T + to_world[:3, 3])[_FACES]
-        # As Mitsuba has it, the normal goes with the transform also where that is a reflection.
+        # In Mitsuba the normal is transformed, too, so a reflection flips the order of the corners.
         flipped ^= bool(np.linalg.det(to_world[:3, :3]) < 0)
     else:
         settings = {name: value for name, value in shape.items() if not is_part(value)}
@@ -133,7 +132,7 @@ def _lamp(shape: mi.Properties, radiance: np.ndarray) -> Lamp | None:
 
 
 def _halved(part: np.ndarray, middles: np.ndarray, times: int) -> Iterator[np.ndarray]:
-    """Parts of lamps that are close together: numbers in the order of the file."""
+    """Splits ``part``, numbers of lamps, into parts that are close together. Each is in the order of the file."""
     if times == 0 or len(part) < 2:
         yield np.sort(part)
         return

@@ -1,9 +1,9 @@
-"""Fewer shapes of a scene file: equal materials are one, and so are meshes of one material.
+"""Merges equal materials of a scene file, and meshes of one material.
 
-Each shape is a case of its own in the kernels, which Dr.Jit records before the first ray. A room of 800 meshes takes
-seconds for that, a tenth of it once meshes of one material are one. Shapes keep the order of the file, a merged one has
-the place of the first, and all of them lose their names. Meshes that bound a medium stay as they are, and those that
-shine as well, unless they are many: see ``many_lamps``.
+Dr.Jit records each shape as a separate case of its kernels before the first ray. This takes seconds for a room of 800
+meshes, and a tenth of that if meshes of one material are merged. Shapes keep the order of the file. A merged mesh has
+the place of the first of its meshes, and all of them lose their names. Meshes that bound a medium stay as they are. So
+do meshes that shine, unless there are many: see ``many_lamps``.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from data_gen.scenes.nodes import MESHES, added, parts_of
 
 # Settings of meshes that change normals
 _NORMALS = ("face_normals", "flip_normals")
-# Instances of a group become meshes if their files have at most this number of bytes in all: copies take memory, unlike
+# The most bytes, over all copies, for which the instances of a group become meshes. Copies take memory, unlike
 # instances
 _MOST_BYTES = 1 << 24
 
 
 def merge(config: mi.parser.ParserConfig, state: mi.parser.ParserState) -> None:
-    """Changes the nodes of a scene file that is parsed; files of meshes are looked for as Mitsuba does."""
-    # Exporters repeat a material in each shape. Equal ones become the first of them.
+    """Merges the nodes of a parsed scene file. Files of meshes are found by Mitsuba's file resolver."""
+    # Exporters repeat a material in each shape. Equal materials are replaced by the first of them.
     mi.parser.transform_merge_equivalent(config, state)
     merge_lamps(state)
     _copy_instances(state)
@@ -37,7 +37,7 @@ def merge(config: mi.parser.ParserConfig, state: mi.parser.ParserState) -> None:
             groups.setdefault(key, []).append(name)
     for names in groups.values():
         merged = _in_pairs(state, [scene[name] for name in names])
-        # The list of nodes may have moved.
+        # Read again, since the list of nodes may have moved
         scene = state.root.props
         scene[names[0]] = merged
         for name in names[1:]:
@@ -45,7 +45,7 @@ def merge(config: mi.parser.ParserConfig, state: mi.parser.ParserState) -> None:
 
 
 def _copy_instances(state: mi.parser.ParserState) -> None:
-    """Puts meshes in the place of instances of groups that are small and have nothing else."""
+    """Replaces instances by meshes, if their groups are small and contain only meshes."""
     instances: dict[int, list[str]] = {}
     for name, number in parts_of(state.root.props):
         if state.nodes[number].props.plugin_name() == "instance":
@@ -65,9 +65,9 @@ def _copy_instances(state: mi.parser.ParserState) -> None:
 
 
 def _copy(state: mi.parser.ParserState, name: str, meshes: Sequence[int]) -> None:
-    """Puts copies of ``meshes`` in the place of the instance of that name."""
+    """Replaces the instance called ``name`` by copies of ``meshes``."""
     instance = state.nodes[state.root.props[name].index()].props
-    # Now, for nodes that are added move the others.
+    # Read before nodes are added, since that moves the others
     placed = [instance["to_world"]] if "to_world" in instance else []
     for i, number in enumerate(meshes):
         props = mi.Properties(state.nodes[number].props)
@@ -78,13 +78,13 @@ def _copy(state: mi.parser.ParserState, name: str, meshes: Sequence[int]) -> Non
 
 
 def _bytes_of(mesh: mi.Properties) -> int:
-    """The bytes of its file; of a mesh without a file, about what it takes in memory."""
+    """The size of a mesh's file in bytes, or for a mesh without a file about its memory."""
     file = Path(str(mi.file_resolver().resolve(mesh["filename"]))) if "filename" in mesh else None
     return file.stat().st_size if file is not None and file.is_file() else 1 << 10
 
 
 def _in_pairs(state: mi.parser.ParserState, meshes: list) -> mi.Properties.ResolvedReference:
-    """One mesh of all: each is copied as often as they can be halved, and not once for each that is added."""
+    """Merges n meshes in pairs, so each is copied log2(n) times. One by one, the first would be copied n times."""
     if len(meshes) == 1:
         return meshes[0]
     props, middle = mi.Properties("merge"), len(meshes) // 2
@@ -94,7 +94,7 @@ def _in_pairs(state: mi.parser.ParserState, meshes: list) -> mi.Properties.Resol
 
 
 def _like(state: mi.parser.ParserState, number: int) -> tuple | None:
-    """What meshes that become one have in common; None for a node that stays as it is."""
+    """A key that is equal for meshes that can be merged; None for a node that must stay as it is."""
     props = state.nodes[number].props
     parts = [part for _, part in parts_of(props)]
     if props.plugin_name() not in MESHES or len(parts) != 1 or state.nodes[parts[0]].type != mi.ObjectType.BSDF:

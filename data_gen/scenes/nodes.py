@@ -1,4 +1,4 @@
-"""Nodes of a scene file that is parsed but not made yet."""
+"""Nodes of a scene file that is parsed but not instantiated yet."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def is_part(value: object) -> bool:
 
 
 def added(state: mi.parser.ParserState, kind: mi.ObjectType, props: mi.Properties) -> mi.Properties.ResolvedReference:
-    """A reference to a new node. The list of nodes may move in memory, and with it the properties of all."""
+    """Adds a node and returns a reference to it. The list of nodes, with all their properties, may move in memory."""
     node = mi.parser.SceneNode()
     node.type, node.props = kind, props
     state.nodes.append(node)

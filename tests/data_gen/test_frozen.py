@@ -180,7 +180,7 @@ def test_what_cannot_be_recorded_says_so_once(renderer, recordings, caplog, monk
     for _ in range(3):
         assert np.array_equal(np.array(kept(secretive, dr.opaque(mi.Float, 1, 4))), np.full(4, 1.25, np.float32))
     (line,) = caplog.messages
-    assert "secretive is recorded anew in each pass" in line and "\n" not in line
+    assert "secretive is recorded again in each pass" in line and "\n" not in line
     assert recordings.total() > 3
 
 

@@ -441,7 +441,7 @@ def test_light_of_a_lamp_that_is_chosen_never_is_found_or_refused(renderer, ligh
         scene = load(renderer, box(0.0, fog=True))
     # Of what gathers photons alone
     if "photons" in SAMPLERS[sampler].options:
-        with pytest.raises(NgptError, match=f"'{sampler}' .*'hidden' has sampling_weight 0; give it a positive"):
+        with pytest.raises(NgptError, match=f"'{sampler}' .*'hidden', which has sampling_weight 0; give it a positive"):
             render_stack(scene, 1, 0, sampler, unbiased=True)
         return
     spp = 3 if SAMPLERS[sampler].batch == 1 else 16

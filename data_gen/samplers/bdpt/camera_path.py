@@ -1,11 +1,11 @@
-"""The path from the camera, vertex by vertex: each is joined to lamps, to a light path, and to photons near by.
+"""The path from the camera, vertex by vertex. Each vertex is joined to lamps, to a light path, and to nearby photons.
 
 Each vertex of the camera path is connected to one vertex of the light path, chosen by its estimated contribution.
 
-Connections to all of them would take half the time of a sample, most of it for little light. One, its light divided by
-the probability of the choice, has the same mean: weights of strategies stay as they are. The better the guess of what
-each connection brings, the less noise this adds; the guess reads what is kept of the light path and nothing else, no
-material and no ray.
+Connections to all of its vertices would take half the time of a sample, most of it for little light. A single
+connection, with its light divided by the probability of the choice, has the same mean, so the MIS weights of strategies
+stay the same. It adds less noise if the contributions are guessed well. The guess reads only the records of the light
+path: it evaluates no material and traces no ray.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from data_gen.samplers.bdpt.vertex import (
 
 
 class Merges(Protocol):
-    """What gathers photons at the vertices of camera paths, see ``vcm.merging``."""
+    """Gathers photons at the vertices of camera paths, see ``vcm.merging``."""
 
     def light(self, z: Vertex, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Spectrum:
         """The weighted light of the photons near the vertex ``z``."""
@@ -44,9 +44,9 @@ class Merges(Protocol):
 
 @dr.syntax
 def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging: Merges | None = None) -> tuple:
-    """L, Le and L_merged of a path from the camera, joined to a ``light_path`` and to photons, where there are.
+    """L, Le and L_merged of a path from the camera, joined to a ``light_path`` and to photons, if there are any.
 
-    Le is the emission that the camera sees directly, L_merged the light of photons, L all other light.
+    Le is the emission that the camera sees directly, L_merged is the light of photons, and L is all other light.
     """
     scene, lights, limits, random = plan.scene, plan.lights, plan.limits, sight.random
     ray = mi.Ray3f(sight.ray)
@@ -60,7 +60,7 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
     sky = Sky.from_camera(limits.hide_emitters)
     active = si.is_valid() & (depth < limits.max_depth)
     toward, density = sight.eye.toward(si, sight.eye.lens, active)
-    end = mis.begin_camera(density, cosine(si, ray.d))  # what the path knows of the other strategies, at si
+    end = mis.begin_camera(density, cosine(si, ray.d))  # partial sums of the MIS weights, at si
     edge = plan.begins(si.p + toward.d * toward.dist)  # the edge that leads to si
     while dr.hint(active, label="camera path"):
         z = Vertex(si, β, end, depth, edge)
@@ -74,7 +74,7 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
         light, weight = lights.connect(scene, si, u_light, smooth)[:2]
         lit = smooth & (light.pdf > 0)
         wo = si.to_local(light.d)
-        # One call for both: the material toward the light, and where the path goes on to.
+        # A single call evaluates the material toward the light and samples the next direction.
         f, p, sample, f_p = bsdf.eval_pdf_sample(context(RADIANCE), si, wo, u_lobe, u_direction)
         f = dr.select(dr.isfinite(dr.sum(f)) & dr.isfinite(p), f, 0)
         lit &= dr.max(f * weight) > 0
@@ -111,9 +111,9 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
         met = active & sky.meets(reached)
         Le_met, p, e = emission_at(scene, lights, reached, si if edge is None else edge.seen_by(si), met)
         if dr.hint(edge is not None, mode="scalar"):
-            # Nothing is connected to the camera itself.
+            # No emitter is sampled from the camera itself.
             p, e = dr.select(edge.first, 0, p), dr.select(edge.first, 0, e)
-        # Light paths do not find longer paths.
+        # Light paths are not that long, so they find no such path.
         end.vc = dr.select(depth <= plan.longest, end.vc, 0)
         L += dr.select(met, β * Le_met / (1 + mis.others_emitted(end, e, p)), 0)
         si = reached
@@ -123,13 +123,13 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
 
 
 def known(end: Partial, joined: mi.Bool) -> Partial:
-    """At a vertex: paths longer than light paths are weighted as if light paths found none."""
+    """The partial sums at a vertex. Paths too long for light paths are weighted as if there were no light paths."""
     return Partial(dr.select(joined, end.vcm, 0), dr.select(joined, end.vc, 0), end.waiting)
 
 
 @dr.syntax
 def connection(plan: Plan, z: Vertex, bsdf, active, light_path: LightPath, u: mi.Float) -> Any:
-    """Estimates the light of all connections of ``z`` to a light path by one connection, which ``u`` chooses."""
+    """Estimates the light of all connections of ``z`` to a light path by one connection. ``u`` chooses it."""
     L = dr.zeros(mi.Spectrum, dr.width(z.depth))
     chosen, times = choose(z, active, light_path, plan.longest, u)
     if active & (times > 0):
@@ -139,21 +139,21 @@ def connection(plan: Plan, z: Vertex, bsdf, active, light_path: LightPath, u: mi
     return L
 
 
-# Added to cosines: shading normals light what geometric ones do not, and gloss is not matte.
+# Added to cosines: a shading normal may face light when the geometric one does not, and glossy materials are not matte.
 _LEAST_COSINE = 0.1
 
 
 @dr.syntax
 def choose(z: Vertex, active, light: LightPath, longest: int, u: mi.Float):
-    """The number of the chosen vertex of ``light``, and 1 / the probability of that choice; 0 where there is none.
+    """The number of the chosen vertex of ``light``, and 1 / the probability of that choice, or 0 if there is none.
 
-    Vertices that paths of at most ``longest`` edges lead to can be chosen, by the random number ``u``.
+    The random number ``u`` chooses among vertices whose connection makes a path of at most ``longest`` edges.
     """
     kept, end = light.kept, dr.minimum(light.count, longest - 1 - z.depth)
     come_from = cosine(z.si, z.si.to_world(z.si.wi))
     i = mi.UInt32(0)  # the current vertex
     chosen = mi.UInt32(0)  # a vertex before i, chosen in proportion to its worth
-    total, own = mi.Float(0), mi.Float(0)  # their worth, and the worth of the chosen one
+    total, own = mi.Float(0), mi.Float(0)  # the worth of all vertices before i, and of the chosen one
     while dr.hint(active & (i < end), label="choice"):
         w = worth(z, come_from, kept.read(i))
         total += w
@@ -169,9 +169,9 @@ def choose(z: Vertex, active, light: LightPath, longest: int, u: mi.Float):
 
 
 def worth(z: Vertex, come_from: mi.Float, y) -> mi.Float:
-    """Light of the connection from ``z`` to the record ``y`` times its MIS weight, as if both were white and matte.
+    """The light of the connection from ``z`` to the record ``y`` times its MIS weight, as if both were white and matte.
 
-    ``come_from`` is the cosine, at ``z``, of the direction to the previous vertex.
+    ``come_from`` is the cosine of the direction from ``z`` to its previous vertex.
     """
     to = mi.Vector3f(y.o + y.d * y.t - z.si.p)
     distance2 = dr.squared_norm(to)

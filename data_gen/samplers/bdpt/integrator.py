@@ -1,18 +1,18 @@
 r"""Bidirectional path tracing: for each camera sample a path from the camera and one from a light, joined every way.
 
-Every way to find a path is a strategy; all are weighted against each other (``mis``). A vertex of the camera path is
-connected to a lamp and to one vertex of the light path, which stands for all of them (``camera_path.choose``).
+Every way to find a path is a strategy. MIS weights combine all strategies (``mis``). Each vertex of the camera path is
+connected to a lamp and to one vertex of the light path, which stands for all its vertices (``camera_path.choose``).
 
     z                 vertices of the camera path
     y                 vertices of the light path, kept while the camera path is traced
     β                 throughput f / p of either
     p, q              density of a sampled direction, and of the same with both directions swapped
     others            Σ p_j / p_s over all other strategies
-    L, Le             radiance of the camera path without, and of only, the emission that the camera sees directly
+    L, Le             radiance of the camera path: Le is emission that the camera sees directly, L is all other light
 
-Both paths are made in one kernel. Light paths that reach the camera end on pixels of their own: they are splatted, so
-samples are independent from pass to pass only. Paths of more than ``joined_depth`` edges are found only from the
-camera, by s = 0 and s = 1. That bounds what is kept of a light path, and paths may be as long as they like.
+Both paths are made in one kernel. A light path that reaches the camera may end on any pixel. It is splatted, so only
+samples of different passes are independent. Paths of more than ``joined_depth`` edges are found only from the camera,
+by s = 0 and s = 1. This limits the memory for a light path, but not the length of paths.
 
 [Veach 1997, "Robust Monte Carlo Methods for Light Transport Simulation", chapter 10]
 """
@@ -96,7 +96,7 @@ class BDPT(GradientIntegrator):
         film.put_all(values)
 
     def samples(self, plan: Plan, camera: CameraSamples, sums: tuple = ()) -> tuple[dict, tuple]:
-        """Layers, and the ``sums`` of splats with the splats of paths from lights added, if there are any."""
+        """The layers, and the ``sums`` of splats, to which the splats of light paths are added if there are any."""
         sight, lit = Sight.of(camera), None
         if plan.joins:
             splatter = Splatter(Splats.on(sight.eye.pixels, 3, sums), sight.ray, sight.importance)
@@ -109,7 +109,7 @@ class BDPT(GradientIntegrator):
         return values, sums
 
     def hidden_from_camera(self, scene, si, camera: mi.DirectionSample3f, active) -> mi.Bool:
-        """Whether something is between ``si`` and the camera's near plane; lamps are not, if they are hidden."""
+        """Whether something is between ``si`` and the camera's near plane. Hidden lamps do not count."""
         if not self.hide_emitters:
             return scene.ray_test(si.spawn_ray_to(camera.p), active)
         on_lamp = si.emitter(scene) != None  # noqa: E711 - a comparison of arrays of pointers

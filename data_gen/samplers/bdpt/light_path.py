@@ -1,4 +1,4 @@
-"""The path from a light, vertex by vertex: what is kept of it, and what a visitor makes of its ends at the camera."""
+"""The path from a light: the records of its vertices, and a visitor that receives its connections to the camera."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ class Seen:
     C: mi.Spectrum  # 0 where the camera does not see it
     others: mi.Float
     pixel: mi.UInt32
-    kept: Any  # what is kept of it
+    kept: Any  # the record of ``y``
 
 
 class Visitor(Protocol):
-    """What comes along on a light path; its state is part of the loop's."""
+    """Is called at each vertex of a light path. Its state is part of the loop's state."""
 
     def start(self) -> Any:
         """The state before the first vertex."""
 
     def sees(self, state: Any, seen: Seen) -> Any:
-        """At each vertex; returns the next state."""
+        """Called at each vertex; returns the next state."""
 
 
 @dataclass
@@ -56,14 +56,15 @@ class End:
 
 @dataclass
 class LightPath:
-    """The vertices of a path from a light, as they are kept."""
+    """The records of the vertices of a path from a light."""
 
     kept: Any  # ``read(i)`` is the ``record`` of the vertex that is i + 1 edges from the light
     count: mi.UInt32  # how many vertices it has
 
 
 def begin(plan: Plan, random, camera_ray: mi.Ray3f) -> tuple[LightRay, End, mi.Bool]:
-    """A path from a light up to its first vertex, and whether it exists; ``camera_ray`` gives time and wavelengths."""
+    """The start and first vertex of a light path, and whether it exists; ``camera_ray`` has its time and
+    wavelengths."""
     scene, lights = plan.scene, plan.lights
     start = lights.sample(scene, random, camera_ray.time, camera_ray.wavelengths)
     active = dr.max(start.β) > 0
@@ -74,22 +75,21 @@ def begin(plan: Plan, random, camera_ray: mi.Ray3f) -> tuple[LightRay, End, mi.B
 
 
 def lit(plan: Plan, start: LightRay, si: mi.SurfaceInteraction3f) -> mis.Partial:
-    """What a path knows at its first vertex."""
+    """The partial sums of MIS weights at the first vertex."""
     e, p_light = plan.lights.densities(plan.scene, start, si)
     return mis.begin_light(e, p_light, start.delta, cosine(si, start.ray.d))
 
 
 def go_on(plan: Plan, random, start: LightRay, y: Vertex, bsdf, active) -> tuple:
-    """The next vertex behind ``y``, as it was reached, whether there is one, the event that leads there, and 1 / the
-    probability to survive."""
+    """The next vertex after ``y``, whether it exists, the event that leads there, and 1 / survival probability."""
     u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
     sample, f_p = bsdf.sample(context(IMPORTANCE), y.si, u_lobe, u_direction, active)
     known = replace(y, end=plan.known(y.end, bsdf))
     d, f_p, end = light_leaves(known, bsdf, sample, f_p, active & (sample.pdf > 0))
-    # Behind a hole nothing has been gathered yet.
+    # The partial sums behind a hole must not include photons gathered at the hole.
     end, edge = plan.onward(y, bsdf, sample, end)
     β = y.β * dr.select(sample.pdf > 0, f_p, 0)
-    # Russian roulette by the fraction of the path's initial light that is left
+    # Russian roulette by the share of the path's initial light that is left
     survives = roulette(dr.max(β) * dr.rcp(dr.max(start.β)), y.depth >= plan.limits.rr_depth)
     active = active & (sample.pdf > 0) & (dr.max(β) > 0) & (u_survival < survives)
     ray = y.si.spawn_ray(d)
@@ -97,7 +97,7 @@ def go_on(plan: Plan, random, start: LightRay, y: Vertex, bsdf, active) -> tuple
     si = hit.compute_surface_interaction(ray)
     end = plan.arrives(end, edge, si, d)
     if edge is not None:
-        # Not all lights are seen from further away as from near by.
+        # The partial sums of the first edge depend on its whole length, through any holes.
         first = lit(plan, start, si)
         end = mis.Partial(dr.select(edge.first, first.vcm, end.vcm), dr.select(edge.first, first.vc, end.vc))
     there = End(ray, hit, Vertex(si, β / survives, end, y.depth + 1, edge))
@@ -106,9 +106,9 @@ def go_on(plan: Plan, random, start: LightRay, y: Vertex, bsdf, active) -> tuple
 
 @dr.syntax
 def light_path(plan: Plan, sight: Sight, visitor: Visitor) -> tuple[LightPath, Any, Any]:
-    """Traces a path from a light; returns its vertices, the random numbers to go on by, and the visitor's state.
+    """Traces a path from a light. Returns its vertices, the remaining random numbers, and the visitor's state.
 
-    It has at most ``plan.longest`` edges, the one to the camera included.
+    The path has at most ``plan.longest`` edges, including the edge to the camera.
     """
     eye, random = sight.eye, sight.random.clone()
     start, end, active = begin(plan, random, sight.ray)
@@ -122,8 +122,8 @@ def light_path(plan: Plan, sight: Sight, visitor: Visitor) -> tuple[LightPath, A
         smooth = active & scatters_smoothly(bsdf)
 
         # ------------------------- Keep --------------------------
-        # In the place of its depth, smooth or not: Dr.Jit 1.5 (LLVM) errs where the places of lanes differ, and where
-        # this loop reads from such places.
+        # Each vertex is kept at the index of its depth, smooth or not. Dr.Jit 1.5 (LLVM) gives wrong results if the
+        # indices of lanes differ, or if this loop reads the array.
         here = record(end.ray, end.hit, y, smooth)
         kept.write(here, y.depth - 1, active)
         count = dr.select(active, y.depth, count)

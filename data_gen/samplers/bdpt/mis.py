@@ -1,32 +1,34 @@
-r"""MIS weights of all strategies that find a path: the balance heuristic, by recursion along both subpaths.
+r"""MIS weights of all strategies that find a path: the balance heuristic, computed by recursion along both subpaths.
 
 A path x0 (camera) x1 ... xk (light) is found by k + 1 strategies: s of its vertices come from the light, the others
 from the camera. With p_s the density of strategy s, its weight is p_s / Σ p_j = 1 / (1 + others), where
 
     others = Σ_{j≠s} p_j / p_s = the strategies with a longer light path + those with a longer camera path.
 
-Either sum is a number that its end carries from vertex to vertex, without the densities themselves (Georgiev 2012,
-"Implementing Vertex Connection and Merging"):
+Each subpath updates its own sum from vertex to vertex, without storing the densities (Georgiev 2012, "Implementing
+Vertex Connection and Merging"):
 
-    vcm   1 / the density of the last vertex, the first summand without what is still unknown of it
-    vc    the sum of all further summands, likewise
+    vcm   1 / the density of the last vertex: the first summand without its factors that are still unknown
+    vc    the sum of all further summands, also without these factors
 
-Densities do not include Russian roulette, so weights depend only on the path. Camera and light begin alike, and ``e``
-stands for both: p_emit / (p_connect cos). It is the density of sampling the first edge outward, divided by the density
-of choosing the end to connect to, per unit area facing the end. Delta events cannot be met by a connection: their
-summands are 0, and the densities of both directions cancel in what is behind them.
+Densities do not include Russian roulette, so weights depend only on the path. Camera and light have the same formula
+for their first edge, with e = p_emit / (p_connect cos). This is the density of sampling the first edge from the end of
+the path, divided by the density of choosing that end for a connection, per unit area facing the end. A connection
+cannot make a delta event: its summands are 0, and in later summands the densities of its two directions cancel.
 
-Holes that connections go through are no vertices: an edge leads through them, and is as long as from vertex to vertex.
-Passing one by chance enters as a weight and not as a density, as it does for a connection.
+Holes that connections go through are no vertices: an edge leads through them, and its length is measured from vertex to
+vertex. If a path passes a hole by chance, the probability is a factor of its weight and not of its density, as for a
+connection.
 
-Both ends may also come to one vertex, and merge: η = π r² N times as many such pairs of N light paths lie within the
-radius r as there are pairs that end in a given unit of area. Paths merge at vertices where photons are gathered, and
-there only if light came from a delta event: else a connection finds the path, and blurs nothing. So a light path knows
-at once, its ``vcm`` is 0 there, and ``gathered`` adds η to it as one more summand; a camera path knows when it leaves
-the next vertex, and η is ``waiting`` until then. Without merging, the formulas are the same as in ``bdpt``.
+Both subpaths may also arrive at one vertex and merge. The density of a merge is the product of the subpaths' densities
+times η = π r² N, for N light paths and radius r. Paths merge only at vertices where photons are gathered, and only if
+the light came from a delta event; otherwise a connection finds the path without blur. A light path knows this at the
+vertex: its ``vcm`` is 0 there, and ``gathered`` adds η as one more summand. A camera path knows it only when it leaves
+the next vertex, so η is ``waiting`` until then. Without photons the formulas are those of ``bdpt``.
 
-``p`` are densities in solid angle, ``q`` the same with both directions of the vertex swapped; cosines are absolute, to
-the geometric normal. All quotients are taken one by one: squares of densities would leave float32.
+``p`` are densities in solid angle, and ``q`` are densities with both directions of the vertex swapped. Cosines are
+absolute, to the geometric normal. Quotients are computed one by one, because squares of densities would leave the range
+of float32.
 """
 
 from __future__ import annotations
@@ -39,26 +41,26 @@ import mitsuba as mi
 
 @dataclass
 class Partial:
-    """What one end of a path stores about the strategies, at its last vertex or on the way from there."""
+    """The partial sums of one subpath, at its last vertex or on the edge behind it."""
 
     vcm: mi.Float
     vc: mi.Float
-    # For a camera path: what is added to ``vc`` if the next event is a delta
+    # For a camera path: the term that is added to ``vc`` if the next event is a delta
     waiting: mi.Float = field(default_factory=lambda: mi.Float(0))
 
 
 def begin_camera(e: mi.Float, cos: mi.Float) -> Partial:
-    """At the first vertex that the camera sees: there is no strategy that meets the camera by chance."""
+    """At the first vertex that the camera sees. No strategy meets the camera by chance."""
     return Partial(dr.rcp(e * cos), mi.Float(0))
 
 
 def begin_light(e: mi.Float, p: mi.Float, delta: mi.Bool, cos: mi.Float) -> Partial:
-    """At the first vertex lit: ``p`` is the density of connecting that vertex to the light's end."""
+    """At the first vertex of a light path; ``p`` is the density of connecting that vertex to the light's end."""
     return Partial(dr.rcp(e * cos), dr.select(delta, 0, dr.rcp(e * p * cos)))
 
 
 def leave(end: Partial, cos: mi.Float, p: mi.Float, q: mi.Float, delta: mi.Bool, η: mi.Float | float = 0.0) -> Partial:
-    """Behind an event that was sampled with density ``p``; camera paths leave a vertex that merges with ``η``."""
+    """Behind an event that was sampled with density ``p``. ``η`` is that of the vertex, for camera paths."""
     vc = dr.select(delta, (end.vc + end.waiting) * cos, cos / p * (end.vcm + end.vc * q))
     return Partial(dr.select(delta, 0, dr.rcp(p)), vc, dr.select(delta, 0, mi.Float(η) * (cos / p)))
 
@@ -74,7 +76,7 @@ def passed(end: Partial, cos: mi.Float, distance2: mi.Float) -> Partial:
 
 
 def gathered(y: Partial, η: mi.Float) -> Partial:
-    """At a vertex of a light path; η is 0 where no photons are gathered."""
+    """At a vertex of a light path, with the summand of merging; η is 0 where no photons are gathered."""
     return Partial(dr.select(y.vcm > 0, y.vcm, η), y.vc)
 
 
@@ -88,7 +90,7 @@ def others_merged(z: Partial, q_z: mi.Float, y: Partial, q_y: mi.Float, η: mi.F
 
 
 def others_emitted(end: Partial, e: mi.Float, p: mi.Float) -> mi.Float:
-    """``others`` for a camera path that met an emitter; ``end``: on the way, ``p``: density of connecting to it."""
+    """``others`` for a camera path that met an emitter; ``p`` is the density of connecting to the emitter instead."""
     return p * (end.vcm + e * end.vc)
 
 
@@ -107,7 +109,7 @@ def others_to_camera(end: Partial, e: mi.Float, cos: mi.Float, q: mi.Float) -> m
 
 @dataclass
 class Side:
-    """One of two vertices at which paths are connected."""
+    """One of the two vertices of a connection."""
 
     cos: mi.Float  # of the edge
     p: mi.Float  # density of sampling the edge
@@ -116,7 +118,7 @@ class Side:
 
 @dataclass
 class Edge:
-    """It connects the last vertices of a camera path and of a light path."""
+    """The edge between the last vertices of a camera path and a light path."""
 
     z: Side
     y: Side

@@ -1,8 +1,8 @@
 """The four ways to complete a path with s vertices from the light and t from the camera, each with its MIS weight.
 
     emitted     s = 0: the camera path has met an emitter
-    to_light    s = 1: its last vertex is connected to a sampled point of an emitter
-    connected   s, t > 1: its last vertex is connected to one of the light path
+    to_light    s = 1: the last vertex of the camera path is connected to a sampled point of an emitter
+    connected   s, t > 1: the last vertex of the camera path is connected to a vertex of the light path
     to_camera   t = 1: a vertex of the light path is connected to the camera
 
 Each returns f / p of the path that it completes, and ``others`` of ``mis``: its weight is 1 / (1 + others).
@@ -25,7 +25,7 @@ from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, Vertex, cosine, 
 
 
 def emission_at(scene, lights: LightEnds, si, ref, active) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
-    """Le at ``si`` toward ``ref`` where ``active``; ``p`` of connecting to it from there, and ``e`` of ``mis``."""
+    """Le at ``si`` toward ``ref`` where ``active``, the density of connecting ``ref`` to it, and ``e`` of ``mis``."""
     light, p = lights.met(scene, si, ref, active)
     Le = light.emitter.eval(si, active)
     cos = dr.abs(dr.dot(light.n, light.d))
@@ -34,7 +34,7 @@ def emission_at(scene, lights: LightEnds, si, ref, active) -> tuple[mi.Spectrum,
 
 
 def to_light(lights: LightEnds, z: Vertex, light, weight, f, *, p, q) -> tuple[mi.Spectrum, mi.Float]:
-    """s = 1: ``light`` and its ``weight`` Le / p are Mitsuba's; f, p and q are from ``evaluate`` toward it."""
+    """s = 1. ``light`` and its ``weight`` Le / p are Mitsuba's; f, p and q are from ``evaluate`` toward it."""
     cos = dr.abs(dr.dot(light.n, light.d))
     e = lights.emission(lights.index_of(light.emitter), light.pdf, cos, dr.square(light.dist))
     p_light = dr.select(light.delta, 0, light.pdf)
@@ -42,7 +42,7 @@ def to_light(lights: LightEnds, z: Vertex, light, weight, f, *, p, q) -> tuple[m
 
 
 def connected(plan: Plan, z: Vertex, z_bsdf, y: Vertex, active) -> tuple[mi.Spectrum, mi.Float]:
-    """s, t > 1, occlusion included."""
+    """s, t > 1, with occlusion."""
     C, edge, _ = connection(plan, z, z_bsdf, y, active)
     return z.β * C, mis.others_connected(z.end, y.end, edge)
 
@@ -50,10 +50,9 @@ def connected(plan: Plan, z: Vertex, z_bsdf, y: Vertex, active) -> tuple[mi.Spec
 def connection(
     plan: Plan, z: Vertex, z_bsdf, y: Vertex, active, sees: Callable | None = None
 ) -> tuple[mi.Spectrum, Edge, tuple[Any, Any]]:
-    """As ``connected()``, without the camera path's throughput; the edge, which its MIS weight depends on; and T of the
-    holes on it, with their number.
+    """f / p without the camera path's throughput; the edge, for the MIS weight; T of holes and their number.
 
-    ``sees(z, y, active)`` gives these two where any number that fits would be wrong.
+    ``sees(z, y, active)``, if given, replaces ``plan.sees`` to find T and the number of holes.
     """
     to = mi.Vector3f(y.si.p - z.si.p)
     distance2 = dr.squared_norm(to)
@@ -61,7 +60,7 @@ def connection(
     f, p_z, q_z = evaluate(RADIANCE, z.si, z_bsdf, z.si.to_local(d), active)
     g, p_y, q_y = evaluate(IMPORTANCE, y.si, y.si.bsdf(), y.si.to_local(-d), active)
     C = y.β * f * g / distance2
-    # Vertices in one place are no path: their density is infinite.
+    # Two vertices at one place make no path: its density would be infinite.
     lit = active & (dr.max(z.β * C) > 0) & (distance2 > 0)
     T, holes = sees(z, y, lit) if sees else plan.sees(z.si, y.si.p, plan.longest - 1 - z.depth - y.depth, lit)
     C = dr.select(lit, C * T, 0)
@@ -69,7 +68,7 @@ def connection(
 
 
 def to_camera(eye: Eye, lens: mi.Point2f, y: Vertex, bsdf, active, seen) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:
-    """t = 1; and the place on the film, in pixels. ``seen`` (y, toward the camera, active) says what comes to it."""
+    """t = 1; the third value is the place on the film, in pixels. ``seen`` (y, camera, active) is the transmittance."""
     camera, importance = eye.toward(y.si, lens, active)
     active = active & (camera.pdf > 0)
     f, _, q = evaluate(IMPORTANCE, y.si, bsdf, y.si.to_local(camera.d), active)

@@ -1,4 +1,4 @@
-"""Vertices of paths from either end, how light scatters there, and the records that are kept of light paths."""
+"""Vertices of camera paths and light paths, how light scatters there, and the records of light paths."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Partial
 
-# By name: Mitsuba's own values belong to a variant.
+# Names, since Mitsuba's own values belong to a variant
 RADIANCE, IMPORTANCE = "Radiance", "Importance"
 
 
 def context(mode: str) -> mi.BSDFContext:
-    """The context for Mitsuba's materials: whether a path carries radiance or importance."""
+    """The context for Mitsuba's materials: ``mode`` is RADIANCE or IMPORTANCE, which the path carries."""
     return mi.BSDFContext(getattr(mi.TransportMode, mode))
 
 
@@ -36,13 +36,13 @@ class Vertex:
 
 @cache
 def record_class(variant: str) -> type:
-    """The class of a kept vertex; Dr.Jit reads its fields' types once, and Mitsuba's types belong to a variant."""
+    """The class of a record. It belongs to a variant, since Dr.Jit reads the types of its fields only once."""
 
     @dataclass
     class Record:
-        """A vertex of a light path as it is kept: 23 words in RGB, and no Bool, with which Dr.Jit 1.5 breaks off.
+        """The record of a vertex of a light path: 23 words in RGB. It has no Bool, with which Dr.Jit 1.5 fails.
 
-        The interaction is computed anew from the ray that led there and what it hit.
+        The interaction is computed again from the ray that led there and its hit.
         """
 
         o: mi.Point3f
@@ -62,7 +62,7 @@ def record_class(variant: str) -> type:
 
 
 def record(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, vertex: Vertex, smooth: mi.Bool) -> Any:
-    """What is kept of a ``vertex`` that ``ray`` has hit; its depth is 0 if nothing can be connected to it."""
+    """The record of a ``vertex`` that ``ray`` has hit. Its depth is 0 if nothing can be connected to it."""
     return record_class(mi.variant())(
         o=mi.Point3f(ray.o),
         d=mi.Vector3f(ray.d),
@@ -83,7 +83,7 @@ def recall(kept, time: mi.Float, wavelengths: mi.Wavelength) -> Vertex:
     hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(kept.t))
     hit.t, hit.prim_uv, hit.prim_index = kept.t, kept.prim_uv, kept.prim_index
     hit.shape, hit.instance = kept.shape, kept.instance
-    # No other field says so: without this the vertex would be void.
+    # Without this the vertex would not be valid.
     hit.valid = mi.Bool(True)
     si = hit.compute_surface_interaction(mi.Ray3f(kept.o, kept.d, time, wavelengths))
     return Vertex(si, kept.β, Partial(kept.vcm, kept.vc), kept.depth)
@@ -95,7 +95,7 @@ def scatters_smoothly(bsdf: mi.BSDFPtr) -> mi.Bool:
 
 
 def evaluate(mode, si, bsdf, wo: mi.Vector3f, active=True) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
-    """f cos for a path that goes on along ``wo`` (local), the density of that, and with both directions swapped."""
+    """f cos for a path that goes on along ``wo`` (local), the density p of ``wo``, and q with directions swapped."""
     if mode == IMPORTANCE:
         f, q = light_scattered(si, bsdf, wo, active)
         p = bsdf.pdf(context(RADIANCE), si, wo, active)
@@ -115,10 +115,10 @@ def reverse_density(si, bsdf, wo: mi.Vector3f, active) -> mi.Float:
 def light_scattered(si, bsdf, wo: mi.Vector3f, active) -> tuple[mi.Spectrum, mi.Float]:
     """f cos of light that leaves along ``wo``, and the density with both directions swapped.
 
-    It is f of radiance in the opposite direction, times cos_g(wo) / cos_g(wi), so both ends agree on f of a path,
-    whatever normals a material has. Normals of bump and normal maps affect only f, and f for light has the cosine to
-    the wrong side.
-    [Veach 1997, "Robust Monte Carlo Methods for Light Transport Simulation", section 5.3.2]
+    It is f of radiance in the opposite direction, times cos_g(wo) / cos_g(wi). So camera paths and light paths agree on
+    f of a path, whatever shading normals a material has. Mitsuba's own f for light is not used: with bump and normal
+    maps it has the cosine of the wrong direction. [Veach 1997, "Robust Monte Carlo Methods for Light Transport
+    Simulation", section 5.3.2]
     """
     f, q = bsdf.eval_pdf(context(RADIANCE), _come_along(si, wo), si.wi, active)
     f *= _quotient(cosine(si, si.to_world(wo)), cosine(si, si.to_world(si.wi)))
@@ -129,14 +129,14 @@ def light_scattered(si, bsdf, wo: mi.Vector3f, active) -> tuple[mi.Spectrum, mi.
 def light_sampled(si, bsdf, sample: mi.BSDFSample3f, f_p: mi.Spectrum, active) -> tuple[mi.Spectrum, mi.Float]:
     """f cos / p of light that leaves by a sampled event, and the density with both directions swapped.
 
-    ``f_p`` is Mitsuba's for IMPORTANCE. For mirrors and glass it has no cosines. Their cosines are to the half-vector,
-    which is their normal, whatever the shape's normal is.
+    ``f_p`` is Mitsuba's for IMPORTANCE. For mirrors and glass it lacks a ratio of cosines. These cosines are to the
+    half-vector, which is the normal of the mirror, whatever the shape's normal is.
     """
     smooth = event_kind(sample.sampled_type) == SMOOTH
     f, q = light_scattered(si, bsdf, sample.wo, active & smooth)
     h = si.wi + sample.eta * sample.wo
     bends = dr.abs(dr.dot(si.wi, h) / dr.dot(sample.wo, h))
-    # Straight through there is no half-vector.
+    # Light that goes straight through has no half-vector.
     bends = dr.select(dr.squared_norm(h) > 1e-6, bends, 1)
     turns = _quotient(cosine(si, si.to_world(sample.wo)), cosine(si, si.to_world(si.wi)))
     return dr.select(smooth, f * dr.rcp(sample.pdf), f_p * (bends * turns)), q
@@ -145,7 +145,7 @@ def light_sampled(si, bsdf, sample: mi.BSDFSample3f, f_p: mi.Spectrum, active) -
 def leave(
     vertex: Vertex, bsdf, sample: mi.BSDFSample3f, active, η: mi.Float | float = 0.0
 ) -> tuple[mi.Vector3f, Partial]:
-    """The direction of a sampled event, and what the path's end knows behind it; ``η`` as in ``mis.leave``."""
+    """The direction of a sampled event, and the partial sums behind it; ``η`` as in ``mis.leave``."""
     si, d = vertex.si, vertex.si.to_world(sample.wo)
     smooth = event_kind(sample.sampled_type) == SMOOTH
     q = reverse_density(si, bsdf, sample.wo, active & smooth)
@@ -155,7 +155,7 @@ def leave(
 def light_leaves(
     vertex: Vertex, bsdf, sample: mi.BSDFSample3f, f_p: mi.Spectrum, active
 ) -> tuple[mi.Vector3f, mi.Spectrum, Partial]:
-    """As ``leave()``, for a light path, with f cos / p as the second value; ``f_p`` is Mitsuba's."""
+    """As ``leave()``, for a light path. The second value is f cos / p; ``f_p`` is Mitsuba's."""
     si, d = vertex.si, vertex.si.to_world(sample.wo)
     f_p, q = light_sampled(si, bsdf, sample, f_p, active)
     return d, f_p, mis.leave(vertex.end, cosine(si, d), sample.pdf, q, event_kind(sample.sampled_type) != SMOOTH)

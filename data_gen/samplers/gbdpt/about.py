@@ -4,10 +4,11 @@ from data_gen.budget import LANE_BYTES
 from data_gen.samplers.registry import Sampler, register
 from data_gen.samplers.shared import BOTH_ENDS, CONNECTABLE, joined_depth
 
-# Bytes of a lane that splats all four differences as well, which are kept per pixel: an eighth of it for a lane, of 8 a
-# pass and the list of vertices that the camera sees, some of them for each lane
+# Bytes of a lane that also splats the four differences. The splats are kept per pixel, and a pass has 8 lanes per
+# pixel, so a lane counts an eighth of them. Each lane also has some entries in the list of vertices that the camera
+# sees
 SPLATTING_BYTES = LANE_BYTES + 224
-# And of nine vertices of the light path the light and the pixel, by which they are chosen for shifts
+# For each of nine vertices of the light path, the light and the pixel, by which vertices are chosen for shifts
 _ROULETTE_BYTES = 9 * 8
 
 register(
@@ -19,7 +20,7 @@ register(
         refusals=BOTH_ENDS,
         notes={
             "transport": "found from both ends and shifted as a whole",
-            "mirrors": "shifted in front of the camera, and where light comes through them to what it sees",
+            "mirrors": "shifted in front of the camera, and between a light and the surface that the camera sees",
         },
         options={"joined_depth": joined_depth(10), "roughness_threshold": CONNECTABLE},
         tried=True,

@@ -1,4 +1,4 @@
-"""The camera path of ``gbdpt``, vertex by vertex: as in ``bdpt``, with what offset paths need."""
+"""The camera path of ``gbdpt``, vertex by vertex: as in ``bdpt``, with the data that offset paths need."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from data_gen.samplers.gbdpt.pairs import difference
 
 @dataclass(kw_only=True)
 class Plan(both_ends.Plan):
-    """``bdpt``'s, and how copies are weighted."""
+    """``bdpt``'s plan, and the weight of a path and its copy."""
 
-    pair: Callable = difference  # Δ of a path and its copy, by one of the weights of ``pairs``
+    pair: Callable = difference  # Δ of a path and its copy, with one of the weights of ``pairs``
 
     def sees_alike(self, si: mi.SurfaceInteraction3f, target: mi.Point3f, like: tuple[Any, Any], apart: mi.Bool) -> Any:
-        """T from the ``target`` to a copy's vertex ``si``, where its path has ``like``: T, and the number of holes.
+        """T from the ``target`` to a copy's vertex ``si``; ``like`` is T and the number of holes of the base path.
 
-        Copies that are not ``apart`` see the same. The others must see the target through as many holes: so all
-        strategies reject the same copies, and a copy is as long as its path.
+        Copies that are not ``apart`` have the same T. The others must see the target through the same number of holes.
+        So all strategies reject the same copies, and a copy is as long as its path.
         """
         T, holes = self.sees(si, target, like[1], apart)
         return T if self.holes is None else dr.select(apart, dr.select(holes == like[1], T, 0), like[0])
@@ -43,16 +43,16 @@ class Plan(both_ends.Plan):
 
 @dataclass
 class Way:
-    """How a base path got here from its last vertex that was not a hole."""
+    """The way of a base path from its last vertex that was not a hole."""
 
     o: mi.Point3f  # that vertex
     p: mi.Float  # density of the direction there
-    weight: mi.Float  # 1 / probability to survive Russian roulette, and to pass the holes, from there on
-    η: mi.Float  # photons that are gathered there
-    holes: mi.UInt32  # how many it has passed
+    weight: mi.Float  # 1 / probability to survive Russian roulette and to pass the holes on the way
+    η: mi.Float  # of ``mis`` at that vertex
+    holes: mi.UInt32  # the number of holes on the way
 
     def behind(self, passed: mi.Bool, new: Way) -> Way:
-        """Behind an event that has begun a ``new`` way, or ``passed`` a hole with the probability p of that one."""
+        """The ``new`` way behind an event, or this way if the event ``passed`` a hole, with probability ``new.p``."""
         weight, holes = self.weight * new.weight / new.p, self.holes + 1
         return dr.select(passed, Way(self.o, self.p, weight, self.η, holes), new)
 
@@ -74,7 +74,7 @@ class Past:
 
 @dataclass
 class Step:
-    """What the base path does at its vertex ``z``; x1 is the next one."""
+    """A step of the base path from its vertex ``z`` to the next vertex x1."""
 
     z: Vertex
     connectable: mi.Bool
@@ -82,28 +82,28 @@ class Step:
     light: mi.DirectionSample3f
     weight: mi.Spectrum  # Le / p
     front: mi.Normal3f | None  # of ``LightEnds.connect()``
-    shared: mi.Bool  # Δ has a share in what is completed at z
+    shared: mi.Bool  # whether Δ includes the paths that are completed at z
     C_light: mi.Spectrum
     others_light: mi.Float
     e_light: mi.Float
     f_light: mi.Spectrum
-    p_light: mi.Float  # of sampling that direction
+    p_light: mi.Float  # the density of sampling the direction to the light
     q_light: mi.Float
-    through: tuple[Any, Any]  # T on the way to the light, and the number of holes
-    joins_light: mi.Bool  # light paths may find the path to that light
-    joins: mi.Bool  # light paths may find paths that end here
-    η: mi.Float  # photons that are gathered here; 0 if none are
+    through: tuple[Any, Any]  # T and the number of holes on the way to the light
+    joins_light: mi.Bool  # whether light paths may find the path to that light
+    joins: mi.Bool  # whether light paths may be connected at z
+    η: mi.Float  # of ``mis`` at z; 0 if no photons are gathered there
     # The sampled direction
     u_lobe: mi.Float
     u_direction: mi.Point2f
     wo: mi.Vector3f
     d: mi.Vector3f
     kind: mi.UInt32
-    passed: mi.Bool | bool  # it goes straight on through a hole, which is no vertex
+    passed: mi.Bool | bool  # whether it passes a hole, which is no vertex
     event: mi.UInt32  # mirror, glass or hole, of ``manifold``
     p: mi.Float
     q: mi.Float
-    f_p: mi.Spectrum  # f / p, survival included
+    f_p: mi.Spectrum  # f / p, divided by the probability to survive
     survival: mi.Float  # 1 / probability
     goes_on: mi.Bool
     β1: mi.Spectrum
@@ -115,20 +115,21 @@ class Step:
     C_met: mi.Spectrum
     others_met: mi.Float
     Le: mi.Spectrum
-    p_met: mi.Float  # of connecting to it
+    p_met: mi.Float  # the density of connecting to it
     e_met: mi.Float
-    counted: mi.Bool  # light paths may find paths that end there
-    way: Way  # that has led there
-    edge: Edge | None  # the same, for weights; None in scenes without holes
+    counted: mi.Bool  # whether light paths may find paths that end there
+    way: Way  # the way that leads there
+    edge: Edge | None  # the edge that leads there, for MIS weights; None in scenes without holes
 
 
 def base_step(
     plan: Plan, random, z: Vertex, past: Past, active, *, brightest_offset: mi.Float, completed: mi.Bool | bool = True
 ) -> tuple[Step, Past]:
-    """Samples an emitter and the next vertex from vertex ``z``; returns the step, and the ``past`` of that vertex.
+    """Samples an emitter and the next vertex from vertex ``z``. Returns the step, and the ``past`` at the next vertex.
 
-    ``brightest_offset`` is the most that any offset path may still contribute: Russian roulette is to starve none.
-    Emitters are sampled where paths are ``completed`` at z. Random numbers are drawn in any case.
+    ``brightest_offset`` is the largest throughput with which an offset path may still contribute, so that Russian
+    roulette does not end a path whose copies are brighter. Emitters are sampled only where ``completed`` is true.
+    Random numbers are drawn in any case.
     """
     scene, lights, materials = plan.scene, plan.lights, plan.materials
     si, end, bsdf = z.si, z.end, z.si.bsdf()
@@ -168,7 +169,7 @@ def base_step(
 
     # ------------------ Emission met by chance -------------------
     met = goes_on & sky.meets(x1)
-    # Longer paths are not found by light paths.
+    # Light paths do not find longer paths.
     counted = z.depth + 1 <= plan.longest
     η_merged = plan.merged(bsdf, joins)
     end1 = mis.leave(end, cosine(si, d), sample.pdf, q_next, kind != SMOOTH, η_merged)
@@ -176,7 +177,7 @@ def base_step(
     Le, p_met, e_met = emission_at(scene, lights, x1, si if edge is None else edge.seen_by(si), met)
     way, passed = Way(si.p, sample.pdf, survival, η_merged, mi.UInt32(0)), False
     if edge is not None:
-        # Nothing is connected to the camera itself.
+        # No emitter is sampled from the camera itself.
         p_met, e_met = dr.select(edge.first, 0, p_met), dr.select(edge.first, 0, e_met)
         passed = plan.holes.passed(bsdf, kind)
         way = past.way.behind(passed, way)
@@ -227,10 +228,10 @@ def base_step(
 
 
 def known_end(end: Partial, joins: mi.Bool) -> Partial:
-    """At a vertex: paths longer than light paths are weighted as if light paths found none."""
+    """The partial sums at a vertex. Paths too long for light paths are weighted as if there were no light paths."""
     return Partial(dr.select(joins, end.vcm, 0), dr.select(joins, end.vc, 0))
 
 
 def known_met(end: Partial, counted: mi.Bool) -> Partial:
-    """As ``known_end()``, on the way to emission that is met by chance: a sampled emitter finds it all the same."""
+    """As ``known_end()``, for emission that is met by chance. Emitter sampling may find it, whatever the length."""
     return Partial(end.vcm, dr.select(counted, end.vc, 0))

@@ -1,4 +1,4 @@
-"""The camera path and its four copies, vertex by vertex; the same strategies complete all five."""
+"""The camera path and its four copies, vertex by vertex. The same strategies complete all five."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from data_gen.samplers.gbdpt.pairs import weighted
 
 
 class MergesPairs(Protocol):
-    """What gathers photons at camera paths and their copies, as the study ``gvcm`` does."""
+    """Gathers photons at camera paths and their copies, as the study ``gvcm`` does."""
 
     def differences(self, z: Vertex, bsdf: mi.BSDFPtr, active: mi.Bool, offsets: list[Offset]) -> tuple:
-        """The light of the photons near to the vertex ``z``, weighted; and Δ of the ``offsets``, with it."""
+        """The weighted light of photons near the vertex ``z``, and Δ of the ``offsets`` with this light added."""
 
 
 @dr.syntax
@@ -35,11 +35,12 @@ def shifted_camera_path(
     merging: MergesPairs | None = None,
     bends: tuple[Course | None, Chain | None] = (None, None),
 ) -> tuple:
-    """L and Le of ``bdpt``'s ``camera_path``, Δ of its four offset paths, and where its course has led.
+    """L and Le as in ``bdpt``'s ``camera_path``, Δ of the four offset paths, and the course at the end of the path.
 
-    Offset paths begin with the ``shifted`` rays, each with its importance, and whether it is on the film. ``bends`` are
-    course and chain. Bent paths are rejected; where there is a course, they are left out of Δ; where there is a chain
-    as well, all others are, and bent ones are followed.
+    Offset paths begin with the ``shifted`` rays, each with its importance and whether it is on the film. ``bends``
+    holds a course and a chain, either of which may be None. Without a course, Δ contains all paths, and bent ones are
+    rejected. With a course, Δ leaves out bent paths. With a chain as well, Δ contains only bent paths, and their copies
+    are followed.
     """
     course, chain = bends
     scene, limits, random = plan.scene, plan.limits, sight.random
@@ -54,15 +55,15 @@ def shifted_camera_path(
     past = Past.of_camera(plan)
     active = si.is_valid() & (depth < limits.max_depth) & matters(course, chain)
     toward, density = sight.eye.toward(si, sight.eye.lens, active)
-    end = mis.begin_camera(density, cosine(si, ray.d))  # what the path knows of the other strategies, at si
-    edge = plan.begins(si.p + toward.d * toward.dist)  # that has led there
+    end = mis.begin_camera(density, cosine(si, ray.d))  # partial sums of the MIS weights, at si
+    edge = plan.begins(si.p + toward.d * toward.dist)  # the edge that leads to si
     while dr.hint(active, label="camera path"):
         # ------- The base path: to a light, and to the next vertex -------
         z = Vertex(si, β, end, depth, edge)
         wanted = completes(course, chain)
         step, past = base_step(plan, random, z, past, active, brightest_offset=brightest(offsets), completed=wanted)
         L += weighted(step.C_light, step.others_light) + weighted(step.C_met, step.others_met)
-        # Δ has a share in such light of the step as belongs to this kernel. ``came`` is the course at z.
+        # ``step`` now has only the light that this kernel includes in Δ. ``came`` is the course at z.
         came, (step, course, chain) = course, along(plan, step, course, chain)
 
         # -------------- All five paths: to the light path ----------------
@@ -88,9 +89,10 @@ def shifted_camera_path(
 
 @dr.syntax
 def shifted_connection(plan: Plan, step: Step, active, light_path: LightPath, u: mi.Float, offsets: list[Offset]):
-    """The light of the paths that join the vertex of ``step`` to one of a light path's, by ``u``; and Δ, with them.
+    """The light of a connection from the vertex of ``step`` to a light path, and the sums Δ with the connection added.
 
-    Only the base path chooses this vertex, so that it stands for all vertices in differences as well.
+    ``u`` chooses the vertex of the light path. The base path makes this choice for its copies too, so the chosen vertex
+    also stands for all vertices in differences.
     """
     z, L, Δ = step.z, dr.zeros(mi.Spectrum, dr.width(step.z.depth)), [offset.Δ for offset in offsets]
     chosen, times = choose(z, active, light_path, plan.longest, u)

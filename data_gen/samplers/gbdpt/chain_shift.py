@@ -1,26 +1,26 @@
-r"""Camera paths that go through mirrors or glass right behind the vertex that is the copy's own, and their copies.
+r"""Camera paths that go through mirrors or glass directly after the vertex x1 below, and their copies.
 
-    x1, x1'   the first vertices of both that are left by a smooth event, at connectable materials
-    ω, ω'     directions there; k = 1 .. 6 specular events further on both paths meet
+    x1, x1'   the first vertex of each path that it leaves by a smooth event, at a connectable material
+    ω, ω'     the directions there; k = 1 .. 6 specular events later both paths meet
     y         the next vertex at a connectable material, or a lamp
-    F, P      products of the events' reflectances, and of the probabilities to take them
+    F, P      products of the events' reflectances, and of the probabilities to sample them
     J         dω' / dω at a fixed y
 
-The copy walks to y (``data_gen.paths.manifold``) and shares everything behind y, whichever strategy completes the path
-there. For every path that ends at y or goes on from there:
+The copy walks to y (``data_gen.paths.manifold``) and shares all vertices behind y, whichever strategy completes the
+path there. For each path that ends at y or goes on from there:
 
     b' / b    f'(ω') F' J / (f(ω) F)
     r         p'(ω') P' J / (p(ω) P)
 
-Only one strategy builds the path beyond x1 from the light's end: the one that joins x1 to the camera. It is ``vc`` of
-``mis`` there, and shifts such paths by a walk of its own (``light_shift``). Each strategy has
-weights of its own, so that they need not agree which walks succeed.
+Only one strategy traces the edges from x1 to y from the light's end: the one that joins x1 to the camera. It
+contributes ``vc`` of ``mis`` there, and shifts such paths by its own walk (``light_shift``). Each strategy has separate
+weights for pairs, so strategies need not agree on which walks succeed.
 
-Paths with mirrors or glass and holes between x1 and y are rejected.
+Paths that have both holes and mirrors or glass between x1 and y are rejected.
 
-A path is *bent* from the first of those events on. The kernel of all paths leaves out the differences of what bent
-paths bring, and marks lanes that have one; in a second kernel these lanes trace the same paths again, and there all
-else is left out. What is bent and cannot be followed is rejected there.
+A path is *bent* from the first of those events on. The kernel of all paths leaves the light of bent paths out of the
+differences, and marks lanes with a bent path. A second kernel traces the paths of these lanes again, and computes the
+differences of bent paths only. There, bent paths that cannot be followed are rejected.
 
 [Hua et al. 2019, "A Survey on Gradient-Domain Rendering", sections 3.4 and 4.2]
 """
@@ -45,11 +45,11 @@ from data_gen.samplers.gbdpt.base_path import Plan, Step, known_met
 
 @dataclass
 class Course:
-    """Where a base path is, at its current vertex."""
+    """The state of a base path at its current vertex, with regard to bends."""
 
     ahead: mi.Bool  # no smooth event so far
-    second: mi.Bool  # right behind the first one, which was at a connectable vertex
-    bent: mi.Bool  # all light that it brings from here on belongs to bent paths
+    second: mi.Bool  # the first smooth event was at the last vertex, which was connectable
+    bent: mi.Bool  # all light that it finds from here on belongs to bent paths
 
 
 def straight(exists: mi.Bool | bool = True) -> Course:
@@ -60,7 +60,7 @@ def straight(exists: mi.Bool | bool = True) -> Course:
 def next_course(course: Course, step: Step) -> Course:
     """The course at the next vertex; emission met by chance at that vertex already belongs to it."""
     smooth = step.kind == SMOOTH
-    # This depends on the sampled event, not on whether the path survives it, so that both kernels agree.
+    # This depends on the sampled event, not on whether the path survives Russian roulette, so that both kernels agree.
     bends = course.second & ~smooth & (step.p > 0) & ~mi.Bool(step.passed)
     second = (course.ahead & smooth & step.connectable) | (course.second & step.passed)
     return Course(course.ahead & ~smooth, second, course.bent | bends)
@@ -69,9 +69,9 @@ def next_course(course: Course, step: Step) -> Course:
 def along(
     plan: Plan, step: Step, course: Course | None, chain: Chain | None
 ) -> tuple[Step, Course | None, Chain | None]:
-    """``step`` with only the light that counts in Δ, and the next ``course`` and ``chain``.
+    """``step`` with only the light that belongs in Δ, and the next ``course`` and ``chain``.
 
-    With a ``chain`` only the light of bent paths counts, without one all other light; without a ``course`` all light.
+    Without a ``course`` this is all light. With a ``chain`` it is the light of bent paths, without one all other light.
     """
     if course is None or plan.materials.all_connectable:
         return step, course, chain
@@ -86,7 +86,7 @@ def along(
 
 
 def matters(course: Course | None, chain: Chain | None) -> mi.Bool:
-    """Whether the path may still contribute to Δ or to the image; without a ``chain`` it contributes to the image."""
+    """Whether the path may still contribute to Δ or to the image. The kernel with a ``chain`` renders only Δ."""
     if course is None or chain is None:
         return mi.Bool(True)
     return course.ahead | course.second | course.bent
@@ -99,19 +99,19 @@ def completes(course: Course | None, chain: Chain | None) -> mi.Bool:
 
 @dataclass
 class Chain:
-    """The way of a base path from x1 on, up to y."""
+    """The part of a base path from x1 to y."""
 
     x1: mi.SurfaceInteraction3f
     ω: mi.Vector3f
     p: mi.Float
-    survival: mi.Float  # 1 / probability to survive Russian roulette, from x1 on
+    survival: mi.Float  # 1 / probability to survive Russian roulette after x1
     events: mi.UInt32  # of ``manifold``
-    open: mi.Bool  # y has not been reached
-    arrives: mi.Bool  # y is where the last step has led
+    open: mi.Bool  # whether y has not been reached yet
+    arrives: mi.Bool  # whether the last step has reached y
 
 
 def no_chain(lanes: int) -> Chain:
-    """The chains of base paths that have none yet, one for each of the ``lanes``."""
+    """Empty chains, one for each of the ``lanes``."""
     return Chain(
         x1=dr.zeros(mi.SurfaceInteraction3f, lanes),
         ω=mi.Vector3f(0),
@@ -124,7 +124,7 @@ def no_chain(lanes: int) -> Chain:
 
 
 def ends(plan: Plan, y: mi.SurfaceInteraction3f) -> mi.Bool:
-    """Whether a chain ends at ``y`` because of that vertex; its copies do not go on there either."""
+    """Whether a chain ends at ``y``, whatever is sampled there. A copy must also end at such a vertex."""
     return ~y.is_valid() | plan.materials.connectable(y.bsdf()) | (y.emitter(plan.scene) != None)  # noqa: E711 - pointers
 
 
@@ -146,10 +146,10 @@ def next_chain(plan: Plan, chain: Chain, course: Course, step: Step) -> Chain:
 
 
 def follow_chain(plan: Plan, step: Step, chain: Chain, start: Any, own: mi.SurfaceInteraction3f, active) -> tuple:
-    """The copy's way from its ``own`` x1' to y, the vertex that ``step`` has led to.
+    """Follows the copy from its ``own`` vertex x1' to y, the vertex to which ``step`` leads.
 
-    ``start`` has β, r and ``end`` at x1', as an offset path does. Returned are the ray that arrives at y, β, r and
-    ``end`` behind it, and what it meets at y: f J / p and ``others``.
+    ``start`` has β, r and ``end`` at x1', as an offset path does. Returns the ray that arrives at y, β, r and ``end``
+    there, and f J / p and ``others`` of the emission at y.
     """
     # -------------------------- The walk -------------------------
     scene, y, reached = plan.scene, step.x1, step.x1.is_valid()

@@ -1,4 +1,4 @@
-"""The four offset paths of a camera sample where the path is connected to one from a light."""
+"""The four offset paths of a camera sample where the camera path is connected to a light path."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from data_gen.samplers.gbdpt.offset_path import Offset, own_vertex
 
 
 def connect(plan: Plan, step: Step, y: Vertex, times, offsets: list[Offset], Δ: list) -> tuple:
-    """C and ``others`` of the connection of the vertex of ``step`` to ``y``, one of the light path; and the sums Δ with
-    it; it counts ``times`` times."""
+    """C and ``others`` of the connection from the vertex of ``step`` to the light path's vertex ``y``, and the sums Δ
+    with the differences of this connection added ``times`` times."""
     z = step.z
     g, edge, through = connection(plan, z, z.si.bsdf(), y, mi.Bool(True))
     C, others = z.β * g, mis.others_connected(z.end, y.end, edge)
@@ -27,7 +27,7 @@ def connect(plan: Plan, step: Step, y: Vertex, times, offsets: list[Offset], Δ:
         others1 = mis.others_connected(offset.end, y.end, edge)
         sums.append(Δ_before + dr.select(~own, times * plan.pair(C, others, offset.β * g, offset.r, others1), 0))
     # --------- Others: from the copy's own vertex, one by one ---------
-    # What a shift to y needs of the materials, except for the offset path's own
+    # The materials of both ends must be connectable, and below also that of the offset path's own vertex.
     both = step.connectable & plan.materials.connectable(y.si.bsdf())
 
     def one(i, *Δ):

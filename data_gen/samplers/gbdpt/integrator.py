@@ -1,28 +1,27 @@
 r"""Gradient-domain bidirectional path tracing: ``bdpt``, and each of its paths shifted to four neighbouring pixels.
 
-Every path is found by one of many strategies, and shifted by one map that does not know which it was. So a path and
-its copy share one weight over all strategies of both: see ``pairs``.
+Many strategies find a path, and one map shifts it, which does not depend on the strategy. So a path and its copy share
+one weight over all strategies of both: see ``pairs``.
 
     x, y = T(x)       a path and its copy through the neighbouring pixel, with the same sub-pixel and lens samples
-    b, b'             f(x) / p_s(x), and f(y) |J| / p_s(x): both with the density of the strategy that has found x
+    b, b'             f(x) / p_s(x), and f(y) |J| / p_s(x), where s is the strategy that has found x
     r                 p_s(y) |J| / p_s(x)
-    others            Σ p_j / p_s over all other strategies, of x or of y; of offset paths by the recursion of ``mis``
+    others            Σ p_j / p_s over all other strategies, of x or of y; for offset paths by the recursion of ``mis``
                       along y itself, as if y were a base path
     Δ                 gradient sample, the sum over all strategies and lengths
 
-The map: mirrors and clear glass in front of the camera are replayed; the first vertex behind them is the copy's own,
-and from there it goes straight to the next vertex of the path, which both share with all further ones. It is rejected,
-alike by all strategies, where one of these three vertices is not connectable, or where the copy is occluded or black.
-What is completed by connecting the camera path's first vertices is shifted in ``offset_path``; what ends by connecting
-a light path to the camera, in ``light_shift``.
+The map: The copy replays events at mirrors and clear glass in front of the camera. The first vertex behind them is its
+own. From there it goes straight to the next vertex of the path, and shares that and all further vertices. All
+strategies reject the shift if one of these three vertices is not connectable, or if the copy is occluded or black.
+Paths that are traced from the camera are shifted in ``offset_path``, light paths that are connected to the camera in
+``light_shift``.
 
-Holes are no vertices (``paths.holes``). On each edge the copy goes straight on through as many of them as the path, and
-is rejected where there are more or fewer. It is weakened by what they let through, whether the path was, or has passed
-them by chance.
+Holes are no vertices (``paths.holes``). On each edge the copy must go through the same number of holes as the path, or
+it is rejected. The copy is weakened by their transmittance, even if the path has passed its holes by chance.
 
-Between that first vertex and the next one mirrors and glass may lie: then the copy walks through the same events to the
-same next vertex. Camera paths do so in a second kernel (``chain_shift``), light paths that end at the first vertex in a
-third and fourth (``light_shift``), each strategy with weights of its own.
+If mirrors or glass lie between that first vertex and the next one, the copy walks through the same events to the same
+next vertex. A second kernel does this for camera paths (``chain_shift``). Light paths that end at the first vertex have
+a third kernel, and a fourth for walks (``light_shift``). For walks each strategy has separate weights.
 
 [Manzi et al. 2015, "Gradient-Domain Bidirectional Path Tracing"; Hua et al. 2019, "A Survey on Gradient-Domain
 Rendering", section 4.2; Sun et al. 2017, "Gradient-Domain Vertex Connection and Merging", eq. 14-15]
@@ -63,7 +62,7 @@ from data_gen.samplers.gbdpt.roulette import Rater, Worth, survivors, thresholds
 class GBDPT(BDPT):
     """Gradient-domain bidirectional path tracing, for surfaces.
 
-    Plugin ``gbdpt``, with the parameters of ``bdpt`` and ``roughness_threshold``. Not handled: as there.
+    Plugin ``gbdpt``, with the parameters of ``bdpt`` and ``roughness_threshold``. It has the same limits as ``bdpt``.
     """
 
     plan_class = Plan
@@ -91,8 +90,8 @@ class GBDPT(BDPT):
         film.put_all(values | dict(zip(SHIFTS, zip(Δ, inside, strict=True), strict=True)))
 
     def samples(self, plan: Plan, camera: CameraSamples, sums: Any = None) -> tuple:
-        """Layers, Δ in the order of SHIFTS and where it is on the film, what is marked, which paths are bent, and the
-        ``sums`` of splats and the ``Worth`` of paths from lights, with this pass added."""
+        """Returns the layers, Δ in the order of SHIFTS and where it is on the film, the marked vertices, which paths
+        are bent, and the ``sums`` (splats and ``Worth`` of light paths) with this pass added."""
         ray, importance, _ = camera.rays()
         inside = [camera.rays(shift)[2] for shift in SHIFTS.values()]
         rater = None
@@ -106,10 +105,11 @@ class GBDPT(BDPT):
 
 
 def both_paths(plan: Plan, camera: CameraSamples, visitor: Visitor | None, alone: mi.Bool | None = None) -> tuple:
-    """L, Le, and for each of SHIFTS Δ, as colours, of the path from the camera, joined to one from a light; the state
-    of the light path's ``visitor``, and whether the camera path is bent.
+    """L, Le and Δ (a colour for each of SHIFTS) of camera paths that are joined to light paths, the state of the light
+    path's ``visitor``, and whether the camera path is bent.
 
-    Δ contains all paths except bent ones. With ``alone`` it contains only bent ones, in the lanes where that is true.
+    Δ contains all paths except bent ones. With ``alone`` it contains only bent ones, in the lanes where ``alone`` is
+    true.
     """
     sight, light, state = Sight.of(camera), None, mi.UInt64(0)
     shifted = [camera.rays(shift) for shift in SHIFTS.values()]
@@ -122,8 +122,8 @@ def both_paths(plan: Plan, camera: CameraSamples, visitor: Visitor | None, alone
 
 
 def shift_bent(frozen: Frozen, plan: Plan, camera: CameraSamples, bent: mi.Bool, Δ: list[mi.Color3f]) -> None:
-    """Adds to Δ the differences of ``bent`` camera paths, which are traced anew: see ``chain_shift``."""
-    # Copies: kernels depend on how the memory of arrays is aligned, which varies for arrays of NumPy.
+    """Adds to Δ the differences of ``bent`` camera paths, which are traced again: see ``chain_shift``."""
+    # Copied, since kernels depend on the alignment of arrays, which varies for arrays of NumPy.
     lanes, exists = (dr.opaque(mi.UInt32(part)) for part in in_packets(np.array(dr.compress(bent)), camera))
     if not dr.width(lanes):
         return
@@ -149,10 +149,11 @@ def shift_splats(
     marks: mi.UInt64,
     threshold: mi.Float,
 ) -> None:
-    """Splats the differences of light paths that end at ``marked`` vertices, of those that survive ``roulette``, which
-    goes by the ``threshold`` of each pixel.
+    """Splats the differences of light paths that end at ``marked`` vertices and survive ``roulette``, whose
+    probabilities depend on the ``threshold`` of each pixel.
 
-    Paths behind mirrors or glass are few, and their walks long: in one kernel for all paths most lanes would wait.
+    Paths behind mirrors or glass have a kernel of their own: they are few, and other lanes would wait for their long
+    walks.
     """
     lanes, depths = marked(marks, plan.longest)
     if not dr.width(lanes):
@@ -181,7 +182,7 @@ def shift_splats(
 def splatted_differences(
     plan: Plan, camera: CameraSamples, depths: mi.UInt32, times: mi.Float, bent: bool, sums: dict[str, tuple]
 ) -> tuple[dict[str, tuple], mi.Bool]:
-    """The ``sums`` with differences of these light paths, and which lanes have bent ones, see ``light_shift``."""
+    """Adds the differences of light paths to ``sums``. Also returns which are bent, see ``light_shift``."""
     sight = Sight.of(camera)
     splats = {name: Splats.on(sight.eye.pixels, 3, one) for name, one in sums.items()}
     return sums, splat_differences(plan, sight, depths, splats, bent, times)

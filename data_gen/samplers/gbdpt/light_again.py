@@ -1,7 +1,7 @@
 """Traces light paths again, up to a vertex that the camera sees, with the data that a shift needs.
 
-The kernel that finds light paths only marks which vertices are seen. These are few, scattered over lanes and steps, and
-a shift is eight rays: so each seen vertex has a lane of its own in a second kernel, which traces its path anew.
+The kernel that finds light paths only marks which vertices are seen. These are few and scattered over lanes and steps,
+and a shift traces eight rays. So each seen vertex gets its own lane in a second kernel, which traces its path again.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Unseen:
 
 
 def marked(state: mi.UInt64, longest: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """The lane and the depth of each marked vertex, ordered by depth: neighbouring lanes trace equally many edges."""
+    """The lane and depth of each marked vertex, ordered by depth, so that neighbours trace equally many edges."""
     lanes = [dr.compress((state >> mi.UInt64(depth)) & 1 != 0) for depth in range(1, longest)]
     depths = [dr.full(mi.UInt32, depth, dr.width(some)) for depth, some in enumerate(lanes, 1)]
     found = [(some, depth) for some, depth in zip(lanes, depths, strict=True) if dr.width(some)]
@@ -71,9 +71,9 @@ class Link:
 
     depth: mi.UInt32  # of the vertex with the smooth event; 0 is the emitter
     p: mi.Float  # density with which the path left that vertex
-    survival: mi.Float  # 1 / probability to survive Russian roulette, and to pass the holes, from there on
+    survival: mi.Float  # 1 / probability to survive Russian roulette and to pass the holes after that vertex
     events: mi.UInt32  # mirrors and glass between the two, of ``manifold``, the last one first
-    whole: mi.Bool  # ``events`` holds all of them, and there are not both events and holes
+    whole: mi.Bool  # whether ``events`` holds all of them, and the link does not have both events and holes
     holes: mi.UInt32  # the number of holes between the two
 
 
@@ -109,16 +109,16 @@ class Again:
     """A light path up to a vertex, traced once more."""
 
     start: LightRay
-    end: End  # the vertex, and how the path came there
+    end: End  # the vertex, and the ray that led there
     link: Link
-    left: Any  # what is kept of the vertex at the other end of the link
+    left: Any  # the record of the vertex at the other end of the link
     lens: mi.Point2f  # the place on the lens to which the vertex is connected
-    there: mi.Bool  # whether the path comes so far
+    there: mi.Bool  # whether the path reaches that vertex
 
 
 @dr.syntax
 def light_again(plan: Plan, sight: Sight, depth: mi.UInt32) -> Again:
-    """Traces light paths up to the vertex at ``depth``; all that ``light_path`` has sampled is sampled again."""
+    """Traces light paths up to the vertex at ``depth``, with the same random numbers as in ``light_path``."""
     eye, random = sight.eye, sight.random.clone()
     start, end, active = begin(plan, random, sight.ray)
     link, left = first_link(), dr.zeros(record_class(mi.variant()))

@@ -1,7 +1,7 @@
-"""Light paths that end at the camera, shifted: the last vertex moves to where a neighbouring pixel looks.
+"""Shifts light paths that end at the camera: the last vertex moves to the point that a neighbouring pixel sees.
 
-The vertex before it stays. This is the shift of camera paths, seen from the other end. Where mirrors and
-glass lie between the two, the vertex before them stays, and the copy goes through the same ones: see ``through_glass``.
+The vertex before it stays. This is the shift of camera paths, seen from the other end. If mirrors or glass lie between
+the two, the vertex before them stays, and the copy goes through the same mirrors and glass: see ``through_glass``.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ class Splatted:
     """A light path that ends at the camera, with the data that a shift needs."""
 
     y: Vertex  # the last vertex
-    d: mi.Vector3f  # the direction in which the path came there
-    uv: mi.Point2f  # its place on the film, in pixels
+    d: mi.Vector3f  # the direction in which the path arrived there
+    uv: mi.Point2f  # the place of ``y`` on the film, in pixels
     lens: mi.Point2f
     C: mi.Spectrum
     others: mi.Float
-    first: mi.Bool  # the vertex before the last is the light's end, ``start``; else ``before``
+    first: mi.Bool  # whether the vertex before the last is the light's end, ``start``; else it is ``before``
     start: LightRay
     before: Vertex
     p: mi.Float  # density with which ``before`` was left
-    survival: mi.Float  # 1 / probability to survive Russian roulette from there on
+    survival: mi.Float  # 1 / probability to survive Russian roulette after ``before``
     events: mi.UInt32  # mirrors and glass between the two, of ``manifold``, the last one first
-    allowed: mi.Bool  # both vertices are connectable, and ``before`` was left by a smooth event
-    # How many holes are between the two, and between the last vertex and the camera
+    allowed: mi.Bool  # whether both vertices are connectable and ``events`` holds all events
+    # The number of holes between the two, and between the last vertex and the camera
     holes: mi.UInt32 | int = 0
     holes_seen: mi.UInt32 | int = 0
 
@@ -56,11 +56,11 @@ def splat_differences(
     bent: bool = False,
     times: mi.Float | float = 1.0,
 ) -> mi.Bool:
-    """Splats the differences of light paths that end at vertices that the camera sees, one for each of its samples.
+    """Splats the differences of light paths that end at a vertex that the camera sees, one for each lane.
 
-    These vertices are at ``depth`` edges from the light, and each counts ``times`` times. A path is bent if it ends
-    behind mirrors or glass. With ``bent`` only the differences of bent paths are splatted, else only all others.
-    Returns which are bent.
+    This vertex is ``depth`` edges from the light, and the path counts ``times`` times. A path is bent if mirrors or
+    glass lie before its last vertex. With ``bent`` only the differences of bent paths are splatted, otherwise only all
+    others. Returns which paths are bent.
     """
     eye, ray, connectable = sight.eye, sight.ray, plan.materials.connectable
     again = light_again(plan, sight, depth)
@@ -104,9 +104,9 @@ def splat_differences(
 def differences(
     plan: Plan, eye: Eye, path: Splatted, lit: mi.Bool, bent: bool = False
 ) -> dict[str, tuple[mi.Spectrum, mi.Bool]]:
-    """Δ of the path for each of SHIFTS, and whether it exists: light arrives, and that pixel is on the film.
+    """For each of SHIFTS: Δ of the path, and whether Δ exists, that is, light arrives and the pixel is on the film.
 
-    Only paths that are ``lit`` count: with ``bent`` the ones with events in between, else the others.
+    Only paths that are ``lit`` count. With ``bent`` these are bent paths, otherwise all others.
     """
     shifts = list(SHIFTS.values())
     state = (mi.UInt32(0), *(mi.Spectrum(0) for _ in shifts))
@@ -130,7 +130,7 @@ def differences(
 
 
 def shifted(plan: Plan, eye: Eye, path: Splatted, uv: mi.Point2f, active, bent: bool = False) -> tuple:
-    """f J / p, r and ``others`` of a path that the camera sees at ``uv`` on the film; f is 0 if there is none."""
+    """f J / p, r and ``others`` of the copy that the camera sees at ``uv`` on the film; f is 0 if there is none."""
     # --------------------- The last vertex -----------------------
     scene, y = plan.scene, path.y
     ray = eye.ray(uv, path.lens)
@@ -197,27 +197,27 @@ def shifted(plan: Plan, eye: Eye, path: Splatted, uv: mi.Point2f, active, bent: 
 
 
 def through_glass(plan: Plan, path: Splatted, x, active) -> tuple:
-    """The edge from ``x`` to the vertex before, through the same ``events`` as the path from its own last vertex.
+    """The edge of the copy from ``x`` to the vertex before, through the same ``events`` as the path.
 
-    Returned are the direction in which light arrives, its β there (0 if it does not), r, and ``vc`` of ``mis``. With
-    Jacobian and densities by [Hua et al. 2019, section 3.4], for ω at either last vertex, at c what is before:
+    Returns the direction in which light arrives at ``x``, its β there (0 if none arrives), r, and ``vc`` of ``mis``. ω
+    is the direction at the last vertex, and c is the vertex before [Hua et al. 2019, section 3.4]:
 
         b' / b    f'_c F' / (f_c F) G              F of radiance that goes the other way
         r         p'_c P' / (p_c P) G η² / η'²     P of the events
         G         cos' cos_c / (cos cos'_c) dω' / dω: of the light's flux, from solid angles at c to areas at x
 
-    No other strategy follows such paths, so weights are this one's own (``pairs``).
+    Other strategies do not follow such paths in this way, so this one has separate weights (``pairs``).
     """
     scene, lights, y, before = plan.scene, plan.lights, path.y, path.before
     far = path.first & lights.far(path.start.index)
     # ------------------------- The chain -------------------------
     ω = -path.d
     beside = mi.Vector3f(dr.select(path.first, path.start.end.n, mi.Vector3f(before.si.n)))
-    # Points have no normal. Any plane that the light crosses serves.
+    # Points have no normal: any plane that the light crosses will do.
     target = Target(dr.select(path.first, path.start.end.p, before.si.p), beside, far)
     point = path.first & path.start.delta & ~far
     target.n = dr.select(far, -path.start.ray.d, dr.select(point, path.start.ray.d, target.n))
-    # Light came from the other side, by rays with other origins, so the walk does not end exactly at its point.
+    # The light path was traced from the other end, by rays with other origins, so its own direction needs a walk, too.
     ω, base, active = walk(scene, y.si, ω, path.events, target, active)
     ω1, shot, J, found = follow(scene, y.si, ω, base, x, path.events, target=target, active=active)
     away, away1 = dr.abs(dr.dot(target.n, base.ray.d)), dr.abs(dr.dot(target.n, shot.ray.d))
@@ -243,7 +243,7 @@ def through_glass(plan: Plan, path: Splatted, x, active) -> tuple:
 
 
 def choose(i: mi.UInt32, values: list[float]) -> mi.Float:
-    """The value of that number."""
+    """Number ``i`` of the ``values``."""
     found = mi.Float(0)
     for k, value in enumerate(values):
         found = dr.select(i == k, mi.Float(value), found)

@@ -1,8 +1,8 @@
 """The four offset paths of a camera sample: how each is shifted, and completed by every strategy.
 
-An offset path is *apart* while it has vertices of its own, *joined* at the vertex that it shares but has come to from
-elsewhere, and *settled* from there on: it differs from its base path only by β, r and the partial sums of its weights.
-A path with β = 0 has ended. Symbols as in ``gbdpt``.
+An offset path is *apart* while it has its own vertices. It is *joined* at the first shared vertex, at which it arrives
+from another direction. It is *settled* after that: it differs from its base path only by β, r and the partial sums of
+its weights. A path with β = 0 has ended. Symbols are as in ``gbdpt.integrator``.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from data_gen.samplers.gbdpt.chain_shift import Chain, Course, follow_chain
 class Offset:
     """The state of one offset path at the current vertex of its base path."""
 
-    ray: mi.Ray3f  # apart: led to the offset path's own vertex; joined: to the shared one
+    ray: mi.Ray3f  # apart: leads to the offset path's own vertex; joined: to the shared one
     hit: mi.PreliminaryIntersection3f  # apart: that vertex
-    β: mi.Spectrum  # f J / p of the base path
+    β: mi.Spectrum  # f J / p, with p of the base path
     r: mi.Float
     end: Partial  # of the offset path, as if it were a base path
     apart: mi.Bool
@@ -40,8 +40,8 @@ class Offset:
 
 @dataclass
 class Own:
-    """An offset path at its last own vertex. It returns there if its base path passes the hole where both meet. ``ray``
-    leads to that vertex, which is the path's ``hit``. β is 0 if there is no such vertex.
+    """The state of an offset path at its last own vertex, which is the path's ``hit``; ``ray`` leads there. The offset
+    path returns to it if its base path passes a hole at the vertex where both meet. β is 0 if there is no such vertex.
     """
 
     ray: mi.Ray3f
@@ -53,7 +53,7 @@ class Own:
 def start(plan: Plan, eye: Eye, x, shifted: tuple) -> Offset:
     """Returns an offset path up to its first vertex, with β = 0 where there is no base path.
 
-    It begins with the ``shifted`` camera ray, its importance, and whether it is on the film.
+    ``shifted`` is the camera ray, its importance, and whether it is on the film.
     """
     ray, importance, inside = shifted
     hit = plan.first_hit(plan.scene, ray)
@@ -90,7 +90,7 @@ def brightest(offsets: list[Offset]) -> mi.Float:
 
 
 def with_differences(offsets: list[Offset], Δ: list[mi.Spectrum]) -> list[Offset]:
-    """The offset paths with ``Δ`` as their sums."""
+    """The offset paths, with their sums replaced by ``Δ``."""
     return [replace(offset, Δ=total) for offset, total in zip(offsets, Δ, strict=True)]
 
 
@@ -102,17 +102,17 @@ def take_step(
     chain: Chain | None = None,
     eye: Eye | None = None,
 ) -> list[Offset]:
-    """Takes all offset paths along a step of their base path, without connections to the light path. ``chain`` is the
-    one behind the step; with it, only bent paths are shifted. ``course`` is the one before the step. Holes in front of
-    the camera are passed as its ``eye`` sees them.
+    """Shifts a step of the base path for all offset paths, except the connections to the light path. ``course`` is from
+    before the step. ``chain`` is from after the step; with it, only bent paths are shifted. ``eye`` gives the MIS
+    weights of vertices behind holes in front of the camera.
     """
     busy = mi.Bool(False)
     for offset in offsets:
         busy |= offset.apart | offset.joined
     offsets = [settled(plan, step, offset) for offset in offsets]
 
-    # A step takes long to compile, so a loop over the four paths holds one copy of it. Each turn takes the first path
-    # and puts it behind the others. After four turns they are in their order again.
+    # A step takes long to compile, so one copy of it is in a loop over the four paths. Each round steps the first path
+    # and moves it behind the others. After four rounds they are in their order again.
     def rotate(i, y, *others):
         own = y.apart | y.joined
         y = dr.if_stmt((y,), own, lambda y: step_own(plan, step, y, course, chain, eye), lambda y: y)
@@ -123,7 +123,7 @@ def take_step(
 
 
 def settled(plan: Plan, step: Step, y: Offset) -> Offset:
-    """A step that both paths take alike. Offset paths that are not settled contribute nothing."""
+    """The step of a settled offset path, which is the same as its base path's. Other offset paths stay as they are."""
     here = ~(y.apart | y.joined)
     x = step.z.si
     # ------------------------ To a light -------------------------
@@ -162,7 +162,7 @@ def step_own(
     chain: Chain | None = None,
     eye: Eye | None = None,
 ) -> Offset:
-    """A step from the offset path's own vertex, or from the shared vertex that it has just joined."""
+    """The step from an offset path's own vertex, or from the shared vertex at which it is joined."""
     # --------------- The vertex: apart, or just joined ---------------
     si = own_vertex(y, step.z.si)
     bsdf = si.bsdf()
@@ -177,12 +177,12 @@ def step_own(
     smooth = step.kind == SMOOTH
     joins = step.goes_on & smooth & step.connectable & connectable
     replays = step.goes_on & ~smooth & y.apart
-    # Rejected if it does neither: β = 0.
+    # If it does neither it is rejected: β = 0.
     nothing = y.own and replace(y.own, β=mi.Spectrum(0))
     none = Offset(y.ray, y.hit, mi.Spectrum(0), y.r, y.end, mi.Bool(False), mi.Bool(False), Δ, nothing)
     state = (none, mi.Spectrum(0), mi.Float(0))
     if chain is not None:
-        # The own vertex stays until the path has a next vertex.
+        # The offset path waits at its own vertex until the chain has reached y.
         waits = y.apart & connectable & (chain.open | chain.arrives)
         joins &= y.joined
         replays &= course.ahead
@@ -209,10 +209,10 @@ def step_own(
 
 
 def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si) -> tuple[Offset, mi.Spectrum, mi.Float]:
-    """Connects ``si`` straight to the base path's next vertex, or follows its direction if it escapes. Includes the
-    emission there.
+    """Connects ``si`` straight to the base path's next vertex, or takes the base path's direction if that escapes. Also
+    returns f J / p and ``others`` of the emission there.
 
-    Where the base path has passed holes on its way there, the copy does so, too.
+    If the base path has passed holes on its way there, the copy must pass the same number of holes.
     """
     # ------------------------ The segment ------------------------
     way, x1 = step.way, step.x1
@@ -244,7 +244,7 @@ def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si) -> tuple[Offs
     Le, p_met, e = emission_at(plan.scene, plan.lights, y1, si, good & step.met)
     others = mis.others_emitted(known_met(end, step.counted), e, p_met)
     end = mis.arrive(end, cosine(x1, d), distance2)
-    # Behind vertices that are not connectable the shift is rejected, but they may emit.
+    # If the next vertex is not connectable the shift is rejected there, but emission at this vertex counts.
     lives = good & reaches & (y.joined | step.x1_connectable)
     joined, own = lives & y.apart, none.own
     if plan.holes:
@@ -257,7 +257,7 @@ def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si) -> tuple[Offs
 
 
 def go_through(plan: Plan, step: Step, y: Offset, none: Offset, si, eye: Eye) -> tuple[Offset, mi.Spectrum, mi.Float]:
-    """Passes the hole at ``si`` as the base path passed one. Both are in front of their first smooth event."""
+    """Passes the hole at ``si``, as the base path has passed one. Both are before the first smooth event."""
     T, d = plan.holes.share(si, mi.Bool(True)), mi.Vector3f(y.ray.d)
     β = y.β * T * (step.survival / step.p)
     good = (dr.max(T) > 0) & dr.isfinite(dr.sum(β))
@@ -265,7 +265,7 @@ def go_through(plan: Plan, step: Step, y: Offset, none: Offset, si, eye: Eye) ->
     hit = plan.scene.ray_intersect_preliminary(ray, active=good)
     y1 = hit.compute_surface_interaction(ray)
     Le, p_met, e = emission_at(plan.scene, plan.lights, y1, si, good & step.met)
-    # Behind mirrors vcm is 0, so that lengths do not count.
+    # Behind mirrors vcm is 0, so lengths do not matter.
     end = mis.passed(y.end, cosine(si, d), mi.Float(1))
     others = dr.select(step.edge.first, 0, mis.others_emitted(known_met(end, step.counted), e, p_met))
     end = mis.arrive(end, cosine(y1, d), mi.Float(1))
@@ -276,10 +276,10 @@ def go_through(plan: Plan, step: Step, y: Offset, none: Offset, si, eye: Eye) ->
 
 
 def replay(plan: Plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
-    """The step by the mirror or glass that the base path's random numbers find here; and emission at the next vertex.
+    """Replays an event at a mirror or glass with the base path's random numbers; includes emission at the next vertex.
 
-    Only camera paths find such events in front of the first one that is smooth, so that their random numbers belong to
-    the path for every strategy that finds it: r = 1, and the shift is a function of the path.
+    Only camera paths sample such events, which are before the first smooth event. So for every strategy their random
+    numbers belong to the path: r = 1, and the shift depends on the path only.
     """
     sample, f_p = bsdf.sample(context(RADIANCE), si, step.u_lobe, step.u_direction)
     good = (sample.pdf > 0) & (event_kind(sample.sampled_type) == step.kind)
@@ -298,14 +298,14 @@ def replay(plan: Plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[O
 
 
 def bend(plan: Plan, step: Step, chain: Chain, y: Offset, none: Offset, si) -> tuple:
-    """Through the mirrors and glass of the base path to its next vertex; and emission there."""
+    """Walks through the mirrors and glass of the base path to its next vertex; includes emission there."""
     ray, β, r, end, C, others = follow_chain(plan, step, chain, y, si, mi.Bool(True))
     lives = step.x1.is_valid() & step.x1_connectable & (dr.max(β) > 0)
     return Offset(ray, none.hit, dr.select(lives, β, 0), r, end, mi.Bool(False), lives, none.Δ, none.own), C, others
 
 
 def to_same_light(plan: Plan, step: Step, y: Offset, si, bsdf, active):
-    """f J / p, the factor of r, and ``others``, of the path that ends at the same point of an emitter."""
+    """f J / p, a factor of r, and ``others`` of the copy that ends at the same point of an emitter."""
     base = step.light
     light, weight, r = plan.lights.seen_from_elsewhere(plan.scene, base, step.weight, si, active, front=step.front)
     f, p, q = evaluate(RADIANCE, si, bsdf, si.to_local(light.d), active)

@@ -1,16 +1,16 @@
-r"""Russian roulette that chooses which light paths that end at the camera are shifted, by the light that they bring.
+r"""Russian roulette that chooses which light paths are shifted, by the light that they bring to the camera.
 
-A shift traces eight rays, and half of the vertices that the camera sees bring little of their pixels' light. Before
-anything of a shift is traced, the light of all paths of the pass is known, and with it
+A shift traces eight rays, but half of the vertices that the camera sees bring little of their pixels' light. The light
+of all paths of a pass is known before shifts are traced:
 
     w      the light that the path has splatted
     I      the light of its pixel in this pass, without lamps seen directly
     I0     the light of the image: (mean of √I)²
     p      = min(1, 2 w / √(I I0)), and at least 0.1
 
-Where noise is seen, relative to the pixel, is between w / I and w / I0. A path is shifted with probability p, and its Δ
-counts 1 / p times. Δ belongs to a path and its copy (``pairs``), whichever of the two was sampled. The roulette stands
-on top of it and may differ for both: it has random numbers of its own. Its expectation is Δ whatever p is.
+The visibility of noise lies between w / I (relative to the pixel) and w / I0 (relative to the image). A path is shifted
+with probability p, and its Δ counts 1 / p times, so the expected value is Δ for any p. The roulette uses its own random
+numbers. It may have another p for a path than for its copy, since Δ itself (``pairs``) does not depend on p.
 
 [Arvo and Kirk 1990, "Particle Transport and Image Synthesis", section 4]
 """
@@ -28,25 +28,25 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.samplers.bdpt.light_path import Seen
 from data_gen.samplers.gbdpt.light_again import Marker
 
-# Among 1, 2, 3, 4 and 6, the one with the least variance x time on four scenes
+# Of 1, 2, 3, 4 and 6 this has the least variance x time on four scenes
 SHARE = 2.0
-# Copies may be brighter than their paths.
+# Above 0, since a copy may be brighter than its path
 LEAST = 0.1
-# For so many vertices of a light path the worth is kept, 8 bytes each. All later ones are shifted.
+# The number of vertices of a light path whose worth is kept, 8 bytes each. All later vertices are shifted.
 RATED = 9
 
 
 @dataclass
 class Worth:
-    """The light that each vertex of light paths splats, and the pixel."""
+    """The light that each vertex of the light paths splats, and the pixel."""
 
-    light: mi.Float  # by depth, of each depth by lane
+    light: mi.Float  # ordered by depth, and for each depth by lane
     pixel: mi.UInt32
-    lanes: mi.UInt32  # how many there are
+    lanes: mi.UInt32  # the number of lanes
 
     @classmethod
     def nothing(cls, lanes: int, longest: int) -> Worth:
-        """The worth of ``lanes`` light paths, of at most ``longest`` edges, before they are traced."""
+        """Zero worth for ``lanes`` light paths of at most ``longest`` edges."""
         places = lanes * min(RATED, longest - 1)
         worth = cls(dr.zeros(mi.Float, places), dr.zeros(mi.UInt32, places), mi.UInt32(lanes))
         dr.make_opaque(worth)
@@ -93,7 +93,7 @@ def survivors(
     light, pixel, kept = worth.of(lane, depth)
     share = SHARE * light / dr.gather(mi.Float, threshold, pixel)
     p = dr.select(kept & (share < 1), dr.fmax(share, LEAST), 1)
-    # Numbers that no path has drawn
+    # Random numbers that no path uses
     u = mi.sample_tea_float32(camera.random.at(lane).next_key(), depth)
     few = dr.compress(u < p)
     return dr.gather(mi.UInt32, lane, few), dr.gather(mi.UInt32, depth, few), dr.gather(mi.Float, dr.rcp(p), few)

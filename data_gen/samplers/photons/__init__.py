@@ -1,1 +1,1 @@
-"""Photons: light paths kept in a map, and the light gathered from those near a point."""
+"""Photon mapping: light paths are kept in a map, and light is gathered from photons near a point."""

@@ -1,6 +1,6 @@
 """The entries of the samplers that use only photons: ``ppm`` on surfaces, and ``bre`` in media.
 
-Each pass is a photon map of its own, which blurs, less from pass to pass.
+Each pass has its own photon map. Maps blur the light, less from pass to pass.
 """
 
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 from data_gen.samplers.registry import Option, Sampler, register
 from data_gen.samplers.shared import GATHERING, IN_MIRRORS, PHOTONS, first_radius, no_media, unseen_media
 
-# What entries of all samplers that use only photons have
+# Fields that the entries of these samplers share
 OF_PHOTONS: dict[str, Any] = {
     "notes": {"transport": "found by photons; blurred, less with every sample", "mirrors": IN_MIRRORS},
     "options": {

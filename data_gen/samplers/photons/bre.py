@@ -1,15 +1,16 @@
-r"""The beam radiance estimate: photons in media are gathered along whole rays, not near to points on them.
+r"""The beam radiance estimate: photons in media are gathered along whole rays, not near points on them.
 
-    b, d, Φ     a photon within radius r of a segment of the camera path, in the same medium; its direction, its power
-    t           the distance from where the segment begins to where b is beside it
-    T(t)        what the media let through up to there, in each colour
+    b, d, Φ     a photon within radius r of a segment of the camera path, in the same medium; its direction; its power
+    t           the distance along the segment to the point nearest to b
+    T(t)        the transmittance of the media up to there, in each colour
     L           Σ T(t) f(d) Φ / (π r² N),    f: the phase function, N: light paths of the pass
 
-Camera paths go through media up to the next surface. So no distance is sampled, each segment gathers from all of its
-length, and the blur is two-dimensional. The same photons give less noise and less bias than near to points.
+Camera paths go through media up to the next surface. No distance is sampled, each segment gathers over its whole
+length, and the blur is two-dimensional. So the same photons give less noise and less bias than near points.
 
-In media whose density varies T is not known. Rays go through them by null collisions, and end at the first real one: a
-ray comes so far with the probability T. Photons count as Φ / σs of their place there, times σs beside them on the ray.
+In media whose density varies T is not known. There a ray samples collisions and ends at the first real one, so it
+reaches a point with the probability T. A photon counts as Φ / σs, with σs at its place, times σs at the nearest point
+of the ray.
 
 [Jarosz et al. 2008, "The Beam Radiance Estimate for Volumetric Photon Mapping"; Křivánek et al. 2014, "Unifying Points,
 Beams, and Paths in Volumetric Light Transport Simulation", short beams; the radius: radius.py]
@@ -37,13 +38,13 @@ from data_gen.samplers.photons.map.vertices import in_media
 from data_gen.samplers.photons.passes import Passes, Start
 from data_gen.samplers.photons.ppm import PPM, Gathering
 
-# Points of the grid within one radius of a ray are gathered in parts 3 radii long, each in a ball of this many radii.
+# A ray is cut into parts 3 radii long. The points within one radius of a part lie in a ball of this many radii.
 BALL = np.sqrt(1 + 1.5**2)
 
 
 @dataclass(init=False)
 class AlongRays:
-    """The photons of a map where they are gathered beside rays; for paths of at most ``max_depth`` edges."""
+    """The photons of a map, to be gathered along rays; for paths of at most ``max_depth`` edges."""
 
     photons: Any
     Φ: mi.Spectrum
@@ -63,9 +64,9 @@ class AlongRays:
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
 
     def light(self, ray, length, medium: mi.MediumPtr, σ: mi.Spectrum, depth: mi.UInt32, active) -> mi.Spectrum:
-        """Σ of the photons beside a piece of a ray through one ``medium``, of paths that are not too long.
+        """The light of photons beside a piece of a ray through one ``medium``, over paths that are not too long.
 
-        ``depth`` is the number of the segment; T is of the piece only.
+        ``depth`` is the number of the segment. T is the transmittance within the piece.
         """
         photons, longest = self.photons, self.max_depth - depth
         phase = medium.phase_function()
@@ -87,7 +88,7 @@ class AlongRays:
 
 
 def seen_along(ray, medium: mi.MediumPtr) -> mi.MediumInteraction3f:
-    """Interactions for the phase function of a ``medium``, for light scattered against the ray."""
+    """Interactions for the phase function of a ``medium``, for light that is scattered against the ray."""
     seen = dr.zeros(mi.MediumInteraction3f, dr.width(ray.d))
     seen.p, seen.time, seen.wavelengths, seen.medium = ray.o, ray.time, ray.wavelengths, medium
     seen.wi, seen.sh_frame = -ray.d, mi.Frame3f(-ray.d)
@@ -95,7 +96,7 @@ def seen_along(ray, medium: mi.MediumPtr) -> mi.MediumInteraction3f:
 
 
 def scattering_along(ray, medium: mi.MediumPtr) -> Callable[[mi.Float, mi.Bool], mi.Spectrum]:
-    """(distance, active) -> σs of a ``medium`` along a ray; a grid is empty outside of its box."""
+    """A function (distance, active) -> σs of a ``medium`` along a ray. A grid is empty outside of its box."""
     _, _, near, far = collisions.extent(medium, ray)
 
     def scattering(t: mi.Float, active: mi.Bool) -> mi.Spectrum:
@@ -108,10 +109,10 @@ def scattering_along(ray, medium: mi.MediumPtr) -> Callable[[mi.Float, mi.Bool],
 
 @dataclass
 class Along:
-    """The things near to camera paths that go piece by piece."""
+    """The photons near camera paths that go piece by piece."""
 
     on_surfaces: Gathering | None
-    in_media: Any  # photons, with ``light`` (piece of a ray, length, medium, σ, depth, where)
+    in_media: Any  # has ``light`` (piece of a ray, length, medium, σ, depth, active)
 
 
 class BRE(PPM):
@@ -121,7 +122,7 @@ class BRE(PPM):
 
     Biased, and consistent: the mean over passes converges to the image of ``volpath``.
 
-    Not handled: light from infinitely far away through a medium without end, and what ``ppm`` does not handle.
+    Not handled: light from infinitely far away through a medium without bounds, and what ``ppm`` does not handle.
     """
 
     follows, map_bytes = "volpath", MEDIA_MAP_BYTES
@@ -136,19 +137,19 @@ class BRE(PPM):
 
 @dr.syntax
 def by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, emission: bool) -> tuple:
-    """``by_vertices()``; through media piece by piece from boundary to boundary."""
+    """As ``by_vertices()``, but through media: piece by piece from boundary to boundary."""
     scene, fog, limits, random = world.scene, world.fog, integrator.limits, start.random.clone()
     connectable = world.materials.connectable
     parts = (near.on_surfaces, near.in_media) if near is not None else (None, None)
     at_surface, along = (None if part is None else part.light for part in parts)
-    ray, medium = mi.Ray3f(start.ray), mi.MediumPtr(fog.within)  # a piece, and what it goes through
+    ray, medium = mi.Ray3f(start.ray), mi.MediumPtr(fog.within)  # a piece, and its medium
     importance = start.importance
     Le = importance * integrator.lamps_in_fog(scene, fog.media, ray, fog.within, mi.UInt32(0))
     L = dr.zeros(mi.Spectrum, dr.width(ray))
-    β, η = mi.Spectrum(importance), mi.Float(1)  # throughput, and the relative index of refraction, of the piece
-    depth = mi.UInt32(1)  # the number of the segment that it is of
+    β, η = mi.Spectrum(importance), mi.Float(1)  # throughput and relative index of refraction at the piece
+    depth = mi.UInt32(1)  # the number of the segment that contains the piece
     sky, active = Sky.from_camera(limits.hide_emitters), mi.Bool(True)
-    # In scenes with grids: whether the path has come through one, and goes on behind a null collision
+    # In scenes with grids: whether the path has gone through one, and whether it continues behind a null collision
     grids, behind, skips = fog.media.grids, mi.Bool(False), mi.Bool(False)
     if dr.hint(grids, mode="scalar"):
         channel = media.choose_channel(random.next_1d())
@@ -181,7 +182,7 @@ def by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, em
         if dr.hint(emission, mode="scalar"):
             met = active & ~first & (found | sky.seen)
             if dr.hint(grids and limits.shows, mode="scalar"):
-                # Le contains neither light that comes through a grid nor the sky: see ``behind_grids()``.
+                # Le leaves out light that comes through a grid, and the sky: see ``behind_grids()``.
                 behind |= stop.passed > 0
                 met |= active & first & (behind | ~found)
             L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)

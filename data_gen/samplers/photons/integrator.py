@@ -1,4 +1,4 @@
-"""The shared part of all photon plugins: parameters, the world of a scene, and the photon maps of a pass."""
+"""The base class of all photon plugins: parameters, the world of a scene, and the photon maps of a pass."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from data_gen.samplers.photons.map.trace import MAP_BYTES, VERTICES_PER_PATH, tr
 from data_gen.samplers.photons.passes import Passes
 from ngpt.errors import NgptError
 
-# Bytes of a camera sample and its features, beside the maps
+# Bytes of a camera sample and its features, without the maps
 CAMERA_BYTES = 256
 # Bytes of a map in media: a word more for each vertex, and two for each light path
 MEDIA_MAP_BYTES = MAP_BYTES + VERTICES_PER_PATH * 8 + 2 * 8
-# Further bytes of it with grids: Φ / σs of each vertex
+# Additional bytes in scenes with grids: Φ / σs of each vertex
 GRID_BYTES = VERTICES_PER_PATH * 3 * 4
 
 
@@ -37,19 +37,19 @@ class Traced:
     paths: int  # light paths of the pass
     number: int  # of the pass
     seed: int  # of the render
-    first_radius: float  # that photons are gathered within in pass 0
+    first_radius: float  # the gathering radius in pass 0
 
     def radius(self, dimension: int = 2) -> float:
-        """The radius of this pass for photons counted in ``dimension`` dimensions."""
+        """The radius of this pass, for photons that are gathered in a disk (``dimension`` 2) or a ball (3)."""
         return self.first_radius * shrunk(self.number, dimension)
 
 
 class PhotonIntegrator(GradientIntegrator):
-    """Derived classes have ``sample_pass(passes, camera, film)``, and say what they need:
+    """Derived classes define ``sample_pass(passes, camera, film)`` and these attributes:
 
-    ``follows``       "volpath" where they render media, or "path" for surfaces
-    ``camera_bytes``  that a camera sample takes
-    ``map_bytes``     that a map takes for each light path; and ``grid_bytes`` more in scenes with grids
+    ``follows``       "volpath" if they render media, or "path" for surfaces only
+    ``camera_bytes``  memory of a camera sample
+    ``map_bytes``     memory of a map for each light path, and ``grid_bytes`` more in scenes with grids
     """
 
     camera_bytes, map_bytes, grid_bytes = CAMERA_BYTES, MAP_BYTES, GRID_BYTES
@@ -60,11 +60,11 @@ class PhotonIntegrator(GradientIntegrator):
 
     @property
     def lane_bytes(self) -> int:
-        """Bytes for a camera sample, with all that its light paths may leave in a map."""
+        """Bytes of a camera sample, with the largest map of its light paths."""
         return self.camera_bytes + self.photons * self.map_bytes
 
     def instead(self, lane_bytes: int) -> str:
-        """The advice, besides a smaller image, that fits a camera sample into ``lane_bytes``; "" if there is none."""
+        """Advice, besides a smaller image, that makes a camera sample fit into ``lane_bytes``; "" if there is none."""
         fits = (lane_bytes - self.camera_bytes) // self.map_bytes
         return f", or no more than -O photons={fits}" if fits > 0 else ""
 
@@ -80,7 +80,7 @@ class PhotonIntegrator(GradientIntegrator):
         return Passes(self, world, pixel_width(scene, sensor))
 
     def maps(self, passes: Passes, camera: CameraSamples) -> Iterator[Traced]:
-        """The photon maps of the pass: of ``photons`` light paths for each sample of the ``camera``."""
+        """The photon maps of the pass, which trace ``photons`` light paths for each sample of the ``camera``."""
         world, limits = passes.world, self.limits
         if world.lights.emitters is None or limits.max_depth <= 1:
             return
@@ -91,12 +91,12 @@ class PhotonIntegrator(GradientIntegrator):
 
 
 def _refuse_lamps_never_chosen(scene, sampler: str) -> None:
-    """No photons start at a lamp of weight 0, so its light would be missing. Mitsuba's paths meet it by chance. No path
-    meets points and single directions of weight 0. They are off in Mitsuba as well.
+    """Raises NgptError for visible lamps of weight 0. No photons start there, so their light would be missing, while
+    Mitsuba's paths meet such lamps by chance. Points and single directions of weight 0 are dark in Mitsuba as well.
     """
     for index, emitter in enumerate(scene.emitters()):
         if visible(emitter) and scene.pdf_emitter(mi.UInt32(index))[0] == 0:
             raise NgptError(
-                f"sampler '{sampler}' cannot render this scene: its photons start at lamps that are chosen, and "
-                f"emitter '{emitter.id()}' has sampling_weight 0; give it a positive one, or use --sampler gpt"
+                f"sampler '{sampler}' cannot render this scene: no photons would start at emitter "
+                f"'{emitter.id()}', which has sampling_weight 0; give it a positive one, or use --sampler gpt"
             )

@@ -1,4 +1,4 @@
-"""The state that the passes of one render share, for integrators that gather photons."""
+"""The state shared by the passes of one render, for integrators that gather photons."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from data_gen.paths.light_ends import World
 
 @dataclass
 class Passes:
-    """The passes of a render, and the memory that one takes.
+    """The passes of a render, and the memory of one pass.
 
-    ``integrator`` has ``sample_pass(passes, camera, film)``, ``lane_bytes`` and ``instead(lane_bytes)``: what, besides
-    a smaller image, would fit into this number of bytes for each camera sample.
+    ``integrator`` has ``sample_pass(passes, camera, film)``, ``lane_bytes`` and ``instead(lane_bytes)``. The last gives
+    advice, besides a smaller image, that makes a camera sample fit into this number of bytes.
     """
 
     integrator: Any
@@ -50,7 +50,7 @@ class Start:
 
 
 def begun(passes: Passes, camera: CameraSamples) -> tuple[Start, dict]:
-    """Where the camera paths of a pass start, and the layers of their features."""
+    """The start of the camera paths of a pass, and the layers of their features."""
     ray, importance, _ = camera.rays()
     random = camera.random.clone()
     dr.eval(ray, importance)

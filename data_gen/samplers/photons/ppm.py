@@ -1,14 +1,14 @@
-r"""Progressive photon mapping: light is carried to where the camera looks, and gathered there from near by.
+r"""Progressive photon mapping: photons carry light to the surfaces that the camera sees, and are gathered there.
 
     x           a vertex of the camera path, at a material that scatters widely
-    b, d, Φ     a photon within radius r of it, the direction it came along, its power
-    A           area of what photons are gathered from: π r², and less along edges (edges.py)
+    b, d, Φ     a photon within radius r of x, the direction in which it arrived, its power
+    A           area of the surface from which photons are gathered: π r², and less along edges (map/radius.py)
     L(x)        Σ f(x; -d) Φ / (A N),    N: light paths of the pass
     β           throughput of the camera path
 
-A camera path goes on by mirrors, glass, sharp gloss and holes. It ends where light is scattered smoothly by a material
-that scatters widely. All light that is scattered there comes from photons, including light of lamps seen from there.
-Emission that the camera path meets on its way counts as it is. So each path of light is found in only one way.
+A camera path goes on at mirrors, glass, sharp gloss and holes. It ends at a smooth event at a material that scatters
+widely. All light scattered there comes from photons, even light directly from lamps. Emission that the camera path
+meets on its way is added in full. So each path of light is found in only one way.
 
 [Hachisuka et al. 2008, "Progressive Photon Mapping"; Knaus and Zwicker 2011, radius.py]
 """
@@ -39,7 +39,7 @@ from data_gen.samplers.photons.passes import Passes, Start, begun
 
 @dataclass(init=False)
 class Gathering:
-    """The photons of a map, where they are gathered on surfaces; for paths of at most ``max_depth`` edges."""
+    """The photons of a map, to be gathered on surfaces; for paths of at most ``max_depth`` edges."""
 
     world: World
     photons: Any
@@ -57,7 +57,7 @@ class Gathering:
         self.number, self.max_depth = number_of(traced.seed, traced.number), dr.opaque(mi.UInt32, max_depth)
 
     def light(self, si, bsdf: mi.BSDFPtr, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
-        """L(x) at the vertex ``si``, on a surface, behind ``depth`` edges, of paths that are not too long."""
+        """L(x) at the vertex ``si`` on a surface, behind ``depth`` edges, over paths that are not too long."""
         longest = self.max_depth - depth
 
         def one(i, near):
@@ -78,19 +78,20 @@ class PPM(PhotonIntegrator):
     ``max_depth``            default -1: no limit
     ``rr_depth``             5
     ``hide_emitters``        false
-    ``radius``               3, of the first pass, in pixels where the camera sees something (the median)
-    ``photons``              1, light paths of a pass for each pixel
+    ``radius``               3, of the first pass, in pixels (their median width at the surfaces that the camera sees)
+    ``photons``              1, the number of light paths in a pass for each pixel
     ``roughness_threshold``  0.05, the microfacet roughness above which photons are gathered at a material
 
-    Biased, and consistent: the mean over passes converges to the image of ``path``, light that ``path`` cannot find
-    included. Passes differ: the first of one render is not one more of another.
+    Biased, and consistent: the mean over passes converges to the image of ``path``, including light that ``path``
+    cannot find. The radius shrinks from pass to pass, so the mean of several short renders is not the image of a long
+    one.
 
     Not handled: media, polarised and spectral variants, emitters other than areas, points, spots and those infinitely
     far away. Rendering raises NgptError for them.
     """
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        """One photon map, and one camera path for each camera sample."""
+        """Traces the photon maps of a pass, and one camera path for each camera sample."""
         start, values = begun(passes, camera)
         near = (one for traced in self.maps(passes, camera) for one in self.near(passes, traced))
         wavelengths = start.ray.wavelengths
@@ -105,26 +106,26 @@ class PPM(PhotonIntegrator):
         film.put_all(values)
 
     def near(self, passes: Passes, traced: Traced) -> Iterator[Any]:
-        """Yields what is gathered from a photon map, one part after another."""
+        """Yields the parts of a photon map that are gathered, one after another."""
         yield Gathering(passes.world, traced, self.limits.max_depth)
 
     def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """Returns L and Le of camera paths (world, start, near, emission). L contains the light gathered from ``near``,
-        and the ``emission`` that the paths meet if that is asked for."""
+        """Returns L and Le of camera paths; the arguments are world, start, near and emission. L is the light gathered
+        from ``near``, plus the emission that the paths meet if ``emission`` is true."""
         return by_vertices(self, *path)
 
 
 @dr.syntax
 def by_vertices(integrator: PhotonIntegrator, world: World, start: Start, near, emission: bool) -> tuple:
-    """L of camera paths from vertex to vertex: what is gathered ``near``, ``emission`` that they meet; and Le.
+    """L and Le of camera paths, vertex by vertex. L is the light gathered ``near`` and, on request, ``emission``.
 
-    ``near.light`` is called with (vertex, its material, depth, where); or there is nothing near.
+    ``near.light`` is called with (vertex, its material, depth, active). ``near`` may be None.
     """
     scene, limits, random = world.scene, integrator.limits, start.random.clone()
     ray, importance = mi.Ray3f(start.ray), start.importance
     connectable, gathered = world.materials.connectable, near.light if near is not None else None
     sky = Sky.from_camera(limits.hide_emitters)
-    β, η = mi.Spectrum(importance), mi.Float(1)  # throughput, and the relative index of refraction up to the vertex
+    β, η = mi.Spectrum(importance), mi.Float(1)  # throughput and relative index of refraction up to the vertex
     depth = mi.UInt32(1)  # edges up to the vertex si
     # ------------------------- The first vertex --------------------------
     si = integrator.first_hit(scene, ray).compute_surface_interaction(ray)

@@ -1,4 +1,4 @@
-"""The scene's own integrator without gradients: references, and images for denoisers that need none."""
+"""The scene's own integrator without gradients, for references and for denoisers that need no gradients."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from data_gen.tails.cache import Known
 
 
 def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places | None = None) -> SamplePass:
-    """The sampler ``primal``; without ``features`` it holds only the primal. Lamps may be chosen by ``places``.
+    """The sampler ``primal``. Without ``features`` it renders only the primal. ``places`` chooses lamps by place.
 
-    With ``tails`` "shared" the tails of paths are found in a cache, see ``data_gen.tails``.
+    With ``tails`` "shared" the tails of paths come from a cache, see ``data_gen.tails``.
     """
     integrator = reference_integrator(scene)
     followed = integrator_name(scene) in ("path", *VOLUMETRIC) and not mi.is_polarized
@@ -50,9 +50,9 @@ def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places |
 
 
 def our_samples(view, plan: Plan, camera: CameraSamples, known: Known | None, *, integrator, features: bool) -> dict:
-    """``samples()`` by the base paths of ``gpt``, which end in what is ``known`` of the cache.
+    """As ``samples()``, with the base paths of ``gpt``, which may end in the ``known`` part of the cache.
 
-    Where they may, the layer ``shared`` is a sample of the error of what comes from there.
+    If they may, the layer ``shared`` is a sample of the error of the light from the cache.
     """
     errors = []
 
@@ -72,7 +72,7 @@ def our_samples(view, plan: Plan, camera: CameraSamples, known: Known | None, *,
 def samples(scene, integrator, radiance, features: bool, camera: CameraSamples) -> dict:
     """Layers: one sample of ``radiance``, and of features, for each camera sample.
 
-    Where there are ``features``, directly seen emission is the mean over a pixel's quarters.
+    With ``features``, directly seen emission is the mean over the quarters of a pixel.
     """
     ray, importance, _ = camera.rays()
     medium, all_lanes = camera.sensor.get_medium(), mi.Bool(True)

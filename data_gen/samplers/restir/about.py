@@ -13,16 +13,16 @@ register(
         refusals=SURFACES,
         loses=THROUGH_HOLES,
         options={
-            "history": Option(32.0, "frames that a reservoir can count for", range=(1, math.inf)),
+            "history": Option(32.0, "the most frames that a reservoir can count for", range=(1, math.inf)),
             "gradients": Option(
                 "pairs",
-                "pairs: of reservoirs of pairs of pixels; after: of the paths that pixels have kept",
+                "pairs: from reservoirs of pairs of pixels; after: from the paths that pixels have kept",
                 choices=("pairs", "after"),
             ),
             "roughness_threshold": CONNECTABLE,
         },
         spp=2,
         warm_up=16,
-        alone="without frames before, it takes 2 to 3 times as long as 'gpt' to the same error",
+        alone="without earlier frames it takes 2 to 3 times as long as 'gpt' for the same error",
     )
 )

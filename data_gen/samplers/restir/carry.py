@@ -1,17 +1,18 @@
-r"""Carries the records of one frame into the scene of another, and recomputes them where shapes or lights have moved.
+r"""Carries records into the scene of another frame, and recomputes them if shapes or lights have moved.
 
-A path is the same path in both scenes if its random numbers are, and rc is the same point of the same shape:
+A path is the same in both scenes if it has the same random numbers, and rc is the same point of the same shape:
 
 | part of the path | in the other scene | Jacobian |
 |---|---|---|
-| prefix, choice of an emitter | the same random numbers; by ``evaluate``, as from pixel to pixel | 1 |
-| rc | the point moves as its shape does | the stretch of the surface there, put into ``geometry`` |
-| the direction from rc on | the same in the world | 1 |
-| what is behind it | the same random numbers: light, and Russian roulette, are found anew | 1 |
+| prefix, choice of an emitter | the same random numbers, replayed by ``evaluate``, as from pixel to pixel | 1 |
+| rc | the point moves with its shape | the stretch of the surface there, as a factor of ``geometry`` |
+| the direction from rc | the same in world space | 1 |
+| the path behind it | the same random numbers; light and Russian roulette are computed again | 1 |
 
-None of this depends on the path's pixel. So a record is carried once, and everything else is E in either scene. The way
-back is the same, and what it cannot undo is never carried: rc on a shape that was not there, or that has other
-triangles. [Lin et al. 2022: shifts between domains of any kind, here between two times]
+None of this depends on the pixel of the path. So a record is carried once, and all other steps evaluate E in one of the
+scenes. The way back follows the same rules. Records that it could not carry back are not carried: rc on a shape that
+does not exist in both scenes, or whose triangles differ. [Lin et al. 2022: shifts between domains of any kind, here
+between two times]
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from data_gen.scenes.geometry import Mesh
 
 
 class Carry:
-    """Carries records from ``source`` to ``target``. It knows how the shapes of one scene lie in the other."""
+    """Carries records from ``source`` to ``target``. It stores how each shape moves between the scenes."""
 
     def __init__(self, source: Stage, target: Stage):
         self.target = target
@@ -68,7 +69,7 @@ class Carry:
         self.stretched = mi.Bool(first > 0)
 
     def __call__(self, seed: int, record: Record, active: mi.Bool) -> Record:
-        """Returns the records in the other scene, evaluated. Records that are not ``active`` have no defined values."""
+        """Returns the records in the target scene, evaluated. Records that are not ``active`` have undefined values."""
         target = self.target
         kind, far = record.kind, record.escapes()
         joined = active & (kind != LIGHT) & (kind != REPLAY) & (kind != STUCK)
@@ -79,18 +80,18 @@ class Carry:
         at = dr.select(known, mi.UInt32(at), 0)
         shape = dr.gather(mi.ShapePtr, self.shapes, at, known)
 
-        # rc: of a mesh by its triangle, of other shapes by their motion
+        # rc: on a mesh it moves with its triangle, on other shapes with their motion
         rows = [[dr.gather(mi.Float, value, at) for value in row] for row in self.moves]
         A = mi.Matrix3f([row[:3] for row in rows])
         P = mi.Point3f(A @ mi.Vector3f(record.P) + mi.Vector3f(*(row[3] for row in rows)))
         moved = replace(record, P=P, shape=shape)
-        # Any viewpoint serves. This one is about as far off as the predecessor was, so rounding errors stay alike.
+        # Any viewpoint will do. This one is about as far away as the previous vertex, so rounding errors are similar.
         hit, ray = moved.hit(P + record.w * dr.rsqrt(dr.maximum(record.geometry, 1e-20)))
         x = hit.compute_surface_interaction(ray, active=known)
         face = dr.gather(mi.Bool, self.stretched, at)
         place = dr.gather(mi.UInt32, self.first, at) + dr.select(face, record.primitive, 0)
         stretch = dr.gather(mi.Float, self.stretches, place)
-        # The normal of a plane that A moves is the previous normal times the inverse transpose.
+        # A plane that A moves has its normal multiplied by the inverse transpose of A.
         n = mi.Vector3f(x.n)
         stretch *= dr.abs(dr.det(A)) / dr.norm(
             sum((mi.Vector3f(*rows[i][:3]) * n[i] for i in range(3)), mi.Vector3f(0))
@@ -99,7 +100,7 @@ class Carry:
 
         behind = known & ~lost & ((kind == RC_LIGHT) | (kind == SUFFIX))
         camera = CameraSamples.replayed(target.sensor, seed, record.pixel, record.sample, record.place)
-        # rc's own numbers come after the numbers of the replayed vertices and of the vertex before it.
+        # The random numbers of rc come after those of the replayed vertices and of the vertex before rc.
         random = camera.random
         random.skip(mi.UInt32(DRAWN) * (record.replayed + 1))
         w, L, p_light, delta = _behind(target.scene, target.plan, random, x, record, behind)
@@ -127,8 +128,8 @@ def _areas(mesh: Mesh) -> np.ndarray:
 def _behind(
     scene: mi.Scene, plan: Plan, random, x: mi.SurfaceInteraction3f, record: Record, active: mi.Bool
 ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float, mi.Bool]:
-    """What is behind rc, ``x``, by these random numbers: ``w``, ``L`` and ``p_light`` of a record; whether its lamp,
-    sampled at rc, is one that no direction meets."""
+    """Recomputes ``w``, ``L`` and ``p_light`` of a record behind rc, ``x``; and whether the lamp sampled at rc is a
+    Dirac delta."""
     light, Le_p, lit = _sampled(scene, plan, x, draw(random), active & record.sampled & (record.behind == 0))
     w = dr.select(lit, light.d, record.w)
     L = dr.select(lit, Le_p, 0)
@@ -144,7 +145,7 @@ def _behind(
 
 
 def _sampled(scene: mi.Scene, plan: Plan, x: mi.SurfaceInteraction3f, numbers, active: mi.Bool):
-    """A sampled emitter, its Le V / p, and whether there is one."""
+    """An emitter sampled at ``x``, its Le V / p, and whether there is one."""
     lit = active & mi.has_flag(x.bsdf().flags(), mi.BSDFFlags.Smooth)
     light, Le_p = plan.lights.seen(scene, x, numbers.light, lit)
     return light, Le_p, lit & (light.pdf != 0)
@@ -152,9 +153,9 @@ def _sampled(scene: mi.Scene, plan: Plan, x: mi.SurfaceInteraction3f, numbers, a
 
 @dr.syntax
 def _further(scene, plan: Plan, random, x, record: Record, active):
-    """``L`` of what ends behind the first vertex after rc, which is ``x``: as in ``walk``, along the one path."""
-    L = mi.Spectrum(0)  # what the path's lamp brings
-    B = mi.Spectrum(1)  # f / p of all vertices since rc, Russian roulette included
+    """``L`` of paths that go on behind ``x``, the first vertex after rc: as in ``walk``, for a single path."""
+    L = mi.Spectrum(0)  # light of the path's lamp
+    B = mi.Spectrum(1)  # f / p of all vertices since rc, with Russian roulette
     η = mi.Float(1)  # product of the relative indices of refraction since rc
     i = mi.UInt32(1)  # vertices behind rc so far
     depth = record.replayed + 3  # number of x in the whole path

@@ -1,13 +1,12 @@
-r"""E(record, place): what the path of a record contributes at another place on the film. All reuse reduces to it.
+r"""E(record, place): the contribution of a record's path at another place on the film. All reuse is computed from it.
 
-The prefix is replayed from the record's random numbers through that place, by the camera as it is now; then the path
-goes straight to rc, and on as before. A path that was sampled there has to come back by the same rules: none of the
-vertices that are replayed may be joined, and the one before rc must be connectable. See
-``data_gen.samplers.restir.record`` for measures and kinds.
+The prefix is replayed from the record's random numbers through that place, with the current camera. Then the path goes
+straight to rc, and on as before. The shift back must follow the same rules: no replayed vertex may be joined, and the
+vertex before rc must be connectable. See ``data_gen.samplers.restir.record`` for measures and kinds.
 
-At its own place, by its own camera, E gives back the f that was recorded, to float32.
+At its own place, with its own camera, E returns the recorded f, up to float32 rounding.
 
-``P`` and ``shape`` of a record belong to this scene: what was found in another is carried here first, see
+``P`` and ``shape`` of a record must belong to this scene. Records from another scene are carried here first, see
 ``data_gen.samplers.restir.carry``.
 """
 
@@ -32,7 +31,7 @@ from data_gen.samplers.restir.walk import Numbers, draw, sample_event
 
 @dataclass
 class Shifted:
-    """A path in another pixel: ``f`` in its measures there, 0 if there is none; ``J``, the Jacobian of the shift."""
+    """A path in another pixel: ``f`` in the measures of that pixel, 0 if it does not exist, and the Jacobian ``J``."""
 
     f: mi.Spectrum
     J: mi.Float
@@ -40,7 +39,7 @@ class Shifted:
 
 
 def evaluate_record(stage: Stage, seed: int, record: Record, place: mi.Point2f, active: mi.Bool) -> Shifted:
-    """E(record, place): the records' paths as paths of the ``place`` on the film; J: Jacobian of the way there."""
+    """E(record, place): the paths of the records, shifted to the ``place`` on the film."""
     scene, plan = stage.scene, stage.plan
     camera = CameraSamples.replayed(stage.sensor, seed, record.pixel, record.sample, place)
     ray, importance, inside = camera.rays()
@@ -52,7 +51,7 @@ def evaluate_record(stage: Stage, seed: int, record: Record, place: mi.Point2f, 
         y, β, good, L_replayed = _replay(scene, plan, random, record, y, good)
     else:
         β, L_replayed = mi.Spectrum(1), mi.Spectrum(0)
-        # Where all is connectable the first event is joined.
+        # If all materials are connectable the first event is always joined.
         good &= record.replayed == 0
     lit = _lit(scene, plan, y, draw(random), good & (kind == LIGHT))
     joined, J, geometry = _connected(scene, plan, record, y, good & (kind != LIGHT) & (kind != REPLAY))
@@ -64,17 +63,17 @@ def evaluate_record(stage: Stage, seed: int, record: Record, place: mi.Point2f, 
 
 @dr.syntax
 def _replay(scene, plan: Plan, random, record: Record, y, good):
-    """The vertex that the prefix leads to, its f / p, whether that can be undone; the radiance of REPLAY."""
-    β = mi.Spectrum(1)  # f / p of the vertices that were left so far
+    """The vertex behind the prefix, f / p up to it, whether the shift can be undone, and the radiance of REPLAY."""
+    β = mi.Spectrum(1)  # f / p of the replayed vertices so far
     L = mi.Spectrum(0)  # radiance of REPLAY
-    i = mi.UInt32(0)  # how many those are
+    i = mi.UInt32(0)  # number of replayed vertices so far
     replayed, ends = record.replayed, record.kind == REPLAY
     active = good & (i < replayed)
     while active:
         event = sample_event(scene, plan, y, draw(random), active)
         last = ends & (i + 1 == replayed)
         Le, p_light = emission(scene, event.x1, y, last & event.found, last & (event.kind == SMOOTH), plan.lights)
-        # What is joined here, the reverse shift would reconnect.
+        # If the event is joined here, the reverse shift would reconnect at it.
         good &= ~active | (event.found & ~event.joined & (last | event.x1.is_valid()))
         β *= event.f_p
         L = dr.select(last, β * Le * mis_weight(event.p, p_light), L)
@@ -85,7 +84,7 @@ def _replay(scene, plan: Plan, random, record: Record, y, good):
 
 
 def _lit(scene: mi.Scene, plan: Plan, y: mi.SurfaceInteraction3f, numbers: Numbers, active: mi.Bool) -> mi.Spectrum:
-    """f m Le V / p of the emitter that the numbers choose."""
+    """f m Le V / p of the emitter that the ``numbers`` sample."""
     bsdf = y.bsdf()
     active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     light = sample_light(scene, y, numbers.light, active, plan.lights)
@@ -96,7 +95,7 @@ def _lit(scene: mi.Scene, plan: Plan, y: mi.SurfaceInteraction3f, numbers: Numbe
 def _connected(
     scene: mi.Scene, plan: Plan, record: Record, y: mi.SurfaceInteraction3f, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
-    """f of the path that goes from ``y`` to rc, the Jacobian of that, and the geometry; J is 1 where not ``active``."""
+    """f of the path from ``y`` to rc, the Jacobian of this step, and its geometry. J is 1 where not ``active``."""
     hit, ray = record.hit(y.p)
     d, far, hits = ray.d, record.escapes(), record.kind == HIT
     x = hit.compute_surface_interaction(ray, active=active)
@@ -106,7 +105,7 @@ def _connected(
     bsdf = y.bsdf()
     f1, p1 = evaluate(bsdf, y, y.to_local(d), active & plan.materials.connectable(bsdf))
     active = active & (dr.max(f1) > 0) & dr.isfinite(J) & (J > 0)
-    # rc on a lamp: Le and the density of emitter sampling are looked up anew, whatever lamp it is.
+    # rc on a lamp: Le and the density of emitter sampling are evaluated again.
     Le, p_light = emission(scene, x, y, active & hits, active & hits, plan.lights)
     # rc on a surface
     behind = active & ~hits
@@ -122,21 +121,21 @@ def _connected(
     return dr.select(active & ~scene.ray_test(shadow, active), f, 0), J, geometry
 
 
-# From lanes and the number of the end, 0 or 1: which record, at what place on the film, and whether there is one
+# (lanes, number of the end: 0 or 1) -> which record, at which place on the film, and whether it exists
 Request = Callable[["mi.UInt32", "mi.UInt32"], "tuple[mi.UInt32, mi.Point2f, mi.Bool]"]
 _NONE = 0xFFFFFFFF
 
 
 @dataclass
 class Requests:
-    """E of some of many ``lanes``, each at one place or, the second half, at two."""
+    """E for some of many lanes. ``slot`` is the index of each lane; results for the second end begin at ``count``."""
 
     slot: mi.UInt32
     count: mi.UInt32
     shifted: Shifted
 
     def at(self, lane: mi.UInt32, active: bool | mi.Bool = True, end: int = 0) -> Shifted:
-        """What is known of these lanes; 0 with a Jacobian of 1 where nothing was asked for."""
+        """The results of these lanes. Where nothing was requested, f is 0 and the Jacobian 1."""
         slot = dr.gather(mi.UInt32, self.slot, dr.select(active, lane, 0))
         asked, slot = (slot != _NONE) & active, slot + (self.count if end else 0)
         f = dr.gather(mi.Spectrum, self.shifted.f, slot, asked)
@@ -157,7 +156,7 @@ def evaluate_some(
     active: mi.Bool,
     request: Request,
 ) -> Requests:
-    """E, by ``evaluate``, for those requests to records of the ``pool`` that are ``active``."""
+    """E, computed by ``evaluate``, of records of the ``pool``, for the lanes whose request is ``active``."""
     slot = dr.full(mi.UInt32, _NONE, lanes)
     index = dr.compress(active)
     count = dr.width(index)

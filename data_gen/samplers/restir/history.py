@@ -3,26 +3,26 @@ r"""Reservoirs of all pixels, and of all pairs of neighbours, kept from frame to
     for each frame
         a candidate for each pixel                                             ``walk``
         E   of each candidate in the four neighbours                           ``_partners``
-        E   of what is kept, in this frame                                     ``_of_kept``
-        E   of each candidate, by the camera of the frame before               ``_there``
-        of each reservoir, one path of all that is offered                     ``merging``
+        E   of each kept path in this frame                                    ``_of_kept``
+        E   of each candidate with the camera of the frame before              ``_there``
+        each reservoir keeps one of the paths that it is offered               ``merging``
 
-There are five reservoirs for each pixel: of its own light, and of the difference to its right and to its lower
-neighbour, one for each sign. Values that change sign have no density to choose by.
+There are five reservoirs for each pixel: one for its own light, and one for each sign of the difference to its right
+and to its lower neighbour. A value that changes sign cannot be a density by which paths are chosen.
 
-A pixel's paths come from its whole area, and a path keeps its place on the film to a fraction of a pixel. With the
+A pixel's paths come from its whole area, and a path keeps its place on the film with the fraction of a pixel. With the
 motion m of a pixel, paths that were at p in the frame before are now at p - m. So the pixel's area, moved by m, lies on
-up to four pixels of the frame before, and what they have kept there is taken over. This would leave a fifth of the
-pixels without history: the nearest of the four has kept one path, and that may lie beside the area. So everything is
-taken over from the nearest pixel. What lies beside the area is moved by a whole pixel: it *wraps*. A path may then have
-been found in three ways: by this frame's candidate, straight, and wrapped. The MIS weights of the three sum to 1,
+up to four pixels of the frame before. Paths that these have kept inside the area are taken over. But each pixel has
+kept only one path, which may lie outside the area, and a fifth of the pixels would have no history. So from the nearest
+pixel of the four all paths are taken over. A path outside the area is moved by a whole pixel: it *wraps*. So a path may
+have been found in three ways: by this frame's candidate, straight, and wrapped. The MIS weights of the three sum to 1,
 whatever m is. Confidence is handed on in proportion to the areas. [Zhang et al. 2024, "Area ReSTIR"; Wang et al. 2026,
 "Gradient-Domain ReSTIR Path Tracing", section 4.3.1]
 
-That is unbiased as long as motion depends on no random numbers. Where more than the camera changes there are two
-scenes, and records are carried into the one where E is evaluated: see ``data_gen.samplers.restir.carry``. The
-``chains`` of a pixel are independent. One chain has no variance: its frames are correlated, over ``cap`` of them, and
-must not be put into a film as if they were samples. Several have the variance over chains.
+This is unbiased as long as motion does not depend on random numbers. If more than the camera changes, there are two
+scenes, and records are carried into the scene in which E is evaluated: see ``data_gen.samplers.restir.carry``. The
+``chains`` of a pixel are independent, so several chains give a variance. The frames of one chain are correlated over
+``cap`` frames, so they must not be put into a film as if they were samples.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ from data_gen.samplers.restir.walk import Candidate, choices, walk
 
 @dataclass
 class Frame:
-    """Estimates of each lane of one frame; emission that the camera sees directly is in none of them.
+    """Estimates of each lane of one frame, without the emission that the camera sees directly.
 
-    ``path``  what the candidates' walks found, without history
+    ``path``  the estimate of the candidates' walks, without history
     """
 
     camera: CameraSamples
@@ -65,10 +65,10 @@ class Frame:
 class History:
     """The reservoirs of a shot, frame after frame.
 
-    Lanes are ordered pixel by pixel, within a pixel by chain. ``cap`` is the confidence that a reservoir can reach, in
-    frames; 1: hardly any history. Without ``pairs``, differences have no reservoirs of their own: they are taken of the
-    paths that the pixels' reservoirs have kept, the paper's baseline. Raises NgptError for what records cannot hold:
-    see ``stage.check``.
+    Lanes are ordered pixel by pixel, within a pixel by chain. ``cap`` is the largest confidence of a reservoir, in
+    frames; 1 means hardly any history. Without ``pairs``, differences have no reservoirs of their own. They are
+    computed from the paths in the pixels' reservoirs, as in the paper's baseline. Raises NgptError for scenes whose
+    paths records cannot hold: see ``stage.check``.
     """
 
     def __init__(self, stage: Stage, seed: int, chains: int = 1, cap: float = 32, pairs: bool = True):
@@ -86,11 +86,11 @@ class History:
     ) -> Frame:
         """Renders a frame.
 
-        ``stage`` is the scene as it is now, where more than the camera has changed. It is another scene than the one of
-        the frame before, which is still as it was then. None: the same scene.
+        ``stage`` is the current scene, if more than the camera has changed. It must be another object than the scene of
+        the frame before, which must not have changed since. None: the same scene.
 
         ``motion`` (H, W, 2) comes from ``data_gen.frames.motion``, NaN where there is no history; None: nothing moves.
-        ``depth`` (H, W) determines which pixel of a pair is the nearer one; its motion applies to both.
+        ``depth`` (H, W) determines which pixel of a pair is nearer. The motion of the nearer one applies to both.
         """
         width, height = self.size
         self.before, self.stage = self.stage, stage or self.stage
@@ -118,7 +118,7 @@ class History:
 
     @contextmanager
     def _then(self) -> Iterator[Stage]:
-        """The scene of the frame before, for a while."""
+        """A context with the scene of the frame before."""
         if self.before is not self.stage:
             yield self.before
             return
@@ -160,10 +160,10 @@ class History:
         dr.eval(primal, dx, dy)
         return Frame(camera, found.L, primal, dx, dy)
 
-    # ------------------------------ E, of as few as there are ------------------------------
+    # ------------------------------ E, where it is needed ------------------------------
 
     def _partners(self, record: Record, W: mi.Float) -> Requests:
-        """Each path of a pixel in its right, left, lower and upper neighbour: requests of lane, of 4 n."""
+        """E of each lane's path in the right, left, lower and upper neighbour (k = 0 to 3): request k n + lane."""
 
         def place(lane: mi.UInt32) -> tuple[mi.UInt32, mi.Point2f]:
             i, pair = lane % self.at.n, lane // self.at.n
@@ -176,9 +176,9 @@ class History:
         return self._of(self.stage, record, 4 * self.at.lanes, 1, active, request)
 
     def _of_kept(self, stage: Stage, kept: Reservoir, elsewhere: bool) -> Requests:
-        """Each path that was kept, where the pixels that look for it have it now: 4 requests for each reservoir.
+        """E of each kept path at its place in this frame: 4 requests for each reservoir, for the corners of its area.
 
-        ``elsewhere``: in the frame before, where else the path could have been.
+        With ``elsewhere``: E in the frame before, at the other place where the path could have been.
         """
 
         def request(lane: mi.UInt32, end: mi.UInt32):
@@ -192,8 +192,8 @@ class History:
         return self._of(stage, kept.record, lanes, self._ends, good, request)
 
     def _there(self, stage: Stage, found: Candidate) -> Requests:
-        """Each candidate in the frame before: requests of lane, of primal, dx and dy as side 0 and 1; all that twice,
-        straight and wrapped."""
+        """E of each candidate in the frame before. There is a request for each lane, for primal and for both sides of
+        dx and dy, first straight and then wrapped."""
 
         def where(lane: mi.UInt32):
             wrapped, e, i = lane >= self.at.all, (lane // self.at.n) % self.at.reservoirs, lane % self.at.n

@@ -1,4 +1,4 @@
-"""Where things are in arrays and on the film: lanes, pixels and pairs, in this frame and in the one before."""
+"""The places of lanes, pixels and pairs in arrays and on the film, in this frame and in the frame before."""
 
 from __future__ import annotations
 
@@ -10,35 +10,35 @@ import numpy as np
 
 from data_gen.samplers.restir.reservoir import CORNERS, Reservoir
 
-# Kinds of reservoirs; for pairs, the step to the second pixel. Reservoirs are numbered in the order 0 primal,
-# 1 dx+, 2 dx-, 3 dy+, 4 dy-.
+# Domains, that is kinds of values, with the step to the second pixel of a pair. Reservoirs are numbered in the order 0
+# primal, 1 dx+, 2 dx-, 3 dy+, 4 dy-.
 STEPS = {"primal": (0, 0), "dx": (1, 0), "dy": (0, 1)}
 RESERVOIRS = 5
-# Where what a pixel shows was not seen in the frame before
+# The motion of a pixel that was not seen in the frame before
 _NOWHERE = -1e6
 
 
 @dataclass
 class Kept:
-    """A path of the frame before, for a reservoir that looks for it."""
+    """A path of the frame before, as it is offered to a reservoir."""
 
     domain: mi.UInt32
     side: mi.UInt32
-    before: mi.Point2i  # first pixel of the pair that it was kept for
+    before: mi.Point2i  # first pixel of the pair for which it was kept
     source: mi.UInt32  # lane of that reservoir
-    place: mi.Point2f  # where the path is now
+    place: mi.Point2f  # the place of the path in this frame
     good: mi.Bool
-    other: mi.Point2i  # first pixel of the other pair that could have kept it,
+    other: mi.Point2i  # first pixel of the other pair that could have kept the path,
     elsewhere: mi.Point2f  # at this place,
-    twice: mi.Bool  # if there is one
+    twice: mi.Bool  # if there is such a pair
 
 
 class Layout:
-    """A frame of ``size`` = (width, height) with ``chains`` of each pixel, and ``reservoirs`` of each of these lanes.
+    """A frame of ``size`` = (width, height) with ``chains`` lanes for each pixel, and ``reservoirs`` for each lane.
 
-    ``motions`` (3, H, W, 2), NaN where there are none, and ``confidence`` (3, H, W) of the frame before are given for
-    pixels and for pairs, in the order of ``STEPS``. What kernels read is opaque: literals would be compiled into them,
-    each anew.
+    ``motions`` (3, H, W, 2), NaN where unknown, and ``confidence`` (3, H, W) of the frame before are given for pixels
+    and for pairs, in the order of ``STEPS``. Numbers that kernels read are opaque: as literals they would be compiled
+    into the kernels, and each value would need a new one.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Layout:
         return mi.Point2i(dr.floor(mi.Point2f(pair) + motion + 0.5))
 
     def corner(self, lane: mi.UInt32, kept: Reservoir) -> Kept:
-        """What reservoir ``lane`` // 4 finds at one of the corners of its area in the frame before."""
+        """The path that reservoir ``lane`` // 4 finds at corner ``lane`` % 4 of its area in the frame before."""
         job, corner = lane // len(CORNERS), lane % len(CORNERS)
         r, i = job // self.n, job % self.n
         domain, pixel = (r + 1) // 2, self.pixel(i)
@@ -93,7 +93,7 @@ class Layout:
         at, straight = pixel + to_side, mi.Point2f(was - motion)
         stays = same(mi.Point2i(dr.floor(straight)), at)
         place = dr.select(stays, straight, mi.Point2f(mi.Point2f(at) + fraction(straight)))
-        # Where else the path that it is now could have been
+        # The other place where this path could have been
         far = mi.Point2f(place + motion)
         other = dr.select(stays, nearest, mi.Point2i(dr.floor(far)) - to_side)
         elsewhere = dr.select(stays, mi.Point2f(mi.Point2f(nearest + to_side) + fraction(was)), far)
@@ -101,9 +101,10 @@ class Layout:
         return Kept(domain, side, before, source, place, good, other, elsewhere, good & ~same(other, before))
 
     def before(self, domain: mi.UInt32, pair: mi.Point2i, side: mi.UInt32, place: mi.Point2f, wrapped: mi.Bool):
-        """Where a path of this frame's ``pair`` could have been in the frame before: place, pair, and whether at all.
+        """Where a path of this frame's ``pair`` could have been in the frame before: place, pair, whether they exist.
 
-        Not ``wrapped``: straight along the motion. Else within the nearest pair, unless that is the same.
+        Without ``wrapped`` it is the place straight along the motion. With it, the place is in the nearest pair, and
+        exists only if that is another pair.
         """
         exists = self.on_film(pair)
         motion = self.motion(domain, pair, exists)
@@ -125,10 +126,10 @@ def same(a: mi.Point2i, b: mi.Point2i) -> mi.Bool:
 
 
 def fraction(place: mi.Point2f) -> mi.Vector2f:
-    """The position within its pixel of a place on the film."""
+    """The position of a place on the film within its pixel."""
     return mi.Vector2f(place - dr.floor(place))
 
 
 def across(domain: mi.UInt32, side: mi.UInt32) -> mi.Vector2f:
-    """The step from the pixel of a pair that a path is in to the other one."""
+    """The step from a path's own pixel to the other pixel of the pair."""
     return mi.Vector2f(step(domain)) * dr.select(side == 0, mi.Float(1), -1)

@@ -1,4 +1,4 @@
-"""Each reservoir keeps one path of all that it is offered; and differences of the paths that pixels have kept."""
+"""Each reservoir keeps one of the paths that it is offered. Also: differences of the paths kept by pixels."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from data_gen.samplers.restir.walk import Candidate
 
 @dataclass
 class Evaluated:
-    """E of all that a frame needs; None where it is not needed."""
+    """All values of E that a frame needs; None where they are not needed."""
 
     partners: Requests | None = None
     here: Requests | None = None
@@ -26,7 +26,7 @@ class Evaluated:
 
 @dataclass
 class _Offer:
-    """A path for a reservoir: its value there, resampling weight, side; lane of the record, and how that has moved."""
+    """A path for a reservoir: value, resampling weight and side; the lane of its record; its new place and geometry."""
 
     value: mi.Spectrum
     weight: mi.Float
@@ -38,16 +38,16 @@ class _Offer:
 
 @dataclass
 class Merging:
-    """What the reservoirs of a frame are offered."""
+    """The offers to the reservoirs of a frame, and the choice among them."""
 
     at: Layout
     ends: int  # number of pixels that a value depends on
     found: Candidate  # of this frame
-    kept: Reservoir | None  # of the frame before, in this one's scene
+    kept: Reservoir | None  # of the frame before, carried into this frame's scene
     e: Evaluated
 
     def merged(self, u: mi.Float) -> Reservoir:
-        """Chooses, by random numbers ``u``, the path that each reservoir keeps, of this frame or of the one before."""
+        """Chooses by random numbers ``u`` the path that each reservoir keeps, from this frame or the frame before."""
         lane = dr.arange(mi.UInt32, self.at.total)
         r, i = lane // self.at.n, lane % self.at.n
         domain, pixel = (r + 1) // 2, self.at.pixel(i)
@@ -68,7 +68,7 @@ class Merging:
         return Reservoir(record, best.side, best.value, weight_of(total, best.value))
 
     def _candidate(self, r: mi.UInt32, i: mi.UInt32, side: mi.UInt32) -> _Offer:
-        """What a pixel's candidate offers; for a pair, what the candidate of either side offers."""
+        """The offer of a pixel's candidate; for a pair, of the candidate of one ``side``."""
         found, e = self.found, self.e
         domain, pixel = (r + 1) // 2, self.at.pixel(i)
         at = pixel + step(domain) * mi.Int32(side)
@@ -92,11 +92,11 @@ class Merging:
         return _Offer(value, weight, side, source, dr.gather(mi.Point2f, found.record.place, source), mi.Float(0))
 
     def _history(self, r: mi.UInt32, lane: mi.UInt32) -> _Offer:
-        """What a reservoir of the frame before offers."""
+        """The offer of a reservoir of the frame before."""
         kept, e = self.kept, self.e
         it = self.at.corner(lane, kept)
         own, partner = e.here.at(lane), e.here.part(lane, it.domain > 0, 1)
-        # In the measure of the pixel that the path is in
+        # In the measure of the path's own pixel
         value = _value(r, own.f, partner / own.J, it.side)
         value = dr.select(dr.all(dr.isfinite(value)), value, 0)
         target = mi.luminance(value) * own.J
@@ -109,7 +109,7 @@ class Merging:
 
 
 def differences(at: Layout, kept: Reservoir, partners: Requests) -> tuple[mi.Spectrum, mi.Spectrum]:
-    """dx and dy of the paths that pixels have kept, each weighted against its mirror image.
+    """dx and dy of the paths that pixels have kept. A path from either side of a pair is weighted by MIS.
 
     ``partners``: E of these paths in the neighbours of their pixels.
     """
@@ -135,6 +135,6 @@ def _pair(own: mi.Spectrum, other: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
 
 
 def _value(r: mi.UInt32, own: mi.Spectrum, other: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
-    """The value of reservoir ``r``, light or one sign of a difference, for a path in its pixel and in the other."""
+    """The value for reservoir ``r``: light, or one sign of a difference. ``own``, ``other``: f in both pixels."""
     sign = dr.select(r % 2 == 1, mi.Float(1), -1)
     return dr.select(r == 0, own, part(_pair(own, other, side), sign))

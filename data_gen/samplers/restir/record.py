@@ -1,28 +1,28 @@
-r"""A path in 80 bytes: all that is needed to find its counterpart in another pixel, or in its own again.
+r"""A path in 80 bytes, which are enough to evaluate it again, in its own pixel or in another one.
 
-A path is a prefix, a vertex *rc* where copies of the path reconnect to it, and what comes behind. The prefix is not
-stored but replayed: its random numbers belong to a pixel and a sample. rc is the first vertex that is joined to its
-predecessor: a smooth event between two connectable vertices, see ``data_gen.samplers.restir.walk``. Each part has a
-measure of its own, so that a shift has one Jacobian and not one at each vertex:
+A path is a prefix, a vertex *rc* where copies of the path reconnect to it, and a rest. The prefix is not stored but
+replayed: its random numbers belong to a pixel and a sample. rc is the first vertex that is joined to the vertex before
+it, that is, by a smooth event between two connectable vertices, see ``data_gen.samplers.restir.walk``. Each part has
+its own measure, so that a shift has one Jacobian and not one at each vertex:
 
 | part | measure | Jacobian of a shift |
 |---|---|---|
 | camera sample, prefix, choice of an emitter | the random numbers; f there is f / p | 1 |
-| the step to rc | solid angle | the reconnection's Jacobian |
-| the direction from rc on | solid angle at rc | 1 |
-| behind it | the random numbers; f, and Russian roulette, are in ``L`` | 1 |
+| the step to rc | solid angle | the Jacobian of the reconnection |
+| the direction from rc | solid angle at rc | 1 |
+| the rest | the random numbers; f / p and Russian roulette are in ``L`` | 1 |
 
-Russian roulette up to rc depends on the prefix's throughput, so it belongs to the density: to W, not to f.
+Russian roulette up to rc depends on the throughput of the prefix. So it belongs to the density: it is in W, not in f.
 
 Kinds of paths, by what ends them:
 
-    LIGHT       a sampled emitter, before there is an rc: its numbers are replayed as well, whatever kind of lamp it is
+    LIGHT       an emitter sampled before there is an rc; its random numbers are replayed, too, for any kind of lamp
     HIT         rc is on a lamp, or the environment
-    RC_LIGHT    an emitter sampled at rc; one that no direction meets (a point) counts as SUFFIX without ``p_light``
-    SUFFIX      anything behind the direction from rc on: ``behind`` vertices, and a lamp, at the last or sampled there
-    REPLAY      a lamp, without an rc: mirrors and glass all along
-    STUCK       it leaves rc by a Dirac delta or a hole: a path that comes from elsewhere cannot follow, so no other
-                pixel has it, and ``evaluate`` gives 0
+    RC_LIGHT    an emitter sampled at rc; if it has a Dirac delta (a point), the kind is SUFFIX without ``p_light``
+    SUFFIX      ``behind`` vertices after rc, and a lamp at the last of them or sampled there
+    REPLAY      a lamp without an rc: only mirrors and glass on the way
+    STUCK       the path leaves rc by a Dirac delta or a hole. A copy arrives from another direction and cannot
+                follow, so no other pixel has the path, and ``evaluate`` gives 0
 
 [Lin et al. 2022, "Generalized Resampled Importance Sampling": hybrid shifts]
 """
@@ -36,10 +36,10 @@ import mitsuba as mi
 
 LIGHT, HIT, RC_LIGHT, SUFFIX, REPLAY, STUCK = range(6)
 
-# Parts of a word, from its lowest bits on: kind, whether the lamp was sampled, vertices behind rc, replayed vertices
+# Parts of a word, from the lowest bits: kind, whether the lamp was sampled, vertices behind rc, replayed vertices
 _KIND_BITS, _COUNT_BITS = 3, 14
 _BEHIND, _REPLAYED = _KIND_BITS + 1, _KIND_BITS + 1 + _COUNT_BITS
-# Vertices that a record can count. Russian roulette ends paths by then, for none survives a step for certain.
+# The most vertices that a record can count. Russian roulette ends paths before, since no step is survived for certain.
 MOST_VERTICES = (1 << _COUNT_BITS) - 1
 
 
@@ -47,18 +47,18 @@ MOST_VERTICES = (1 << _COUNT_BITS) - 1
 class Record:
     """A path that lives in the pixel of its ``place``. 20 words of 4 bytes, RGB variants only."""
 
-    pixel: mi.UInt32  # whose numbers the path was sampled with; ``sample`` counts on over the frames of a shot
+    pixel: mi.UInt32  # whose random numbers the path has; ``sample`` continues over the frames of a shot
     sample: mi.UInt32
-    place: mi.Point2f  # on the film, in pixels: where the path lives now, at first where its camera sample fell
-    word: mi.UInt32  # kind, ``sampled``, ``behind``, and how many vertices are left by replay
+    place: mi.Point2f  # on the film, in pixels: the path's current place, at first that of its camera sample
+    word: mi.UInt32  # kind, ``sampled``, ``behind`` and ``replayed``
     P: mi.Point3f  # rc, if it is on a surface
-    shape: mi.ShapePtr  # there; none where rc is in the environment, and for paths without rc
+    shape: mi.ShapePtr  # of rc; none if rc is in the environment, and for paths without rc
     primitive: mi.UInt32
     uv: mi.Point2f  # of the primitive
-    w: mi.Vector3f  # unit, the direction from rc on; toward rc if that is in the environment
-    L: mi.Spectrum  # radiance that comes along ``w``, divided by the density of all that is behind; of RC_LIGHT Le / p
-    p_light: mi.Float  # density with which the other technique finds the lamp from rc: 0 if it could not
-    geometry: mi.Float  # |cos θ| / d² at rc, toward its predecessor: the part of the Jacobian that is this path's
+    w: mi.Vector3f  # unit, the direction from rc; toward rc if that is in the environment
+    L: mi.Spectrum  # radiance along ``w``, divided by the density of the path behind; for RC_LIGHT Le / p
+    p_light: mi.Float  # density of emitter sampling at rc, if the lamp can be found from there, else 0
+    geometry: mi.Float  # |cos θ| / d² at rc, toward the vertex before: this path's part of the Jacobian
 
     @property
     def kind(self) -> mi.UInt32:
@@ -66,12 +66,12 @@ class Record:
 
     @property
     def sampled(self) -> mi.Bool:
-        """Whether the lamp was sampled: of what leaves rc along ``w``, from the last vertex behind it, or from rc."""
+        """Whether the lamp was sampled, from rc or from the last vertex behind it, and not met by chance."""
         return (self.word >> _KIND_BITS) & 1 == 1
 
     @property
     def behind(self) -> mi.UInt32:
-        """Vertices after rc, the lamp's own among them if it was not sampled."""
+        """The number of vertices after rc, including the lamp's if it was not sampled."""
         return (self.word >> _BEHIND) & MOST_VERTICES
 
     @property
@@ -79,12 +79,12 @@ class Record:
         return self.word >> _REPLAYED
 
     def hit(self, origin: mi.Point3f) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
-        """rc as what a ray from ``origin`` meets, and the ray."""
+        """rc as the hit of a ray from ``origin``, and the ray."""
         to = self.P - origin
         distance = dr.norm(to)
         far = self.escapes()
         hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(self.pixel))
-        # A mesh's vertex follows from ``uv``, a sphere's from the distance, which is each path's own.
+        # The point follows from ``uv`` on a mesh, and from the distance on a sphere, which differs for each ``origin``.
         hit.t = dr.select(far, dr.inf, distance)
         hit.shape, hit.prim_index, hit.prim_uv = self.shape, self.primitive, self.uv
         hit.valid = ~far
@@ -95,7 +95,7 @@ class Record:
         return self.shape == None  # noqa: E711 - a comparison of arrays of pointers
 
     def moved(self, place: mi.Point2f, geometry: mi.Float) -> Record:
-        """The record's path elsewhere on the film, where ``evaluate`` has found its ``geometry``."""
+        """The record with its path at another ``place`` on the film, where ``evaluate`` has given ``geometry``."""
         return replace(self, place=place, geometry=geometry)
 
 
@@ -105,7 +105,7 @@ def word_of(kind: mi.UInt32, replayed: mi.UInt32, behind: mi.UInt32, sampled: bo
 
 
 def geometry_of(normal: mi.Normal3f, at: mi.Point3f, origin: mi.Point3f) -> mi.Float:
-    """|cos θ| / d² at a vertex with a geometric ``normal``: solid angle at ``origin`` for each unit of area."""
+    """|cos θ| / d² at a vertex with a geometric ``normal``: the solid angle at ``origin`` per unit of area."""
     to = origin - at
     squared = dr.squared_norm(to)
     return dr.abs(dr.dot(normal, to)) * dr.rsqrt(squared) / squared

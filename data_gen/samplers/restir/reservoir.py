@@ -1,15 +1,15 @@
-r"""Reservoirs: each keeps one of many paths, with a weight that accounts for the others. Pure functions on arrays.
+r"""Reservoirs: each keeps one of many paths, with a weight that accounts for the others. All functions are pure.
 
-A reservoir holds one path of its pixel, or of its pair of pixels. ``value`` · ``W`` is unbiased for the integral over
-all paths, for whatever path it holds: W is an estimate of 1 / density. M, the confidence, says how many candidates have
-been seen; it weighs reservoirs against each other and is held below a cap, so that a chain can forget: that is
-``confidence_after``.
+A reservoir holds one path of its pixel, or of its pair of pixels. ``value`` · ``W`` is an unbiased estimate of the
+integral over all paths; W estimates 1 / density. M, the confidence, is the number of candidates seen so far. It weights
+reservoirs against each other, and is kept below a cap so that a chain can forget: see ``confidence_after``.
 
-All values are light, or one sign of a difference: never negative. Paths are chosen in proportion to p̂, their luminance.
+A value is light, or one sign of a difference, so it is never negative. Paths are chosen in proportion to p̂, the
+luminance of their value.
 
 | quantity | formula | identity |
 |---|---|---|
-| resampling weight of path l | w = m p̂ \|J\| W, p̂ in the pixel that the reservoir is for | |
+| resampling weight of path l | w = m p̂ \|J\| W, with p̂ in the reservoir's pixel | |
 | choice | path l with probability w_l / Σ w | |
 | weight of the chosen path | W = Σ w / p̂ | E[Σ over choices of value · W] = Σ m · value \|J\| W |
 | MIS weights of one path in all pixels that could have found it | ``weigh`` | they sum to 1 |
@@ -41,22 +41,22 @@ class Reservoir:
 
 
 def share(own: mi.Float, others: mi.Float) -> mi.Float:
-    """The balance heuristic: the part of a density in the sum of that and others; 0 of nothing."""
+    """The balance heuristic: own / (own + others), or 0 if ``own`` is 0."""
     return dr.select(own > 0, own / (own + others), 0)
 
 
 def weight_of(total: mi.Float, value: mi.Spectrum) -> mi.Float:
-    """W of the chosen path, whose value is given, from the sum of all resampling weights."""
+    """W of the chosen path, given the sum of all resampling weights and its value."""
     target = mi.luminance(value)
     return dr.select((target > 0) & dr.isfinite(total), total / target, 0)
 
 
 def weigh(own: mi.Float, others: mi.Float, target: mi.Float, W: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """The MIS weight of a path by the generalised balance heuristic, and its resampling weight; 0 of what is not.
+    """The MIS weight of a path by the generalised balance heuristic, and its resampling weight; 0 if it is not finite.
 
-    ``own``         M p̂ of the path in the reservoir that it is from
-    ``others``      the sum of M p̂ |J| of all others that could have found it
-    ``target``, W   p̂ |J| in the pixel that the reservoir is for, and the path's W
+    ``own``         M p̂ of the path in the reservoir that it comes from
+    ``others``      the sum of M p̂ |J| over all other reservoirs that could have found it
+    ``target``, W   p̂ |J| in the pixel of the new reservoir, and the path's W
     """
     m = share(own, others)
     w = m * target * W
@@ -64,7 +64,7 @@ def weigh(own: mi.Float, others: mi.Float, target: mi.Float, W: mi.Float) -> tup
 
 
 def choose(weights: list[mi.Float], u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-    """The number of the path that is kept, by a random number in [0, 1), and the sum of all resampling weights.
+    """The number of the path that is kept, chosen by ``u`` in [0, 1), and the sum of all resampling weights.
 
     The weight of the chosen path is positive if any weight is.
     """
@@ -77,12 +77,12 @@ def choose(weights: list[mi.Float], u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
 
 
 def difference(first: mi.Spectrum, second: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
-    """What a path of a pair of pixels adds to "second pixel - first pixel", weighted against its mirror image.
+    """The contribution of a path to "second pixel - first pixel", with its MIS weight for a pair of pixels.
 
     ``first`` and ``second`` are f of the path in either pixel, in the measure of the pixel (``side``) that sampled it:
-    one is f itself, the other f |J| of the shift. A pair of paths can be sampled from both sides: the weight is p̂'s
-    share, since after resampling no density is known. [Wang et al. 2026,
-    "Gradient-Domain ReSTIR Path Tracing", equations 13 to 16]
+    one is f itself, the other f |J| of the shift. A pair of paths can be sampled from both sides. The weight uses p̂
+    instead of densities, since no density is known after resampling. [Wang et al. 2026, "Gradient-Domain ReSTIR Path
+    Tracing", equations 13 to 16]
     """
     a, b = mi.luminance(first), mi.luminance(second)
     own, other = dr.select(side == 0, a, b), dr.select(side == 0, b, a)
@@ -90,7 +90,7 @@ def difference(first: mi.Spectrum, second: mi.Spectrum, side: mi.UInt32) -> mi.S
 
 
 def part(value: mi.Spectrum, sign: int) -> mi.Spectrum:
-    """The positive or the negative part of a difference, each not negative: it is their difference."""
+    """The positive (``sign`` 1) or negative (-1) part of a difference, never below 0; ``value`` is their difference."""
     return dr.maximum(sign * value, 0)
 
 
@@ -100,7 +100,7 @@ def confidence_after(
     """(steps, H, W) float32: the confidence of a frame, at most ``cap``.
 
     It is 1 plus the confidence of the frame ``before``, weighted by areas; 0 for pairs that reach over the edge of the
-    film. It depends on motion only: what has no random numbers in it may decide what counts.
+    film. It depends on motion only, and not on random numbers, so weights by it cause no bias.
     """
     count, height, width = before.shape
     y, x = np.mgrid[:height, :width]
@@ -124,14 +124,14 @@ def confidence_after(
     return after.astype(np.float32)
 
 
-# The pixels that a pixel's area lies on when it is moved by a fraction, starting at the one of its own corner.
+# The pixels that a pixel's area overlaps after a move by a fraction of a pixel, relative to the first of them.
 CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 
 
 def pair_motions(motion: np.ndarray, depth: np.ndarray | None, steps: Iterable[tuple[int, int]]) -> np.ndarray:
-    """(steps, H, W, 2): the motion of a pixel, or of a pair of it and the pixel one step on: the nearer one's motion.
+    """(steps, H, W, 2): the motion of each pixel or pair of pixels. A pair has the motion of its nearer pixel.
 
-    NaN where that is not known, and for pairs that reach over the edge of the film.
+    NaN where motion is not known, and for pairs that reach over the edge of the film.
     """
     height, width = motion.shape[:2]
     found = np.full((0, height, width, 2), np.nan)

@@ -25,7 +25,7 @@ LANE_BYTES = 3072
 class Restir:
     """Renders frames one after the other, with ``spp`` independent chains for each pixel.
 
-    ``history``    the confidence that a reservoir can reach, in frames
+    ``history``    the largest confidence of a reservoir, in frames
     ``gradients``  "pairs": pairs of pixels have reservoirs of their own; "after": gradients come from the paths that
                    the pixels' reservoirs have kept, the paper's baseline
     ``roughness_threshold``  as for ``gpt``
@@ -65,11 +65,11 @@ class Restir:
         depth: np.ndarray | None,
         changed: tuple[mi.Scene, Sequence[Geometry]] | None = None,
     ) -> GradientFilm:
-        """Renders frame number ``index`` of the shot. If that is not the one after the last, history begins anew.
+        """Renders frame number ``index`` of the shot. If it does not follow the last one, history starts again.
 
-        ``motion`` and ``depth`` are as for ``History.next_frame``. ``changed`` is the scene in this frame, and where
-        its shapes are; None if only the camera has moved. The scene in ``changed`` must be another object than the
-        scene of the frame before, which must not have changed since.
+        ``motion`` and ``depth`` are as for ``History.next_frame``. ``changed`` is the scene of this frame with the
+        geometry of its shapes, or None if only the camera has moved. This scene must be another object than the scene
+        of the frame before, which must not have changed since.
         """
         stage = None if changed is None else self._stage(*changed)
         self.stage = stage or self.stage
@@ -99,7 +99,7 @@ class Restir:
         film.put("primal", mi.Color3f(frame.primal + direct))
         film.put("direct", mi.Color3f(direct))
         for name in ("dx", "dy"):
-            # The film takes the mean of both directions of a difference. Here there is one for both.
+            # The film takes the mean of both directions of a difference. Here a single value stands for both.
             film.put(f"{name}+", mi.Color3f(2 * getattr(frame, name)))
             film.put(f"{name}-", mi.Color3f(0 * frame.primal))
         film.put_all(features(self.stage.scene, self.stage.sensor, camera.random.clone(), ray))

@@ -26,7 +26,7 @@ class Stage:
 
 
 def check(plan: Plan) -> None:
-    """Raises NgptError where records would be wrong: other colours than RGB, lamps that hide from the camera, media."""
+    """Raises NgptError if records would be wrong: for colours other than RGB, hidden emitters, and media."""
     if not mi.is_rgb or mi.is_polarized:
         raise NgptError(f"restir: records hold RGB, and the variant is '{mi.variant()}'; use 'llvm_ad_rgb'")
     if plan.limits.hide_emitters:
@@ -45,7 +45,7 @@ class Pose:
 
     @contextmanager
     def of(self, sensor: mi.Sensor) -> Iterator[None]:
-        """The sensor in this pose, for a while. Evaluate all results within the block."""
+        """A context in which the sensor has this pose. All results must be evaluated within it."""
         now = Pose(sensor)
         now._to(self, sensor)
         try:
@@ -54,7 +54,7 @@ class Pose:
             self._to(now, sensor)
 
     def _to(self, other: Pose, sensor: mi.Sensor) -> None:
-        """From this pose, which the sensor has, to another."""
+        """Moves the sensor, which has this pose, to another pose."""
         changed = {k: v for k, v in other.values.items() if not np.array_equal(_numbers(v), _numbers(self.values[k]))}
         if changed:
             params = mi.traverse(sensor)

@@ -1,17 +1,17 @@
-r"""Candidates: one random walk, and the one of its paths that a reservoir keeps.
+r"""Candidates: a random walk, and the choice of one of its paths for a reservoir.
 
-A walk is Mitsuba's ``path``: emitter sampling and BSDF sampling at each vertex. Each emitter found is a path. One of
-them is chosen as the walk goes on, with probability in proportion to the luminance of its contribution C = f W, and
-its W becomes the sum of all these luminances over the luminance of its own f: C's mean over the choices is the walk's
-radiance. [Lin et al. 2022; Chao 1982 for the choice in one go]
+A walk is that of Mitsuba's ``path``: emitter sampling and BSDF sampling at each vertex. Each emitter found ends a path.
+One of these paths is chosen during the walk, with a probability in proportion to the luminance of f W, its contribution
+C. Its W becomes the sum of these luminances over all paths, divided by the luminance of its own f. So the mean of C
+over the choices is the radiance of the walk. [Lin et al. 2022; Chao 1982 for a choice in one pass]
 
     F       integrand of the walk up to vertex x, in the measures of ``data_gen.samplers.restir.record``
-    W       1 / density of the same, Russian roulette included
-    B       radiance behind rc, as part of ``L``: f / p of all vertices since
+    W       1 / density of the same, with Russian roulette
+    B       f / p of all vertices after rc, a factor of ``L``
     phase   BEFORE rc; AT rc; BEHIND it
 
-At joined events f and p belong to the material as a whole, not to the lobe that was sampled: ``evaluate`` knows no
-other. Their mixture is unbiased for ``blendbsdf`` too, whose samples give the density of only one part.
+At joined events f and p are those of the whole material, not of the sampled lobe, since ``evaluate`` has no others.
+This is unbiased for ``blendbsdf`` too, whose samples give the density of only one of its parts.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ _BEFORE, _AT, _BEHIND = 0, 1, 2
 class Candidate:
     """The path that was chosen: its record, its integrand ``f`` and its weight ``W``; f W estimates the radiance.
 
-    ``W`` is 0 where the walk met no light. ``L`` is the sum over all paths of the walk: what ``path`` would have given.
-    Emission that the camera sees directly is in neither.
+    ``W`` is 0 where the walk met no light. ``L`` is the sum over all paths of the walk, the estimate of ``path``. Both
+    leave out emission that the camera sees directly.
     """
 
     record: Record
@@ -63,7 +63,7 @@ class Candidate:
 
 @dataclass
 class _Choice:
-    """What differs between the paths of a walk; rc they share. Names as in ``Record``."""
+    """The fields of ``Record`` in which the paths of a walk differ. They share rc."""
 
     word: mi.UInt32
     f: mi.Spectrum  # integrand of the path
@@ -74,7 +74,7 @@ class _Choice:
 
 @dataclass
 class _Kept:
-    """The path that is chosen of those that were found so far."""
+    """The path that is chosen from those found so far."""
 
     chosen: _Choice
     total: mi.Float  # Σ of the luminances of all paths
@@ -92,7 +92,7 @@ class _Kept:
 
 @dataclass
 class _RC:
-    """The vertex where copies of the path reconnect, and how the walk goes on from there. Names as in ``Record``."""
+    """The vertex where copies of the path reconnect, and the direction from there. Names as in ``Record``."""
 
     P: mi.Point3f
     shape: mi.ShapePtr
@@ -106,7 +106,7 @@ class _RC:
 class _State:
     x: mi.SurfaceInteraction3f
     depth: mi.UInt32  # number of x, from 1 on
-    F: mi.Spectrum  # integrand up to x, or up to rc where that is before x
+    F: mi.Spectrum  # integrand up to x, or up to rc if that is before x
     W: mi.Float  # 1 / density of the same
     B: mi.Spectrum  # f / p of the vertices behind rc
     η: mi.Float  # product of the relative indices of refraction up to x, or since rc
@@ -114,17 +114,17 @@ class _State:
     replayed: mi.UInt32  # vertices before rc that a copy leaves by replay
     stuck: mi.Bool  # rc was left by a Dirac delta or a hole
     rc: _RC
-    walks: mi.Bool  # x was reached
+    walks: mi.Bool  # whether x was reached
 
 
 def choices(seed: int, camera: CameraSamples, sample: mi.UInt32) -> mi.Sampler:
-    """Random numbers for the choices of reservoirs, independent of those that a replay draws again."""
+    """Random numbers for the choices of reservoirs, independent of those for paths."""
     own = int(np.random.SeedSequence([seed, 1]).generate_state(1, np.uint64)[0])
     return sample_streams(own, camera.pixel, sample)
 
 
 def walk(stage: Stage, camera: CameraSamples, sample: mi.UInt32, choice) -> Candidate:
-    """A candidate for each camera sample, which has number ``sample``; ``choice`` draws what chooses among paths."""
+    """A candidate for each camera sample, of number ``sample``. ``choice`` has the random numbers for choices."""
     ray, importance, _ = camera.rays()
     none = empty(dr.width(camera.pixel))
     start = _State(
@@ -162,7 +162,7 @@ def walk(stage: Stage, camera: CameraSamples, sample: mi.UInt32, choice) -> Cand
 
 @dr.syntax
 def _walk(scene, plan: Plan, random, choice, at: _State, kept: _Kept) -> tuple[_RC, _Kept]:
-    """The whole walk: where copies of its paths reconnect, and the one that is kept."""
+    """The whole walk: returns rc, where copies of its paths reconnect, and the chosen path."""
     active = at.x.is_valid() & (at.depth < plan.limits.max_depth)
     while active:
         numbers = draw(random)
@@ -175,7 +175,7 @@ def _walk(scene, plan: Plan, random, choice, at: _State, kept: _Kept) -> tuple[_
 
 
 def _to_light(scene, plan: Plan, at: _State, numbers: Numbers) -> _Choice:
-    """The path that ends at an emitter which is sampled at x."""
+    """The path that ends at an emitter sampled at x."""
     x, bsdf = at.x, at.x.bsdf()
     before, at_rc, behind = at.phase == _BEFORE, at.phase == _AT, at.phase == _BEHIND
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -183,7 +183,7 @@ def _to_light(scene, plan: Plan, at: _State, numbers: Numbers) -> _Choice:
     lit &= light.pdf != 0
     f, p = evaluate(bsdf, x, x.to_local(light.d), lit)
     fm = f * light_mis(light.delta, light.pdf, p)
-    # What kind of path that is
+    # The kind of path
     kind_at_rc = dr.select(light.delta, mi.UInt32(SUFFIX), mi.UInt32(RC_LIGHT))
     kind_behind = dr.select(at.stuck, mi.UInt32(STUCK), mi.UInt32(SUFFIX))
     kind = dr.select(before, mi.UInt32(LIGHT), dr.select(at_rc, kind_at_rc, kind_behind))
@@ -204,27 +204,27 @@ def _onward(scene, plan: Plan, at: _State, numbers: Numbers, active: mi.Bool) ->
     # ------------------------- The event -------------------------
     event = sample_event(scene, plan, x, numbers, active)
     x1 = event.x1
-    joins = before & event.joined  # x1 is rc,
-    there = joins & x1.is_valid()  # on a surface
-    # A ray starts beside its surface, to leave it: what it meets is seen from x in a direction that differs a bit.
+    joins = before & event.joined  # whether x1 is rc,
+    there = joins & x1.is_valid()  # and on a surface
+    # A ray starts slightly off its surface, so the direction from x to its hit differs a bit from that of the ray.
     d = dr.select(there, dr.normalize(x1.p - x.p), event.ray.d)
     x1 = seen_from(x1, d)
     f, p = evaluate(x.bsdf(), x, dr.select(there, x.to_local(d), event.wo), event.kind == SMOOTH)
-    follows = at_rc & (event.kind == SMOOTH) & (p > 0)  # a copy can leave rc along d
+    follows = at_rc & (event.kind == SMOOTH) & (p > 0)  # whether a copy can leave rc along d
     stuck = at.stuck | (at_rc & ~follows)
-    # The two steps whose directions have a density in solid angle; in others f is f / p.
+    # The directions of these two steps have a density in solid angle. In other steps the integrand is f / p.
     density = joins | follows
     f_p = dr.select(density, f / p, event.f_p)
     η = dr.select(event.found, at.η * event.η, at.η)
 
     # ---------------------- Russian roulette ---------------------
-    # Behind rc it depends only on what is behind rc, so that it can be played again from there.
+    # Behind rc it depends only on the path behind rc, so that it can be repeated from there.
     throughput = dr.max(dr.select(behind, at.B, at.F * at.W) * f_p)
     q = roulette(throughput, at.depth >= plan.limits.rr_depth, η)
-    # Where a join has no density, after that correction, there is no such path.
+    # If a join has density 0 for the corrected direction, there is no such path.
     walks = (throughput > 0) & (numbers.survival < q) & event.found & (~joins | (p > 0))
     survival = dr.select(walks, dr.rcp(q), 0)
-    # Up to rc survival belongs to the density, behind it to B.
+    # Up to rc, survival belongs to the density; behind it, to B.
     W = dr.select(behind, at.W, at.W * survival * dr.select(density, dr.rcp(p), 1))
     F = dr.select(behind, at.F, at.F * dr.select(density, f, event.f_p))
     B = dr.select(behind, at.B * f_p * survival, at.B)
@@ -250,7 +250,7 @@ def _onward(scene, plan: Plan, at: _State, numbers: Numbers, active: mi.Bool) ->
         word=word_of(kind, left, dr.select(before, 0, at.depth - 1 - replayed), False),
         f=dr.select(walks, F * B * Le * m, 0),
         w=rc.w,
-        # Behind rc m is a part of L; at rc it is the other paths' own.
+        # Behind rc, m is a factor of L. At rc it is not, since each copy computes its own m.
         L=dr.select(behind, B * Le * m, Le),
         p_light=dr.select(follows, p_light, 0),
     )
@@ -265,7 +265,7 @@ DRAWN = 6
 
 @dataclass
 class Numbers:
-    """Random numbers of a vertex: drawn whether used or not, so that a replay finds its own."""
+    """The random numbers of a vertex. All are drawn, used or not, so that a replay gets the same ones."""
 
     light: mi.Point2f
     lobe: mi.Float
@@ -290,11 +290,11 @@ class Event:
     ray: mi.Ray3f
     hit: mi.PreliminaryIntersection3f
     x1: mi.SurfaceInteraction3f
-    joined: mi.Bool  # x1 is where copies of the path reconnect, if none before it is
+    joined: mi.Bool  # whether copies of the path reconnect at x1, unless they do so before
 
 
 def sample_event(scene: mi.Scene, plan: Plan, x: mi.SurfaceInteraction3f, numbers: Numbers, active: mi.Bool) -> Event:
-    """The event of these random ``numbers``, and where it leads: the same for the same vertex."""
+    """The event that these random ``numbers`` sample at ``x``, and the vertex to which it leads."""
     bsdf = x.bsdf()
     sample, f_p = bsdf.sample(mi.BSDFContext(), x, numbers.lobe, numbers.direction, active)
     found = active & (sample.pdf > 0) & (dr.max(f_p) > 0)
@@ -303,8 +303,8 @@ def sample_event(scene: mi.Scene, plan: Plan, x: mi.SurfaceInteraction3f, number
     hit = scene.ray_intersect_preliminary(ray, active=found)
     x1 = hit.compute_surface_interaction(ray)
     rough = ~x1.is_valid() | plan.materials.connectable(x1.bsdf())
-    # Both vertices, so that a path and its copy agree on where to reconnect. A record has no room for the instance that
-    # a shape is part of: such vertices are replayed.
+    # Both vertices count, so that a path and its copy agree on where to reconnect. A record has no room for the
+    # instance of a shape, so vertices on instances are replayed.
     joined = (kind == SMOOTH) & plan.materials.connectable(bsdf) & rough
     joined &= hit.instance == None  # noqa: E711 - a comparison of arrays of pointers
     return Event(found, kind, sample.wo, sample.pdf, sample.eta, dr.select(found, f_p, 0), ray, hit, x1, joined)

@@ -1,1 +1,1 @@
-"""Twins to read before the integrators that do it fast."""
+"""Short versions of ``gpt``, to be read before the fast one."""

@@ -15,7 +15,7 @@ register(
         },
         loses=THROUGH_HOLES,
         rank=9,
-        lane_bytes=320,  # five paths that are recorded as one function: all that they return is there at once
+        lane_bytes=320,  # five paths are recorded as one function, so all their results are in memory together
     )
 )
 register(

@@ -1,15 +1,15 @@
 r"""The teaching gradient-domain path tracer: Algorithm 1 of the survey, random sequence replay.
 
-It is here to be read, and as a check on faster samplers: every difference it takes is between two complete path-traced
-samples, so there is nothing to go wrong, but also nothing saved. One sample costs five.
+It is here to be read, and to check faster samplers. Each difference is between two complete path-traced samples, so
+little can go wrong, but no work is shared: one sample costs five.
 
     L               radiance of a path, a function of its random numbers u and its position on the film
-    base, offset    the path through pixel p, and the path of the same u through a neighbour q of p
-    Δ               L(u, q) - L(u, p): small where equal random numbers give similar paths, so of low variance
+    base, offset    the path through pixel p, and the path with the same u through a neighbour q of p
+    Δ               L(u, q) - L(u, p): small, with low variance, where equal random numbers give similar paths
 
-The density of u is the same for both paths, hence the Jacobian of the shift and the densities cancel (survey, eq. 6-8),
-and the difference needs no more than Mitsuba's own estimator, called twice. Both directions of a difference, p to q and
-q to p, are sampled and weighted 1/2 each.
+The density of u is the same for both paths, so the Jacobian of the shift and the densities cancel (survey, eq. 6-8).
+The difference only needs two calls of Mitsuba's own estimator. Both directions of a difference, p to q and q to p, are
+sampled, each with weight 1/2.
 
 [Hua et al. 2019, "A Survey on Gradient-Domain Rendering", section 2.3 and Algorithm 1]
 """
@@ -36,8 +36,8 @@ from data_gen.scenes.load import reference_integrator
 class GPTBasic(GradientIntegrator):
     """Gradient-domain path tracing by random sequence replay, around any Mitsuba integrator that samples radiance.
 
-    Plugin ``gpt_basic``. Its only parameter is a nested integrator (default: ``path``), which decides what transport
-    is rendered. Not meant for production: shifted paths part for good at the first reflection that differs.
+    Plugin ``gpt_basic``. Its only parameter is a nested integrator (default: ``path``), which determines the transport.
+    Not meant for production: after the first reflection that differs, shifted paths have nothing in common.
     """
 
     nested = True
@@ -72,13 +72,13 @@ class GPTBasic(GradientIntegrator):
         return layers | features(scene, camera.sensor, camera.random.clone(), ray)
 
     def radiance(self, scene, estimate, camera: CameraSamples, shift) -> tuple[mi.Color3f, mi.Color3f, mi.Bool]:
-        """L(u, p + shift) without, and with only, the emission seen directly; and whether p + shift is on the film.
+        """L(u, p + shift) without directly seen emission, that emission, and whether p + shift is on the film.
 
-        Direct emission has little noise of its own, but its edges would be the strongest gradients of the image.
+        Direct emission has little noise, but its edges would be the strongest gradients of the image.
         """
         ray, importance, inside = camera.rays(shift)
         medium = camera.sensor.get_medium()
-        # The clone starts from the same state each time: same u.
+        # Each clone starts from the same state, so u is the same.
         L = estimate(camera.random.clone(), ray, medium, inside)
         Le = emission_seen(scene, self.integrator, medium, ray, inside)
         L, Le = to_rgb((L - Le) * importance, ray.wavelengths), to_rgb(Le * importance, ray.wavelengths)

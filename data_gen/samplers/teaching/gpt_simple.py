@@ -1,14 +1,15 @@
-r"""The gradient-domain path tracer to be read: ``gpt`` where every shift is a reconnection.
+r"""The gradient-domain path tracer to be read: ``gpt`` with reconnection as the only shift.
 
 It renders scenes whose materials all scatter widely. There an offset path always goes straight from its own first
-vertex to the second vertex of its base path, so that the first two steps can be written down one after the other. What
-``gpt`` does beyond that (replay, half-vectors, ghosts, shared emitters, kernels cut to a scene) is left out. Functions
-and symbols (x, y, L, Le, β, J, p, r, w, m, Δ, a) are as in ``data_gen.samplers.gpt.integrator``, to be read side by
-side. R is the radiance that reaches a settled path, and r is 0 once a path is rejected.
+vertex to the second vertex of its base path, so the code for the first two steps has no loop. The other techniques of
+``gpt`` (replay, half-vectors, ghosts, shared emitters, specialised kernels) are left out. Functions and symbols (x, y,
+L, Le, β, J, p, r, w, m, Δ, a) are as in ``data_gen.samplers.gpt.integrator``, to be read side by side. R is the
+radiance that reaches a settled path. r is 0 after a path is rejected.
 
-An offset path is *apart* from its base path at the first vertex, *joined* to it at the second (it shares the vertex,
-but arrives there from elsewhere), and *settled* from the third on, where both are one path. A rejected one needs no
-code of its own: with β' = 0 and r = 0, the formulas give w = 1 and Δ = -2 C(x) / p(x), as they should.
+An offset path is *apart* from its base path at the first vertex. It is *joined* to it at the second, which it shares,
+but where it arrives from another direction. It is *settled* from the third vertex on, where both are the same path. A
+rejected path needs no extra code: with β' = 0 and r = 0, the formulas give w = 1 and Δ = -2 C(x) / p(x), as they
+should.
 
 [Kettunen et al. 2015, "Gradient-Domain Path Tracing"; Hua et al. 2019, "A Survey on Gradient-Domain Rendering",
 sections 3.3, 3.5 and 4.1]
@@ -41,10 +42,10 @@ class GPTSimple(GradientIntegrator):
     """Gradient-domain path tracing with reconnection only, for surfaces that scatter widely.
 
     Plugin ``gpt_simple``. Parameters, as for Mitsuba's ``path``: ``max_depth`` (default -1: no limit) and ``rr_depth``
-    (5, and from the third vertex on at the earliest).
+    (5; Russian roulette never starts before the third vertex).
 
-    Not handled: mirrors, glass, polish and holes, media, hidden emitters and polarised variants. Media are not seen;
-    for the others rendering raises NgptError.
+    Not handled: mirrors, glass, polish, holes, media, hidden emitters and polarised variants. Media are ignored. For
+    the others rendering raises NgptError.
     """
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
@@ -89,13 +90,13 @@ def trace(scene, limits: Limits, random, ray, importance, shifted):
 
 @dr.syntax
 def walk(scene, limits: Limits, random, x):
-    """R, the radiance that reaches the second vertex from the third, ``x``."""
+    """R, the radiance that reaches the second vertex from ``x``, the third."""
     R, β, depth = mi.Spectrum(0), mi.Spectrum(1), mi.UInt32(3)
     active = x.is_valid() & (depth < limits.max_depth)
     while dr.hint(active, label="gpt_simple"):
         step = base_step(scene, random, x, β, active)
         R += β * step.L_light + step.β1 * step.L_bsdf
-        # Roulette by the throughput since the second vertex, which all five paths share: none is starved.
+        # Roulette by the throughput since the second vertex, which all five paths share, so it suits each of them.
         q = roulette(dr.max(step.β1), depth >= limits.rr_depth)
         survives = random.next_1d() < q
         x, β = step.x1, step.β1 / q
@@ -106,7 +107,7 @@ def walk(scene, limits: Limits, random, x):
 
 @dataclass
 class Step:
-    """What the base path does at its current vertex x; x1 is the next one."""
+    """A step of the base path from its current vertex x to the next vertex x1."""
 
     x: mi.SurfaceInteraction3f
     β: mi.Spectrum
@@ -117,29 +118,29 @@ class Step:
     # BSDF sampling
     wo: mi.Vector3f
     p: mi.Float
-    goes_on: mi.Bool  # there is a next vertex, or an escape
+    goes_on: mi.Bool  # whether there is a next vertex, or an escape
     β1: mi.Spectrum  # β f / p
     x1: mi.SurfaceInteraction3f
     Le: mi.Spectrum  # emitted at x1 toward x
     p_light: mi.Float  # density with which emitter sampling would have found x1
     L_bsdf: mi.Spectrum  # m Le
-    smooth: mi.Bool  # no mirror, no hole
-    hole: mi.Bool  # the path goes on as if nothing were there
-    hit: mi.PreliminaryIntersection3f  # x1 before all of it is known
+    smooth: mi.Bool  # whether the event is no mirror and no hole
+    hole: mi.Bool  # whether the path passes a hole
+    hit: mi.PreliminaryIntersection3f  # the hit at x1
 
 
 @dataclass
 class Offset:
     """The state of one offset path at the current vertex of its base path."""
 
-    y: mi.SurfaceInteraction3f  # apart: its own vertex; joined: the shared one, reached from its own
+    y: mi.SurfaceInteraction3f  # apart: its own vertex; joined: the shared vertex, reached from its own
     β: mi.Spectrum
     r: mi.Float
     Δ: mi.Spectrum
 
 
 def base_step(scene, random, x, β, active) -> Step:
-    """Samples an emitter and the next vertex from vertex x; nothing where not ``active``."""
+    """Samples an emitter and the next vertex from vertex x, where ``active``."""
     # ---------------------- Emitter sampling ----------------------
     u_light = random.next_2d()
     light = sample_light(scene, x, u_light, active)
@@ -161,47 +162,47 @@ def base_step(scene, random, x, β, active) -> Step:
 
 
 def reflected(light: LightSample, x) -> mi.Spectrum:
-    """f m Le V / p of a sampled emitter at vertex x: m is 1 where BSDF sampling cannot find it."""
+    """f m Le V / p of a sampled emitter at vertex x. m is 1 if BSDF sampling cannot find the emitter."""
     f, p = evaluate(x.bsdf(), x, x.to_local(light.d))
     return f * light.weight * dr.select(light.delta, 1, mis_weight(light.p, p))
 
 
 def start(scene, active, ray, importance) -> Offset:
-    """An offset path up to its first vertex; rejected where either path has none, as it is from the other side."""
+    """An offset path up to its first vertex. If either path has no such vertex it is rejected, from both sides."""
     y = scene.ray_intersect(mi.Ray3f(ray))
     lives = active & y.is_valid()
     return Offset(y, β=dr.select(lives, importance, 0), r=dr.select(lives, mi.Float(1), 0), Δ=mi.Spectrum(0))
 
 
 def step_apart(scene, step: Step, path: Offset) -> Offset:
-    """A step from the offset path's own vertex y, to the base path's next vertex."""
+    """The step from the offset path's own vertex y to the base path's next vertex."""
     x, x1, y = step.x, step.x1, path.y
 
     # --------------- Emitter sampling: replay ---------------
-    # The same random numbers have the same density here and there, so r stays 1 (survey, eq. 6).
+    # The same random numbers have the same density at x and at y, so r stays 1 (survey, eq. 6).
     light = sample_light(scene, y, step.u_light, path.r > 0)
     Δ = gradient_weight(path.r, True) * (path.β * reflected(light, y) - step.β * step.L_light)
 
     # -------------- BSDF sampling: reconnection -------------
-    # An escape counts as a vertex at infinity: the same direction leads there, with J = 1.
+    # An escape counts as a vertex at infinity, to which the same direction leads, with J = 1.
     reaches = x1.is_valid()
     direction = dr.select(reaches, dr.normalize(x1.p - y.p), x.to_world(step.wo))
     shadow = dr.select(reaches, y.spawn_ray_to(x1.p), y.spawn_ray(direction))
     J = dr.select(reaches, reconnection_jacobian(x.p, y.p, x1.p, x1.n), 1)
     f, p = evaluate(y.bsdf(), y, y.to_local(direction))
     r = path.r * J * p / step.p
-    # Where y cannot see x1 no path is sampled that way, none is shifted back, and w is 1 (survey, section 3.5).
+    # If y cannot see x1, no path goes that way, so none is shifted back, and w is 1 (survey, section 3.5).
     good = step.goes_on & (p > 0) & dr.isfinite(r) & ~scene.ray_test(shadow, step.goes_on & (path.r > 0))
     r, β = dr.select(good, r, 0), dr.select(good, path.β * f * (J / step.p), 0)
     y1 = seen_from(x1, direction)
     Le, p_light = emission(scene, y1, y, good, good)
-    # From here on the pair has another r, and another weight (survey, eq. 17).
+    # For this emission and all later light the pair has the new r, and a new weight (survey, eq. 17).
     Δ += gradient_weight(r, True) * (β * Le * mis_weight(p, p_light) - step.β1 * step.L_bsdf)
     return Offset(y1, β, r, Δ)
 
 
 def step_joined(step: Step, path: Offset) -> tuple[mi.Spectrum, mi.Spectrum]:
-    """A step from the shared vertex, to which the offset path has come from elsewhere: Δ so far, and a."""
+    """The step from the shared vertex, where the offset path arrives from another direction. Returns Δ so far and a."""
     y = path.y
 
     # ---------- Emitter sampling: the same emitter ----------
@@ -209,19 +210,19 @@ def step_joined(step: Step, path: Offset) -> tuple[mi.Spectrum, mi.Spectrum]:
     Δ = path.Δ + w2 * (path.β * reflected(step.light, y) - step.β * step.L_light)
 
     # ---------- BSDF sampling: the same direction -----------
-    # Vertex and direction are the same, so J = 1; but the density of that direction is another for another arrival.
+    # Vertex and direction are the same, so J = 1. But the density of that direction depends on the direction of
+    # arrival.
     f, p = evaluate(y.bsdf(), y, step.wo)
     good = step.goes_on & (p > 0)
     r, β = dr.select(good, path.r * p / step.p, 0), dr.select(good, path.β * f / step.p, 0)
     w2 = gradient_weight(r, True)
     Δ += w2 * (β * step.Le * mis_weight(p, step.p_light) - step.β1 * step.L_bsdf)
-    # All densities from here on are the same for both paths: r and w stay, and of C(y) - C(x) all but β is common.
+    # All later densities are the same for both paths, so r and w stay the same, and C(y) and C(x) differ only by β.
     return Δ, w2 * (β - step.β1)
 
 
 def refuse(scene) -> None:
-    """Raises NgptError for materials that paths cannot be reconnected at; also for polish, which no description
-    shows."""
+    """Raises NgptError for materials at which paths cannot be reconnected, also for polish, which rules cannot see."""
     if materials := Materials(scene, CONNECTABLE.default).unconnectable:
         more = f" and {len(materials) - 3} more" if len(materials) > 3 else ""
         reason = f"paths cannot be reconnected at {', '.join(materials[:3])}{more}"

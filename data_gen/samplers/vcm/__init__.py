@@ -1,1 +1,1 @@
-"""Vertex connection and merging: paths from both ends that are joined, and photons gathered, under one weight."""
+"""Vertex connection and merging: connections of paths from both ends, and photons, combined by MIS weights."""

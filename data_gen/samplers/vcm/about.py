@@ -3,10 +3,10 @@
 from data_gen.samplers.registry import Sampler, register
 from data_gen.samplers.shared import BOTH_ENDS, GATHERING, IN_MIRRORS, first_radius, joined_depth, spectra
 
-# Light through glass and back has long paths, which the camera finds only by rare and bright ones. 16 vertices of a
-# light path are kept.
+# Light that goes through glass and back has long paths, which camera paths find rarely, as bright dots. So up to 16
+# vertices of a light path are kept.
 _OPTIONS = {"radius": first_radius(2.0), "joined_depth": joined_depth(17), "roughness_threshold": GATHERING}
-_NOTES = {"transport": "found from both ends and by photons; blurred where by photons", "mirrors": IN_MIRRORS}
+_NOTES = {"transport": "found from both ends and by photons, which blur", "mirrors": IN_MIRRORS}
 
 register(
     Sampler(

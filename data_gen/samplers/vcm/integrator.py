@@ -1,14 +1,14 @@
-r"""Vertex connection and merging: ``bdpt`` and ``ppm`` in one, and every path of light under one weight.
+r"""Vertex connection and merging: ``bdpt`` and ``ppm`` in one sampler, combined by MIS weights.
 
-    s, t        vertices of a path that come from the light, and from the camera
+    s, t        the number of vertices of a path that come from the light, and from the camera
     z, y        vertices of the camera path and of light paths
-    r, η        radius of a pass, and π r² N; N: light paths of the pass
+    r, η        the radius of a pass, and π r² N with N light paths in the pass
 
-A pass has one camera sample and one light path for each pixel. Light paths are traced once: their vertices are
-connected to the camera (splats), kept in a map, connected to the camera path of the same sample (one of them,
-``bdpt.camera_path``), and gathered at all camera paths, within the radius, where materials scatter widely. Only those
-that light reaches from mirrors or clear glass are gathered (docs/samplers/photons.md). Their light is the layer
-``caustic`` (``ngpt.layers.GATHERED``).
+A pass has one camera sample and one light path for each pixel. Light paths are traced once. Their vertices are
+connected to the camera (splats) and kept in a map. One of them is connected to each vertex of the same sample's camera
+path (``bdpt.camera_path``). They are also gathered as photons, within the radius, at the vertices of all camera paths
+where materials scatter widely. Only vertices that light reaches from mirrors or clear glass are gathered
+(docs/samplers/photons.md). Their light is the layer ``caustic`` (``ngpt.layers.GATHERED``).
 
 [Georgiev et al. 2012, "Light Transport Simulation with Vertex Connection and Merging"; Hachisuka et al. 2012, "A Path
 Space Extension for Robust Light Transport Simulation"]
@@ -39,19 +39,19 @@ from data_gen.samplers.photons.map.radius import number_of, pixel_width, shrunk
 from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.vcm.merging import VERTEX_BYTES, Keeper, Map, Merging, Photons, eta
 
-# Bytes of a camera sample, its features and its light path, beside the map: what was seen, and some more
+# Bytes of a camera sample, its features and its light path, without the map: measured, with a margin
 SAMPLE_BYTES = 1536
 
 
 class VCM(BDPT):
     """Vertex connection and merging, for surfaces; no gradients.
 
-    Plugin ``vcm``, with the parameters of Mitsuba's ``path`` and the options of its entry. Biased, and consistent, as
-    ``ppm``, but only where light comes through glass or by mirrors. Not handled: media, polarised and spectral
+    Plugin ``vcm``, with the parameters of Mitsuba's ``path`` and the options of its entry. Biased and consistent, as
+    ``ppm``, but only for light that comes through glass or by mirrors. Not handled: media, polarised and spectral
     variants, and what ``bdpt`` does not handle. Rendering raises NgptError for them.
     """
 
-    # What becomes of light paths that end at the camera
+    # The visitor that receives light paths that end at the camera
     splatter = Splatter
     sample_bytes = SAMPLE_BYTES
 
@@ -61,13 +61,13 @@ class VCM(BDPT):
 
     @property
     def lane_bytes(self) -> int:
-        """Bytes for a camera sample, with all that its light path may leave in the map."""
+        """Bytes of a camera sample, with the largest map of its light path."""
         # Dr.Jit gives each array the next power of two of bytes.
         places = 1 << (self.vertices - 1).bit_length() if self.vertices else 0
         return self.sample_bytes + places * VERTEX_BYTES
 
     def instead(self, lane_bytes: int) -> str:
-        """The advice, besides a smaller image, that fits a camera sample into ``lane_bytes``; "" if there is none."""
+        """Advice, besides a smaller image, that makes a camera sample fit into ``lane_bytes``; "" if there is none."""
         places = (lane_bytes - self.sample_bytes) // VERTEX_BYTES
         fits = 1 + (1 << (places.bit_length() - 1)) if places > 0 else 0
         return f", or no more than -O joined_depth={fits}" if fits else ""
@@ -78,7 +78,7 @@ class VCM(BDPT):
         return Passes(self, world, pixel_width(scene, sensor))
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        """Traces one light path and one camera path for each camera sample; a pixel has one sample."""
+        """Traces one light path and one camera path for each camera sample. Each pixel has one sample."""
         world, frozen, sight, photons = passes.world, passes.frozen, Sight.of(camera), None
         dr.eval(sight.ray, sight.importance)
         values = frozen(features, world.scene, camera.sensor, camera.random.clone(), sight.ray)
@@ -95,8 +95,8 @@ class VCM(BDPT):
     def light_pass(
         self, passes: Passes, sight: Sight, camera: CameraSamples, splats: Splats
     ) -> tuple[Photons, Sight, Any]:
-        """The light paths of a pass, whose ends at the camera are splatted: their vertices as photons, the
-        ``sight`` with random numbers to go on by, and the splatter's state."""
+        """Traces the light paths of a pass and splats their connections to the camera. Returns the vertices as photons,
+        the ``sight`` with the remaining random numbers, and the splatter's state."""
         n, radius = dr.width(sight.ray), self.options["radius"] * passes.width * shrunk(camera.first)
         η, empty = dr.opaque(mi.Float, eta(radius, n)), Map.empty(n, self.vertices)
         kept, numbers, state, sums = passes.frozen(self.light_paths, passes.world, sight, η, empty, sums=splats.zeros)
@@ -106,7 +106,8 @@ class VCM(BDPT):
         return photons, replace(sight, random=type(sight.random)(numbers)), state
 
     def light_paths(self, world: World, sight: Sight, η: mi.Float, empty: Map, sums: tuple) -> tuple:
-        """Fills the ``empty`` map and the ``sums`` of splats; with them random numbers, and the splatter's state."""
+        """Fills the ``empty`` map and the ``sums`` of splats. Returns the map, the state of the random numbers, the
+        splatter's state, and the sums."""
         splatter = self.splatter(Splats.on(sight.eye.pixels, 3, sums), sight.ray, sight.importance)
         path, random, state = light_path(self.plan(world, η=η), sight, Keeper(splatter, η, empty))
         return replace(empty, count=path.count), random.state, state, sums
@@ -114,7 +115,7 @@ class VCM(BDPT):
     # ------------------------ Camera paths: joins, and merges ------------------------
 
     def camera_pass(self, world: World, sight: Sight, photons: Photons | None) -> tuple:
-        """L, Le and L_merged of camera paths, joined to their own light paths and to the ``photons`` of all."""
+        """L, Le and L_merged of camera paths, joined to their own light paths and to all ``photons``."""
         sight = replace(sight, random=sight.random.clone())
         if photons is None:
             return camera_path(self.plan(world), sight, None)

@@ -1,8 +1,8 @@
-"""What is kept of the light paths of a pass, as a map; and merging: photons of it that are gathered at a camera path.
+"""The map of the light paths of a pass, and merging: gathering its photons at camera paths.
 
 All photons within the radius r are gathered at z, the last vertex of a camera path, whichever light path they belong
-to. Each ends a path of its own there. The density of that path is η times the density of connecting z to its light path
-at a given place; η = π r² N. So ``mis`` has a weight for it beside all connections of that path.
+to. Each of them completes a path. The density of this path is η = π r² N times the product of the densities of its
+camera path and its light path. So ``mis`` can weight it against all connections of the same path.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.radius import spread
 from data_gen.samplers.photons.map.vertices import Photon, faces
 
-# Bytes of a vertex: 23 words of a record and whether it is a photon, and 12 words of a grid that is made.
+# Bytes of a vertex: 23 words of a record, one for whether it is a photon, and 12 words while the grid is made.
 VERTEX_BYTES = (23 + 1 + 12) * 4
 
 
 @dataclass
 class Map:
-    """The vertices of light paths: the vertex at depth d of path i has the place i ``size`` + d - 1."""
+    """The vertices of light paths. The vertex at depth d of path i is at place i * ``size`` + d - 1."""
 
     vertices: Any  # ``record_class``
     photon: mi.UInt32  # 1 where photons are gathered
     first: mi.UInt32  # the place of each path's first vertex
-    count: mi.UInt32  # how many vertices each path has
+    count: mi.UInt32  # the number of vertices of each path
 
     @classmethod
     def empty(cls, paths: int, size: int) -> Map:
         """An empty map for this number of light paths of at most ``size`` vertices."""
         n, kind = paths * size, record_class(mi.variant())
         vertices = kind(*(dr.empty(t, n) for t in get_type_hints(kind, {"mi": mi}).values()))
-        # Where nothing was kept
+        # 0 says that nothing is kept there
         vertices.depth = dr.zeros(mi.UInt32, n)
         first = dr.arange(mi.UInt32, paths) * dr.opaque(mi.UInt32, size)
         found = cls(vertices, dr.zeros(mi.UInt32, n), first, dr.zeros(mi.UInt32, paths))
@@ -53,7 +53,7 @@ class Map:
 
 
 class Reader:
-    """The vertices of each lane's own light path, as ``bdpt`` reads them: no part of a loop's state."""
+    """Reads the vertices of each lane's own light path, as ``bdpt`` does. It is no part of a loop's state."""
 
     def __init__(self, kept: Map):
         self.kept = kept
@@ -64,7 +64,7 @@ class Reader:
 
 
 class Keeper:
-    """Splats what a light path brings to the camera, as ``bdpt`` does, and keeps its vertices in a map."""
+    """Splats the connections of a light path to the camera, as ``bdpt`` does, and keeps its vertices in a map."""
 
     def __init__(self, splatter: Visitor, η: mi.Float, kept: Map):
         self.splatter, self.η, self.kept = splatter, η, kept
@@ -76,7 +76,7 @@ class Keeper:
         place, here = self.kept.first + seen.y.depth - 1, seen.kept.depth > 0
         for target, value in zip(_values(self.kept.vertices), _values(seen.kept), strict=True):
             dr.scatter(target, value, place, here)
-        # As ``Plan.known`` has it
+        # ``Plan.known`` has set vcm to η there.
         photon = dr.select(seen.y.end.vcm == self.η, mi.UInt32(1), 0)
         dr.scatter(self.kept.photon, photon, place, here)
         return self.splatter.sees(state, seen)
@@ -84,7 +84,7 @@ class Keeper:
 
 @dataclass(init=False)
 class Photons:
-    """The photons of a map, gathered within ``radius``; ``paths`` light paths have brought them."""
+    """The photons of a map of ``paths`` light paths, to be gathered within ``radius``."""
 
     kept: Map
     grid: Grid
@@ -102,7 +102,7 @@ class Photons:
 
 
 class Merging:
-    """Merges camera paths of at most ``plan.longest`` edges, photons and theirs together; as ``bdpt`` asks for it."""
+    """Merges camera paths with photons, if both have at most ``plan.longest`` edges together: ``bdpt``'s ``Merges``."""
 
     def __init__(self, photons: Photons, plan: Plan):
         self.photons, self.plan, self.materials, self.longest = photons, plan, plan.materials, plan.longest
@@ -122,11 +122,11 @@ class Merging:
         return photons.K * L * self.spread(z.si, active & (dr.max(L) > 0))
 
     def spread(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
-        """Factor of the kernel K at a vertex: near edges there is less area. MIS weights do not change."""
+        """A factor of the kernel K at a vertex, since there is less area near edges. MIS weights do not include it."""
         return spread(self.plan, x, self.photons.radius2, self.photons.number, active)
 
     def photon(self, i: mi.UInt32, z: Vertex, near: mi.Bool) -> tuple[Photon, Partial, mi.Bool]:
-        """The photon of place ``i`` in the grid, ``near`` to z; its light path's end; and whether it is gathered."""
+        """The photon at place ``i`` of the grid, its partial sums, and whether it is gathered at ``z``."""
         grid, vertices = self.photons.grid, self.photons.kept.vertices
         j = dr.gather(mi.UInt32, grid.index, i, near)
 
@@ -139,15 +139,15 @@ class Merging:
         return found, Partial(its("vcm"), its("vc")), gathered
 
     def merged(self, z: Vertex, bsdf: mi.BSDFPtr, photon: Photon, end: Partial, active) -> tuple[mi.Spectrum, mi.Float]:
-        """What a ``photon`` brings to the camera by ``z``, without the kernel; ``end`` is its light path's."""
+        """f / p of the path that a ``photon`` completes at ``z``, without the kernel, and ``others``."""
         g, p, q = brought(photon, z.si, bsdf, active)
         return z.β * g, mis.others_merged(z.end, q, end, p, self.photons.η)
 
 
 def brought(photon: Photon, si, bsdf: mi.BSDFPtr, active) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
-    """What a ``photon`` adds to radiance at ``si``, without the kernel; p of the direction to the light, q swapped."""
+    """The radiance that a ``photon`` adds at ``si``, without the kernel; p of the direction to the light; q."""
     f, p, q = evaluate(RADIANCE, si, bsdf, si.to_local(-photon.d), active)
-    # f has a cosine; the photons lie as densely as the geometric one is large.
+    # f contains the shading cosine, but the density of photons follows the geometric one.
     return f * photon.Φ / dr.abs(dr.dot(photon.n, photon.d)), p, q
 
 

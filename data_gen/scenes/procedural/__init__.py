@@ -1,1 +1,1 @@
-"""Scenes made from a seed: rooms, things, materials, textures."""
+"""Scenes made from a seed: rooms, things, materials and textures."""

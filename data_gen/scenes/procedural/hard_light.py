@@ -1,4 +1,4 @@
-"""Light that paths find hard, added to a scene: openings between two rooms, lamps of unlike power, mirrors and panes.
+"""Adds light that is hard to find: openings between two rooms, lamps of very different power, mirrors, panes.
 
 partition   a wall across a room, with a doorway, a door left ajar, a crack, slats, or a pane of glass in it
 lamps       four lamps whose power differs by up to 100 : 1: bare, in shades, in glass, or behind a ledge
@@ -16,19 +16,19 @@ from data_gen.scenes.procedural.meshes import Mesh, box, lathe, merge, quads, sp
 from data_gen.scenes.procedural.stage import Stage
 from data_gen.scenes.procedural.textures import colour
 
-# How far a partition keeps from the camera, and how tall a door is, in metres.
+# The least distance of a partition from the camera, and the height of a door, in metres
 CLEAR, DOOR = 0.5, 2.05
 
 
 def partition(stage: Stage) -> None:
-    """Divides the room by a wall that light passes in one place. An open set gets the same wall."""
+    """Divides a room or an open set by a wall with a single opening for light."""
     rng, height = stage.rng, stage.height
-    # Across x, or, turned by a quarter, across z.
+    # The wall stands across x or, turned by 90 degrees, across z.
     turned = bool(rng.random() < 0.5)
     length, across = (stage.area[0], stage.area[1]) if turned else (stage.area[1], stage.area[0])
     camera = stage.standing[-1][1 if turned else 0]
     places = rng.uniform(-0.3, 0.3, 50) * across
-    # In a narrow room none may be clear of the camera.
+    # In a narrow room no place may be far enough from the camera.
     place = next((c for c in places if abs(c - camera) > CLEAR), max(places, key=lambda c: abs(c - camera)))
     kind = str(rng.choice(["doorway", "ajar", "crack", "slats", "pane"]))
     low, high = (
@@ -44,7 +44,7 @@ def partition(stage: Stage) -> None:
     middle = rng.uniform(-0.5, 0.5) * (length - wide) * 0.8
     u0, u1 = (middle - wide / 2) / length + 0.5, (middle + wide / 2) / length + 0.5
     opening = [(u0, u1, low / height, high / height)]
-    # Along z at x = 0, both faces of a wall 10 cm thick.
+    # Both faces of a wall 10 cm thick, along z at x = 0
     start, along = [0.05, 0, length / 2], [0, 0, -length]
     behind, back = [-0.05, 0, -length / 2], [0, 0, length]
     parts: list[things.Part] = [
@@ -76,7 +76,7 @@ def _bare(rng: np.random.Generator, radius: float) -> list[things.Part]:
 
 
 def _shaded(rng: np.random.Generator, radius: float) -> list[things.Part]:
-    """Open below, or above and below."""
+    """A lampshade, open below, or above and below."""
     top, tall = rng.choice([0.001, rng.uniform(1.2, 2.0)]) * radius, rng.uniform(3, 6) * radius
     profile = [(rng.uniform(2.0, 4.0) * radius, -tall / 2), (top, tall / 2)]
     return [(str(rng.choice(["fabric", "metal"])), lathe(profile))]
@@ -94,7 +94,7 @@ FIXTURES: list[Callable[[np.random.Generator, float], list[things.Part]]] = [_ba
 
 
 def lamps(stage: Stage, count: int) -> list[tuple[Mesh, np.ndarray]]:
-    """Lamps, (mesh, radiance (R, G, B)) each, anywhere in the room and of powers from 1 to 100."""
+    """``count`` lamps, each (mesh, radiance (R, G, B)), anywhere in the room. Their powers differ by up to 1 : 100."""
     rng, (width, depth), height = stage.rng, stage.area, stage.height
     brightest = np.exp(rng.uniform(np.log(20), np.log(250)))
     made = []

@@ -1,9 +1,9 @@
-"""Materials of things: the same plugins in every scene, with other pictures and numbers.
+"""Materials of things: every scene has the same plugins, with different pictures and numbers.
 
-Dr.Jit compiles one kernel for each *set* of plugins, in 10 s and more, and keeps it. Every scene has one material of
-each entry of ``SLOTS``, so the kernels of the first scene serve all others. What plugins take for a constant of the
-kernel (transforms of textures, scales of bump maps and environments) is put into meshes and pictures instead, and the
-refractive index of glass is fixed.
+Dr.Jit compiles a kernel for each *set* of plugins, in 10 s and more, and keeps it. Every scene has one material for
+each entry of ``SLOTS``, so all scenes can use the kernels of the first. Some parameters are constants in kernels:
+transforms of textures, and scales of bump maps and environments. Meshes and pictures vary instead of these. The
+refractive index of glass is the same in all scenes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from data_gen.scenes.procedural.textures import leaf, random_picture
 
-# Role of a part -> the slots it may be made of.
+# Role of a part -> the slots of materials that it may have
 ROLES = {
     "wall": ["matte0", "matte1", "bump0"],
     "floor": ["matte2", "varnish0", "principled0", "varnish0"],
@@ -61,7 +61,7 @@ def two_sided(bsdf: xml.Element) -> xml.Element:
 
 
 class Palette:
-    """The materials of one scene. ``save(image, raw)`` stores a picture and returns its file name."""
+    """Makes the materials of one scene. ``save(image, raw)`` stores a picture and returns its file name."""
 
     def __init__(self, rng: np.random.Generator, save):
         self.rng, self.save = rng, save
@@ -92,10 +92,10 @@ class Palette:
     def _bump(self) -> xml.Element:
         name = str(self.rng.choice(["noise", "weave", "bricks", "dots"]))
         relief = random_picture(self.rng, (name,)).mean(axis=-1)
-        # The height is in the picture: the plugin's own scale would be compiled into the kernel.
+        # The picture contains the height, since the plugin's own scale would be compiled into the kernel.
         bump = plugin("bsdf", "bumpmap", scale=0.3)
         bump.append(self.picture("arbitrary", self.rng.uniform(0.15, 1) * relief, raw=True))
-        # Not a coat: Mitsuba's roughplastic is NaN where the tilted frame leaves a direction below the horizon.
+        # Not roughplastic, which is NaN in Mitsuba where a direction is below the horizon of the tilted frame
         return two_sided(inside(bump, self._disney()))
 
     def _plastic(self) -> xml.Element:
@@ -105,7 +105,7 @@ class Palette:
         return two_sided(self._disney())
 
     def _disney(self) -> xml.Element:
-        # Not 0, which would leave the lobe out of the kernel.
+        # Never 0, which would remove the lobe from the kernel
         rng, metallic = self.rng, 1.0 if self.rng.random() < 0.4 else 0.01
         principled = plugin(
             "bsdf", "principled", metallic=metallic, specular=rng.uniform(0.2, 0.8), clearcoat=rng.uniform(0.01, 1)

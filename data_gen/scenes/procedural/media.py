@@ -1,6 +1,6 @@
-"""Media for a scene: fog, beams in fog, smoke, or coloured liquids in glass, as elements of its file.
+"""Media for a scene: fog, beams in fog, smoke, or coloured liquids in glass, as elements of the scene's file.
 
-Densities come from the size of what holds them, so that light is dimmed about as much across a room as across a ball.
+Densities depend on the size of the space, so that light is dimmed about as much across a room as across a ball.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ FORWARD = (0.0, 0.3, 0.7)
 
 @dataclass
 class Media:
-    """``elements`` of the scene itself, and of its camera."""
+    """``elements`` for the scene itself, and elements for its ``camera``."""
 
     elements: list[xml.Element] = field(default_factory=list)
     camera: list[xml.Element] = field(default_factory=list)
 
 
 def fog(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
-    """Grey or slightly coloured fog that fills the place; across it, light falls by e^-0.2 to e^-2."""
+    """Grey or slightly coloured fog that fills the place. Its transmittance across the place is e^-0.2 to e^-2."""
     size = np.array([stage.area[0], stage.height, stage.area[1]]) if stage.closed else 3 * np.full(3, stage.area[0])
     depth = np.exp(rng.uniform(np.log(0.2), np.log(2)))
     tint = 1 + rng.uniform(-0.25, 0.25, 3) * (rng.random() < 0.4)
     across = max(stage.area)
     air = _homogeneous(rng, depth / across * tint, np.clip(rng.uniform(0.75, 0.99) * _tinted(rng), 0, 0.995))
     air.set("id", "air")
-    # Wider than the room by its window frames; an open set ends in the distance.
+    # Larger than the room, to contain the window frames; in an open set the fog ends far away
     low, high = [-size[0] / 2 - 0.3, -0.3, -size[2] / 2 - 0.3], [size[0] / 2 + 0.3, size[1] + 0.3, size[2] / 2 + 0.3]
     around = _boundary(low, high, xml.Element("ref", name="interior", id="air"))
     return Media([air, around], [xml.Element("ref", name="medium", id="air")])
@@ -85,7 +85,7 @@ def smoke(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
 
 
 def liquid(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
-    """Two things of glass whose inside absorbs and scatters: ink, milk, amber."""
+    """Two glass objects whose inside absorbs and scatters, like ink, milk or amber."""
     media = Media()
     for i in range(2):
         size = rng.uniform(0.1, 0.35)
@@ -99,7 +99,7 @@ def liquid(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
         spot = stage.free_spot(stage.area)
         stage.standing.append((spot[0], spot[1], 1.5 * size))
         write_ply(folder / f"liquid{i}.ply", mesh.placed([spot[0], 0, spot[1]], rng.uniform(0, 6.3)))
-        # Light that passes through keeps between a tenth of its dimmest colour and most of its colours.
+        # The share of light that passes through, in each colour: from a few percent to nearly all
         clear = np.clip(colour(rng, 0.1, 0.95, 2.5), 0.02, 0.98)
         sigma_t = -np.log(clear) / size * np.exp(rng.uniform(np.log(0.5), np.log(3)))
         albedo = np.clip(float(rng.choice([0, 0.5, 0.9, 0.98])) * _tinted(rng), 0, 0.99)
@@ -115,7 +115,7 @@ KINDS: dict[str, Maker] = {made.__name__: made for made in (fog, beams, smoke, l
 
 
 def some_media(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
-    """One kind of them, its files in ``folder``."""
+    """Media of a random kind, with their files in ``folder``."""
     return KINDS[str(rng.choice(list(KINDS), p=[0.35, 0.2, 0.3, 0.15]))](stage, rng, folder)
 
 
@@ -145,7 +145,7 @@ def _grid(rng: np.random.Generator, file: str, low: np.ndarray, high: np.ndarray
 
 
 def _boundary(low, high, medium: xml.Element) -> xml.Element:
-    """A box that nobody sees, with a medium in it."""
+    """An invisible box with a medium in it."""
     low, high = np.asarray(low), np.asarray(high)
     shape = plugin("shape", "cube")
     transform = xml.SubElement(shape, "transform", name="to_world")

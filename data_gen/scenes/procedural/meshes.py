@@ -1,6 +1,6 @@
 """Triangle meshes made in code, with normals and texture coordinates in metres, and a PLY writer for them.
 
-Every mesh carries normals and texture coordinates, so that all of them run through the same kernel.
+Every mesh has normals and texture coordinates, so that all meshes use the same kernel.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Mesh:
-    """``vertices`` and ``normals`` (n, 3), ``uvs`` (n, 2), ``faces`` (m, 3) indices; outside is counter-clockwise."""
+    """``vertices`` and ``normals`` (n, 3), ``uvs`` (n, 2), ``faces`` (m, 3) indices, counter-clockwise from outside."""
 
     vertices: np.ndarray
     normals: np.ndarray
@@ -27,7 +27,7 @@ class Mesh:
         return Mesh(self.vertices @ linear.T + matrix[:3, 3], normals, self.uvs, self.faces)
 
     def placed(self, position, angle: float = 0.0, scale=1.0) -> Mesh:
-        """Scaled, turned by ``angle`` radians about the vertical, and moved to ``position``."""
+        """The mesh scaled, turned by ``angle`` radians about the vertical, and moved to ``position``."""
         matrix = np.eye(4)
         matrix[:3, :3] = rotation([0, 1, 0], angle) @ np.diag(np.broadcast_to(scale, 3))
         matrix[:3, 3] = position
@@ -52,7 +52,7 @@ def rotation(axis, angle: float) -> np.ndarray:
 
 
 def quads(corners) -> Mesh:
-    """Flat quads of corners (n, 4, 3), counter-clockwise seen from the front."""
+    """Flat quads with corners (n, 4, 3), counter-clockwise from the front."""
     corners = np.asarray(corners, float).reshape(-1, 4, 3)
     u, v = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
     normals = np.repeat(_unit(np.cross(u, v)), 4, axis=0)
@@ -75,7 +75,7 @@ def box(size, center=(0, 0, 0)) -> Mesh:
 def wall(origin, u, v, openings=()) -> Mesh:
     """A wall from ``origin`` along the edges ``u``, ``v`` (front: u x v), with rectangular openings cut out.
 
-    An opening is (u0, u1, v0, v1), fractions of the edges; openings must not overlap in u.
+    An opening is (u0, u1, v0, v1), in fractions of the edges. Openings must not overlap in u.
     """
     origin, u, v = (np.asarray(a, float) for a in (origin, u, v))
     cells, end = [], 0.0
@@ -91,7 +91,7 @@ def wall(origin, u, v, openings=()) -> Mesh:
 
 
 def lathe(profile, segments: int = 48) -> Mesh:
-    """The profile (n, 2) of (radius, height) turned about the vertical; outside where heights rise along it."""
+    """A profile (n, 2) of (radius, height), turned about the vertical. Rising heights have their front outside."""
     profile = np.asarray(profile, float)
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     ring = np.stack([np.cos(angle), np.zeros_like(angle), -np.sin(angle)], axis=1)
@@ -129,7 +129,7 @@ def sphere(radius: float, segments: int = 48) -> Mesh:
 
 
 def cylinder(radius: float, height: float, segments: int = 32) -> Mesh:
-    """Stands on the ground; rims are doubled so that they stay sharp."""
+    """A cylinder that stands on the ground. Vertices at its rims are doubled, so that the rims look sharp."""
     side = lathe([(radius, 0), (radius, height)], segments)
     return merge([lathe([(0, 0), (radius, 0)], segments), side, lathe([(radius, height), (0, height)], segments)])
 
@@ -140,7 +140,7 @@ def torus(radius: float, thickness: float, segments: int = 48) -> Mesh:
 
 
 def rock(rng: np.random.Generator, radius: float, roughness: float, segments: int = 64) -> Mesh:
-    """A sphere displaced along its normals by waves of random directions."""
+    """A sphere, displaced along its normals by waves in random directions."""
     ball = sphere(radius, segments)
     unit = ball.vertices / radius
     height = np.zeros(len(unit))
@@ -155,7 +155,7 @@ def rock(rng: np.random.Generator, radius: float, roughness: float, segments: in
 
 
 def cloth(rng: np.random.Generator, width: float, height: float, folds: float, depth: float) -> Mesh:
-    """A curtain hanging in the x-y plane from (0, 0), front toward +z."""
+    """A curtain in the x-y plane, with a corner at (0, 0) and its front toward +z."""
     x, y = np.linspace(0, width, 96), np.linspace(0, height, 16)
     phase, second = rng.uniform(0, 6.3, 2)
     wave = np.sin(x * folds + phase)[None] + 0.4 * np.sin(x[None] * folds * 2.3 + second + y[:, None])
@@ -172,7 +172,7 @@ def scattered_quads(rng: np.random.Generator, count: int, radius: float, size: f
     length = size * rng.uniform(0.5, 1.3, (count, 1))
     u, v = u * length / 2, v * length
     mesh = quads(np.stack([center - u - v, center + u - v, center + u + v, center - u + v], axis=1))
-    # One leaf is one texture, whatever its size.
+    # Each leaf shows the whole texture, whatever its size.
     return Mesh(mesh.vertices, mesh.normals, np.tile([[0, 0], [1, 0], [1, 1], [0, 1]], (count, 1)), mesh.faces)
 
 

@@ -1,7 +1,8 @@
-"""Scenes that never run out: rooms and open sets made from a seed, written as Mitsuba scene files.
+"""Any number of scenes: rooms and open sets made from a seed, written as Mitsuba scene files.
 
-A scene is a folder: ``scene.xml``, one mesh for each material, and the pictures. Units are metres, +y is up. Its camera
-stands in free space, as a painter would place it; ``data_gen.dataset.cameras`` finds further ones from there.
+A scene is a folder with ``scene.xml``, one mesh for each material, and the pictures. Units are metres, and +y is up.
+The camera stands in free space and looks at the middle of the scene; ``data_gen.dataset.cameras`` finds more cameras
+from there.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ MAX_DEPTH = 12
 
 
 def room(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
-    """Four walls, furniture, and light from lamps, windows or both."""
+    """A room with furniture, lit by lamps, windows or both. Returns the origin and target of its camera."""
     rng = stage.rng
     width, depth, height = rng.uniform(3, 8), rng.uniform(3, 8), rng.uniform(2.3, 3.6)
     stage.area, stage.height, stage.closed = (width, depth), height, True
@@ -65,7 +66,7 @@ def room(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _side(stage: Stage, start, end, height: float, windows: bool) -> None:
-    """One wall of a room, with windows, their bars, panes and blinds, or with pictures."""
+    """Adds a wall of a room, with windows (bars, panes, blinds, curtains) or with pictures."""
     rng = stage.rng
     length = float(np.linalg.norm(end - start))
     u = np.array([end[0] - start[0], 0, end[1] - start[1]])
@@ -105,7 +106,7 @@ def _side(stage: Stage, start, end, height: float, windows: bool) -> None:
 
 
 def _lamps(stage: Stage, width: float, depth: float, height: float) -> None:
-    """Panels, globes, spots under the ceiling, a strip behind a ledge, or lamps with shades."""
+    """Adds a panel, a globe, spots under the ceiling, a strip behind a ledge or a shaded lamp; and floor lamps."""
     rng = stage.rng
     kind = str(rng.choice(["panel", "panel", "globe", "points", "cove", "shade"]))
     x, z = rng.uniform(-0.25, 0.25, 2) * [width, depth]
@@ -134,7 +135,7 @@ def _lamps(stage: Stage, width: float, depth: float, height: float) -> None:
 
 
 def open_set(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
-    """Things on a ground without walls, under a sky or between the lamps of a studio."""
+    """As ``room``, for things on a ground without walls, under a sky or between the lamps of a studio."""
     rng = stage.rng
     small = rng.random() < 0.4
     area = stage.area = (1.6, 1.6) if small else (7.0, 7.0)
@@ -166,17 +167,17 @@ LAYOUTS = {"room": room, "open": open_set}
 
 
 def make_scene(seed: int | tuple[int, ...], folder: Path, shares: Mapping[str, float] | None = None) -> Path:
-    """Makes the scene of ``seed`` in the (existing, empty) ``folder``; the same seed gives the same files.
+    """Makes the scene of ``seed`` in the (existing, empty) ``folder``; returns its file. Equal seeds give equal files.
 
-    ``shares`` are the probabilities (0 to 1) of further sights, of all that are in
-    ``data_gen.scenes.procedural.variety.SHARES``. Without them there are none.
+    ``shares`` has a probability (0 to 1) for each sight in ``data_gen.scenes.procedural.variety.SHARES``. Without
+    ``shares`` there are no sights.
     """
     rng = np.random.default_rng(seed)
     layout = "room" if rng.random() < 0.7 else "open"
     stage = Stage(rng)
     origin, target = LAYOUTS[layout](stage)
     sights, further = further_sights(seed, shares) if shares else (frozenset(), rng)
-    # Nothing more comes to stand where the camera is.
+    # No further thing may stand at the camera.
     stage.standing.append((origin[0], origin[2], 0.6))
     bulbs = add_sights(stage, sights, further)
     media = some_media(stage, further, folder) if "media" in sights else Media()
@@ -194,7 +195,7 @@ def make_scene(seed: int | tuple[int, ...], folder: Path, shares: Mapping[str, f
     root.append(inside(_camera(rng, origin, target), *media.camera))
     palette = Palette(rng, save)
     for slot in SLOTS:
-        # Far below, where nobody looks: a placeholder for each material that this scene does not use.
+        # A material that this scene does not use gets a placeholder far below the floor, where no camera looks.
         mesh = merge(stage.meshes.get(slot, [box([0.01] * 3, [0, -50, 0])]))
         root.append(_shape(folder, slot, mesh, palette.material(slot)))
     black = plugin("bsdf", "diffuse", reflectance=(0.0, 0.0, 0.0))

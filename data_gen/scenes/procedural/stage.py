@@ -1,4 +1,4 @@
-"""A scene while it is made: parts by slot, lights, and where things stand."""
+"""A scene while it is made: its parts by slot, and the places of things."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ SIZES = {"wall": (0.7, 4), "floor": (0.4, 3), "paper": (0.15, 0.6)}
 
 
 class Stage:
-    """Parts by slot, and where things stand on the floor."""
+    """Parts by slot of material, and the places of things on the floor."""
 
     def __init__(self, rng: np.random.Generator):
         self.rng = rng
         self.meshes: dict[str, list[Mesh]] = {}
         self.standing: list[tuple[float, float, float]] = []
         self.sky = False
-        # The space of a room or an open set, in metres: x and z, and y.
+        # The size of a room or an open set in metres: (x, z), and y; ``closed`` says whether it has walls.
         self.area, self.height, self.closed = (4.0, 4.0), 2.4, False
-        # Every role is played by one slot at a time; few slots make a scene of one mind, many a jumble.
+        # The slots of each role. With few slots a scene looks uniform, with many it looks mixed.
         self.cast = {role: rng.permutation(slots)[: rng.integers(1, len(slots) + 1)] for role, slots in ROLES.items()}
 
     def add(self, parts: list[things.Part]) -> None:
         for role, mesh in parts:
             slot = str(self.rng.choice(self.cast[role]))
             if role != "leaf":
-                # Metres that the picture covers.
+                # The size in metres that the picture covers
                 low, high = SIZES.get(role, (0.1, 1.5))
                 size = np.exp(self.rng.uniform(np.log(low), np.log(high)))
                 turn = rotation([0, 0, 1], float(self.rng.choice([0, 0, 0, 0.25, 0.5])) * np.pi)[:2, :2]
@@ -38,7 +38,7 @@ class Stage:
             self.meshes.setdefault(slot, []).append(mesh)
 
     def stand(self, parts: list[things.Part], area: tuple[float, float], angle: float | None = None) -> bool:
-        """Puts a thing on the floor, x and z within ``area`` / 2, where nothing stands; False if there is no room."""
+        """Puts a thing on a free place of the floor, x and z within ``area`` / 2. False if it finds no place."""
         reach = max(np.hypot(*mesh.vertices[:, [0, 2]].T).max() for _, mesh in parts)
         for _ in range(20):
             x, z = (self.rng.uniform(-0.5, 0.5, 2)) * np.maximum(np.array(area) - 2 * reach, 0)
@@ -50,7 +50,7 @@ class Stage:
         return False
 
     def free_spot(self, area: tuple[float, float]) -> np.ndarray:
-        """The place on the floor, of 200 tried, that is farthest from what stands there, (x, z)."""
+        """The place (x, z) on the floor, of 200 random ones, that is farthest from all things."""
         spots = self.rng.uniform(-0.45, 0.45, (200, 2)) * area
         gaps = [min([np.hypot(*(spot - [x, z])) - r for x, z, r in self.standing], default=1.0) for spot in spots]
         return spots[int(np.argmax(gaps))]

@@ -1,4 +1,4 @@
-"""Pictures made in code: what covers walls, floors and things, and the skies above them.
+"""Pictures made in code, for walls, floors and things, and skies.
 
 A pattern is a (H, W) array in [0, 1] that tiles; ``coloured`` lays two or three colours over it.
 """
@@ -14,7 +14,8 @@ SIZE = 256
 
 
 def noise(rng: np.random.Generator, slope: float = 1.0, stretch: float = 1.0) -> np.ndarray:
-    """Tileable noise whose spectrum falls with frequency to the power of ``slope``; ``stretch`` draws out rows."""
+    """Tileable noise in [0, 1] with a spectrum of amplitude frequency^-``slope``; ``stretch`` lengthens it along
+    rows."""
     y = np.fft.fftfreq(SIZE)[:, None] * SIZE
     x = np.fft.rfftfreq(SIZE)[None, :] * SIZE * stretch
     frequency = np.hypot(x, y)
@@ -77,7 +78,7 @@ def dots(rng: np.random.Generator) -> np.ndarray:
 
 
 def text(rng: np.random.Generator) -> np.ndarray:
-    """Lines of strokes that look like print from afar: high contrast at the scale of pixels."""
+    """Lines of random glyphs that look like print from afar, with high contrast at the scale of pixels."""
     page = np.ones((SIZE, SIZE))
     height = int(rng.choice([8, 16, 32]))
     for top in range(height // 2, SIZE - height, height + height // 3):
@@ -105,7 +106,7 @@ PATTERNS: dict[str, Callable[[np.random.Generator], np.ndarray]] = {
 
 
 def colour(rng: np.random.Generator, low: float = 0.08, high: float = 0.8, saturation: float = 1.0) -> np.ndarray:
-    """A linear RGB reflectance: any hue, mostly of low saturation, as things in houses are."""
+    """A linear RGB reflectance of any hue, mostly with low saturation, as for things in houses."""
     value = rng.uniform(low, high)
     saturation *= rng.beta(1.0, 2.6)
     hue = np.clip(np.abs((rng.random() * 6 + np.array([0, 4, 2])) % 6 - 3) - 1, 0, 1)
@@ -113,7 +114,7 @@ def colour(rng: np.random.Generator, low: float = 0.08, high: float = 0.8, satur
 
 
 def coloured(rng: np.random.Generator, pattern: np.ndarray, low: float = 0.06, high: float = 0.8) -> np.ndarray:
-    """(H, W, 3) linear reflectance: two colours, sometimes near to each other, and some dirt."""
+    """(H, W, 3) linear reflectance: the ``pattern`` in two colours, which may be similar, with some dirt."""
     one, other = colour(rng, low, high), colour(rng, low, high)
     if rng.random() < 0.4:
         other = one * rng.uniform(0.4, 0.9)
@@ -166,6 +167,6 @@ def sky(rng: np.random.Generator) -> np.ndarray:
 
 
 def write_pfm(path: Path, image: np.ndarray) -> None:
-    """(H, W, 3) float32 as a PFM, rows from the bottom up as the format asks."""
+    """Writes (H, W, 3) float32 as a PFM, with rows from the bottom up, as the format requires."""
     height, width = image.shape[:2]
     path.write_bytes(f"PF\n{width} {height}\n-1.0\n".encode() + np.ascontiguousarray(image[::-1], "<f4").tobytes())

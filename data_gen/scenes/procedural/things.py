@@ -1,6 +1,6 @@
-"""Things to put into a scene: each is a list of (role, mesh), standing on y = 0 around the origin, in metres.
+"""Things to put into a scene. Each is a list of (role, mesh) in metres, and stands on y = 0 around the origin.
 
-A role says what a part may be made of; ``data_gen.scenes.procedural.materials`` turns it into a material.
+The role of a part determines its possible materials, see ``data_gen.scenes.procedural.materials``.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def placed(parts: list[Part], position, angle: float = 0.0, scale=1.0) -> list[P
 
 
 def vessel(rng: np.random.Generator) -> list[Part]:
-    """A vase, bowl, bottle or cup: a wall of some thickness turned about the vertical."""
+    """A vase, bowl, bottle or cup: a profile with a thick wall, turned about the vertical."""
     height = rng.uniform(0.08, 0.4)
     rows = np.linspace(0, 1, 24)
     knots = rng.uniform(0.25, 1, 4) * height * rng.uniform(0.3, 0.9)
@@ -95,7 +95,7 @@ SMALL: list[Callable[[np.random.Generator], list[Part]]] = [vessel, vessel, ball
 
 
 def clutter(rng: np.random.Generator, width: float, depth: float, count: int) -> list[Part]:
-    """Small things on an area of ``width`` x ``depth``, one to a cell of a grid so that they do not meet."""
+    """Small things on an area of ``width`` x ``depth``, one in each cell of a grid, so that they do not overlap."""
     columns = max(int(width / 0.28), 1)
     rows = max(int(depth / 0.28), 1)
     cells = rng.permutation(columns * rows)[:count]
@@ -187,7 +187,7 @@ def stairs(rng: np.random.Generator) -> list[Part]:
 
 
 def screen(rng: np.random.Generator) -> list[Part]:
-    """Slats or a grid of bars: fine geometry that throws a pattern of shadows."""
+    """Slats or a grid of bars: fine geometry that casts a pattern of shadows."""
     width, height = rng.uniform(0.8, 1.8), rng.uniform(1.2, 2.2)
     pitch, bar = rng.uniform(0.04, 0.12), rng.uniform(0.008, 0.03)
     parts = [box([bar, height, bar], [x, height / 2, 0]) for x in np.arange(-width / 2, width / 2, pitch)]
@@ -225,7 +225,7 @@ def curtain(rng: np.random.Generator) -> list[Part]:
 
 
 def picture(rng: np.random.Generator, width: float, height: float) -> list[Part]:
-    """Hangs in the x-y plane around the origin, front toward +z."""
+    """A framed picture in the x-y plane around the origin, with its front toward +z."""
     bar = rng.uniform(0.015, 0.06)
     sides = [box([width + 2 * bar, bar, 0.03], [0, s * (height + bar) / 2, 0.015]) for s in (-1, 1)]
     sides += [box([bar, height, 0.03], [s * (width + bar) / 2, 0, 0.015]) for s in (-1, 1)]
@@ -244,7 +244,7 @@ SIDES = 4
 
 
 def tube(points: np.ndarray, radius: float, taper: float = 1.0) -> Mesh:
-    """A tube of ``radius`` along ``points`` (n, 3), ``taper`` times as thick at its end as where it starts."""
+    """A tube of ``radius`` along ``points`` (n, 3). At its end it is ``taper`` times as thick as at its start."""
     along = np.gradient(points, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across = np.cross(along, [0.31, 0.17, 0.93])
@@ -257,7 +257,7 @@ def tube(points: np.ndarray, radius: float, taper: float = 1.0) -> Mesh:
 
 
 def wires(rng: np.random.Generator, area: tuple[float, float], height: float) -> list[Part]:
-    """Some wires that hang across the whole place, of 0.3 to 2 mm radius."""
+    """Some wires of 0.3 to 2 mm radius that hang across the whole place."""
     strands = []
     for _ in range(rng.integers(3, 12)):
         a, b = rng.uniform(-0.5, 0.5, (2, 3)) * [area[0], 0.35 * height, area[1]] + [0, 0.7 * height, 0]
@@ -268,7 +268,7 @@ def wires(rng: np.random.Generator, area: tuple[float, float], height: float) ->
 
 
 def tuft(rng: np.random.Generator) -> list[Part]:
-    """Grass, bristles or fur: hundreds of bent blades that grow out of a spot."""
+    """Grass, bristles or fur: hundreds of bent blades that grow from one place."""
     count, length = rng.integers(150, 500), rng.uniform(0.08, 0.5)
     t = np.linspace(0, 1, 6)[:, None]
     blades = []

@@ -1,8 +1,8 @@
-"""Sights that few scenes have, each added to some scenes: fine pictures, hair, many small lamps, caustics, media, and
-the light of ``data_gen.scenes.procedural.hard_light``.
+"""Sights, which are rare features of scenes: fine pictures, hair, many small lamps, caustics, media, and the light of
+``data_gen.scenes.procedural.hard_light``.
 
-They come on top of a scene that is there already, drawn from random numbers of their own: a scene that none of them
-falls to is the same without this file.
+They are added to a finished scene and use separate random numbers, so a scene without sights does not depend on this
+file.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from data_gen.scenes.procedural.meshes import Mesh, box, cylinder, lathe, merge,
 from data_gen.scenes.procedural.stage import Stage
 from data_gen.scenes.procedural.textures import colour
 
-# The share of scenes that each falls to, independently, where a configuration says nothing else. LATER ones are drawn
-# from random numbers of their own, so scenes without them are the same as before there were any.
+# The default probability of each sight; sights are independent. The LATER ones use separate random numbers, so scenes
+# without them are the same as before these sights existed.
 LATER = {"partition": 0.0, "lamps": 0.0, "mirrors": 0.0}
 SHARES = {"fine": 0.25, "hair": 0.25, "bulbs": 0.15, "caustic": 0.15, "media": 0.16} | LATER
 
-# Small lamps are this many emitters, whatever they are: kernels depend on the number.
+# Small lamps are always this number of emitters, since kernels depend on it.
 EMITTERS = 4
 
-# Radius and height along a dish, outside and then inside.
+# (radius, height) along the profile of a dish, first outside, then inside
 DISH = np.array([(0, 0), (1, 0), (1.3, 1), (1.15, 1), (0.85, 0.15), (0, 0.12)])
 
 
@@ -40,7 +40,7 @@ class Lamp:
 def further_sights(
     seed: int | tuple[int, ...], shares: Mapping[str, float] = SHARES
 ) -> tuple[frozenset[str], np.random.Generator]:
-    """The names of what falls to the scene of ``seed``, and the random numbers to make it of.
+    """The names of the sights of the scene of ``seed``, and the random numbers to make them.
 
     ``shares`` has all names of ``SHARES``, in the same order.
     """
@@ -51,7 +51,7 @@ def further_sights(
 
 
 def add_sights(stage: Stage, sights: frozenset[str], rng: np.random.Generator) -> list[Lamp]:
-    """Puts all of them except media on the stage. Returns the lamps among them, ``EMITTERS`` or none."""
+    """Puts all ``sights`` except media on the stage. Returns their lamps: ``EMITTERS`` lamps or none."""
     before, stage.rng = stage.rng, rng
     lamps: list[Lamp] = []
     if "partition" in sights:
@@ -60,13 +60,13 @@ def add_sights(stage: Stage, sights: frozenset[str], rng: np.random.Generator) -
         hard_light.mirrors(stage)
     if "hair" in sights:
         hair(stage)
-    # These sights bring all the lamps that a scene may have further.
+    # "caustic" and "bulbs" already use all additional lamps that a scene may have.
     if "lamps" in sights and not sights & {"caustic", "bulbs"}:
         lamps = [Lamp(*lamp) for lamp in hard_light.lamps(stage, EMITTERS)]
     if "caustic" in sights:
         lamps = caustic(stage)
     if "bulbs" in sights:
-        # Where there is a caustic, its lamp stays one of them.
+        # If there is a caustic, its lamp stays one of the emitters.
         lamps = bulbs(stage, lamps)
     if "fine" in sights:
         fine_pictures(stage)
@@ -96,7 +96,7 @@ def hair(stage: Stage) -> None:
 
 
 def bulbs(stage: Stage, others: list[Lamp]) -> list[Lamp]:
-    """10 to 50 small lamps: strings of bulbs, a grid under the ceiling, or candles here and there; and ``others``."""
+    """10 to 50 small lamps: strings of bulbs, a grid under the ceiling, or scattered candles; and the ``others``."""
     rng, (width, depth), height = stage.rng, stage.area, stage.height
     count, radius = int(rng.integers(10, 51)), rng.uniform(0.006, 0.03)
     kind = str(rng.choice(["strings", "grid", "candles"]))
@@ -125,7 +125,7 @@ def bulbs(stage: Stage, others: list[Lamp]) -> list[Lamp]:
 
 
 def caustic(stage: Stage) -> list[Lamp]:
-    """Glass, or a polished ring, with a small bright lamp a step away: light gathered on the floor or on a slab."""
+    """A glass object or a polished ring, which focuses the light of a small lamp on the floor or on a slab."""
     rng = stage.rng
     size = rng.uniform(0.08, 0.22)
     kind = str(rng.choice(["ball", "can", "dish", "ring"]))

@@ -1,4 +1,4 @@
-"""How photons and camera paths go through media: where they scatter next, and in what medium they begin."""
+"""How photons and camera paths go through media: where they scatter next, and in which medium they start."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from ngpt.errors import NgptError
 
 
 class Fog:
-    """The media of a scene. One of them may be around the camera ``sensor``: ``within``.
+    """The media of a scene. ``within`` is the medium around the camera ``sensor``, or none.
 
-    Raises NgptError, in the name of the ``sampler``, where light from infinitely far away comes through a medium
-    without end.
+    Raises NgptError, with the name of the ``sampler``, if light from infinitely far away comes through a medium without
+    bounds.
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor, lights: LightEnds, sampler: str):
         self.media = Media(scene)
         self.within = mi.MediumPtr(sensor.get_medium())
-        # Where a ray begins: of a meter on a shape, or one infinitely far away, to_world says nothing of that.
+        # The start of a ray. For a meter on a shape, or one infinitely far away, to_world does not give it.
         middle = mi.Point2f(0.5)
         self.eye = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, middle, middle)[0].o
         corner = mi.Point3f(scene.bbox().max) + float(np.linalg.norm(np.array(scene.bbox().extents())))
@@ -35,10 +35,10 @@ class Fog:
 
     @dr.syntax
     def around(self, scene, p: mi.Point3f) -> mi.MediumPtr:
-        """The medium around points ``p``. Lamps do not know their medium, unless they are boundaries themselves.
+        """The medium around points ``p``, since Mitsuba does not know the medium of a lamp that is no boundary itself.
 
-        It is that on this side of the first boundary of media toward the camera, or the camera's if there is none.
-        Other surfaces are in the same medium on both sides, and may be in the way.
+        The first boundary on the way to the camera gives the medium on its side of ``p``. Without a boundary it is the
+        camera's medium. Other surfaces on the way have the same medium on both sides.
         """
         to = self.eye - p
         distance = dr.norm(to)
@@ -62,10 +62,10 @@ class Fog:
         return segment, vertex(segment.ray, segment.hit, segment.place)
 
     def power(self, photons) -> mi.Spectrum:
-        """What counts of each photon of a map in media: the power Φ that is scattered there; with grids, Φ / σs.
+        """The weight of each photon of a map in media: the power Φ that is scattered there, or Φ / σs with grids.
 
-        The sum of Φ / σs over a volume is the light that goes through, which is smooth where σs is not: the density of
-        a grid is taken where the camera path scatters, and is not blurred.
+        The sum of Φ / σs over a volume is the light that goes through it, which is smooth even if σs is not. σs is then
+        evaluated where the camera path scatters, so the density of a grid is not blurred.
         """
         if not self.media.grids:
             return photons.β

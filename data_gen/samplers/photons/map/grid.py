@@ -1,8 +1,8 @@
-"""The photons of a map by place: a dense uniform grid, whose cells are runs of one sorted list.
+"""Search for photons by place: a dense uniform grid, whose cells are runs of one sorted list.
 
-A cell's edge is at least the diameter of what is gathered. So a ball touches two cells along each axis at most: four
-rows of two cells, which are neighbours in the list. Counts and stable sorts build the list. The photons of a point are
-gathered in its order, so sums have the same bits every time.
+The edge of a cell is at least the diameter of the ball in which photons are gathered. So a ball touches at most two
+cells along each axis: four rows of two cells, which are neighbours in the list. Counts and a stable sort build the
+list, and photons are gathered in its order, so sums have the same bits every time.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# With more cells than this for each photon, most are empty, and larger cells cost less.
+# With more cells for each photon most cells are empty, and larger cells cost less.
 _CELLS_PER_PHOTON = 4
 _LEAST_CELLS = 1 << 12
 
 
 @dataclass(init=False)
 class Grid:
-    """Points of index ``index[i]`` at ``p[i]``, sorted by cell; cell c has those from ``start[c]`` to ``start[c + 1]``.
+    """Points ``p[i]`` with numbers ``index[i]``, sorted by cell. Cell c has i from ``start[c]`` to ``start[c + 1]``.
 
-    ``points`` are all points, and those that ``exist`` are entered; ``radius`` is the largest that is asked for.
+    Of the ``points`` those that ``exist`` are entered. ``radius`` is the largest radius of a search.
     """
 
     low: mi.Point3f
@@ -46,7 +46,7 @@ class Grid:
         low, high = (np.array([f(axis)[0] for axis in p], np.float64) for f in (dr.min, dr.max))
         most = max(_LEAST_CELLS, _CELLS_PER_PHOTON * dr.width(index))
         edge, cells = self.cells(high - low, 2 * radius, most)
-        # Half a cell of room on all sides: the cells of a ball around any of the points are in the grid.
+        # A cell of room on all sides: the cells of a ball around any of the points are in the grid.
         self.low = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in low - edge))
         self.edge, self.rate = (dr.opaque(mi.Float, value) for value in (edge, 1 / edge))
         self.n = mi.Vector3u(*(dr.opaque(mi.UInt32, int(n)) for n in cells))
@@ -71,7 +71,7 @@ class Grid:
         return x + self.n.x * (y + self.n.y * z)
 
     def row(self, p: mi.Point3f, k: mi.UInt32, active) -> tuple[mi.UInt32, mi.UInt32]:
-        """The start and end in the list of row ``k`` of 4 of the cells near ``p``; nothing if ``p`` is far off."""
+        """The start and end in the list of row ``k`` (0 to 3) of the cells near ``p``; empty far off the grid."""
         near = [(q - o) * self.rate - 0.5 for q, o in zip(p, self.low, strict=True)]
         for f, n in zip(near, self.n, strict=True):
             active = active & (f >= 0) & (f < n - 1)
@@ -80,9 +80,10 @@ class Grid:
         return dr.gather(mi.UInt32, self.start, cell, active), dr.gather(mi.UInt32, self.start, cell + 2, active)
 
     def each(self, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, visit, state: tuple) -> tuple:
-        """``state`` after ``visit`` (state, place in the list, near) for all points that may be nearer to ``p``.
+        """``state`` after ``visit`` (state, place in the list, near) for all points that may be near ``p``.
 
-        ``near`` says which are, and ``visit`` changes nothing for others. May be called within symbolic loops.
+        ``near`` says whether a point is within the radius, and ``visit`` must change nothing if not. May be called
+        within symbolic loops.
         """
 
         def nearer(q, k):
@@ -92,16 +93,16 @@ class Grid:
         return self.rows((none, none + 4), lambda k: p, nearer, active, visit, state)
 
     def along(self, ray: mi.Ray3f, length: mi.Float, radius2: mi.Float, active: mi.Bool, visit, state: tuple) -> tuple:
-        """As ``each()``, for points nearer than the radius to a piece of a ray, beside it and not past its ends.
+        """As ``each()``, for points within the radius of a piece of a ray, but not past its ends.
 
-        The piece is cut into parts so short that two cells along each axis hold what is near to one. Each point is
-        beside only one part.
+        The piece is cut into parts, so short that the points near a part lie in two cells along each axis. Each point
+        belongs to only one part.
         """
-        # All points near to the part lie in the ball about its middle, whose radius is half an edge. Half of the part's
-        # length:
+        # Half the length of a part. All points near the part lie in a ball about its middle, whose radius is half an
+        # edge.
         half = dr.sqrt(dr.maximum(0.25 * dr.square(self.edge) - radius2, 0))
         rate = dr.rcp(2 * half)
-        # The interval in which the ray is in the grid, and beside points
+        # The interval in which the ray is inside the grid
         begin, end = mi.Float(0), mi.Float(length)
         for o, d, low, n in zip(ray.o, ray.d, self.low, self.n, strict=True):
             first, last = (low - o) / d, (low + self.edge * n - o) / d
@@ -123,13 +124,14 @@ class Grid:
         return self.rows((4 * first, 4 * last), middle, beside, crosses, visit, state)
 
     def rows(self, numbers: tuple, center, is_near, active: mi.Bool, visit, state: tuple) -> tuple:
-        """``state`` after visits to all points in the rows of these ``numbers`` (from, to): number k has row k % 4.
+        """``state`` after visits to all points in rows ``numbers`` = (from, to); k is row k % 4 near ``center`` (k).
 
-        ``center`` (k) is what the row is near to, and ``is_near`` (point, k) whether a point of it is.
+        ``is_near`` (point, k) says whether a point is within the radius.
         """
         first, last = numbers
 
-        # k - 1 is the number of the row, i the place of the point in the list, end that behind the row's last.
+        # k - 1 is the number of the row, i the place of the point in the list, end the place behind the row's last
+        # point.
         def step(k, i, end, state):
             at = i < end
             near = at & is_near(dr.gather(mi.Point3f, self.p, i, at), k - 1)
@@ -140,7 +142,7 @@ class Grid:
             moves = ((k + 1, k), (begin, i), (stop, end))
             return *(dr.select(next_row, new, old) for new, old in moves), state
 
-        # A first step without a point: i = end, and so the first row is next.
+        # The first step has no point: i = end, so the first row is next.
         none = dr.zeros(mi.UInt32, dr.width(first))
         begun = (mi.UInt32(first), mi.UInt32(none), mi.UInt32(none), state)
         goes_on = lambda k, i, end, state: active & ((k < last) | (i < end))  # noqa: E731
@@ -149,6 +151,7 @@ class Grid:
     def gather(self, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, value, total):
         """``total`` plus the sum of ``value`` (place in the list, near) over all points within the radius of ``p``.
 
-        ``value`` gives the type of ``total``, and 0 where not ``near``. May be called within symbolic loops.
+        ``value`` returns the type of ``total``, and must return 0 where not ``near``. May be called within symbolic
+        loops.
         """
         return self.each(p, radius2, active, lambda sums, i, near: (sums[0] + value(i, near),), (total,))[0]

@@ -1,22 +1,22 @@
 r"""The radius within which photons are gathered. It is given in pixels, and shrinks from pass to pass.
 
-Pass i gathers within r_i, with r_(i+1)^d = r_i^d (i + α) / (i + 1); d is 2 on surfaces and 3 in media, the dimension of
-what photons are counted in. So r^d falls like i^(α - 1): slowly enough that the noise of the mean over passes goes to
-zero like i^-α, and its bias like r², i^(2 (α - 1) / d). Every pass is on its own, no point keeps statistics (Knaus and
-Zwicker 2011, "Progressive Photon Mapping: A Probabilistic Approach", eq. 15 and 24).
+Pass i gathers within r_i, with r_(i+1)^d = r_i^d (i + α) / (i + 1). d is the dimension in which photons are gathered: 2
+for disks, 3 for balls. So r^d falls like i^(α - 1). The variance of the mean over passes goes to zero like i^-α, and
+its bias like r², that is i^(2 (α - 1) / d). Passes are independent, and no point keeps statistics (Knaus and Zwicker
+2011, "Progressive Photon Mapping: A Probabilistic Approach", eq. 15 and 24).
 
-The share of surface in the disk about a point also matters, since no photons lie beyond the edge of a surface.
+Beyond the edge of a surface there are no photons, so the area of surface in the disk about a point also matters.
 
-    A           area of the surfaces within radius r of x that photons are gathered from
-    w           of a probe: 1 / cos where a line through the disk, normal to it, meets such a surface; 0 where it does
-                not; its mean is A / (π r²)
+    A           area of the surfaces within radius r of x from which photons are gathered
+    w           weight of a probe, which is a line normal to the disk: 1 / cos where it meets such a surface, else 0.
+                Its mean is A / (π r²)
 
-If photons were counted over π r², uniform light on a surface would be too dark along the edges, in proportion to r.
-Counted over A, it is right. π r² / A is the sum of the products (1 - w₁) ... (1 - wₖ) over k from 0 on, whose mean is
-right, and which has one term on a plane: one probe for each point.
+If the light of photons were divided by π r², a uniformly lit surface would be too dark along its edges, in proportion
+to r. Divided by A, it is right. An unbiased estimate of π r² / A is the sum of the products (1 - w₁) ... (1 - wₖ) over
+k = 0, 1, ... On a plane it has one term and needs one probe.
 
-The place and the pass determine the probes' random numbers. So π r² / A is a property of x in each pass, by whatever
-path it is reached.
+The place and the pass determine the random numbers of the probes. So in each pass the estimate depends only on x, not
+on the path that leads there.
 
 [the sum: Booth 2007, "Unbiased Monte Carlo Estimation of the Reciprocal of an Integral"]
 """
@@ -38,8 +38,8 @@ ALPHA = 2 / 3
 
 
 def shrunk(i: int, dimension: int = 2) -> float:
-    """r_i / r_0, i from 0, where photons are counted in a disk, or in a ball (``dimension`` 3)."""
-    # The product of (k + α) / (k + 1) over k = 1 .. i, by the Gamma function
+    """r_i / r_0, i from 0, for photons that are gathered in a disk (``dimension`` 2) or a ball (3)."""
+    # The product of (k + α) / (k + 1) over k = 1 .. i, computed by the Gamma function
     log_ratio = math.lgamma(i + 1 + ALPHA) - math.lgamma(1 + ALPHA) - math.lgamma(i + 2)
     return math.exp(log_ratio / dimension)
 
@@ -47,12 +47,12 @@ def shrunk(i: int, dimension: int = 2) -> float:
 def pixel_width(scene: mi.Scene, sensor: mi.Sensor) -> float:
     """The width of a pixel of ``sensor`` at the surfaces it sees, in world units: the median over the image.
 
-    A thousandth of the scene's diagonal where the camera sees nothing, or has no adjacent rays.
+    It is a thousandth of the scene's diagonal if the camera sees nothing, or has no adjacent rays.
     """
     camera = CameraSamples(sensor, 0, 1)
     ray, _, _ = camera.rays()
     depth = features(scene, camera.sensor, camera.random.clone(), ray)["depth"]
-    # With a perspective camera Mitsuba 3.9 begins the neighbour's ray where this one begins, on the near plane.
+    # For a perspective camera Mitsuba 3.9 starts the neighbour's ray at the start of this ray, on the near plane.
     fans = dr.squared_norm(ray.d_x - ray.d) > 0
     aside = dr.select(fans, dr.norm(ray.d_x - ray.d) * depth, dr.norm(ray.o_x - ray.o))
     dr.eval(depth, aside)
@@ -62,13 +62,13 @@ def pixel_width(scene: mi.Scene, sensor: mi.Sensor) -> float:
     return float(wide)
 
 
-# Rays for a point: narrow things keep some of the loss, as long as they are much narrower than the radius.
+# Most rays for a point. Objects much narrower than the radius need more, and stay a bit too dark.
 RAYS = 24
-# A term that is less ends the sum.
+# A smaller term ends the sum.
 LEAST = 0.01
-# In radii: points so near to each other get the same numbers, however they were rounded.
+# Places per radius: nearby points get the same random numbers, so rounding does not matter.
 PLACES = 8
-# Rounds of the hash: with Mitsuba's 4, one probe after another misses.
+# Rounds of the hash. With Mitsuba's 4 the probes of a point are correlated, and all may miss.
 ROUNDS = 8
 
 
@@ -79,7 +79,7 @@ def number_of(seed: int, number: int) -> mi.UInt32:
 
 @dr.syntax
 def spread(world: World, x: mi.SurfaceInteraction3f, radius2: mi.Float, number: mi.UInt32, active: mi.Bool) -> mi.Float:
-    """π r² / A at vertices ``x`` where light is gathered; ``number`` is the pass's, see ``number_of()``."""
+    """Estimates π r² / A at vertices ``x`` where light is gathered; ``number`` is from ``number_of()``."""
     scene, receives = world.scene, world.materials.connectable
     frame, n = mi.Frame3f(x.n), mi.Vector3f(x.n)
     radius = dr.sqrt(radius2)
@@ -87,7 +87,7 @@ def spread(world: World, x: mi.SurfaceInteraction3f, radius2: mi.Float, number: 
     other, _ = mi.sample_tea_32(place[1], place[2], ROUNDS)
     place, _ = mi.sample_tea_32(place[0] ^ number, other, ROUNDS)
     total, term, rays = mi.Float(0), mi.Float(1), mi.UInt32(0)
-    # What is left of a probe
+    # The rest of a probe
     ray, begins = mi.Ray3f(x.p, -n, dr.zeros(mi.Float), x.time, x.wavelengths), mi.Bool(True)
     going = mi.Bool(active)
     while dr.hint(going, label="probes of edges"):

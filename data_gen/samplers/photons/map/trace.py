@@ -1,10 +1,11 @@
-"""Light paths as a map of vertices: all paths side by side, in one kernel, each with places of its own in the map.
+"""Traces light paths into a map of vertices: all paths in one kernel, each with its own places in the map.
 
-So vertices lie in the map by path, then by bounce: the same seed gives the same map. (Places handed out by a counter
-would come in the order of threads.) Places that a path does not need stay empty, and have the depth 0.
+So vertices are ordered by path, then by bounce, and the same seed gives the same map. (With a counter for places, the
+order would depend on threads.) Places that a path does not need stay empty, and have depth 0.
 
-In media, vertices are also where light scatters. Their normal is 0, and their power is the power scattered there. Its
-sum over a volume is σs times the light that goes through, so a camera path contributes only its transmittance.
+Points where light scatters in media are vertices, too. Their normal is 0, and their power is the scattered power. The
+sum of it over a volume is σs times the light that goes through, so a camera path multiplies it only by its
+transmittance.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ from data_gen.paths.walk import UNLIMITED, roulette
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, context, light_sampled
 from data_gen.samplers.photons.map.vertices import at, put, vertices_class
 
-# Places of a map, for each light path of it; at least 2. Paths that have more vertices go on in another map.
+# Places of a map for each of its light paths; at least 2. Paths with more vertices go on in another map.
 VERTICES_PER_PATH = 8
-# Bytes of a vertex: 13 words of a record, as much again in the map before, and 9 words of a grid that is made.
+# Bytes of a vertex: 13 words of a record, 13 more in the map before, and 9 words while the grid is made.
 VERTEX_BYTES = (13 + 13 + 9) * 4
-# Bytes of a light path beside that: rays, throughput and random numbers, twice, and its start.
+# Other bytes of a light path: rays, throughput and random numbers, twice, and its start.
 PATH_BYTES = 512
-# Bytes that a map takes for each light path.
+# Bytes of a map for each light path.
 MAP_BYTES = VERTICES_PER_PATH * VERTEX_BYTES + PATH_BYTES
 
 
@@ -39,20 +40,19 @@ class Paths:
     """The state of light paths at the start of their next edge."""
 
     ray: mi.Ray3f  # along that edge
-    β: mi.Spectrum  # power there, times the number of light paths
-    brightest: mi.Float  # one over what they began with
+    β: mi.Spectrum  # power at its start, times the number of light paths
+    brightest: mi.Float  # 1 / the largest channel of their initial power
     bounce: mi.UInt32  # the number of the edge, from 1
     alive: mi.Bool
     channel: mi.UInt32 | None  # the colour by which distances are sampled; None in scenes without media
-    medium: mi.MediumPtr | None  # that the edge begins in
+    medium: mi.MediumPtr | None  # the medium at the start of the edge
 
 
 def trace(world: World, random: mi.Sampler, max_depth: int, rr_depth: int, frozen: Callable = call) -> Iterator[Any]:
-    """One light path for each lane of ``random``, of at most ``max_depth`` edges, as maps of vertices.
+    """Yields maps of the vertices of light paths: one path for each lane of ``random``, of at most ``max_depth`` edges.
 
-    Light is gathered at materials that are connectable, and within the media of the world's fog. A map has
-    VERTICES_PER_PATH places for each path; further maps hold only the paths that go on. ``frozen`` calls the functions
-    that make kernels.
+    Light is gathered at connectable materials, and in the media of the world's fog. A map has VERTICES_PER_PATH places
+    for each path. Further maps hold only the paths that go on. ``frozen`` calls the functions that make kernels.
     """
     start, channel, medium, numbers = frozen(begun, world, random)
     dr.eval(start, channel, medium, numbers)
@@ -70,13 +70,13 @@ def trace(world: World, random: mi.Sampler, max_depth: int, rr_depth: int, froze
         paths, numbers, photons = frozen(_walk, world, paths, random, depths, photons, (place + used, end))
         dr.eval(paths, numbers, photons)
         random = type(random)(numbers)
-        # The first place of further maps stays empty, so that sums over photons keep their groups and their last bits.
+        # The first place of each path in further maps stays empty, so that sums over photons keep their last bits.
         used = 1
         yield photons
 
 
 def empty_map(kind: type, paths: int, places: int) -> tuple[Any, mi.UInt32, mi.UInt32]:
-    """A map of this kind of vertices with so many places for each light path.
+    """An empty map of vertices of this ``kind``, with ``places`` places for each light path.
 
     Returns the map, the first place of each path, and the place behind its last.
     """
@@ -88,7 +88,7 @@ def empty_map(kind: type, paths: int, places: int) -> tuple[Any, mi.UInt32, mi.U
 
 
 def begun(world: World, random) -> tuple:
-    """Where light paths begin, their colours and media in fog, and their random numbers from then on."""
+    """The starts of light paths, their colours and media in scenes with fog, and the state of their random numbers."""
     random, channel, medium = random.clone(), None, None
     start = world.lights.sample(world.scene, random, mi.Float(0), dr.zeros(mi.Ray3f).wavelengths)
     if world.fog:
@@ -98,14 +98,14 @@ def begun(world: World, random) -> tuple:
 
 @dr.syntax
 def _walk(world: World, paths: Paths, random, depths: tuple, photons, places: tuple) -> tuple:
-    """Enters vertices at each path's ``places`` (from, to); paths that are alive then have more of them.
+    """Enters vertices at each path's ``places`` (from, to). Paths that are still alive afterwards have more vertices.
 
-    ``depths``: the most edges of a path, and the edge from which on Russian roulette is played.
+    ``depths`` is the largest number of edges of a path, and the first edge with Russian roulette.
     """
     scene, fog, receives = world.scene, world.fog, world.materials.connectable
     (max_depth, rr_depth), kind, random = depths, type(photons), random.clone()
-    place, end = places  # of the vertex to come, and behind the last
-    # What ``Paths`` says, of the edge to come
+    place, end = places  # the place of the next vertex, and that behind the last
+    # The fields of ``Paths``, for the next edge
     ray, β, brightest = mi.Ray3f(paths.ray), paths.β, paths.brightest
     bounce, alive, channel, medium = mi.UInt32(paths.bounce), mi.Bool(paths.alive), paths.channel, paths.medium
     while dr.hint(alive & (place < end), label="light paths"):
@@ -139,7 +139,7 @@ def _walk(world: World, paths: Paths, random, depths: tuple, photons, places: tu
 
 
 def event(si: mi.SurfaceInteraction3f, where: media.Place | None, random, exists: mi.Bool) -> tuple:
-    """How light paths are scattered at vertices: the sample, f / p, and a random number for Russian roulette."""
+    """Samples how light paths scatter at vertices: the sample, f / p, and a random number for Russian roulette."""
     u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
     bsdf, at_surface = si.bsdf(), exists if where is None else exists & ~where.scatters
     sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, at_surface)
@@ -150,9 +150,9 @@ def event(si: mi.SurfaceInteraction3f, where: media.Place | None, random, exists
 
 
 def lives(sample, β: mi.Spectrum, brightest: mi.Float, u: mi.Float, exists: mi.Bool, plays: mi.Bool) -> tuple:
-    """Which light paths survive an event that leaves the power β, and the probability of that.
+    """Which light paths survive an event, after which they have power β, and the probability to survive.
 
-    Russian roulette is by what is left of the light that the path began with, where it ``plays``.
+    Where it ``plays``, Russian roulette depends on the share of the path's initial light that is left.
     """
     survival = roulette(dr.max(β) * brightest, plays)
     return exists & (sample.pdf > 0) & (dr.max(β) > 0) & dr.isfinite(dr.sum(β)) & (u < survival), survival

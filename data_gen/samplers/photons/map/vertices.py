@@ -1,4 +1,4 @@
-"""The record of a photon map: vertices of light paths, an array of each field; and how they are read."""
+"""The record of a photon map: vertices of light paths, with an array for each field, and functions that read them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 
-# Photons on surfaces that face another way, by more than about 45 degrees, belong to another surface.
+# Photons whose normals differ by more than about 45 degrees belong to another surface.
 NORMAL_COSINE = 0.7
 
 
@@ -37,7 +37,7 @@ def faces(photon: Photon, x: mi.SurfaceInteraction3f) -> mi.Bool:
 
 
 def light(photon: Photon, x: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active) -> mi.Spectrum:
-    """f Φ, what a photon adds to radiance at ``x`` with material ``bsdf``, without the kernel."""
+    """f Φ, the radiance that a photon adds at ``x`` with material ``bsdf``, without the factor of the kernel."""
     f = bsdf.eval(context(RADIANCE), x, x.to_local(-photon.d), active)
     # f contains the shading cosine, but the density of photons follows the geometric one.
     L = f * photon.Φ / dr.abs(dr.dot(photon.n, photon.d))
