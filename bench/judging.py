@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import ngpt
-from bench.common import metadata, save
+from bench.common import kept, metadata, save
 from ngpt.evaluation.config import scene_name
 from ngpt.evaluation.references import HALVES, Reference, read_reference
 from ngpt.measure.metrics import EPSILON, scores, squared_error, trimmed_mean
@@ -90,14 +90,9 @@ class Judge:
     """Errors by two halves of a reference: NAME-WxH-a.exr and -b.exr of a folder, rendered there where they are not."""
 
     def __init__(self, loaded: Any, name: str, folder: Path, size: str, spp: int):
-        from data_gen.render import render_stack
-
-        folder.mkdir(parents=True, exist_ok=True)
         files = [folder / f"{name}-{size}{half}.exr" for half in HALVES]
         for i, file in enumerate(files):
-            if not file.exists():
-                print(f"rendering {file}", flush=True)
-                ngpt.write(file, render_stack(loaded, spp, REFERENCE_SEED + i, "primal", tails="paths"))
+            kept(file, lambda seed=REFERENCE_SEED + i: _whole_paths(loaded, spp, seed))
         self.reference: Reference = read_reference(files)
         # The denoised reference, in double precision
         halves = [ngpt.reconstruct(half, "oidn").image for half in self.reference.stacks]
@@ -121,6 +116,12 @@ class Judge:
 
     def values(self, image: np.ndarray) -> dict[str, float]:
         return {"error": self.steady(image), **self.scores(image, "FLIP")}
+
+
+def _whole_paths(loaded: Any, spp: int, seed: int) -> ngpt.GradientStack:
+    from data_gen.render import render_stack  # of the variant that is set
+
+    return render_stack(loaded, spp, seed, "primal", tails="paths")
 
 
 def processor_seconds() -> float:
