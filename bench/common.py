@@ -1,7 +1,8 @@
 """Functions of all benchmarks: times, versions of packages, and cached renders."""
 
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,6 @@ from typing import Any
 import numpy as np
 
 import ngpt
-from ngpt.evaluation.config import scene_name
 from ngpt.measure.averages import summary
 from ngpt.stack import GradientStack
 from ngpt.system import machine
@@ -51,6 +51,18 @@ def write_page(page: Path, text: str, marks: tuple[str, str]) -> None:
     page.write_text(f"{before}{marks[0]}\n\n{text}\n\n{marks[1]}{after}")
 
 
+def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> None:
+    """Prints a table in Markdown."""
+    for line in (head, ["---"] * len(head), *lines):
+        print(f"| {' | '.join(line)} |", flush=True)
+
+
+def digits(value: float | None) -> str:
+    if value is None or math.isnan(value):
+        return "-"
+    return f"{value:.4g}" if value < 100 else f"{value:.0f}"
+
+
 def blocks(image: np.ndarray, side: int = 8) -> np.ndarray:
     """Means over blocks of (..., H, W, C)."""
     *n, h, w, c = image.shape
@@ -58,13 +70,13 @@ def blocks(image: np.ndarray, side: int = 8) -> np.ndarray:
     return image.reshape(*n, h // side, side, w // side, side, c).mean(axis=(-4, -2))
 
 
-def kept(path: Path, make: Callable[[], GradientStack], names: dict[str, str] | None = None) -> GradientStack:
-    """The stack of a file, read with these ``names`` of layers. If there is no such file, makes and writes it."""
+def kept(path: Path, make: Callable[[], GradientStack]) -> GradientStack:
+    """The stack of a file. If there is no such file, makes and writes it."""
     if not path.exists():
         print(f"rendering {path.name}", flush=True)
         path.parent.mkdir(parents=True, exist_ok=True)
         ngpt.write(path, make())
-    return ngpt.read(path, names)
+    return ngpt.read(path)
 
 
 def renderer(variant: str | None = None) -> tuple[Callable[..., Any], Callable[..., GradientStack]]:
@@ -76,17 +88,3 @@ def renderer(variant: str | None = None) -> tuple[Callable[..., Any], Callable[.
     from data_gen.scenes.load import load_scene
 
     return load_scene, render_stack
-
-
-def rendered(
-    folder: Path, size: Sequence[int], scene: str | Path, spp: int, sampler: str, seed: int, **options: Any
-) -> GradientStack:
-    """A stack of a scene, from the folder if it is there; ``options`` are the sampler's."""
-
-    def make() -> GradientStack:
-        load_scene, render_stack = renderer()
-        return render_stack(load_scene(str(scene), (width, height)), spp, seed, sampler, unbiased=True, **options)
-
-    width, height = size
-    how = "".join(f"-{name}={value:g}" for name, value in options.items())
-    return kept(folder / f"{scene_name(str(scene))}-{sampler}-{spp}-{seed}{how}-{width}x{height}.exr", make)

@@ -13,16 +13,19 @@ import math
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
+from ngpt.measure.averages import geometric_mean
+
 REACH = 4.0  # how far a slope is trusted past the measured points
 # Squared errors fall as 1/samples. Two short renders may take nearly the same time; then the slope is mostly noise.
 STEEPEST = -1.0
 
 # (samples or seconds, error)
 Points = Sequence[tuple[float, float]]
+Ratio = tuple[float, str]  # with its mark
 _Segment = tuple[tuple[float, float], tuple[float, float]]
 
 
-def first_at(error: float, points: Points) -> tuple[float, str] | None:
+def first_at(error: float, points: Points) -> Ratio | None:
     """The place where a curve first falls to ``error``, and its mark.
 
     A curve that never falls gives its first point as an upper bound if its error is low enough, and None otherwise. All
@@ -45,7 +48,7 @@ def first_at(error: float, points: Points) -> tuple[float, str] | None:
     return math.exp(segment[0][0] + (target - segment[0][1]) / _slope(segment)), ""
 
 
-def error_at(x: float, points: Points) -> tuple[float, str] | None:
+def error_at(x: float, points: Points) -> Ratio | None:
     """The error of a curve at ``x``, and the mark of what is divided by it: ">" where the error is below that.
 
     None where there are fewer than two points. All numbers must be positive.
@@ -65,11 +68,30 @@ def error_at(x: float, points: Points) -> tuple[float, str] | None:
     return math.exp(a[1] + (at - a[0]) * _slope((a, b))), ""
 
 
+def over_least(error: float, x: float, curves: Iterable[Points]) -> Ratio | None:
+    """An error over the least one that a curve has at ``x``, with its mark; None where no curve has two points."""
+    least = min((answer for points in curves if (answer := error_at(x, points))), default=None)
+    return (error / least[0], least[1]) if least else None
+
+
 def joined(marks: Iterable[str]) -> str:
     """The mark of a mean: "<" or ">" if all bounds have that side; else "~" if there is any mark; else ""."""
     found = set(marks) - {""}
     bounds = found & {"<", ">"}
     return bounds.pop() if len(bounds) == 1 else "~" if found else ""
+
+
+def marked(value: Ratio | None) -> str:
+    """A ratio with its mark as text."""
+    return f"{value[1]}{value[0]:.2f}" if value else "-"
+
+
+def over(values: Sequence[Ratio | None]) -> str:
+    """The geometric mean of the values as text, with its mark, if none is missing."""
+    known = [value for value in values if value]
+    if len(known) < len(values):
+        return "-"
+    return marked((geometric_mean(value for value, _ in known), joined(mark for _, mark in known)))
 
 
 def _curve(points: Points) -> tuple[list[tuple[float, float]], list[_Segment]]:

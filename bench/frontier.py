@@ -1,16 +1,19 @@
-"""Speed against accuracy as a picture: error over total seconds, both axes logarithmic, by hand as SVG."""
+"""Speed against accuracy as a picture: error over total seconds, both axes logarithmic."""
 
+import io
 from dataclasses import dataclass
 from typing import Any
 
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
 from bench.wholetime import envelope
 from ngpt.measure.averages import geometric_mean
-from ngpt.report.axes import Axes
-from ngpt.system.text import markup
 
 # The dash patterns that tell the samplers of one method apart.
-DASHES = ("", "7 3", "2 3", "7 3 2 3", "12 4", "1 5")
-COLORS = ("#777777", "#2f7fd6", "#d9772b", "#3a9a5b", "#b0489a", "#c9a400", "#17a2a8", "#8a5a2b", "#d62f45", "#5b4fd6")
+DASHES = ("-", "--", ":", "-.", (0, (8, 3)), (0, (1, 4)))
+# Text stays text, and the same points give the same file.
+LOOK = {"svg.fonttype": "none", "svg.hashsalt": "ngpt"}
 
 
 @dataclass(frozen=True)
@@ -58,43 +61,27 @@ def points_against(results: dict[str, Any], scenes: list[str]) -> list[Point]:
 
 
 def draw(points: list[Point], title: str, metric: str) -> str:
-    """An SVG: a line for each method over its sample counts, filled rings for the Pareto set, the line through it.
-
-    Samplers of one method share its colour, and differ in dashes.
-    """
-    x = [p.seconds for p in points]
-    y = [p.error for p in points]
-    margin = max(160, 40 + 7 * max(len(p.method) for p in points))
-    axes = Axes((min(x) / 1.15, max(x) * 1.15), (min(y) / 1.2, max(y) * 1.2), width=520 + margin, margin=margin)
-    parts = axes.frame("seconds, rendering and reconstruction", metric, title)
+    """An SVG: a line for each method over its sample counts, rings for the Pareto set, and a grey line through it."""
+    families: dict[str, dict[str, None]] = {}
+    for p in points:
+        families.setdefault(p.family or p.method, {})[p.method] = None
     best = sorted((p for p, is_best in zip(points, pareto(points), strict=True) if is_best), key=lambda p: p.seconds)
-    path = "L".join(f"{axes.x(p.seconds):.1f} {axes.y(p.error):.1f}" for p in best)
-    parts.append(f'<path d="M{path}" fill="none" stroke="#000000" stroke-width="7" stroke-opacity="0.12"/>')
-    looks = _looks(points)
-    for method, (color, dash) in looks.items():
-        own = sorted((p for p in points if p.method == method), key=lambda p: (p.spp, p.seconds))
-        path = "L".join(f"{axes.x(p.seconds):.1f} {axes.y(p.error):.1f}" for p in own)
-        dashes = f' stroke-dasharray="{dash}"' if dash else ""
-        parts.append(f'<path d="M{path}" fill="none" stroke="{color}" stroke-width="1.6"{dashes}/>')
-        for p in (p for p in own if p.spp):
-            shape = f'cx="{axes.x(p.seconds):.1f}" cy="{axes.y(p.error):.1f}"'
-            name = markup(f"{method}, {p.spp} spp: {p.seconds:.3g} s, {p.error:.3g}")
-            look = f'r="4.5" fill="{color}" stroke="black"' if p in best else f'r="2.5" fill="{color}"'
-            parts.append(f"<circle {shape} {look}><title>{name}</title></circle>")
-    parts += axes.legend([(method, *look) for method, look in looks.items()])
-    note = "rings: Pareto set"
-    parts.append(f'<text x="{axes.right + 10}" y="{axes.bottom}" font-size="11" fill="#555555">{note}</text>')
-    return "\n".join([*parts, "</svg>"]) + "\n"
-
-
-def _looks(points: list[Point]) -> dict[str, tuple[str, str]]:
-    """(colour, dashes) of each method: colours by family, dashes by its members and by the rounds of the colours."""
-    families: dict[str, list[str]] = {}
-    for name, family in dict.fromkeys((p.method, p.family or p.method) for p in points):
-        families.setdefault(family, []).append(name)
-    looks = {}
-    for i, names in enumerate(families.values()):
-        for j, name in enumerate(names):
-            looks[name] = (COLORS[i % len(COLORS)], DASHES[(i // len(COLORS) + j) % len(DASHES)])
-    # In the order of the points.
-    return {name: looks[name] for name in dict.fromkeys(p.method for p in points)}
+    with mpl.rc_context(LOOK):
+        figure = Figure(figsize=(9, 5.5), layout="constrained")
+        axes = figure.subplots()
+        axes.loglog([p.seconds for p in best], [p.error for p in best], color="0.85", linewidth=7)
+        for i, methods in enumerate(families.values()):
+            for method, dash in zip(methods, DASHES * len(methods), strict=False):
+                own = sorted((p for p in points if p.method == method), key=lambda p: (p.spp, p.seconds))
+                look = {"color": f"C{i % 10}", "linestyle": dash, "label": method, "gid": f"line {method}"}
+                axes.plot([p.seconds for p in own], [p.error for p in own], **look)
+                counted = [p for p in own if p.spp]
+                edges = ["black" if p in best else "none" for p in counted]
+                where = [p.seconds for p in counted], [p.error for p in counted]
+                axes.scatter(*where, color=f"C{i % 10}", edgecolors=edges, zorder=3)
+        axes.set(xlabel="seconds, rendering and reconstruction", ylabel=metric, title=title)
+        axes.grid(which="both", alpha=0.3)
+        axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), title="rings: Pareto set")
+        text = io.StringIO()
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    return text.getvalue()

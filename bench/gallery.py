@@ -12,7 +12,6 @@ the result.
 
 import argparse
 import json
-import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,8 +19,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 import ngpt
-from bench import panels
 from bench.common import kept, metadata, save, write_page
+from bench.judging import timed
 from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.stack import GradientStack
@@ -33,6 +32,8 @@ PAGE = ROOT / "docs" / "gallery.md"
 RESULT = ROOT / "bench" / "results" / "gallery.json"
 MARKS = ("<!-- python -m bench.gallery: rows -->", "<!-- rows ends -->")
 REFERENCE_SEED = 1 << 20
+PAPER, INK, GAP, HEADING = (255, 255, 255), (20, 20, 20), 8, 30  # the latter in pixels
+HEADINGS = ("Noisy", "Denoised", "Reference")
 WIPE_FRAMES, WIPE_MS, REST_MS = 24, 60, 1400  # of the moving line; milliseconds of a frame, and at each end
 
 
@@ -86,9 +87,8 @@ def main() -> None:
             continue
         shown, rows[name] = images(args, row)
         exposure = auto_exposure(shown[-1])
-        tiles = [[to_srgb8(image, exposure)] for image in shown]
-        lines = [["Noisy"], ["Denoised"], ["Reference"]]
-        panels.save(ROOT / "docs" / "images" / "gallery" / f"{name}.webp", panels.columns(lines, tiles))
+        tiles = dict(zip(HEADINGS, (to_srgb8(image, exposure) for image in shown), strict=True))
+        written(ROOT / "docs" / "images" / "gallery" / f"{name}.webp", [beside(tiles)], quality=88)
     found = {"benchmark": "gallery", "size": list(args.size), "rows": rows}
     save(RESULT, found | {"metadata": metadata("mitsuba", "mitsuba-oidn")})
     write_page(PAGE, table(found), MARKS)
@@ -106,16 +106,14 @@ def images(args: argparse.Namespace, row: Shown) -> tuple[list[np.ndarray], dict
     """Noisy image, result and reference, (H, W, 3) scene-linear, and their values in the table."""
     stack = rendered(args, row, row.sampler, row.spp, 0, unbiased=False)
     ngpt.reconstruct(stack)  # loads what the method needs
-    start = time.process_time()
-    result = ngpt.reconstruct(stack)
-    seconds = float(stack.attributes["gallery:seconds"]) + time.process_time() - start
+    result, seconds = timed(lambda: ngpt.reconstruct(stack))
     reference = (args, row, row.reference, row.reference_spp)
     halves = [rendered(*reference, REFERENCE_SEED + i, unbiased=True)["primal"] for i in (0, 1)]
     facts = {
         "options": options(row),
         "sampler": stack.attributes["ngpt:sampler"],
         "method": result.method,
-        "CPU seconds": seconds,
+        "CPU seconds": float(stack.attributes["gallery:seconds"]) + seconds,
         "noisy": relmse_trimmed(stack["primal"], *halves),
         "result": relmse_trimmed(result.image, *halves),
         "oidn": relmse_trimmed(ngpt.denoise(stack, "oidn"), *halves),
@@ -132,10 +130,10 @@ def rendered(args: argparse.Namespace, row: Shown, sampler: str, spp: int, seed:
         import data_gen
 
         path = args.folder / row.scene if (args.folder / row.scene).exists() else row.scene
-        start = time.process_time()
-        stack, _ = data_gen.render_scene(path, spp, seed, sampler, size=tuple(args.size), unbiased=unbiased)
-        stack.attributes["gallery:seconds"] = time.process_time() - start
-        return stack
+        how = {"size": tuple(args.size), "unbiased": unbiased}
+        made, seconds = timed(lambda: data_gen.render_scene(path, spp, seed, sampler, **how))
+        made.stack.attributes["gallery:seconds"] = seconds
+        return made.stack
 
     return kept(file, make)
 
@@ -158,16 +156,32 @@ def write_wipe(path: Path, before: np.ndarray, after: np.ndarray) -> None:
     for x in [*places, *places[-2:0:-1]]:
         frame = Image.fromarray(np.concatenate([after[:, :x], before[:, x:]], axis=1))
         draw = ImageDraw.Draw(frame)
-        draw.rectangle((x - 1, 0, x, height), fill=panels.PAPER)
-        font, edge = ImageFont.load_default(15), {"stroke_width": 2, "stroke_fill": panels.INK}
+        draw.rectangle((x - 1, 0, x, height), fill=PAPER)
+        font, edge = ImageFont.load_default(15), {"stroke_width": 2, "stroke_fill": INK}
         for text, place, shown in (("denoised", 6, x > width / 4), ("noisy", width - 52, x < width * 3 / 4)):
             if shown:
-                draw.text((place, height - 22), text, panels.PAPER, font, **edge)
+                draw.text((place, height - 22), text, PAPER, font, **edge)
         frames.append(frame)
     waits = [REST_MS if i in (0, WIPE_FRAMES) else WIPE_MS for i in range(len(frames))]
+    written(path, frames, duration=waits, loop=0, quality=70)
+
+
+def beside(tiles: dict[str, np.ndarray]) -> Image.Image:
+    """(H, W, 3) uint8 images of one size in a row, each below its heading."""
+    height, width = next(iter(tiles.values())).shape[:2]
+    canvas = Image.new("RGB", (len(tiles) * (width + GAP) - GAP, HEADING + height), PAPER)
+    for i, (text, tile) in enumerate(tiles.items()):
+        ImageDraw.Draw(canvas).text((i * (width + GAP), 0), text, INK, ImageFont.load_default(19))
+        canvas.paste(Image.fromarray(tile), (i * (width + GAP), HEADING))
+    return canvas
+
+
+def written(path: Path, frames: list[Image.Image], **options: Any) -> None:
+    """Writes a picture or a moving one, as WebP."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_output(path, overwrite=True) as temporary:
-        frames[0].save(temporary, "WEBP", save_all=True, append_images=frames[1:], duration=waits, loop=0, quality=70)
-    print(f"{path}: {width}x{height}, {path.stat().st_size / 1000:.0f} kB")
+        frames[0].save(temporary, "WEBP", save_all=len(frames) > 1, append_images=frames[1:], **options)
+    print(f"{path}: {frames[0].width}x{frames[0].height}, {path.stat().st_size / 1000:.0f} kB")
 
 
 if __name__ == "__main__":

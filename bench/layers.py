@@ -12,13 +12,14 @@ scenes.
 import argparse
 import tempfile
 from collections.abc import Callable, Container, Iterator, Sequence
-from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from bench.common import metadata, rendered
+from bench.common import kept, metadata, renderer
 from ngpt.evaluation.config import scene_name
 from ngpt.io.exr import read
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
@@ -34,6 +35,7 @@ TABLE = Path(__file__).parent / "results" / "layers.json"
 SPP, SIZE, REFERENCE_SPP = (4, 16, 64), (192, 108), 2048
 # Layers that a renderer gives together
 GROUPS = (("albedo",), ("normal",), ("depth",), ("primal_var",), ("dx", "dy"), ("dx_var", "dy_var"))
+SAMPLER = "gpt"  # whose stacks have all layers
 NEED_OIDN = ("ngpt-combine", "ngpt-primal", "oidn")
 # Samples per pixel for the table of renderers
 RENDERER_SPP = 16
@@ -80,8 +82,10 @@ CHOICES: tuple[tuple[str, ...], ...] = (
 )
 
 
-@dataclass(frozen=True)
-class Row:
+Judged = tuple[GradientStack, np.ndarray]  # a stack and its reference
+
+
+class Row(NamedTuple):
     """A renderer's file with some layers in addition to the colour: the method of `auto`, and mean errors over scenes.
 
     ``oidn``   whether OIDN was available
@@ -103,8 +107,15 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=["diffuse", "glossy", "environment", "lens"])
     parser.add_argument("--size", type=int, nargs=2, default=SIZE, metavar=("WIDTH", "HEIGHT"))
     args = parser.parse_args()
-    truth = {s: rendered(args.cache, args.size, s, REFERENCE_SPP, "primal", 1)["primal"] for s in args.scenes}
-    stacks = {n: [(rendered(args.cache, args.size, s, n, "auto", 0), truth[s]) for s in args.scenes] for n in SPP}
+    load_scene, render_stack = renderer()
+
+    def rendered(scene: str, spp: int, sampler: str, seed: int) -> GradientStack:
+        file = "{}-{}-{}-{}-{}x{}.exr".format(scene_name(scene), sampler, spp, seed, *args.size)
+        loaded = partial(load_scene, scene, tuple(args.size))
+        return kept(args.cache / file, lambda: render_stack(loaded(), spp, seed, sampler, unbiased=True))
+
+    truth = {s: rendered(s, REFERENCE_SPP, "primal", 1)["primal"] for s in args.scenes}
+    stacks = {n: [(rendered(s, n, SAMPLER, 0), truth[s]) for s in args.scenes] for n in SPP}
     rows = [
         {"method": method, "layers": layers, "error": [error_of(stacks[n], method, layers) for n in SPP]}
         for method, layers in sorted({("primal", ("primal",)), *cases()}, key=lambda case: (len(case[1]), case))
@@ -145,11 +156,10 @@ def used(method: str, layers: Container[str]) -> tuple[str, ...]:
     return tuple(name for name in LAYERS if name in layers and name in (*entry.needs, *entry.uses, *entry.estimates))
 
 
-def error_of(scenes: Sequence[tuple[GradientStack, np.ndarray]], method: str, layers: Sequence[str]) -> float:
-    """The geometric mean over (stack, reference) of a method's error with these layers."""
-    return geometric_mean(
-        relmse_trimmed(reconstruct(part(stack, layers), method).image, truth) for stack, truth in scenes
-    )
+def error_of(scenes: Sequence[Judged], method: str, layers: Sequence[str] = ()) -> float:
+    """The geometric mean over the scenes of a method's error, with these layers only if there are any."""
+    given = ((part(stack, layers) if layers else stack, truth) for stack, truth in scenes)
+    return geometric_mean(relmse_trimmed(reconstruct(stack, method).image, truth) for stack, truth in given)
 
 
 def part(stack: GradientStack, layers: Sequence[str]) -> GradientStack:
@@ -163,10 +173,10 @@ def apart(stack: GradientStack, layers: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in ("direct", "caustic", "caustic_var") if "dx" in layers and name in stack)
 
 
-def renderers(scenes: Sequence[tuple[GradientStack, np.ndarray]], folder: Path) -> list[Row]:
+def renderers(scenes: Sequence[Judged], folder: Path) -> list[Row]:
     """A row for each renderer, each choice of layers that it writes, and with and without OIDN."""
     rows, known = [], {}
-    for renderer, names in {**RENDERERS, "any, by our names": OWN}.items():
+    for name, names in {**RENDERERS, "any, by our names": OWN}.items():
         for layers in CHOICES:
             held = ("primal", *layers)
             # Layers of any renderer are measured by the names of one.
@@ -179,7 +189,7 @@ def renderers(scenes: Sequence[tuple[GradientStack, np.ndarray]], folder: Path) 
                 key = held, oidn, tuple(stack.names for stack, _ in files)
                 if key not in known:
                     known[key] = measured(files, oidn)
-                rows.append(Row(renderer, layers, oidn, *known[key]))
+                rows.append(Row(name, layers, oidn, *known[key]))
     return rows
 
 
@@ -196,15 +206,10 @@ def written(
     return read(path)
 
 
-def measured(files: Sequence[tuple[GradientStack, np.ndarray]], oidn: bool) -> tuple[str, float, float | None, float]:
+def measured(files: Sequence[Judged], oidn: bool) -> tuple[str, float, float | None, float]:
     """The method that `auto` chose, its error, the error of `oidn` if it is installed, and the error of the input."""
-
-    def error(method: str) -> float:
-        images = (reconstruct(stack, method).image for stack, _ in files)
-        return geometric_mean(relmse_trimmed(image, truth) for image, (_, truth) in zip(images, files, strict=True))
-
     method = choose(files[0][0], lambda name: not METHODS[name].missing() and (oidn or name not in NEED_OIDN))
-    return method, error(method), error("oidn") if oidn else None, error("primal")
+    return method, error_of(files, method), error_of(files, "oidn") if oidn else None, error_of(files, "primal")
 
 
 def by_layers(rows: list[dict]) -> str:

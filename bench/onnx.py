@@ -15,24 +15,30 @@ Per size, on synthetic stacks with features and variances, all in this process a
     ngpt-combine    as ngpt.reconstruct() runs it: base, OIDN of the primal and of the base, network
 
 Two more values are measured in separate processes: the peak memory, and the seconds from the command to the end of
-`ngpt denoise` for a stack of 64x64 pixels. Rows whose package is not installed are left out, and the results say so.
+`ngpt denoise` for a stack of 64x64 pixels.
 """
 
 import argparse
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
+import mitsuba_oidn
 import numpy as np
+import torch
 
 import ngpt
 from bench.common import measure, metadata, save
-from bench.reconstruction import synthetic
+from ngpt.classical.gradients import forward_differences
+from ngpt.export.network import network_model
 from ngpt.methods import METHODS, reconstruct
 from ngpt.network.run_onnx import Network, planes
+from ngpt.network.run_torch import layers_of
+from ngpt.network.safetensors import load_weights
 from ngpt.network.shipped import WEIGHTS
-from ngpt.repair import repair
+from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
 
 SIZES = ("1280x720", "1920x1080")
@@ -57,8 +63,23 @@ def main() -> None:
             print(size, {name: round(row["median"], 3) for name, row in result["sizes"][size].items()}, flush=True)
         result["start-up"] = start_up(Path(folder), args.repeats)
         result["peak MiB"] = {size: peak(size) for size in args.sizes}
-        result["bytes"] = {"float32": FAST.stat().st_size, "float16": half.stat().st_size if half else None}
+        result["bytes"] = {"float32": FAST.stat().st_size, "float16": half.stat().st_size}
     save(args.output, result)
+
+
+def synthetic(width: int, height: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """(primal, dx, dy) and their variances: shading with edges, noise that varies tenfold, fireflies, all seeded."""
+    random = np.random.default_rng(0)
+    y, x = (np.mgrid[:height, :width] / height).astype(np.float32)
+    boxes = sum(((x - a) % 0.31 < 0.13) * ((y - b) % 0.23 < 0.1) for a, b in ((0, 0), (0.1, 0.05), (0.2, 0.15)))
+    truth = np.stack([0.1 + 0.3 * y + 0.2 * boxes * (1 + 0.3 * np.sin(7 * x + c)) for c in range(3)], -1)
+    layers, variances = [], []
+    for image, share in ((truth, 0.7), *((d, 0.1) for d in forward_differences(truth))):
+        deviation = share * truth.mean(-1, keepdims=True) * random.gamma(1, 1, (height, width, 1))
+        deviation *= 1 + 20 * (random.random((height, width, 1)) < 0.003)
+        layers.append((image + deviation * random.standard_normal(image.shape)).astype(np.float32))
+        variances.append((deviation**2 * random.gamma(4, 0.25, image.shape)).astype(np.float32))
+    return layers, variances
 
 
 def stack_of(width: int, height: int) -> GradientStack:
@@ -73,23 +94,21 @@ def stack_of(width: int, height: int) -> GradientStack:
     )
 
 
-def half_precision(folder: Path) -> Path | None:
-    try:
-        from ngpt.export.network import network_model
-    except ModuleNotFoundError:
-        return None
-    path, weights = folder / "half.onnx", TWIN
-    path.write_bytes(network_model(weights, "ngpt-fast", "float16").SerializeToString())
+def half_precision(folder: Path) -> Path:
+    path = folder / "half.onnx"
+    path.write_bytes(network_model(TWIN, "ngpt-fast", "float16").SerializeToString())
     return path
 
 
-def bench_size(stack: GradientStack, half: Path | None, repeats: int) -> dict:
+def bench_size(stack: GradientStack, half: Path, repeats: int) -> dict:
     data, network = repair(stack), Network(FAST)
     layers = {"primal": data.image, "dx": data.dx, "dy": data.dy, **data.features}
     layers |= dict(zip(("primal_var", "dx_var", "dy_var"), data.variances, strict=True))
     base = METHODS["wcv"].run(data)
     feed = {name: planes(layer)[None] for name, layer in layers.items()}
-    feed["direct"] = np.zeros_like(feed["primal"])
+    # The graph wants layers that these stacks do not have, such as the light that is kept apart.
+    zero = np.zeros_like(feed["primal"])
+    feed = {entry.name: zero for entry in network.session.get_inputs()} | feed
     calls = {
         "ngpt-fast": lambda: reconstruct(stack, "ngpt-fast"),
         "repair": lambda: repair(stack),
@@ -97,21 +116,13 @@ def bench_size(stack: GradientStack, half: Path | None, repeats: int) -> dict:
         "network": lambda: network.reconstruct(layers, base),
         "graph alone": lambda: network.session.run(None, feed),
     }
-    if half:
-        in_half = Network(half)
-        calls["float16"] = lambda: in_half.reconstruct(layers, base)
+    in_half = Network(half)
+    calls["float16"] = lambda: in_half.reconstruct(layers, base)
     calls |= torch_calls(data) | oidn_calls(stack, data)
     return measure(calls, repeats)
 
 
-def torch_calls(data) -> dict:
-    try:
-        import torch
-    except ModuleNotFoundError:
-        return {}
-    from ngpt.network.run_torch import layers_of
-    from ngpt.network.safetensors import load_weights
-
+def torch_calls(data: Repaired) -> dict[str, Callable[[], object]]:
     model, _ = load_weights(TWIN)
     layers = {name: layer[None] for name, layer in layers_of(data, model.config).items()}
 
@@ -122,14 +133,10 @@ def torch_calls(data) -> dict:
     return {"torch": lambda: run(False), "torch bf16": lambda: run(True)}
 
 
-def oidn_calls(stack: GradientStack, data) -> dict:
-    try:
-        import mitsuba_oidn
-    except ModuleNotFoundError:
-        return {}
+def oidn_calls(stack: GradientStack, data: Repaired) -> dict[str, Callable[[], object]]:
     features = {name: np.ascontiguousarray(data.features[name]) for name in ("albedo", "normal")}
 
-    def run(quality) -> None:
+    def run(quality: mitsuba_oidn.Quality) -> None:
         np.array(mitsuba_oidn.denoise(data.image, **features, hdr=True, quality=quality))
 
     return {

@@ -13,16 +13,19 @@ import argparse
 import json
 import math
 from collections import Counter
+from collections.abc import Iterable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from bench.common import save, write_page
-from bench.curves import error_at
+from bench.curves import over_least
 from bench.frontier import draw, points_against
-from bench.tables import RIVALS, heading
+from bench.tables import RIVALS
 from bench.wholetime import against_rivals, groups_of, ratio
 from bench.worth import marked, worth_of_gradients
 from ngpt.measure.averages import geometric_mean
+from ngpt.system.writing import markdown_table
 
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "bench" / "results" / "main.json"
@@ -37,6 +40,7 @@ DRAWN = ("blind", "all")
 TUNED = ("diffuse", "glossy", "coffee", "living-room", "staircase")
 # Ratios over OIDN from which a loss is listed by name
 LOSS = 1.1
+VALUES = ("error", "FLIP")
 
 
 def main() -> None:
@@ -139,28 +143,32 @@ class Size:
         rows = [row for n in self.counts if (row := self.means.get((group, n, method, rival)))]
         return f"{sum(row[f'less{key}'] for row in rows)} of {sum(row[f'scenes{key}'] for row in rows)}"
 
+    def heads(self) -> list[str]:
+        return [f"{n} spp" for n in self.counts]
+
     def drawn(self) -> list[str]:
         return [group for group in DRAWN if group in self.groups]
+
+
+def table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    return "\n".join(markdown_table(list(heads), rows))
 
 
 def of_groups(sizes: list[Size], *groups: str, methods: tuple[str, ...] = (*SHARED, *OURS)) -> str:
     """Error and FLIP over both rivals' for each group and size, and in how many cells they are less."""
     tables = []
     for size in sizes:
-        lines = heading(f"{size.name}: error, FLIP", "over", *(f"{n} spp" for n in size.counts), "less error, FLIP")
-        for group in (group for group in groups if group in size.groups):
-            for method in methods:
-                for rival, text in size.rivals.items():
-                    rows = [size.means.get((group, n, method, rival)) for n in size.counts]
-                    if not any(rows):
-                        continue
-                    cells = list(map(size.both, rows))
-                    won = ", ".join(size.won(group, method, rival, key) for key in ("", " FLIP"))
-                    scenes = max(row["scenes"] for row in rows if row)
-                    first = f"{group} ({scenes}): {SHARED.get(method, f'`{method}`')}"
-                    lines.append(f"| {first} | {text} | {' | '.join(cells)} | {won} |")
-        if len(lines) > 2:
-            tables.append("\n".join(lines))
+        rows = []
+        for group, method, (rival, text) in product(groups, methods, size.rivals.items()):
+            found = [size.means.get((group, n, method, rival)) for n in size.counts]
+            if group in size.groups and any(found):
+                won = ", ".join(size.won(group, method, rival, key) for key in ("", " FLIP"))
+                scenes = max(row["scenes"] for row in found if row)
+                first = f"{group} ({scenes}): {SHARED.get(method, f'`{method}`')}"
+                rows.append([first, text, *map(size.both, found), won])
+        if rows:
+            heads = [f"{size.name}: error, FLIP", "over", *size.heads(), "less error, FLIP"]
+            tables.append(table(heads, rows))
     return "\n\n".join(tables) or "Not measured yet."
 
 
@@ -171,123 +179,102 @@ def frontier(size: Size, group: str) -> str:
 
 def settings(size: Size) -> str:
     """In how many cells of `ngpt-combine` each setting of a rival has the least error at its time."""
-    lines = heading(f"{size.name}: best setting", *(f"{n} spp" for n in size.counts))
-    for rival, columns in size.kept["rivals"].items():
-        chosen = {
-            n: Counter(row["setting"] for (_, *key), row in size.rows.items() if key == [n, OURS[0], rival])
-            for n in size.counts
-        }
-        for column in columns:
-            if any(found[column] for found in chosen.values()):
-                lines.append(f"| `{column}` | {' | '.join(str(chosen[n][column]) for n in size.counts)} |")
-    return "\n".join(lines)
+    chosen = Counter((rival, row["setting"], n) for (_, n, m, rival), row in size.rows.items() if m == OURS[0])
+    columns = [(rival, column) for rival, columns in size.kept["rivals"].items() for column in columns]
+    found = {(rival, column): [chosen[rival, column, n] for n in size.counts] for rival, column in columns}
+    rows = ([f"`{column}`", *map(str, counts)] for (_, column), counts in found.items() if any(counts))
+    return table([f"{size.name}: best setting", *size.heads()], rows)
 
 
 def by_scene(size: Size) -> str:
     """Error and FLIP over both rivals' in each scene; and the seconds of the first of our networks."""
+    rows = []
+    for scene, n in product(size.scenes, size.counts):
+        cells = [size.both(size.rows.get((scene, n, m, rival))) for m in OURS for rival in size.rivals]
+        cell = size.cells.get((scene, n, OURS[0]))
+        seconds = f"{cell['seconds']['total']:.3g}" if cell else ""
+        rows.append([scene if n == size.counts[0] else "", str(n), seconds, *cells])
     heads = [f"`{method}` over {text}" for method in OURS for text in size.rivals.values()]
-    lines = heading(f"{size.name}: scene", "spp", "seconds", *heads)
-    for scene in size.scenes:
-        for n in size.counts:
-            cells = [size.both(size.rows.get((scene, n, m, rival))) for m in OURS for rival in size.rivals]
-            cell = size.cells.get((scene, n, OURS[0]))
-            seconds = f"{cell['seconds']['total']:.3g}" if cell else ""
-            lines.append(f"| {scene if n == size.counts[0] else ''} | {n} | {seconds} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+    return table([f"{size.name}: scene", "spp", "seconds", *heads], rows)
 
 
 def worth(sizes: list[Size]) -> str:
     """W/C of the best pipelines, a line for each group and size."""
-    counts = sorted({n for size in sizes for n in size.counts})
-    lines = heading("W / C, geometric means", "C", *(f"{n} spp" for n in counts))
+    counts, rows = sorted({n for size in sizes for n in size.counts}), []
     for size in sizes:
-        rows = {(row["group"], row["spp"]): row for row in size.kept["worth"]["means"] if row["method"] is None}
-        for group in (group for group in dict.fromkeys(group for group, _ in rows) if group in size.groups):
-            here = {n: rows.get((group, n)) for n in counts}
-            first = next(row for row in here.values() if row)
-            cells = [marked(first, "C"), *(marked(here[n], "W/C") for n in counts)]
-            lines.append(f"| {group} ({first['scenes']}), {size.name} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        found = {(row["group"], row["spp"]): row for row in size.kept["worth"]["means"] if row["method"] is None}
+        for group in (group for group in dict.fromkeys(group for group, _ in found) if group in size.groups):
+            first = next(row for (name, _), row in found.items() if name == group)
+            cells = [marked(first, "C"), *(marked(found.get((group, n)), "W/C") for n in counts)]
+            rows.append([f"{group} ({first['scenes']}), {size.name}", *cells])
+    return table(["W / C, geometric means", "C", *(f"{n} spp" for n in counts)], rows)
 
 
 def worth_by_scene(size: Size) -> str:
-    rows = {(row["scene"], row["spp"]): row for row in size.kept["worth"]["rows"] if row["best"]}
-    lines = heading(f"{size.name}: scene", "C", *(f"W / C at {n} spp" for n in size.counts))
-    for scene in dict.fromkeys(scene for scene, _ in rows):
-        here = [rows.get((scene, n)) for n in size.counts]
-        first = next(row for row in here if row)
-        lines.append(f"| {scene} | {' | '.join([marked(first, 'C'), *(marked(row, 'W/C') for row in here)])} |")
-    return "\n".join(lines)
+    found = {(row["scene"], row["spp"]): row for row in size.kept["worth"]["rows"] if row["best"]}
+    first = {scene: row for (scene, _), row in reversed(found.items())}
+    rows = [
+        [scene, marked(first[scene], "C"), *(marked(found.get((scene, n)), "W/C") for n in size.counts)]
+        for scene in dict.fromkeys(scene for scene, _ in found)
+    ]
+    return table([f"{size.name}: scene", "C", *(f"W / C at {n} spp" for n in size.counts)], rows)
 
 
 def by_method(sizes: list[Size]) -> str:
     """Errors over Mitsuba's with OIDN, over all scenes, and what each method takes after the render."""
-    size, rival = sizes[0], "mitsuba"
-    seconds = [f"seconds, {s.name}" for s in sizes]
-    lines = heading(f"{size.name}: method", *(f"{n} spp" for n in size.counts), *seconds)
+    size, rows = sizes[0], []
     for method in COMPARED:
-        cells = [ratio(size.means.get((size.groups[-1], n, method, rival)), "error") for n in size.counts]
-        times = [
-            [c["seconds"]["reconstruct"] for (_, n, m), c in s.cells.items() if (n, m) == (s.counts[0], method)]
-            for s in sizes
-        ]
-        cells += [f"{geometric_mean(found):.2f}" if found else "" for found in times]
-        lines.append(f"| `{method}` | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        cells = [ratio(size.means.get((size.groups[-1], n, method, "mitsuba")), "error") for n in size.counts]
+        for s in sizes:
+            of = (c for (_, n, m), c in s.cells.items() if (n, m) == (s.counts[0], method))
+            cells.append(mean(cell["seconds"]["reconstruct"] for cell in of))
+        rows.append([f"`{method}`", *cells])
+    return table([f"{size.name}: method", *size.heads(), *(f"seconds, {s.name}" for s in sizes)], rows)
+
+
+def mean(values: Iterable[float]) -> str:
+    found = list(values)
+    return f"{geometric_mean(found):.2f}" if found else ""
 
 
 def better(sizes: list[Size]) -> str:
     """OIDN on our samples over OIDN on Mitsuba's, each at its best setting: means, and the worst scene in brackets."""
-    size = sizes[0]
-    groups = {"all": size.scenes, "apart": [scene for scene in size.scenes if scene not in TUNED]}
-    lines = heading(f"{size.name}: new over old", *(f"{n} spp" for n in size.counts))
-    for group, scenes in groups.items():
+    size, rows = sizes[0], []
+    for group, scenes in {"all": size.scenes, "apart": [s for s in size.scenes if s not in TUNED]}.items():
         cells = []
-        for n in (n for n in size.counts if scenes):
-            found = [[size.rows.get((s, n, c, "mitsuba")) for c in size.kept["rivals"]["oidn"]] for s in scenes]
-            least = {
-                key: [min(row[key] for row in rows if row and row[key]) for rows in found if any(rows)]
-                for key in ("error", "FLIP")
-            }
-            error, flips = least["error"], least["FLIP"]
-            known = error and flips
-            cells.append(
-                f"{geometric_mean(error):.2f} ({max(error):.2f}), FLIP {geometric_mean(flips):.2f}" if known else ""
-            )
-        if cells:
-            lines.append(f"| {group} ({len(scenes)}) | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        for n in size.counts:
+            of = [[size.rows.get((s, n, c, "mitsuba")) for c in size.kept["rivals"]["oidn"]] for s in scenes]
+            error, flips = ([min(r[v] for r in each if r and r[v]) for each in of if any(each)] for v in VALUES)
+            cells.append(f"{mean(error)} ({max(error):.2f}), FLIP {mean(flips)}" if error and flips else "")
+        if scenes:
+            rows.append([f"{group} ({len(scenes)})", *cells])
+    return table([f"{size.name}: new over old", *size.heads()], rows)
 
 
 def over_primal(sizes: list[Size]) -> str:
     """Error of ngpt-combine over ngpt-primal's at the same whole time."""
     size = sizes[0]
     ratios: dict[tuple[str, int], float] = {}
-    for scene in size.scenes:
-        mine = {n: size.cells.get((scene, n, "ngpt-combine")) for n in size.counts}
-        curve = [c for (s, _, m), c in size.cells.items() if (s, m) == (scene, "ngpt-primal") and (c["error"] or 0) > 0]
+    known = {place: cell for place, cell in size.cells.items() if (cell["error"] or 0) > 0}
+    for (scene, n, method), mine in known.items():
+        curve = [cell for (s, _, m), cell in known.items() if (s, m) == (scene, "ngpt-primal")]
         points = [(cell["seconds"]["total"], cell["error"]) for cell in curve]
-        for n, cell in mine.items():
-            if cell and (cell["error"] or 0) > 0 and (theirs := error_at(cell["seconds"]["total"], points)):
-                ratios[scene, n] = cell["error"] / theirs[0]
-    lines = heading("error of `ngpt-combine` over `ngpt-primal`", *(f"{n} spp" for n in size.counts))
+        if method == "ngpt-combine" and (found := over_least(mine["error"], mine["seconds"]["total"], [points])):
+            ratios[scene, n] = found[0]
+    rows = []
     for group in size.groups:
-        cells = []
-        for n in size.counts:
-            found = [ratios[scene, n] for scene in size.members(group) if (scene, n) in ratios]
-            cells.append(f"{geometric_mean(found):.2f}" if found else "")
-        lines.append(f"| {group} ({len(size.members(group))}) | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        scenes = size.members(group)
+        cells = (mean(ratios[scene, n] for scene in scenes if (scene, n) in ratios) for n in size.counts)
+        rows.append([f"{group} ({len(scenes)})", *cells])
+    return table(["error of `ngpt-combine` over `ngpt-primal`", *size.heads()], rows)
 
 
 def losses(size: Size, method: str) -> str:
     """The scenes in which it has more than ``LOSS`` times OIDN's error somewhere, the worst first."""
-    lines = heading("scene", *(f"{n} spp" for n in size.counts))
     found = {scene: [size.rows.get((scene, n, method, "oidn")) for n in size.counts] for scene in size.scenes}
     worst = {scene: max((row["error"] for row in rows if row), default=-math.inf) for scene, rows in found.items()}
-    for scene in sorted((scene for scene in found if worst[scene] > LOSS), key=lambda scene: -worst[scene]):
-        lines.append(f"| {scene} | {' | '.join(ratio(row, 'error') for row in found[scene])} |")
-    return "\n".join(lines)
+    lost = sorted((scene for scene in found if worst[scene] > LOSS), key=lambda scene: -worst[scene])
+    return table(["scene", *size.heads()], ([scene, *(ratio(row, "error") for row in found[scene])] for scene in lost))
 
 
 if __name__ == "__main__":

@@ -8,11 +8,11 @@
 A cell is a scene, a number of samples and a pipeline, named SAMPLER+METHOD:
 
     auto+auto        the defaults of `render_scene` and `reconstruct`
-    mitsuba+oidn     the rival: OIDN on Mitsuba's own points and lamps and whole paths (``bench.tails.RIVAL``)
+    mitsuba+oidn     the rival: OIDN on Mitsuba's own points and lamps and whole paths (``bench.judging.RIVAL``)
     primal+oidn      the rival of pipelines with gradients: OIDN on our samples
     all others       the methods that ship
 
-The error is ``bench.tails.steady_error``, by two halves of a reference; FLIP is over their mean. Seconds are
+The error is ``bench.judging.Judge.steady``, by two halves of a reference; FLIP is over their mean. Seconds are
 of processors, of render and method, with compiled kernels. References are kept in the folder --cache, and made there
 where they are missing. What is worse than before, and why noise is not, is in ``bench.verdict``.
 """
@@ -23,21 +23,17 @@ import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
-
-import numpy as np
 
 import ngpt
 from bench import verdict
 from bench.common import metadata, renderer, save, write_page
-from bench.curves import error_at
-from bench.seeds import opened
-from bench.tails import RIVAL, WARM_SPP, clean_image, marked, over, processor_seconds, reference_of, steady_error
+from bench.curves import Ratio, marked, over, over_least
+from bench.judging import RIVAL, WARM_SPP, Judge, opened, processor_seconds, timed
 from ngpt.errors import NgptError
-from ngpt.evaluation.references import Reference
 from ngpt.measure.averages import geometric_mean
-from ngpt.measure.flip import flip
 from ngpt.stack import GradientStack
 from ngpt.subpixels import FEWEST
 from ngpt.system.writing import markdown_table
@@ -133,61 +129,55 @@ def measured(names: Sequence[str], cache: Path, seeds: Sequence[int]) -> Iterato
     """The cells of each scene; then the time of all, without references, is printed."""
     seconds = used = 0.0
     for name in names:
-        loaded, reference = opened_with_reference(name, cache)
+        loaded, judge = opened_with_judge(name, cache)
         start, start_used = time.perf_counter(), processor_seconds()
-        yield cells_of(name, loaded, reference, seeds)
+        yield cells_of(name, loaded, judge, seeds)
         seconds, used = seconds + time.perf_counter() - start, used + processor_seconds() - start_used
         print(f"{name}: {seconds:.0f} s in all, {used:.0f} s of processors", flush=True)
 
 
-def opened_with_reference(name: str, cache: Path) -> tuple[Any, Reference]:
+def opened_with_judge(name: str, cache: Path) -> tuple[Any, Judge]:
     """The loaded scene and its reference, which is rendered where the folder lacks it."""
     load_scene, _ = renderer()
     # A kernel knows the shapes of all scenes in memory.
     gc.collect()
     case = CASES[name]
-    width, height = SIZE
     with opened(case.scene) as (_, file):
         loaded = load_scene(file, SIZE)
-    wanted = argparse.Namespace(references=cache, size=f"{width}x{height}", reference_spp=case.reference_spp)
-    cache.mkdir(parents=True, exist_ok=True)
-    return loaded, reference_of(loaded, name, wanted)
+    return loaded, Judge(loaded, name, cache, "{}x{}".format(*SIZE), case.reference_spp)
 
 
-def cells_of(name: str, loaded: Any, reference: Reference, seeds: Sequence[int]) -> list[dict[str, Any]]:
+def cells_of(name: str, loaded: Any, judge: Judge, seeds: Sequence[int]) -> list[dict[str, Any]]:
     """The cells of a scene, with error, FLIP and seconds by seed."""
-    clean = clean_image(reference)
     for sampler, methods in METHODS.items():
         # The default has subpixels, and so other kernels, from FEWEST samples on.
         for few in (WARM_SPP, FEWEST):
-            stack, _ = render(loaded, sampler, few, 0)
+            stack = render(loaded, sampler, few, 0)
             for method in methods:
                 ngpt.reconstruct(stack, method)
     cells = []
     for spp in SPP:
         by_pipeline: dict[str, dict[str, Any]] = {pipeline: {} for pipeline in PIPELINES}
         for seed in seeds:
-            for pipeline, values in of_seed(loaded, spp, seed, reference, clean).items():
+            for pipeline, values in of_seed(loaded, spp, seed, judge).items():
                 for value, number in values.items():
                     by_pipeline[pipeline].setdefault(value, {})[str(seed)] = number
         cells += [{"scene": name, "spp": spp, "pipeline": each} | values for each, values in by_pipeline.items()]
     return cells
 
 
-def of_seed(loaded: Any, spp: int, seed: int, reference: Reference, clean: np.ndarray) -> dict[str, dict[str, float]]:
+def of_seed(loaded: Any, spp: int, seed: int, judge: Judge) -> dict[str, dict[str, float]]:
     """Values by pipeline. The pipeline that the default chooses is neither rendered nor denoised a second time."""
     found: dict[str, dict[str, float]] = {}
     stacks: dict[str, tuple[GradientStack, float]] = {}
     for sampler, methods in METHODS.items():
-        stack, seconds = stacks.get(sampler) or render(loaded, sampler, spp, seed)
+        stack, seconds = stacks.get(sampler) or timed(partial(render, loaded, sampler, spp, seed))
         for method in methods:
             if (pipeline := f"{sampler}+{method}") in found:
                 continue
-            start = processor_seconds()
-            result = ngpt.reconstruct(stack, method)
-            whole = seconds + processor_seconds() - start
-            error = max(steady_error(result.image, reference, clean), _LEAST_ERROR)
-            values = {"error": error, "FLIP": flip(result.image, reference.mean)[0], "seconds": whole}
+            result, more = timed(partial(ngpt.reconstruct, stack, method))
+            values = judge.values(result.image) | {"seconds": seconds + more}
+            values["error"] = max(values["error"], _LEAST_ERROR)
             found[pipeline] = {value: float(f"{number:.4g}") for value, number in values.items()}
             if pipeline == DEFAULT:
                 taken = str(stack.attributes["ngpt:sampler"])
@@ -196,14 +186,12 @@ def of_seed(loaded: Any, spp: int, seed: int, reference: Reference, clean: np.nd
     return {pipeline: found[pipeline] for pipeline in PIPELINES}
 
 
-def render(loaded: Any, sampler: str, spp: int, seed: int) -> tuple[GradientStack, float]:
-    """The stack as `ngpt render` makes it, or as Mitsuba would, and processor seconds."""
+def render(loaded: Any, sampler: str, spp: int, seed: int) -> GradientStack:
+    """The stack as `ngpt render` makes it, or as Mitsuba would."""
     from data_gen import render_scene
 
     options: dict[str, Any] = RIVAL | {"tails": "paths", "subpixels": 1} if sampler == "mitsuba" else {}
-    start = processor_seconds()
-    stack = render_scene(loaded, spp, seed, "primal" if options else sampler, **options).stack
-    return stack, processor_seconds() - start
+    return render_scene(loaded, spp, seed, "primal" if options else sampler, **options).stack
 
 
 def text(cells: list[dict[str, Any]]) -> str:
@@ -232,20 +220,18 @@ def mean_of(cell: dict[str, Any], value: str) -> float:
     return geometric_mean(cell[value].values())
 
 
-def over_best(of: dict[verdict.Key, dict[str, Any]], scene: str, spp: int, equal: str) -> list[tuple[float, str]]:
+def over_best(of: dict[verdict.Key, dict[str, Any]], scene: str, spp: int, equal: str) -> list[Ratio | None]:
     """Error and FLIP of the default over the least of ``OURS``, at as many samples or after as many seconds; with the
     marks of ``bench.curves``."""
-    default = of[scene, str(spp), DEFAULT]
-    found = []
+    default, found = of[scene, str(spp), DEFAULT], []
     for value in verdict.LIMITS:
+        error = mean_of(default, value)
         if equal == "samples":
-            least = min((mean_of(of[scene, str(spp), each], value), "") for each in OURS)
+            found.append((error / min(mean_of(of[scene, str(spp), each], value) for each in OURS), ""))
         else:
             curves = ([of[scene, str(n), each] for n in SPP] for each in OURS)
             points = ([(mean_of(cell, "seconds"), mean_of(cell, value)) for cell in curve] for curve in curves)
-            read = (error_at(mean_of(default, "seconds"), each) for each in points)
-            least = min(each for each in read if each)
-        found.append((mean_of(default, value) / least[0], least[1]))
+            found.append(over_least(error, mean_of(default, "seconds"), points))
     return found
 
 

@@ -16,40 +16,25 @@ ngpt does with subpixels (``ngpt.denoisers.oidn.of_both``): the mean of an image
 way:
 
     seconds  of processors, of the render and of OIDN, both warmed up
-    error    after ``steady`` of ``bench.tails``, since references of some rooms are noisy; FLIP is over their mean
+    error    ``bench.judging.Judge.steady``, since references of some rooms are noisy; FLIP is over their mean
 
 The table divides the error and FLIP of the default by those of each of RIVALS at the default's whole time. Values are
-geometric means over seeds. At each time, a rival has its best way. ``bench.curves`` explains the marks. Scenes and
-references are as of `bench.seeds`. Cells that the file has are not measured again.
+geometric means over seeds. At each time, a rival has its best way. ``bench.curves`` explains the marks.
+``bench.judging`` opens scenes and makes references. Cells that the file has are not measured again.
 """
 
 import argparse
 import gc
-import json
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 import ngpt
-from bench.common import metadata, renderer, save
-from bench.curves import error_at
-from bench.seeds import opened
-from bench.tails import (
-    WARM_SPP,
-    add_references,
-    check_references,
-    clean_image,
-    marked,
-    processor_seconds,
-    reference_of,
-    steady_error,
-    table,
-)
-from ngpt.evaluation.references import Reference
+from bench.common import renderer, table
+from bench.curves import marked, over_least
+from bench.judging import WARM_SPP, Cells, Judge, command, opened, parsed, timed
 from ngpt.measure.averages import geometric_mean
-from ngpt.measure.metrics import scores
 from ngpt.stack import GradientStack
 from ngpt.subpixels import FEWEST, means
 
@@ -88,61 +73,40 @@ class Images(NamedTuple):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="*", metavar="SCENE", help="none: only the table")
-    add_references(parser)
-    parser.add_argument("--size", default="320x180")
-    parser.add_argument("--spp", type=int, nargs="+", default=[4, 16, 64])
+    parser = command(__doc__, "rivals", "320x180", (4, 16, 64))
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--renders", nargs="+", default=list(RENDERS), choices=RENDERS)
     parser.add_argument("--ways", nargs="+", default=list(WAYS), choices=list(WAYS))
-    parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/rivals.json"))
-    args = parser.parse_args()
-    check_references(parser, args)
-    cells = json.loads(args.output.read_text())["cells"] if args.output.exists() else []
-    result = {"benchmark": "rivals", "metadata": metadata("mitsuba", "drjit", "mitsuba-oidn"), "cells": cells}
-    for scene in args.scenes:
-        for cell in measured(scene, args, {place(cell) for cell in cells}):
-            cells.append(cell)
-            save(args.output, result)
-            print(*place(cell), f"{min(way['seconds'] for way in cell['ways'].values()):.2f} s", flush=True)
+    args = parsed(parser)
+    cells = Cells(args.output, "rivals", CELL)
+    cells.measure(args.scenes, lambda scene, known: measured(scene, args, known))
     table(["scene", "spp", "whole s", *RIVALS], list(rows(cells)))
-
-
-def place(cell: dict[str, Any]) -> tuple:
-    return tuple(cell[name] for name in CELL)
 
 
 def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterator[dict[str, Any]]:
     """The cells of a scene that are not ``known``, one after the other."""
     load_scene, _ = renderer()
-    size = tuple(map(int, args.size.split("x")))
+    size = args.pixels
     with opened(scene) as (name, file):
-        reference = reference_of(load_scene(file, size), name, args)
-        clean = clean_image(reference)
+        judge = Judge(load_scene(file, size), name, args.references, args.size, args.reference_spp)
         for render in args.renders:
             gc.collect()  # a kernel knows the shapes of all scenes in memory
             make = by_default(file, size) if render == "default" else by_ways(images_of(file, size, render), args.ways)
             warm = False
             for spp in args.spp:
                 for seed in args.seeds:
-                    cell = dict(zip(CELL, (name, args.size, render, spp, seed), strict=True))
-                    if place(cell) in known:
+                    place = (name, args.size, render, spp, seed)
+                    if place in known:
                         continue
                     if not warm:
                         # The default has subpixels, and so other kernels, from FEWEST samples on.
                         warm = bool([make(few, 0) for few in (WARM_SPP, FEWEST)])
-                    yield cell | {
-                        "ways": {way: judged(*made, reference, clean) for way, made in make(spp, seed).items()}
-                    }
+                    made = make(spp, seed).items()
+                    ways = {way: {"seconds": seconds} | judge.values(image) for way, (image, seconds) in made}
+                    yield dict(zip(CELL, place, strict=True)) | {"ways": ways}
 
 
 Made = dict[str, tuple[np.ndarray, float]]  # by way: the image and its whole seconds
-
-
-def judged(image: np.ndarray, seconds: float, reference: Reference, clean: np.ndarray) -> dict[str, float]:
-    flip = scores(["FLIP"], image, *reference.images)["FLIP"]
-    return {"seconds": seconds, "error": steady_error(image, reference, clean), "FLIP": flip}
 
 
 def by_default(file: str, size: tuple[int, int]) -> Callable[[int, int], Made]:
@@ -151,33 +115,31 @@ def by_default(file: str, size: tuple[int, int]) -> Callable[[int, int], Made]:
 
     scene = load_scene(file, size)
 
-    def make(spp: int, seed: int) -> Made:
-        start = processor_seconds()
+    def image(spp: int, seed: int) -> np.ndarray:
         plan = without_features(scene, plan_sampler(scene, spp, None))
         how = {"unbiased": False, "subpixels": "auto", **plan.options}
-        image = ngpt.reconstruct(render_stack(scene, spp, seed, plan.sampler, **how), plan.method or "auto").image
-        return {"default": (image, processor_seconds() - start)}
+        return ngpt.reconstruct(render_stack(scene, spp, seed, plan.sampler, **how), plan.method or "auto").image
 
-    return make
+    return lambda spp, seed: {"default": timed(lambda: image(spp, seed))}
 
 
 def by_ways(images: Callable[[int, int, int], Images], ways: Sequence[str]) -> Callable[[int, int], Made]:
+    def denoised(given: Images, k: int, auxiliary: str) -> np.ndarray:
+        layers = given._asdict()
+        if k > 1:
+            stack = GradientStack({name: means(layer, k) for name, layer in layers.items()}, fine=layers)
+        else:
+            stack = GradientStack(layers)
+        return ngpt.reconstruct(stack, "oidn", auxiliary=auxiliary).image
+
     def make(spp: int, seed: int) -> Made:
-        rendered, made = {}, {}
-        for k in sorted({WAYS[way][0] for way in ways}):
-            start = processor_seconds()
-            rendered[k] = images(spp, seed, k), processor_seconds() - start
+        rendered = {k: timed(lambda k=k: images(spp, seed, k)) for k in sorted({WAYS[way][0] for way in ways})}
+        made = {}
         for way in ways:
             k, auxiliary = WAYS[way]
             given, seconds = rendered[k]
-            start = processor_seconds()
-            layers = given._asdict()
-            if k > 1:
-                stack = GradientStack({name: means(layer, k) for name, layer in layers.items()}, fine=layers)
-            else:
-                stack = GradientStack(layers)
-            image = ngpt.reconstruct(stack, "oidn", auxiliary=auxiliary).image
-            made[way] = image, seconds + processor_seconds() - start
+            image, more = timed(lambda given=given, k=k, a=auxiliary: denoised(given, k, a))
+            made[way] = image, seconds + more
         return made
 
     return make
@@ -272,10 +234,7 @@ def over(mine: list[dict], cells: list[dict], renders: tuple[str, ...], ways: tu
     seconds, found = geometric_mean([each["seconds"] for each in mine]), []
     for value in VALUES:
         curves = [points(cells, render, way, value) for render in renders for way in ways]
-        answers = [answer for curve in curves if (answer := error_at(seconds, curve))]
-        least = min(answers, default=None)
-        own = geometric_mean([each[value] for each in mine])
-        found.append((own / least[0], least[1]) if least else None)
+        found.append(over_least(geometric_mean([each[value] for each in mine]), seconds, curves))
     return found
 
 

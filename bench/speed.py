@@ -26,10 +26,33 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bench.common import metadata, save
-from ngpt.measure.averages import summary
+import mitsuba_oidn
+import numpy as np
+import torch
 
-WORKER = "--worker"
+import ngpt
+from bench.common import metadata, save
+from bench.onnx import stack_of
+from ngpt.measure.averages import summary
+from ngpt.methods import reconstruct
+from ngpt.network import tza
+from ngpt.network.oidnet import SHAPES, OidnUNet
+from ngpt.stack import GradientStack
+
+# Runs at the earlier commit, so it uses what every version has: a line of a method and a file gives seconds.
+WORKER = """
+import sys, time
+import ngpt
+from ngpt.methods import reconstruct
+given = {}
+for line in sys.stdin:
+    name, file = line.split()
+    if file not in given:
+        given[file] = ngpt.read(file)
+    clock, cpu = time.perf_counter(), time.process_time()
+    reconstruct(given[file], name)
+    print(time.perf_counter() - clock, time.process_time() - cpu, flush=True)
+"""
 # Row -> the method that runs, and the kind of stack that it runs on.
 ROWS = {
     "wcv": ("", "caustic"),
@@ -50,21 +73,25 @@ def main() -> None:
     args = parser.parse_args()
     result = {"benchmark": "speed", **vars(args), "metadata": metadata("onnxruntime", "mitsuba-oidn")}
     del result["output"]
-    with tempfile.TemporaryDirectory() as folder:
-        old = Path(folder) / "old"
-        git("worktree", "add", "--detach", str(old), args.before)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder, given = Path(temporary), stacks(args.size)
+        for kind, stack in given.items():
+            ngpt.write(folder / f"{kind or 'clean'}.exr", stack)
+        git("worktree", "add", "--detach", str(folder / "old"), args.before)
         try:
-            worker = start(old, args.size)
+            worker = start(folder / "old")
             calls: dict[str, Callable[[], tuple[float, float]]] = {
-                name: lambda call=call: timed(call) for name, call in rows(args.size, Path(folder)).items()
+                name: lambda call=call: timed(call) for name, call in rows(given, folder).items()
             }
-            calls |= {f"before: {name}": lambda name=name: ask(worker, name) for name in CALLS}
+            for row, (name, kind) in CALLS.items():
+                line = f"{name} {folder / (kind or 'clean')}.exr"
+                calls[f"before: {row}"] = lambda line=line: ask(worker, line)
             calls = {name: call for name, call in calls.items() if name not in args.without}
             result["rows"] = measured(calls, args.repeats)
             worker.kill()
             worker.wait()
         finally:
-            git("worktree", "remove", "--force", str(old))
+            git("worktree", "remove", "--force", str(folder / "old"))
     for name, row in result["rows"].items():
         clock, cpu, ratio = (row[key]["median"] for key in ("clock", "processors", "over oidn"))
         print(f"{name:22}{clock:8.3f} s by the clock {cpu:8.3f} s of processors {ratio:8.2f} times oidn")
@@ -76,16 +103,7 @@ def git(*arguments: str) -> None:
     subprocess.run(["git", *arguments], cwd=root, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
-def rows(size: str, folder: Path) -> dict[str, Callable[[], object]]:
-    import mitsuba_oidn
-    import numpy as np
-    import torch
-
-    from ngpt.methods import reconstruct
-    from ngpt.network import tza
-    from ngpt.network.oidnet import SHAPES, OidnUNet
-
-    given = stacks(size)
+def rows(given: dict[str, GradientStack], folder: Path) -> dict[str, Callable[[], object]]:
     stack = given[""]
     torch.manual_seed(0)
     files = {}
@@ -102,12 +120,8 @@ def rows(size: str, folder: Path) -> dict[str, Callable[[], object]]:
     }
 
 
-def stacks(size: str) -> dict[str, Any]:
+def stacks(size: str) -> dict[str, GradientStack]:
     """The stacks of the rows by what sets them apart; half a percent of the pixels have light in ``caustic``."""
-    import numpy as np
-
-    from bench.onnx import stack_of
-
     noisy = stack_of(*map(int, size.split("x")))
     clean = noisy.replace()
     # Marks the features as clean, as stacks by ngpt do; earlier commits do not read it.
@@ -143,36 +157,19 @@ def timed(call: Callable[[], object]) -> tuple[float, float]:
     return time.perf_counter() - clock, time.process_time() - cpu
 
 
-def start(folder: Path, size: str) -> subprocess.Popen:
-    """This file again, which imports the methods of ``folder``."""
-    return subprocess.Popen(
-        # Without -P the folder of this file would hide modules of the same names.
-        [sys.executable, "-P", __file__, WORKER, size],
-        env=os.environ | {"PYTHONPATH": str(folder)},
-        cwd=folder,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+def start(folder: Path) -> subprocess.Popen:
+    """A process that runs the methods of ``folder``."""
+    how: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "cwd": folder}
+    return subprocess.Popen([sys.executable, "-c", WORKER], env=os.environ | {"PYTHONPATH": str(folder)}, **how)
 
 
-def ask(worker: subprocess.Popen, name: str) -> tuple[float, float]:
+def ask(worker: subprocess.Popen, line: str) -> tuple[float, float]:
     assert worker.stdin and worker.stdout
-    worker.stdin.write(f"{name}\n")
+    worker.stdin.write(f"{line}\n")
     worker.stdin.flush()
     clock, cpu = map(float, worker.stdout.readline().split())
     return clock, cpu
 
 
-def work(size: str) -> None:
-    """Runs each method that it reads from standard input, and prints its seconds."""
-    from ngpt.methods import reconstruct
-
-    given = stacks(size)
-    for row in sys.stdin:
-        name, kind = CALLS[row.strip()]
-        print(*timed(lambda name=name, kind=kind: reconstruct(given[kind], name)), flush=True)
-
-
 if __name__ == "__main__":
-    work(sys.argv[2]) if sys.argv[1:2] == [WORKER] else main()
+    main()

@@ -15,80 +15,76 @@ the cost of a sample of each sampler. ``PAGES`` gives the page of each table, an
 
 import argparse
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from bench.common import save, write_page
 from ngpt.measure.averages import geometric_mean
+from ngpt.system.writing import markdown_table
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "bench" / "results"
-
-
-def by_scene(result: dict[str, Any]) -> str:
-    cells = {(cell["scene"], cell["spp"], cell["method"]): cell["error"] for cell in result["cells"]}
-    columns = list(dict.fromkeys((scene, spp) for scene, spp, _ in cells))
-    methods = list(dict.fromkeys(method for *_, method in cells))
-    several = len({spp for _, spp in columns}) > 1
-    lines = heading(
-        "method (sampler)", *(f"{scene}, {spp} spp" if several else scene for scene, spp in columns), "mean"
-    )
-    least = {column: min(e for (*place, _), e in cells.items() if tuple(place) == column) for column in columns}
-    for method in methods:
-        ratios = [cells[*column, method] / least[column] if (*column, method) in cells else None for column in columns]
-        shown = ["" if r is None else "**1**" if r == 1 else short(r) for r in ratios]
-        # A mean needs all scenes: means over different scenes could not be compared.
-        shown.append("" if None in ratios else short(geometric_mean(ratios)))
-        lines.append(f"| `{method}` | {' | '.join(shown)} |")
-    lines.append(f"| *least error* | {' | '.join(f'{error:.2g}' for error in least.values())} | |")
-    costs = result.get("costs", {})
-    for sampler in dict.fromkeys(name for cost in costs.values() for name in cost):
-        of = [costs.get(scene, {}) for scene, _ in columns]
-        shown = [short(cost[sampler] / cost["primal"], 2) if sampler in cost else "" for cost in of]
-        if sampler != "primal":
-            lines.append(f"| *cost of `{sampler}`* | {' | '.join(shown)} | |")
-    return "\n".join(lines)
-
-
-def means(result: dict[str, Any]) -> str:
-    methods = list(dict.fromkeys(cell["method"] for cell in result["cells"]))
-    both = all("FLIP" in cell for cell in result["cells"])
-    lines = heading("spp", *(f"`{method}`{', FLIP' if both else ''}" for method in methods))
-    for spp in sorted({cell["spp"] for cell in result["cells"]}):
-        texts = {method: [] for method in methods}
-        for key in ("error", "FLIP") if both else ("error",):
-            found = {
-                m: geometric_mean([c[key] for c in result["cells"] if (c["spp"], c["method"]) == (spp, m)])
-                for m in methods
-            }
-            for method, value in found.items():
-                text = f"{value:.3f}" if key == "FLIP" else f"{value:.2g}"
-                texts[method].append(f"**{text}**" if value == min(found.values()) else text)
-        lines.append(f"| {spp} | {' | '.join(', '.join(text) for text in texts.values())} |")
-    return "\n".join(lines)
 
 
 # Columns of evaluations and their names in tables: OIDN on our own samples, and the usual alternative of a user
 RIVALS = {"oidn": "OIDN", "mitsuba": "Mitsuba + OIDN"}
 
 
+def pivoted(result: dict[str, Any], value: str = "error") -> pd.DataFrame:
+    """A row for each scene and number of samples, a column for each method, as the cells are ordered."""
+    return pd.DataFrame(result["cells"]).pivot_table(value, ["scene", "spp"], "method", sort=False, observed=True)
+
+
+def by_scene(result: dict[str, Any]) -> str:
+    errors = pivoted(result)
+    ratios = errors.div(errors.min(axis=1), axis=0)
+    several = errors.index.unique("spp").size > 1
+    heads = [f"{scene}, {spp} spp" if several else scene for scene, spp in errors.index]
+    rows = []
+    for method in dict.fromkeys(cell["method"] for cell in result["cells"]):
+        shown = ["" if math.isnan(r) else "**1**" if r == 1 else short(r) for r in ratios[method]]
+        # A mean needs all scenes: means over different scenes could not be compared.
+        rows.append([f"`{method}`", *shown, "" if "" in shown else short(geometric_mean(ratios[method]))])
+    rows.append(["*least error*", *(f"{error:.2g}" for error in errors.min(axis=1)), ""])
+    costs = pd.DataFrame(result.get("costs", {})).reindex(columns=errors.index.get_level_values("scene"))
+    for sampler, cost in (costs / costs.loc["primal"] if len(costs) else costs).iterrows():
+        if sampler != "primal":
+            rows.append([f"*cost of `{sampler}`*", *("" if math.isnan(c) else short(c, 2) for c in cost), ""])
+    return "\n".join(markdown_table(["method (sampler)", *heads, "mean"], rows))
+
+
+def means(result: dict[str, Any]) -> str:
+    values = ["error", "FLIP"] if all("FLIP" in cell for cell in result["cells"]) else ["error"]
+    of = {value: pivoted(result, value).groupby("spp").agg(geometric_mean) for value in values}
+    methods = list(dict.fromkeys(cell["method"] for cell in result["cells"]))
+
+    def text(value: str, spp: int, method: str) -> str:
+        line = of[value].loc[spp]
+        shown = f"{line[method]:.3f}" if value == "FLIP" else f"{line[method]:.2g}"
+        return f"**{shown}**" if line[method] == line.min() else shown
+
+    rows = [[str(n), *(", ".join(text(v, n, method) for v in values) for method in methods)] for n in of["error"].index]
+    heads = (f"`{method}`{', FLIP' if len(values) > 1 else ''}" for method in methods)
+    return "\n".join(markdown_table(["spp", *heads], rows))
+
+
 def rivals(result: dict[str, Any]) -> str:
-    of = {(cell["scene"], cell["spp"], cell["method"]): cell for cell in result["cells"]}
-    methods = [name for name in dict.fromkeys(method for *_, method in of) if name not in RIVALS]
-    places = list(dict.fromkeys((scene, spp) for scene, spp, _ in of))
-    lines = heading(f"{len(places)} cells", *(f"`{method}`" for method in methods))
+    of = {"error": pivoted(result), "FLIP": pivoted(result, "FLIP")}
+    methods = [name for name in dict.fromkeys(cell["method"] for cell in result["cells"]) if name not in RIVALS]
+    rows = []
     for rival, text in RIVALS.items():
         over = {
-            (method, key): [of[*p, method][key] / of[*p, rival][key] for p in places if (*p, method) in of]
-            for method in methods
-            for key in ("error", "FLIP")
+            value: [(found[method] / found[rival])[found[method].notna()] for method in methods]
+            for value, found in of.items()
         }
-        less = [f"{sum(r < 1 for r in over[m, 'error'])} of {len(over[m, 'error'])}" for m in methods]
-        lines.append(f"| less error than {text} | {' | '.join(less)} |")
-        for key in ("error", "FLIP"):
-            lines.append(f"| {key} over its | {' | '.join(short(geometric_mean(over[m, key])) for m in methods)} |")
-    return "\n".join(lines)
+        less = [f"{(ratios < 1).sum()} of {ratios.size}" for ratios in over["error"]]
+        rows.append([f"less error than {text}", *less])
+        rows += [[f"{value} over its", *map(short, map(geometric_mean, each))] for value, each in over.items()]
+    return "\n".join(markdown_table([f"{len(of['error'])} cells", *(f"`{method}`" for method in methods)], rows))
 
 
 PAGES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
@@ -150,10 +146,6 @@ def cells_of(results: dict[str, Any]) -> list[dict[str, Any]]:
 
 def short(value: float, digits: int = 3) -> str:
     return f"{value:.{digits}g}" if value < 100 else f"{value:.0f}"
-
-
-def heading(first: str, *others: str) -> list[str]:
-    return [f"| {first} | {' | '.join(others)} |", "|---" + "|--:" * len(others) + "|"]
 
 
 if __name__ == "__main__":

@@ -21,22 +21,21 @@ Cells that the file has are not measured again. Values are medians over seeds, m
 
 import argparse
 import gc
-import json
 import os
-import resource
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 import ngpt
-from bench.common import blocks, metadata, renderer, save
-from bench.curves import error_at, joined
+from bench.common import blocks, digits, renderer, table
+from bench.curves import Ratio, error_at, joined, marked, over, over_least
+from bench.judging import RIVAL, WARM_SPP, Cells, Judge, command, parsed, timed
 from bench.worth import worth_tables
 from ngpt.evaluation.config import scene_name
-from ngpt.evaluation.references import HALVES, Reference, read_reference
-from ngpt.measure.averages import geometric_mean, median
-from ngpt.measure.metrics import EPSILON, relmse_trimmed, scores, squared_error, trimmed_mean
+from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import choose
 
 RAW = "raw"
@@ -46,71 +45,44 @@ METHODS = {
     "gpt": ["wcv", "ngpt-fast", "ngpt-combine", "oidn"],
     "mitsuba": ["oidn"],
 }
-# Mitsuba as it is
-RIVAL = {"points": "independent", "lamps": "uniform"}
 TAILS = ("paths", "shared")
 VALUES = ("error", "steady", "FLIP", "blocks", "energy")
 ERRORS = VALUES[:-1]
-# Far from the seeds of images
-REFERENCE_SEED = 1 << 20
-# With this number of samples a render reaches its second round, so that all kernels are compiled.
-WARM_SPP = 9
+RATIOS = ("seconds", *(f"{name}, {at}" for at in ("samples", "time") for name in ERRORS))
 CELL = ("scene", "size", "sampler", "tails", "spp", "seed")
-
-
-def add_references(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--references", type=Path, metavar="FOLDER")
-    parser.add_argument("--reference-spp", type=int, default=256, help="of each half that is made")
-
-
-def check_references(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
-    if args.scenes and not args.references:
-        parser.error("give the folder of --references")
+PIPELINE = ["scene", "size", "sampler", "method"]
+# Columns of an evaluation; `oidn` reads no gradients.
+PIPELINES = {
+    f"{sampler}+{method}": {"sampler": sampler, "stack": "gradients" if sampler == "gpt" else "primal"}
+    for sampler in ("primal", "gpt")
+    for method in METHODS[sampler]
+    if (sampler, method) != ("gpt", "oidn") and method != RAW
+}
+MITSUBA = "mitsuba+oidn"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="*", metavar="SCENE", help="files or built-in names; none: only the tables")
-    add_references(parser)
-    parser.add_argument("--size", default="640x360")
+    parser = command(__doc__, "tails", "640x360", (4, 16, 64))
     parser.add_argument("--tails", nargs="+", default=list(TAILS), choices=list(TAILS))
     parser.add_argument("--samplers", nargs="+", default=list(METHODS), choices=list(METHODS))
-    parser.add_argument("--spp", type=int, nargs="+", default=[4, 16, 64])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--groups", nargs="*", default=[], metavar="NAME=SCENE,...", help="scenes to take means over")
-    parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/tails.json"))
-    args = parser.parse_args()
-    check_references(parser, args)
-    result = {
-        "benchmark": "tails",
-        "metadata": metadata("mitsuba", "drjit", "mitsuba-oidn", "onnxruntime"),
-        "cells": [],
-    }
-    if args.output.exists():
-        result["cells"] = json.loads(args.output.read_text())["cells"]
-    for scene in args.scenes:
-        for cell in measured(scene, args, {place(cell) for cell in result["cells"]}):
-            result["cells"].append(cell)
-            save(args.output, result)
-            print(*place(cell), f"{cell['seconds']:.2f} s", flush=True)
+    args = parsed(parser)
+    cells = Cells(args.output, "tails", CELL)
+    cells.measure(args.scenes, lambda scene, known: measured(scene, args, known))
     groups = dict(text.split("=", 1) for text in args.groups)
-    show(result["cells"], {name: members.split(",") for name, members in groups.items()})
+    show(cells, {name: members.split(",") for name, members in groups.items()})
 
 
-def place(cell: dict[str, Any]) -> tuple:
-    return tuple(cell[name] for name in CELL)
-
-
-def measured(scene: str, args: argparse.Namespace, known: set[tuple]):
+def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterator[dict[str, Any]]:
     """The cells of a scene that are not ``known``, one after the other."""
     load_scene, render_stack = renderer()
     from data_gen.choosing.plans import plan_sampler
 
     # A kernel knows the shapes of all scenes in memory.
     gc.collect()
-    loaded = load_scene(scene, tuple(map(int, args.size.split("x"))))
-    reference = reference_of(loaded, scene, args)
-    clean = clean_image(reference)
+    loaded = load_scene(scene, args.pixels)
+    judge = Judge(loaded, scene_name(scene), args.references, args.size, args.reference_spp)
     chosen = plan_sampler(loaded, min(args.spp), None)
     for sampler in args.samplers:
         warm: set[str] = set()
@@ -126,139 +98,105 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]):
                         for method in METHODS[sampler]:
                             image_of(stack, method)
                         warm.add(tails)
-                    load, start = os.getloadavg()[0], processor_seconds()
-                    stack = render_stack(loaded, spp, seed, name, tails=tails, **options)
-                    cell = dict(zip(CELL, values, strict=True)) | {"seconds": processor_seconds() - start}
-                    cell |= {"load average": load, "options": stack.attributes.get("ngpt:samplerOptions", "")}
+                    load = os.getloadavg()[0]
+                    stack, seconds = timed(partial(render_stack, loaded, spp, seed, name, tails=tails, **options))
+                    cell = dict(zip(CELL, values, strict=True)) | {"seconds": seconds, "load average": load}
+                    cell["options"] = stack.attributes.get("ngpt:samplerOptions", "")
                     if sampler == chosen.sampler and tails == "shared":
                         cell["auto"] = chosen.method or choose(stack)
-                    yield cell | {"methods": {name: judged(stack, name, reference, clean) for name in METHODS[sampler]}}
-
-
-def processor_seconds() -> float:
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return used.ru_utime + used.ru_stime
-
-
-def reference_of(loaded: Any, scene: str, args: argparse.Namespace) -> Reference:
-    from data_gen.render import render_stack
-
-    args.references.mkdir(parents=True, exist_ok=True)
-    files = [args.references / f"{scene_name(scene)}-{args.size}{half}.exr" for half in HALVES]
-    for i, file in enumerate(files):
-        if not file.exists():
-            print(f"rendering {file}", flush=True)
-            ngpt.write(file, render_stack(loaded, args.reference_spp, REFERENCE_SEED + i, "primal", tails="paths"))
-    return read_reference(files)
+                    yield cell | {"methods": {method: judged(stack, method, judge) for method in METHODS[sampler]}}
 
 
 def image_of(stack: ngpt.GradientStack, method: str) -> np.ndarray:
     return stack["primal"] if method == RAW else ngpt.reconstruct(stack, method).image
 
 
-def judged(stack: ngpt.GradientStack, method: str, reference: Reference, clean: np.ndarray) -> dict[str, float | None]:
+def judged(stack: ngpt.GradientStack, method: str, judge: Judge) -> dict[str, float | None]:
     """Seconds of the reconstruction, and ``VALUES``; no FLIP of the raw primal."""
-    start = processor_seconds()
-    image = image_of(stack, method)
-    seconds = processor_seconds() - start if method != RAW else 0.0
-    names = ["relMSE trimmed", *(["FLIP"] if method != RAW else [])]
-    found = scores(names, image, *reference.images)
-    coarse = relmse_trimmed(*(blocks(each.astype(np.float64)) for each in (image, *reference.images)))
+    image, seconds = timed(lambda: image_of(stack, method))
+    found = judge.scores(image, "relMSE trimmed", *(["FLIP"] if method != RAW else []))
+    coarse = relmse_trimmed(*(blocks(each.astype(np.float64)) for each in (image, *judge.reference.images)))
     return {
-        "seconds": seconds,
+        "seconds": seconds if method != RAW else 0.0,
         "error": found["relMSE trimmed"],
-        "steady": steady_error(image, reference, clean),
+        "steady": judge.steady(image),
         "FLIP": found.get("FLIP"),
         "blocks": coarse**0.5 if coarse > 0 else None,
-        "energy": float(image.mean(dtype=np.float64) / reference.mean.mean(dtype=np.float64)),
+        "energy": judge.light(image),
     }
 
 
-def clean_image(reference: Reference) -> np.ndarray:
-    """The denoised reference, (H, W, 3) double precision."""
-    return np.mean([ngpt.reconstruct(half, "oidn").image for half in reference.stacks], axis=0, dtype=np.float64)
-
-
-def steady_error(image: np.ndarray, reference: Reference, clean: np.ndarray) -> float:
-    """relMSE by both halves of the reference, relative to the ``clean`` one, without the 0.1 % that are worst by it."""
-    each = (squared_error(image, *halves) / (clean**2 + EPSILON) for halves in (reference.images, (clean,)))
-    return trimmed_mean(*each, share=0.001)
-
-
-def rows_of(cells: list[dict]) -> dict[tuple, dict[int, dict[str, dict]]]:
-    """(scene, size, sampler, method) -> samples -> tails -> medians over seeds, also of ``render`` and ``whole``."""
-    each: dict[tuple, dict[int, dict[str, list]]] = {}
-    for cell in cells:
-        for method, values in cell["methods"].items():
-            line = values | {"render": cell["seconds"], "whole": cell["seconds"] + values["seconds"]}
-            by_spp = each.setdefault((cell["scene"], cell["size"], cell["sampler"], method), {})
-            by_spp.setdefault(cell["spp"], {}).setdefault(cell["tails"], []).append(line)
+def medians(cells: list[dict]) -> dict[tuple, pd.DataFrame]:
+    """Pipeline -> medians over seeds of ``VALUES``, ``render`` and ``whole`` seconds, by samples and tails."""
+    lines = [
+        {name: cell[name] for name in CELL}
+        | {"method": method, "render": cell["seconds"], "whole": cell["seconds"] + values["seconds"]}
+        | {name: values.get(name) for name in VALUES}
+        for cell in cells
+        for method, values in cell["methods"].items()
+    ]
+    frame = pd.DataFrame(lines).astype(dict.fromkeys(VALUES, float))
     return {
-        key: {
-            spp: {
-                tails: {name: median(line.get(name) for line in lines) for name in ("render", "whole", *VALUES)}
-                for tails, lines in by.items()
-            }
-            for spp, by in sorted(by_spp.items())
-        }
-        for key, by_spp in each.items()
+        key: here.groupby(["spp", "tails"])[["render", "whole", *VALUES]].median()
+        for key, here in frame.groupby(PIPELINE, sort=False)
     }
 
 
-def ratios(by_spp: dict[int, dict[str, dict]], spp: int) -> dict[str, tuple[float, str]]:
+def with_tails(here: pd.DataFrame, tails: str) -> pd.DataFrame:
+    """The rows with these tails, by samples."""
+    return here[here.index.get_level_values("tails") == tails].droplevel("tails")
+
+
+def points(here: pd.DataFrame, value: str) -> list[tuple[float, float]]:
+    known = here[here[value] > 0]
+    return list(zip(known["whole"], known[value], strict=True))
+
+
+def ratios(here: pd.DataFrame, spp: int) -> dict[str, Ratio]:
     """Shared over paths, with marks: ``seconds``, and errors at equal samples and at equal whole time."""
-    paths, shared = (by_spp[spp].get(tails) for tails in TAILS)
-    found: dict[str, tuple[float, str]] = {}
-    if not paths or not shared:
-        return found
-    found["seconds"] = shared["whole"] / paths["whole"], ""
+    if any((spp, tails) not in here.index for tails in TAILS):
+        return {}
+    paths, shared = (here.loc[spp, tails] for tails in TAILS)
+    found = {"seconds": (shared["whole"] / paths["whole"], "")}
     for name in ERRORS:
-        if (shared[name] or 0) <= 0 or (paths[name] or 0) <= 0:
-            continue
-        found[f"{name}, samples"] = shared[name] / paths[name], ""
-        lines = [by["paths"] for by in by_spp.values() if "paths" in by]
-        points = [(line["whole"], line[name]) for line in lines if (line[name] or 0) > 0]
-        if answer := error_at(shared["whole"], points):
-            found[f"{name}, time"] = shared[name] / answer[0], answer[1]
+        if shared[name] > 0 and paths[name] > 0:
+            found[f"{name}, samples"] = shared[name] / paths[name], ""
+            if time := over_least(shared[name], shared["whole"], [points(with_tails(here, "paths"), name)]):
+                found[f"{name}, time"] = time
     return found
 
 
-RATIOS = ("seconds", *(f"{name}, {at}" for at in ("samples", "time") for name in ERRORS))
-
-
 def show(cells: list[dict], groups: dict[str, list[str]]) -> None:
-    rows = rows_of(cells)
-    heads = ["scene", "sampler", "method", "spp", "render s", "whole s", *VALUES, *RATIOS]
-    found: dict[tuple, dict[str, dict[str, tuple[float, str]]]] = {}
+    found: dict[tuple, dict[str, dict[str, Ratio]]] = {}
     lines = []
-    for (scene, size, sampler, method), by_spp in rows.items():
-        for spp, by in by_spp.items():
-            told = ratios(by_spp, spp)
-            found.setdefault((size, sampler, method, spp), {})[scene] = told
-            values = [
-                " / ".join(digits(by.get(t, {}).get(name)) for t in TAILS) for name in ("render", "whole", *VALUES)
-            ]
-            lines.append([f"{scene} {size}", sampler, method, str(spp), *values, *map(marked, map(told.get, RATIOS))])
+    for (scene, size, sampler, method), here in medians(cells).items():
+        for spp in here.index.unique("spp"):
+            told = ratios(here, spp)
+            found.setdefault((size, sampler, method, str(spp)), {})[scene] = told
+            pair = here.loc[spp].reindex(TAILS)
+            values = [" / ".join(map(digits, pair[name])) for name in ("render", "whole", *VALUES)]
+            lines.append(
+                [f"{scene} {size}", sampler, method, str(spp), *values, *(marked(told.get(r)) for r in RATIOS)]
+            )
     print("\ntails=paths / tails=shared, and the second over the first; seconds of processors")
-    table(heads, lines)
+    table(["scene", "sampler", "method", "spp", "render s", "whole s", *VALUES, *RATIOS], lines)
     lines = []
     for name, members in groups.items():
-        for (size, sampler, method, spp), by_scene in found.items():
-            here = [told for scene, told in by_scene.items() if scene in members and "seconds" in told]
+        for (size, *place), by_scene in found.items():
+            here = [told for scene, told in by_scene.items() if scene in members and told]
             if here:
                 means = [over([told.get(key) for told in here]) for key in RATIOS]
-                lines.append([f"{name} ({len(here)}) {size}", sampler, method, str(spp), *means])
+                lines.append([f"{name} ({len(here)}) {size}", *place, *means])
     print("\ngeometric means over scenes")
     table(["scenes", "sampler", "method", "spp", *RATIOS], lines)
     for tails in TAILS:
         print(f"\ngradients, tails={tails}")
-        told = worth_tables(evaluated(cells, tails, groups))
-        for title, (head, *lines) in told.items():
+        for title, (head, *lines) in worth_tables(evaluated(cells, tails, groups)).items():
             print(f"\n{title}")
             table(head, lines)
     for tails in sorted({cell["tails"] for cell in cells}):
         print(f"\npipelines after equal whole time, tails={tails}: error and FLIP relative to `primal` with `oidn`")
-        table(["scenes", "processor s", *pipelines(), "mitsuba+oidn"], against_oidn(cells, tails, groups))
+        table(["scenes", "processor s", *PIPELINES, MITSUBA], against_oidn(cells, tails, groups))
         if tails == "shared":
             print("\nwhat `ngpt render` and `ngpt denoise` take by default, relative to the best of our pipelines")
             table(["scenes", *(f"{seconds} s" for seconds in SECONDS)], default_over_best(cells, tails, groups))
@@ -266,25 +204,12 @@ def show(cells: list[dict], groups: dict[str, list[str]]) -> None:
     print(f"\nload average {min(loads):.1f} to {max(loads):.1f}")
 
 
-def pipelines() -> dict[str, dict[str, str]]:
-    """Columns of an evaluation; `oidn` reads no gradients."""
-    pairs = [(sampler, method) for sampler, methods in METHODS.items() for method in methods]
-    return {
-        f"{sampler}+{method}": {"sampler": sampler, "stack": "gradients" if sampler == "gpt" else "primal"}
-        for sampler, method in pairs
-        if (sampler, method) != ("gpt", "oidn") and method != RAW and sampler != "mitsuba"
-    }
-
-
-def curves_of(cells: list[dict], tails: str) -> dict[str, dict[str, dict[str, list]]]:
-    """Scene -> pipeline -> error and FLIP -> (whole seconds, value) of all ``pipelines`` and of Mitsuba."""
-    curves: dict[str, dict[str, dict[str, list]]] = {}
-    for (scene, _, sampler, method), by_spp in rows_of(cells).items():
-        if (name := f"{sampler}+{method}") in (*pipelines(), "mitsuba+oidn"):
-            each = "paths" if sampler == "mitsuba" else tails
-            lines = [by[each] for by in by_spp.values() if each in by]
-            points = {value: [(line["whole"], line[value]) for line in lines] for value in ("error", "FLIP")}
-            curves.setdefault(scene, {})[name] = points
+def curves_of(cells: list[dict], tails: str) -> dict[str, dict[str, pd.DataFrame]]:
+    """Scene -> pipeline -> medians by samples, of all ``PIPELINES`` and of Mitsuba."""
+    curves: dict[str, dict[str, pd.DataFrame]] = {}
+    for (scene, _, sampler, method), here in medians(cells).items():
+        if (name := f"{sampler}+{method}") in (*PIPELINES, MITSUBA):
+            curves.setdefault(scene, {})[name] = with_tails(here, "paths" if name == MITSUBA else tails)
     return curves
 
 
@@ -294,23 +219,25 @@ def groups_of(curves: dict[str, Any], groups: dict[str, list[str]]) -> list[tupl
     return [*((scene, [scene]) for scene in curves), *((name, members) for name, members in known if members)]
 
 
+def both(scenes: list[str], ratio: Callable[[str, str], Ratio | None]) -> str:
+    """Means of a ratio of error and of FLIP, a function of scene and value."""
+    return ", ".join(over([ratio(scene, value) for scene in scenes]) for value in ("error", "FLIP"))
+
+
 def against_oidn(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> list[list[str]]:
-    """A row for each scene and group, and each of ``SECONDS``: error and FLIP of all ``pipelines`` and of Mitsuba."""
+    """A row for each scene and group, and each of ``SECONDS``: error and FLIP of all ``PIPELINES`` and of Mitsuba."""
     curves = curves_of(cells, tails)
 
-    def ratio(scene: str, name: str, value: str, seconds: float) -> tuple[float, str] | None:
-        a, b = (error_at(seconds, curves[scene].get(each, {}).get(value, [])) for each in (name, "primal+oidn"))
+    def ratio(name: str, seconds: float, scene: str, value: str) -> Ratio | None:
+        here = [curves[scene].get(each) for each in (name, "primal+oidn")]
+        a, b = (None if each is None else error_at(seconds, points(each, value)) for each in here)
         return (a[0] / b[0], joined((a[1], b[1]))) if a and b else None
 
-    rows = []
-    for label, here in groups_of(curves, groups):
-        for seconds in SECONDS:
-            values = [
-                ", ".join(over([ratio(scene, name, value, seconds) for scene in here]) for value in ("error", "FLIP"))
-                for name in (*pipelines(), "mitsuba+oidn")
-            ]
-            rows.append([label, str(seconds), *values])
-    return rows
+    return [
+        [label, str(seconds), *(both(here, partial(ratio, name, seconds)) for name in (*PIPELINES, MITSUBA))]
+        for label, here in groups_of(curves, groups)
+        for seconds in SECONDS
+    ]
 
 
 def default_over_best(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> list[list[str]]:
@@ -318,8 +245,8 @@ def default_over_best(cells: list[dict], tails: str, groups: dict[str, list[str]
     curves = curves_of(cells, tails)
     taken = {cell["scene"]: f"{cell['sampler']}+{cell['auto']}" for cell in cells if "auto" in cell}
 
-    def ratio(scene: str, value: str, seconds: float) -> tuple[float, str] | None:
-        ours = {name: error_at(seconds, curves[scene][name][value]) for name in pipelines() if name in curves[scene]}
+    def ratio(seconds: float, scene: str, value: str) -> Ratio | None:
+        ours = {name: error_at(seconds, points(here, value)) for name, here in curves[scene].items() if name != MITSUBA}
         known = {name: found for name, found in ours.items() if found}
         if taken.get(scene) not in known:
             return None
@@ -327,7 +254,7 @@ def default_over_best(cells: list[dict], tails: str, groups: dict[str, list[str]
         return mine[0] / best[0], joined((mine[1], best[1]))
 
     return [
-        [label, *(", ".join(over([ratio(s, v, t) for s in here]) for v in ("error", "FLIP")) for t in SECONDS)]
+        [label, *(both(here, partial(ratio, seconds)) for seconds in SECONDS)]
         for label, here in groups_of(curves, groups)
     ]
 
@@ -335,37 +262,15 @@ def default_over_best(cells: list[dict], tails: str, groups: dict[str, list[str]
 def evaluated(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> dict[str, Any]:
     """The cells with these ``tails`` as results of `ngpt evaluate`, as far as ``worth_of_gradients`` reads them."""
     summary, renders = [], []
-    for (scene, _, sampler, method), by_spp in rows_of(cells).items():
-        name = f"{sampler}+{method}"
-        for spp, by in by_spp.items():
-            if name in pipelines() and tails in by:
-                row, line = {"scene": scene, "method": name, "spp": spp}, by[tails]
+    for (scene, _, sampler, method), here in medians(cells).items():
+        if (name := f"{sampler}+{method}") in PIPELINES:
+            for spp, line in with_tails(here, tails).iterrows():
+                row = {"scene": scene, "method": name, "spp": spp}
                 summary.append(row | {"error": line["error"], "seconds": {"total": line["whole"]}})
                 renders.append(row | {"absent": None, "spp used": spp, "seconds": {"render": line["render"]}})
     settings = {"spp": sorted({cell["spp"] for cell in cells}), "groups": groups}
     scenes = list(dict.fromkeys(row["scene"] for row in summary))
-    return {"scenes": scenes, "summary": summary, "cells": renders, "methods": pipelines(), "settings": settings}
-
-
-def digits(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}" if value < 100 else f"{value:.0f}"
-
-
-def marked(value: tuple[float, str] | None) -> str:
-    return f"{value[1]}{value[0]:.2f}" if value else "-"
-
-
-def over(values: list[tuple[float, str] | None]) -> str:
-    """The geometric mean of the values as text, with its mark, if none is missing."""
-    known = [value for value in values if value]
-    if len(known) < len(values):
-        return "-"
-    return marked((geometric_mean(value for value, _ in known), joined(mark for _, mark in known)))
-
-
-def table(head: list[str], lines: list[list[str]]) -> None:
-    for line in (head, ["---"] * len(head), *lines):
-        print(f"| {' | '.join(line)} |", flush=True)
+    return {"scenes": scenes, "summary": summary, "cells": renders, "methods": PIPELINES, "settings": settings}
 
 
 if __name__ == "__main__":

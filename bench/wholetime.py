@@ -7,7 +7,8 @@ counts from the time of its quickest cell on, unless no setting was measured in 
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from itertools import product
 from typing import Any
 
 from bench.curves import Points, error_at, joined
@@ -37,7 +38,8 @@ def against_rivals(results: dict[str, Any]) -> dict[str, Any]:
                     if found:
                         place = {name: row[name] for name in ("scene", "spp", "method")}
                         rows.append(place | {"seconds": row["seconds"]["total"], "rival": rival} | found)
-    return {"rows": rows, "means": _means(results, rows)}
+    keys = {"spp": results["settings"]["spp"], "method": results["methods"], "rival": results["settings"]["against"]}
+    return {"rows": rows, "means": [entry | _mean(here) for entry, here in grouped(results, rows, **keys)]}
 
 
 def _timed(results: dict[str, Any], scene: str) -> list[dict[str, Any]]:
@@ -81,20 +83,6 @@ def _over(row: dict[str, Any], primary: str, curves: dict[str, dict[str, Points]
     return entry | ({"FLIP": mine / flip[0], "FLIP mark": flip[1]} if flip and mine else {})
 
 
-def _means(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    means = []
-    for group, members in groups_of(results, [row["scene"] for row in rows]).items():
-        for spp in results["settings"]["spp"]:
-            for method in results["methods"]:
-                for rival in results["settings"]["against"]:
-                    key = (spp, method, rival)
-                    here = [r for r in rows if r["scene"] in members and (r["spp"], r["method"], r["rival"]) == key]
-                    if here:
-                        entry = {"group": group, "spp": spp, "method": method, "rival": rival}
-                        means.append(entry | _mean(here))
-    return means
-
-
 def _mean(rows: list[dict[str, Any]]) -> dict[str, Any]:
     seen = [row for row in rows if row["FLIP"] is not None]
     return {
@@ -135,36 +123,27 @@ def envelope(results: dict[str, Any], rival: str, scenes: list[str]) -> list[tup
 def against_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
     """Title -> rows of text, the header first: means of groups, then each scene; columns of rivals are left out."""
     tables: dict[str, list[list[str]]] = {}
-    rivals = list(results["settings"]["against"])
-    settings = {column for columns in results["settings"]["against"].values() for column in columns}
+    rivals = results["settings"]["against"]
+    settings = {column for columns in rivals.values() for column in columns}
     ratios = against_rivals(results)
-    means, by_scene = ([row for row in ratios[key] if row["method"] not in settings] for key in ("means", "rows"))
-    heads = [text for rival in rivals for text in (f"error over {rival}", f"FLIP over {rival}")]
-    heads += [text for rival in rivals for text in (f"less error than {rival}", f"less FLIP than {rival}")]
-    if means:
-        rows = [["scenes", "spp", "method", "seconds", *heads]]
-        for (group, spp, method), by_rival in _by_place(means, "group").items():
-            one = next(iter(by_rival.values()))
-            found = [by_rival.get(rival) for rival in rivals]
-            counts = [text for row in found for text in (_count(row, ""), _count(row, " FLIP"))]
-            first = [f"{group} ({one['scenes']})", str(spp), method, f"{one['seconds']:.3g}"]
-            rows.append([*first, *_ratios(found), *counts])
-        tables["Errors over those of rivals at equal whole time, geometric means"] = rows
-    if by_scene:
-        rows = [["scene", "spp", "method", "seconds", *heads[: 2 * len(rivals)]]]
-        for (scene, spp, method), by_rival in _by_place(by_scene, "scene").items():
-            one = next(iter(by_rival.values()))
-            first = [scene, str(spp), method, f"{one['seconds']:.3g}"]
-            rows.append([*first, *_ratios([by_rival.get(rival) for rival in rivals])])
-        tables["Errors over those of rivals at equal whole time, scene by scene"] = rows
+    for kind, first, how in (("means", "group", "geometric means"), ("rows", "scene", "scene by scene")):
+        by_place: dict[tuple, dict[str, dict[str, Any]]] = {}
+        for row in ratios[kind]:
+            if row["method"] not in settings:
+                by_place.setdefault((row[first], row["spp"], row["method"]), {})[row["rival"]] = row
+        heads = ["scenes" if kind == "means" else "scene", "spp", "method", "seconds"]
+        heads += [f"{value} over {rival}" for rival in rivals for value in ("error", FLIP)]
+        heads += [f"less {value} than {r}" for r in rivals for value in ("error", FLIP) if kind == "means"]
+        lines = [heads]
+        for (name, spp, method), by_rival in by_place.items():
+            one, found = next(iter(by_rival.values())), [by_rival.get(rival) for rival in rivals]
+            name = f"{name} ({one['scenes']})" if kind == "means" else name
+            counts = [_count(row, key) for row in found for key in ("", " FLIP") if kind == "means"]
+            cells = [ratio(row, key) for row in found for key in ("error", FLIP)]
+            lines.append([name, str(spp), method, f"{one['seconds']:.3g}", *cells, *counts])
+        if len(lines) > 1:
+            tables[f"Errors over those of rivals at equal whole time, {how}"] = lines
     return tables
-
-
-def _by_place(rows: list[dict[str, Any]], first: str) -> dict[tuple, dict[str, dict[str, Any]]]:
-    found: dict[tuple, dict[str, dict[str, Any]]] = {}
-    for row in rows:
-        found.setdefault((row[first], row["spp"], row["method"]), {})[row["rival"]] = row
-    return found
 
 
 def ratio(row: dict[str, Any] | None, key: str) -> str:
@@ -174,12 +153,19 @@ def ratio(row: dict[str, Any] | None, key: str) -> str:
     return f"{row['mark' if key == 'error' else 'FLIP mark']}{row[key]:.2f}"
 
 
-def _ratios(rows: list[dict[str, Any] | None]) -> list[str]:
-    return [ratio(row, key) for row in rows for key in ("error", FLIP)]
-
-
 def _count(row: dict[str, Any] | None, key: str) -> str:
     return f"{row[f'less{key}']} of {row[f'scenes{key}']}" if row else ""
+
+
+def grouped(
+    results: dict[str, Any], rows: list[dict[str, Any]], **keys: Iterable
+) -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
+    """The rows of each group of scenes with each combination of ``keys``, where there are any."""
+    for group, members in groups_of(results, [row["scene"] for row in rows]).items():
+        for values in product(*keys.values()):
+            place = dict(zip(keys, values, strict=True))
+            if here := [row for row in rows if row["scene"] in members and place.items() <= row.items()]:
+                yield {"group": group} | place, here
 
 
 def groups_of(results: dict[str, Any], scenes: Iterable[str]) -> dict[str, list[str]]:

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from bench.curves import first_at, joined
-from bench.wholetime import groups_of
+from bench.wholetime import grouped
 from ngpt.measure.averages import geometric_mean, median
 
 
@@ -91,48 +91,40 @@ def _of_a_sample(renders: Sequence[tuple[int, float]]) -> float:
 
 def _means(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Geometric means over each group of scenes and over all: of each column, and with method None of the best ones."""
+    both = [*rows, *(row | {"method": None} for row in rows if row["best"])]
     means = []
-    for group, members in groups_of(results, [row["scene"] for row in rows]).items():
-        for spp in results["settings"]["spp"]:
-            for method in (None, *results["methods"]):
-                here = [row for row in rows if row["scene"] in members and row["spp"] == spp]
-                here = [row for row in here if (row["best"] if method is None else row["method"] == method)]
-                if not here:
-                    continue
-                entry: dict[str, Any] = {"group": group, "spp": spp, "method": method, "scenes": len(here)}
-                for key in ("W", "C", "W/C"):
-                    values = [row[key] for row in here if row[key] is not None]
-                    entry[key] = geometric_mean(values) if len(values) == len(here) else None
-                means.append(entry | {"mark": joined(row["mark"] for row in here)})
+    for entry, here in grouped(results, both, spp=results["settings"]["spp"], method=(None, *results["methods"])):
+        entry["scenes"] = len(here)
+        for key in ("W", "C", "W/C"):
+            values = [row[key] for row in here]
+            entry[key] = None if None in values else geometric_mean(values)
+        means.append(entry | {"mark": joined(row["mark"] for row in here)})
     return means
 
 
 def worth_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
     """Title -> rows of text, the header first: W/C of the means, and all values of each scene."""
-    worth = worth_of_gradients(results)
+    worth, keys = worth_of_gradients(results), ("W", "C", "W/C")
     columns = [name for name in results["methods"] if any(row["method"] == name for row in worth["rows"])]
-    heads = [f"W/C {name}" for name in columns]
-    tables = {}
+    heads = [*keys, *(f"W/C {name}" for name in columns)]
     means = {(row["group"], row["spp"], row["method"]): row for row in worth["means"]}
-    if means:
-        table = [["scenes", "spp", "W", "C", "W/C", *heads]]
-        for group, spp, method in means:
-            if method is None:
-                best = means[group, spp, None]
-                others = [marked(means.get((group, spp, name)), "W/C") for name in columns]
-                name = f"{group} ({best['scenes']})"
-                table.append([name, str(spp), *(marked(best, key) for key in ("W", "C", "W/C")), *others])
-        tables["Worth of gradients, geometric means; best pipelines, then each column with gradients"] = table
     rows = {(row["scene"], row["spp"], row["method"]): row for row in worth["rows"]}
-    table = [["scene", "spp", "with gradients", "without", "W", "C", "W/C", *heads]]
-    for best in worth["rows"]:
-        if best["best"]:
-            others = [marked(rows.get((best["scene"], best["spp"], name)), "W/C") for name in columns]
-            values = [marked(best, key) for key in ("W", "C", "W/C")]
-            table.append([best["scene"], str(best["spp"]), best["method"], best["rival"], *values, *others])
-    if len(table) > 1:
-        tables["Worth of gradients, scene by scene"] = table
-    return tables
+
+    def cells(best: dict[str, Any], of: dict[tuple, dict[str, Any]], name: str) -> list[str]:
+        others = [marked(of.get((best[name], best["spp"], column)), "W/C") for column in columns]
+        return [*(marked(best, key) for key in keys), *others]
+
+    by_group = [["scenes", "spp", *heads]]
+    for best in (row for row in worth["means"] if row["method"] is None):
+        by_group.append([f"{best['group']} ({best['scenes']})", str(best["spp"]), *cells(best, means, "group")])
+    by_scene = [["scene", "spp", "with gradients", "without", *heads]]
+    for best in (row for row in worth["rows"] if row["best"]):
+        by_scene.append([best["scene"], str(best["spp"]), best["method"], best["rival"], *cells(best, rows, "scene")])
+    tables = {
+        "Worth of gradients, geometric means; best pipelines, then each column with gradients": by_group,
+        "Worth of gradients, scene by scene": by_scene,
+    }
+    return {title: lines for title, lines in tables.items() if len(lines) > 1}
 
 
 def marked(row: dict[str, Any] | None, key: str) -> str:

@@ -46,7 +46,7 @@ _TRIM = 0.001
 _CUT = 0.03
 # The mean square error over the mean of squared standard errors. A standard error is right for two values in three, and
 # a few values far off raise the mean square. Standard errors of l1 count the light that it leaves out, so its factor is
-# below 1. By python -m bench.adaptive, six scenes.
+# below 1. By bench/adaptive.py of commit e61ee6f3, six scenes.
 _TAILS, _TAIL = {"l1": 0.75}, 1.25
 # Side, in pixels, of the part of an image that the method is timed on
 _PART = 96

@@ -7,7 +7,7 @@ Crops are rendered meanwhile, with references (kept in DIR, small) and without (
 Training begins with the weights in the repository. While the file BUSY exists, a benchmark say, all of it stands still.
 It has a low priority, ends by itself after all steps, and at once by Ctrl-C or SIGTERM.
 
-What is worth keeping is DIR/NETWORK/weights.safetensors; `python -m bench.rooms` tells whether it is better.
+What is worth keeping is DIR/NETWORK/weights.safetensors; docs/train/training.md says how to see whether it is better.
 """
 
 import argparse

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from full_stack import hidden_oidn
 
-from bench.layers import CHOICES, NEED_OIDN, RENDERERS, renderers
+from bench.layers import CHOICES, NEED_OIDN, RENDERERS, SAMPLER, renderers
 from ngpt.denoisers import oidn
 from ngpt.methods import METHODS, choose
 
@@ -24,7 +24,7 @@ def rows(renderer, tmp_path_factory):
 
     scenes = [load_scene(name, (96, 64)) for name in ("diffuse", "glossy")]
     truths = [render_stack(scene, 512, seed=1, sampler="primal", unbiased=True)["primal"] for scene in scenes]
-    stacks = [render_stack(scene, 16, seed=0, sampler="gpt", unbiased=True) for scene in scenes]
+    stacks = [render_stack(scene, 16, seed=0, sampler=SAMPLER, unbiased=True) for scene in scenes]
     return renderers(list(zip(stacks, truths, strict=True)), tmp_path_factory.mktemp("files"))
 
 

@@ -26,7 +26,7 @@ from ngpt.stack import GradientStack
 # The most frequent winners come first: where time is short, the others are not measured.
 WITH_GRADIENTS = ("ngpt-combine", "ngpt-fast", "wcv", "l1")
 WITHOUT = ("oidn", "ngpt-primal", "primal")
-# These numbers come from python -m bench.pipelines on scenes that are not ``--apart``.
+# These numbers come from bench/pipelines.py of commit e61ee6f3, on scenes that are not ``--apart``.
 # The usual exponents of the error as a power of the samples, for methods that use gradients and for denoisers; the
 # weight of the pilot in an exponent, and the steepest and flattest exponents allowed
 BY_GRADIENTS, BY_DENOISERS = -0.95, -0.55

@@ -23,7 +23,7 @@ from ngpt.system.late import ndimage
 
 SPREAD = 2.6  # pixels, the standard deviation of the window over which the change is averaged: as large as 9x9 pixels
 SEED = 20261122
-# By `python -m bench.uncertainty`, on scenes named there. Other methods have the most frequent factor.
+# By bench/uncertainty.py of commit e61ee6f3, on scenes named there. Other methods have the most frequent factor.
 FACTORS = {"primal": 0.9, "l2": 0.9, "l1": 1.7, "cv": 0.85, "wcv": 1.1, "wl2": 1.4}
 FACTOR = 1.2
 

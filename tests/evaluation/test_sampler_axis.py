@@ -148,9 +148,16 @@ def test_folders_of_stacks_have_samplers_without_a_renderer(tmp_path, rng, monke
     plot = ElementTree.ElementTree(ElementTree.fromstring(draw(points, "room", "relMSE")))
     texts = [element.text for element in plot.iter("{http://www.w3.org/2000/svg}text")]
     assert set(names) <= set(texts)
-    lines = [e for e in plot.iter("{http://www.w3.org/2000/svg}path") if e.get("stroke-width") == "1.6"]
-    (_, ours, theirs) = [(e.get("stroke"), e.get("stroke-dasharray")) for e in lines]
-    assert ours[0] == theirs[0] and ours[1] != theirs[1]  # one colour for l2, dashes by sampler
+    looks = {}
+    for group in plot.iter("{http://www.w3.org/2000/svg}g"):
+        if group.get("id", "").startswith("line "):
+            path = next(group.iter("{http://www.w3.org/2000/svg}path"))
+            looks[group.get("id")[5:]] = dict(entry.split(": ") for entry in path.get("style").split("; "))
+    assert set(looks) == set(names)
+    ours, theirs = looks["l2 (ours)"], looks["l2 (theirs)"]
+    # One colour for l2, dashes by sampler
+    assert ours["stroke"] == theirs["stroke"] != looks["primal"]["stroke"]
+    assert ours.get("stroke-dasharray") != theirs.get("stroke-dasharray")
     page = write_evaluation_report(tmp_path / "out", tmp_path / "report.html").read_text()
     assert "l2 (theirs)" in page and "equal rendering time to 4 spp of sampler auto" in page
     # A single sampler that is not the usual one: names are those of the methods.

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.seeds import HEAD, errors, noise, opened, rows, spread
+from bench.judging import opened
+from bench.seeds import HEAD, errors, noise, rows, spread
 from ngpt.shared import shared_variance
 
 SEEDS, SHAPE, CELL = 64, (64, 64, 3), 16

@@ -11,10 +11,8 @@ import pytest
 from crops import view
 
 import ngpt
-from bench.ablations import VARIANTS
 from data_gen.dataset.config import read_config
 from ngpt.cli import main
-from ngpt.system import configs
 from ngpt.system.templates import entries
 from ngpt.training.parameters import TABLES, configuration_row, purpose
 from ngpt.training.settings import read_settings
@@ -171,16 +169,6 @@ def test_every_configuration_trains_on_a_set_of_our_own_generator(path, kind, tr
     status, output, errors = train("--config", path.stem, "--out", str(tmp_path / "run"), *changes)
     assert status == 0, errors
     assert "validation: 1 of 2 scenes set aside" in output and "finished at step 2" in output and "relMSE" in output
-
-
-def test_ablations_differ_from_the_papers_network_in_what_they_are_named_for():
-    found = {
-        name: read_settings(configs.find_config("ablations", configs.TRAINING), VARIANTS[name]) for name in VARIANTS
-    }
-    assert len({str(settings) for settings in found.values()}) == len(VARIANTS)
-    assert not found["no gradients"].model.reads_gradients and found["l1 alone"].loss["kind"] == "l1"
-    others = {str((one.run, one.optimizer, one.augmentation)) for one in found.values()}
-    assert len(others) == 1 and found["bilinear"].model.pooling == "bilinear"
 
 
 @pytest.mark.parametrize("model", ["fast", "combine", "primal", "temporal"])

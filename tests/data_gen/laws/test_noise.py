@@ -10,7 +10,6 @@ from media_scenes import haze
 from registered import cases, quick, scene_for
 from unbiased import failed_shifts, load, render_ours
 
-from bench.gradientmap import variances_of_differences
 from data_gen.budget import Budget
 from data_gen.passes import render_passes
 from data_gen.samplers import SAMPLERS
@@ -70,6 +69,27 @@ def test_gradients_have_less_noise_than_pixels_in_media(renderer):
     noise = layers["primal_var"][:, 1:] + layers["primal_var"][:, :-1]
     assert noise.sum() / layers["dx_var"][:, :-1].sum() > 8
     assert failed_shifts(scene, "gpt") < 0.1
+
+
+def variances_of_differences(stack: GradientStack) -> tuple[np.ndarray, np.ndarray]:
+    """Variance of the difference of neighbours as independent pixels, (H, W, 3) along x and along y.
+
+    NaN where there is no neighbour, and where the camera sees a light in either.
+    """
+    dark = stack["direct"].sum(axis=-1) == 0
+    values = np.where(dark[..., None], stack["primal_var"], np.nan)
+    across, down = np.full((2, *values.shape), np.nan, np.float64)
+    across[:, :-1] = values[:, :-1] + values[:, 1:]
+    down[:-1] = values[:-1] + values[1:]
+    return across, down
+
+
+def test_variances_of_differences_leave_out_lights_and_borders():
+    layers = {"primal_var": np.full((9, 12, 3), 2.0), "direct": np.zeros((9, 12, 3)), "primal": np.zeros((9, 12, 3))}
+    layers["direct"][0, 0] = 1
+    x, y = variances_of_differences(GradientStack.from_arrays(**layers))
+    assert (x[1:, :-1] == 4).all() and (y[:-1, 1:] == 4).all()
+    assert np.isnan(x[:, -1]).all() and np.isnan(y[-1]).all() and np.isnan(x[0, 0]).all() and np.isnan(y[0, 0]).all()
 
 
 def gains(renderer, name, full):
