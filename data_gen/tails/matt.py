@@ -86,8 +86,7 @@ class Matt:
         return active & (~listed | tilted)
 
     def reflectance(self, x: mi.SurfaceInteraction3f, place: Place | None, active: mi.Bool) -> mi.Color3f:
-        """ρ in [0, 1]: π times the diffuse lobe's f in a direction on the side of ``wi``, or ρ of the phase function.
-        """
+        """ρ in [0, 1]: π times the diffuse lobe's f in a direction on the side of ``wi``, or ρ of the phase function."""
         on_surface = active & ~media.scatters(place)
         known, ρ = self.plain.of(x, on_surface)
         ρ = dr.select(known, ρ, reflectance(x.bsdf(), x, on_surface & ~known))
