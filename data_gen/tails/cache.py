@@ -1,4 +1,5 @@
-"""The cache: for each cell the mean of the light that arrives at its surfaces: the irradiance over π.
+"""The cache: for each cell the mean light that arrives. On surfaces it is the irradiance over π, in media the mean
+radiance over all directions.
 
 Cells are cubes, apart by their size and by the side and direction of the surface. A cell is small against the *spread*
 of a path at the vertex where the path looks it up: the width of the bundle of paths that arrive there, over which the

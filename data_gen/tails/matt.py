@@ -5,9 +5,9 @@ with a diffuse part scatters some of that light as a matt surface of reflectance
 
     f cos θ = ρ cos θ / π + rest.
 
-The path ends for the first term and goes on for the rest: gloss, metal, mirrors, what goes through, and what bumps and
-Fresnel's law change about the diffuse part. Any ρ gives the right mean, and the closer it comes to the material, the
-less is left to go on for. No light is divided by ρ, which may be 0.
+The path ends for the first term and goes on for the rest: gloss, metal, mirrors, transmission, and what bumps and
+Fresnel's law change about the diffuse part. Any ρ gives the right mean. The closer it comes to the material, the
+smaller the rest is. No light is divided by ρ, which may be 0.
 
 In a medium the cache knows the mean radiance over all directions. A phase function is split in the same way,
 
@@ -36,7 +36,7 @@ from data_gen.paths.vertex import SMOOTH, ByMaterial, event_kind, materials_of
 _TILT = 1.0
 # Flags of all other lobes
 _ELSE = ("Delta", "Delta1D", "Null", "Glossy", "DiffuseTransmission")
-# In media whose ρ is smaller, most paths would go on, and the cache would cost more than it gains.
+# In media whose ρ is smaller, nearly all paths would go on at each vertex.
 _LEAST_EVEN = 0.1
 # Materials that disturb the normal of the material inside
 _BUMPS = re.compile("(Bump|Normal)Map")
@@ -86,7 +86,7 @@ class Matt:
         return active & (~listed | tilted)
 
     def reflectance(self, x: mi.SurfaceInteraction3f, place: Place | None, active: mi.Bool) -> mi.Color3f:
-        """ρ in [0, 1]: π times the diffuse lobe's f in a direction on the side of ``wi``, or ρ of the phase function."""
+        """ρ in [0, 1]: π times the diffuse lobe's f in a direction on the side of ``wi``; in media, ρ of the phase."""
         on_surface = active & ~media.scatters(place)
         known, ρ = self.plain.of(x, on_surface)
         ρ = dr.select(known, ρ, reflectance(x.bsdf(), x, on_surface & ~known))

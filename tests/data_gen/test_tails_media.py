@@ -113,25 +113,15 @@ def test_the_first_segment_counts_as_a_whole(renderer):
     assert Filled(scene).length(mi.Ray3f(mi.Point3f(0, 3, 0), mi.Vector3f(0, 0, 1)), x)[0] == 5
 
 
-def in_fog(phase, name):
-    scene = filled({"albedo": 0.95, "sigma_t": 0.6, "phase": phase})
-    scene.__name__ = name
-    return scene
+KEPT = {name: filled({"albedo": 0.95, "sigma_t": 0.6, "phase": phase}) for name, (phase, _) in PHASES.items()}
+KEPT |= {scene.__name__: scene for scene in (nested, milk, hovering, coloured_smoke, wisps)} | {"colours": colours}
+SLOW = ("rayleigh", "a little forward", "table", "hovering", "coloured_smoke")
 
 
-KEPT = [
-    *(in_fog(phase, name.replace(" ", "_")) for name, (phase, _) in PHASES.items()),
-    *(colours, nested, milk, hovering, coloured_smoke, wisps),
-]
-SLOW = ("rayleigh", "a_little_forward", "table", "hovering", "coloured_smoke")
-
-
-@pytest.mark.parametrize(
-    "scene", [pytest.param(scene, marks=pytest.mark.slow if scene.__name__ in SLOW else ()) for scene in KEPT]
-)
-def test_each_medium_keeps_its_light(renderer, monkeypatch, scene):
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in KEPT])
+def test_each_medium_keeps_its_light(renderer, monkeypatch, name):
     monkeypatch.setattr("data_gen.samplers.gpt.rounds._PAYS", 0)
-    keeps_its_light(load(mi, scene, (32, 24)))
+    keeps_its_light(load(mi, KEPT[name], (32, 24)))
 
 
 def test_less_noise_in_fog(renderer):

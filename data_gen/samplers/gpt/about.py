@@ -18,15 +18,16 @@ register(
         options={
             "shift": Option(
                 "replay",
-                "before paths join; half-vector copies the half vectors of smooth events, manifold follows some of the "
-                "light of 'caustic' to its lamps",
+                "how offset paths continue before they join: half-vector copies the half vectors of smooth events, "
+                "manifold follows some of the light of 'caustic' to its lamps",
                 choices=("replay", "half-vector", "manifold"),
             ),
             "reuse": Option(False, "the primal is the mean over base paths and the offset paths of neighbours"),
             "roughness_threshold": CONNECTABLE,
             "tails": TAILS,
             "caustic": Option(
-                True, "light over rough surfaces and then mirrors or glass has a layer; else it is in the gradients"
+                True,
+                "light that meets rough surfaces and then mirrors or glass has a layer; if false, gradients hold it",
             ),
         },
         rank=1,

@@ -1,23 +1,24 @@
 """Paths of ``gpt`` and ``primal`` that end in the cache (``data_gen.tails``), and those that feed it.
 
-A path may end at the first vertex from the second on where the material has a diffuse part, the path's spread is large,
-and the cell is trusted. A path of ``gpt`` ends only where all offset paths have joined it. What it would have found
-behind the vertex, as far as the surface scatters like a matt one (``data_gen.tails.matt``), is then
+A path may end at its second vertex or a later one. Three conditions must hold: the material has a diffuse part, or the
+vertex is in a medium that scatters evenly enough; the path's spread is large; and the cell is trusted. A path of
+``gpt`` ends only where all offset paths have joined it. The cache then supplies the light that a matt surface, or an
+even phase function, would scatter toward the path (``data_gen.tails.matt``):
 
     ρ C,
 
-the vertex's reflectance times the mean light of the cell; an offset path adds a ρ C to its difference, with the factor
-``a`` that it would have had for all that follows (``offset_path.settle``). Where the material has nothing else the path
-is over. Elsewhere it goes on for the rest. The step before finds the emission at the vertex itself, with its usual MIS
+the vertex's ρ times the mean light of the cell. An offset path adds a ρ C to its difference, with the factor ``a`` that
+it would have had for all that follows (``offset_path.settle``). If the vertex scatters in no other way, the path is
+over. Otherwise it goes on for the rest. The step before finds the emission at the vertex itself, with its usual MIS
 weight.
 
-Where there is the layer ``caustic``, the cache keeps the light apart that belongs to it from the vertex on, because it
-has come over a sharp surface behind it (``data_gen.paths.caustic``). It goes into the layer and into no difference.
+If there is the layer ``caustic``, the cache stores the light of that layer separately: light that has passed a sharp
+surface behind the vertex (``data_gen.paths.caustic``). It goes into the layer and into no difference.
 
-A path that feeds the cache opens a record at its first such vertex, and at those behind it, as many as there is room
-for; from the second on it may end in the cache itself, in its own half of the records. So light of many bounces comes
-together one by one. A record is the light that arrives: the path leaves the vertex as if it were matt and white, also
-where the texture is black. [Müller et al. 2021, "Real-time neural radiance caching for path tracing", section 4]
+A path that feeds the cache opens a record at its first such vertex and at later ones, ``RECORDS`` at most. From the
+second on it may end in the cache itself, in its own half of the records. So light of many bounces builds up. A record
+holds the light that arrives. Therefore the path leaves the vertex as if it were matt and white, even where the texture
+is black. [Müller et al. 2021, "Real-time neural radiance caching for path tracing", section 4]
 """
 
 from __future__ import annotations
