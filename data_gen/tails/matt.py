@@ -152,7 +152,8 @@ def even_part(phase: mi.PhaseFunction) -> float:
     elif name == "RayleighPhaseFunction":
         ρ = 0.75
     elif name == "HGPhaseFunction":
-        g = float(np.max(np.abs(np.array(mi.traverse(phase)["g"]))))
+        # Read by element: an array of numpy would evaluate the variable, and kernels could no longer be recorded.
+        g = abs(float(mi.traverse(phase)["g"][0]))
         ρ = (1 - g) / (1 + g) ** 2
     return ρ if ρ >= _LEAST_EVEN else 0.0
 

@@ -9,6 +9,7 @@ register(
         "the scene's own integrator, without gradients (rooms, references)",
         "data_gen.samplers.primal.sampler",
         standing="use",
+        notes={"media": "albedo counts them, normal and depth do not"},
         options={"features": Option(True, "albedo, normal, depth and emission seen directly"), "tails": TAILS},
         gradients=False,
         tried=True,
