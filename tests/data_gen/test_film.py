@@ -195,7 +195,7 @@ def test_what_is_put_and_what_is_splatted_are_one_value(renderer):
 
 
 def test_films_of_independent_samples_take_no_splats(renderer):
-    with pytest.raises(ValueError, match="make it with batches"):
+    with pytest.raises(ValueError, match="make the film with batches"):
         film(2, 1).splat("primal", renderer.UInt32([0]), renderer.Color3f(1))
 
 

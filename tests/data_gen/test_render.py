@@ -176,9 +176,9 @@ def test_inspection_of_media_lens_maps_and_shutter(scene_file):
     text = text.replace("<film", '<float name="shutter_close" value="0.5"/><film').replace('="constant"', '="point"')
     report = inspect_scene(scene_file(text=text))
     assert report["media"] == ["mist"] and report["shutter"] == 0.5 and not report["lens"]
-    assert report["sampler"] == "gpt"
+    assert report["sampler"] == "primal"
     plan = "\n".join(report["plan"])
-    assert "media: offset paths join where light scatters" in plan and "refused by gbdpt" in plan
+    assert "media: albedo counts them" in plan and "refused by gbdpt" in plan
     assert "nothing moves" in plan and "'direct' layer" not in plan
     assert "small lights in media: paths find their beams" in plan and "glass" not in plan
     through_glass = "\n".join(inspect_scene(scene_file(text=text.replace('"diffuse"', '"dielectric"')))["plan"])

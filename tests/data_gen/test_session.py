@@ -30,7 +30,7 @@ def test_a_file_a_name_and_a_scene_give_the_bits_of_the_command(renderer, comman
     told = []
     stack, plan = data_gen.render_scene("diffuse", 4, 3, size=SIZE, chosen=told.append)
     assert same(ngpt.read("s.exr"), stack) and told == [plan]
-    assert (plan.sampler, plan.method, plan.shared) == ("primal", "oidn", False) and "no media" in plan.reason
+    assert (plan.sampler, plan.method, plan.shared) == ("primal", "oidn", False) and "more samples pay" in plan.reason
     scene = data_gen.load_scene("diffuse", SIZE)
     again, plan = data_gen.render_scene(scene, 4, 3, "primal", chosen=told.append)
     assert same(stack, again) and plan.sampler == "primal" and len(told) == 1
