@@ -111,7 +111,7 @@ class Judge:
         return scores(names, image, *self.reference.images)
 
     def light(self, image: np.ndarray) -> float:
-        """The mean of the image over that of the reference."""
+        """The mean of the image divided by the mean of the reference."""
         return float(image.mean(dtype=np.float64) / self.reference.mean.mean(dtype=np.float64))
 
     def values(self, image: np.ndarray) -> dict[str, float]:

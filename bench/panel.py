@@ -54,6 +54,8 @@ OURS = [f"{sampler}+{method}" for sampler in ("gpt", "primal") for method in MET
 PIPELINES = [DEFAULT, *OURS, "mitsuba+oidn"]
 SEEDS = tuple(range(1, 1 + verdict.LEAST_SEEDS))
 EQUAL = ("samples", "seconds")
+# Pipelines that the default is divided by one by one, after equal seconds
+RIVALS = ("mitsuba+oidn", "gpt+ngpt-combine")
 # Where the error is too small for the halves of the reference to measure
 _LEAST_ERROR = 1e-6
 
@@ -195,7 +197,7 @@ def render(loaded: Any, sampler: str, spp: int, seed: int) -> GradientStack:
 
 
 def text(cells: list[dict[str, Any]]) -> str:
-    """Tables of errors and FLIP, and of the default over the best of our pipelines."""
+    """Tables of errors and FLIP, and of the default over two rivals and over the best of our pipelines."""
     of = {verdict.key_of(cell): cell for cell in cells}
     scenes = list(dict.fromkeys(cell["scene"] for cell in cells))
     rows = []
@@ -205,6 +207,14 @@ def text(cells: list[dict[str, Any]]) -> str:
             values = (f"{mean_of(cell, 'error'):.2g}, {mean_of(cell, 'FLIP'):.3f}" for cell in of_all)
             rows.append([f"{scene} ({CASES[scene].kind})", str(spp), *values])
     lines = ["Error, FLIP:", "", *markdown_table(["scene", "spp", *PIPELINES], rows), ""]
+    rows = []
+    for scene in scenes:
+        for spp in SPP:
+            ratios = (over_best(of, scene, spp, "seconds", [rival]) for rival in RIVALS)
+            seconds = f"{mean_of(of[scene, str(spp), DEFAULT], 'seconds'):.2g}"
+            rows.append([scene, str(spp), seconds, *(", ".join(map(marked, each)) for each in ratios)])
+    lines += ["The default over two rivals after equal seconds of processors, error and FLIP:", ""]
+    lines += [*markdown_table(["scene", "spp", "seconds", *RIVALS], rows), ""]
     best = {scene: [over_best(of, scene, spp, equal) for equal in EQUAL for spp in SPP] for scene in scenes}
     rows = [[scene, *(", ".join(map(marked, each)) for each in columns)] for scene, columns in best.items()]
     means = [
@@ -220,16 +230,18 @@ def mean_of(cell: dict[str, Any], value: str) -> float:
     return geometric_mean(cell[value].values())
 
 
-def over_best(of: dict[verdict.Key, dict[str, Any]], scene: str, spp: int, equal: str) -> list[Ratio | None]:
-    """Error and FLIP of the default over the least of ``OURS``, at as many samples or after as many seconds; with the
-    marks of ``bench.curves``."""
+def over_best(
+    of: dict[verdict.Key, dict[str, Any]], scene: str, spp: int, equal: str, others: Sequence[str] = OURS
+) -> list[Ratio | None]:
+    """Error and FLIP of the default over the least of the ``others``, at as many samples or after as many seconds; with
+    the marks of ``bench.curves``."""
     default, found = of[scene, str(spp), DEFAULT], []
     for value in verdict.LIMITS:
         error = mean_of(default, value)
         if equal == "samples":
-            found.append((error / min(mean_of(of[scene, str(spp), each], value) for each in OURS), ""))
+            found.append((error / min(mean_of(of[scene, str(spp), each], value) for each in others), ""))
         else:
-            curves = ([of[scene, str(n), each] for n in SPP] for each in OURS)
+            curves = ([of[scene, str(n), each] for n in SPP] for each in others)
             points = ([(mean_of(cell, "seconds"), mean_of(cell, value)) for cell in curve] for curve in curves)
             found.append(over_least(error, mean_of(default, "seconds"), points))
     return found

@@ -142,7 +142,7 @@ def against_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
             cells = [ratio(row, key) for row in found for key in ("error", FLIP)]
             lines.append([name, str(spp), method, f"{one['seconds']:.3g}", *cells, *counts])
         if len(lines) > 1:
-            tables[f"Errors over those of rivals at equal whole time, {how}"] = lines
+            tables[f"Errors divided by the errors of rivals at equal whole time, {how}"] = lines
     return tables
 
 

@@ -80,6 +80,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         hides=hides,
     )
     sampler, method, reason = described(facts)
+    tries = any(each.tried and each.finds and not each.refuses(facts) for each in SAMPLERS.values())
     still = f"Mitsuba {mi.__version__} has no animation"
     return {
         "plugins": {kind.lower(): dict(counts.most_common()) for kind, counts in plugins.items() if counts},
@@ -93,7 +94,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         "plan": [
             f"{sampler}: {SAMPLERS[sampler].summary}",
             f"because {reason}",
-            *(["in a long render a pilot tries samplers for hidden lamps"] * ((sampler, method) == SIMPLE)),
+            *(["in a long render a pilot tries samplers for hidden lamps"] * ((sampler, method) == SIMPLE and tries)),
             *([unable] if unable else SAMPLERS[sampler].notes_on(facts)),
             *([f"integrator '{integrator}': the image of '{followed}' is rendered"] * (integrator != followed)),
             *_contents(plugins, facts),

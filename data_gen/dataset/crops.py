@@ -95,7 +95,7 @@ def made_scene(config: Config, name: str, folder: Path) -> Path:
 
 
 def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:
-    """Samples per pixel of the inputs: log-uniform, stratified, smallest first. Those of a pair are equal."""
+    """Samples per pixel of the inputs: log-uniform, stratified, smallest first. The two numbers of a pair are equal."""
     low, high = np.log(config.spp[0]), np.log(config.spp[1] + 1)
     if config.pairs:
         return 2 * [int(np.exp(low + rng.random() * (high - low)))]

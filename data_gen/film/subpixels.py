@@ -81,7 +81,7 @@ class Subpixels:
         dr.eval(dr.while_loop(state, lambda i, n: i < strands.end, one, label="subpixels"), sums, counts)
 
     def develop(self, width: int, height: int) -> dict[str, np.ndarray]:
-        """Those layers of ``FINE`` that have values, (K H, K W, 3) float32.
+        """The layers of ``FINE``, without layers that have no values, (K H, K W, 3) float32.
 
         A subpixel without a sample gets the mean of the pixel's other subpixels. If a pixel has no sample, its
         subpixels are NaN.

@@ -6,8 +6,9 @@ there it misses the lamp. So their light goes into a separate layer, for methods
     rough   the path has scattered smoothly at a connectable vertex
     late    and has later left a vertex by a mirror, glass or sharp gloss: its light belongs to the layer
 
-Both are properties of a path, not of its shift. So primal - caustic is the image of a subset of the paths, and the
-differences are those of this image: a path of the layer counts 0 in them, whether it is a base path or a shifted copy.
+Both are properties of a path, not of its shift. So primal - caustic is the image of a subset of the paths, and dx
+and dy are the differences of this image. A path of the layer counts 0 in them, whether it is a base path or a shifted
+copy.
 This is exact, because the shift is rejected from both sides where either path of a pair is late.
 """
 

@@ -72,7 +72,7 @@ class Holes:
     """Materials that light goes straight through, with a known share."""
 
     def __init__(self, bsdfs: list[mi.BSDF]):
-        numbers = {dr_number(bsdf) for bsdf in bsdfs}
+        numbers = {dr_number(mi.BSDFPtr(bsdf)) for bsdf in bsdfs}
         table = [number in numbers for number in range(max(numbers) + 1)]
         self.known = ByMaterial(mi.Bool(table))
 

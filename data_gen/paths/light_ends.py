@@ -40,7 +40,7 @@ class LightEnds:
     For emitters that are infinitely far away, Mitsuba samples the direction, and the ray starts on a disk that covers
     the scene. Directions from a point light are uniform on the sphere, directions from a spot are uniform in its cone.
 
-    Raises NgptError, with the name of the ``sampler``, for other emitters, of which Mitsuba does not expose enough.
+    Raises NgptError, with the name of the ``sampler``, for other emitters: Mitsuba does not expose enough about them.
     """
 
     def __init__(self, scene: mi.Scene, sampler: str = "bdpt"):

@@ -148,8 +148,8 @@ def _replayed(lights: Lights, base, base_weight, y: mi.SurfaceInteraction3f, lit
 def emission(
     scene, si: mi.SurfaceInteraction3f, ref: mi.SurfaceInteraction3f, active, sampled, lights: Lights | None = None
 ) -> tuple:
-    """Le at ``si`` toward ``ref`` where ``active``, and the density of emitter sampling where ``sampled``. The density
-    is Mitsuba's, or that of ``lights`` if they are given."""
+    """Le at ``si`` toward ``ref`` where ``active``, and the density of emitter sampling where ``sampled``. If
+    ``lights`` are given, they compute the density. Otherwise Mitsuba does."""
     light, places = mi.DirectionSample3f(scene, si, ref), lights and lights.places
     p = places.density(ref, light, sampled) if places else scene.pdf_emitter_direction(ref, light, sampled)
     if lights and lights.bent:

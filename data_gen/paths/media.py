@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.vertex import consistent, evaluate
+from data_gen.paths.vertex import consistent, dr_number, evaluate
 from data_gen.scenes.facts import media_of, shapes_of
 
 
@@ -37,7 +37,7 @@ class Media:
 
     def __init__(self, scene: mi.Scene):
         self.grids = any(not medium.is_homogeneous() for medium in media_of(scene))
-        matched = {dr_number(shape): index_matched(shape) for shape in shapes_of(scene)}
+        matched = {dr_number(mi.ShapePtr(shape)): index_matched(shape) for shape in shapes_of(scene)}
         table = np.zeros(max(matched, default=0) + 1, bool)
         table[list(matched)] = list(matched.values())
         self.boundaries = bool(table.any())
@@ -56,10 +56,6 @@ def index_matched(shape: mi.Shape) -> bool:
         return False
     others = (mi.BSDFFlags.Smooth, mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission)
     return not any(mi.has_flag(bsdf.flags(), flag) for flag in others)
-
-
-def dr_number(shape: mi.Shape) -> int:
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
 # ------------------------------ Vertices ------------------------------

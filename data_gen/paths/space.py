@@ -55,8 +55,12 @@ class Space:
     def fly(self, x, place: Place | None, ray, drawn: Drawn | None, active) -> Segment:
         return straight(ray, self.scene.ray_intersect_preliminary(ray, active=active))
 
-    def length(self, ray, x) -> mi.Float:
-        """How long the whole segment of the camera's ``ray`` to the vertex ``x`` is; infinite where there is none."""
+    def around(self, sensor: mi.Sensor) -> mi.MediumPtr | None:
+        """The medium around a camera; None in empty space."""
+        return None
+
+    def length(self, origin: mi.Point3f, x) -> mi.Float:
+        """The length of the whole segment from ``origin`` to the vertex ``x``; infinite if ``x`` is not valid."""
         return x.t
 
     def end(self, x, segment: Segment) -> mi.SurfaceInteraction3f:
@@ -110,14 +114,16 @@ class Filled(Space):
         trace, medium = segments.next_surface(self.scene), place.toward(x, ray.d)
         return segments.fly(self.media, trace, ray, medium, drawn.channel, drawn.numbers, active=active)
 
-    def length(self, ray, x) -> mi.Float:
+    def around(self, sensor: mi.Sensor) -> mi.MediumPtr:
+        return mi.MediumPtr(sensor.get_medium())
+
+    def length(self, origin: mi.Point3f, x) -> mi.Float:
         # x.t is the length of the last piece.
-        return dr.select(x.is_valid(), dr.norm(x.p - ray.o), x.t)
+        return dr.select(x.is_valid(), dr.norm(x.p - origin), x.t)
 
     def end(self, x, segment: Segment) -> mi.SurfaceInteraction3f:
         x1 = super().end(x, segment)
-        # The length of the whole segment, not of its last piece
-        x1.t = dr.select(x1.is_valid(), dr.norm(x1.p - x.p), x1.t)
+        x1.t = self.length(x.p, x1)
         return x1
 
     def sees(

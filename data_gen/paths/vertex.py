@@ -42,7 +42,7 @@ class Materials:
     ):
         shapes = [shape for shape in scene.shapes() if not passed(shape)]
         # Dr.Jit's number of each material -> one of its shapes
-        users = {dr_number(shape.bsdf()): shape for shape in shapes if shape.bsdf() is not None}
+        users = {dr_number(mi.BSDFPtr(shape.bsdf())): shape for shape in shapes if shape.bsdf() is not None}
         table = np.ones(max(users, default=0) + 1, bool)
         self.unconnectable: list[str] = []
         for number, shape in users.items():
@@ -73,7 +73,7 @@ class Materials:
 
 
 class ByMaterial:
-    """A table of values for materials, indexed by Dr.Jit's number of a material.
+    """A table of values for materials or media, indexed by Dr.Jit's numbers.
 
     Mitsuba does not list the materials inside shape groups, so they have no value.
     """
@@ -83,7 +83,7 @@ class ByMaterial:
         self.size, self.values = dr.opaque(mi.UInt32, dr.width(values)), values
         dr.eval(self.values)
 
-    def of(self, bsdf: mi.BSDFPtr, active: mi.Bool | bool = True) -> tuple[mi.Bool, mi.Bool | mi.Float]:
+    def of(self, bsdf: mi.BSDFPtr | mi.MediumPtr, active: mi.Bool | bool = True) -> tuple[mi.Bool, mi.Bool | mi.Float]:
         """Whether each material is ``active`` and has a value, and the value, or 0."""
         number = dr.reinterpret_array(mi.UInt32, bsdf)
         listed = active & (number < self.size)
@@ -92,12 +92,12 @@ class ByMaterial:
 
 def materials_of(scene: mi.Scene) -> dict[int, mi.BSDF]:
     """The materials of a scene's shapes by Dr.Jit's number of each."""
-    return {dr_number(shape.bsdf()): shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None}
+    return {dr_number(mi.BSDFPtr(shape.bsdf())): shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None}
 
 
-def dr_number(bsdf: mi.BSDF) -> int:
-    """The number of a material in Dr.Jit's arrays of pointers."""
-    return int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])
+def dr_number(pointer: mi.BSDFPtr | mi.MediumPtr | mi.ShapePtr) -> int:
+    """The number of one object in Dr.Jit's arrays of pointers."""
+    return int(dr.reinterpret_array(mi.UInt32, pointer)[0])
 
 
 def smallest_roughness(bsdf: mi.BSDF) -> float:

@@ -29,7 +29,7 @@ import numpy as np
 
 from data_gen.paths import media
 from data_gen.paths.media import Place
-from data_gen.paths.vertex import SMOOTH, ByMaterial, event_kind, materials_of
+from data_gen.paths.vertex import SMOOTH, ByMaterial, dr_number, event_kind, materials_of
 
 # The tangent of the angle between the normal and the direction that ρ is read off: as far from a mirror direction as
 # from the horizon
@@ -47,7 +47,7 @@ class Matt:
 
     def __init__(self, scene: mi.Scene, fogs: Sequence[mi.Medium] = ()):
         bsdfs = materials_of(scene)
-        evens = {_number(fog): even_part(fog.phase_function()) for fog in fogs}
+        evens = {dr_number(mi.MediumPtr(fog)): even_part(fog.phase_function()) for fog in fogs}
         of_media = np.zeros(max(evens, default=0) + 1, np.float32)
         of_media[list(evens)] = list(evens.values())
         self.evens = ByMaterial(mi.Float(of_media))
@@ -156,10 +156,6 @@ def even_part(phase: mi.PhaseFunction) -> float:
         g = abs(float(mi.traverse(phase)["g"][0]))
         ρ = (1 - g) / (1 + g) ** 2
     return ρ if ρ >= _LEAST_EVEN else 0.0
-
-
-def _number(medium: mi.Medium) -> int:
-    return int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(medium))[0])
 
 
 def matt_lobe(x: mi.SurfaceInteraction3f, place: Place | None, wo: mi.Vector3f) -> mi.Float:

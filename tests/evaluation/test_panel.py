@@ -37,6 +37,8 @@ def test_the_default_is_over_the_least_of_ours():
     shown = panel.text([cell for name in NAMES for cell in cells(name, [1])])
     lines = shown.splitlines()
     assert any(line.startswith("| haze (fog) | 16 | 0.12, 0.198 | 0.062, 0.099") for line in lines)
+    # 2 / 5 of the rival at equal seconds, and gpt+ngpt-combine has half of its samples then
+    assert "| haze | 16 | 16 | 0.40, 0.40 | 1.00, 2.00 |" in lines
     assert lines[-1].startswith("| mean | 2.00, 2.00 | 2.00, 2.00 | 2.00, 2.00 | 1.33")
 
 

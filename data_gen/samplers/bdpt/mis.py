@@ -24,7 +24,7 @@ Both subpaths may also arrive at one vertex and merge. The density of a merge is
 times η = π r² N, for N light paths and radius r. Paths merge only at vertices where photons are gathered, and only if
 the light came from a delta event; otherwise a connection finds the path without blur. A light path knows this at the
 vertex: its ``vcm`` is 0 there, and ``gathered`` adds η as one more summand. A camera path knows it only when it leaves
-the next vertex, so η is ``waiting`` until then. Without photons the formulas are those of ``bdpt``.
+the next vertex, so η is ``waiting`` until then. Without photons the formulas are the same as in ``bdpt``.
 
 ``p`` are densities in solid angle, and ``q`` are densities with both directions of the vertex swapped. Cosines are
 absolute, to the geometric normal. Quotients are computed one by one, because squares of densities would leave the range

@@ -131,7 +131,7 @@ class GPT(GradientIntegrator):
         """
         # ------------------------- Paths -----------------------------
         scene, (ray, importance, _) = plan.space.scene, camera.rays()
-        within = mi.MediumPtr(camera.sensor.get_medium()) if plan.space.media else None
+        within = plan.space.around(camera.sensor)
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         # Clones of the random numbers, here and below: features draw as many as they like, and change no path.
         paths = trace(self, plan, camera.random.clone(), (ray, importance), shifted, within, known=known)

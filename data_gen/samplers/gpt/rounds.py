@@ -130,7 +130,7 @@ def paths(view, plan: Plan, known: Known, camera: CameraSamples, half: mi.UInt32
     RGB.
     """
     ray, importance, _ = camera.rays()
-    within = mi.MediumPtr(camera.sensor.get_medium()) if plan.space.media else None
+    within = plan.space.around(camera.sensor)
     count, records = feed(view, plan, known, camera.random.clone(), (ray, importance, within), half)
     colours = ([each for E in r.E for each in mi.Color3f(E)] for r in records)
     return count, [

@@ -106,7 +106,7 @@ def feed(view, plan: Plan, known: Known, random, camera_ray: tuple, half: mi.UIn
     first = space.first(view, ray, within, drawn)
     x = media.vertex(mi.Ray3f(first.ray), first.hit, first.place)
     path = begin(plan, x, first.place, drawn.channel if drawn else None, importance * first.weight)
-    path.trail, path.ρ, lanes = Trail.to(space.length(ray, x)), mi.Color3f(0), dr.width(x.t)
+    path.trail, path.ρ, lanes = Trail.to(space.length(ray.o, x)), mi.Color3f(0), dr.width(x.t)
     blank = Place(dr.zeros(mi.Point3f, lanes), mi.UInt32(0), mi.Int32(0))
     dark = [dr.zeros(mi.Spectrum, lanes) for _ in known.means]
     none = [Record(blank, mi.Spectrum(0), mi.Bool(False), list(dark)) for _ in range(RECORDS)]

@@ -42,7 +42,7 @@ def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=Non
     x, β = media.vertex(mi.Ray3f(first.ray), first.hit, first.place), importance * first.weight
     path = begin(plan, x, first.place, drawn.channel if drawn else None, β)
     if known:
-        path.trail, path.ρ = Trail.to(space.length(ray, x)), mi.Color3f(0)
+        path.trail, path.ρ = Trail.to(space.length(ray.o, x)), mi.Color3f(0)
     # Kept out of the gradients: it has little noise, but its edges would be the strongest of the image.
     if space.media:
         Le = importance * view.lamps_in_fog(scene, space.media, ray, within, drawn.channel)
