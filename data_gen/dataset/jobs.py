@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack
 from functools import partial
-from multiprocessing import active_children, get_context
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from data_gen.dataset.config import Config, Job, as_json
 from data_gen.dataset.crops import make_shard
 from ngpt.errors import NgptError
 from ngpt.system.files import exclusive
+from ngpt.system.interrupts import Interrupt, noted
 from ngpt.system.workers import end_with_parent
 from ngpt.system.writing import write_json
 from ngpt.training.dataset import FORMAT, MANIFEST, VERSION, checksum, read_manifest
@@ -36,23 +39,39 @@ class Serial(Executor):
 class Pool(ProcessPoolExecutor):
     """``count`` worker processes that end with this process, however it ends.
 
-    ``interruptible``: whether Ctrl-C ends them at once. Otherwise the caller decides when to ``end`` them.
+    ``interruptible``: in a ``with`` block, Ctrl-C and SIGTERM end the workers at once: waiting for their current crops
+    would take minutes, and these crops are made again later. Otherwise the caller decides when to ``end`` them.
     """
 
     def __init__(self, count: int, interruptible: bool = True):
         # Spawned, since LLVM does not survive a fork.
         super().__init__(count, mp_context=get_context("spawn"), initializer=end_with_parent, initargs=(interruptible,))
+        # An exception out of a signal handler may leave a lock of the executor held, on which its own thread then waits
+        # for ever. So the handler only ends the workers; the executor notices, and the signal has its effect at the end
+        # of the block.
+        self._signals, self._interrupt = ExitStack(), Interrupt()
+        self._interruptible = interruptible
+
+    def __enter__(self) -> Self:
+        if self._interruptible:
+            self._interrupt = self._signals.enter_context(noted(self.end))
+        return super().__enter__()
+
+    def submit(self, fn, /, *args, **kwargs) -> Future:
+        future = super().submit(fn, *args, **kwargs)
+        if self._interrupt():
+            self.end()  # the signal may have come before the workers were there
+        return future
 
     def end(self) -> None:
-        for process in tuple(self._processes.values()):
+        for process in tuple((self._processes or {}).values()):
             process.terminate()
 
-    def __exit__(self, kind, *rest):
-        if kind is not None and issubclass(kind, KeyboardInterrupt):
-            # Waiting for their current crops would take minutes; these crops are made again later.
-            for process in active_children():
-                process.terminate()
-        return super().__exit__(kind, *rest)
+    def __exit__(self, *error) -> None:
+        with self._signals:
+            super().__exit__(*error)
+        if self._interrupt():
+            signal.raise_signal(self._interrupt.signal)
 
 
 def processes(count: int) -> Executor:

@@ -1,7 +1,8 @@
 """Reads, computes and writes at the same time, so that computing never waits for a disk or a decoder."""
 
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
+from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from ngpt.errors import NgptError, WrongUse
@@ -31,18 +32,28 @@ def overlapped(
                 thread.submit(int)
         except RuntimeError as error:  # Python's error if it cannot start a thread
             raise MemoryError(str(error)) from error
-        coming: Future | None = None
-        going: Future | None = None
+        coming: SimpleQueue | None = None
+        going: SimpleQueue | None = None
         for i, item in enumerate(items):
-            value = (coming or reader.submit(_attempt, read, item)).result()
-            coming = reader.submit(_attempt, read, items[i + 1]) if i + 1 < len(items) else None
+            value = (coming or _begun(reader, read, item)).get()
+            coming = _begun(reader, read, items[i + 1]) if i + 1 < len(items) else None
             value = _attempt(compute, value)
             if going:
-                yield _told(going.result())
-            going = writer.submit(_attempt, write, value)
+                yield _told(going.get())
+            going = _begun(writer, write, value)
             del value  # only the writer keeps it, so that it is freed once written
         if going:
-            yield _told(going.result())
+            yield _told(going.get())
+
+
+def _begun(thread: ThreadPoolExecutor, stage: Callable[[Any], Any], value: Any) -> SimpleQueue:
+    """Begins a stage; its result or error will be in the queue.
+
+    An interrupt while one waits for a future may leave its lock held, and the thread would wait for that lock for ever.
+    """
+    outcome: SimpleQueue = SimpleQueue()
+    thread.submit(lambda: outcome.put(_attempt(stage, value)))
+    return outcome
 
 
 def _attempt(stage: Callable[[Any], Any], value: Any) -> Any:

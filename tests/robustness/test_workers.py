@@ -5,12 +5,12 @@ import signal
 import sys
 
 import pytest
-from processes import children, running, start, wait_for
+from processes import children, complete, running, start, wait_for
 
 from ngpt.system.files import exclusive
 
 WORKERS = """
-import sys, time
+import signal, sys, threading, time
 from data_gen.dataset.jobs import processes
 from ngpt.system.console import run_command
 from ngpt.system.files import exclusive
@@ -18,8 +18,16 @@ from ngpt.system.files import exclusive
 def run():
     with exclusive(sys.argv[1]), processes(2) as pool:
         tasks = [pool.submit(time.sleep, 600) for _ in range(2)]
+        if "locked" in sys.argv:
+            tasks[0]._condition = InterruptedOnceLocked()
         print("ready", flush=True)
         tasks[0].result()
+
+class InterruptedOnceLocked(threading.Condition):
+    def __enter__(self):
+        super().__enter__()
+        if threading.current_thread() is threading.main_thread():
+            signal.raise_signal(signal.SIGINT)
 
 if __name__ == "__main__":
     sys.exit(run_command(run))
@@ -42,6 +50,14 @@ def test_workers_end_with_their_parent_and_its_lock_does_too(tmp_path, number):
         assert not interrupted or pool.stderr.read() == "ngpt: error: interrupted\n"
     with exclusive(tmp_path):
         pass
+
+
+def test_an_interrupt_never_leaves_a_lock_of_the_pool_held(tmp_path):
+    """Its own thread would wait for the lock, and the command would hang."""
+    pytest.importorskip("mitsuba")
+    (tmp_path / "workers.py").write_text(WORKERS)
+    run = complete([sys.executable, tmp_path / "workers.py", tmp_path, "locked"], timeout=60)
+    assert (run.returncode, run.stderr) == (130, "ngpt: error: interrupted\n")
 
 
 def test_a_forked_process_does_not_hold_the_lock_of_a_dead_one(tmp_path):
