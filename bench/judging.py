@@ -41,8 +41,14 @@ def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
     args = parser.parse_args()
     if args.scenes and not args.references:
         parser.error("give the folder of --references")
-    args.pixels = tuple(map(int, args.size.split("x")))
+    args.pixels = parsed_size(args.size)
     return args
+
+
+def parsed_size(text: str) -> tuple[int, int]:
+    """Width and height of "320x180"."""
+    width, height = map(int, text.split("x"))
+    return width, height
 
 
 class Cells(list[dict[str, Any]]):

@@ -4,6 +4,7 @@
     python -m bench.panel --scenes diffuse haze    only these
     python -m bench.panel --baseline               measures three seeds, which become the numbers in git and the page's
     python -m bench.panel --table                  prints the tables of docs/lab/panel.md and measures nothing
+    python -m bench.panel --files a/scene.xml      the same tables of other scenes, with three seeds; compares nothing
 
 A cell is a scene, a number of samples and a pipeline, named SAMPLER+METHOD:
 
@@ -31,7 +32,7 @@ import ngpt
 from bench import verdict
 from bench.common import metadata, renderer, save, write_page
 from bench.curves import Ratio, marked, over, over_least
-from bench.judging import RIVAL, WARM_SPP, Judge, opened, processor_seconds, timed
+from bench.judging import RIVAL, WARM_SPP, Judge, opened, parsed_size, processor_seconds, timed
 from ngpt.errors import NgptError
 from ngpt.measure.averages import geometric_mean
 from ngpt.stack import GradientStack
@@ -61,9 +62,10 @@ _LEAST_ERROR = 1e-6
 
 
 class Case(NamedTuple):
-    """The purpose of a scene in the panel, how to open it, and the samples of each half of its reference."""
+    """The purpose of a scene in the panel, its group, how to open it, and the samples of each half of its reference."""
 
     kind: str
+    group: str
     scene: str
     reference_spp: int = 256
 
@@ -73,22 +75,24 @@ def _file(name: str) -> str:
 
 
 CASES = {
-    "diffuse": Case("room", "diffuse"),
-    "glossy": Case("room of metal and mirrors", "glossy"),
-    "checks": Case("textures", _file("checks")),
-    "crowd": Case("instances", _file("crowd")),
-    "lampshade": Case("hidden lamp", _file("lampshade")),
-    "ajar": Case("light through a gap", _file("ajar"), 512),
-    "trellis": Case("masks", _file("trellis")),
-    "environment": Case("sky", "environment"),
-    "lens": Case("focus blur", "lens"),
-    "product": Case("product shot", _file("product"), 512),
-    "mirror-caustic": Case("caustics in a mirror", _file("mirror-caustic"), 1024),
-    "haze": Case("fog", "haze"),
-    "smoke": Case("smoke", "smoke"),
-    "cloud": Case("cloud", "cloud"),
-    "generator-20261128-caustic": Case("glass, of the generator", "generator:20261128:caustic", 512),
-    "generator-20261129-mirrors": Case("mirrors, of the generator", "generator:20261129:mirrors"),
+    "diffuse": Case("room", "rooms", "diffuse"),
+    "glossy": Case("room of metal and mirrors", "rooms", "glossy"),
+    "checks": Case("textures", "rooms", _file("checks")),
+    "crowd": Case("instances", "rooms", _file("crowd")),
+    "lampshade": Case("hidden lamp", "hidden lamps", _file("lampshade")),
+    "ajar": Case("light through a gap", "hidden lamps", _file("ajar"), 512),
+    "trellis": Case("masks", "masks", _file("trellis")),
+    "environment": Case("sky", "sky, blur", "environment"),
+    "lens": Case("focus blur", "sky, blur", "lens"),
+    "product": Case("product shot", "products", _file("product"), 512),
+    "mirror-caustic": Case("caustics in a mirror", "glass, mirrors", _file("mirror-caustic"), 1024),
+    "haze": Case("fog", "media", "haze"),
+    "smoke": Case("smoke", "media", "smoke"),
+    "cloud": Case("cloud", "media", "cloud"),
+    "generator-20261128-caustic": Case(
+        "glass, of the generator", "caustics, mirrors", "generator:20261128:caustic", 512
+    ),
+    "generator-20261129-mirrors": Case("mirrors, of the generator", "caustics, mirrors", "generator:20261129:mirrors"),
 }
 
 
@@ -97,8 +101,14 @@ def main() -> int:
     parser.add_argument("--scenes", nargs="+", default=list(CASES), choices=list(CASES), metavar="SCENE")
     parser.add_argument("--baseline", action="store_true", help="the cells of these scenes become the numbers in git")
     parser.add_argument("--table", action="store_true", help="print the tables of the numbers in git")
+    parser.add_argument("--files", nargs="+", metavar="SCENE", help="tables of these files, which are not in the panel")
+    parser.add_argument("--size", default="320x180", help="of the images of --files (default: %(default)s)")
     parser.add_argument("--cache", type=Path, default=ROOT / "out" / "panel", help="folder for references")
     args = parser.parse_args()
+    if args.files:
+        found = measured(args.files, args.cache, SEEDS, parsed_size(args.size))
+        print(text([cell for cells in found for cell in cells]))
+        return 0
     before = json.loads(RESULT.read_text())["cells"] if RESULT.exists() else []
     if args.table:
         print(text(before))
@@ -127,26 +137,32 @@ def main() -> int:
     return 1 if worse else 0
 
 
-def measured(names: Sequence[str], cache: Path, seeds: Sequence[int]) -> Iterator[list[dict[str, Any]]]:
+def measured(
+    names: Sequence[str], cache: Path, seeds: Sequence[int], size: tuple[int, int] = SIZE
+) -> Iterator[list[dict[str, Any]]]:
     """The cells of each scene; then the time of all, without references, is printed."""
     seconds = used = 0.0
     for name in names:
-        loaded, judge = opened_with_judge(name, cache)
+        name, loaded, judge = opened_with_judge(name, cache, size)
         start, start_used = time.perf_counter(), processor_seconds()
         yield cells_of(name, loaded, judge, seeds)
         seconds, used = seconds + time.perf_counter() - start, used + processor_seconds() - start_used
         print(f"{name}: {seconds:.0f} s in all, {used:.0f} s of processors", flush=True)
 
 
-def opened_with_judge(name: str, cache: Path) -> tuple[Any, Judge]:
-    """The loaded scene and its reference, which is rendered where the folder lacks it."""
+def opened_with_judge(name: str, cache: Path, size: tuple[int, int]) -> tuple[str, Any, Judge]:
+    """The name of a scene in tables, the loaded scene, and its reference, which is rendered where the folder lacks it.
+
+    ``name`` is one of ``CASES``, or another scene.
+    """
     load_scene, _ = renderer()
     # A kernel knows the shapes of all scenes in memory.
     gc.collect()
-    case = CASES[name]
-    with opened(case.scene) as (_, file):
-        loaded = load_scene(file, SIZE)
-    return loaded, Judge(loaded, name, cache, "{}x{}".format(*SIZE), case.reference_spp)
+    case = CASES.get(name) or Case("", "", name)
+    with opened(case.scene) as (shown, file):
+        loaded = load_scene(file, size)
+    shown = name if name in CASES else shown
+    return shown, loaded, Judge(loaded, shown, cache, "{}x{}".format(*size), case.reference_spp)
 
 
 def cells_of(name: str, loaded: Any, judge: Judge, seeds: Sequence[int]) -> list[dict[str, Any]]:
@@ -205,7 +221,8 @@ def text(cells: list[dict[str, Any]]) -> str:
         for spp in SPP:
             of_all = (of[scene, str(spp), pipeline] for pipeline in PIPELINES)
             values = (f"{mean_of(cell, 'error'):.2g}, {mean_of(cell, 'FLIP'):.3f}" for cell in of_all)
-            rows.append([f"{scene} ({CASES[scene].kind})", str(spp), *values])
+            shown = f"{scene} ({CASES[scene].kind})" if scene in CASES else scene
+            rows.append([shown, str(spp), *values])
     lines = ["Error, FLIP:", "", *markdown_table(["scene", "spp", *PIPELINES], rows), ""]
     rows = []
     for scene in scenes:
@@ -215,6 +232,8 @@ def text(cells: list[dict[str, Any]]) -> str:
             rows.append([scene, str(spp), seconds, *(", ".join(map(marked, each)) for each in ratios)])
     lines += ["The default over two rivals after equal seconds of processors, error and FLIP:", ""]
     lines += [*markdown_table(["scene", "spp", "seconds", *RIVALS], rows), ""]
+    lines += ["Our other pipelines over the default after equal seconds, error and FLIP, by kinds of scenes:", ""]
+    lines += [*markdown_table(["scenes", "pipeline", *(f"{spp} spp" for spp in SPP)], rows_by_group(of, scenes)), ""]
     best = {scene: [over_best(of, scene, spp, equal) for equal in EQUAL for spp in SPP] for scene in scenes}
     rows = [[scene, *(", ".join(map(marked, each)) for each in columns)] for scene, columns in best.items()]
     means = [
@@ -230,20 +249,43 @@ def mean_of(cell: dict[str, Any], value: str) -> float:
     return geometric_mean(cell[value].values())
 
 
+def rows_by_group(of: dict[verdict.Key, dict[str, Any]], scenes: Sequence[str]) -> Iterator[list[str]]:
+    """Below 1, a pipeline is better than the default in this kind of scene. Means are geometric."""
+    groups: dict[str, list[str]] = {}
+    for scene in scenes:
+        groups.setdefault(CASES[scene].group if scene in CASES else "files", []).append(scene)
+    for group, members in groups.items():
+        for pipeline in OURS:
+            places = [(scene, str(spp)) for scene in members for spp in SPP]
+            if all(of[*place, pipeline]["error"] == of[*place, DEFAULT]["error"] for place in places):
+                continue  # it is the default
+            by_spp = ([over_best(of, scene, spp, "seconds", [DEFAULT], pipeline) for scene in members] for spp in SPP)
+            yield [
+                group,
+                pipeline,
+                *(", ".join(over([each[i] for each in ratios]) for i in (0, 1)) for ratios in by_spp),
+            ]
+
+
 def over_best(
-    of: dict[verdict.Key, dict[str, Any]], scene: str, spp: int, equal: str, others: Sequence[str] = OURS
+    of: dict[verdict.Key, dict[str, Any]],
+    scene: str,
+    spp: int,
+    equal: str,
+    others: Sequence[str] = OURS,
+    pipeline: str = DEFAULT,
 ) -> list[Ratio | None]:
-    """Error and FLIP of the default over the least of the ``others``, at as many samples or after as many seconds; with
-    the marks of ``bench.curves``."""
-    default, found = of[scene, str(spp), DEFAULT], []
+    """Error and FLIP of the ``pipeline`` over the least of the ``others``, at as many samples or after as many seconds;
+    with the marks of ``bench.curves``."""
+    this, found = of[scene, str(spp), pipeline], []
     for value in verdict.LIMITS:
-        error = mean_of(default, value)
+        error = mean_of(this, value)
         if equal == "samples":
             found.append((error / min(mean_of(of[scene, str(spp), each], value) for each in others), ""))
         else:
             curves = ([of[scene, str(n), each] for n in SPP] for each in others)
             points = ([(mean_of(cell, "seconds"), mean_of(cell, value)) for cell in curve] for curve in curves)
-            found.append(over_least(error, mean_of(default, "seconds"), points))
+            found.append(over_least(error, mean_of(this, "seconds"), points))
     return found
 
 

@@ -39,7 +39,24 @@ def test_the_default_is_over_the_least_of_ours():
     assert any(line.startswith("| haze (fog) | 16 | 0.12, 0.198 | 0.062, 0.099") for line in lines)
     # 2 / 5 of the rival at equal seconds, and gpt+ngpt-combine has half of its samples then
     assert "| haze | 16 | 16 | 0.40, 0.40 | 1.00, 2.00 |" in lines
+    # At 16 seconds, gpt+ngpt-combine has half of the default's error by sample, and half of its samples.
+    assert "| rooms | gpt+ngpt-combine | 1.00, 0.50 | 0.99, 0.50 | ~0.99, ~0.51 |" in lines
     assert lines[-1].startswith("| mean | 2.00, 2.00 | 2.00, 2.00 | 2.00, 2.00 | 1.33")
+
+
+def test_other_scenes_have_tables_of_their_own(tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def measured(names, cache, seeds, size):
+        asked.append((list(names), list(seeds), size))
+        yield from (cells(name, seeds) for name in ("hall", "yard"))
+
+    monkeypatch.setattr(panel, "measured", measured)
+    monkeypatch.setattr(sys, "argv", ["panel", "--files", "hall.xml", "yard.xml", "--size", "32x18"])
+    assert panel.main() == 0 and asked == [(["hall.xml", "yard.xml"], [1, 2, 3], (32, 18))]
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.startswith("| hall | 4 |") for line in lines)
+    assert "| files | gpt+ngpt-combine | 1.00, 0.50 | 1.00, 0.50 | ~1.00, ~0.50 |" in lines
 
 
 @pytest.mark.parametrize(("factors", "status"), [({}, 0), ({"auto+auto": 1.3}, 1), ({"primal+oidn": 1.02}, 0)])
