@@ -172,8 +172,8 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
     lines += _of_tiny_lamps(plugins, facts)
     if facts.grids and (able := _finding(facts, "grids")):
         lines.append(f"media whose density varies: photons are gathered in them by {able}")
-    if facts.media and points and not SAMPLERS["gpt"].refuses(facts):
-        lines.append("small lights in media: paths find their beams with less noise than photons: `--sampler gpt`")
+    if facts.media and points and not SAMPLERS["primal"].refuses(facts):
+        lines.append("small lights in media: the paths of the default find their beams with less noise than photons")
     if any(name in plugins["BSDF"] for name in ("mask", "null")):
         lines.append("holes: features belong to what is seen through them")
     if any(name in plugins["BSDF"] for name in ("bumpmap", "normalmap")):

@@ -180,7 +180,7 @@ def test_inspection_of_media_lens_maps_and_shutter(scene_file):
     plan = "\n".join(report["plan"])
     assert "media: albedo counts them" in plan and "refused by gbdpt" in plan
     assert "nothing moves" in plan and "'direct' layer" not in plan
-    assert "small lights in media: paths find their beams" in plan and "glass" not in plan
+    assert "small lights in media: the paths of the default find their beams" in plan and "glass" not in plan
     through_glass = "\n".join(inspect_scene(scene_file(text=text.replace('"diffuse"', '"dielectric"')))["plan"])
     assert "found by photons alone for lights without size: `--sampler bre`" in through_glass
     assert "both ends" not in through_glass  # which see no media
