@@ -14,7 +14,6 @@ import data_gen.samplers.bdpt.about
 import data_gen.samplers.photons.about
 import data_gen.samplers.vcm.about
 import data_gen.samplers.primal.about
-import data_gen.samplers.restir.about
 # isort: on
 
 from data_gen.samplers.registry import (

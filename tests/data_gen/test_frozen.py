@@ -131,7 +131,7 @@ def loaded_and_gone(mi, sampler, size):
         render_scene("glossy", spp, sampler=sampler, size=size)
 
 
-@pytest.mark.parametrize("sampler", ["gpt", "primal", "ppm", "vcm", "restir"])
+@pytest.mark.parametrize("sampler", ["gpt", "primal", "ppm", "vcm"])
 def test_a_scene_goes_with_its_last_render(renderer, sampler):
     assert_a_scene_goes_with_its_last_render(renderer, sampler)
 
