@@ -9,7 +9,7 @@ import pytest
 from browser import Browser, Session
 from skips import allowed
 
-from data_gen.samplers import SAMPLERS
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
 from ngpt.classical.gradients import forward_differences
 from ngpt.cli import main
 from ngpt.errors import NgptError
@@ -19,7 +19,7 @@ from ngpt.stack import GradientStack
 pytest_plugins = ["durations"]
 
 # Other installed packages, such as ngpt-studies, add methods and samplers. Tests of all of them must know these, too.
-for registry in (METHODS, SAMPLERS):
+for registry in (METHODS, SAMPLERS, FRAME_SAMPLERS):
     registry.load()
 
 

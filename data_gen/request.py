@@ -172,7 +172,7 @@ class RenderRequest:
 
     def identity(self, frame: int | None = None) -> dict[str, Any]:
         """All that decides which image is rendered: requests of equal identities may continue each other."""
-        entry = FRAME_SAMPLERS.get(self.sampler) or SAMPLERS.get(self.sampler)
+        entry = SAMPLERS.get(self.sampler) or FRAME_SAMPLERS.get(self.sampler)
         return {
             "scene": self._scene(frame) if isinstance(self.scene, str) else None,
             "frame": frame,

@@ -93,7 +93,7 @@ def overview() -> dict[str, Any]:
     use_variant()
     from data_gen.scenes.builtin import SCENES
 
-    SAMPLERS.load()
+    SAMPLERS.load(), FRAME_SAMPLERS.load()
     titles = {"samplers": "use", "samplers for some scenes": "niche", "samplers to compare with": "study"}
     found = {title: {n: entry.summary for n, entry in by_standing(kind).items()} for title, kind in titles.items()}
     return found | {"built-in scenes": {name: (make.__doc__ or "").split("\n")[0] for name, make in SCENES.items()}}

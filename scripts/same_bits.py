@@ -46,6 +46,7 @@ def hashes(samplers: list[str]) -> dict[str, str]:
     from ngpt.errors import NgptError
 
     data_gen.use_variant()
+    FRAME_SAMPLERS.load()
     found = {}
     scenes = {name: data_gen.load_scene(name, SIZE) for name in SCENES}
     for scene, sampler, options in renders(samplers):

@@ -11,7 +11,7 @@ import pytest
 from full_stack import full_stack
 
 import ngpt
-from data_gen.samplers import SAMPLERS
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import METRICS
 from ngpt.methods import METHODS
@@ -53,7 +53,7 @@ def site(tmp_path, monkeypatch):
     folder.mkdir()
     monkeypatch.syspath_prepend(folder)
     modules = set(sys.modules)
-    registries = [METHODS, METRICS, SAMPLERS]
+    registries = [METHODS, METRICS, SAMPLERS, FRAME_SAMPLERS]
     if "torch" in sys.modules:
         from ngpt.network.config import KINDS
         from ngpt.training.loss import TERMS
@@ -221,14 +221,14 @@ def test_names_of_ours_are_refused(site, capsys):
         "METHOD, METRIC = METHODS['l1'], METRICS['MSE']\n"
     )
     groups = {"ngpt.methods": {"wcv": "own:METHOD", "auto": "own:METHOD"}, "ngpt.metrics": {"relMSE": "own:METRIC"}}
-    groups |= {"ngpt.samplers": {"gpt": "own:METHOD", "restir": "own:METHOD"}}
+    groups |= {"ngpt.samplers": {"gpt": "own:METHOD"}, "ngpt.frame_samplers": {"primal": "own:METHOD"}}
     install(site, "own", groups)
-    before = dict(METHODS), dict(METRICS), dict(SAMPLERS)
-    for registry in (METHODS, METRICS, SAMPLERS):
+    before = dict(METHODS), dict(METRICS), dict(SAMPLERS), dict(FRAME_SAMPLERS)
+    for registry in (METHODS, METRICS, SAMPLERS, FRAME_SAMPLERS):
         registry.load()
-    assert (dict(METHODS), dict(METRICS), dict(SAMPLERS)) == before
+    assert (dict(METHODS), dict(METRICS), dict(SAMPLERS), dict(FRAME_SAMPLERS)) == before
     told = capsys.readouterr().err
-    for name in ("wcv", "auto", "relMSE", "gpt", "restir"):
+    for name in ("wcv", "auto", "relMSE", "gpt", "primal"):
         assert f"'{name}' of the package 'own' is left out: ngpt has a" in told
     assert "Traceback" not in told and len(told.splitlines()) == 5
 

@@ -113,7 +113,7 @@ def _able(scene: mi.Scene, method: str, gradients_too: bool = False) -> list[str
     """
     needs_gradients = method != "auto" and "dx" in runnable(method).needs
     names = candidates(scene, gradients=needs_gradients)
-    names += candidates(scene, gradients=True)[:1] if gradients_too else []
+    names += candidates(scene, gradients=True) if gradients_too else []
     able = [name for name in dict.fromkeys(names) if methods_for(name, method)]
     if not able:
         raise NgptError(f"method '{method}' cannot use what the samplers of this scene render; name another, or auto")

@@ -62,14 +62,14 @@ def candidates(scene: mi.Scene, biased: bool = False, gradients: bool = False) -
     """Samplers that could render the scene: the one that its description stands for, then the ones to compare it with.
 
     If the first is the simple way, the others are those that find light which it hardly finds. ``biased`` adds biased
-    samplers at the end. ``gradients`` leaves out samplers that render none.
+    samplers at the end. ``gradients`` asks for the one that the description stands for, which has no rival.
     """
     facts = scene_facts(scene)
     first, method, _ = described(facts, gradients)
-    if math.prod(int(n) for n in scene.sensors()[0].film().crop_size()) < _LEAST_PIXELS:
+    if gradients or math.prod(int(n) for n in scene.sensors()[0].film().crop_size()) < _LEAST_PIXELS:
         return [first]
     able = [s for s in SAMPLERS.values() if s.name != first and s.tried and not s.refuses(facts)]
-    able = [s for s in able if (s.finds or (first, method) != SIMPLE) and (s.gradients or not gradients)]
+    able = [s for s in able if s.finds or (first, method) != SIMPLE]
     return [first] + [s.name for kind in (False, True)[: 1 + biased] for s in able if s.biased == kind]
 
 

@@ -17,7 +17,7 @@ from data_gen.scenes.lamps import emitter_numbers
 from ngpt.errors import NgptError
 
 # An emitter is an area, a point (spots are points that fill a cone), or infinitely far away.
-_AREA, _POINT, _FAR = 0, 1, 2
+AREA, POINT, FAR = 0, 1, 2
 
 
 @dataclass
@@ -74,7 +74,7 @@ class LightEnds:
         return dr.gather(mi.UInt32, self.indices, dr.reinterpret_array(mi.UInt32, emitter), active)
 
     def far(self, index: mi.UInt32) -> mi.Bool:
-        return dr.gather(mi.UInt32, self.kind, index) == _FAR
+        return dr.gather(mi.UInt32, self.kind, index) == FAR
 
     def emission(self, index: mi.UInt32, p: mi.Float, cos: mi.Float, distance2: mi.Float) -> mi.Float:
         """``e`` of ``mis`` for the emitter with number ``index``.
@@ -85,14 +85,14 @@ class LightEnds:
         """
         kind = dr.gather(mi.UInt32, self.kind, index)
         e = mi.Float(1 / (np.pi * self.radius**2))
-        if _POINT in self.kinds:
-            e = dr.select(kind == _POINT, _cone_density(dr.gather(mi.Float, self.cutoff, index)) / distance2, e)
-        if _AREA in self.kinds:
+        if POINT in self.kinds:
+            e = dr.select(kind == POINT, _cone_density(dr.gather(mi.Float, self.cutoff, index)) / distance2, e)
+        if AREA in self.kinds:
             area = cos / (dr.pi * distance2)
             if self.balls:
                 of_ball = dr.gather(mi.Float, self.of_ball, index)
                 area = dr.select(of_ball > 0, of_ball / (dr.pi * p), area)
-            e = dr.select(kind == _AREA, area, e)
+            e = dr.select(kind == AREA, area, e)
         return e
 
     def connect(self, scene, si: mi.SurfaceInteraction3f, u: mi.Point2f, active) -> tuple:
@@ -116,8 +116,8 @@ class LightEnds:
         end = dr.zeros(mi.DirectionSample3f, n)
         origin, d = dr.zeros(mi.Point3f, n), mi.Vector3f(0, 0, 1)
         β, delta, front = mi.Spectrum(0), mi.Bool(False), None
-        if _AREA in self.kinds:
-            here = kind == _AREA
+        if AREA in self.kinds:
+            here = kind == AREA
             place, _ = emitter.sample_position(time, u_position, here)
             if self.bent:
                 front = self._place_bent(place, index, u_position, here)
@@ -130,8 +130,8 @@ class LightEnds:
                 β = dr.select(here & (dr.dot(front, d) <= 0), 0, β)
             origin = dr.select(here, si.spawn_ray(d).o, origin)
             end.p, end.n, end.uv, end.pdf = place.p, place.n, place.uv, place.pdf
-        if _POINT in self.kinds:
-            here = kind == _POINT
+        if POINT in self.kinds:
+            here = kind == POINT
             cutoff = dr.gather(mi.Float, self.cutoff, index)
             frame = mi.Frame3f(dr.gather(mi.Vector3f, self.axis, index))
             position = dr.gather(mi.Point3f, self.position, index)
@@ -142,8 +142,8 @@ class LightEnds:
             β = dr.select(here, intensity * (weight / _cone_density(cutoff)), β)
             origin, d, delta = dr.select(here, position, origin), dr.select(here, along, d), delta | here
             end.p = dr.select(here, position, end.p)
-        if _FAR in self.kinds:
-            here = kind == _FAR
+        if FAR in self.kinds:
+            here = kind == FAR
             middle = _somewhere(mi.Point3f(self.center), time, wavelengths)
             sky, arrives = emitter.sample_direction(middle, u_position, here)
             disk = mi.warp.square_to_uniform_disk_concentric(u_direction)
@@ -170,7 +170,7 @@ class LightEnds:
         end, d = mi.DirectionSample3f(start.end), start.ray.d
         distance2 = dr.squared_norm(end.p - y.p)
         cos = dr.abs(dr.dot(end.n, d))
-        area = dr.gather(mi.UInt32, self.kind, start.index) == _AREA
+        area = dr.gather(mi.UInt32, self.kind, start.index) == AREA
         p = dr.select(area, end.pdf * distance2 / cos, end.pdf)
         if self.balls:
             end.d, end.dist, end.emitter = -d, dr.sqrt(distance2), start.emitter
@@ -185,21 +185,21 @@ class LightEnds:
         cosine at y, which is 1 / distance², or 1 if the distance is infinite.
         """
         kind = dr.gather(mi.UInt32, self.kind, start.index)
-        far = kind == _FAR
+        far = kind == FAR
         to = mi.Vector3f(y.p - start.end.p)
         per_distance2 = dr.select(far, 1, dr.rcp(dr.squared_norm(to)))
         d = dr.select(far, start.ray.d, dr.normalize(to))
         β, ratio = mi.Spectrum(start.β), mi.Float(1)
-        if _AREA in self.kinds:
+        if AREA in self.kinds:
             # p' / p of a cosine distribution. No light leaves the back of the emitter.
             cosines = dr.dot(start.end.n, d) / dr.dot(start.end.n, start.ray.d)
             shines = cosines > 0
             if start.front is not None:
                 shines &= dr.dot(start.front, d) > 0
-            ratio = dr.select(kind == _AREA, dr.select(shines, cosines, 0), ratio)
+            ratio = dr.select(kind == AREA, dr.select(shines, cosines, 0), ratio)
             β *= ratio
-        if _POINT in self.kinds:
-            here = kind == _POINT
+        if POINT in self.kinds:
+            here = kind == POINT
             beside = _somewhere(start.end.p + d, y.time, y.wavelengths)
             _, intensity = start.emitter.sample_direction(beside, mi.Point2f(0.5), here)
             density = scene.pdf_emitter(start.index) * _cone_density(dr.gather(mi.Float, self.cutoff, start.index))
@@ -207,61 +207,24 @@ class LightEnds:
         ray = mi.Ray3f(start.ray.o, d, y.time, y.wavelengths)
         return LightRay(ray, β, start.emitter, start.index, start.end, start.delta, start.front), ratio, per_distance2
 
-    def seen_from_elsewhere(
-        self, scene, light: mi.DirectionSample3f, weight: mi.Spectrum, si: mi.SurfaceInteraction3f, active, *, front
-    ) -> tuple[mi.DirectionSample3f, mi.Spectrum, mi.Float]:
-        """A sampled ``light`` of ``weight`` Le / p shifted: the same point of the emitter, seen from ``si``.
-
-        ``front`` is the third value of ``connect()``. Returns the shifted light, the weight Le J / p with the p of
-        ``light``, and p' J / p, where J = dω' / dω.
-        """
-        index = self.index_of(light.emitter, active)
-        kind = dr.gather(mi.UInt32, self.kind, index, active)
-        far = kind == _FAR
-        other = mi.DirectionSample3f(light)
-        other.emitter = light.emitter  # which Mitsuba 3.9 does not copy
-        to = mi.Vector3f(light.p - si.p)
-        distance = dr.norm(to)
-        other.d, other.dist = dr.select(far, light.d, to / distance), dr.select(far, light.dist, distance)
-        other.p = dr.select(far, si.p + light.d * light.dist, light.p)
-        weight, r = mi.Spectrum(weight), mi.Float(1)
-        if _AREA in self.kinds:
-            here = kind == _AREA
-            facing = dr.dot(light.n, other.d) / dr.dot(light.n, light.d)
-            shines = facing > 0
-            if front is not None:
-                shines &= dr.dot(front, other.d) < 0
-            J = dr.select(shines, facing * dr.square(light.dist / distance), 0)
-            weight *= dr.select(here, J, 1)
-            other.pdf = dr.select(here, dr.select(J > 0, light.pdf / J, 0), light.pdf)
-            if self.balls:
-                ball = active & here & (dr.gather(mi.Float, self.of_ball, index, active) > 0)
-                other.pdf = dr.select(ball, scene.pdf_emitter_direction(si, other, ball), other.pdf)
-                r = dr.select(ball, other.pdf * J / light.pdf, r)
-        if _POINT in self.kinds:
-            here = active & (kind == _POINT)
-            _, intensity = light.emitter.sample_direction(si, mi.Point2f(0.5), here)
-            weight = dr.select(here, intensity / scene.pdf_emitter(index, here), weight)
-        return other, weight, r
-
 
 def _kind(emitter: mi.Emitter) -> int | None:
     """The kind of an emitter; None if light paths cannot start there."""
     if mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
-        return _FAR
+        return FAR
     if is_area(emitter):
-        return _AREA
-    return _POINT if emitter.class_name() in ("PointLight", "SpotLight") else None
+        return AREA
+    return POINT if emitter.class_name() in ("PointLight", "SpotLight") else None
 
 
 def _table(scene: mi.Scene, number: int, emitter: mi.Emitter, kind: int) -> list[float]:
     """Position, axis and cosine of the cutoff of a point or spot; last, the density of starts on a sphere."""
-    if kind == _AREA:
+    if kind == AREA:
         shape = emitter.get_shape()
         ball = shape.class_name() == "Sphere"
         density = float(scene.pdf_emitter(mi.UInt32(number))[0] / shape.surface_area()[0]) if ball else 0.0
         return [0, 0, 0, 0, 0, 1, -1, density]
-    if kind == _POINT:
+    if kind == POINT:
         position = emitter.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5))[0].p
         params = mi.traverse(emitter)
         axis, cutoff = mi.Vector3f(0, 0, 1), -1.0

@@ -80,11 +80,6 @@ def event(sampled_type: mi.UInt32) -> mi.UInt32:
     return dr.select(mi.has_flag(sampled_type, mi.BSDFFlags.Null), PASS, code)
 
 
-def prepend_event(events: mi.UInt32, code: mi.UInt32) -> tuple[mi.UInt32, mi.Bool]:
-    """The chain with one more event in front, and whether there is room for it."""
-    return (events << 2) | code, has_room(events)
-
-
 def has_room(events: mi.UInt32) -> mi.Bool:
     return events < (1 << (2 * MAX_EVENTS - 2))
 

@@ -11,11 +11,9 @@ docs and the tests read the entries. Reading them does not import Mitsuba.
 import data_gen.samplers.gpt.about
 import data_gen.samplers.teaching.about
 import data_gen.samplers.bdpt.about
-import data_gen.samplers.gbdpt.about
 import data_gen.samplers.photons.about
 import data_gen.samplers.vcm.about
 import data_gen.samplers.primal.about
-import data_gen.samplers.restir.about
 # isort: on
 
 from data_gen.samplers.registry import (

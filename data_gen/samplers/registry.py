@@ -186,8 +186,12 @@ class Sampler(Entry):
 class FrameSampler(Entry):
     """A sampler of shots: it renders frames in order, since it reuses earlier frames, and no single images.
 
-    Its ``make`` (scene, seed, samples per pixel, memory in MiB, options) returns an object whose ``film(index, motion,
-    depth)`` is the film of a frame, numbered in the shot.
+    Its ``make`` (scene, seed, samples per pixel, memory in MiB, options) returns an object with
+
+    ``film(index, motion, depth, changed)``  the film of frame number ``index`` of the shot. ``motion`` (H, W, 2) and
+                                             ``depth`` (H, W) are as in ``data_gen.frames.motion``. ``changed`` is None
+                                             where only the camera moves, or else the frame's scene and its shapes
+    ``confidence``                           the mean number of frames that a pixel of the last film counts for
     """
 
     _: KW_ONLY
@@ -196,9 +200,9 @@ class FrameSampler(Entry):
     alone: str  # the reason, in a message, why it renders no single images
 
 
-FRAME_SAMPLERS: dict[str, FrameSampler] = {}
-# Other packages add samplers by entry points.
-SAMPLERS: Registry[Sampler] = Registry("ngpt.samplers", "sampler", Sampler, {}, FRAME_SAMPLERS)
+# Other packages add samplers by entry points. ngpt has no sampler of shots itself.
+SAMPLERS: Registry[Sampler] = Registry("ngpt.samplers", "sampler", Sampler, {})
+FRAME_SAMPLERS: Registry[FrameSampler] = Registry("ngpt.frame_samplers", "sampler", FrameSampler, {}, SAMPLERS)
 
 
 def plugin_of(name: str) -> str:
@@ -225,8 +229,8 @@ def find(name: str, facts: Facts | None = None) -> Sampler:
     if name in FRAME_SAMPLERS:
         raise WrongUse(f"sampler '{name}' is for shots (--frames): {FRAME_SAMPLERS[name].alone}; use --sampler gpt")
     if name not in SAMPLERS:
-        known = f"auto, {', '.join(SAMPLERS)}; for shots (--frames): {', '.join(FRAME_SAMPLERS)}"
-        raise SAMPLERS.unknown(name, ("auto", *SAMPLERS, *FRAME_SAMPLERS), known)
+        names = ("auto", *SAMPLERS)
+        raise SAMPLERS.unknown(name, names, ", ".join(names))
     sampler = SAMPLERS[name]
     if facts is not None and (reason := sampler.refuses(facts)):
         able = [other for other in SAMPLERS.values() if not other.refuses(facts)]

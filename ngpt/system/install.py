@@ -13,7 +13,12 @@ PUBLISHED = False
 NAME, STUDIES = "ngpt-recon", "ngpt-studies"
 # The entries that ngpt-studies adds, by the word that their registry uses for an entry
 _PHOTONS = ("beams", "gbeams", "gbre", "gplanes", "gpm", "gvcm", "gvpm", "planes", "vpm")
-BROUGHT = {"method": ("nlm",), "network": ("kpcn",), "sampler": ("gmlt", "gpt-tiles", "split", *_PHOTONS)}
+_SAMPLERS = ("gbdpt", "gmlt", "gpt-tiles", "restir", "split", *_PHOTONS)
+BROUGHT = {
+    "method": ("nlm",),
+    "network": ("kpcn",),
+    "sampler": _SAMPLERS,
+}
 CHECKOUT = Path(__file__).parents[2]
 
 

@@ -96,10 +96,10 @@ class Registry(dict[str, T]):
         self._imported: set[str] = set()
 
     def __contains__(self, name: object) -> bool:
-        return super().__contains__(name) or any(point.name == name for point in self._others())
+        return super().__contains__(name) or bool(self._called(str(name)))
 
     def __missing__(self, name: str) -> T:
-        named = [point for point in self._others() if point.name == name]
+        named = self._called(name)
         if not named:
             raise KeyError(name)
         if len(named) > 1:
@@ -141,6 +141,9 @@ class Registry(dict[str, T]):
         if line := study(self.what, name):
             return WrongUse(line)
         return WrongUse(f"unknown {self.what} '{name}'; {did_you_mean(name, names)}choose one of: {choices}")
+
+    def _called(self, name: str) -> list[Any]:
+        return [] if name in self.taken else [point for point in self._others() if point.name == name]
 
     def _others(self) -> list[Any]:
         return [point for point in points(self.group) if not self._is_taken(point)]

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bdpt_ends import Copies, check_copies_to_the_camera, check_going_straight_and_back, compare_copies, without_hole
+from bdpt_ends import without_hole
+from path_copies import Copies, check_copies_to_the_camera, check_going_straight_and_back, compare_copies
 from renders import dr, mi
 from scipy.spatial import cKDTree
 from test_holes import assert_connections_go_on_through_many_holes

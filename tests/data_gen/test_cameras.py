@@ -37,7 +37,7 @@ from data_gen.scenes.lamps import lamp_weights
 
 FROM_BOTH_ENDS = ("bdpt", "gbdpt", "vcm", "gvcm")
 # Where light paths end at the camera, and elsewhere
-QUICK = [("bdpt", "principal point"), ("gbdpt", "near plane"), ("gpt", "principal point, crop")]
+QUICK = [("bdpt", "principal point"), ("bdpt", "near plane"), ("gpt", "principal point, crop")]
 SLOW = [(name, view) for view in CAMERAS for name in (*SAMPLERS, *FRAME_SAMPLERS) if (name, view) not in QUICK]
 # Of a layer: a cell of the matrix fails by chance once in 3000 times.
 LEVEL = 1e-4

@@ -46,7 +46,7 @@ def test_what_does_not_know_its_share_is_no_hole(renderer):
     assert holes(mask) and holes({"type": "diffuse"}) is None and holes(unknown[0]) is None
 
 
-@pytest.mark.parametrize("sampler", ["bdpt", "vcm", "gbdpt"])
+@pytest.mark.parametrize("sampler", ["bdpt", "vcm"])
 def test_connections_go_on_through_many_holes(renderer, sampler):
     assert_connections_go_on_through_many_holes(renderer, sampler)
 

@@ -31,7 +31,6 @@ IN_GLASS, IN_HOLES = (
         (GLASS, POINT, "vcm", ""),
         (MASK, POINT, "gpt", ""),
         (MASK, POINT, "bdpt", ""),
-        (MASK, POINT, "gbdpt", ""),
         (MASK, POINT, "gpt-basic", IN_HOLES),
         (MASK, LAMP.format(0.3), "gpt-basic", ""),
         ('<bsdf type="plastic"/>', POINT, "primal", ""),

@@ -160,7 +160,6 @@ def test_a_render_goes_on_and_its_image_is_made_anew(renderer, command, kept):
     [
         ("-o a.exr --denoise wcvv", "invalid choice: 'wcvv'"),
         ("-o a.png --denoise wcv --sampler primal", "needs gradients, and sampler 'primal' renders none"),
-        ("-o a.png --denoise wcv --sampler restir --frames 0:2", "sampler 'restir' renders none"),
         ("-o {frame}.exr --denoise wcv --sampler primal --frames 0:2", "sampler 'primal' renders none"),
         ("-o a.png --denoise ngpt-primal --spp 1", "needs variances"),
         ("-o a.png --denoise nfor", "method 'nfor' cannot be used: none here; name another"),

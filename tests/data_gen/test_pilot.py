@@ -47,9 +47,9 @@ def test_the_least_error_is_chosen_and_the_others_are_named(renderer):
 def test_errors_that_fall_slowly_lose_in_long_renders(renderer):
     """With the power that a pilot saw, as in scenes whose light paths from the camera hardly find."""
     slow, usual = seen("gpt", 0.07, 1.0, step=-0.55), seen("gpt", 0.07, 1.0)
-    rival = seen("gbdpt", 0.01, 8.0)
+    rival = seen("gpt-basic", 0.01, 8.0)
     assert best_of([slow, rival], 100.0)[0] == best_of([usual, rival], 100.0)[0] == "gpt"
-    assert best_of([slow, rival], 5000.0)[0] == "gbdpt" and best_of([usual, rival], 5000.0)[0] == "gpt"
+    assert best_of([slow, rival], 5000.0)[0] == "gpt-basic" and best_of([usual, rival], 5000.0)[0] == "gpt"
 
 
 def test_light_that_a_reconstruction_has_lost_counts(rng):
@@ -87,15 +87,15 @@ def test_photons_are_judged_by_others_and_by_the_time_there_is(renderer, rng):
 
 
 def test_a_choice_needs_a_margin(renderer):
-    ours, better, alike = seen("gpt", 0.01, 1.0), seen("gbdpt", 0.007, 1.0), seen("gbdpt", 0.0095, 1.0)
-    assert best_of([ours, alike], 1000.0)[0] == "gpt" and best_of([ours, better], 1000.0)[0] == "gbdpt"
+    ours, better, alike = seen("gpt", 0.01, 1.0), seen("gpt-basic", 0.007, 1.0), seen("gpt-basic", 0.0095, 1.0)
+    assert best_of([ours, alike], 1000.0)[0] == "gpt" and best_of([ours, better], 1000.0)[0] == "gpt-basic"
 
 
 def test_candidates_are_those_of_the_registry(renderer):
     """The simple way comes first, and then what finds light that it hardly finds."""
     scene = load(renderer, "diffuse", (48, 32))
-    assert candidates(scene) == ["primal", "bdpt", "gbdpt"] and candidates(scene, gradients=True) == ["gpt", "gbdpt"]
-    assert candidates(scene, biased=True) == ["primal", "bdpt", "gbdpt", "ppm"]
+    assert candidates(scene) == ["primal", "bdpt"] and candidates(scene, gradients=True) == ["gpt"]
+    assert candidates(scene, biased=True) == ["primal", "bdpt", "ppm"]
     assert candidates(load(renderer, "diffuse", (16, 12))) == ["primal"]
     assert candidates(load(renderer, "haze", (48, 32))) == ["primal"]
 
@@ -117,7 +117,7 @@ def test_scenes_are_rendered_the_simple_way(renderer, monkeypatch):
         plan = plans.plan_sampler(load(renderer, name, (64, 32)), spp, None, **more)
         return plan.sampler, plan.method
 
-    assert (simple("primal"), simple("ppm"), simple("gbdpt")) == ("oidn", "primal", "wcv")
+    assert (simple("primal"), simple("ppm"), simple("gpt-basic")) == ("oidn", "primal", "wcv")
     for scene in ("glossy", "diffuse", "environment", "lens", "haze"):
         assert chosen(scene) == chosen(scene, 1) == ("primal", "oidn")
         assert chosen(scene, gradients=True) == ("gpt", "")
@@ -142,8 +142,8 @@ def test_adaptive_samples_are_of_what_the_default_takes(renderer, how):
 def test_the_simple_way_stays_unless_another_is_clearly_better(renderer):
     """What a pilot expects of images was seen to be wrong by 1.6 times."""
     simple_way = Pipeline("primal", "oidn", 16, 0.01, -0.55, 1.0, 0.0)
-    rival = replace(simple_way, sampler="gbdpt", method="ngpt-combine", error=0.008)
-    for ranked, best in (([rival, simple_way], "primal"), ([replace(rival, error=0.004), simple_way], "gbdpt")):
+    rival = replace(simple_way, sampler="gpt-basic", method="ngpt-combine", error=0.008)
+    for ranked, best in (([rival, simple_way], "primal"), ([replace(rival, error=0.004), simple_way], "gpt-basic")):
         assert best_image(ranked, "primal", 16.0).sampler == best
     assert best_image([rival], "primal", 16.0) is rival
 

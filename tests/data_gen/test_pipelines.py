@@ -144,7 +144,7 @@ def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
     """Pilots have a tenth of the time, trials two thirds of it; and the less time, the smaller the images."""
     scene = load(renderer, "diffuse", (48, 32))
     monkeypatch.setattr(plans, "PIXELS", 24 * 16)
-    monkeypatch.setattr(plans, "candidates", lambda scene, **_: ["gpt", "primal", "bdpt", "gbdpt"])
+    monkeypatch.setattr(plans, "candidates", lambda scene, **_: ["gpt", "primal", "bdpt", "ppm"])
     tried, sizes = [], []
 
     def try_out(scene, name, clock, limit, stop, unbiased):
@@ -160,7 +160,7 @@ def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
         tried.clear()
         found = plans.plan(scene, seconds, pilot=Pilot(ticking(1.0)))
         assert found.sampler == "gpt" and "no time for a pilot" in found.reason
-        assert [name for name, _ in tried] == ["gpt", "primal", "bdpt", "gbdpt"][:names]
+        assert [name for name, _ in tried] == ["gpt", "primal", "bdpt", "ppm"][:names]
         assert (sizes or [None])[-1] == size
         assert all(0 < limit < 0.1 * seconds for _, limit in tried)
 
@@ -200,9 +200,9 @@ def test_all_that_follows_a_render_is_counted_at_its_size(renderer, monkeypatch)
 
 
 def test_slow_compilation_keeps_other_samplers_out(renderer, monkeypatch):
-    """gbdpt takes three times as long as gpt: where that took 20 s, it is not begun in a rest of 40."""
+    """ppm takes one and a half times as long as gpt: where that took 20 s, it is not begun in a rest of 40."""
     scene, tried = load(renderer, "diffuse", (16, 12)), []
-    for took, names in ((20.0, ["gpt"]), (10.0, ["gpt", "gbdpt"])):
+    for took, names in ((20.0, ["gpt"]), (10.0, ["gpt", "ppm"])):
         tried.clear()
 
         def try_out(scene, name, clock, limit, stop, unbiased, took=took):
@@ -210,7 +210,7 @@ def test_slow_compilation_keeps_other_samplers_out(renderer, monkeypatch):
             return None, clock() + took
 
         monkeypatch.setattr(trials, "try_out", try_out)
-        trials.try_all(scene, ["gpt", "gbdpt"], lambda _: 40.0, pilot=Pilot(ticking(0.1)))
+        trials.try_all(scene, ["gpt", "ppm"], lambda _: 40.0, pilot=Pilot(ticking(0.1)))
         assert tried == names
 
 

@@ -34,12 +34,8 @@ def test_defaults_are_allowed_and_other_values_are_not(name, option):
 def test_names():
     with pytest.raises(NgptError, match="there is a sampler 'gpt' already"):
         register(Sampler("gpt", "another", "other"))
-    with pytest.raises(NgptError, match="there is a sampler 'restir' already"):
-        register(Sampler("restir", "another", "other"))
     with pytest.raises(NgptError, match=r"unknown sampler 'gtp'; did you mean 'gpt'\? choose one of: auto, gpt,"):
         find("gtp")
-    with pytest.raises(NgptError, match=r"; for shots \(--frames\): restir$"):
-        find("foo")
     with pytest.raises(NgptError, match="standing 'useful' is none of use, niche, study"):
         Sampler("new", "another", "other", standing="useful")
 
@@ -54,17 +50,12 @@ def test_options_of_auto_are_refused_with_samplers_that_have_them():
         check_options("auto", {"point": "sobol"})
     with pytest.raises(NgptError, match=r"sampler 'auto', option 'points': .*rounds"):
         check_options("auto", {"points": "halton"})
-    check_options("restir", {"history": "4"})
-    with pytest.raises(NgptError, match="sampler 'restir', option 'history': '0' is not allowed"):
-        check_options("restir", {"history": "0"})
 
 
 def test_frames_take_options_from_the_command_line(renderer, command):
     line = "render diffuse --frames 0:1 --size 8x6 -o shot --force"
-    for options in ("--sampler restir -O gradients=after", "--spp 2 --sampler gpt -O caustic=false"):
-        command(f"{line} {options}")
-        attributes = ngpt.read("shot/diffuse.0000.exr").attributes
-        assert attributes["ngpt:samplerOptions"] == options.rpartition(" ")[2]
+    command(f"{line} --spp 2 --sampler gpt -O caustic=false")
+    assert ngpt.read("shot/diffuse.0000.exr").attributes["ngpt:samplerOptions"] == "caustic=false"
 
 
 def test_the_table_in_the_docs_is_what_entries_say():
@@ -84,5 +75,5 @@ def test_light_paths_refuse_hair(renderer):
     masked = {"type": "mask", "opacity": 0.5, "within": {"type": "hair"}}
     for bsdf in ({"type": "hair"}, masked):
         refused = {name for name, sampler in SAMPLERS.items() if "'hair'" in sampler.refuses(facts(bsdf))}
-        assert {name for name in refused if SAMPLERS[name].standing != "study"} == {"bdpt", "gbdpt", "vcm", "ppm"}
+        assert {name for name in refused if SAMPLERS[name].standing != "study"} == {"bdpt", "vcm", "ppm"}
     assert not facts({"type": "mask", "opacity": 0.5, "within": {"type": "diffuse"}}).hair

@@ -165,7 +165,7 @@ def test_inspection_names_what_matters(scene_file):
     assert not any("photons" in line for line in inspect_scene("diffuse")["plan"])
     assert "thinlens" in inspect_scene("lens")["plugins"]["sensor"]
     flat = inspect_scene(scene_file(text=SCENE.replace("perspective", "orthographic").format(**PLAIN)))["plan"]
-    assert [line.split(":")[0] for line in flat if "light paths cannot reach" in line] == ["refused by gbdpt, vcm"]
+    assert [line.split(":")[0] for line in flat if "light paths cannot reach" in line] == ["refused by bdpt, vcm"]
     with pytest.raises(NgptError, match="not a scene Mitsuba can read"):
         inspect_scene(scene_file(text="<scene"))
 
@@ -178,7 +178,7 @@ def test_inspection_of_media_lens_maps_and_shutter(scene_file):
     assert report["media"] == ["mist"] and report["shutter"] == 0.5 and not report["lens"]
     assert report["sampler"] == "primal"
     plan = "\n".join(report["plan"])
-    assert "media: albedo counts them" in plan and "refused by gbdpt" in plan
+    assert "media: albedo counts them" in plan and "refused by bdpt" in plan
     assert "nothing moves" in plan and "'direct' layer" not in plan
     assert "small lights in media: the paths of the default find their beams" in plan and "glass" not in plan
     through_glass = "\n".join(inspect_scene(scene_file(text=text.replace('"diffuse"', '"dielectric"')))["plan"])

@@ -104,7 +104,6 @@ def test_a_shot_is_rendered_and_gone_on_with(renderer, command):
         ("render none.xml --frames 0:2 -o made", 1),
         ("render diffuse --frames 0:2 -o made --camera none.json", 1),
         ("render diffuse --frames 0:2 -o made --sampler gvpm", 1),
-        ("render diffuse --frames 0:2 -o made --sampler restir --time 9", 1),
         ("render diffuse --frames 0:2 -o made/{frame}.exr --size 300x200 --memory 9", 1),
         ("dataset --config data-tiny --out made --variant none", 2),
     ],

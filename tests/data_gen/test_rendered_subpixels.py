@@ -160,8 +160,6 @@ def test_what_cannot_be_kept_is_refused(renderer):
         render_stack(scene, 4, 3, "bdpt", subpixels=2)
     with pytest.raises(WrongUse, match="'3' subpixels cannot be kept; write 1, 2, 4, or auto"):
         render_stack(scene, 4, 3, "primal", subpixels=3)
-    with pytest.raises(WrongUse, match="'restir' reuses earlier frames"):
-        next(render_frames("diffuse", [0], sampler="restir", subpixels=2))
 
 
 def test_a_render_goes_on_with_its_subpixels(command, tmp_path, renderer):

@@ -28,7 +28,7 @@ def key_of(scene: str, folder: Path, sampler: str = "gpt") -> str:
 
 def test_a_sampler_has_the_key_of_the_code_it_runs(tree, tmp_path):
     """What is shared changes all, a sampler's own code that sampler, and those that use it."""
-    names = ("auto", "gpt", "bdpt", "gbdpt", "primal", "ppm", "bre")
+    names = ("auto", "gpt", "bdpt", "primal", "ppm", "bre")
     last: dict[str, str] = {}
 
     def changed(file: str = "", text: str = "\nsomething = 1\n") -> set[str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from data_gen.samplers import SAMPLERS, find
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, find
 from ngpt.errors import WrongUse
 from ngpt.methods import METHODS, runnable
 from ngpt.system import install, parts
@@ -28,10 +28,11 @@ STUDIES = tomllib.loads((ROOT / "studies" / "pyproject.toml").read_text())["proj
 
 
 def test_studies_are_those_of_their_package():
-    groups = {"method": "ngpt.methods", "network": "ngpt.networks", "sampler": "ngpt.samplers"}
-    points = STUDIES["entry-points"]
-    assert {what: set(points[group]) for what, group in groups.items()} == {k: {*v} for k, v in install.BROUGHT.items()}
-    assert set(points) == set(groups.values()) and STUDIES["name"] == install.STUDIES
+    groups = {"method": ("methods",), "network": ("networks",), "sampler": ("samplers", "frame_samplers")}
+    points = {group.removeprefix("ngpt."): set(names) for group, names in STUDIES["entry-points"].items()}
+    found = {what: set.union(*(points.pop(group) for group in some)) for what, some in groups.items()}
+    assert found == {what: {*names} for what, names in install.BROUGHT.items()}
+    assert not points and STUDIES["name"] == install.STUDIES
 
 
 def ask_for(what, name):
@@ -39,7 +40,7 @@ def ask_for(what, name):
     if what == "method":
         return METHODS, lambda: runnable(name)
     if what == "sampler":
-        return SAMPLERS, lambda: find(name)
+        return FRAME_SAMPLERS if name in FRAME_SAMPLERS else SAMPLERS, lambda: find(name)
     pytest.importorskip("torch")
     from ngpt.network.config import KINDS, ModelConfig
 

@@ -8,6 +8,7 @@ register(
         "bdpt",
         "paths from the camera and from the lights, without gradients (hidden lamps, caustics seen directly)",
         "data_gen.samplers.bdpt.integrator",
+        standing="use",
         refusals=BOTH_ENDS,
         notes={
             "transport": "found from both ends",

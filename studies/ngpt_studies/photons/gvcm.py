@@ -37,15 +37,15 @@ from data_gen.paths.light_ends import World
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.vertex import Vertex
-from data_gen.samplers.gbdpt.base_path import Plan
-from data_gen.samplers.gbdpt.camera_path import shifted_camera_path
-from data_gen.samplers.gbdpt.light_again import Marker, marked
-from data_gen.samplers.gbdpt.light_shift import splat_differences
-from data_gen.samplers.gbdpt.offset_path import Offset, own_vertex
-from data_gen.samplers.gbdpt.pairs import difference, difference_of_one, weighted
 from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.vcm.integrator import VCM
 from data_gen.samplers.vcm.merging import Merging, Photons, brought
+from ngpt_studies.gbdpt.base_path import Plan
+from ngpt_studies.gbdpt.camera_path import shifted_camera_path
+from ngpt_studies.gbdpt.light_again import Marker, marked
+from ngpt_studies.gbdpt.light_shift import splat_differences
+from ngpt_studies.gbdpt.offset_path import Offset, own_vertex
+from ngpt_studies.gbdpt.pairs import difference, difference_of_one, weighted
 from ngpt_studies.photons.map.vertices import is_near
 
 

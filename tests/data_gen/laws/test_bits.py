@@ -18,7 +18,6 @@ MORE = [
     ("gpt", "glossy", 40, {"tails": "shared"}),
     ("primal", "diffuse", 40, {"tails": "shared"}),
     slow("gpt", "diffuse", 70, {"reuse": True}),
-    slow("gbdpt", caustics, 32, {}),
     slow("bre", wisps, 3, {}),
 ]
 

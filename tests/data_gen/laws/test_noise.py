@@ -113,7 +113,7 @@ POINTS = [
         name,
         points,
         id=f"{name}-{points}",
-        marks=() if (name, points) in {("gbdpt", "sobol"), ("primal", "rounds")} else pytest.mark.slow,
+        marks=() if (name, points) in {("bdpt", "sobol"), ("primal", "rounds")} else pytest.mark.slow,
     )
     for points, names in (("sobol", SAMPLERS), ("rounds", ("primal", "gpt")))
     for name in names

@@ -28,10 +28,7 @@ def unseen_fog():
 
 
 TABLE = [
-    *(
-        (name, points(FLAT), {}, "light paths cannot reach a camera 'orthographic'")
-        for name in ("bdpt", "gbdpt", "vcm")
-    ),
+    *((name, points(FLAT), {}, "light paths cannot reach a camera 'orthographic'") for name in ("bdpt", "vcm")),
     ("bdpt", points(PROJECTED), {}, r"from emitter 'lamp' \(Projector\); use --sampler gpt"),
     ("vcm", points(PROJECTED), {}, r"from emitter 'lamp' \(Projector\)"),
     *((name, unseen_fog, {}, rf"there are media .*, which '{name}' does not see") for name in ("bdpt", "vcm")),

@@ -12,7 +12,7 @@ import media_scenes
 import numpy as np
 import pytest
 from bdpt_scenes import SCENES as OF_ALL_LAMPS
-from reference_scenes import BENT, BUILTIN, LARGE, MEDIA, PLACES, SMALL, at_place, of
+from reference_scenes import BUILTIN, LARGE, MEDIA, PLACES, SMALL, at_place, of
 from references import REFERENCES, references
 from registered import quick, slow
 from unbiased import DISTANCES, FAR, assert_unbiased, load, render_ours, render_references, sum_of_squares
@@ -96,9 +96,6 @@ QUICK = [
     Case("gpt-simple", "courtyard to 3", (1,), size=SMALL, spp=64),
     Case("bdpt", "lit: sky"),
     Case("bdpt", "lit: areas", options={"joined_depth": 1}),
-    Case("gbdpt", "lit: sky", (FAR,)),
-    Case("gbdpt", "curtains", (FAR,), spp=64),
-    Case("gbdpt", "few_edges", (FAR,), size=SMALL, spp=64),
 ]
 LONG = {"spp": 256}
 SLOW = [
@@ -120,9 +117,6 @@ SLOW = [
     Case("gpt-simple", "panels", (FAR,), size=(24, 24)),
     *(Case("bdpt", f"lit: {scene}", spp=16) for scene in OF_ALL_LAMPS),
     Case("bdpt", "lit: areas", options={"joined_depth": 3}),
-    *(Case("gbdpt", f"lit: {scene}", (FAR,), spp=64) for scene in OF_ALL_LAMPS),
-    *(Case("gbdpt", "lit: areas", (FAR,), {"joined_depth": depth}, spp=64) for depth in (1, 3)),
-    *(Case("gbdpt", scene, by="bdpt", spp=64) for scene in BENT),
 ]
 
 

@@ -18,7 +18,7 @@ from data_gen.samplers.bdpt import plan as both_ends
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import emission_at, to_light
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, context, cosine, reverse_density, scatters_smoothly
-from data_gen.samplers.gbdpt.pairs import difference
+from ngpt_studies.gbdpt.pairs import difference
 
 
 @dataclass(kw_only=True)

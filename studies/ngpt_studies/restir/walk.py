@@ -5,7 +5,7 @@ One of these paths is chosen during the walk, with a probability in proportion t
 C. Its W becomes the sum of these luminances over all paths, divided by the luminance of its own f. So the mean of C
 over the choices is the radiance of the walk. [Lin et al. 2022; Chao 1982 for a choice in one pass]
 
-    F       integrand of the walk up to vertex x, in the measures of ``data_gen.samplers.restir.record``
+    F       integrand of the walk up to vertex x, in the measures of ``ngpt_studies.restir.record``
     W       1 / density of the same, with Russian roulette
     B       f / p of all vertices after rc, a factor of ``L``
     phase   BEFORE rc; AT rc; BEHIND it
@@ -30,7 +30,7 @@ from data_gen.paths.vertex import DELTA, SMOOTH, evaluate, event_kind, seen_from
 from data_gen.paths.walk import roulette
 from data_gen.samplers.gpt.base_path import light_mis
 from data_gen.samplers.gpt.plan import Plan
-from data_gen.samplers.restir.record import (
+from ngpt_studies.restir.record import (
     HIT,
     LIGHT,
     RC_LIGHT,
@@ -42,7 +42,7 @@ from data_gen.samplers.restir.record import (
     geometry_of,
     word_of,
 )
-from data_gen.samplers.restir.stage import Stage
+from ngpt_studies.restir.stage import Stage
 
 _BEFORE, _AT, _BEHIND = 0, 1, 2
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from restir_shots import FRAMES, Room, close, inverse, lamp, rendered_by_gpt, things
 
-from data_gen.samplers.restir import history as of_history
-from data_gen.samplers.restir import layout, merging
-from data_gen.samplers.restir.evaluate import evaluate_record
-from data_gen.samplers.restir.record import gather
-from data_gen.samplers.restir.reservoir import confidence_after, pair_motions
-from data_gen.samplers.restir.stage import Pose
 from ngpt.testing import z_test
+from ngpt_studies.restir import history as of_history
+from ngpt_studies.restir import layout, merging
+from ngpt_studies.restir.evaluate import evaluate_record
+from ngpt_studies.restir.record import gather
+from ngpt_studies.restir.reservoir import confidence_after, pair_motions
+from ngpt_studies.restir.stage import Pose
 
 STEPS = ((0, 0), (1, 0), (0, 1))
 SHOTS = [

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.samplers.restir.reservoir import CORNERS, Reservoir
+from ngpt_studies.restir.reservoir import CORNERS, Reservoir
 
 # Domains, that is kinds of values, with the step to the second pixel of a pair. Reservoirs are numbered in the order 0
 # primal, 1 dx+, 2 dx-, 3 dy+, 4 dy-.

@@ -10,11 +10,11 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.walk import Limits
 from data_gen.render import render_stack
 from data_gen.samplers.gpt.plan import make_plan
-from data_gen.samplers.restir import walk
-from data_gen.samplers.restir.evaluate import evaluate_record
-from data_gen.samplers.restir.history import History
-from data_gen.samplers.restir.stage import Stage
 from data_gen.scenes import builtin, geometry
+from ngpt_studies.restir import walk
+from ngpt_studies.restir.evaluate import evaluate_record
+from ngpt_studies.restir.history import History
+from ngpt_studies.restir.stage import Stage
 
 SIZE, CHAINS, FRAMES, SEED = 24, 48, 3, 3
 

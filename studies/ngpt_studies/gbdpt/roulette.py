@@ -26,7 +26,7 @@ import numpy as np
 from data_gen.film.splats import Splats
 from data_gen.paths.camera import CameraSamples
 from data_gen.samplers.bdpt.light_path import Seen
-from data_gen.samplers.gbdpt.light_again import Marker
+from ngpt_studies.gbdpt.light_again import Marker
 
 # Of 1, 2, 3, 4 and 6 this has the least variance x time on four scenes
 SHARE = 2.0

@@ -8,8 +8,8 @@ import mitsuba as mi
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.strategies import connection
 from data_gen.samplers.bdpt.vertex import Vertex
-from data_gen.samplers.gbdpt.base_path import Plan, Step
-from data_gen.samplers.gbdpt.offset_path import Offset, own_vertex
+from ngpt_studies.gbdpt.base_path import Plan, Step
+from ngpt_studies.gbdpt.offset_path import Offset, own_vertex
 
 
 def connect(plan: Plan, step: Step, y: Vertex, times, offsets: list[Offset], Δ: list) -> tuple:

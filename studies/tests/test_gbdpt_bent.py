@@ -9,9 +9,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from bdpt_ends import Ends, check_back, close, fresh, plan_of
+from bdpt_ends import Ends
 from bdpt_scenes import ENDS, LIT, by_a_wall, by_the_sun
 from data_gen_scenes import glass
+from path_copies import check_back, close, fresh, plan_of
 from renders import dr, mi
 from unbiased import load, render_ours
 
@@ -30,7 +31,7 @@ from data_gen.samplers.bdpt.vertex import (
     light_leaves,
     scatters_smoothly,
 )
-from data_gen.samplers.gbdpt.pairs import difference_of_one
+from ngpt_studies.gbdpt.pairs import difference_of_one
 
 
 def event(si, code, mode, active):
@@ -55,8 +56,8 @@ class Bent(Ends):
         super().__init__(scene, spp=64, length=0)
 
     def camera_path(self, x, end, d):
-        from data_gen.samplers.gbdpt.base_path import base_step
-        from data_gen.samplers.gbdpt.chain_shift import along, no_chain, straight
+        from ngpt_studies.gbdpt.base_path import base_step
+        from ngpt_studies.gbdpt.chain_shift import along, no_chain, straight
 
         z = Vertex(x, mi.Spectrum(1), end, mi.UInt32(1))
         active, course, chain, self.good = x.is_valid(), straight(), no_chain(dr.width(d)), mi.Bool(False)
@@ -80,7 +81,7 @@ class Bent(Ends):
         return x, self.first_end(x, ray.d), active
 
     def copy(self, chain, x, end, active):
-        from data_gen.samplers.gbdpt.chain_shift import follow_chain
+        from ngpt_studies.gbdpt.chain_shift import follow_chain
 
         start = SimpleNamespace(β=mi.Spectrum(1), r=mi.Float(1), end=end)
         found = follow_chain(self.plan, self.step, chain, start, x, mi.Bool(active))
@@ -90,7 +91,7 @@ class Bent(Ends):
     def direction(self, x, active):
         """That in which the copy leaves its own vertex."""
         from data_gen.paths.manifold import Target, follow, shoot
-        from data_gen.samplers.gbdpt import chain_shift
+        from ngpt_studies.gbdpt import chain_shift
 
         step, chain = self.step, self.chain
         reached = step.x1.is_valid()
@@ -192,8 +193,8 @@ class Caustics(Ends):
     """One light path of each lane up to the first vertex behind mirrors or glass, which the camera sees."""
 
     def __init__(self, description):
-        from data_gen.samplers.gbdpt.light_again import first_link, next_link
-        from data_gen.samplers.gbdpt.light_shift import Splatted
+        from ngpt_studies.gbdpt.light_again import first_link, next_link
+        from ngpt_studies.gbdpt.light_shift import Splatted
 
         super().__init__(load(mi, description, (32, 32)), spp=64, length=5)
         self.plan = plan_of(self.scene)
@@ -221,7 +222,7 @@ class Caustics(Ends):
 
     def shift(self, path, uv, active):
         """(C', r, others') at that place on the film."""
-        from data_gen.samplers.gbdpt.light_shift import shifted
+        from ngpt_studies.gbdpt.light_shift import shifted
 
         return shifted(self.plan, self.eye, path, uv, active, True)
 
@@ -233,7 +234,7 @@ class Caustics(Ends):
 
     def moved(self, uv, good):
         """The copy at ``uv`` as if light had found it: traced forward from the vertex that stays."""
-        from data_gen.samplers.gbdpt.light_shift import through_glass
+        from ngpt_studies.gbdpt.light_shift import through_glass
 
         scene, path = self.scene, self.path
         x = scene.ray_intersect(self.eye.ray(uv, path.lens), good)
@@ -324,7 +325,7 @@ def test_copies_of_light_paths_are_paths_that_light_could_have_found(caustics):
 
 def test_what_is_bent_is_shifted_by_a_kernel_of_its_own(renderer, monkeypatch):
     """All of it, and from the vertex that light has left: Dr.Jit 1.5 (LLVM) once read another lane's."""
-    from data_gen.samplers.gbdpt import integrator, light_shift
+    from ngpt_studies.gbdpt import integrator, light_shift
 
     found, differences = {False: renderer.UInt32(0), True: renderer.UInt32(0)}, light_shift.differences
 
@@ -357,7 +358,7 @@ def crop_below_the_glass(mi):
 @pytest.mark.parametrize("light", [False, True])
 def test_less_noise_than_without(renderer, monkeypatch, light):
     """Camera paths under glass; light of one direction, through a ball, by a mirror and straight to a floor."""
-    from data_gen.samplers.gbdpt import chain_shift, light_shift
+    from ngpt_studies.gbdpt import chain_shift, light_shift
 
     scene = load(renderer, by_the_sun, (48, 48)) if light else crop_below_the_glass(renderer)
     follow = chain_shift.follow

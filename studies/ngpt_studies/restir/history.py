@@ -20,7 +20,7 @@ whatever m is. Confidence is handed on in proportion to the areas. [Zhang et al.
 "Gradient-Domain ReSTIR Path Tracing", section 4.3.1]
 
 This is unbiased as long as motion does not depend on random numbers. If more than the camera changes, there are two
-scenes, and records are carried into the scene in which E is evaluated: see ``data_gen.samplers.restir.carry``. The
+scenes, and records are carried into the scene in which E is evaluated: see ``ngpt_studies.restir.carry``. The
 ``chains`` of a pixel are independent, so several chains give a variance. The frames of one chain are correlated over
 ``cap`` frames, so they must not be put into a film as if they were samples.
 """
@@ -38,14 +38,14 @@ import numpy as np
 
 from data_gen.passes import recording
 from data_gen.paths.camera import CameraSamples
-from data_gen.samplers.restir.carry import Carry
-from data_gen.samplers.restir.evaluate import Request, Requests, evaluate_record, evaluate_some
-from data_gen.samplers.restir.layout import RESERVOIRS, STEPS, Layout, across, step
-from data_gen.samplers.restir.merging import Evaluated, Merging, differences
-from data_gen.samplers.restir.record import Record
-from data_gen.samplers.restir.reservoir import CORNERS, Reservoir, confidence_after, pair_motions
-from data_gen.samplers.restir.stage import Pose, Stage, check
-from data_gen.samplers.restir.walk import Candidate, choices, walk
+from ngpt_studies.restir.carry import Carry
+from ngpt_studies.restir.evaluate import Request, Requests, evaluate_record, evaluate_some
+from ngpt_studies.restir.layout import RESERVOIRS, STEPS, Layout, across, step
+from ngpt_studies.restir.merging import Evaluated, Merging, differences
+from ngpt_studies.restir.record import Record
+from ngpt_studies.restir.reservoir import CORNERS, Reservoir, confidence_after, pair_motions
+from ngpt_studies.restir.stage import Pose, Stage, check
+from ngpt_studies.restir.walk import Candidate, choices, walk
 
 
 @dataclass

@@ -13,10 +13,10 @@ from data_gen.paths.features import features
 from data_gen.paths.lights import emission_seen
 from data_gen.paths.walk import Limits
 from data_gen.samplers.gpt.plan import make_plan
-from data_gen.samplers.restir.history import Frame, History
-from data_gen.samplers.restir.stage import Stage
 from data_gen.scenes.geometry import Geometry
 from data_gen.scenes.load import reference_integrator
+from ngpt_studies.restir.history import Frame, History
+from ngpt_studies.restir.stage import Stage
 
 # Bytes of a lane: five reservoirs of 100 bytes, five of the frame before, and the evaluations of the requested paths
 LANE_BYTES = 3072

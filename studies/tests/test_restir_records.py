@@ -11,10 +11,10 @@ from restir_shots import SIZE, Candidates, Room, close, inverse, worth
 from data_gen.paths.shift import reconnection_jacobian
 from data_gen.paths.space import Filled
 from data_gen.paths.walk import Limits
-from data_gen.samplers.restir.record import MOST_VERTICES, STUCK, empty, geometry_of, word_of
-from data_gen.samplers.restir.stage import check
 from data_gen.scenes.builtin import _camera, _diffuse, _sphere, _wall
 from ngpt.errors import NgptError
+from ngpt_studies.restir.record import MOST_VERTICES, STUCK, empty, geometry_of, word_of
+from ngpt_studies.restir.stage import check
 
 
 def lamps():

@@ -40,7 +40,7 @@ from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import emission_at
 from data_gen.samplers.bdpt.vertex import RADIANCE, cosine, evaluate
-from data_gen.samplers.gbdpt.base_path import Plan, Step, known_met
+from ngpt_studies.gbdpt.base_path import Plan, Step, known_met
 
 
 @dataclass

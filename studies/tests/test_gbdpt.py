@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bdpt_ends import Copies, check_copies_to_the_camera, check_going_straight_and_back, compare_copies, plan_of
 from bdpt_scenes import SCENES, corner
+from path_copies import Copies, check_copies_to_the_camera, check_going_straight_and_back, compare_copies, plan_of
 from renders import dr, mi
+from test_holes import assert_connections_go_on_through_many_holes
 from unbiased import FAR, load, render_ours
 
 from data_gen.film.splats import Splats
@@ -19,6 +20,7 @@ from data_gen.samplers.bdpt.light_path import Seen, light_path
 from data_gen.samplers.bdpt.strategies import to_camera
 from data_gen.samplers.bdpt.vertex import cosine
 from data_gen.scenes.builtin import _wall
+from ngpt_studies.gbdpt.same_light import seen_from_elsewhere
 
 
 @pytest.fixture
@@ -35,7 +37,7 @@ def test_lights_seen_from_elsewhere_are_the_same_lights(renderer):
     both, u = x.is_valid() & y.is_valid(), camera.random.clone().next_2d()
     light, weight = scene.sample_emitter_direction(x, u, False, both)
     expected, expected_weight = scene.sample_emitter_direction(y, u, False, both)
-    ours, ours_weight, r = lights.seen_from_elsewhere(scene, light, weight, y, both, front=None)
+    ours, ours_weight, r = seen_from_elsewhere(lights, scene, light, weight, y, both, front=None)
     both = np.array(both & (light.pdf > 0))
     index = np.array(lights.index_of(light.emitter))
     assert set(index[both]) == {0, 1, 2}
@@ -56,7 +58,7 @@ def copies(renderer):
 @pytest.mark.parametrize("t", [1, 2, 3, 4])
 def test_copies_of_paths_to_a_light(copies, t):
     """The fourth vertex is one step behind what both have in common: an error of that step shows there alone."""
-    from data_gen.samplers.gbdpt.offset_path import to_same_light
+    from ngpt_studies.gbdpt.offset_path import to_same_light
 
     step, offset, own, good = copies.steps[t - 1], copies.offsets[t - 1], copies.copied[t - 1], copies.straight(t)
     good &= step.connectable
@@ -98,7 +100,7 @@ def test_there_is_no_way_to_what_is_too_smooth_nor_back(renderer):
 
 def test_roulette_leaves_differences_as_they_are(renderer, long_passes, monkeypatch):
     """Few shifts survive, of the same paths as without a roulette: so all the noise comes from the roulette."""
-    from data_gen.samplers.gbdpt import integrator, roulette
+    from ngpt_studies.gbdpt import integrator, roulette
 
     scene = load(renderer, "diffuse", (16, 16))
 
@@ -121,7 +123,7 @@ def test_roulette_leaves_differences_as_they_are(renderer, long_passes, monkeypa
 
 def test_who_survives(renderer):
     """By 1 / p, as ``roulette`` has it, and by numbers of their own for each vertex and seed."""
-    from data_gen.samplers.gbdpt.roulette import LEAST, RATED, SHARE, Worth, survivors
+    from ngpt_studies.gbdpt.roulette import LEAST, RATED, SHARE, Worth, survivors
 
     sensor = load(renderer, "diffuse", (32, 32)).sensors()[0]
     n, places = 32 * 32 * 8, np.random.default_rng(5)
@@ -158,7 +160,7 @@ def test_who_survives(renderer):
 @pytest.mark.parametrize("name", ["lens", "glossy"])
 def test_what_the_camera_has_seen_is_found_again(renderer, name):
     """The second kernel splats what the first one has splatted, and never a vertex that was not seen."""
-    from data_gen.samplers.gbdpt.light_again import Marker, light_again, marked
+    from ngpt_studies.gbdpt.light_again import Marker, light_again, marked
 
     scene = load(renderer, name, (32, 24))
     camera, longest = CameraSamples(scene.sensors()[0], 5, 64), 7
@@ -187,7 +189,7 @@ def test_what_the_camera_has_seen_is_found_again(renderer, name):
 
 def test_mirrors_in_front_of_the_camera_are_followed(renderer, long_passes, monkeypatch):
     """A wall of mirror shows the room as if through a window."""
-    from data_gen.samplers.gbdpt import offset_path
+    from ngpt_studies.gbdpt import offset_path
 
     def behind_a_mirror():
         scene = corner()
@@ -208,3 +210,8 @@ def test_mirrors_in_front_of_the_camera_are_followed(renderer, long_passes, monk
     monkeypatch.setattr(offset_path, "replay", reject)
     # What splats and the rest of the room add is the same in both.
     assert followed < 0.8 * noise()
+
+
+@pytest.mark.slow
+def test_connections_go_on_through_many_holes(renderer):
+    assert_connections_go_on_through_many_holes(renderer, "gbdpt")

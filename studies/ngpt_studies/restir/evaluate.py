@@ -2,12 +2,12 @@ r"""E(record, place): the contribution of a record's path at another place on th
 
 The prefix is replayed from the record's random numbers through that place, with the current camera. Then the path goes
 straight to rc, and on as before. The shift back must follow the same rules: no replayed vertex may be joined, and the
-vertex before rc must be connectable. See ``data_gen.samplers.restir.record`` for measures and kinds.
+vertex before rc must be connectable. See ``ngpt_studies.restir.record`` for measures and kinds.
 
 At its own place, with its own camera, E returns the recorded f, up to float32 rounding.
 
 ``P`` and ``shape`` of a record must belong to this scene. Records from another scene are carried here first, see
-``data_gen.samplers.restir.carry``.
+``ngpt_studies.restir.carry``.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from data_gen.paths.mis import mis_weight
 from data_gen.paths.vertex import SMOOTH, evaluate, seen_from
 from data_gen.samplers.gpt.base_path import light_mis
 from data_gen.samplers.gpt.plan import Plan
-from data_gen.samplers.restir.record import HIT, LIGHT, RC_LIGHT, REPLAY, STUCK, Record, gather, geometry_of
-from data_gen.samplers.restir.stage import Stage
-from data_gen.samplers.restir.walk import Numbers, draw, sample_event
+from ngpt_studies.restir.record import HIT, LIGHT, RC_LIGHT, REPLAY, STUCK, Record, gather, geometry_of
+from ngpt_studies.restir.stage import Stage
+from ngpt_studies.restir.walk import Numbers, draw, sample_event
 
 
 @dataclass

@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from data_gen.samplers.restir.reservoir import choose, difference, part, weigh, weight_of
+from ngpt_studies.restir.reservoir import choose, difference, part, weigh, weight_of
 
 # Of five paths: light in two pixels, of which the second does not have the last; densities of either's candidates.
 LIGHT = np.array([[0.2, 1.5, 0.7, 0.05, 2.0], [0.4, 1.0, 0.1, 0.6, 0.0]])

@@ -26,7 +26,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.samplers.restir.record import Record
+from ngpt_studies.restir.record import Record
 
 
 @dataclass

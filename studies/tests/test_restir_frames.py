@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_shot import assert_sizes_may_not_change, assert_too_little_memory_is_refused_first
 
 import data_gen
 import ngpt
@@ -90,11 +91,33 @@ def test_single_images_are_refused_and_why(renderer, tmp_path, capsys):
         ({"history": 0}, "'0' is not allowed; it takes a number of 1 or more"),
         ({"shift": "replay"}, "no option 'shift'"),
         ({"memory": 1}, "--memory"),
+        ({"subpixels": 2}, "'restir' reuses earlier frames"),
     ],
 )
 def test_what_cannot_be_rendered_is_refused(renderer, options, message):
     with pytest.raises(NgptError, match=message):
         rendered(spp=4, size=(32, 24), **options)
+
+
+def test_too_little_memory_is_refused_before_motion_is_computed(renderer, tmp_path, monkeypatch):
+    assert_too_little_memory_is_refused_first(tmp_path, monkeypatch, "restir")
+
+
+def test_crop_windows_are_of_one_size(renderer, tmp_path):
+    assert_sizes_may_not_change(tmp_path, sampler="restir")
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "message"),
+    [
+        ("-o made --time 9", 1, "renders a number of samples, not for a time: use --spp"),
+        ("-o made -O history=0", 2, "sampler 'restir', option 'history': '0' is not allowed"),
+        ("-o a.png --denoise wcv", 2, "sampler 'restir' renders none"),
+    ],
+)
+def test_what_is_refused_prints_a_line_and_leaves_nothing(renderer, command, tmp_path, words, status, message):
+    assert message in command(f"render diffuse --frames 0:2 --sampler restir {words}", status).err
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_change_that_changes_nothing_gives_the_same_frames(renderer, frames):
@@ -138,11 +161,12 @@ def test_media_are_refused():
     assert not FRAME_SAMPLERS["restir"].refuses(Facts("path", ()))
 
 
-def test_the_command_renders_a_shot(renderer, tmp_path):
+def test_the_command_renders_a_shot_with_options(renderer, tmp_path):
     path = tmp_path / "path.json"
     path.write_text(json.dumps({"keys": KEYS}))
     command = ["render", "diffuse", "--frames", "0:2", "--camera", str(path), "--sampler", "restir", "--size", "16x12"]
-    assert main([*command, "-o", str(tmp_path / "shot")]) == 0
+    assert main([*command, "-O", "gradients=after", "-o", str(tmp_path / "shot")]) == 0
     stack = ngpt.read(tmp_path / "shot" / "diffuse.0001.exr")
     assert stack.attributes["ngpt:sampler"] == "restir"
+    assert stack.attributes["ngpt:samplerOptions"] == "gradients=after"
     assert stack.attributes["ngpt:spp"] == FRAME_SAMPLERS["restir"].spp

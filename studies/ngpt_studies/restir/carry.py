@@ -30,10 +30,10 @@ from data_gen.paths.vertex import SMOOTH, evaluate
 from data_gen.paths.walk import roulette
 from data_gen.samplers.gpt.base_path import light_mis
 from data_gen.samplers.gpt.plan import Plan
-from data_gen.samplers.restir.record import LIGHT, RC_LIGHT, REPLAY, STUCK, SUFFIX, Record, word_of
-from data_gen.samplers.restir.stage import Stage
-from data_gen.samplers.restir.walk import DRAWN, draw, sample_event
 from data_gen.scenes.geometry import Mesh
+from ngpt_studies.restir.record import LIGHT, RC_LIGHT, REPLAY, STUCK, SUFFIX, Record, word_of
+from ngpt_studies.restir.stage import Stage
+from ngpt_studies.restir.walk import DRAWN, draw, sample_event
 
 
 class Carry:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from restir_shots import SEED, Candidates, Room, close, inverse, lamp, set_vertices, things, worth
 
-from data_gen.samplers.restir.carry import Carry
-from data_gen.samplers.restir.record import STUCK
 from data_gen.scenes.geometry import Mesh
+from ngpt_studies.restir.carry import Carry
+from ngpt_studies.restir.record import STUCK
 
 
 @pytest.fixture(scope="module")

@@ -50,13 +50,13 @@ from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials
 from data_gen.samplers.bdpt.integrator import BDPT
 from data_gen.samplers.bdpt.light_path import Visitor, light_path
-from data_gen.samplers.gbdpt.base_path import Plan
-from data_gen.samplers.gbdpt.camera_path import shifted_camera_path
-from data_gen.samplers.gbdpt.chain_shift import no_chain, straight
-from data_gen.samplers.gbdpt.light_again import Unseen, marked
-from data_gen.samplers.gbdpt.light_shift import splat_differences
-from data_gen.samplers.gbdpt.pairs import difference, difference_of_one
-from data_gen.samplers.gbdpt.roulette import Rater, Worth, survivors, thresholds
+from ngpt_studies.gbdpt.base_path import Plan
+from ngpt_studies.gbdpt.camera_path import shifted_camera_path
+from ngpt_studies.gbdpt.chain_shift import no_chain, straight
+from ngpt_studies.gbdpt.light_again import Unseen, marked
+from ngpt_studies.gbdpt.light_shift import splat_differences
+from ngpt_studies.gbdpt.pairs import difference, difference_of_one
+from ngpt_studies.gbdpt.roulette import Rater, Worth, survivors, thresholds
 
 
 class GBDPT(BDPT):

@@ -12,11 +12,11 @@ from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.camera_path import choose
 from data_gen.samplers.bdpt.light_path import LightPath
 from data_gen.samplers.bdpt.vertex import Vertex, cosine, recall, scatters_smoothly
-from data_gen.samplers.gbdpt.base_path import Past, Plan, Step, base_step
-from data_gen.samplers.gbdpt.chain_shift import Chain, Course, along, completes, matters
-from data_gen.samplers.gbdpt.connected_offsets import connect
-from data_gen.samplers.gbdpt.offset_path import Offset, brightest, start, take_step, with_differences
-from data_gen.samplers.gbdpt.pairs import weighted
+from ngpt_studies.gbdpt.base_path import Past, Plan, Step, base_step
+from ngpt_studies.gbdpt.chain_shift import Chain, Course, along, completes, matters
+from ngpt_studies.gbdpt.connected_offsets import connect
+from ngpt_studies.gbdpt.offset_path import Offset, brightest, start, take_step, with_differences
+from ngpt_studies.gbdpt.pairs import weighted
 
 
 class MergesPairs(Protocol):

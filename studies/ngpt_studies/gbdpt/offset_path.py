@@ -19,8 +19,9 @@ from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import emission_at
 from data_gen.samplers.bdpt.vertex import RADIANCE, context, cosine, evaluate
-from data_gen.samplers.gbdpt.base_path import Plan, Step, known_end, known_met
-from data_gen.samplers.gbdpt.chain_shift import Chain, Course, follow_chain
+from ngpt_studies.gbdpt.base_path import Plan, Step, known_end, known_met
+from ngpt_studies.gbdpt.chain_shift import Chain, Course, follow_chain
+from ngpt_studies.gbdpt.same_light import seen_from_elsewhere
 
 
 @dataclass
@@ -307,7 +308,7 @@ def bend(plan: Plan, step: Step, chain: Chain, y: Offset, none: Offset, si) -> t
 def to_same_light(plan: Plan, step: Step, y: Offset, si, bsdf, active):
     """f J / p, a factor of r, and ``others`` of the copy that ends at the same point of an emitter."""
     base = step.light
-    light, weight, r = plan.lights.seen_from_elsewhere(plan.scene, base, step.weight, si, active, front=step.front)
+    light, weight, r = seen_from_elsewhere(plan.lights, plan.scene, base, step.weight, si, active, front=step.front)
     f, p, q = evaluate(RADIANCE, si, bsdf, si.to_local(light.d), active)
     C = y.β * f * weight
     lit = active & (dr.max(C) > 0)

@@ -15,13 +15,13 @@ import mitsuba as mi
 from data_gen.film.splats import Splats
 from data_gen.paths.eye import Sight
 from data_gen.paths.light_ends import LightRay
-from data_gen.paths.manifold import event, prepend_event
+from data_gen.paths.manifold import event, has_room
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.samplers.bdpt.light_path import End, Seen, begin, go_on
 from data_gen.samplers.bdpt.plan import Plan
 from data_gen.samplers.bdpt.vertex import record, record_class
-from data_gen.samplers.gbdpt.pairs import weighted
+from ngpt_studies.gbdpt.pairs import weighted
 
 
 @dataclass
@@ -93,7 +93,8 @@ def next_link(
         return dr.select(passed, through, next_link(link, depth, sample, survival))
     smooth = event_kind(sample.sampled_type) == SMOOTH
     code = event(sample.sampled_type)
-    events, fits = prepend_event(link.events, code)
+    # One more event in front
+    events, fits = (link.events << 2) | code, has_room(link.events)
     return Link(
         dr.select(smooth, depth, link.depth),
         dr.select(smooth, sample.pdf, link.p),

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.samplers.restir.evaluate import Requests
-from data_gen.samplers.restir.layout import STEPS, Layout, step
-from data_gen.samplers.restir.record import gather
-from data_gen.samplers.restir.reservoir import CORNERS, Reservoir, choose, difference, part, weigh, weight_of
-from data_gen.samplers.restir.walk import Candidate
+from ngpt_studies.restir.evaluate import Requests
+from ngpt_studies.restir.layout import STEPS, Layout, step
+from ngpt_studies.restir.record import gather
+from ngpt_studies.restir.reservoir import CORNERS, Reservoir, choose, difference, part, weigh, weight_of
+from ngpt_studies.restir.walk import Candidate
 
 
 @dataclass

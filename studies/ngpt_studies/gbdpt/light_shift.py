@@ -21,9 +21,9 @@ from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import to_camera
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, cosine, evaluate, recall, scatters_smoothly
-from data_gen.samplers.gbdpt.base_path import Plan
-from data_gen.samplers.gbdpt.light_again import light_again
-from data_gen.samplers.gbdpt.pairs import difference, difference_of_one
+from ngpt_studies.gbdpt.base_path import Plan
+from ngpt_studies.gbdpt.light_again import light_again
+from ngpt_studies.gbdpt.pairs import difference, difference_of_one
 
 
 @dataclass

@@ -2,7 +2,7 @@ r"""A path in 80 bytes, which are enough to evaluate it again, in its own pixel 
 
 A path is a prefix, a vertex *rc* where copies of the path reconnect to it, and a rest. The prefix is not stored but
 replayed: its random numbers belong to a pixel and a sample. rc is the first vertex that is joined to the vertex before
-it, that is, by a smooth event between two connectable vertices, see ``data_gen.samplers.restir.walk``. Each part has
+it, that is, by a smooth event between two connectable vertices, see ``ngpt_studies.restir.walk``. Each part has
 its own measure, so that a shift has one Jacobian and not one at each vertex:
 
 | part | measure | Jacobian of a shift |
