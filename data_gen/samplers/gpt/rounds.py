@@ -41,15 +41,15 @@ Take = Callable[[Known | None, CameraSamples, GradientFilm], None]
 
 
 def sharing(view, plan: Plan, frozen: Frozen, take: Take) -> SamplePass:
-    """Returns the pass that ``take`` makes. Its paths share a cache if the ``plan`` says so, else they are whole."""
+    """Returns the pass that ``take`` makes. Its paths share a cache if the ``plan`` says so."""
     return SharedTails(view, plan, frozen, take) if plan.matt else partial(take, None)
 
 
 class SharedTails:
     """A ``data_gen.passes.SamplePass`` whose paths may end in a cache. The cache changes only between rounds.
 
-    ``take`` puts samples into a film. It is given what is known, or None if paths do not end in a cache. ``view`` is the
-    integrator. ``cache`` is None before the first round, and if the cache is turned off. Then ``off`` says why.
+    ``take`` puts samples into a film. It is given what is known, or None if paths do not end in a cache. ``view`` is
+    the integrator. ``cache`` is None before the first round, and if the cache is turned off. Then ``off`` says why.
     """
 
     def __init__(self, view, plan: Plan, frozen: Frozen, take: Take):
