@@ -72,7 +72,7 @@ def start(plan: Plan, base: Path, first: Segment, importance: mi.Spectrum, insid
     """Returns an offset path after its ``first`` segment, ``inside`` the film or not. It has ended if it has found no
     vertex.
 
-    If its base path has ended, that walks on as a ghost if the kernel can replay. Otherwise the shift is rejected.
+    A base path that has ended walks on as a ghost if the kernel can replay. Otherwise the shift is rejected.
     """
     hit, none = first.hit, dr.zeros(mi.Spectrum, dr.width(first.hit.t))
     lives = inside & hit.is_valid()

@@ -15,11 +15,11 @@ usual MIS weight.
 If there is the layer ``caustic``, the cache stores the light of that layer separately: light that has passed a sharp
 surface behind the vertex (``data_gen.paths.caustic``). It goes into the layer and into no difference.
 
-A path that feeds the cache opens a record at its first vertex that meets these conditions, and at later ones, at most
-``RECORDS``. From the second such vertex on it may end in the cache itself, in its own half of the records. So light of
-many bounces builds up. A record holds the light that arrives. Therefore the path leaves the vertex as if it were matt
-and white, even where the texture is black. [Müller et al. 2021, "Real-time neural radiance caching for path tracing",
-section 4]
+A path that feeds the cache opens a record at its first vertex that meets the first two conditions, and at later ones,
+at most ``RECORDS``. From the second such vertex on it may end in the cache itself, in its own half of the records. So
+light of many bounces builds up. A record holds the light that arrives. Therefore the path leaves the vertex as if it
+were matt and white, even where the texture is black. [Müller et al. 2021, "Real-time neural radiance caching for path
+tracing", section 4]
 """
 
 from __future__ import annotations
