@@ -46,7 +46,7 @@ def copy_where_smooth(step: Step, y: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, 
         # f |J| / p and in r.
         f_p=dr.select(copies, f * (J / step.p), replayed.f_p),
         r=dr.select(copies, p * J / step.p, replayed.r),
-        # A replayed smooth event is rejected, since the reverse shift would copy its half-vector instead. Beside a ghost
+        # A replayed smooth event is rejected, since the reverse shift would copy its half-vector. Beside a ghost
         # neither shift has a half-vector to copy.
         allowed=dr.select(copies, found, (replayed.kind != SMOOTH) | ~step.x.is_valid()),
     )
