@@ -112,11 +112,12 @@ Made = dict[str, tuple[np.ndarray, float]]  # by way: the image and its whole se
 def by_default(file: str, size: tuple[int, int]) -> Callable[[int, int], Made]:
     load_scene, render_stack = renderer()
     from data_gen.choosing.plans import plan_sampler, without_features
+    from data_gen.request import RenderRequest
 
     scene = load_scene(file, size)
 
     def image(spp: int, seed: int) -> np.ndarray:
-        plan = without_features(scene, plan_sampler(scene, spp, None))
+        plan = without_features(scene, plan_sampler(scene, RenderRequest(scene, spp)))
         how = {"unbiased": False, "subpixels": "auto", **plan.options}
         return ngpt.reconstruct(render_stack(scene, spp, seed, plan.sampler, **how), plan.method or "auto").image
 

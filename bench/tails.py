@@ -78,12 +78,13 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterato
     """The cells of a scene that are not ``known``, one after the other."""
     load_scene, render_stack = renderer()
     from data_gen.choosing.plans import plan_sampler
+    from data_gen.request import RenderRequest
 
     # A kernel knows the shapes of all scenes in memory.
     gc.collect()
     loaded = load_scene(scene, args.pixels)
     judge = Judge(loaded, scene_name(scene), args.references, args.size, args.reference_spp)
-    chosen = plan_sampler(loaded, min(args.spp), None)
+    chosen = plan_sampler(loaded, RenderRequest(loaded, min(args.spp)))
     for sampler in args.samplers:
         warm: set[str] = set()
         name, options = ("primal", RIVAL) if sampler == "mitsuba" else (sampler, {})

@@ -1,9 +1,9 @@
 """Adaptive samples: a few samples everywhere first, then more of them where the result's error is large.
 
 Before each step the chosen method reconstructs the image twice, which gives the standard error of its result
-(``ngpt.api.uncertainty``); docs/use/adaptive.md says how the samples of a step follow from it. The samples that decide
-the counts stay in the means, so a pixel whose first samples were too dark by chance might get too few: errors that are
-means over about 9x9 pixels, relative to the light there, keep this bias small.
+(``ngpt.api.uncertainty``). docs/use/adaptive.md says how the samples of a step follow from it. The samples that decide
+the counts stay in the means. So a pixel whose first samples were too dark by chance might get too few samples. This
+bias is small, because errors are means over about 9x9 pixels, relative to the light there.
 """
 
 from __future__ import annotations
@@ -38,11 +38,13 @@ BLOCK = PACKET
 LEAST = 2 * BLOCK
 # The least and the most that a pixel gets, relative to an even share
 _FLOOR, _CAP = 0.25, 16.0
-# A step to a given error goes a bit further than is thought to be needed, and is no smaller than this of what there is.
+# If an error is given, a step aims at _MARGIN times the samples that seem to be needed, and adds at least this share of
+# the samples so far.
 _MARGIN, _SMALLEST = 1.05, 0.125
 # The worst pixels are left out, as ngpt.measure.metrics.relmse_trimmed does.
 _TRIM = 0.001
-# This share of the changes is cut to the next smaller one: else all pixels around a firefly get its samples.
+# This share of the changes, the largest ones, is cut to the next smaller change. Otherwise all pixels around a firefly
+# would get more samples.
 _CUT = 0.03
 # The mean square error over the mean of squared standard errors. A standard error is right for two values in three, and
 # a few values far off raise the mean square. Standard errors of l1 count the light that it leaves out, so its factor is
@@ -60,17 +62,19 @@ class Adaptive:
     pixels, for the result x of the ``method`` and the converged image r, as far as standard errors foretell it.
     """
 
-    error: float | None = None  # that ends the render; None: as far as samples or time go
+    error: float | None = None  # at which the render ends; None: samples or time end it
     method: str = "auto"
 
     def chosen_by(self, stack: GradientStack) -> str:
-        """The method that the choice goes by. Where none is named and no error is to be foretold, it is ``wcv`` for
-        gradients: networks need many times its seconds, and their errors are in about the same places."""
+        """The method whose errors decide where samples go. If no method is named and no error must be foretold, it is
+        ``wcv`` for a stack with gradients: networks take many times as long, and have their errors in about the same
+        places."""
         return "wcv" if self.method == "auto" and self.error is None and "dx" in stack else self.method
 
 
 def check_adaptive(adaptive: Adaptive, sampler: Sampler, options: dict, spp: int | None) -> None:
-    """Raises NgptError for what cannot be rendered with samples in different numbers."""
+    """Raises NgptError for samplers and options that need the same number of samples in all pixels, and for numbers
+    that make no sense."""
     if adaptive.error is not None and not 0 < adaptive.error < math.inf:
         raise WrongUse(f"an error of {adaptive.error:g} is never reached; give a positive number, such as 0.05")
     if spp is not None and spp < LEAST:
@@ -85,7 +89,7 @@ def check_adaptive(adaptive: Adaptive, sampler: Sampler, options: dict, spp: int
 def render_adaptive(
     sample: SamplePass, sensor: mi.Sensor, seed: int, adaptive: Adaptive, budget: Budget, watch: Watch, **how: Any
 ) -> tuple[GradientFilm, dict]:
-    """The film, and attributes that say what its samples were chosen for.
+    """Renders adaptive samples. Returns the film, and the attributes that say what its samples were chosen for.
 
     For the parameters see ``data_gen.passes.render_passes()``; samples of the ``budget``, and what is reported of them,
     are means over pixels. The first 16 samples of each pixel are always rendered. The seed, the size, the method and
@@ -156,7 +160,8 @@ def assess(stack: GradientStack, method: str) -> Assessment:
     result, again = reconstruct(stack, method), reconstruct(noisier(stack), method)
     light = ndimage.uniform_filter(np.nan_to_num(result.image).astype(np.float64), (3, 3, 1))
     unit = np.sqrt(np.square(light) + EPSILON)
-    # Made relative before averaging over neighbours: the error of a lamp's edge must not count for the dark beside it.
+    # Errors are made relative before they are averaged over neighbours: the error at the edge of a lamp must not count
+    # for the dark pixels beside it.
     once, twice = (np.nan_to_num(r.image) / unit for r in (result, again))
     factor = FACTORS.get(result.method, FACTOR)
     squares = np.square(factor * (twice - once))
@@ -168,7 +173,8 @@ def assess(stack: GradientStack, method: str) -> Assessment:
 
 
 def seconds_to_assess(stack: GradientStack, method: str, clock: Callable[[], float] = wall) -> float:
-    """What ``assess`` is expected to take, from a part in the middle of the image; 0 where that is most of it."""
+    """The seconds that ``assess`` is expected to take, measured on a part in the middle of the image. Returns 0 for an
+    image that is less than four times as large as this part."""
     if stack.width * stack.height < 4 * _PART**2:
         return 0.0
     seconds = 0.0
@@ -197,7 +203,8 @@ def share_out(need: np.ndarray, n: np.ndarray, samples: float) -> np.ndarray:
 
 
 def gain(need: np.ndarray) -> float:
-    """Squared error relative to as many even samples, if ``need`` (per pixel) is right and the counts are exact."""
+    """The squared error relative to the same number of even samples, if ``need`` (of each pixel) is right and counts
+    follow it exactly."""
     shares = np.clip(need / max(need.mean(), 1e-300), _FLOOR, _CAP)
     squares = np.square(need)
     return float((squares / (shares / shares.mean())).mean() / max(squares.mean(), 1e-300))
@@ -235,14 +242,14 @@ class UnevenRender:
         lane_bytes += bytes_of_rays(sensor)
         room = BLOCK * lane_bytes // height
         self.film = film_of(width, height, budget.memory, room, net=self.net, **kind)
-        # Raises NgptError where not even one row's worth fits.
+        # Raises NgptError if not even a block for each pixel of a row fits.
         self.at_once = lanes_within(budget.memory, self.film, BLOCK * width, lane_bytes) // BLOCK
         self.clock = budget.clock
         self.end = None if budget.seconds is None else self.clock() + budget.seconds
         self.passes: list[tuple[int, float]] = []  # blocks and seconds of each
         self.ended = False
         self.rounds, self.done = rounds_of(sample), 0
-        # The first samples of all pixels come together, and so do the rounds in which an even render has them.
+        # The first block has the samples of several rounds of an even render. So all these rounds begin before it.
         for first in (0, BLOCK - 1):
             self.rounds.begin(sensor, seed, first, self.film)
 
@@ -277,12 +284,12 @@ class UnevenRender:
         if not self.passes:
             return max(1, min(self.at_once, passes.FIRST_LANES // BLOCK))
         begin, each = foretold(self.passes)
-        # Where a pass takes long to begin, it goes on for longer.
+        # If passes take long to begin, they are made longer.
         n = max(1, min(self.at_once, int(max(passes.PASS_SECONDS - begin, 3 * begin) / each)))
         if whole or self.end is None:
             return n
         left = self.end - self.clock()
-        # Two thirds of the time left, since a pass may take longer than others did; all of it where that is too little.
+        # Two thirds of the time left, since a pass may take longer than others did, or all of it if that is too little.
         most = int((2 / 3 * left - begin) / each)
         return min(n, most if most > 0 else int(left > begin + each))
 

@@ -18,7 +18,6 @@ from data_gen.request import RenderRequest, said_by
 from data_gen.samplers import FRAME_SAMPLERS
 from ngpt.errors import NgptError
 from ngpt.io.exr import pass_through, read, with_channels, write
-from ngpt.io.openexr import read_header
 from ngpt.io.results import MADE_BY
 from ngpt.merging import DIAGNOSTICS, OPTIONS, REQUEST, UNFINISHED, merge
 from ngpt.methods import METHODS
@@ -53,13 +52,14 @@ class Unfinished(NgptError):
         self.stack = stack
 
 
-def rest_of(request: RenderRequest, path: Path, frame: int | None = None) -> RenderRequest | None:
+def rest_of(
+    request: RenderRequest, path: Path, attributes: Mapping[str, Any], frame: int | None = None
+) -> RenderRequest | None:
     """The part of a request that its file still lacks, for an image or for a ``frame``; None if it lacks nothing.
 
-    Its sampler is the file's, and its seed is one for the next part. Raises NgptError if the file is of another
-    request.
+    ``attributes`` are from the header of the file at ``path``. The sampler of the rest is the file's, and its seed is
+    the one for the next part. Raises NgptError if the file is of another request.
     """
-    attributes, _ = read_header(path)
     said = _same(request, path, attributes, frame)
     seeds, sampler = str(attributes.get("ngpt:seed", "")).split(), str(attributes.get("ngpt:sampler", ""))
     done, took = (_number(attributes.get(name)) for name in ("ngpt:spp", "ngpt:seconds"))

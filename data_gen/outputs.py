@@ -101,9 +101,10 @@ class Output:
         """
         if not finished(self.stack):
             return self.request
-        rest = rest_of(self.request, self.stack, self.frame)
+        attributes, _ = read_header(self.stack)
+        rest = rest_of(self.request, self.stack, attributes, self.frame)
         for_whom = self.denoising or Denoising(self.request.method or "auto")
-        for_whom.check(str(read_header(self.stack)[0].get("ngpt:sampler", "")), None, str(self.stack))
+        for_whom.check(str(attributes.get("ngpt:sampler", "")), None, str(self.stack))
         return rest
 
     def done(self) -> bool:

@@ -1,4 +1,4 @@
-"""Rendering pass by pass: within a given memory and time, the same bits whatever the passes."""
+"""Renders pass by pass, within a given memory and time. The bits of the result do not depend on the passes."""
 
 from __future__ import annotations
 
@@ -26,19 +26,20 @@ _LOG = logging.getLogger(f"ngpt.{__name__}")
 # A function that takes the samples of one pass: it puts, or splats, one value for each camera sample into the film.
 SamplePass = Callable[[CameraSamples, GradientFilm], None]
 
-# Rays of lanes side by side are traced together, and do best where they start from one pixel.
+# The rays of this number of neighbouring lanes are traced together. This is quickest if they start from one pixel.
 PACKET = 16
 _BLOCK_LANES = 1 << 21
 # Lanes are numbered with 32 bits.
 _MOST_LANES = 1 << 30
-# Lanes of the first pass of a render that time may end: fewer leave cores idle.
+# The least lanes of the first pass of a render that time may end: fewer would leave cores idle.
 _FEWEST_LANES = 1 << 13
-# The share of the remaining time that the last pass is planned to take; and, in a render with a time limit, how many
-# times as long as the longest pass before it a pass may be
+# For renders with a time limit: the share of the remaining time that the last pass is planned to take, and how many
+# times as many samples as the largest pass before it a pass may have
 _CAUTION, _GROWTH = 0.9, 8
-# Lanes of the first pass of others: enough to render small images at one go, and to judge how long the next may be.
+# Lanes of the first pass of other renders: enough to render small images in one pass, and to foretell how long the next
+# pass takes
 FIRST_LANES = 1 << 20
-# Seconds of a pass: starting it costs little in comparison, and the render still reacts soon.
+# Seconds that a pass should take: much more than to start it, and so few that the render reacts soon
 PASS_SECONDS = 2.0
 
 
@@ -48,7 +49,7 @@ class Rounds(Protocol):
 
     ``shares``  whether they depend on it in the current render
     ``said``    header attributes that say so
-    ``seed``    the seed by which rounds find it; None: the seed of the render
+    ``seed``    the seed of what rounds find; None: the seed of the render
     """
 
     shares: bool
@@ -56,11 +57,11 @@ class Rounds(Protocol):
     seed: int | None
 
     def begin(self, sensor: mi.Sensor, seed: int, sample: int, film: GradientFilm) -> None:
-        """Called before each pass, with what the ``film`` has; ``sample`` is the first sample of the pass, and 0
-        begins another render."""
+        """Called before each pass. The ``film`` holds all earlier passes. ``sample`` is the number of the first sample
+        of the pass; 0 begins another render."""
 
     def end_of_round(self, sample: int) -> int | None:
-        """The sample before which a pass must end that begins with this ``sample``; None: there is no limit."""
+        """The sample before which a pass must end if it begins with this ``sample``; None: there is no limit."""
 
 
 class _OneRound:
@@ -82,7 +83,7 @@ def rounds_of(sample: SamplePass) -> Rounds:
 
 
 def _nothing(left: int) -> str:
-    """Has nothing to suggest that would fit into this number of bytes per lane."""
+    """Suggests nothing that would fit into this number of bytes per lane."""
     return ""
 
 
@@ -98,7 +99,7 @@ def render_passes(
     points: str = "sobol",
     **kind: Any,
 ) -> GradientFilm:
-    """Calls ``sample`` with the camera samples of pass after pass, and returns the film it filled.
+    """Calls ``sample`` with the camera samples of one pass after the other, and returns the film that it has filled.
 
     The first pass is always rendered. A further pass is rendered only if it is expected to fit into the rest of the
     ``budget``'s time. The last block may be a partial one. Passes are short at first if ``points`` are "rounds", which
@@ -111,8 +112,8 @@ def render_passes(
     other: each pass is one block of ``batch`` samples per pixel, and the film's variances are computed over passes.
     Such a ``sample`` may keep a state from pass to pass; ``CameraSamples.first`` gives its position.
 
-    A ``sample`` may come in ``Rounds``; no pass crosses the end of a round. The ``kind`` of film, its ``subpixels``
-    and whether it has ``gradients``, is as in ``film_within``.
+    If ``sample`` has ``Rounds``, no pass crosses the end of a round. ``kind`` holds ``subpixels`` and ``gradients`` of
+    the film, as in ``film_within``.
 
     Raises NgptError where one block of samples does not fit into the memory.
     """
@@ -144,7 +145,7 @@ def render_passes(
         if not done:
             return min(left, size * (1 if seconds else max(1, min(blocks, FIRST_LANES // (film.pixels * size)))))
         begin, each = foretold(done)
-        # Where a pass takes long to begin, it goes on for longer.
+        # If passes take long to begin, they are made longer.
         wanted = min(time_left - begin, max(PASS_SECONDS - begin, 3 * begin)) / each
         if seconds is not None:
             # What short passes took says little of one that is a hundred times as long.
@@ -152,7 +153,8 @@ def render_passes(
         n = min(left, size * max(1, min(blocks, int(wanted / size))))
         if begin + each * n <= time_left:
             return n
-        # Part of a block: no other can follow it. It may take longer than others did.
+        # A part of a block: no other pass can follow it. A share of the time is left, since it may take longer than
+        # others.
         return 0 if batch else max(0, min(n, int((_CAUTION * time_left - begin) / each)))
 
     report()
@@ -169,14 +171,14 @@ def render_passes(
             camera = CameraSamples(sensor, seed, n, film.samples, min(n, size), net=net)
             film.begin_pass(camera)
             sample(camera, film)
-            # The film takes the pass with nothing else in memory.
+            # Frees its memory before the film takes the pass.
             del camera
             film.end_pass(min(n, size))
             dr.sync_thread()
         now, wall = budget.clock(), time.perf_counter() - wall
         first = ", kernels compiled or loaded" if not done else ""
         _LOG.debug("pass of %d samples per pixel, %.3g s%s", n, now - begin, first)
-        # Kernels say how long they were compiled by the wall clock.
+        # Kernels report wall seconds of compilation, and the budget's clock may be another one: so their share counts.
         done.append((n, max((now - begin) * (1 - sum(compiled) / max(wall, 1e-9)), 1e-6)))
         watch.look(film)
         now = budget.clock()
@@ -202,8 +204,8 @@ def end_of_time(gone: float, seconds: float, early: bool) -> tuple[int, int]:
 
 
 def growing_block(pixels: int, done: int, block: int) -> int:
-    """The number of samples of a pixel that the next block takes side by side, after ``done`` samples. It is small at
-    first if time may end the render at any moment. Then it is as large as possible, up to ``block``."""
+    """The number of samples of a pixel in the next block of a render that time may end, after ``done`` samples. It is
+    small at first, and then as large as ``block`` allows."""
     first = 1
     while first < block and pixels * first < _FEWEST_LANES:
         first *= 2
@@ -211,9 +213,10 @@ def growing_block(pixels: int, done: int, block: int) -> int:
 
 
 def foretold(done: list[tuple[int, float]]) -> tuple[float, float]:
-    """Seconds to begin a pass and seconds per block, from the times of passes: a line, fitted by least squares.
+    """Seconds to begin a pass, and seconds for each of its samples or blocks: a line fitted by least squares.
 
-    It uses the last eight passes, without the very first, which compiles kernels.
+    ``done`` holds the number of samples or blocks of each pass, and its seconds. The last eight passes are used,
+    without the very first one, which compiles kernels.
     """
     blocks, seconds = np.array(done[1:][-8:] or done).T
     fastest = float((seconds / blocks).min())
@@ -225,7 +228,8 @@ def foretold(done: list[tuple[int, float]]) -> tuple[float, float]:
 
 @contextmanager
 def compilation() -> Iterator[list[float]]:
-    """Yields a list that has the seconds for which kernels were compiled in it, once that is over."""
+    """Yields a list. When the ``with`` block ends, it gets the seconds that each kernel of the block took to
+    compile."""
     compiled: list[float] = []
     if dr.flag(dr.JitFlag.KernelHistory):  # The caller reads it, which empties it.
         yield compiled
@@ -247,11 +251,11 @@ def film_within(
     net: int = ROUND,
     **kind: Any,
 ) -> tuple[GradientFilm, int, int]:
-    """An empty film for ``spp`` samples per pixel, samples of a block, and how many blocks may make a pass.
+    """An empty film for ``spp`` samples per pixel, the samples of a pixel in a block, and the most blocks of a pass.
 
-    ``instead`` is as in ``blocks_within``, ``net`` as in ``CameraSamples``. ``kind`` has further parameters of the
-    film. Where memory is short, the film has fewer ``subpixels``, and a warning says so. Raises NgptError where one
-    block of samples does not fit into ``memory``.
+    ``memory`` is in MiB. ``instead`` is as in ``blocks_within``, ``net`` as in ``CameraSamples``. ``kind`` holds
+    further parameters of the film. If memory is short, the film has fewer ``subpixels``, and a warning says so. Raises
+    NgptError if one block of samples does not fit into ``memory``.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     block = batch or block_of_samples(width * height)
@@ -262,7 +266,8 @@ def film_within(
 
 
 def film_of(width: int, height: int, memory: int, pixel_bytes: int, *, subpixels: int = 1, **how: Any) -> GradientFilm:
-    """A film with the requested subpixels, or with fewer where a pass of ``pixel_bytes`` per pixel would not fit."""
+    """A film with the requested subpixels, or with fewer if a pass of ``pixel_bytes`` per pixel would not fit into
+    ``memory`` MiB beside it."""
     k = subpixels
     while True:
         film = GradientFilm(width, height, subpixels=k, **how)
@@ -280,7 +285,7 @@ def film_of(width: int, height: int, memory: int, pixel_bytes: int, *, subpixels
 
 @contextmanager
 def recording() -> Iterator[None]:
-    """Within the block, where kernels are recorded, Python does not free scenes of earlier renders.
+    """In this context kernels can be recorded: Python does not free scenes of earlier renders.
 
     A call of Dr.Jit holds one function for each object (material, lamp ...) that lives at that moment. If a second
     scene were freed while a kernel is recorded, a lamp could be one of two in one call and the only one in the next.
@@ -297,7 +302,7 @@ def recording() -> Iterator[None]:
 
 
 def block_of_samples(pixels: int) -> int:
-    """How many samples of a pixel go side by side: as many as are traced together, or fewer where images are large.
+    """The number of samples of a pixel in a block: as many as are traced together, or fewer if the image is large.
 
     The results of a ray depend, in the last bits, on the rays traced with it. So the grouping of rays must not depend
     on how a render is split into passes: passes consist of whole blocks.
@@ -315,10 +320,10 @@ def blocks_within(
     lane_bytes: int = LANE_BYTES,
     instead: Callable[[int], str] = _nothing,
 ) -> int:
-    """How many blocks of ``block`` samples a pass may have, so that it and the film stay within ``memory`` MiB.
+    """How many blocks of ``block`` samples per pixel a pass may have, so that it and the film fit into ``memory`` MiB.
 
-    Raises NgptError where not even one fits. ``instead`` is called with the bytes that are left for a lane, and returns
-    what else would fit.
+    Raises NgptError if not even one block fits. ``instead`` is called with the bytes that are left for a lane, and
+    returns a text for the message that says what else would fit.
     """
     lanes = film.pixels * block
     blocks = lanes_within(memory, film, lanes, lane_bytes, instead) // lanes
@@ -333,7 +338,7 @@ def lanes_within(
     lane_bytes: int = LANE_BYTES,
     instead: Callable[[int], str] = _nothing,
 ) -> int:
-    """How many lanes a pass may have; raises NgptError where it is less than ``lanes``, see ``blocks_within``."""
+    """The most lanes of a pass. Raises NgptError if they are fewer than ``lanes``, see ``blocks_within``."""
     available = min((memory * 2**20 - film.bytes) // lane_bytes, _MOST_LANES)
     most = 1 << (available.bit_length() - 1) if available > 0 else 0
     if most < lanes:

@@ -159,7 +159,6 @@ def _loaded(request: RenderRequest, watch: Watch) -> mi.Scene:
 
 def _planned(scene: mi.Scene, request: RenderRequest, watch: Watch) -> Plan:
     """How to render: as requested, or as a pilot or the description of the scene suggests."""
-    from data_gen.adaptive import Adaptive
     from data_gen.choosing import plans
     from data_gen.choosing.trials import Pilot
 
@@ -168,13 +167,11 @@ def _planned(scene: mi.Scene, request: RenderRequest, watch: Watch) -> Plan:
         return plans.Plan(request.sampler, request.method or "", request.shares, budget.seconds, "as it was asked for")
     pilot = Pilot(budget.clock, watch.said, watch.stop, request.unbiased)
     if request.shares:
-        adaptive = Adaptive(request.error, request.method or "auto")
-        plan = plans.plan_adaptive(scene, adaptive, budget.seconds, gradients=request.gradients)
-    elif request.method is None or budget.seconds is None:
-        how = {"gradients": request.gradients}
-        plan = plans.plan_sampler(scene, budget.spp, budget.seconds, budget.memory, pilot, **how)
+        plan = plans.plan_adaptive(scene, request)
+    elif request.method is None:
+        plan = plans.plan_sampler(scene, request, pilot)
     else:
-        plan = plans.plan(scene, budget.seconds, request.method, budget.memory, pilot)
+        plan = plans.plan(scene, request, pilot)
     plan = plan if request.needs_features else plans.without_features(scene, plan)
     _LOG.info("plan: sampler %s, method %s: %s", plan.sampler, plan.method or "any", plan.reason)
     return plan

@@ -14,14 +14,15 @@ _NOISE = 0.01
 
 
 def features_pay(scene: mi.Scene) -> bool:
-    """Whether what the camera sees is sharp: features that a lens has blurred are noise, as the image is."""
+    """Whether albedo and normals pay: not if the lens blurs them, since they are as noisy as the image then."""
     return scene.sensors()[0].class_name() != "ThinLensCamera" or noise_of_features(scene) < _NOISE
 
 
 def noise_of_features(scene: mi.Scene) -> float:
-    """The share of the variance of albedo and normal over the image that two points of the lens do not agree on.
+    """The noise of albedo and normal, as a share of their variance over the image.
 
-    It is measured with single samples at the first surface. The random numbers are always the same.
+    The noise is the difference between what two points of the lens see. It is measured with single samples at the first
+    surface. The random numbers are always the same.
     """
     random = mi.PCG32(_PIXELS)
     place, *lens = (mi.Point2f(random.next_float32(), random.next_float32()) for _ in range(3))

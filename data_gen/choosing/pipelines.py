@@ -4,8 +4,8 @@ Every method that can use a sampler's four small stacks (``data_gen.choosing.tri
 each half merged. The error at the number of samples that fit into the time is extrapolated by a power law. Its exponent
 comes partly from the pilot, which compares one stack to two, and partly from what is usual for this kind of method.
 
-No biased sampler (photons) judges others. Where one finds most of the light, the samplers that judge it are noisy:
-twice the standard error is added to the error they give. Light that no sampler has found in the pilot is not handled.
+A biased sampler (photons) never judges others. If it finds most of the light, the samplers that judge it are noisy. So
+twice the standard error is added to its measured error. Light that no sampler has found in the pilot is not handled.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from ngpt.merging import merge
 from ngpt.methods import METHODS, reconstruct, runnable
 from ngpt.stack import GradientStack
 
-# The best of each kind of stack at some number of samples; what is not here is behind one of them, or far slower.
-# The most frequent winners come first: where time is short, the others are not measured.
+# The methods that are best for each kind of stack at some number of samples. All others have more error or are far
+# slower. The most frequent winners come first: if time is short, the others are not measured.
 WITH_GRADIENTS = ("ngpt-combine", "ngpt-fast", "wcv", "l1")
 WITHOUT = ("oidn", "ngpt-primal", "primal")
 # These numbers come from bench/pipelines.py of commit e61ee6f3, on scenes that are not ``--apart``.
@@ -31,10 +31,10 @@ WITHOUT = ("oidn", "ngpt-primal", "primal")
 # weight of the pilot in an exponent, and the steepest and flattest exponents allowed
 BY_GRADIENTS, BY_DENOISERS = -0.95, -0.55
 SEEN, STEEPEST, FLATTEST = 0.3, -1.2, -0.2
-# The exponent for images by photons, from theory; and how many standard errors are added to their error
+# The exponent for images by photons, from theory, and the number of standard errors that are added to their error
 _BY_PHOTONS, _DOUBT = -2 / 3, 2.0
-# The power of the pilot's gain that adaptive samples with gradients achieve: the pilot's need is smoother than the true
-# one; and the number of samples from which on they are considered
+# The power of the pilot's gain that adaptive samples with gradients achieve: the need that a pilot sees is smoother
+# than the true one. And the number of samples from which on adaptive samples are considered
 REALISED, FROM = 2.0, 2 * LEAST
 
 
@@ -65,12 +65,12 @@ class Pipeline:
 
     @property
     def doubtful(self) -> bool:
-        """Whether the others find too little of the light to judge it."""
+        """Whether the other samplers find too little of the light to judge this one."""
         return _DOUBT * self.doubt > self.error
 
     @property
     def gain(self) -> float:
-        """The error relative to as many even samples."""
+        """The error relative to the error of as many even samples."""
         return self.adaptive ** (REALISED if SAMPLERS[self.sampler].gradients else 1)
 
     def samples(self, seconds: float) -> float:
@@ -87,7 +87,7 @@ class Pipeline:
 
     @property
     def least(self) -> int:
-        """Samples below which nothing is expected."""
+        """The fewest samples per pixel for which an error is expected."""
         if self.shared:
             return FROM
         batch = SAMPLERS[self.sampler].batch
@@ -164,7 +164,7 @@ def measure(
 
 
 def _need(stack: GradientStack, clock: Callable[[], float]) -> tuple[float, float]:
-    """What sharing samples out is expected to gain, and the seconds of each choice."""
+    """The expected error of adaptive samples relative to even ones, and the seconds of each choice of counts."""
     method = Adaptive().chosen_by(stack)
     start = clock()
     found = assess(stack, method)

@@ -1,9 +1,9 @@
 """Which sampler, how many samples and which method: chosen by a pilot, small renders by each sampler that could do it.
 
 ``plan`` is for a given time and a method that makes the image: the least error wins. ``plan_sampler`` is for
-``--sampler auto`` where the method is not known: the least error wins again, with even samples and one simple method
-for each sampler. It chooses photons where they are clearly better, but not in scenes whose light only photons can find.
-No pilot can see light that none of the samplers has found.
+``--sampler auto`` if the method is not known: the least error wins again, with even samples and one simple method for
+each sampler. It chooses photons where they are clearly better, but not in scenes whose light only photons can find. A
+pilot cannot notice light that none of the samplers has found.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from typing import Any
 import mitsuba as mi
 
 from data_gen import samplers
-from data_gen.adaptive import Adaptive
 from data_gen.budget import DEFAULT_MEMORY
 from data_gen.choosing.look import features_pay
 from data_gen.choosing.pipelines import Pipeline, choose, measure, methods_for
 from data_gen.choosing.trials import PIXELS, Pilot, Trial, candidates, try_all
 from data_gen.passes import film_within
+from data_gen.request import RenderRequest
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.load import at_most
@@ -36,21 +36,21 @@ SHARE, _TRIALS = 0.1, 2 / 3
 # paths per second. Two trials on the smallest images take 3.0 to 13.5 processor seconds, with their methods about 4
 # more.
 LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
-# Seconds of `ngpt denoise` besides the method, and of `ngpt render` to write the stack: to start the process, and to
-# write a million pixels, read them and write the image
+# Seconds of `ngpt denoise` besides the method, and of `ngpt render` to write the stack: to start a process; and for a
+# million pixels, to write the stack, read it and write the image
 _BEGINS, _FILES = 0.8, 3.7
 # The power of the pixels by which the seconds of methods grow: from 4,080 to 230,400 pixels 0.84 (ngpt-combine), 0.86
 # (oidn, ngpt-primal) to 0.96 (ngpt-fast), from 57,600 on 0.89 to 1.1. A call takes some time whatever the size.
 _GROWS = 0.9
-# Seconds for a million pixels, on two cores, of methods that no pilot has measured; of methods that are not listed
+# Seconds for a million pixels, on two cores, of methods that no pilot has measured, and of methods that are not listed
 _METHOD_SECONDS, _OTHERS = {"auto": 18.0, "ngpt-combine": 18.0, "ngpt-primal": 14.0, "oidn": 13.0}, 3.0
-# Seconds from which on the pilot's images are as large as they ever are, and the least share of that
+# The seconds from which on the images of a pilot have all of PIXELS, and the least share of PIXELS
 LONG, LEAST_PIXELS = 400.0, 1 / 16
-# A rival's error must be smaller by this factor: smaller differences could be chance. The errors of networks and
-# denoisers are expected less well, and their choice was seen to be wrong by 1.6 times.
+# Another sampler is chosen only if its error is smaller by this factor, since smaller differences could be chance.
+# Errors of networks and denoisers are foretold less well: in one choice they were wrong by a factor of 1.6.
 _MARGIN, _MARGIN_OF_IMAGES = 1.1, 1.6
-# The share of light that only photons find from which on they are taken, if so many samples fit into the time; seconds
-# of a million of their samples on two cores, and until the first one is done
+# Photons are taken if only they find at least this share of the light, and if this number of samples per pixel fits
+# into the time. Then their seconds on two cores: for a million samples, and until the first one is done
 _CAUSTIC_SHARE, _CAUSTIC_SPP = 0.02, 16
 _CAUSTIC_SECONDS, _CAUSTIC_BEGINS = 10.0, 8.0
 
@@ -74,10 +74,11 @@ def explore(
     *,
     patient: bool = False,
 ) -> list[Pipeline]:
-    """The pipelines of a scene, for an image of its size; see ``plan``, which chooses among them. None where no trial
-    fits into the time. If ``patient``, the first sampler has a trial and a method however long they take, and the
-    sampler for gradients is tried too. ``after`` is the part of the seconds that follows the render: its file, a
-    process that reads it, the method, the image's file.
+    """The pipelines of a scene, for an image of its size. ``plan`` chooses among them.
+
+    The list is empty if no trial fits into its share of the ``seconds``. If ``patient``, the first sampler has a trial
+    and a method however long they take, and the sampler for gradients is tried, too. ``memory`` is in MiB. ``after`` of
+    a pipeline counts all that follows the render: its file, a process that reads it, the method, the image's file.
     """
     start = pilot.clock()
     able = _able(scene, method, gradients_too=patient)
@@ -102,14 +103,13 @@ def explore(
 
 
 def _beside(scene: mi.Scene) -> float:
-    """Seconds for processes and files that come on top of a method's own."""
+    """The seconds that processes and files take beside the method."""
     return _BEGINS + _FILES * _pixels(scene) / 1e6
 
 
 def _able(scene: mi.Scene, method: str, gradients_too: bool = False) -> list[str]:
-    """The samplers to try, whose stacks the method can use: the one that the description stands for first.
-
-    ``gradients_too``: also the one that would stand there for gradients.
+    """The samplers to try: those whose stacks the method can use. The one that the scene's description stands for comes
+    first. ``gradients_too`` adds the one that it stands for if gradients are asked for.
     """
     needs_gradients = method != "auto" and "dx" in runnable(method).needs
     names = candidates(scene, gradients=needs_gradients)
@@ -122,22 +122,24 @@ def _able(scene: mi.Scene, method: str, gradients_too: bool = False) -> list[str
 
 def plan(
     scene: mi.Scene,
-    seconds: float,
-    method: str = "auto",
-    memory: int = DEFAULT_MEMORY,
+    request: RenderRequest,
     pilot: Pilot = Pilot(),  # noqa: B008 - it is frozen
 ) -> Plan:
-    """How to use these ``seconds`` of the pilot's clock, which include the pilot and the method.
+    """How to use the time of a ``request`` for a loaded ``scene``. The time includes the pilot and the method.
 
-    Only the given ``method`` is considered, unless it is "auto". The pilot tries the sampler that the scene's
+    Only the requested method is considered, unless it is "auto". The pilot tries the sampler that the scene's
     description stands for, then the other unbiased samplers that ``--sampler auto`` compares, as far as they fit into a
-    tenth of the time, compilation and methods included. The less time, the smaller are its images. Another sampler is
-    chosen only if it is expected to leave clearly less error. If there is no time for a pilot, or if the pilot finds
-    that nothing fits, the description decides, and the render takes the remaining time. Photons are taken without a
-    pilot where a look finds light that only they find, and there is time for them. The measurements change from
-    run to run. Raises NgptError for a method that does not run here or cannot use any of the stacks.
+    tenth of the time, compilation and methods included. The less time there is, the smaller are the pilot's images.
+    Another sampler is chosen only if it is expected to leave clearly less error. If there is no time for a pilot, or if
+    the pilot finds that nothing fits, the description decides, and the render takes the remaining time. A sampler that
+    gathers photons is taken without a pilot if a quick measurement finds much light that only photons find, and if
+    there is time for it. The measurements change from run to run.
+
+    Raises NgptError for a method that does not run here or cannot use any of the stacks.
     """
-    start = pilot.clock()
+    start, method = pilot.clock(), request.method or "auto"
+    seconds, memory = request.budget.seconds, request.budget.memory
+    assert seconds is not None
     able = _able(scene, method)
     if for_caustics := _for_caustics(scene, seconds, method, start, pilot):
         return for_caustics
@@ -181,32 +183,28 @@ def _for_caustics(scene: mi.Scene, seconds: float, method: str, start: float, pi
 
 def plan_sampler(
     scene: mi.Scene,
-    spp: int | None,
-    seconds: float | None,
-    memory: int = DEFAULT_MEMORY,
+    request: RenderRequest,
     pilot: Pilot = Pilot(),  # noqa: B008 - it is frozen
-    *,
-    gradients: bool = False,
 ) -> Plan:
-    """The sampler for a render of ``spp`` samples per pixel, or of this many ``seconds``; one of them may be None.
+    """The sampler for the ``request`` of a loaded ``scene``. Samples, time or both end the render.
 
     The description decides, at no cost, where only one sampler can render the scene, and where the render is too short
-    for a pilot; ``gradients``: only samplers that render them are considered. The measurements of a pilot change from
-    run to run, its choice hardly ever does. The render itself has the bits of ``--sampler NAME``. Raises NgptError
-    where no sampler with gradients can render the scene, and before anything is tried where the image does not fit into
-    ``memory`` (MiB).
+    for a pilot. If gradients are requested, only samplers that render them are considered. The measurements of a pilot
+    change from run to run, its choice hardly ever does. The render itself has the bits of ``--sampler NAME``.
+
+    Raises NgptError if gradients are requested and no sampler can render them in this scene. Raises it before anything
+    is tried if the image does not fit into the memory.
     """
-    start = pilot.clock()
-    facts = scene_facts(scene)
-    sampler, method, reason = samplers.described(facts, gradients)
+    start, spp, seconds = pilot.clock(), request.budget.spp, request.budget.seconds
+    sampler, method, reason = samplers.described(scene_facts(scene), request.gradients)
     described = Plan(sampler, method, False, seconds, reason)
-    names = candidates(scene, biased=True, gradients=gradients)
+    names = candidates(scene, biased=True, gradients=request.gradients)
     if len(names) == 1:
         return described
     short = spp is not None and spp * _pixels(scene) < _LEAST_PATHS
     if short or (seconds is not None and seconds < LEAST_SECONDS):
         return replace(described, reason=f"{reason}; the render is too short to try others")
-    _check_memory(scene, sampler, spp, memory)
+    _check_memory(scene, sampler, spp, request.budget.memory)
     longest = math.inf if seconds is None else seconds
     with at_most(scene, PIXELS) as scale:
 
@@ -227,16 +225,16 @@ def plan_sampler(
     return replace(described, sampler=found[0], method=method, reason=found[1], render=left)
 
 
-def plan_adaptive(scene: mi.Scene, adaptive: Adaptive, seconds: float | None, *, gradients: bool = False) -> Plan:
-    """The plan for samples that are shared out: by the description, and by the ``adaptive`` method if one is named."""
-    named = adaptive.method if adaptive.method != "auto" else ""
-    gradients = gradients or bool(named and "dx" in runnable(named).needs)
+def plan_adaptive(scene: mi.Scene, request: RenderRequest) -> Plan:
+    """The plan for adaptive samples: the scene's description decides, and the ``request``'s method if it names one."""
+    named = "" if request.method in (None, "auto") else str(request.method)
+    gradients = request.gradients or bool(named and "dx" in runnable(named).needs)
     sampler, method, reason = samplers.described(scene_facts(scene), gradients)
-    return Plan(sampler, named or method, True, seconds, reason)
+    return Plan(sampler, named or method, True, request.budget.seconds, reason)
 
 
 def without_features(scene: mi.Scene, plan: Plan) -> Plan:
-    """The plan for an image that only its method will use: it keeps features only where they pay."""
+    """The plan for an image whose stack nobody else uses: it renders albedo and normals only if they pay."""
     if (plan.sampler, plan.method) != samplers.SIMPLE or features_pay(scene):
         return plan
     why = "the lens blurs albedo and normal, which are left out"
@@ -256,7 +254,7 @@ def _check_memory(scene: mi.Scene, sampler: str, spp: int | None, memory: int) -
 
 
 def simple(sampler: str) -> str:
-    """The method by which samplers are compared where nothing says which one will run."""
+    """The method by which a sampler is compared with others if the method that will run is not known."""
     if SAMPLERS[sampler].gradients:
         return "wcv"
     able = not SAMPLERS[sampler].biased and not METHODS["oidn"].missing()
@@ -264,17 +262,18 @@ def simple(sampler: str) -> str:
 
 
 def best_image(ranked: Sequence[Pipeline], default: str, seconds: float, margin: float = _MARGIN_OF_IMAGES) -> Pipeline:
-    """The first of pipelines in the order of their errors, but the first of sampler ``default`` unless its error is
-    more than ``margin`` times as large."""
+    """The best of ``ranked`` pipelines, the best first, or the best of sampler ``default`` unless its error is at least
+    ``margin`` times as large."""
     own = next((p for p in ranked if p.sampler == default), ranked[0])
     errors = [p.expected(p.samples(seconds)) for p in (ranked[0], own)]
     return own if errors[1] < margin * errors[0] else ranked[0]
 
 
 def best_of(pipelines: Sequence[Pipeline], seconds: float) -> tuple[str, str]:
-    """The sampler for a render of this many ``seconds``, at the pilot's size, and the reason.
+    """The sampler for a render of this many ``seconds`` at the pilot's size, and the reason.
 
-    The first of ``pipelines`` is the scene's own, which stays unless another is expected to leave clearly less error.
+    The first of ``pipelines`` has the sampler that the scene's description stands for. It stays unless another is
+    expected to leave clearly less error.
     """
     own = pipelines[0].sampler
     ranked = choose(pipelines, seconds)

@@ -1,9 +1,10 @@
 """Trials of samplers on a scene: small stacks, the seconds of a sample, and the error of an image without a reference.
 
-The error of an image x, which a bias may be part of, is the mean of (x - a)(x - b) / (m² + 1e-3), where a and b are two
-independent images that had no part in x: their noise has no mean, as in ``ngpt.measure.metrics``. They are primals of
-the sampler's other stacks and of all other unbiased samplers. The difference of two reconstructions would not do: light
-that a sampler finds in one pixel of a thousand is an outlier, which a method takes out of both.
+The error of an image x, with its bias, is the mean of (x - a)(x - b) / (m² + 1e-3). Here a and b are two images that
+are independent of x and of each other, so their noise cancels in the mean, as in ``ngpt.measure.metrics``. They are
+made of primals of the sampler's other stacks and of all other unbiased samplers. The difference between two
+reconstructions would not show the error: light that a sampler finds in one pixel of a thousand is an outlier, which a
+method removes from both.
 
 What a sample takes is measured in processor seconds, which other work on the machine hardly changes, so a busy moment
 favours no sampler. Users give wall seconds. One factor for all trials converts processor seconds to these: the wall
@@ -42,7 +43,7 @@ SEED = 0x9E3779B9
 
 @dataclass(frozen=True)
 class Trial:
-    stacks: list[GradientStack]  # four of as many samples
+    stacks: list[GradientStack]  # four, with the same number of samples each
     seconds: float  # of one sample of the whole image
     # The same in processor seconds of all cores together; 0 if not known, or where a graphics card renders
     processor: float = 0.0
@@ -50,7 +51,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Pilot:
-    """The clock of trials, and the functions that are called while they go on."""
+    """The clock of trials, the functions that are called while they go on, and whether they share no tails."""
 
     clock: Callable[[], float] = time.perf_counter
     said: Callable[[str], None] = lambda line: None  # called with what is tried
@@ -61,8 +62,8 @@ class Pilot:
 def candidates(scene: mi.Scene, biased: bool = False, gradients: bool = False) -> list[str]:
     """Samplers that could render the scene: the one that its description stands for, then the ones to compare it with.
 
-    If the first is the simple way, the others are those that find light which it hardly finds. ``biased`` adds biased
-    samplers at the end. ``gradients`` asks for the one that the description stands for, which has no rival.
+    If the first is the default (``SIMPLE``), the others are those that find light which it hardly finds. ``biased``
+    adds biased samplers at the end. ``gradients`` asks for the one that the description stands for, which has no rival.
     """
     facts = scene_facts(scene)
     first, method, _ = described(facts, gradients)
@@ -173,7 +174,9 @@ def try_out(
 
 
 @dataclass(frozen=True)
-class Witnesses:  # that judge the images of each sampler
+class Witnesses:
+    """The images by which the images of each sampler are judged."""
+
     primals: dict[str, list[np.ndarray]]  # four of each sampler, by name
     noise: dict[str, float]  # of a single primal, by name of sampler
     scale: np.ndarray  # what errors are relative to: an image from all samplers, those with little noise count most
@@ -187,8 +190,8 @@ class Witnesses:  # that judge the images of each sampler
         return cls(primals, noise, mean_of(means, noise))
 
     def against(self, sampler: str, half: int) -> tuple[np.ndarray, np.ndarray]:
-        """Two independent images without the sampler's other half: made of its own ``half`` and all other unbiased
-        samplers. If there are none, only its own images judge it."""
+        """Two independent images from all unbiased samplers. Of ``sampler`` itself, only one ``half`` of its stacks is
+        used. If all samplers are biased, all are used."""
         names = [*(n for n in self.primals if n != sampler), sampler]
         fair = [n for n in names if not SAMPLERS[n].biased] or names
         noise = {n: self.noise[n] if n == sampler else self.noise[n] / 2 for n in fair}
@@ -201,10 +204,10 @@ class Witnesses:  # that judge the images of each sampler
         return side(0), side(1)
 
     def error(self, sampler: str, halves: Sequence[Sequence[np.ndarray]]) -> float:
-        """The error of independent images by ``sampler``, some from each of its halves.
+        """The error of images by ``sampler``: ``halves`` holds some images from each half of its stacks.
 
-        It is at least the noise by which the images of one half differ from each other. This bound is certain even
-        where noise in the other samplers hides the rest.
+        It is at least the noise by which the images of one half differ from each other. This bound holds even if the
+        noise of the other samplers hides the rest.
         """
         judged = [
             error_of(image, *self.against(sampler, 1 - half), self.scale)
@@ -240,5 +243,5 @@ def error_of(x: np.ndarray, a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> 
 
 
 def _denominator(scale: np.ndarray) -> np.ndarray:
-    """m² + 1e-3 of an image that has noise itself, which the mean over 7x7 pixels lessens."""
+    """m² + 1e-3, where m is the mean over 7x7 pixels of an image that has some noise itself."""
     return ndimage.uniform_filter(scale.astype(np.float64), (7, 7, 1)) ** 2 + EPSILON

@@ -34,8 +34,8 @@ class Stream:
 
     ``executor`` should have separate workers (processes, a cluster). ``ahead`` shards are rendered at a time. A crop
     stays readable after its shard has left the buffer. Entering the context waits for the first crops. An error in a
-    worker is raised as NgptError on entering, and by every later access. ``kept`` is a folder for references; with
-    shots it raises NgptError, and with pairs, which have no references, it is ignored.
+    worker is raised as NgptError on entering, and by every later access. ``kept`` is a folder for references. Raises
+    NgptError for ``kept`` with shots or with pairs, whose references cannot be kept.
     """
 
     def __init__(
@@ -50,8 +50,12 @@ class Stream:
         self.config, self.executor, self.capacity, self.ahead, self.variant = config, executor, capacity, ahead, variant
         if kept and config.frames > 1:
             raise NgptError("references of shots cannot be kept without their inputs; leave data.kept out")
-        # Pairs have none.
-        self.kept = home(config, Path(kept)) if kept and not config.pairs else None
+        if kept and config.pairs:
+            raise NgptError(
+                "pairs (reference_spp = 0) have no references to keep; leave data.kept out, or make the pairs before "
+                "the training: ngpt dataset"
+            )
+        self.kept = home(config, Path(kept)) if kept else None
         self._crops: deque[Crop] = deque(maxlen=capacity)
         self._error: BaseException | None = None
         self._changed = threading.Condition()

@@ -1,4 +1,5 @@
-"""Sampling of "bent" lamps with the right density: mesh lamps whose vertex normals differ from the face normals.
+"""Sampling of "bent" lamps with the right density. These are mesh lamps whose vertex normals differ from their face
+normals.
 
 Mitsuba uses the vertex normals to convert the density of a point on a mesh into a density of directions, both when it
 samples the point and when it evaluates the density (its issue 1952). But the solid angle of a face depends on the

@@ -153,7 +153,7 @@ class CameraSamples:
         """Prepares these samples for a function that is recorded once and uses their rays displaced by ``shifts``.
 
         Such a function cannot call most cameras, since Dr.Jit 1.5 does not find their arrays. So the rays are evaluated
-        before.
+        beforehand.
         """
         if bytes_of_rays(self.sensor):
             rays = [self.rays(shift) for shift in shifts]
@@ -168,7 +168,7 @@ def bytes_of_rays(sensor: mi.Sensor) -> int:
 
 
 def in_packets(lanes: np.ndarray, camera: CameraSamples) -> tuple[np.ndarray, np.ndarray]:
-    """The ``lanes`` with gaps between blocks of samples, so that no two blocks share a packet; and which of them exist.
+    """The ``lanes``, with gaps so that no two blocks of samples share a packet, and which of them exist.
 
     The last bits of a ray's result depend on the rays traced with it, and a block must not depend on its pass.
     """

@@ -6,10 +6,9 @@ there it misses the lamp. So their light goes into a separate layer, for methods
     rough   the path has scattered smoothly at a connectable vertex
     late    and has later left a vertex by a mirror, glass or sharp gloss: its light belongs to the layer
 
-Both are properties of a path, not of its shift. So primal - caustic is the image of a subset of the paths, and dx
-and dy are the differences of this image. A path of the layer counts 0 in them, whether it is a base path or a shifted
-copy.
-This is exact, because the shift is rejected from both sides where either path of a pair is late.
+Both are properties of a path, not of its shift. So primal - caustic is the image of a subset of the paths, and dx and
+dy are the differences of this image. A path of the layer counts 0 in them, whether it is a base path or a shifted copy.
+This is exact, because the shift is rejected from both sides if either path of a pair is late.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ from data_gen.paths.vertex import DELTA, SMOOTH
 
 
 def classes(rough: mi.Bool, late: mi.Bool, found: mi.Bool, kind: mi.UInt32, connectable: mi.Bool) -> tuple:
-    """``rough`` and ``late`` after a vertex; ``kind`` is the kind of event by which the path left it.
+    """``rough`` and ``late`` after a vertex. ``kind`` is the kind of event by which the path left it.
 
-    Where no direction was ``found`` the path ends, and both stay as they are.
+    If no direction was ``found``, the path ends, and both stay as they are.
     """
     smooth = found & (kind == SMOOTH)
     sharp = (found & (kind == DELTA)) | (smooth & ~connectable)

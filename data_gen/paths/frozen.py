@@ -1,8 +1,8 @@
 """Functions whose kernels are recorded once in a render, and only launched in later calls.
 
-Python and Dr.Jit take a second to record the kernel of ``gpt``, however few its samples are, and a pass of photons has
-few camera samples and many kernels. A function is recorded again if its arrays have other types, if the widths of two
-arrays become equal or a width becomes 1, and if a scene is loaded or freed in the process.
+Python and Dr.Jit take a second to record the kernel of ``gpt``, however few its samples are. A pass of photons has few
+camera samples and many kernels. A function is recorded again if its arrays have other types, if the widths of two
+arrays become equal or a width becomes 1, or if a scene is loaded or freed in the process.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _LOG = logging.getLogger(f"ngpt.{__name__}")
 
 
 class Frozen:
-    """Calls functions: ``frozen(f, *args)`` returns ``f(*args)``, and records the kernels of f if the types are new.
+    """Calls functions: ``frozen(f, *args)`` returns ``f(*args)``, and records the kernels of f in the first call.
 
     All arrays that f uses must be among its arguments, or belong to the ``scene`` or to attributes of the ``owners``.
     All else that f uses must not change while this object lives. f must not use the width of an array as a number. If f
@@ -193,7 +193,8 @@ def call(f: Callable, *args: Any) -> Any:
 
 
 def evaluated(f: Callable) -> Callable:
-    """f with its results evaluated at once, as ``Frozen`` does. Each use of a lazy result would trace all paths."""
+    """f with its results evaluated at once, as ``Frozen`` does. Each further use of a lazy result would trace all
+    paths again."""
 
     def computed(*args: Any) -> Any:
         result = f(*args)

@@ -24,7 +24,7 @@ _KNOWN = ("MaskBSDF", "Null", "ThinDielectric", "BlendBSDF")
 
 @dataclass
 class _Straight:
-    """The point ``o`` from which a path went straight on, through any holes."""
+    """The point ``o`` from which a path has gone straight on, through holes if there are any."""
 
     o: mi.Point3f
 
@@ -37,8 +37,8 @@ class _Straight:
 
 @dataclass
 class Aim(_Straight):
-    """Adds the density ``p`` with which the direction from ``o`` was sampled. ``p`` is infinite where emitters cannot
-    be sampled: at the camera and at mirrors.
+    """A straight way from ``o``, whose direction was sampled with density ``p``. ``p`` is infinite if emitters cannot
+    be sampled from ``o``: at the camera and at mirrors.
     """
 
     p: mi.Float

@@ -77,7 +77,7 @@ class LightEnds:
         return dr.gather(mi.UInt32, self.kind, index) == FAR
 
     def emission(self, index: mi.UInt32, p: mi.Float, cos: mi.Float, distance2: mi.Float) -> mi.Float:
-        """``e`` of ``mis`` for the emitter with number ``index``.
+        """``e`` of ``data_gen.samplers.bdpt.mis`` for the emitter with number ``index``.
 
         ``p``          density of connecting to this point of the emitter from the other end of the edge; not for deltas
         ``cos``        absolute cosine at the emitter
@@ -108,6 +108,7 @@ class LightEnds:
         return light, p
 
     def sample(self, scene, random, time, wavelengths) -> LightRay:
+        """Samples an emitter, a point on it and a direction: the first edge of a light path."""
         u, u_position, u_direction = random.next_1d(), random.next_2d(), random.next_2d()
         index, weight, _ = scene.sample_emitter(u)
         emitter = dr.gather(mi.EmitterPtr, self.emitters, index)
@@ -166,7 +167,7 @@ class LightEnds:
         return mi.Normal3f(dr.select(bent, ours.front, front))
 
     def densities(self, scene, start: LightRay, y: mi.SurfaceInteraction3f) -> tuple[mi.Float, mi.Float]:
-        """``e`` and ``p`` of ``mis``, seen from the first vertex ``y`` of a light path."""
+        """``e`` and ``p`` of ``data_gen.samplers.bdpt.mis``, seen from the first vertex ``y`` of a light path."""
         end, d = mi.DirectionSample3f(start.end), start.ray.d
         distance2 = dr.squared_norm(end.p - y.p)
         cos = dr.abs(dr.dot(end.n, d))
@@ -254,5 +255,5 @@ class World:
     scene: mi.Scene
     lights: LightEnds
     materials: Materials | None = None  # None for samplers that do not use them
-    fog: Any = None  # ``photons.map.fog.Fog``: the media, for samplers that gather photons in them
+    fog: Any = None  # a ``data_gen.samplers.photons.map.fog.Fog``: the media, for samplers that gather photons there
     holes: Holes | None = None  # the holes, if they are no vertices; else None

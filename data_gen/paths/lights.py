@@ -85,14 +85,16 @@ def sample_light(
 ) -> LightSample:
     """Emitter sampling at a vertex. The weight is Le V / p, or Le / p without occlusion if ``lights`` are given."""
     if lights:
-        light, weight = lights.anywhere(scene, si, u, active)
-    else:
-        light, weight = scene.sample_emitter_direction(si, u, True, active)
+        return _sampled(*lights.anywhere(scene, si, u, active), active)
+    return _sampled(*scene.sample_emitter_direction(si, u, True, active), active)
+
+
+def _sampled(light: mi.DirectionSample3f, weight: mi.Spectrum, active: mi.Bool) -> LightSample:
     return LightSample(light.d, light.pdf, light.delta, dr.select(active & (light.pdf != 0), weight, 0), light.p)
 
 
 def shadowed(scene: mi.Scene, si: mi.SurfaceInteraction3f, light: LightSample, f: mi.Spectrum) -> mi.Spectrum:
-    """f Le V / p of a ``light`` sample whose weight is Le / p. Only where that is above 0, a shadow ray is traced."""
+    """f Le V / p of a ``light`` sample whose weight is Le / p. A shadow ray is traced only where f Le / p > 0."""
     lit = f * light.weight
     return dr.select(scene.ray_test(si.spawn_ray_to(light.target), dr.max(lit) > 0), 0, lit)
 
@@ -112,14 +114,8 @@ def replay_lamp(
     P is the probability of choosing the lamp. ``p`` of the result includes P(y), its ``weight`` includes P(x). The
     second value is the ratio P(y) / P(x), a factor of r.
     """
-    places = lights.places
-
-    def anew(active: mi.Bool) -> LightSample:
-        light, weight = lights.at(y, chosen, active)
-        return LightSample(light.d, light.pdf, light.delta, dr.select(active & (light.pdf != 0), weight, 0), light.p)
-
-    sample = _replayed(lights, base, base_weight, y, lit, anew)
-    ratio = places.probability(y, chosen.lamp) / chosen.p
+    sample = _replayed(lights, base, base_weight, y, lit, lambda anew: _sampled(*lights.at(y, chosen, anew), anew))
+    ratio = lights.places.probability(y, chosen.lamp) / chosen.p
     # A base path that has ended has no vertex x and takes no part in the reverse shift: the MIS weight is 1/2.
     return replace(sample, p=sample.p * ratio), dr.select(x.is_valid(), ratio, 1)
 

@@ -34,7 +34,7 @@ TOLERANCE = 1e-4
 RETURNS = 1e-3
 
 
-# Called at each event but the first: would a chain have ended here, whichever event is sampled?
+# Called at each event except the first. It says whether a chain would have ended there, whichever event is sampled.
 Ends = Callable[["mi.SurfaceInteraction3f"], "mi.Bool"]
 
 
@@ -180,7 +180,7 @@ def on_surface(si: mi.SurfaceInteraction3f, d: mi.Vector3f, dp: mi.Vector3f) -> 
 
 
 def turn(code, η, n, d, dn: tuple, dd: tuple) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]:
-    """The direction ``d`` after an event, and its differentials (Igehy 1999, eq. 14-18); ``η`` is n_t / n_i."""
+    """The direction ``d`` after an event, and its two differentials (Igehy 1999, eq. 14-18). ``η`` is n_t / n_i."""
     back = dr.dot(d, n) > 0
     N = mi.Vector3f(dr.select(back, -n, n))
     cos = dr.dot(d, N)

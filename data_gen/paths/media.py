@@ -20,10 +20,13 @@ from data_gen.scenes.facts import media_of, shapes_of
 
 @dataclass
 class Place:
+    """Where a vertex is: on a surface, or in a medium."""
+
     medium: mi.MediumPtr  # around it, on the side from which the path has come; null where there is none
     scatters: mi.Bool  # in the medium, not on a surface
 
     def toward(self, x: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.MediumPtr:
+        """The medium that a path enters when it leaves ``x`` in direction ``d``."""
         changes = ~self.scatters & x.is_valid() & x.is_medium_transition()
         return dr.select(changes, x.target_medium(d), self.medium)
 
@@ -124,7 +127,7 @@ def evaluate_and_sample(
     u_lobe: mi.Float,
     u_direction: mi.Point2f,
 ) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum]:
-    """Both in one call, because calls to virtual functions of materials are expensive."""
+    """``evaluate_vertex()`` for ``wo``, and ``sample_vertex()``: in one call, because virtual calls are expensive."""
     context = mi.BSDFContext()
     if place is None:
         f, p, sample, f_p = bsdf.eval_pdf_sample(context, x, wo, u_lobe, u_direction)
@@ -183,6 +186,7 @@ def end_of(ray: mi.Ray3f) -> mi.Float:
 
 
 def shortened(ray: mi.Ray3f, length: mi.Float) -> mi.Ray3f:
+    """The ray, at most as long as ``length``."""
     short = mi.Ray3f(ray)
     short.maxt = dr.minimum(ray.maxt, length)
     return short

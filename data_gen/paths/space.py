@@ -24,8 +24,8 @@ class Drawn:
     """Random numbers of a path for one step through media."""
 
     channel: mi.UInt32  # the colour by which the path samples its distances, the same in all steps
-    numbers: Numbers  # of the segment
-    light: mi.UInt32 | None  # key of the numbers for the way to the emitter; None without grids
+    numbers: Numbers  # for the segment
+    light: mi.UInt32 | None  # the key of the random numbers for the way to the emitter; None without grids
 
 
 class Space:

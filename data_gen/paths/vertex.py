@@ -23,8 +23,8 @@ class Materials:
     A vertex is *connectable* if its material has a component without a Dirac delta, and the smallest roughness of all
     such components exceeds ``threshold``. This includes materials that also have a mirror component (``plastic``),
     although the shift is rejected when the mirror is sampled at the shared vertex. Connectability depends only on the
-    material, so a path and its shifted copy agree on it, which keeps the shift invertible. Of a textured roughness the
-    smallest texel counts. Materials without a roughness parameter (``diffuse``, ``measured``) count as rough.
+    material, so a path and its shifted copy agree on it, which keeps the shift invertible. The smallest texel of a
+    textured roughness counts. Materials without a roughness parameter (``diffuse``, ``measured``) count as rough.
 
     Shapes for which ``passed`` is true have no vertices and are ignored. With ``media`` in the scene, rough glass is
     never connectable, because few paths find light that leaves a medium through it, see docs/samplers/media.md.

@@ -18,7 +18,7 @@ from ngpt.errors import NgptError
 
 UNLIMITED = 0xFFFFFFFF
 
-# The largest probability to survive, even at a perfect mirror: below 1, so that all paths end.
+# The largest probability of survival, even at a perfect mirror: below 1, so that all paths end.
 _MOST = 0.95
 
 
@@ -65,7 +65,7 @@ class Limits:
 
 
 def roulette(throughput: mi.Float, plays: mi.Bool | bool, η: mi.Float | None = None) -> mi.Float:
-    """Russian roulette: the probability to survive, by which survivors must be divided; 1 where ``plays`` is false.
+    """Russian roulette: the probability of survival, by which survivors must be divided; 1 where ``plays`` is false.
 
     For a path from the camera, ``throughput`` is the largest channel of its weight after the step, and ``η`` the
     product of the relative indices of refraction so far. η² undoes the change of radiance by refraction, as in
@@ -88,8 +88,8 @@ def brightest(paths: Iterable[Any]) -> mi.Float:
 class Sky:
     """Whether a path that escapes sees the environment.
 
-    An environment that is hidden from the camera is hidden behind holes, too, since nothing has been scattered there
-    yet.
+    An environment that is hidden from the camera is also hidden behind holes, because a path through them has not been
+    scattered yet.
     """
 
     seen: mi.Bool

@@ -1,22 +1,23 @@
 """The cache: for each cell the mean light that arrives. On surfaces it is the irradiance over π, in media the mean
 radiance over all directions.
 
-Cells are cubes, apart by their size and by the side and direction of the surface. A cell is small against the *spread*
-of a path at the vertex where the path looks it up: the width of the bundle of paths that arrive there, over which the
-light of the cell is blurred. Smooth events add to it,
+Cells are cubes. Cells of different size are separate, and so are cells for different directions of the surface normal.
+The *spread* of a path at a vertex is the width of the bundle of similar paths that arrive there. A path reads cells
+that are small compared to its spread. Each smooth event adds to the spread:
 
     spread = Σ t / sqrt(p |cos θ|),
 
 for steps of length t whose direction has density p and meets the surface at θ [the same area: Bekaert et al. 2003,
 "Custom path-space filtering"; Müller et al. 2021, "Real-time neural radiance caching for path tracing"].
 
-There are two *halves* of all records, which come from different paths and never read each other. Paths of the image
-read the mean of both. Half of the difference between the two is a sample of the error of that mean: both halves have
-the same distribution, so its variance is that of the mean, and so are its covariances between cells, and between all
-sums of what is read. So a render knows the noise that its pixels share, however far a record's light has spread.
+Records belong to one of two *halves*, which come from different paths. Paths that feed a half never read light of the
+other half. Paths of the image read the mean of both. Half of the difference between the halves is a sample of the error
+of that mean: both halves have the same distribution, so this sample has the same variance as the mean. The same holds
+for covariances between cells, and for all sums of values that paths read. So a render can estimate the noise that its
+pixels share, however far the light of a record has spread.
 
-Sums are integers, so that they do not depend on the order of additions. What paths read, ``Known``, is made of them
-between two rounds: within a round nothing changes.
+Sums are integers, so they do not depend on the order of additions. ``Known`` is what paths read. It is computed from
+the sums between two rounds, and does not change within a round.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ from data_gen.paths.streams import mixed
 from data_gen.tails.schedule import FINENESS
 from data_gen.tails.table import INSIDE, Grid, Place, in_table, key, octahedral
 
-# MiB that the cache takes, and the MiB of a render from which on this is little
+# MiB that the cache takes, and the least memory limit of a render that has a cache, in MiB
 MIB, LEAST_MIB = 320, 640
-# A path may end where its spread has reached this share of its way to the first rough surface.
+# A path may end where its spread exceeds this share of the length of its way to the first rough surface.
 NEAR = 1 / 8
 HALVES = 2
 
@@ -51,13 +52,13 @@ class Trail:
 
     @classmethod
     def to(cls, first: mi.Float) -> Trail:
-        """The trail of a path at its first vertex, so far from the camera."""
+        """The trail of a path at its first vertex, at distance ``first`` from the camera."""
         return cls(mi.Float(first), dr.zeros(mi.Float, dr.width(first)))
 
     def on(self, x: mi.SurfaceInteraction3f, inside: mi.Bool, smooth: mi.Bool, p: mi.Float, active: mi.Bool) -> Trail:
-        """At the next vertex ``x``, if there is one, behind an event of density ``p`` that was ``smooth``, or not.
+        """The trail at the next vertex ``x``, after an event that was ``smooth`` or not, with density ``p``.
 
-        A vertex ``inside`` a medium meets the bundle of paths face to face.
+        It does not change if there is no next vertex. At a vertex ``inside`` a medium the cosine is 1.
         """
         there = active & x.is_valid()
         cosine = dr.select(inside, 1, dr.abs(x.wi.z))
@@ -68,34 +69,37 @@ class Trail:
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
-# Cells that there is room for, and the share of them that may be taken
+# Slots of the table of cells, and the share of them that may be used
 CELLS, _FULL = 1 << 20, 0.5
 # A cell is trusted once each half has this number of records in it, whatever their values: see ``Cache``. Few are
 # enough, since about as many paths read a cell as there are records in it.
 LEAST = 4
-# Paths that feed the cache read only cells with this number of records in each half. A share of these paths make
-# further records instead: otherwise cells that many paths read would keep the noise of their first records.
+# Paths that feed the cache read only cells with LEAST_TO_FEED records in each half. With probability RENEW they make a
+# further record instead. Otherwise cells that many paths read would keep the noise of their first records.
 LEAST_TO_FEED, RENEW = 16, 0.25
-# A cell is torn where the light in its two parts along an axis differs by more than this share of their sum, at the
-# coarsest fineness, and by more than this number of standard errors.
+# A cell is torn if the light in its two parts along an axis differs by more than TORN times their sum (at the coarsest
+# fineness) and by more than _CERTAIN standard errors, and if each part has _ENOUGH records.
 TORN, _CERTAIN, _ENOUGH = 0.2, 2.5, 3
-# The unit in which the light of a record counts for that: 1 is all that a record can have, whatever its light.
+# For this test the light of a record is mapped to [0, 1], and stored as an integer in units of 1 / _PARTS.
 _PARTS = 4095
 # The weight of a new record, as an integer that can be halved often: see ``fade``
 _WHOLE = 256
-# The light of a record is at most this multiple of the mean of all records so far, or this part of their sum. Brighter
-# records are cut: a single path would make a spot that no denoiser removes.
+# The light of a record is cut to MOST times the mean of all records so far, or to 1 / PARTS of their sum if that is
+# more. Otherwise a single bright path would leave a spot that no denoiser removes.
 MOST, PARTS = 3000, 200
-# The light of the brightest record of the first round, and the brightest light that can be represented, in units of
-# sums, both as powers of two
+# Sums are integers in a unit of light. The unit is chosen so that the brightest of the first records has about 2^_BITS
+# units. No record has more than 2^_MOST_BITS units.
 _BITS, _MOST_BITS = 24, 40
 
 
 @dataclass
 class Known:
-    """The values that paths read, by cell: the mean of each sort of light, RGB; the records of the smaller half; and
-    half of the difference between the two halves, with 1 where the first half says that the cell is torn, plus 2 where
-    the second one does."""
+    """What paths read. Each sort of light has four numbers for each cell in both lists:
+
+    ``means``        the mean of the two halves, RGB; then the number of records in the half that has fewer of them
+    ``differences``  half of the difference between the two halves, RGB; then 1 if the first half says that the cell is
+                     torn, plus 2 if the second half does
+    """
 
     keys: mi.UInt32
     means: list[mi.Float]
@@ -104,9 +108,10 @@ class Known:
     grid: Grid
 
     def place_of(self, x: mi.SurfaceInteraction3f, inside: mi.Bool, spread: mi.Float, kind: mi.UInt32 | int) -> Place:
-        """The place of vertex ``x`` among the cells that are ``fineness`` times smaller than the ``spread``.
+        """The place of vertex ``x`` among the cells whose edge is at most ``spread`` / ``fineness``.
 
-        Vertices ``inside`` media share no light with those on surfaces, nor do vertices of different ``kind``.
+        Vertices ``inside`` media share no cells with vertices on surfaces. Vertices of different ``kind`` share none
+        either.
         """
         level = mi.Int32(dr.floor(dr.log2(dr.maximum(spread / self.fineness, 1e-20))))
         normal = dr.select(inside, mi.UInt32(INSIDE), octahedral(mi.Normal3f(dr.mulsign(x.sh_frame.n, x.wi.z))))
@@ -115,12 +120,14 @@ class Known:
     def look(
         self, place: Place, least: int, active: mi.Bool, half: mi.UInt32 | None = None
     ) -> tuple[list[mi.Color3f], list[mi.Color3f], mi.Bool]:
-        """The light of each sort at a place, a sample of its error, and whether it is known, by the ``least`` number of
-        records in each half; to all, or to paths that feed a ``half``.
+        """The light of each sort at a place, a sample of its error, and whether the light is known.
 
-        The records of one half decide only whether the light of the other half may be read. Otherwise cells that have
-        found rare light would look torn, and light would be lost. Where just one half says that a cell is torn, the
-        path reads the light of that half every other time, and goes on the other times.
+        It is known if each half has ``least`` records in the cell, and the cell is not torn. Paths that feed a ``half``
+        read the light of that half. All other paths (None) read the mean of both.
+
+        The records of one half decide only whether the light of the *other* half may be read. Otherwise a half that has
+        found rare light would say that the cell is torn, and this light would be lost. If just one half says that a
+        cell is torn, a path of the image reads the light of that half every other time, and goes on the other times.
         """
         h, name, _ = key(place)
         slot, found = in_table(self.keys, h, name, active)
@@ -131,11 +138,11 @@ class Known:
         known = found & (means[0].w >= least) & (torn < 3)
         mean, error = ([mi.Color3f(v.x, v.y, v.z) for v in each] for each in (means, differences))
         if half is None:
-            # Every other time, by the digits of the place
+            # Every other time: a hash of the place decides.
             known &= (torn == 0) | (mixed(dr.reinterpret_array(mi.UInt32, place.p.x)) & 1 == 0)
             which = torn
         else:
-            # The other half has the other bit.
+            # The other half decides.
             known &= (torn >> (1 - half)) & 1 == 0
             which = half + 1
         sign = dr.select(which == 0, mi.Float(0), dr.select(which == 1, 1, -1))
@@ -144,26 +151,25 @@ class Known:
 
 
 class Cache:
-    """Growing sums of ``sorts`` kinds of light by cell, and the means of them that paths may read.
+    """The sums of ``sorts`` sorts of light in each cell, and ``known``, their means, which paths may read.
 
     The number of a cell's records decides whether the cell is trusted, not the light in them. Where light is rare, a
     cell that has found some looks uncertain, and a cell that has missed it looks certain. Trusting only the certain
     cells would lose light: see docs/samplers/tails.md. A *torn* cell is not trusted either: its two parts along an axis
     have different light, for example because a wall goes through it. Paths do not end in such a cell.
-
     """
 
     def __init__(self, fineness: float, sorts: int = 1, grid: Grid | None = None):
         self.keys = dr.zeros(mi.UInt32, CELLS)
-        # By half and cell: the weights of its records, and sums of their light by these
+        # For each half and cell: the sum of the weights of its records, and the weighted sums of their light
         self.weight = dr.zeros(mi.UInt32, HALVES * CELLS)
         self.sums = [dr.zeros(mi.Int64, HALVES * CELLS) for _ in range(3 * sorts)]
-        # By half and cell, of all records and of those in the upper part along each axis: how many, and the sums of
-        # their light and of its square, in _PARTS
+        # For each half and cell: the number of records, and the sums of their light and of its square, in units of
+        # 1 / _PARTS. Each of them for all records, and for the records in the upper part along x, y and z
         self.parts = [[dr.zeros(mi.UInt32, HALVES * CELLS) for _ in range(4)] for _ in range(3)]
         self.unit, self.full = 0.0, False
-        # For all records so far: their number, the sum of the light of the brightest colour of each, in units, and how
-        # much of it was cut
+        # For all records so far: their number, the sum of their light (the largest channel of each, in units), and how
+        # much of this light was cut
         self.records = self.light = self.cut = 0
         means, differences = ([dr.zeros(mi.Float, 4 * CELLS) for _ in range(sorts)] for _ in range(2))
         grid = grid or Grid.at()
@@ -171,15 +177,16 @@ class Cache:
         dr.make_opaque(self.keys, self.weight, self.sums, self.parts, means, differences)
 
     def add(self, place: Place, half: mi.UInt32, values: list[mi.Float]) -> None:
-        """Adds records to their cells: ``values`` are RGB of each sort of light, also below 0; ``half`` is 0 or 1."""
+        """Adds records to their cells. ``values`` are R, G, B of each sort of light, which may be below 0. ``half`` is
+        0 or 1."""
         largest = reduce(dr.maximum, map(dr.abs, values))
         good = dr.isfinite(sum(values))
         if not self.unit:
             first = dr.max(dr.select(good, largest, 0))[0]
             if first > 0:
-                # No less than what has an inverse among floats
+                # A smaller number may have no inverse in float32.
                 self.unit = 2.0 ** max(math.ceil(math.log2(first)) - _BITS, -126)
-        # Opaque: it would be compiled into the kernel, a new one for every scene.
+        # Opaque: a literal would be compiled into the kernel, so every scene would need a new kernel.
         scale = dr.opaque(mi.Float, 1 / self.unit if self.unit else 0)
         brightest = dr.select(good, dr.minimum(largest * scale, 2.0**_MOST_BITS), 0)
         self.records += int(dr.count(good)[0])
@@ -199,7 +206,8 @@ class Cache:
         for each, count in zip(self.sums, counts, strict=True):
             dr.scatter_add(each, count, of_half, placed, **direct)
         dr.scatter_add(self.weight, mi.UInt32(_WHOLE), of_half, placed, **direct)
-        # Relative to the cell's light, or to all light where that is not known: a bright record counts little more.
+        # The light of a record relative to the light of its cell, or to the mean of all records if the cell's is not
+        # known. It is below 1, so a very bright record counts little more than a bright one.
         here = [dr.gather(mi.Vector4f, each, slot, placed) for each in self.known.means]
         brightest_here = sum(dr.maximum(v.x, dr.maximum(v.y, v.z)) for v in here) / self._unit_or_1()
         usual = dr.maximum(dr.select(here[0].w > 0, brightest_here, mean), 1e-20)
@@ -211,13 +219,13 @@ class Cache:
         dr.eval(self.keys, self.weight, self.sums, self.parts)
 
     def fade(self) -> None:
-        """Halves the weight of what is known, before paths add records that end in it.
+        """Halves the weight of all records so far, before new paths make records that end in them.
 
-        Such records repeat the noise of the cells they read. Let g be the share of their light that comes from there,
-        and let the number of records double in each round. With equal weights, the noise of the first records would be
-        (1 + g) / 2 of itself a round later. Where light is rare, g is large, and that is more than sqrt(1/2), the rate
-        of independent records. With half the weight it is (1 + 2 g) / 3. The records' own noise grows by 13 %. A
-        cell keeps the weight of ``LEAST`` records, so that it is not forgotten.
+        New records repeat the noise of the cells that their paths read. Let g be the share of their light that comes
+        from there, and let the number of records double in each round. With equal weights, a round would multiply the
+        noise of the old records by (1 + g) / 2. Where light is rare, g is large, and this factor is above sqrt(1/2),
+        the factor for independent records. With half the weight the factor is (1 + 2 g) / 3, which is smaller. The own
+        noise of the records grows by 13 %. A cell keeps the weight of ``LEAST`` records, so that it is not forgotten.
         """
         much = self.weight >= 2 * LEAST * _WHOLE
         self.sums = [dr.select(much, each >> 1, each) for each in self.sums]
@@ -228,11 +236,11 @@ class Cache:
         return dr.opaque(mi.Float, self.unit or 1.0)
 
     def settle(self, fineness: float) -> None:
-        """Rebuilds what is known from all records so far; from here on cells have this ``fineness``."""
+        """Computes ``known`` from all records so far. From now on cells have this ``fineness``."""
         cells = int(dr.count(self.keys != 0)[0])
         if cells > _FULL * CELLS and not self.full:
             self.full = True
-            what = "light that comes to other places is found by single paths; --unbiased does without the cache"
+            what = "paths that come to other places do not end there; --unbiased turns the cache off"
             _LOG.warning("the cache of tails is full (%d cells): %s", cells, what)
         cell, unit = dr.arange(mi.UInt32, CELLS), self._unit_or_1()
         counts, weights = (
@@ -244,7 +252,7 @@ class Cache:
         torn = dr.select(dr.gather(mi.Bool, torn, cell), mi.Float(1), 0) + dr.select(
             dr.gather(mi.Bool, torn, cell + CELLS), mi.Float(2), 0
         )
-        # Old values go first, to make room for the new ones.
+        # Frees the memory of the old values before the new ones are made.
         self.known.means.clear()
         self.known.differences.clear()
         means, differences = ([dr.zeros(mi.Float, 4 * CELLS) for _ in range(len(self.sums) // 3)] for _ in range(2))
@@ -263,10 +271,10 @@ class Cache:
         dr.eval(self.known.keys, means, differences)
 
     def torn(self, fineness: float) -> mi.Bool:
-        """By half and cell: whether the half has found different light in the two parts of the cell along an axis.
+        """For each half and cell: whether the half has found different light in two parts of the cell along an axis.
 
-        Finer cells are judged more strictly, as their light may differ less: so the light that passes through walls
-        vanishes with the size of cells.
+        The finer the cells, the smaller is the difference that counts. So the light that leaks through walls vanishes
+        with the size of cells.
         """
         torn = mi.Bool(False)
         whole, *uppers = ([mi.Float(each[i]) for each in self.parts] for i in range(4))

@@ -1,14 +1,14 @@
 """The number of paths that feed the cache, chosen so that the noise at equal time is least.
 
-The noise of a render has two parts: each pixel's own, which falls with the samples of the image, and what pixels share,
-which falls with the paths that feed the cache. With V and S the variances that one path of either kind would give, and
-equal costs of both, the least variance for a given time has
+The noise of a render has two parts. The own noise of each pixel falls with the number of paths of the image. The noise
+that pixels share falls with the number of paths that feed the cache. Let V and S be the variances that these two parts
+would have with one path each. If both kinds of paths cost the same, the variance at equal time is least for
 
     paths that feed / paths of the image = sqrt(S / V).
 
-Both are measured over blocks of pixels, since a denoiser leaves the noise of large structures, and relative to the
-light, as errors are judged. The ratio is rounded to a power of two: so that it is the same in all renders of a scene,
-nearly always.
+V and S are measured over blocks of pixels, because a denoiser removes fine noise and leaves coarse noise. They are
+relative to the light, as errors are. The ratio is rounded to a power of two, so that it is nearly always the same in
+all renders of a scene.
 """
 
 from __future__ import annotations
@@ -19,16 +19,19 @@ import numpy as np
 
 from data_gen.film import GradientFilm
 
-# Paths that feed the cache, for each path of the image: at first, and at least and at most
+# The number of paths that feed the cache for each path of the image: in the first round, at least, and at most
 BEGIN, LEAST, MOST = 1 / 2, 1 / 16, 1.0
-# Side of a block, in pixels, and the share of blocks with the most noise that do not count
+# The side of a block in pixels, and the share of the noisiest blocks that is left out
 _BLOCK, _TRIM = 16, 0.01
-# Dark blocks count less: light is relative to its own block plus this share of the mean.
+# Noise is divided by the light of its block plus this share of the mean light, so dark blocks count less.
 _DARK = 0.05
 
 
 def share(film: GradientFilm, fed: float) -> float | None:
-    """Paths that should feed the cache, for each path of the image, after ``fed`` for each pixel; None: not known."""
+    """The number of paths that should feed the cache for each path of the image; None if it cannot be measured yet.
+
+    ``film`` holds the samples so far. ``fed`` is the number of paths per pixel that have fed the cache so far.
+    """
     samples = float(film.samples_each.mean())
     if not samples or not fed or "shared" not in film.moments:
         return None

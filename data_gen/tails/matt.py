@@ -6,16 +6,16 @@ with a diffuse part scatters some of that light as a matt surface of reflectance
     f cos θ = ρ cos θ / π + rest.
 
 The path ends for the first term and goes on for the rest: gloss, metal, mirrors, transmission, and what bumps and
-Fresnel's law change about the diffuse part. Any ρ gives the right mean. The closer it comes to the material, the
-smaller the rest is. No light is divided by ρ, which may be 0.
+Fresnel's law change about the diffuse part. Any ρ gives the right mean. The better ρ fits the material, the smaller is
+the rest. Nothing is divided by ρ, so ρ may be 0.
 
 In a medium the cache knows the mean radiance over all directions. A phase function is split in the same way,
 
     f = ρ / 4π + rest,
 
-where ρ is 4π times its least value, so that the rest is nowhere negative. The throughput already has the albedo. So a
-cell needs neither the extinction nor the albedo: thin and dense parts of a grid, and both sides of an index-matched
-boundary, may share it.
+where ρ is 4π times its least value, so that the rest is nowhere negative. The throughput of a path already includes the
+albedo. So a cell needs neither the extinction nor the albedo: thin and dense parts of a grid may share it, and so may
+both sides of an index-matched boundary.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from data_gen.paths import media
 from data_gen.paths.media import Place
 from data_gen.paths.vertex import SMOOTH, ByMaterial, dr_number, event_kind, materials_of
 
-# The tangent of the angle between the normal and the direction that ρ is read off: as far from a mirror direction as
-# from the horizon
+# ρ is read from the value of a material in one direction. This is the tangent of the angle between that direction and
+# the normal: the direction is far from the horizon, and from the mirror direction on the other side of the normal.
 _TILT = 1.0
-# Flags of all other lobes
+# Flags of all lobes but the diffuse reflection
 _ELSE = ("Delta", "Delta1D", "Null", "Glossy", "DiffuseTransmission")
-# In media whose ρ is smaller, nearly all paths would go on at each vertex.
+# The least ρ of a medium in which paths may end. With a smaller ρ nearly all paths would go on at each vertex.
 _LEAST_EVEN = 0.1
-# Materials that disturb the normal of the material inside
+# Materials that tilt the normal of the material inside
 _BUMPS = re.compile("(Bump|Normal)Map")
 
 
 class Matt:
-    """Facts about a scene's materials that the cache needs, and about the ``fogs`` that paths go through."""
+    """The facts that the cache needs about a scene's materials, and about its media ``fogs``."""
 
     def __init__(self, scene: mi.Scene, fogs: Sequence[mi.Medium] = ()):
         bsdfs = materials_of(scene)
@@ -66,12 +66,12 @@ class Matt:
         self.plain = Plain(bsdfs)
 
     def at(self, x: mi.SurfaceInteraction3f, place: Place | None, active: mi.Bool) -> mi.Bool:
-        """Whether the material or the phase function at a vertex has a part that the cache answers for."""
+        """Whether a path may end here for the diffuse part of the material, or the even part of the phase function."""
         matt = mi.has_flag(x.bsdf().flags(), mi.BSDFFlags.DiffuseReflection)
         return active & (matt if place is None else matt | (self._even(place, active) > 0))
 
     def lambertian(self, x: mi.SurfaceInteraction3f, place: Place | None, active: mi.Bool) -> mi.Bool:
-        """Whether that part is all: a path that ends there has no rest to go on for."""
+        """Whether a vertex scatters in no other way: a path that ends there need not go on for a rest."""
         listed, lambertian = self.nothing_else.of(x.bsdf(), active)
         all_matt = listed & lambertian
         return all_matt if place is None else all_matt | (self._even(place, active) == 1)
@@ -81,12 +81,13 @@ class Matt:
         return self.evens.of(place.medium, active & place.scatters)[1]
 
     def tilted(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-        """Whether its diffuse part may be tilted by a bump or normal map, and so miss directions of a matt surface."""
+        """Whether a bump or normal map may tilt the diffuse part, which then misses directions of a matt surface."""
         listed, tilted = self.tilts.of(x.bsdf(), active)
         return active & (~listed | tilted)
 
     def reflectance(self, x: mi.SurfaceInteraction3f, place: Place | None, active: mi.Bool) -> mi.Color3f:
-        """ρ in [0, 1]: π times the diffuse lobe's f in a direction on the side of ``wi``; in media, ρ of the phase."""
+        """ρ in [0, 1]. On a surface it is π times f of the diffuse lobe, in one direction on the side of ``wi``. In a
+        medium it is ρ of the phase function."""
         on_surface = active & ~media.scatters(place)
         known, ρ = self.plain.of(x, on_surface)
         ρ = dr.select(known, ρ, reflectance(x.bsdf(), x, on_surface & ~known))
@@ -94,8 +95,7 @@ class Matt:
 
 
 class Plain:
-    """ρ of the materials that have one for each side: matt ones without a texture. A table is quicker than to ask
-    them."""
+    """A table of ρ for the sides of all matt materials without a texture. It is quicker than calls of the materials."""
 
     def __init__(self, bsdfs: dict[int, mi.BSDF]):
         # By material and side: RGB, and 1 where it is known
@@ -106,11 +106,12 @@ class Plain:
             if is_lambertian(bsdf) and is_constant(bsdf):
                 table[number, :, :3] = np.array(reflectance(bsdf, x, mi.Bool(True))).T
                 table[number, :, 3] = 1
-        # Opaque: the numbers may be others in each process, and the kernel is to be the same.
+        # Opaque: the numbers may differ between processes, and the kernel should not.
         self.size, self.table = dr.opaque(mi.UInt32, len(table)), mi.Float(table.ravel())
         dr.eval(self.table)
 
     def of(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Bool, mi.Color3f]:
+        """Whether the table has the material at ``x``, and its ρ on the side of ``wi``."""
         number = dr.reinterpret_array(mi.UInt32, x.bsdf())
         row = 2 * number + dr.select(x.wi.z < 0, mi.UInt32(1), 0)
         v = dr.gather(mi.Vector4f, self.table, row, active & (number < self.size))
@@ -118,9 +119,9 @@ class Plain:
 
 
 def reflectance(bsdf: mi.BSDF | mi.BSDFPtr, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
-    """ρ by the material itself: π times f of its diffuse lobe, see ``Matt.reflectance``."""
+    """ρ in [0, 1], evaluated by the material: π times f of its diffuse lobe, see ``Matt.reflectance``."""
     context = mi.BSDFContext()
-    # Materials of several lobes leave out the other lobes, except ``principled``.
+    # With this mask materials of several lobes leave out the other lobes, except ``principled``.
     context.type_mask = mi.BSDFFlags.DiffuseReflection
     along = mi.Vector2f(x.wi.x, x.wi.y)
     across = dr.rsqrt(dr.maximum(dr.squared_norm(along), 1e-12)) * along
@@ -131,7 +132,7 @@ def reflectance(bsdf: mi.BSDF | mi.BSDFPtr, x: mi.SurfaceInteraction3f, active: 
 
 
 def is_lambertian(bsdf: mi.BSDF) -> bool:
-    """Whether a material scatters as a matt surface, on one side or on both, and not otherwise."""
+    """Whether a material scatters only as a matt surface does, on one side or on both."""
     flags = bsdf.flags()
     more = any(mi.has_flag(flags, getattr(mi.BSDFFlags, name)) for name in _ELSE)
     known = bsdf.class_name() in ("SmoothDiffuse", "TwoSidedBRDF") and not _BUMPS.search(str(bsdf))
@@ -152,20 +153,20 @@ def even_part(phase: mi.PhaseFunction) -> float:
     elif name == "RayleighPhaseFunction":
         ρ = 0.75
     elif name == "HGPhaseFunction":
-        # Read by element: an array of numpy would evaluate the variable, and kernels could no longer be recorded.
+        # Read by element: a conversion to NumPy would evaluate the variable, and kernels could no longer be recorded.
         g = abs(float(mi.traverse(phase)["g"][0]))
         ρ = (1 - g) / (1 + g) ** 2
     return ρ if ρ >= _LEAST_EVEN else 0.0
 
 
 def matt_lobe(x: mi.SurfaceInteraction3f, place: Place | None, wo: mi.Vector3f) -> mi.Float:
-    """f cos θ of a matt surface of reflectance 1, on the side that the path has come to; 1 / 4π in a medium."""
+    """f cos θ of a matt surface of reflectance 1, on the side from which the path has come; 1 / 4π in a medium."""
     cosine = dr.maximum(dr.mulsign(wo.z, x.wi.z), 0) * dr.inv_pi
     return cosine if place is None else dr.select(place.scatters, dr.inv_four_pi, cosine)
 
 
 def along_lobe(x: mi.SurfaceInteraction3f, place: Place | None, u: mi.Point2f) -> mi.Vector3f:
-    """A direction with the density ``matt_lobe``."""
+    """A direction sampled with the density ``matt_lobe``."""
     wo = mi.warp.square_to_cosine_hemisphere(u)
     wo.z *= dr.mulsign(mi.Float(1), x.wi.z)
     return wo if place is None else dr.select(place.scatters, mi.warp.square_to_uniform_sphere(u), wo)
@@ -179,8 +180,11 @@ def evaluate_and_sample(
     u: tuple[mi.Float, mi.Point2f],
     both: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum]:
-    """As ``data_gen.paths.media.evaluate_and_sample``, but half of the directions of ``both`` lanes come as at a matt
-    surface, or evenly in a medium. Each density is the mean of both ways. ``u`` chooses the lobe and the direction."""
+    """As ``data_gen.paths.media.evaluate_and_sample``, with two ways of sampling in the lanes of ``both``.
+
+    In these lanes half of the directions are sampled as at a matt surface, or evenly in a medium. Each density is the
+    mean over the two ways. ``u`` are the random numbers for the lobe and for the direction.
+    """
     u_lobe, u_direction = u
     by_lobe = both & (u_lobe < 0.5)
     u_lobe = dr.select(both, 2 * u_lobe - dr.select(by_lobe, mi.Float(0), 1), u_lobe)

@@ -1,18 +1,19 @@
-"""When the cache is fed, how much, and how fine its cells are: all by the number of paths of the image.
+"""When the cache is fed, and how fine its cells are. Both depend on the number of paths of the image so far.
 
-So large images have as many rounds as small ones with more samples; and the cache is the same after the same number of
-paths, whether samples or time end the render.
+So a large image has as many rounds as a small image with more samples. After the same number of paths the cache is the
+same, whether a number of samples or a time ends the render.
 """
 
 from __future__ import annotations
 
-# The cache begins with the first round before which the image has this number of paths, or at once if the image has
-# this number of pixels. Small images of few samples have none: it would take longer to compile than they take.
+# The cache begins when the image has this number of paths, or at once if the image has this number of pixels. Small
+# images of few samples have no cache: its kernels would take longer to compile than these images take to render.
 BEGIN = 1 << 14
-# Paths of the image at the end of the first round, or more
+# The least number of paths of the image at the end of the first round
 FIRST = 1 << 16
-# The fineness of cells: how many times smaller they are than the spread of a path. It grows slowly with the paths of
-# the image, from this number on. Bias falls with the square of the size of cells, and so at the rate of noise.
+# The fineness of cells says how many times smaller they are than the spread of a path. It is FINENESS at first. From
+# _COARSE paths of the image on, it grows as the power _RATE of their number. Bias falls with the square of the size of
+# cells, and so as fast as noise.
 FINENESS, _COARSE, _RATE = 8.0, 1 << 20, 1 / 4
 
 
@@ -27,7 +28,7 @@ def first_sample(pixels: int) -> int:
 
 
 def end_of_round(sample: int, pixels: int) -> int:
-    """The number of the first sample that is in a later round than ``sample``, from ``first_sample`` on."""
+    """The number of the first sample in the round after the one of ``sample``, which is at least ``first_sample``."""
     return max(_power_of_two(FIRST / pixels), 1 << sample.bit_length())
 
 

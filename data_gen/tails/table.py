@@ -1,4 +1,4 @@
-"""A table of cells: cubes of a grid, separated further by direction and kind, and found by a hash of both."""
+"""A hash table of cells: cubes of a grid, which are further separated by the surface's direction and by kind."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import mitsuba as mi
 
 from data_gen.paths.streams import mixed
 
-# The number of adjacent places in the table in which a cell may be: enough for each cell to find one, in any order
+# A cell is in one of this number of adjacent slots of the table. They are enough for each cell to find a free slot, in
+# whatever order cells are added.
 _PLACES = 512
-# Directions along an axis of the octahedral map, and the code of cells that have none: those in media
+# The number of directions along an axis of the octahedral map, and the code of cells in media, which have no direction
 _DIRECTIONS = 8
 INSIDE = _DIRECTIONS**2
 
@@ -22,15 +23,15 @@ class Place:
     """The place of a vertex in the grid of the cache."""
 
     p: mi.Point3f  # from the origin of the grid of its level
-    code: mi.UInt32  # direction of the normal on the side that is seen, and what else tells cells apart
-    level: mi.Int32  # cells have the side 2^level
+    code: mi.UInt32  # direction of the normal on the side that is seen, and the kind of cell
+    level: mi.Int32  # the edge of cells is 2^level
 
 
 @dataclass
 class Grid:
-    """Where cells lie: ``origin``, and by how much of a cell's edge the grid of each level is shifted from there.
+    """Where cells lie: the ``origin``, and the ``shift`` of the grid of each level from there, in edges of its cells.
 
-    Near the origin floats are the finest. A camera there sees small cells beside it, however large the scene is.
+    Floats are finest near the origin. If the camera is there, cells beside it can be small, however large the scene is.
     """
 
     origin: mi.Point3f
@@ -43,11 +44,13 @@ class Grid:
         return cls(mi.Point3f(*point), mi.Vector3f(*vector))
 
     def place_of(self, p: mi.Point3f, level: mi.Int32) -> mi.Point3f:
+        """``p`` relative to the origin of the grid of a ``level``."""
         return mi.Point3f(mi.Vector3f(p - self.origin) + self.shift * dr.exp2(mi.Float(level)))
 
 
 def octahedral(n: mi.Vector3f) -> mi.UInt32:
-    """The number of a direction's cell on the sphere. [Meyer et al. 2010, "On floating-point normal vectors"]"""
+    """The number of the cell of the sphere that ``n`` is in, below ``INSIDE``. [Meyer et al. 2010, "On floating-point
+    normal vectors"]"""
     s = dr.rcp(dr.abs(n.x) + dr.abs(n.y) + dr.abs(n.z))
     u, v = n.x * s, n.y * s
     folded = n.z < 0
@@ -58,8 +61,8 @@ def octahedral(n: mi.Vector3f) -> mi.UInt32:
 
 
 def key(place: Place) -> tuple[mi.UInt32, mi.UInt32, list[mi.Bool]]:
-    """The first slot of a table to search for the cell, the cell's check value there, which is never 0, and whether the
-    place is in the upper half of the cell along each axis."""
+    """A hash that says in which slot the search for the cell begins, the cell's check value, and whether the place is
+    in the upper half of the cell along each axis. The check value is never 0, which marks free slots."""
     q = place.p * dr.exp2(mi.Float(-place.level))
     corner = [dr.floor(q[i]) for i in range(3)]
     x, y, z = (mi.UInt32(mi.Int32(c)) for c in corner)
@@ -72,9 +75,10 @@ def key(place: Place) -> tuple[mi.UInt32, mi.UInt32, list[mi.Bool]]:
 def in_table(
     keys: mi.UInt32, h: mi.UInt32, name: mi.UInt32, active: mi.Bool, *, fill: bool = False
 ) -> tuple[mi.UInt32, mi.Bool]:
-    """The places of cells in a table, and which are there; ``fill``: cells that are not there are made.
+    """The slots of cells in a table, and which cells have a slot. With ``fill``, cells without a slot get a free one.
 
-    All places from ``h`` on up to the first empty one are searched.
+    ``h`` and ``name`` are the first two values of ``key``. The slots from ``h`` on are searched, up to the first free
+    one.
     """
     last, lanes = dr.width(keys) - 1, dr.width(h)
 

@@ -213,8 +213,8 @@ def test_a_pilot_chooses_for_a_method(renderer, command, monkeypatch):
     """What it chose is rendered, in the time that is left, and written down."""
     asked = []
 
-    def plan(scene, seconds, method, memory, pilot):
-        asked.append((seconds, method))
+    def plan(scene, request, pilot):
+        asked.append((request.seconds, request.method))
         return plans.Plan("primal", "oidn", True, 1.5, "for a test")
 
     monkeypatch.setattr(plans, "plan", plan)

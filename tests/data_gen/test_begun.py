@@ -10,13 +10,14 @@ from unbiased import load, same
 
 import ngpt
 from ngpt.errors import NgptError, WrongUse
+from ngpt.io.openexr import read_header
 from ngpt.stack import GradientStack
 
 pytest.importorskip("mitsuba")
 
 from data_gen import begun, passes
 from data_gen.adaptive import LEAST
-from data_gen.begun import frame_seed, part_seed, rest_of
+from data_gen.begun import frame_seed, part_seed
 from data_gen.cli import onlook, render
 from data_gen.film import GradientFilm
 from data_gen.frames.camera_path import CameraPath, Key
@@ -43,6 +44,10 @@ def box(**given):
 
 def left(path, frame=None, **given):
     return rest_of(box(**given), path, frame)
+
+
+def rest_of(asked, path, frame=None):
+    return begun.rest_of(asked, path, read_header(path)[0], frame)
 
 
 def test_a_file_is_finished_where_it_has_what_is_asked_for(tmp_path):

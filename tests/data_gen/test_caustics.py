@@ -12,6 +12,7 @@ from data_gen.caustics import share_of_caustics
 from data_gen.choosing import plans
 from data_gen.choosing.trials import Pilot
 from data_gen.render import render_stack
+from data_gen.request import RenderRequest
 
 
 def burning_glass(mi, ball="dielectric", lamp=None, film=(48, 36)):
@@ -60,17 +61,21 @@ def test_lamps_that_paths_meet_do_not_count(renderer):
     assert share_of_caustics(burning_glass(renderer, lamp=tiny)) > 0.1
 
 
+def planned(scene, seconds, method="auto", **more):
+    return plans.plan(scene, RenderRequest(scene, seconds=seconds, method=method), **more)
+
+
 def test_a_plan_takes_photons_where_there_is_time(renderer):
     scene = burning_glass(renderer)
-    planned = plans.plan(scene, 60.0)
-    assert (planned.sampler, planned.method) == ("vcm", "oidn") and 20 < planned.render < 60
-    assert "of the light is what smooth glass or mirrors make" in planned.reason
+    plan = planned(scene, 60.0)
+    assert (plan.sampler, plan.method) == ("vcm", "oidn") and 20 < plan.render < 60
+    assert "of the light is what smooth glass or mirrors make" in plan.reason
     # Too short, too large, a method that cannot use them, and nothing to find
-    assert plans.plan(scene, 5.0).sampler == "primal"
-    assert plans.plan(burning_glass(renderer, film=(1920, 1080)), 60.0).sampler == "primal"
-    assert plans.plan(scene, 60.0, "ngpt-combine").sampler == "gpt"
-    assert plans.plan(burning_glass(renderer, "diffuse"), 60.0).sampler == "primal"
-    assert plans.plan(scene, 60.0, pilot=Pilot(stop=lambda: True)).sampler == "primal"
+    assert planned(scene, 5.0).sampler == "primal"
+    assert planned(burning_glass(renderer, film=(1920, 1080)), 60.0).sampler == "primal"
+    assert planned(scene, 60.0, "ngpt-combine").sampler == "gpt"
+    assert planned(burning_glass(renderer, "diffuse"), 60.0).sampler == "primal"
+    assert planned(scene, 60.0, pilot=Pilot(stop=lambda: True)).sampler == "primal"
 
 
 def test_how_much_is_said(renderer, caplog):

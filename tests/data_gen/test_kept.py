@@ -161,6 +161,18 @@ def test_kept_references_are_met_again_with_new_inputs(monkeypatch, tmp_path):
     assert places[0] == places[1] != places[2]
 
 
+@pytest.mark.parametrize(
+    ("config", "why"),
+    [
+        (Config(scenes=1, reference_spp=0, inputs=2), "pairs .* have no references"),
+        (Config(scenes=1, frames=3), "shots"),
+    ],
+)
+def test_what_has_no_references_to_keep_is_refused(config, why, tmp_path):
+    with pytest.raises(NgptError, match=f"{why}.*leave data.kept out"):
+        stream.Stream(config, None, kept=tmp_path)
+
+
 def test_an_error_of_a_worker_reaches_the_reader(monkeypatch):
     def fail(*_):
         raise NgptError("disk full")

@@ -43,7 +43,7 @@ def test_images_of_a_wide_lens_are_made_without_features(renderer, tmp_path):
     # Only a scene with a name is known again.
     image.attributes |= RenderRequest("lens", 2).header()
     write(tmp_path / "begun.exr", image)
-    left = rest_of(RenderRequest("lens", 4), tmp_path / "begun.exr")
+    left = rest_of(RenderRequest("lens", 4), tmp_path / "begun.exr", image.attributes)
     assert left.sampler == "primal" and left.options["features"] is False
     rest = data_gen.render_scene(replace(left, scene=scene)).stack
     assert rest.names == image.names and not np.array_equal(rest["primal"], image["primal"])

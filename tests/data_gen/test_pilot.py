@@ -14,6 +14,7 @@ from data_gen.choosing.pipelines import Pipeline, usual_fall
 from data_gen.choosing.plans import best_image, best_of, simple
 from data_gen.choosing.trials import Witnesses, candidates
 from data_gen.render import render_stack
+from data_gen.request import RenderRequest
 from data_gen.samplers import SAMPLERS, Sampler
 
 SHAPE = (32, 48, 3)
@@ -104,7 +105,7 @@ def test_short_renders_are_not_measured(renderer, monkeypatch):
     scene = load(renderer, "diffuse", (48, 32))
     monkeypatch.setattr(plans, "try_all", None)
     for spp, seconds in ((1000, None), (None, 10.0), (1 << 30, 10.0), (1000, 1000.0)):
-        choice = plans.plan_sampler(scene, spp, seconds)
+        choice = plans.plan_sampler(scene, RenderRequest(scene, spp, seconds=seconds))
         assert choice.sampler == "primal" and "too short" in choice.reason and choice.render == seconds
 
 
@@ -114,7 +115,8 @@ def test_scenes_are_rendered_the_simple_way(renderer, monkeypatch):
     monkeypatch.setitem(plans.METHODS, "oidn", replace(oidn, missing=lambda: ""))
 
     def chosen(name, spp=8, **more):
-        plan = plans.plan_sampler(load(renderer, name, (64, 32)), spp, None, **more)
+        scene = load(renderer, name, (64, 32))
+        plan = plans.plan_sampler(scene, RenderRequest(scene, spp, **more))
         return plan.sampler, plan.method
 
     assert (simple("primal"), simple("ppm"), simple("gpt-basic")) == ("oidn", "primal", "wcv")
@@ -122,9 +124,9 @@ def test_scenes_are_rendered_the_simple_way(renderer, monkeypatch):
         assert chosen(scene) == chosen(scene, 1) == ("primal", "oidn")
         assert chosen(scene, gradients=True) == ("gpt", "")
     glossy = load(renderer, "glossy", (64, 32))
-    plan = plans.plan(glossy, 40.0)
+    plan = plans.plan(glossy, RenderRequest(glossy, seconds=40.0, method="auto"))
     assert (plan.sampler, plan.method) == ("primal", "oidn") and 35 < plan.render < 40 and "no time" in plan.reason
-    assert plans.plan(glossy, 5.0, "wcv").sampler == "gpt"
+    assert plans.plan(glossy, RenderRequest(glossy, seconds=5.0, method="wcv")).sampler == "gpt"
     monkeypatch.setitem(plans.METHODS, "oidn", replace(oidn, missing=lambda: "no OIDN"))
     assert chosen("glossy") == ("gpt", "")
 
@@ -153,7 +155,7 @@ def test_a_pilot_leaves_the_scene_as_it_was(renderer, monkeypatch):
     before = render_stack(scene, 2, 0, "gpt", unbiased=True)
     monkeypatch.setattr(plans, "PIXELS", 24 * 16)
     monkeypatch.setattr(plans, "candidates", lambda scene, biased, gradients: ["primal", "gpt"])
-    choice = plans.plan_sampler(scene, 1 << 30, 1e6)
+    choice = plans.plan_sampler(scene, RenderRequest(scene, 1 << 30, seconds=1e6))
     assert choice.sampler in ("gpt", "primal") and choice.reason.startswith("chosen by a pilot: expected to leave")
     after = render_stack(scene, 2, 0, "gpt", unbiased=True)
     assert all(np.array_equal(before[name], after[name]) for name in before.names)

@@ -19,6 +19,7 @@ from data_gen.adaptive import gain
 from data_gen.choosing import pipelines, plans, trials
 from data_gen.choosing.pipelines import Pipeline, choose, measure, methods_for
 from data_gen.choosing.trials import Pilot, Trial, by_processor, try_out
+from data_gen.request import RenderRequest
 
 SHAPE = (48, 64)
 
@@ -114,28 +115,32 @@ def ticking(tick):
     return lambda: tick * next(seconds)
 
 
+def planned(scene, seconds, method="auto", **more):
+    return plans.plan(scene, RenderRequest(scene, seconds=seconds, method=method), **more)
+
+
 def test_a_plan_fits_into_the_time_and_leaves_the_scene_as_it_was(renderer, monkeypatch):
     scene = load(renderer, "diffuse", (48, 32))
     monkeypatch.setattr(plans, "PIXELS", 24 * 16)
     monkeypatch.setattr(plans, "candidates", lambda scene, **_: ["gpt", "primal"])
-    found = plans.plan(scene, 200.0, pilot=Pilot(ticking(0.01)))
+    found = planned(scene, 200.0, pilot=Pilot(ticking(0.01)))
     assert found.sampler in ("gpt", "primal") and found.method in plans.methods_for(found.sampler)
     assert 0 < found.render < 200 and "expected to leave an error of" in found.reason
     assert tuple(scene.sensors()[0].film().size()) == (48, 32)
     with pytest.raises(NgptError, match="unknown method 'none'"):
-        plans.plan(scene, 200.0, "none")
+        planned(scene, 200.0, "none")
     # Where there is no time for a pilot the description decides, and what is left is rendered.
-    found = plans.plan(scene, 1.0, "wcv", pilot=Pilot(ticking(0.1)))
+    found = planned(scene, 1.0, "wcv", pilot=Pilot(ticking(0.1)))
     assert (found.sampler, found.method, found.shared) == ("gpt", "wcv", False) and 0 < found.render < 1
     assert "no time for a pilot" in found.reason
-    found = plans.plan(scene, 30.0, pilot=Pilot(ticking(5.0)))
+    found = planned(scene, 30.0, pilot=Pilot(ticking(5.0)))
     assert (found.sampler, found.method) == ("gpt", "auto") and 0 < found.render < 30
 
 
 def test_stop_ends_a_pilot_and_the_render_begins(renderer, monkeypatch):
     scene = load(renderer, "diffuse", (48, 32))
     told = []
-    found = plans.plan(scene, 4000.0, pilot=Pilot(said=told.append, stop=lambda: len(told) > 1))
+    found = planned(scene, 4000.0, pilot=Pilot(said=told.append, stop=lambda: len(told) > 1))
     assert [line.split(";")[0] for line in told] == ["pilot: trying 'primal'", "pilot: trying 'bdpt'"]
     assert (found.sampler, found.method) == ("primal", "oidn") and found.render > 0
 
@@ -158,7 +163,7 @@ def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
     cases = ((95.0, 0, None), (150.0, 1, (9, 6)), (300.0, 2, (18, 12)), (750.0, 3, (24, 16)), (1500.0, 4, (24, 16)))
     for seconds, names, size in cases:
         tried.clear()
-        found = plans.plan(scene, seconds, pilot=Pilot(ticking(1.0)))
+        found = planned(scene, seconds, pilot=Pilot(ticking(1.0)))
         assert found.sampler == "gpt" and "no time for a pilot" in found.reason
         assert [name for name, _ in tried] == ["gpt", "primal", "bdpt", "ppm"][:names]
         assert (sizes or [None])[-1] == size
@@ -193,10 +198,8 @@ def test_all_that_follows_a_render_is_counted_at_its_size(renderer, monkeypatch)
     assert found.seconds == pytest.approx(0.04)
     assert found.after == pytest.approx(0.5 * 4**0.9 + 0.8 + 3.7 * 96 * 64 / 1e6)
     # Where no pilot measured it, at most half of the time is kept for the method.
-    assert plans.plan(scene, 0.2, pilot=Pilot(lambda: 0.0)).render == pytest.approx(0.1)
-    assert plans.plan(scene, 20.0, "wcv", pilot=Pilot(lambda: 0.0)).render == pytest.approx(
-        20 - 0.8 - 6.7 * 96 * 64 / 1e6
-    )
+    assert planned(scene, 0.2, pilot=Pilot(lambda: 0.0)).render == pytest.approx(0.1)
+    assert planned(scene, 20.0, "wcv", pilot=Pilot(lambda: 0.0)).render == pytest.approx(20 - 0.8 - 6.7 * 96 * 64 / 1e6)
 
 
 def test_slow_compilation_keeps_other_samplers_out(renderer, monkeypatch):

@@ -29,22 +29,22 @@ class Path:
 
     x: mi.SurfaceInteraction3f
     place: media.Place | None  # where x is; None in scenes without media
-    channel: mi.UInt32 | None  # by which distances are sampled; None as well
-    β: mi.Spectrum  # throughput up to x; 0 of a ghost
+    channel: mi.UInt32 | None  # colour by which distances are sampled; None in scenes without media
+    β: mi.Spectrum  # throughput up to x; 0 for a ghost
     η: mi.Float  # product of the relative indices of refraction up to x
     depth: mi.UInt32  # number of x, from 1 on
     sky: Sky  # whether an escape sees the environment
-    rough: mi.Bool  # has scattered smoothly at a connectable vertex: see data_gen.paths.caustic
-    late: mi.Bool  # and has later left a vertex by a mirror, glass or sharp gloss
+    rough: mi.Bool  # the path has scattered smoothly at a connectable vertex: see data_gen.paths.caustic
+    late: mi.Bool  # and it has later left a vertex by a mirror, glass or sharp gloss
     chain: Chain | None  # see data_gen.samplers.gpt.manifold_shift; None without that shift
     walks: mi.Bool  # some path of the five may go on from x
-    aim: Aim | None = None  # in which it has come to x; None in scenes without holes
-    # Where paths may end in the cache: how far this one has come, and the reflectance for which it has ended at x
+    aim: Aim | None = None  # of the edge that has led to x; None in scenes without holes
+    # If paths may end in the cache: how far this one has come, and ρ of the part of x that the cache has supplied
     trail: Trail | None = None
     ρ: mi.Color3f | None = None
 
     def goes_on(self, plan: Plan, offsets: list) -> mi.Bool:
-        """Whether there is another step: as long as the base path lives, or a ghost has company."""
+        """Whether there is another step: while the base path lives, or offset paths are apart from a ghost."""
         company = dr.any([y.apart for y in offsets])
         return self.walks & (self.x.is_valid() | company) & (self.depth < plan.limits.max_depth)
 
@@ -53,7 +53,7 @@ class Path:
 class Recording:
     """What a path records for the cache."""
 
-    any: mi.Bool  # it has a record, and all light that it finds is of use
+    any: mi.Bool  # it has a record: light that it finds before is of no use
     here: mi.Bool  # its newest record is at the current vertex
 
 
@@ -75,7 +75,7 @@ class Step:
     light_weight: mi.Spectrum  # Le / p
     lamp: Chosen | None  # None where lamps are not chosen by place
     T_light: mi.Spectrum | int  # transmittance
-    lit: mi.Bool  # the sample is seen from x, or is of no use
+    lit: mi.Bool  # the sample is visible from x, or nothing uses it and it was not tested
     L_light: mi.Spectrum  # f m Le V / p
     # BSDF sampling
     wo: mi.Vector3f
@@ -95,11 +95,11 @@ class Step:
     L_bsdf: mi.Spectrum  # m Le
     # See data_gen.paths.caustic; L_light and L_bsdf hold nothing of that layer
     L_caustic: mi.Spectrum  # f m Le / p of both techniques
-    ends_late: mi.Bool  # the path is late behind x, or behind x1 at the latest
+    ends_late: mi.Bool  # the path is late after x, or after x1 at the latest
     # See data_gen.samplers.gpt.manifold_shift; L_bsdf and L_caustic hold nothing of that light
     L_followed: mi.Spectrum  # m Le
-    more: mi.UInt32 | int  # edges that may follow behind x1
-    # In scenes with holes: whether x was one, and in which aim the path is behind x
+    more: mi.UInt32 | int  # number of edges that may follow after x1
+    # In scenes with holes: whether the path has passed one at x, and its aim after x
     passed: mi.Bool | None = None
     aim: Aim | None = None
     # For a matt surface of reflectance 1 at x: f m Le V / p, and f / p, survival included. None where no path ends in
@@ -109,7 +109,7 @@ class Step:
 
 
 def begin(plan: Plan, x: mi.SurfaceInteraction3f, place, channel, β: mi.Spectrum) -> Path:
-    """Returns a base path at its first vertex. A path that finds no vertex has throughput 0, but may walk on as a
+    """Returns a base path at its first vertex. A path that has found no vertex has throughput 0, but may walk on as a
     ghost.
     """
     return Path(
@@ -131,11 +131,11 @@ def begin(plan: Plan, x: mi.SurfaceInteraction3f, place, channel, β: mi.Spectru
 def base_step(
     scene, plan: Plan, random, path: Path, offsets: list, recording: Recording | None = None
 ) -> tuple[Step, Path]:
-    """Samples an emitter and the next vertex from the ``path``'s vertex; returns that step, and the path behind it.
+    """Samples an emitter and the next vertex from the ``path``'s vertex. Returns that step, and the path after it.
 
-    Random numbers are drawn whether used or not: a replay needs the same ones, whatever its path meets. A path
-    that is ``recording`` goes on from its newest record as if the surface were matt and white too, see
-    ``data_gen.samplers.gpt.tails``.
+    All random numbers are drawn, also those that are not used: a replay needs the same numbers, whatever its path
+    meets. A path that is ``recording`` leaves the vertex of its newest record as if the surface were also matt and
+    white: see ``data_gen.samplers.gpt.tails``.
     """
     x, place, space = path.x, path.place, plan.space
 
@@ -147,12 +147,12 @@ def base_step(
     # --------------------- Emitter sampling ----------------------
     bsdf = x.bsdf()
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) | media.scatters(place)
-    # Offset paths take over the point on a shared emitter, with shadow rays of their own: Le / p must come without V.
+    # Offset paths use the same point on the emitter, with their own shadow rays. So Le / p must not include V.
     light, light_weight, lamp = plan.lights.sample(scene, x, u_light, lit)
     lit &= light.pdf != 0
     if recording:
         lit &= recording.any
-    # Toward the emitter and along a new direction at once
+    # One call evaluates the direction to the emitter and samples a new direction.
     to_light = x.to_local(light.d)
     E_light: Any = None
     E_p: Any = None
@@ -170,7 +170,7 @@ def base_step(
         f_p, survival_of_rest = rest(f_p, path.ρ * E_p)
         followed = u_survival < survival_of_light
         f = dr.select(followed, f * dr.rcp(dr.maximum(survival_of_light, 1e-20)), 0)
-    # No shadow ray toward what lies behind the surface, except for paths that arrive from elsewhere.
+    # No shadow ray is traced where f is 0, as behind the surface, unless a joined path arrives there from elsewhere.
     asked = dr.max(dr.abs(f)) > 0
     if recording:
         asked |= recording.here & (E_light > 0)
@@ -178,7 +178,7 @@ def base_step(
     more = plan.limits.max_depth - path.depth - 1
     T_light, visible = space.sees(x, place, light.p, drawn, asked, most=more)
     lit &= visible
-    # The sample's share of L (survey, eq. 2), weighted by m against the density p of finding it by BSDF sampling
+    # The contribution of the sample to L (survey, eq. 2), with its MIS weight m. BSDF sampling finds it with density p.
     Le_light = light_weight * light_mis(light.delta, light.pdf, p)
     L_light = dr.select(lit, f * Le_light, 0) * T_light
     if path.ρ is not None:
@@ -186,13 +186,14 @@ def base_step(
 
     # ----------------------- BSDF sampling -----------------------
     found = sample.pdf > 0
-    # At its end a base path reconnects to nothing: with DELTA its offset paths are sent to replay, beside a ghost.
+    # Where a base path ends, there is nothing to reconnect to. DELTA makes its offset paths replay, beside a ghost.
     kind = dr.select(found, event_kind(sample.sampled_type), DELTA)
     sky = path.sky.behind(kind)
     η = dr.select(found, path.η * sample.eta, path.η)
 
     # ---------------------- Russian roulette ---------------------
-    # The rest of f, where it is followed, is as bright as f. Otherwise it would have to survive twice.
+    # Roulette uses the brightness that the rest has if it is followed. Otherwise a faint rest would have to survive
+    # twice.
     whole = f_p * dr.rcp(dr.maximum(survival_of_rest, 1e-20))
     largest = brightest(path.β * whole, whole, offsets)
     if recording:
@@ -212,8 +213,8 @@ def base_step(
     if path.ρ is not None:
         E_p = dr.select(goes_on, E_p * survival, 0)
     if recording:
-        # All later light belongs to the record, however dark the surface is. Behind a mirror it belongs to earlier
-        # records only.
+        # All later light belongs to the record, however dark the surface is. After a mirror event it belongs only to
+        # earlier records, and E_p is 0.
         β1 = dr.select(recording.here, dr.maximum(β1, E_p * segment.weight), β1)
     # After a mirror emitter sampling could not have found x1: p_light = 0, and m = 1.
     aim, passed, seen_by, sampled, p_x1 = None, None, x, kind == SMOOTH, sample.pdf
@@ -299,23 +300,25 @@ def base_step(
 
 
 def brightest(β1: mi.Spectrum, f_p: mi.Spectrum, offsets: list) -> mi.Float:
-    """Returns the throughput of the brightest of the five paths behind a step. Russian roulette uses it, so no path is
-    starved.
+    """Returns the throughput of the brightest of the five paths after a step. Russian roulette uses it, so that no path
+    is starved.
     """
     largest = dr.max(dr.abs(β1))
     for y in offsets:
-        # The most that an offset path may still contribute to Δ / 2: w β' until it is settled, with its β' of before
-        # this step, since its f is not known yet; then w |β' - β|, which is |a| / 2.
+        # The most that an offset path can still contribute to Δ / 2. Until it is settled, this is w β', with β' from
+        # before this step, because its f is not known yet. Then it is w |β' - β| = |a| / 2.
         ahead = dr.select(y.apart | y.joined, dr.max(y.β) / (1 + y.r), 0)
         largest = dr.fmax(largest, dr.fmax(ahead, dr.max(dr.abs(y.a * f_p)) / 2))
     return largest
 
 
 def matt_too(plan: Plan, path: Path, recording: Recording | None) -> mi.Bool | None:
-    """Returns where all directions into which a matt surface scatters must be sampled, even those that the material
-    does not sample. None stands for nowhere. A record holds the light that arrives at a matt surface. Where the cache
-    has supplied a vertex's matt part, the rest is negative in directions into which a material, tilted by a bump or
-    normal map, scatters nothing. So these directions count, too.
+    """Returns the lanes in which all directions of a matt surface must be sampled, even those that the material does
+    not sample. None stands for no lane.
+
+    A record needs them, because it holds the light that arrives at a matt surface. They also count where the cache has
+    supplied the matt part of a vertex, if a bump or normal map tilts the material: in directions into which the
+    material scatters nothing, the rest is negative.
     """
     x, both = path.x, None
     if path.ρ is not None and plan.matt.any_tilted:
@@ -327,8 +330,8 @@ def matt_too(plan: Plan, path: Path, recording: Recording | None) -> mi.Bool | N
 
 
 def rest(f: mi.Spectrum, ended: mi.Spectrum) -> tuple[mi.Spectrum, mi.Float]:
-    """Returns the rest of ``f`` after the cache has supplied ``ended``, and the probability to follow it. The
-    probability is the rest's size relative to f, so a path that is followed weighs as much as f."""
+    """Returns the rest of ``f`` after the cache has supplied ``ended``, and the probability of following it. The
+    probability is the size of the rest relative to f, so that a path that follows it has the brightness of f."""
     left = f - ended
     size = dr.max(dr.abs(left)) / dr.maximum(dr.max(dr.abs(f)), 1e-20)
     return left, dr.select(dr.max(ended) > 0, dr.minimum(size, 1), 1)

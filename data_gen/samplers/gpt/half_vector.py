@@ -1,7 +1,7 @@
 """The shift "half-vector": an offset path leaves its vertex with the half-vector of its base path's event.
 
-It is taken instead of random sequence replay where the base path goes on by a smooth event. [Kettunen et al. 2015,
-section 5.2 and supplement; Hua et al. 2019, section 3.2]
+It replaces random sequence replay where the base path goes on by a smooth event. [Kettunen et al. 2015, section 5.2 and
+supplement; Hua et al. 2019, section 3.2]
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Departure:
 
 def copy_where_smooth(step: Step, y: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, replayed: Departure) -> Departure:
     """Returns the departure from ``y`` with the base path's half-vector if it has one, else ``replayed``."""
-    # A Dirac event has no density to divide by. It is replayed, which gives the same direction as its half-vector.
+    # A Dirac event has no density to divide by. It is replayed, which gives the same direction as the half-vector.
     copies = step.goes_on & (step.kind == SMOOTH)
     same = y.bsdf() == step.x.bsdf()
     wo, J, exists = shift.copy_half_vector(step.x.wi, step.wo, step.η, y.wi, same)
@@ -42,9 +42,11 @@ def copy_where_smooth(step: Step, y: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, 
         wo=dr.select(copies, wo, replayed.wo),
         p=dr.select(copies, p, replayed.p),
         kind=dr.select(copies, SMOOTH, replayed.kind),
-        # The same half-vector does not take the same numbers (survey, eq. 15): |J| stays, in f |J| / p and in r.
+        # The same half-vector does not mean the same random numbers (survey, eq. 15). So |J| does not cancel in
+        # f |J| / p and in r.
         f_p=dr.select(copies, f * (J / step.p), replayed.f_p),
         r=dr.select(copies, p * J / step.p, replayed.r),
-        # Past the end of its base path an offset path has no half-vectors to copy. The reverse shift has none either.
+        # A replayed smooth event is rejected, since the reverse shift would copy its half-vector. Beside a ghost
+        # neither shift has a half-vector to copy.
         allowed=dr.select(copies, found, (replayed.kind != SMOOTH) | ~step.x.is_valid()),
     )

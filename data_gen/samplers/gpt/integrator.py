@@ -76,8 +76,8 @@ class GPT(GradientIntegrator):
     shift "half-vector" is rarely better than "replay"; for "manifold" see ``manifold_shift``, for the other options
     ``data_gen.paths.caustic`` and ``data_gen.tails``.
 
-    Not handled: polarised variants, for which rendering raises NgptError. Through media only "replay" goes. There is no
-    limit to the collisions in grids, and each null event at a mask or a thin pane counts in ``max_depth``.
+    Not handled: polarised variants, for which rendering raises NgptError. In media only the shift "replay" works. The
+    number of collisions in grids is not limited. Each null event at a mask or a thin pane counts in ``max_depth``.
     """
 
     def __init__(self, props: mi.Properties):
@@ -93,7 +93,7 @@ class GPT(GradientIntegrator):
     def parameters(cls, scene: mi.Scene) -> dict[str, Any]:
         return super().parameters(scene) | {"volumes": integrator_name(scene) in VOLUMETRIC}
 
-    # This is no attribute, since each render of a plugin decides it anew.
+    # Not an attribute, because each render of a plugin decides it anew.
     @property
     def shared(self) -> bool:
         return self.options["tails"] == "shared"
@@ -116,7 +116,7 @@ class GPT(GradientIntegrator):
         return make_plan(scene, self.limits, self.roughness_threshold, self.shift, **more)
 
     def sample_pass(self, frozen: Frozen, plan: Plan, known: Known | None, camera: CameraSamples, film: GradientFilm):
-        """Takes one base path and its four offset paths for each camera sample; paths end in what is ``known``."""
+        """Traces one base path and its four offset paths for each camera sample. Paths may end in what is ``known``."""
         values, Δ, inside, rest = frozen(self.samples, plan, known, camera.look((0, 0), *SHIFTS.values(), *QUARTERS))
         if self.reuse:
             values["primal"] = reused(camera, rest, Δ, inside) + values["direct"]
@@ -126,14 +126,14 @@ class GPT(GradientIntegrator):
         film.put_all(values | dict(zip(SHIFTS, zip(Δ, inside, strict=True), strict=True)))
 
     def samples(self, plan: Plan, known: Known | None, camera: CameraSamples) -> tuple[dict, list, list, Any]:
-        """Returns the layers, Δ in the order of SHIFTS, where it is on the film, and what some options need: A of Δ, or
-        a chain.
+        """Returns the layers, Δ in the order of SHIFTS, whether each of its neighbours is on the film, and what some
+        options need: A for ``reuse``, or the chain for the shift "manifold".
         """
         # ------------------------- Paths -----------------------------
         scene, (ray, importance, _) = plan.space.scene, camera.rays()
         within = plan.space.around(camera.sensor)
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
-        # Clones of the random numbers, here and below: features draw as many as they like, and change no path.
+        # Paths and features use clones of the random numbers, so that the numbers drawn for features change no path.
         paths = trace(self, plan, camera.random.clone(), (ray, importance), shifted, within, known=known)
         Le = self.emission_in_pixel(scene, camera, paths.Le, plan.space.media, within)
         L, Le, L_caustic = (to_rgb(light, ray.wavelengths) for light in (paths.L, Le, paths.L_caustic))

@@ -3,17 +3,17 @@
 Replay loses such light: from beside z_b, the same direction does not lead to the same small lamp. Here the offset path
 goes through the same events to the same point x_c of the lamp, by the walks of ``data_gen.paths.manifold``.
 
-    z_b, z_b'   the first vertices that are left by a smooth event, after as many specular ones from the camera
-    ω, ω'       directions there; k specular events further on, k = 1 .. 6, both paths meet the lamp at x_c
+    z_b, z_b'   the first vertices that the paths leave by a smooth event, after equally many specular events
+    ω, ω'       directions there; after k further specular events, k = 1 .. 6, both paths meet the lamp at x_c
     F           product of the reflectances of the k events; P: product of the probabilities to take them
     b, b'       f(x) / p(x) and f(y) |J| / p(x); p, p' densities of ω at z_b, ω' at z_b'
     r           p' P' J / (p P)
     Δ           2 (b' - b) / (1 + r), or -2 b where no walk leads there and back
 
 Up to z_b' the offset path replays the base path's random numbers, with r = 1. Only BSDF sampling finds this light,
-since emitter sampling finds no lamp behind glass. These paths are a class of their own, so they are shifted apart from
-all other light. The kernel of ``gpt`` only leaves one record for each lane. Such paths are rare, so this kernel runs
-only on the few lanes that have a record, four times as wide, one for each direction.
+since emitter sampling finds no lamp behind glass. These paths are a class of their own, so they are shifted separately
+from all other light. The kernel of ``gpt`` leaves one record in each lane that has found such a path. Such paths are
+rare, so a second kernel runs only for lanes with a record. It has four lanes for each record, one for each offset path.
 
 [Hua et al. 2019, sections 3.4 and 3.5]
 """
@@ -33,7 +33,8 @@ from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import SMOOTH, evaluate, event_kind, seen_from
 from data_gen.samplers.gpt.plan import Plan
 
-# States of a chain, in its highest bits: no rough vertex so far; one, with the events behind it; none that is followed.
+# States of a chain, in its highest bits: no rough vertex so far; a rough vertex, with the events after it in the lower
+# bits; a chain that is not followed.
 _BEFORE, _OPEN, _LOST = 0, 1 << 31, 1 << 30
 _EVENT_BITS = 2 * MAX_EVENTS
 _EVENTS = (1 << _EVENT_BITS) - 1
@@ -43,8 +44,8 @@ _EVENTS = (1 << _EVENT_BITS) - 1
 class Chain:
     """What a base path remembers of its earlier vertices.
 
-    ``record``    steps before z_b and, in the lowest bits, the events behind it; 0 while nothing is found there
-    ``survival``  product of the factors of Russian roulette, up to where it is found
+    ``record``    number of steps before z_b and, in the lowest bits, the events after it; 0 if no lamp is found there
+    ``survival``  product of the factors of Russian roulette, up to that lamp
     """
 
     state: mi.UInt32
@@ -52,26 +53,27 @@ class Chain:
     survival: mi.Float
 
     def end(self, depth, survival, late, x1, Le) -> tuple[Chain, mi.Bool]:
-        """Behind the ``depth``-th vertex: whether the chain ends at ``x1``, where it finds ``Le``, and then its record.
+        """The chain after the ``depth``-th vertex, with a record if it ends at ``x1``, and whether it ends there.
 
-        Only ``late`` light is followed: for a lamp behind panes only, replay is no worse.
+        It ends where it finds ``Le``. Only ``late`` light is followed: replay is as good for a lamp behind panes only.
         """
-        # A lane has one record. A lamp that is also a mirror could be met again later.
+        # A lane has room for one record. From a lamp that is also a mirror, the path could go on to another lamp.
         sharp = mi.has_flag(x1.bsdf().flags(), mi.BSDFFlags.Delta) | mi.has_flag(x1.bsdf().flags(), mi.BSDFFlags.Null)
         ends = late & (self.state > _OPEN) & ~(x1.is_valid() & sharp) & (dr.max(Le) > 0)
         events = self.state & _EVENTS
         k = (33 - dr.lzcnt(events)) >> 1
         record = dr.select(ends, ((depth - 1 - k) << _EVENT_BITS) | events, self.record)
-        # Later light does not belong to the record.
+        # Roulette after the record does not belong to it.
         return Chain(self.state, record, dr.select(self.record == 0, self.survival * survival, self.survival)), ends
 
 
 def no_chain(lanes: int) -> Chain:
+    """The chains of paths at their first vertices."""
     return Chain(dr.zeros(mi.UInt32, lanes), dr.zeros(mi.UInt32, lanes), dr.full(mi.Float, 1, lanes))
 
 
 def advance(chain: Chain, sampled_type, goes_on, connectable) -> Chain:
-    """The chain behind an event at a vertex that is ``connectable`` or not."""
+    """The chain after an event at a vertex that is ``connectable`` or not."""
     code = event(sampled_type)
     before, open_ = chain.state == _BEFORE, chain.state >= _OPEN
     longer, fits = add_event(chain.state & _EVENTS, code)
@@ -83,18 +85,18 @@ def advance(chain: Chain, sampled_type, goes_on, connectable) -> Chain:
 
 @dataclass
 class Recorded:
-    """What some lanes have recorded, for one of the offset paths of each."""
+    """The record of each lane, and the offset path that the lane shifts."""
 
-    shift: mi.Vector2f  # that displaces the offset path, in pixels
+    shift: mi.Vector2f  # of the offset path, in pixels
     word: mi.UInt32  # the ``record`` of ``Chain``
     survival: mi.Float
-    exists: mi.Bool
+    exists: mi.Bool  # False in lanes that only fill up a packet
 
 
 def add_followed(plan: Plan, first_hit, camera: CameraSamples, shifts, chain: Chain, Δ: list) -> list:
     """``Δ``, colours of all lanes for each of the ``shifts``, with the samples of all recorded paths added.
 
-    ``first_hit`` is where a camera ray leads. All arguments are evaluated.
+    ``first_hit`` (ray) is the first intersection of a camera ray. All arguments are evaluated.
     """
     lanes, exists = in_packets(np.array(dr.compress(chain.record != 0)), camera)
     if not len(lanes):
@@ -152,7 +154,7 @@ def followed(plan: Plan, first_hit, camera: CameraSamples, recorded: Recorded) -
     J *= shot.P / (sample.pdf * base.P)
     b1 = β1 * f1 * shot.weight * (J * survival) * emitter.eval(seen_from(x_c, shot.ray.d), exists)
     r = p1 * J
-    # The reverse shift begins where the offset path may: it needs the same kind of vertex.
+    # The reverse shift begins at z_b', which must be connectable as well.
     exists &= plan.materials.connectable(z1.bsdf()) & (p1 > 0) & dr.isfinite(r) & dr.isfinite(dr.sum(b1))
     Δ = gradient_weight(r, exists) * (dr.select(exists, b1, 0) - b)
     return to_rgb(dr.select(active & dr.isfinite(dr.sum(b)), Δ, 0), camera_ray.wavelengths)

@@ -23,21 +23,21 @@ from data_gen.samplers.gpt.plan import Plan
 class Offset:
     """The state of one offset path at the current vertex of its base path."""
 
-    ray: mi.Ray3f  # apart: led to the offset path's own vertex; joined: to the shared one
-    hit: mi.PreliminaryIntersection3f  # apart: that vertex
-    place: media.Place | None  # apart: where it is; None in scenes without media
+    ray: mi.Ray3f  # to the path's own vertex while it is apart, to the shared vertex when it is joined
+    hit: mi.PreliminaryIntersection3f  # while apart: at its own vertex
+    place: media.Place | None  # while apart: of that vertex; None in scenes without media
     β: mi.Spectrum
     r: mi.Float
     apart: mi.Bool
     joined: mi.Bool
     sky: Sky  # whether an escape sees the environment
     rough: mi.Bool  # see data_gen.paths.caustic; it is never late
-    a: mi.Spectrum  # settled: all that follows in Δ is a times what the base path finds
+    a: mi.Spectrum  # once settled: all that follows in Δ is a times what the base path finds
     Δ: mi.Spectrum  # 2 w (C(y) |J| - C(x)) / p(x), so far
-    w2: mi.Float  # settled: 2 w of all that follows
+    w2: mi.Float  # once settled: 2 w of all that follows
     A: mi.Spectrum  # 2 w C(x) / p(x), the base path's part of Δ, so far
-    failed: mi.Bool  # the base path went on to where no offset path corresponds to it
-    # In scenes with holes: its own aim; settled: ``p`` of it, which is the base path's from the next scattering on
+    failed: mi.Bool  # the base path has taken a step to which no offset path corresponds
+    # In scenes with holes: its own aim. Once settled only ``p`` counts, the base path's from the next scattering on
     aim: Aim | None = None
 
 
@@ -69,17 +69,17 @@ class Move:
 
 
 def start(plan: Plan, base: Path, first: Segment, importance: mi.Spectrum, inside: mi.Bool) -> Offset:
-    """Returns an offset path behind its ``first`` segment, ``inside`` the film or not. It has ended if it finds no
+    """Returns an offset path after its ``first`` segment, ``inside`` the film or not. It has ended if it has found no
     vertex.
 
-    A base path that has ended there walks on as a ghost if the kernel can replay, else the shift is rejected.
+    A base path that has ended walks on as a ghost if the kernel can replay. Otherwise the shift is rejected.
     """
     hit, none = first.hit, dr.zeros(mi.Spectrum, dr.width(first.hit.t))
     lives = inside & hit.is_valid()
     ended = inside & ~hit.is_valid() & base.x.is_valid()
-    # From the neighbour's side, a base path that has ended there would walk on as a ghost, and this path would be
-    # replayed beside it. Both have the same random numbers, hence r = 1 and w = 1/2. Without ghosts nothing shifts
-    # back, and w = 1 (survey, section 3.5).
+    # An offset path that has ended beside a living base path: for the neighbour, the ended path is the base path. It
+    # would walk on as a ghost, and the living path would be replayed beside it. Both use the same random numbers, so
+    # r = 1 and w = 1/2. Without ghosts there is no reverse shift, and w = 1 (survey, section 3.5).
     w2_ended = 1 if plan.replays else 2
     return Offset(
         ray=mi.Ray3f(first.ray),
@@ -93,7 +93,7 @@ def start(plan: Plan, base: Path, first: Segment, importance: mi.Spectrum, insid
         rough=mi.Bool(False),
         a=dr.select(ended, -base.β * w2_ended, 0),
         Δ=none,
-        # Beyond the border of the film no path could take its part of the weight.
+        # Outside the film no path could take the other part of the weight.
         w2=dr.select(ended, w2_ended, dr.select(inside, mi.Float(0), 2)),
         A=mi.Spectrum(none),
         failed=mi.Bool(False) if plan.replays else ended,
@@ -105,9 +105,9 @@ def next_steps(scene, plan: Plan, step: Step, offsets: list[Offset], first: bool
     """Takes all offset paths along a step. In the ``first`` step all of them are apart, and none is joined. In most
     later steps all of them are settled.
 
-    Loops over the four of them keep the kernel small, and are recorded in a fraction of the time. Their state rotates,
-    so that each path stays in registers when its turn comes. Rare branches are real ones, not masks: they cost 2.5
-    times less.
+    Loops over the four paths keep the kernel small, and are recorded in a fraction of the time. Their state rotates, so
+    that the path whose turn it is stays in registers. Rare branches are real branches and not masks, which makes them
+    2.5 times cheaper.
     """
     if not offsets:
         return []
@@ -138,16 +138,16 @@ def next_steps(scene, plan: Plan, step: Step, offsets: list[Offset], first: bool
 
 def settle(step: Step, offsets: list[Offset]) -> None:
     """Adds to settled paths what the base path finds in this step."""
-    # Both paths are one by now. With all that came before in a = 2 w (β' - β), the sample 2 w (C(y) |J| - C(x)) / p(x)
-    # of either technique is a times what the base path finds (survey, eq. 4 and 16).
+    # From here on both paths are the same. All that came before is in a = 2 w (β' - β). So the sample
+    # 2 w (C(y) |J| - C(x)) / p(x) of either technique is a times what the base path finds (survey, eq. 4 and 16).
     C = step.L_light + step.f_p * step.L_bsdf
     for y in offsets:
         y.Δ = y.Δ + y.a * C
         y.A = y.A + y.w2 * step.β * C
         y.a = y.a * step.f_p
         if y.aim is not None:
-            # Only m differs: one had arrived from elsewhere at the vertex from which both came straight on through
-            # holes.
+            # Only m differs. Both paths have come straight on through holes from the vertex before, where the offset
+            # path had arrived from elsewhere.
             β1 = y.a + y.w2 * step.β1  # 2 w β'
             m = mis_weight(y.aim.p, step.p_light) - mis_weight(step.aim.p, step.p_light)
             y.Δ = y.Δ + dr.select(step.passed & (dr.max(dr.abs(β1)) > 0), β1 * step.Le * m, 0)
@@ -163,20 +163,20 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
 
     # ----------------- Emitter sampling: replay ------------------
     L_light, r_light = replayed_light(scene, plan, step, path, own)
-    # Survey, eq. 16, with the weights of eq. 17; β' holds the |J| of all steps before.
+    # Survey, eq. 16, with the weights of eq. 17. β' includes the |J| of all earlier steps.
     w2_light = gradient_weight(path.r * r_light, True)
     Δ = path.Δ + w2_light * (path.β * L_light - step.β * step.L_light)
 
     # ------------- BSDF sampling: reconnect, or part -------------
     joins = step.goes_on & shift.reconnects(step.kind, step.x_connectable, step.x1_connectable, own.connectable)
-    # Beside a ghost as well, which walks but does not go on
+    # Also beside a ghost: a ghost walks, but does not go on.
     parts = step.walks & ~joins & ~step.ends_late
     move = dr.if_stmt((no_move(path),), joins, lambda move: reconnect(scene, plan, step, own, move), lambda move: move)
     if plan.replays:
         move = dr.if_stmt((move,), parts, lambda move: part(scene, plan, step, own, move), lambda move: move)
 
     # --------------------- Weight and gradient -------------------
-    # One ratio p' |J| / p for each step: products of densities along a path would leave float32 (survey, eq. 17).
+    # One ratio p' |J| / p for each step (survey, eq. 17): products of densities would leave the range of float32.
     β1, r1 = path.β * move.f_p, path.r * move.r
     good = move.good & dr.isfinite(r1) & dr.isfinite(dr.sum(β1))
     β1, r1 = dr.select(good, β1, 0), dr.select(good, r1, 0)
@@ -204,12 +204,12 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
 
 
 def replayed_light(scene, plan: Plan, step: Step, path: Offset, own: Own) -> tuple[mi.Spectrum, mi.Float | int]:
-    """f m Le V / p of the emitter that the base path's random numbers lead to from y, and a factor of r.
+    """f m Le V / p of the emitter to which the base path's random numbers lead from y, and a factor of r.
 
-    Densities of the same numbers cancel (survey, eq. 6 and 7), so r stays what it was, and the numbers lead to, or
-    near, the same point of an emitter. It is never rejected: an emitter that y does not see is a sample of value 0, and
-    the reverse shift knows it as such. Where an emitter is chosen by place, y takes the same one, where it has another
-    probability: the ratio of the two does not cancel.
+    The numbers lead to, or near, the same point of an emitter. Densities of the same numbers cancel (survey, eq. 6 and
+    7), so the factor is 1. The shift is never rejected: an emitter that y does not see is a sample of value 0, also for
+    the reverse shift. Where lamps are chosen by place, y takes the same lamp, but with another probability. The ratio
+    of the two probabilities does not cancel: it is the factor of r.
     """
     y, bsdf = own.y, own.bsdf
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) | media.scatters(own.place)
@@ -219,7 +219,7 @@ def replayed_light(scene, plan: Plan, step: Step, path: Offset, own: Own) -> tup
     else:
         light, r = replay_lamp(lights, base, weight, step.lamp, step.x, y, lit=lit)
     f, p = media.evaluate_vertex(bsdf, y, own.place, y.to_local(light.d), lit)
-    # A shadow ray where there is something to be shadowed
+    # A shadow ray only where there is light to block
     L_light = f * light.weight
     T, visible = plan.space.sees(y, own.place, light.target, step.drawn, dr.max(L_light) > 0, most=step.more)
     # Each path has its own m: from y, the emitter is found with other densities than from x.
@@ -236,9 +236,9 @@ def no_move(path: Offset) -> Move:
 
 
 def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
-    """Connects straight to the base path's next vertex, or follows its direction if it escapes."""
+    """Connects straight to the base path's next vertex, or follows its direction if the base path escapes."""
     # ------------------------ The segment ------------------------
-    # An escape is a vertex at infinity: all directions to it are the same one.
+    # An escape is a vertex at infinity: the direction to it is the same from everywhere.
     x1, y = step.x1, own.y
     reaches = x1.is_valid()
     ray = dr.select(reaches, y.spawn_ray_to(x1.p), y.spawn_ray(step.x.to_world(step.wo)))
@@ -247,12 +247,12 @@ def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
     # ---------------------- Its throughput -----------------------
     # In the measure of areas J would be 1 (survey, section 3.3); all densities here are in solid angle.
     in_medium = media.scatters(step.segment.place)
-    # Rays begin a little above their surface, which in a scene of millimetres, or a kilometre away, is not little.
+    # Rays begin a little above their surface. In a scene of millimetres, or far from the origin, this distance counts.
     origin = step.x.spawn_ray_to(x1.p).o
     J = dr.select(reaches, shift.reconnection_jacobian(origin, ray.o, x1.p, x1.n, in_medium), 1)
     f, p = media.evaluate_vertex(own.bsdf, y, own.place, y.to_local(direction))
-    # Rejected if occluded, unlike a shadow ray: no path through an obstacle is sampled, so none is shifted back. Moves
-    # with p = 0 are rejected already.
+    # If the segment is occluded, the shift is rejected: no path through an obstacle is sampled, so none is shifted
+    # back. An occluded shadow ray, in contrast, is a sample of value 0. Moves with p = 0 are rejected already.
     T, T_c, occluded = plan.space.reconnect(y, own.place, ray, x1, step.segment, step.drawn, active=p > 0)
 
     # ---------------------- Emission at x1 -----------------------
@@ -264,7 +264,7 @@ def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
         ray=mi.Ray3f(y.p, direction, y.time, y.wavelengths),
         hit=move.hit,
         place=own.place,
-        # f |J| over the density of the *base* path (survey, eq. 4): p' enters only by the weight.
+        # f |J| over the density of the *base* path (survey, eq. 4): p' enters only through the weight.
         f_p=dr.select(p > 0, f * (J / step.p * step.survival), 0) * T,
         r=J * p / step.p * T_c,
         sky=Sky(mi.Bool(True)),
@@ -277,7 +277,7 @@ def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
 
 
 def part(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
-    """A move in a direction of its own, with the half-vector of the base path or along its random numbers."""
+    """Moves in a direction of its own, which has the base path's half-vector or comes from its random numbers."""
     # -------------------- Random sequence replay -----------------
     # |J| = p / p' (survey, eq. 6), hence f |J| / p = f / p', which is what sampling returns (eq. 7), and r = 1.
     y = own.y
@@ -290,7 +290,7 @@ def part(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
 
     # --------------- Next vertex, and Le there -------------------
     sky = move.sky.behind(kind) if plan.hides else move.sky
-    # The same random number has the same density in other media.
+    # The distance comes from the same random number, so densities cancel in other media, too.
     segment = plan.space.fly(y, own.place, y.spawn_ray(y.to_world(leaves.wo)), step.drawn, found)
     y1 = plan.space.end(y, segment)
     reaches = found & y1.is_valid()
@@ -302,11 +302,11 @@ def part(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
     Le, p_light = emission(scene, y1, seen_by, seen, sampled, plan.lights)
 
     # ----------------- Would it be shifted back? -----------------
-    # Reject what would not be, or the weights of the pair would not sum to 1 (survey, section 3.5).
+    # If not, the move is rejected. Otherwise the weights of the pair would not sum to 1 (survey, section 3.5).
     y1_connectable = ~reaches | plan.materials.connectable(y1.bsdf()) | media.scatters(segment.place)
     inverts = shift.replay_inverts(kind, own.connectable, y1_connectable, step.x_connectable)
-    # Light of the layer ``caustic`` has no differences. If one of the two paths is late, the shift back meets a late
-    # path, too. A base path that is late, or will be, has not come this far.
+    # Light of the layer ``caustic`` has no differences. The reverse shift rejects late paths in the same way. Beside a
+    # base path that is late, or will be, this code is not reached.
     rough = move.rough
     if plan.caustic:
         rough, late = caustic.classes(rough, mi.Bool(False), found, kind, own.connectable)
@@ -328,12 +328,12 @@ def part(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
 
 
 def step_joined(step: Step, path: Offset) -> Offset:
-    """A step from the shared vertex x, to which a joined offset path has come from elsewhere; settles it."""
+    """A step of a joined offset path, which has come to the shared vertex x from elsewhere. It settles the path."""
     y = seen_from(step.x, path.ray.d)
     bsdf = y.bsdf()
 
     # --------------- Emitter sampling: the same sample -----------
-    # One vertex, one emitter, one shadow ray: only f and m know from where the path has come.
+    # Vertex, emitter and shadow ray are shared. Only f and m depend on where the path has come from.
     f, p = media.evaluate_vertex(bsdf, y, step.place, y.to_local(step.light.d), step.lit)
     L_light = dr.select(step.lit, f * step.light_weight * light_mis(step.light.delta, step.light.pdf, p), 0)
     L_light *= step.T_light
@@ -341,11 +341,12 @@ def step_joined(step: Step, path: Offset) -> Offset:
     Δ = path.Δ + w2_light * (path.β * L_light - step.β * step.L_light)
 
     # -------------- BSDF sampling: the same direction ------------
-    # J = 1 (same vertex, same direction), but sampled with another p' after another arrival: the last factor of r.
+    # J = 1: same vertex, same direction. But p' differs, since the path has arrived from elsewhere. This is the last
+    # factor of r that is not 1.
     f, p = media.evaluate_vertex(bsdf, y, step.place, step.wo, step.goes_on)
     β1 = path.β * dr.select(p > 0, f * (step.survival / step.p), 0) * step.segment.weight
     r1 = path.r * p / step.p
-    # Where the base path has ended r1 is not finite, and both halves of what follows are 0, whatever w.
+    # Where the base path has ended, r1 is not finite. Both terms of what follows are 0 there, whatever w is.
     good = shift.keeps_joined(step.kind) & dr.isfinite(r1) & dr.isfinite(dr.sum(β1))
     β1 = dr.select(good, β1, 0)
     L_bsdf = step.Le * mis_weight(p, step.p_light)

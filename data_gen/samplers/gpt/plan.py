@@ -27,12 +27,12 @@ class Plan:
     replays: bool  # offset paths may stay apart for more than a step: there are mirrors, glass, holes or polish
     half_vectors: bool  # smooth events that cannot be reconnected are shifted by half-vector copy, else by replay
     caustic: bool  # light that no shift can follow goes into a layer of its own, see ``data_gen.paths.caustic``
-    manifold: bool  # some of it is followed all the same, see ``data_gen.samplers.gpt.manifold_shift``
+    manifold: bool  # some of that light is shifted all the same, see ``data_gen.samplers.gpt.manifold_shift``
     matt: Matt | None = None  # where paths may end in the cache of ``data_gen.tails``; None: nowhere
 
     @property
     def hides(self) -> bool:
-        """The environment hides from the camera, so that a path must know whether it has seen a surface."""
+        """Whether the environment is hidden from the camera, so that a path must know whether it has met a surface."""
         return self.limits.hide_emitters and self.lights.far
 
 
@@ -47,15 +47,16 @@ def make_plan(
     places: Places | None = None,
     shared: bool = False,
 ) -> Plan:
-    """Inspects the scene; the parameters are as for ``gpt``. Lamps are chosen by ``places``, if given.
+    """Inspects the scene. The parameters are those of ``gpt``.
 
-    Without ``volumes`` its media are not seen. Raises NgptError for shifts that know no media.
+    Lamps are chosen by ``places``, if given. Without ``volumes`` the scene's media are ignored. With ``shared`` paths
+    may end in the cache. Raises NgptError for a shift that does not work in media, if there are ``volumes``.
     """
     if volumes and shift != "replay":
         raise NgptError(f"gpt: shift '{shift}' does not go through media; use 'replay'")
     space = Filled(scene) if volumes else Space(scene)
     materials = Materials(scene, roughness_threshold, space.passed, media=volumes)
-    # If all vertices are connectable, the reverse shift would reconnect to the end of a replay, which is never allowed.
+    # If all vertices are connectable, no replay is allowed: the reverse shift would reconnect instead.
     replays = not materials.all_connectable
     return Plan(
         materials,

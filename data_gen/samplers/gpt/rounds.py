@@ -23,37 +23,38 @@ from data_gen.tails.schedule import end_of_round, fineness, first_sample
 from data_gen.tails.table import Grid, Place
 from ngpt.shared import CUT, TAILS
 
-# Paths that feed the cache before its first round, at least
+# The least number of paths that feed the cache before its first round
 FEWEST = 1 << 13
 
-# Paths that feed the cache have random numbers of their own: "TAILS".
+# Gives paths that feed the cache their own random numbers ("TAILS" in ASCII)
 _SEED = 0x5441494C53
-# Paths that feed the cache together, so that there is room for their new cells
+# The most paths that feed the cache before it is checked again whether there is room for new cells
 _AT_ONCE = 1 << 18
-# The first round comes in two parts, since paths of the second may end in what paths of the first have found.
+# The paths that feed the cache before its first round come in two parts, since those of the second may end in what the
+# others have found. This is the share of the first part.
 _FIRST_PART = 1 / 4
-# Where fewer of the first paths come by a place to end than this share of them, none end: it would cost more than it
-# gains. Measured: .74 to 1 in rooms, .04 to .39 outdoors and of products.
+# If fewer than this share of the first paths pass a vertex where paths may end, the cache is turned off, since it would
+# cost more than it gains. Measured: .74 to 1 in rooms, .04 to .39 outdoors and in product shots.
 _PAYS = 0.5
 
 Take = Callable[[Known | None, CameraSamples, GradientFilm], None]
 
 
 def sharing(view, plan: Plan, frozen: Frozen, take: Take) -> SamplePass:
-    """Returns the pass that ``take`` makes. Its paths share a cache if the ``plan`` says so, else they are whole."""
+    """Returns the pass that ``take`` makes. Its paths share a cache if the ``plan`` says so."""
     return SharedTails(view, plan, frozen, take) if plan.matt else partial(take, None)
 
 
 class SharedTails:
     """A ``data_gen.passes.SamplePass`` whose paths may end in a cache. The cache changes only between rounds.
 
-    ``take`` puts samples into a film, and is given what is known, or None where all paths go on by themselves. ``view``
-    is the integrator. ``cache`` is None before the first round, and where it is ``off``, which says why.
+    ``take`` puts samples into a film. It is given what is known, or None if paths do not end in a cache. ``view`` is
+    the integrator. ``cache`` is None before the first round, and if the cache is turned off. Then ``off`` says why.
     """
 
     def __init__(self, view, plan: Plan, frozen: Frozen, take: Take):
         self.frozen, self.take = frozen, take
-        # This is no method of the object, which holds ``frozen``: a reference back would form a cycle.
+        # Not a method of this object: ``frozen`` keeps it, and a reference back to this object would form a cycle.
         self.plan, self.paths = plan, partial(paths, view, plan)
         self.seed: int | None = None
         self.cache: Cache | None = None
@@ -102,12 +103,12 @@ class SharedTails:
                 with recording():
                     able = self.feed(sensor, seed, min(part - self.fed, _AT_ONCE))
                 if first and able < _PAYS:
-                    self.off, self.cache = f"only {able:.0%} of the paths come by a place to end", None
+                    self.off, self.cache = f"only {able:.0%} of the paths pass a vertex where they may end", None
                     return
                 self.cache.settle(size)
 
     def feed(self, sensor: mi.Sensor, seed: int, n: int) -> float:
-        """Lets this number of paths feed the cache. Returns the share of paths that pass a place to end."""
+        """Lets this number of paths feed the cache. Returns the share that pass a vertex where paths may end."""
         # The paths are spread over the image row by row, since neighbouring rays trace faster.
         number = np.arange(n, dtype=np.int64)
         some, first = number * self.pixels // n, self.fed + number % -(-n // self.pixels)
@@ -118,7 +119,8 @@ class SharedTails:
         lanes = [dr.compress(count > i) for i in range(len(records))]
         there = [(which, record) for which, record in zip(lanes, records, strict=True) if dr.width(which)]
         if there:
-            # Kernels that add them one by one would take longer to launch than to run.
+            # One call for all: separate kernels for first, second and third records would take longer to launch than
+            # to run.
             fields = zip(*([dr.gather(type(v), v, which) for v in record] for which, record in there), strict=True)
             x, y, z, code, level, halves, *values = map(joined, fields)
             self.cache.add(Place(mi.Point3f(x, y, z), code, level), halves, values)
@@ -126,8 +128,8 @@ class SharedTails:
 
 
 def paths(view, plan: Plan, known: Known, camera: CameraSamples, half: mi.UInt32) -> tuple[mi.UInt32, list[list]]:
-    """Returns the number of records of each path, and the records: place, half of the cache, and light of each sort,
-    RGB.
+    """Returns the number of records of each path, and the records: place, half of the cache, and RGB of each sort of
+    light.
     """
     ray, importance, _ = camera.rays()
     within = plan.space.around(camera.sensor)
@@ -139,8 +141,8 @@ def paths(view, plan: Plan, known: Known, camera: CameraSamples, half: mi.UInt32
 
 
 def grid(sensor: mi.Sensor, seed: int) -> Grid:
-    """Returns the cells' grid about a camera. It differs for each seed, so that no wall lies on a cell border for every
-    seed.
+    """Returns the grid of cells around a camera. Each seed shifts it, so that no wall lies on the border of cells for
+    all seeds.
     """
     origin = np.array(sensor.world_transform().translation(), np.float64).ravel()
     return Grid.at(origin, np.random.default_rng([seed, _SEED]).random(3))

@@ -9,16 +9,17 @@ even phase function, would scatter toward the path (``data_gen.tails.matt``):
 
 the vertex's ρ times the mean light of the cell. An offset path adds a ρ C to its difference, with the factor ``a`` that
 it would have had for all that follows (``offset_path.settle``). If the vertex scatters in no other way, the path is
-over. Otherwise it goes on for the rest. The step before finds the emission at the vertex itself, with its usual MIS
-weight.
+over. Otherwise it goes on for the rest. The step before has already found the emission at the vertex itself, with its
+usual MIS weight.
 
 If there is the layer ``caustic``, the cache stores the light of that layer separately: light that has passed a sharp
 surface behind the vertex (``data_gen.paths.caustic``). It goes into the layer and into no difference.
 
-A path that feeds the cache opens a record at its first such vertex and at later ones, ``RECORDS`` at most. From the
-second on it may end in the cache itself, in its own half of the records. So light of many bounces builds up. A record
-holds the light that arrives. Therefore the path leaves the vertex as if it were matt and white, even where the texture
-is black. [Müller et al. 2021, "Real-time neural radiance caching for path tracing", section 4]
+A path that feeds the cache opens a record at its first vertex that meets the first two conditions, and at later ones,
+at most ``RECORDS``. From the second such vertex on it may end in the cache itself, in its own half of the records. So
+light of many bounces builds up. A record holds the light that arrives. Therefore the path leaves the vertex as if it
+were matt and white, even where the texture is black. [Müller et al. 2021, "Real-time neural radiance caching for path
+tracing", section 4]
 """
 
 from __future__ import annotations
@@ -36,9 +37,9 @@ from data_gen.samplers.gpt.plan import Plan
 from data_gen.tails.cache import LEAST, LEAST_TO_FEED, NEAR, RENEW, Known, Trail
 from data_gen.tails.table import Place
 
-# Records that a path may have
+# The most records that a path may have
 RECORDS = 3
-# The number of bounces that are left. Cells are kept apart by it where few bounces are left.
+# If the depth of paths is limited, cells are separated by the number of bounces that are left, where it is below this.
 _ALL = 16
 
 
@@ -48,7 +49,7 @@ def place(plan: Plan, known: Known, path: Path) -> tuple[Place, mi.Bool]:
     able = path.walks & x.is_valid() & (path.depth < plan.limits.max_depth) & (trail.spread > NEAR * trail.reach)
     able = plan.matt.at(x, path.place, able)
     if plan.replays:
-        # Elsewhere all light is late, also what a diffuse part scatters.
+        # At other vertices all light is late, even the light that a diffuse part scatters.
         able &= plan.materials.connectable(x.bsdf()) | media.scatters(path.place)
     most = plan.limits.max_depth
     late = mi.UInt32(0) if most == UNLIMITED else path.depth - dr.minimum(path.depth, max(most - _ALL, 0))
@@ -56,16 +57,16 @@ def place(plan: Plan, known: Known, path: Path) -> tuple[Place, mi.Bool]:
 
 
 def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.Spectrum, mi.Spectrum, mi.Spectrum]:
-    """Ends paths where the cache knows the light that follows. Returns the paths, and that light, in the layer
-    ``caustic`` or not.
+    """Ends paths where the cache knows the light that follows.
 
-    The last value is a sample of the error of all that comes from the cache (``data_gen.tails.cache``). Differences get
-    what is theirs, but for what is in that layer.
+    Returns the paths, that light without the layer ``caustic``, that light of the layer, and a sample of the error of
+    both (``data_gen.tails.cache``). The differences of the ``offsets`` get their part of the light that is not of the
+    layer.
     """
     where, able = place(plan, known, path)
     lambertian = plan.matt.lambertian(path.x, path.place, able)
     for y in offsets:
-        # A joined path has come from elsewhere, so the rest of the material's scattering differs for it.
+        # A joined path has come from elsewhere, so the material scatters another rest for it than for the base path.
         able &= ~(y.apart | (y.joined & ~lambertian))
     sorts, errors, ends = known.look(where, LEAST, able)
     ρ = plan.matt.reflectance(path.x, path.place, ends)
@@ -73,20 +74,20 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
     found, caustic_found = caustic.split(path.late, found)
     caustic_found = sum(late, caustic_found)
     for y in offsets:
-        # For a joined path: the factor with which it would settle at this vertex, which scatters alike in all
-        # directions
+        # For a joined path: the factor with which it would settle at this vertex, which scatters evenly
         joined = gradient_weight(y.r, True) * (y.β - path.β)
         y.Δ = y.Δ + dr.select(y.joined, joined, y.a) * found
     path.walks = path.walks & ~(ends & lambertian)
     path.ρ = ρ
-    # Where it goes on, it does so as the paths that feed the cache do: they have a record here.
+    # A path that could have ended here but goes on has a new spread from here, as after a record of a path that feeds
+    # the cache.
     path.trail.spread = dr.select(able & ~ends, 0, path.trail.spread)
     return path, path.β * found, path.β * caustic_found, path.β * ρ * sum(errors)
 
 
 @dataclass
 class Record:
-    """A vertex where a path has come by, and the light of each sort that it has found to arrive there."""
+    """A vertex of a path that feeds the cache, and the light of each sort that the path has found to arrive there."""
 
     place: Place
     T: mi.Spectrum  # throughput from there on
@@ -94,13 +95,16 @@ class Record:
     E: list[mi.Spectrum]
 
     def find(self, light: mi.Spectrum, late: mi.Bool) -> None:
+        """Adds light that the path has found, to the sort that it belongs to."""
         parts = caustic.split(late, light) if len(self.E) > 1 else (light,)
         self.E = [E + part for E, part in zip(self.E, parts, strict=True)]
 
 
 def feed(view, plan: Plan, known: Known, random, camera_ray: tuple, half: mi.UInt32) -> tuple[mi.UInt32, list[Record]]:
-    """Paths that feed a ``half`` of the cache, from a camera ray, its importance, and the medium around the camera: how
-    many records each has, and these."""
+    """Traces paths that feed a ``half`` of the cache. Returns the number of records of each path, and the records.
+
+    ``camera_ray`` is a camera ray, its importance, and the medium around the camera.
+    """
     (ray, importance, within), space = camera_ray, plan.space
     drawn = space.begin(random)
     first = space.first(view, ray, within, drawn)
@@ -110,7 +114,7 @@ def feed(view, plan: Plan, known: Known, random, camera_ray: tuple, half: mi.UIn
     blank = Place(dr.zeros(mi.Point3f, lanes), mi.UInt32(0), mi.Int32(0))
     dark = [dr.zeros(mi.Spectrum, lanes) for _ in known.means]
     none = [Record(blank, mi.Spectrum(0), mi.Bool(False), list(dark)) for _ in range(RECORDS)]
-    # Here light is late counted from each record, and not from the camera.
+    # Light is late relative to each record here, and not relative to the camera.
     whole = replace(plan, caustic=False)
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
         return walk(whole, known, random, path, none, half)
@@ -124,18 +128,18 @@ def walk(plan: Plan, known: Known, random, path: Path, records: list, half: mi.U
         step, path = base_step(scene, plan, random, path, [], Recording(count > 0, fresh))
         rough = mi.Bool(True)
         for i in range(RECORDS):
-            # The newest record is at the step's vertex, if that has one: there all light is scattered alike.
+            # A record at the step's vertex is the newest one. There light is scattered as by a matt white surface.
             r, here = records[i], fresh & (count == i + 1)
             r.find(
                 dr.select(here, step.E_light, r.T * step.L_light), caustic.lit_late(rough, r.late, step.x_connectable)
             )
-            # A record is at a vertex that scatters widely, so its path has been rough since.
+            # A record is at a vertex that scatters widely, so the path has been rough since then.
             _, r.late = caustic.classes(rough, r.late, step.goes_on, step.kind, step.x_connectable)
             r.T = dr.select(here, step.E_p * step.segment.weight, r.T * step.f_p)
             r.find(r.T * step.L_bsdf, r.late)
         where, able = place(plan, known, path)
         sorts, _, ends = known.look(where, LEAST_TO_FEED, able, half)
-        # The first vertex is where others will end: it has a record in any case.
+        # The first vertex where paths may end has a record in any case.
         ends &= (count > 0) & ((count == RECORDS) | (random.next_1d() >= RENEW))
         ρ = plan.matt.reflectance(path.x, path.place, ends)
         fresh = able & ~ends & (count < RECORDS)

@@ -18,10 +18,10 @@ from data_gen.tails.cache import Trail
 
 @dataclass
 class Traced:
-    """Base paths and their offset paths, as far as they have come."""
+    """What base paths and their offset paths have found so far."""
 
-    L: mi.Spectrum  # of base paths, emission that the camera sees directly not included
-    Le: mi.Spectrum  # the same emission
+    L: mi.Spectrum  # radiance of base paths, without the emission that the camera sees directly
+    Le: mi.Spectrum  # that emission
     L_caustic: mi.Spectrum  # of the layer ``caustic``
     shared: mi.Spectrum  # a sample of the error of what comes from the cache
     offsets: list[Offset]
@@ -32,8 +32,8 @@ def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=Non
     """Traces base paths that begin with ``camera_ray``, a ray and its importance, and their four offset paths.
 
     Offset paths begin with the ``shifted`` rays, and are in the order of SHIFTS. The camera is in the medium
-    ``within``; ``view`` is the integrator, which knows what hides from it. Paths may end in what is ``known`` of the
-    cache.
+    ``within``. ``view`` is the integrator, which knows what is hidden from the camera. Paths may end in what is
+    ``known`` of the cache; None: there is no cache.
     """
     # --------------------- First vertices ------------------------
     (ray, importance), space, scene = camera_ray, plan.space, plan.space.scene
@@ -62,10 +62,10 @@ def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=Non
     so_far = Traced(L, Le, L_caustic, shared, offsets, path.chain)
     if plan.limits.max_depth < 2:
         return so_far
-    # Loop optimisation would record each loop twice, and the kernel be no quicker.
+    # Loop optimisation would record each loop twice, and would not make the kernel quicker.
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
         if not plan.replays:
-            # Without it in the loop, that loop has no paths apart.
+            # If the first step is outside the loop, the loop needs no code for paths that are apart.
             path, so_far = go_on(scene, plan, random, path, so_far, known=known, first=True)
         return walk(scene, plan, random, path, so_far, known)
 
