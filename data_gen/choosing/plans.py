@@ -178,7 +178,8 @@ def _for_caustics(scene: mi.Scene, seconds: float, method: str, start: float, pi
     if share is None or share < _CAUSTIC_SHARE:
         return None
     why = f"about {share:.0%} of the light is what smooth glass or mirrors make of lamps without size, or tiny ones"
-    return Plan(able[0], methods[0], False, left - (pilot.clock() - start), why)
+    # However long the look took, the render is begun.
+    return Plan(able[0], methods[0], False, max(left - (pilot.clock() - start), 1e-3), why)
 
 
 def plan_sampler(

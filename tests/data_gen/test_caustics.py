@@ -67,7 +67,7 @@ def planned(scene, seconds, method="auto", **more):
 
 def test_a_plan_takes_photons_where_there_is_time(renderer):
     scene = burning_glass(renderer)
-    plan = planned(scene, 60.0)
+    plan = planned(scene, 60.0, pilot=Pilot(lambda: 0.0))
     assert (plan.sampler, plan.method) == ("vcm", "oidn") and 20 < plan.render < 60
     assert "of the light is what smooth glass or mirrors make" in plan.reason
     # Too short, too large, a method that cannot use them, and nothing to find
@@ -76,6 +76,13 @@ def test_a_plan_takes_photons_where_there_is_time(renderer):
     assert planned(scene, 60.0, "ngpt-combine").sampler == "gpt"
     assert planned(burning_glass(renderer, "diffuse"), 60.0).sampler == "primal"
     assert planned(scene, 60.0, pilot=Pilot(stop=lambda: True)).sampler == "primal"
+
+
+def test_a_look_that_takes_all_of_the_time_leaves_some_for_the_render(renderer, monkeypatch):
+    monkeypatch.setattr("data_gen.caustics.share_of_caustics", lambda scene: 0.5)
+    clock = iter((0.0, 100.0))
+    plan = planned(burning_glass(renderer), 60.0, pilot=Pilot(lambda: next(clock)))
+    assert plan.sampler == "vcm" and 0 < plan.render < 1
 
 
 def test_how_much_is_said(renderer, caplog):
