@@ -90,8 +90,13 @@ def test_passes_of_any_size_are_recorded_once(renderer, recordings, caplog, samp
     assert recordings.of == {"samples": 1} and not caplog.records, others
 
 
-@pytest.mark.parametrize("scene", ["diffuse", "lens"])
-@pytest.mark.parametrize("sampler", ["bdpt", "gbdpt", "vcm"])
+BOTH_ENDS = [("bdpt", "diffuse"), ("gbdpt", "lens"), ("vcm", "diffuse")]
+MORE_BOTH_ENDS = [("bdpt", "lens"), ("gbdpt", "diffuse"), ("vcm", "lens")]
+
+
+@pytest.mark.parametrize(
+    ("sampler", "scene"), [*BOTH_ENDS, *(pytest.param(*case, marks=pytest.mark.slow) for case in MORE_BOTH_ENDS)]
+)
 def test_paths_from_both_ends_are_recorded_once(renderer, recordings, sampler, scene):
     others = [load(renderer, textured_lamp, (4, 4))]
     render(renderer, load(renderer, scene, (16, 12)), sampler, [1] * 5)

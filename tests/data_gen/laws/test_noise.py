@@ -107,13 +107,13 @@ def gains(renderer, name, full):
     return found
 
 
-# Quick ones; the slow suite has all.
+# Quick ones, with light paths and in rounds; the slow suite has all.
 POINTS = [
     pytest.param(
         name,
         points,
         id=f"{name}-{points}",
-        marks=() if (name, points) in {("gbdpt", "sobol"), ("primal", "rounds")} else pytest.mark.slow,
+        marks=() if (name, points) in {("bdpt", "sobol"), ("primal", "rounds")} else pytest.mark.slow,
     )
     for points, names in (("sobol", SAMPLERS), ("rounds", ("primal", "gpt")))
     for name in names
