@@ -71,10 +71,10 @@ def moved(place, options=None, spp=32):
 
 
 UNCONNECTABLE = {"roughness_threshold": 10.0}
-# What ``few_edges`` below and ``test_holes`` show as well, in which light goes through more holes
-SHOWN = {("gpt", "leaf"), ("gbdpt", "leaf")}
+# What other cases of the same sampler below show as well; ``test_holes`` has more holes than the leaf.
+SHOWN = {("gpt", "quick"), ("gpt", "leaf"), ("bdpt", "quick"), ("gbdpt", "quick"), ("gbdpt", "leaf")}
 QUICK = [
-    # Over eight pixels, which see all that one does and more; users have differences over one, as ``plenty`` has.
+    # Over eight pixels, which see all that one does and more; users have differences over one, as ``plenty`` below.
     *(case for case in registered(False, (FAR,)) if (case.sampler, case.scene) not in SHOWN),
     Case("gpt", "glass", (FAR,)),
     Case("gpt", "lens", (FAR,)),
@@ -92,8 +92,8 @@ QUICK = [
     Case("gpt-basic", "within_fog", (1,), size=SMALL, spp=48),
     # Paths end at a step that is written out.
     Case("gpt-simple", "courtyard to 2", (1,), size=SMALL, spp=64),
-    Case("bdpt", "lit: sky"),
     Case("bdpt", "lit: areas", options={"joined_depth": 1}),
+    Case("gbdpt", "lit: sky", (FAR,)),
 ]
 LONG = {"spp": 256}
 SLOW = [
