@@ -98,8 +98,8 @@ MOST = {
 }
 
 
-# Edges, walls without thickness and light that is found by luck are tested in other ways below, too.
-SLOW = (shelf, door, shade, corner_box, sheet, slit, foggy_slit, half_fog)
+# Edges, walls and light that is found by luck are tested in other ways below, too.
+SLOW = (shelf, thin_wall, door, shade, corner_box, sheet, slit, foggy_slit, half_fog)
 
 
 @pytest.mark.parametrize(

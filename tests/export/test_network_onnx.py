@@ -64,7 +64,8 @@ def exported(path):
 
 # What others have parts of
 MORE = ("relative to its base", "converging", "halved by maxima", "halved by lines", "primal alone")
-MORE += ("by a pyramid of kernels", "drawn to gradients", "a choice drawn to gradients")
+MORE += ("by a pyramid of kernels", "drawn to gradients", "a choice drawn to gradients", "by kernels of two")
+MORE += ("halved by averages",)
 
 
 @pytest.fixture(scope="module", params=[pytest.param(n, marks=pytest.mark.slow) if n in MORE else n for n in GRAPHED])
