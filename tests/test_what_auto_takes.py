@@ -28,6 +28,7 @@ def rows(renderer, tmp_path_factory):
     return renderers(list(zip(stacks, truths, strict=True)), tmp_path_factory.mktemp("files"))
 
 
+@pytest.mark.slow
 def test_nobody_gets_the_input_back(rows):
     assert {row.renderer for row in rows} >= {*RENDERERS, "any, by our names"} and len(RENDERERS) == 8
     assert {row.layers for row in rows} == set(CHOICES)
@@ -37,6 +38,7 @@ def test_nobody_gets_the_input_back(rows):
         assert row.method != "primal" and row.error < most * row.before, row
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())
 def test_where_oidn_is_there_nothing_is_above_its_own_error_by_more_than_5_per_cent(rows):
     """Gradients with features leave less, with variances and without."""
@@ -46,6 +48,7 @@ def test_where_oidn_is_there_nothing_is_above_its_own_error_by_more_than_5_per_c
         assert row.error <= (0.9 if {"dx", "albedo"} <= set(row.layers) else 1.05) * row.by_oidn, row
 
 
+@pytest.mark.slow
 def test_without_oidn_more_layers_beside_gradients_leave_less(rows):
     left = {row.layers: row.error for row in rows if not row.oidn}
     assert all(row.method not in NEED_OIDN for row in rows if not row.oidn)

@@ -36,6 +36,7 @@ def test_configurations_that_cannot_be(change, message):
         ModelConfig(**RIGHT | change)
 
 
+@pytest.mark.slow
 def test_it_learns():
     assert learns(KPCN, wall(STEP, SPOT, 0.5), 0.35)
 

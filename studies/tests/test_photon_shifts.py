@@ -98,7 +98,10 @@ def test_jacobian_by_finite_differences(rays, far):
     assert_told(area_ratio(g, lambda i, j: copied(i, j)[0])[good], told[good], quantile=1)
 
 
-@pytest.mark.parametrize("name", ["areas", "sky", "points", "glossy"])
+# The sky is infinitely far away, and has a lamp with an area and a ball of glass before it.
+@pytest.mark.parametrize(
+    "name", ["sky", *(pytest.param(n, marks=pytest.mark.slow) for n in ("areas", "points", "glossy"))]
+)
 def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(renderer, name):
     """Points where photons are gathered are beside photons, on the surfaces where other photons are."""
     mi, world = renderer, world_of(load(renderer, SCENES[name], (8, 8)))

@@ -85,7 +85,7 @@ def judge(campaign, notes, each=1):
     assert slope < MIB and ratio < SLOWER, worst
 
 
-@pytest.mark.parametrize("count", [40, at_length(1000)])
+@pytest.mark.parametrize("count", [at_length(1000)])
 def test_many_stacks_in_one_call(tmp_path, count):
     (tmp_path / "in").mkdir()
     for i in range(6):
@@ -107,7 +107,7 @@ def test_many_small_crops(tmp_path, scenes):
     judge("Small crops in one process of data_gen", notes)
 
 
-@pytest.mark.parametrize("steps", [150, at_length(5000)])
+@pytest.mark.parametrize("steps", [at_length(5000)])
 def test_many_training_steps(tmp_path, steps):
     changes = {"run.steps": steps, "run.save": steps // 4, "run.validate": steps // 4, "run.log": 50}
     arguments = make_work("train", tmp_path).arguments(tmp_path / "out", **changes)[2:]

@@ -169,7 +169,7 @@ def test_gradients_are_shared_out_by_what_is_quick(renderer):
     same(stack, render(renderer, 32, method="wcv"))
 
 
-@pytest.mark.parametrize("sampler", ["primal", "gpt"])
+@pytest.mark.parametrize("sampler", [pytest.param("primal", marks=pytest.mark.slow), "gpt"])
 def test_an_error_is_reached(renderer, converged, sampler):
     scene, halves = load(renderer, "diffuse", (48, 32)), converged("diffuse")
     method = "primal" if sampler == "primal" else "wcv"

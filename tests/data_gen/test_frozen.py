@@ -90,8 +90,14 @@ def test_passes_of_any_size_are_recorded_once(renderer, recordings, caplog, samp
     assert recordings.of == {"samples": 1} and not caplog.records, others
 
 
-@pytest.mark.parametrize("scene", ["diffuse", "lens"])
-@pytest.mark.parametrize("sampler", ["bdpt", "vcm"])
+@pytest.mark.parametrize(
+    ("sampler", "scene"),
+    [
+        ("bdpt", "lens"),
+        ("vcm", "diffuse"),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("bdpt", "diffuse"), ("vcm", "lens"))),
+    ],
+)
 def test_paths_from_both_ends_are_recorded_once(renderer, recordings, sampler, scene):
     assert_paths_are_recorded_once(renderer, recordings, sampler, scene)
 

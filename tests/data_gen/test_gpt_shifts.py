@@ -163,8 +163,13 @@ def steps(renderer):
     return cache(Steps)
 
 
-@pytest.mark.parametrize("shift", ["replay", "half-vector"])
-@pytest.mark.parametrize(("threshold", "caustic"), [(0.05, True), (0.05, False), (10.0, True)])
+PLANS = [("replay", 0.05, True), ("half-vector", 0.05, False), ("replay", 10.0, True), ("half-vector", 10.0, True)]
+MORE_PLANS = [("replay", 0.05, False), ("half-vector", 0.05, True)]
+
+
+@pytest.mark.parametrize(
+    ("shift", "threshold", "caustic"), [*PLANS, *(pytest.param(*plan, marks=pytest.mark.slow) for plan in MORE_PLANS)]
+)
 def test_the_shift_of_the_shift_is_the_path(steps, shift, threshold, caustic):
     steps = steps(shift, threshold, caustic)
     taken, undone = steps.round_trips()

@@ -10,6 +10,7 @@ pytest.importorskip("mitsuba")
 from ngpt.testing import z_test
 
 
+@pytest.mark.slow
 def test_it_is_the_light_of_volpath(renderer):
     """Of all lamps together, which Mitsuba's ``path`` does not find: it loses a twelfth."""
     import straight_on
@@ -46,7 +47,7 @@ def test_what_does_not_know_its_share_is_no_hole(renderer):
     assert holes(mask) and holes({"type": "diffuse"}) is None and holes(unknown[0]) is None
 
 
-@pytest.mark.parametrize("sampler", ["bdpt", "vcm"])
+@pytest.mark.parametrize("sampler", ["bdpt", pytest.param("vcm", marks=pytest.mark.slow)])
 def test_connections_go_on_through_many_holes(renderer, sampler):
     assert_connections_go_on_through_many_holes(renderer, sampler)
 

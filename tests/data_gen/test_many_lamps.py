@@ -97,7 +97,9 @@ def expected(renderer, many):
     return np.stack([np.array(renderer.render(scene, spp=32, seed=100 + i)) for i in range(12)])
 
 
-@pytest.mark.parametrize("sampler", ["path", "primal", "gpt", "bdpt"])
+@pytest.mark.parametrize(
+    "sampler", ["path", "bdpt", *(pytest.param(s, marks=pytest.mark.slow) for s in ("primal", "gpt"))]
+)
 def test_their_light_is_that_of_the_file(renderer, many, expected, sampler):
     from data_gen.render import render_stack
 

@@ -11,12 +11,13 @@ from data_gen.render import render_stack
 from data_gen.scenes.builtin import _camera, _light, _wall
 
 PPM = Image(radius=0.3, photons=64, block=6, batches=12, size=(24, 24), references=64, images=24)
+SMALL = replace(PPM, size=(16, 16), block=4)
 VCM = Image(0.5, None, 6, 64, (24, 24), 0.02, by="bdpt", references=32, images=8)
 # Where nothing but merging finds light
 ALONE = replace(VCM, radius=2.0, batches=24, by="ppm", references=1, images=24)
 
 QUICK = [
-    ("ppm", "areas", PPM),
+    # Also with a lamp of an area
     ("ppm", "sky", PPM),
     ("vcm", "glass", VCM),
     ("bre", "colours", BRE),
@@ -26,6 +27,7 @@ QUICK = [
 ]
 # Along boundaries that bend nothing, of media within each other, it is too dark by a share that falls like the radius.
 SLOW = [
+    ("ppm", "areas", PPM),
     ("ppm", "glass", PPM),
     ("ppm", "points", replace(PPM, by="bdpt")),
     *(("vcm", name, VCM) for name in ("areas", "points", "sky")),
@@ -51,7 +53,8 @@ def test_light_that_merging_alone_finds(renderer):
     ("sampler", "name", "max_depth", "image"),
     [
         # Further emission in glass, and more bounces of photons seen through it
-        *(("ppm", "glass", depth, replace(PPM, size=(16, 16), block=4)) for depth in (2, 4)),
+        pytest.param("ppm", "glass", 2, SMALL, marks=pytest.mark.slow),
+        ("ppm", "glass", 4, SMALL),
         ("bre", "haze", 2, replace(BRE, radius=0.3, photons=48)),
     ],
 )

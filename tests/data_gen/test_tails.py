@@ -302,7 +302,8 @@ def renders(renderer):
     return rendered
 
 
-@pytest.mark.parametrize("scene", ["diffuse", "glossy", bulb, mirrors, nested])
+# A room without mirrors shows nothing that the others do not.
+@pytest.mark.parametrize("scene", [pytest.param("diffuse", marks=pytest.mark.slow), "glossy", bulb, mirrors, nested])
 def test_differences_are_those_of_the_image(renders, scene):
     """In the mean over blocks, within four standard errors and a little for places where but one of two paths ends."""
     stacks = renders(scene, "gpt", "shared")
@@ -316,8 +317,20 @@ def test_differences_are_those_of_the_image(renders, scene):
         assert (np.abs(each.mean(axis=0)) < 4 * doubt + 2e-3 * lights.mean()).all(), layer
 
 
-@pytest.mark.parametrize("scene", ["glossy", bulb, mirrors, milk])
-@pytest.mark.parametrize("sampler", ["primal", "gpt"])
+@pytest.mark.parametrize(
+    ("sampler", "scene"),
+    [
+        ("primal", "glossy"),
+        ("primal", milk),
+        ("gpt", "glossy"),
+        ("gpt", bulb),
+        ("gpt", mirrors),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (("primal", bulb), ("primal", mirrors), ("gpt", milk))
+        ),
+    ],
+)
 def test_no_light_is_lost_or_counted_twice(renders, sampler, scene):
     """Also not light that comes through glass or off a mirror, which ``gpt`` keeps in a layer of its own."""
     both = [renders(scene, sampler, tails) for tails in ("shared", "paths")]

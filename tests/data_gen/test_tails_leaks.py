@@ -98,7 +98,8 @@ MOST = {
 }
 
 
-SLOW = (foggy_slit, half_fog)
+# Edges, walls and light that is found by luck are tested in other ways below, too.
+SLOW = (shelf, thin_wall, door, shade, corner_box, sheet, slit, foggy_slit, half_fog)
 
 
 @pytest.mark.parametrize(
@@ -137,6 +138,7 @@ def test_coarse_cells_have_little_bias(renderer, monkeypatch, description, most)
     assert abs(bias(images(scene, "shared", 256, range(6)), paths).rms) < most
 
 
+@pytest.mark.slow
 def test_bias_vanishes_with_the_size_of_cells(renderer, monkeypatch):
     """Light that passes a wall without thickness, where no cell is torn, at three sizes of cells."""
     scene, found = load(renderer, thin_wall, (16, 12)), []
@@ -157,7 +159,13 @@ def test_cells_shrink_with_paths():
 WALLS = [(0.0, 0.0, 1, 0), (0.0005, 0.05, 1, 0), (0.02, 0.0, 1, 0), (0.1, 0.03, 1e3, 0), (0.02, 0.02, 1e-3, 10)]
 
 
-@pytest.mark.parametrize("wall", WALLS)
+# The thinnest, and one that is far from the origin
+QUICK = (WALLS[1], WALLS[4])
+
+
+@pytest.mark.parametrize(
+    "wall", [wall if wall in QUICK else pytest.param(wall, marks=pytest.mark.slow) for wall in WALLS]
+)
 def test_dark_rooms_stay_dark(renderer, monkeypatch, wall):
     """Light of the dark room over the truth. Measured: 1.01 to 1.05; without torn cells, 1.1 to 1.2."""
     monkeypatch.setattr(schedule, "FIRST", 1 << 16)

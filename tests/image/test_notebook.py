@@ -84,6 +84,7 @@ def test_the_first_five_cells_lead_to_a_clean_image(renderer, tmp_path, monkeypa
         assert text.startswith("%pip install") and "ngpt.denoise(" in text and "clean.exr" in text
 
 
+@pytest.mark.slow
 def test_a_sampler_of_ones_own(renderer, tmp_path, monkeypatch):
     from data_gen.samplers import SAMPLERS
 
@@ -95,6 +96,7 @@ def test_a_sampler_of_ones_own(renderer, tmp_path, monkeypatch):
     assert abs(made["z"]) < 4.5 and made["gains"]["gpt"] < made["gains"]["mine"] < 1
 
 
+@pytest.mark.slow
 def test_a_shot(renderer, tmp_path, monkeypatch):
     made, _ = run(DOCS / "use" / "shot.ipynb", tmp_path, monkeypatch)
     assert made["found"]["with history"] < 0.85 * made["found"]["frame by frame"]

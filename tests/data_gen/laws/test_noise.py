@@ -107,7 +107,7 @@ def gains(renderer, name, full):
     return found
 
 
-# Quick ones; the slow suite has all.
+# Quick ones, with light paths and in rounds; the slow suite has all.
 POINTS = [
     pytest.param(
         name,

@@ -15,7 +15,7 @@ SPECTRAL, MONO = "llvm_ad_spectral", "llvm_ad_mono"
 # Variant, sampler, scene, size, over how many pixels. In monochromatic variants Dr.Jit does not find a number that the
 # kernels of light paths use.
 CASES = [
-    (SPECTRAL, "gpt", "diffuse", (24, 24), 1),
+    slow(SPECTRAL, "gpt", "diffuse", (24, 24), 1),
     (SPECTRAL, "gpt", colours, (16, 16), 1),
     (MONO, "gpt", coloured_smoke, (16, 16), 4),
     *(slow(variant, sampler, "lens", (24, 24), 1) for variant in (SPECTRAL, MONO) for sampler in ("bdpt", "gbdpt")),
