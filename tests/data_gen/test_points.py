@@ -169,8 +169,6 @@ def test_box_means_are_those_of_scipy_to_the_bit(renderer, rng, shape, kind):
             pytest.param(*case, marks=pytest.mark.slow)
             for case in (
                 ("ppm", "diffuse", (64, 40), 9),
-                # Two passes of eight, which say nothing of a net
-                ("gbdpt", "diffuse", (48, 32), 16),
                 ("bdpt", "diffuse", (64, 40), 12),
                 ("vcm", "diffuse", (64, 40), 9),
                 ("vcm", "diffuse", (64, 40), 17),
