@@ -13,6 +13,7 @@ import numpy as np
 
 import ngpt
 from bench.common import kept, metadata, save
+from ngpt.cli.arguments import size as pixels
 from ngpt.evaluation.config import scene_name
 from ngpt.evaluation.references import HALVES, Reference, read_reference
 from ngpt.measure.metrics import EPSILON, scores, squared_error, trimmed_mean
@@ -41,14 +42,8 @@ def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
     args = parser.parse_args()
     if args.scenes and not args.references:
         parser.error("give the folder of --references")
-    args.pixels = parsed_size(args.size)
+    args.pixels = pixels(args.size)
     return args
-
-
-def parsed_size(text: str) -> tuple[int, int]:
-    """Width and height of "320x180"."""
-    width, height = map(int, text.split("x"))
-    return width, height
 
 
 class Cells(list[dict[str, Any]]):

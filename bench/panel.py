@@ -32,7 +32,8 @@ import ngpt
 from bench import verdict
 from bench.common import metadata, renderer, save, write_page
 from bench.curves import Ratio, marked, over, over_least
-from bench.judging import RIVAL, WARM_SPP, Judge, opened, parsed_size, processor_seconds, timed
+from bench.judging import RIVAL, WARM_SPP, Judge, opened, processor_seconds, timed
+from ngpt.cli.arguments import size
 from ngpt.errors import NgptError
 from ngpt.measure.averages import geometric_mean
 from ngpt.stack import GradientStack
@@ -89,10 +90,8 @@ CASES = {
     "haze": Case("fog", "media", "haze"),
     "smoke": Case("smoke", "media", "smoke"),
     "cloud": Case("cloud", "media", "cloud"),
-    "generator-20261128-caustic": Case(
-        "glass, of the generator", "caustics, mirrors", "generator:20261128:caustic", 512
-    ),
-    "generator-20261129-mirrors": Case("mirrors, of the generator", "caustics, mirrors", "generator:20261129:mirrors"),
+    "generator-20261128-caustic": Case("glass, of the generator", "glass, mirrors", "generator:20261128:caustic", 512),
+    "generator-20261129-mirrors": Case("mirrors, of the generator", "glass, mirrors", "generator:20261129:mirrors"),
 }
 
 
@@ -102,11 +101,11 @@ def main() -> int:
     parser.add_argument("--baseline", action="store_true", help="the cells of these scenes become the numbers in git")
     parser.add_argument("--table", action="store_true", help="print the tables of the numbers in git")
     parser.add_argument("--files", nargs="+", metavar="SCENE", help="tables of these files, which are not in the panel")
-    parser.add_argument("--size", default="320x180", help="of the images of --files (default: %(default)s)")
+    parser.add_argument("--size", type=size, default="320x180", help="of the images of --files (default: %(default)s)")
     parser.add_argument("--cache", type=Path, default=ROOT / "out" / "panel", help="folder for references")
     args = parser.parse_args()
     if args.files:
-        found = measured(args.files, args.cache, SEEDS, parsed_size(args.size))
+        found = measured(args.files, args.cache, SEEDS, args.size)
         print(text([cell for cells in found for cell in cells]))
         return 0
     before = json.loads(RESULT.read_text())["cells"] if RESULT.exists() else []
@@ -142,27 +141,26 @@ def measured(
 ) -> Iterator[list[dict[str, Any]]]:
     """The cells of each scene; then the time of all, without references, is printed."""
     seconds = used = 0.0
-    for name in names:
-        name, loaded, judge = opened_with_judge(name, cache, size)
+    for scene in names:
+        name, loaded, judge = opened_with_judge(scene, cache, size)
         start, start_used = time.perf_counter(), processor_seconds()
         yield cells_of(name, loaded, judge, seeds)
         seconds, used = seconds + time.perf_counter() - start, used + processor_seconds() - start_used
         print(f"{name}: {seconds:.0f} s in all, {used:.0f} s of processors", flush=True)
 
 
-def opened_with_judge(name: str, cache: Path, size: tuple[int, int]) -> tuple[str, Any, Judge]:
+def opened_with_judge(scene: str, cache: Path, size: tuple[int, int]) -> tuple[str, Any, Judge]:
     """The name of a scene in tables, the loaded scene, and its reference, which is rendered where the folder lacks it.
 
-    ``name`` is one of ``CASES``, or another scene.
+    ``scene`` is one of ``CASES``, or a file.
     """
     load_scene, _ = renderer()
     # A kernel knows the shapes of all scenes in memory.
     gc.collect()
-    case = CASES.get(name) or Case("", "", name)
-    with opened(case.scene) as (shown, file):
+    case = CASES.get(scene) or Case("", "", scene)
+    with opened(case.scene) as (name, file):
         loaded = load_scene(file, size)
-    shown = name if name in CASES else shown
-    return shown, loaded, Judge(loaded, shown, cache, "{}x{}".format(*size), case.reference_spp)
+    return name, loaded, Judge(loaded, name, cache, "{}x{}".format(*size), case.reference_spp)
 
 
 def cells_of(name: str, loaded: Any, judge: Judge, seeds: Sequence[int]) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, SIMPLE, by_standing, described
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, SIMPLE, by_standing, described, tried
 from data_gen.scenes.builtin import SCENES, no_scene
 from data_gen.scenes.facts import Facts, polarised, scene_facts, spectral
 from data_gen.scenes.integrators import AROUND, lack, same_image
@@ -80,7 +80,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         hides=hides,
     )
     sampler, method, reason = described(facts)
-    tries = any(each.tried and each.finds and not each.refuses(facts) for each in SAMPLERS.values())
+    tries = any(each.finds for each in tried(facts))
     still = f"Mitsuba {mi.__version__} has no animation"
     return {
         "plugins": {kind.lower(): dict(counts.most_common()) for kind, counts in plugins.items() if counts},

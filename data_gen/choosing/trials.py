@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.render import render_stack
-from data_gen.samplers import SAMPLERS, SIMPLE, described
+from data_gen.samplers import SAMPLERS, SIMPLE, described, tried
 from data_gen.scenes.facts import scene_facts
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import EPSILON, trimmed_mean
@@ -69,8 +69,7 @@ def candidates(scene: mi.Scene, biased: bool = False, gradients: bool = False) -
     first, method, _ = described(facts, gradients)
     if gradients or math.prod(int(n) for n in scene.sensors()[0].film().crop_size()) < _LEAST_PIXELS:
         return [first]
-    able = [s for s in SAMPLERS.values() if s.name != first and s.tried and not s.refuses(facts)]
-    able = [s for s in able if s.finds or (first, method) != SIMPLE]
+    able = [s for s in tried(facts) if s.name != first and (s.finds or (first, method) != SIMPLE)]
     return [first] + [s.name for kind in (False, True)[: 1 + biased] for s in able if s.biased == kind]
 
 

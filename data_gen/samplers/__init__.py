@@ -29,4 +29,5 @@ from data_gen.samplers.registry import (
     described,
     find,
     register,
+    tried,
 )

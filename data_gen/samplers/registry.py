@@ -244,6 +244,11 @@ def find(name: str, facts: Facts | None = None) -> Sampler:
 SIMPLE = ("primal", "oidn")
 
 
+def tried(facts: Facts) -> list[Sampler]:
+    """Returns the samplers that a pilot may try in a scene of these ``facts``."""
+    return [sampler for sampler in SAMPLERS.values() if sampler.tried and not sampler.refuses(facts)]
+
+
 def described(facts: Facts, gradients: bool = False) -> tuple[str, str, str]:
     """What "auto" stands for in `ngpt render`, judged by the scene's description only: sampler, method, and why.
 

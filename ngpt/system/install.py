@@ -14,11 +14,7 @@ NAME, STUDIES = "ngpt-recon", "ngpt-studies"
 # The entries that ngpt-studies adds, by the word that their registry uses for an entry
 _PHOTONS = ("beams", "gbeams", "gbre", "gplanes", "gpm", "gvcm", "gvpm", "planes", "vpm")
 _SAMPLERS = ("gbdpt", "gmlt", "gpt-tiles", "restir", "split", *_PHOTONS)
-BROUGHT = {
-    "method": ("nlm",),
-    "network": ("kpcn",),
-    "sampler": _SAMPLERS,
-}
+BROUGHT = {"method": ("nlm",), "network": ("kpcn",), "sampler": _SAMPLERS}
 CHECKOUT = Path(__file__).parents[2]
 
 

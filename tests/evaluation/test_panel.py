@@ -44,6 +44,19 @@ def test_the_default_is_over_the_least_of_ours():
     assert lines[-1].startswith("| mean | 2.00, 2.00 | 2.00, 2.00 | 2.00, 2.00 | 1.33")
 
 
+def test_the_page_has_the_tables_of_the_numbers_in_git():
+    cells = json.loads(panel.RESULT.read_text())["cells"]
+    assert {cell["scene"] for cell in cells} == set(panel.CASES)
+    assert panel.text(cells) in panel.PAGE.read_text()
+
+
+def test_a_scene_is_called_alike_in_the_panel_and_where_it_is_opened():
+    for name, case in panel.CASES.items():
+        if not case.scene.startswith("generator:"):  # which takes long to make
+            with panel.opened(case.scene) as (shown, _):
+                assert shown == name
+
+
 def test_other_scenes_have_tables_of_their_own(tmp_path, monkeypatch, capsys):
     asked = []
 

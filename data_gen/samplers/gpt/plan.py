@@ -47,7 +47,7 @@ def make_plan(
     places: Places | None = None,
     shared: bool = False,
 ) -> Plan:
-    """Inspects the scene. The parameters are those of ``gpt``.
+    """Returns the plan for a scene. ``shift``, ``roughness_threshold`` and ``caustic`` are options of ``gpt``.
 
     Lamps are chosen by ``places``, if given. Without ``volumes`` the scene's media are ignored. With ``shared`` paths
     may end in the cache. Raises NgptError for a shift that does not work in media, if there are ``volumes``.
