@@ -1,6 +1,8 @@
 # `make demo` and `make test` are all a fresh machine needs; each prepares what it uses (scripts/setup).
 
 PY = .venv/bin/python
+# Some containers set it. Then each of the many processes of a test run compiles every module again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo quick test test-hosts durations test-slow campaigns check docs wheel try-wheel bench setup-demo setup-dev setup-test setup-hosts setup-quick setup-docs
 

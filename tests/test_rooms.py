@@ -113,7 +113,8 @@ def of_the_lab(graph: dict[str, set[str]]) -> list[str]:
     return [f"{name} imports {target}" for name in core for target in sorted(graph[name]) if is_in(target, LAB)]
 
 
-GRAPH = {name: imports(name, file, modules(ROOT)) for name, file in modules(ROOT).items()}
+MODULES = modules(ROOT)
+GRAPH = {name: imports(name, file, MODULES) for name, file in MODULES.items()}
 
 
 def test_every_import_leads_down():

@@ -118,9 +118,11 @@ class Registry(dict[str, T]):
         except KeyError:
             return default
 
-    def names(self) -> list[str]:
-        """The names of all entries; nothing is imported."""
-        return list(dict.fromkeys([*self, *(point.name for point in self._others())]))
+    def names(self) -> Iterator[str]:
+        """The names of all entries; nothing is imported. Entry points take 10 ms to list, and come last."""
+        known = list(self)
+        yield from known
+        yield from dict.fromkeys(point.name for point in self._others() if point.name not in known)
 
     def load(self) -> list[str]:
         """Imports the entries of all other packages and returns their names. Broken ones are left out, with a
