@@ -82,8 +82,8 @@ def check_adaptive(adaptive: Adaptive, sampler: Sampler, options: dict, spp: int
     if sampler.even:
         able = ", ".join(name for name, other in SAMPLERS.items() if not other.even)
         raise NgptError(f"samples of '{sampler.name}' depend on each other and cannot be adaptive; use one of: {able}")
-    if options.get("reuse") or options.get("shift") == "manifold":
-        raise NgptError("options 'reuse' and 'shift=manifold' need samples of all pixels in each pass; leave them out")
+    if options.get("reuse"):
+        raise NgptError("option 'reuse' needs samples of all pixels in each pass; leave it out")
 
 
 def render_adaptive(

@@ -7,15 +7,12 @@ from typing import Self
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from data_gen.paths.streams import sample_streams
 from data_gen.scenes.cameras import camera_name
 
 # Shifts by half a pixel. A sample and its three shifted copies have one place in each quarter of the pixel.
 QUARTERS = ("x", "y", "xy")
-# Neighbouring lanes whose rays are traced together, as in ``data_gen.passes``
-_PACKET = 16
 # Origin, direction and length of eight rays
 _SEEN_BYTES = 8 * 7 * 4
 
@@ -165,16 +162,3 @@ class CameraSamples:
 def bytes_of_rays(sensor: mi.Sensor) -> int:
     """The most bytes that a lane takes for the rays that ``look`` keeps."""
     return 0 if camera_name(sensor) == "perspective" else _SEEN_BYTES
-
-
-def in_packets(lanes: np.ndarray, camera: CameraSamples) -> tuple[np.ndarray, np.ndarray]:
-    """The ``lanes``, with gaps so that no two blocks of samples share a packet, and which of them exist.
-
-    The last bits of a ray's result depend on the rays traced with it, and a block must not depend on its pass.
-    """
-    _, counts = np.unique(lanes // (camera.pixels * camera.block), return_counts=True)
-    padded = -(-counts // _PACKET) * _PACKET
-    place = np.arange(len(lanes)) + np.repeat(np.cumsum(padded - counts) - (padded - counts), counts)
-    spread, exists = np.zeros(padded.sum(), np.uint32), np.zeros(padded.sum(), bool)
-    spread[place], exists[place] = lanes, True
-    return spread, exists

@@ -93,9 +93,7 @@ def why_not_shared(settings: Mapping[str, Any], variant: str) -> str:
     """Why paths of a sampler with the option ``tails`` cannot share their tails under these ``settings``, or ""."""
     if "rgb" not in variant or "polarized" in variant:
         return f"variant '{variant}' renders other colours than RGB"
-    unable = {"reuse": (True, "reuse"), "shift": ("manifold", "shift=manifold")}
-    reasons = (f"{name} needs whole paths" for key, (value, name) in unable.items() if settings.get(key) == value)
-    return next(reasons, "")
+    return "reuse needs whole paths" if settings.get("reuse") else ""
 
 
 def joined_depth(default: int) -> Option:

@@ -3,7 +3,7 @@
 The cache has folders for each scene, NAME-HASH, named by what the pictures depend on: the contents of the scene's
 files, the size, Mitsuba's version, and the code that their sampler runs. In them are RENDER-SPP-SEED.exr, where RENDER
 is a kind of stack ("gradients"), followed by the sampler where it is not the usual one and its options where there are
-some ("gradients-gpt-shift=manifold"), and SPP the number of samples that were rendered; the two halves of references,
+some ("gradients-gpt-reuse=true"), and SPP the number of samples that were rendered; the two halves of references,
 reference-*-a.exr and -b.exr; and cost-*.json. A folder of stacks of one's own looks the same, without the costs; its
 reference may be one image.
 """

@@ -90,8 +90,8 @@ class Bent(Ends):
 
     def direction(self, x, active):
         """That in which the copy leaves its own vertex."""
-        from data_gen.paths.manifold import Target, follow, shoot
         from ngpt_studies.gbdpt import chain_shift
+        from ngpt_studies.gbdpt.manifold import Target, follow, shoot
 
         step, chain = self.step, self.chain
         reached = step.x1.is_valid()

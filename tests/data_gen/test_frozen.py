@@ -77,7 +77,6 @@ RECORDED = [
     ("gpt", "environment", (), {}),
     ("gpt", "haze", (), {}),
     ("gpt", "glossy", (), {"reuse": True}),
-    ("gpt", "glossy", (), {"shift": "manifold"}),
     ("gpt", seen_by("thinlens", aperture_radius=0.05, focus_distance=4.0), (), {}),
     ("primal", seen_by("orthographic"), (), {}),
 ]

@@ -447,7 +447,6 @@ def test_claims_hold_for_pixels_blocks_and_images(renderer):
     ("scene", "options", "reason"),
     [
         ("diffuse", {"reuse": True}, "reuse needs whole paths"),
-        ("diffuse", {"shift": "manifold"}, "shift=manifold needs whole paths"),
     ],
 )
 def test_what_cannot_share_says_why(renderer, scene, options, reason):

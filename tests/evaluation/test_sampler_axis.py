@@ -61,9 +61,9 @@ def test_tables_of_samplers_are_their_options(tmp_path):
         clock = "gpt"
         [samplers.gpt]
         caustic = true
-        [samplers.gpt-followed]
+        [samplers.gpt-half]
         sampler = "gpt"
-        shift = "manifold"
+        shift = "half-vector"
         [samplers.ppm]
         radius = 1
         photons = 2
@@ -74,14 +74,14 @@ def test_tables_of_samplers_are_their_options(tmp_path):
         "primal (primal)": ("path", "primal"),
         "primal (ppm)": ("features ppm radius=1 photons=2", "ppm"),
         "wcv (gpt)": ("gradients gpt", "gpt"),
-        "wcv (gpt-followed)": ("gradients gpt shift=manifold", "gpt-followed"),
+        "wcv (gpt-half)": ("gradients gpt shift=half-vector", "gpt-half"),
     }
     assert config.render("path", "ppm").options == {"sampler": "ppm", "radius": "1", "photons": "2"}
     (tmp_path / "eval.toml").write_text(text.replace("radius = 1", "radius = -1"))
     with pytest.raises(NgptError, match=r"samplers\.ppm: sampler 'ppm', option 'radius': '-1' is not allowed"):
         read_config(tmp_path / "eval.toml")
     (tmp_path / "eval.toml").write_text(text.replace('sampler = "gpt"', 'sampler = "gtp"'))
-    with pytest.raises(NgptError, match=r"samplers\.gpt-followed: unknown sampler 'gtp'; did you mean 'gpt'"):
+    with pytest.raises(NgptError, match=r"samplers\.gpt-half: unknown sampler 'gtp'; did you mean 'gpt'"):
         read_config(tmp_path / "eval.toml")
 
 

@@ -18,9 +18,8 @@ register(
         options={
             "shift": Option(
                 "replay",
-                "how offset paths continue before they join: half-vector copies the half vectors of smooth events, "
-                "manifold follows some of the light of 'caustic' to its lamps",
-                choices=("replay", "half-vector", "manifold"),
+                "how offset paths continue before they join: half-vector copies the half vectors of smooth events",
+                choices=("replay", "half-vector"),
             ),
             "reuse": Option(False, "the primal is the mean over base paths and the offset paths of neighbours"),
             "roughness_threshold": CONNECTABLE,

@@ -16,7 +16,6 @@ from data_gen.paths.segments import Segment
 from data_gen.paths.space import Drawn
 from data_gen.paths.vertex import DELTA, SMOOTH, event_kind
 from data_gen.paths.walk import Sky, roulette
-from data_gen.samplers.gpt.manifold_shift import Chain, advance, no_chain
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.scenes.lamps import Chosen
 from data_gen.tails import matt
@@ -36,7 +35,6 @@ class Path:
     sky: Sky  # whether an escape sees the environment
     rough: mi.Bool  # the path has scattered smoothly at a connectable vertex: see data_gen.paths.caustic
     late: mi.Bool  # and it has later left a vertex by a mirror, glass or sharp gloss
-    chain: Chain | None  # see data_gen.samplers.gpt.manifold_shift; None without that shift
     walks: mi.Bool  # some path of the five may go on from x
     aim: Aim | None = None  # of the edge that has led to x; None in scenes without holes
     # If paths may end in the cache: how far this one has come, and ρ of the part of x that the cache has supplied
@@ -96,8 +94,6 @@ class Step:
     # See data_gen.paths.caustic; L_light and L_bsdf hold nothing of that layer
     L_caustic: mi.Spectrum  # f m Le / p of both techniques
     ends_late: mi.Bool  # the path is late after x, or after x1 at the latest
-    # See data_gen.samplers.gpt.manifold_shift; L_bsdf and L_caustic hold nothing of that light
-    L_followed: mi.Spectrum  # m Le
     more: mi.UInt32 | int  # number of edges that may follow after x1
     # In scenes with holes: whether the path has passed one at x, and its aim after x
     passed: mi.Bool | None = None
@@ -122,7 +118,6 @@ def begin(plan: Plan, x: mi.SurfaceInteraction3f, place, channel, β: mi.Spectru
         sky=Sky.from_camera(plan.hides),
         rough=mi.Bool(False),
         late=mi.Bool(False),
-        chain=no_chain(dr.width(x.t)) if plan.manifold else None,
         walks=mi.Bool(True),
         aim=Aim.of_camera(x.p) if plan.space.holes else None,
     )
@@ -227,16 +222,11 @@ def base_step(
 
     # ------------------- The layer ``caustic`` -------------------
     x_connectable = plan.materials.connectable(bsdf) | media.scatters(place)
-    rough, late, chain, ends_late = path.rough, path.late, path.chain, mi.Bool(False)
-    L_caustic, L_followed = mi.Spectrum(0), mi.Spectrum(0)
+    rough, late, ends_late, L_caustic = path.rough, path.late, mi.Bool(False), mi.Spectrum(0)
     if plan.caustic:
         L_light, caustic_light = caustic.split(caustic.lit_late(rough, late, x_connectable), L_light)
         rough, late = caustic.classes(rough, late, found, kind, x_connectable)
         L_bsdf, caustic_bsdf = caustic.split(late, L_bsdf)
-        if plan.manifold:
-            chain = advance(chain, sample.sampled_type, goes_on, x_connectable)
-            chain, follows = chain.end(path.depth, survival, late, x1, Le)
-            caustic_bsdf, L_followed = caustic.split(follows, caustic_bsdf)
         L_caustic = caustic_light + f_p * caustic_bsdf
         sharp = plan.materials.sharp(x1, scene) & ~media.scatters(segment.place)
         ends_late = late | caustic.ends_late(kind == SMOOTH, x_connectable, sharp)
@@ -273,7 +263,6 @@ def base_step(
         L_bsdf=L_bsdf,
         L_caustic=L_caustic,
         ends_late=ends_late,
-        L_followed=L_followed,
         more=more,
         passed=passed,
         aim=aim,
@@ -290,7 +279,6 @@ def base_step(
         sky=sky,
         rough=rough,
         late=late,
-        chain=chain,
         walks=walks,
         aim=aim,
         trail=path.trail and path.trail.on(x1, media.scatters(segment.place), kind == SMOOTH, sample.pdf, goes_on),

@@ -53,7 +53,6 @@ from data_gen.paths.features import features
 from data_gen.paths.frozen import Frozen
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import GradientIntegrator
-from data_gen.samplers.gpt.manifold_shift import add_followed
 from data_gen.samplers.gpt.plan import Plan, make_plan
 from data_gen.samplers.gpt.rounds import sharing
 from data_gen.samplers.gpt.trace import trace
@@ -73,8 +72,8 @@ class GPT(GradientIntegrator):
                      counterpart: rejected, or of zero density, at a step that the base path took
 
     The primal of ``reuse`` has 2.6 times less variance, but the noise of neighbouring pixels is then correlated. The
-    shift "half-vector" is rarely better than "replay"; for "manifold" see ``manifold_shift``, for the other options
-    ``data_gen.paths.caustic`` and ``data_gen.tails``.
+    shift "half-vector" is rarely better than "replay". For the other options see ``data_gen.paths.caustic`` and
+    ``data_gen.tails``.
 
     Not handled: polarised variants, for which rendering raises NgptError. In media only the shift "replay" works. The
     number of collisions in grids is not limited. Each null event at a mask or a thin pane counts in ``max_depth``.
@@ -86,8 +85,6 @@ class GPT(GradientIntegrator):
         self.reuse, self.caustic = self.options["reuse"], self.options["caustic"]
         self.volumes = props.get("volumes", False)
         self.follows = "volpath" if self.volumes else "path"
-        if self.shift == "manifold" and (self.reuse or not self.caustic):
-            raise NgptError("gpt: shift 'manifold' needs the layer 'caustic', and cannot be combined with 'reuse'")
 
     @classmethod
     def parameters(cls, scene: mi.Scene) -> dict[str, Any]:
@@ -117,17 +114,14 @@ class GPT(GradientIntegrator):
 
     def sample_pass(self, frozen: Frozen, plan: Plan, known: Known | None, camera: CameraSamples, film: GradientFilm):
         """Traces one base path and its four offset paths for each camera sample. Paths may end in what is ``known``."""
-        values, Δ, inside, rest = frozen(self.samples, plan, known, camera.look((0, 0), *SHIFTS.values(), *QUARTERS))
+        values, Δ, inside, A = frozen(self.samples, plan, known, camera.look((0, 0), *SHIFTS.values(), *QUARTERS))
         if self.reuse:
-            values["primal"] = reused(camera, rest, Δ, inside) + values["direct"]
-        if plan.manifold:
-            first_hit = partial(self.first_hit, plan.space.scene)
-            Δ = add_followed(plan, first_hit, camera, list(SHIFTS.values()), rest, Δ)
+            values["primal"] = reused(camera, A, Δ, inside) + values["direct"]
         film.put_all(values | dict(zip(SHIFTS, zip(Δ, inside, strict=True), strict=True)))
 
-    def samples(self, plan: Plan, known: Known | None, camera: CameraSamples) -> tuple[dict, list, list, Any]:
-        """Returns the layers, Δ in the order of SHIFTS, whether each of its neighbours is on the film, and what some
-        options need: A for ``reuse``, or the chain for the shift "manifold".
+    def samples(self, plan: Plan, known: Known | None, camera: CameraSamples) -> tuple[dict, list, list, list | None]:
+        """Returns the layers, Δ in the order of SHIFTS, whether each of its neighbours is on the film, and A for
+        ``reuse``.
         """
         # ------------------------- Paths -----------------------------
         scene, (ray, importance, _) = plan.space.scene, camera.rays()
@@ -150,7 +144,7 @@ class GPT(GradientIntegrator):
         if self.diagnostics:
             values["shift_failures"] = count([y.failed for y in paths.offsets]) / dr.fmax(count(inside), 1)
         A = [to_rgb(y.A, ray.wavelengths) for y in paths.offsets] if self.reuse else None
-        return values, Δ, inside, paths.chain if plan.manifold else A
+        return values, Δ, inside, A
 
 
 def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f:

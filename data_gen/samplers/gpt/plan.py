@@ -27,7 +27,6 @@ class Plan:
     replays: bool  # offset paths may stay apart for more than a step: there are mirrors, glass, holes or polish
     half_vectors: bool  # smooth events that cannot be reconnected are shifted by half-vector copy, else by replay
     caustic: bool  # light that no shift can follow goes into a layer of its own, see ``data_gen.paths.caustic``
-    manifold: bool  # some of that light is shifted all the same, see ``data_gen.samplers.gpt.manifold_shift``
     matt: Matt | None = None  # where paths may end in the cache of ``data_gen.tails``; None: nowhere
 
     @property
@@ -66,6 +65,5 @@ def make_plan(
         replays=replays,
         half_vectors=replays and shift == "half-vector",
         caustic=caustic and replays,
-        manifold=caustic and replays and shift == "manifold",
         matt=Matt(scene, media_of(scene) if volumes else ()) if shared else None,
     )

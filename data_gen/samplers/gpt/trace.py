@@ -9,7 +9,6 @@ import mitsuba as mi
 
 from data_gen.paths import media
 from data_gen.samplers.gpt.base_path import Path, base_step, begin
-from data_gen.samplers.gpt.manifold_shift import Chain
 from data_gen.samplers.gpt.offset_path import Offset, next_steps, start
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.gpt.tails import end
@@ -25,7 +24,6 @@ class Traced:
     L_caustic: mi.Spectrum  # of the layer ``caustic``
     shared: mi.Spectrum  # a sample of the error of what comes from the cache
     offsets: list[Offset]
-    chain: Chain | None  # what the shift "manifold" has recorded
 
 
 def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=None, *, known=None) -> Traced:
@@ -59,7 +57,7 @@ def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=Non
             y.A = dr.select(inside, 1, 2) * L_first
         offsets.append(y)
     L, L_caustic, shared = (light + dr.zeros(mi.Spectrum, dr.width(x.t)) for light in (L, 0, 0))
-    so_far = Traced(L, Le, L_caustic, shared, offsets, path.chain)
+    so_far = Traced(L, Le, L_caustic, shared, offsets)
     if plan.limits.max_depth < 2:
         return so_far
     # Loop optimisation would record each loop twice, and would not make the kernel quicker.
@@ -77,14 +75,12 @@ def go_on(scene, plan: Plan, random, path: Path, so_far: Traced, *, known, first
     L, L_caustic = so_far.L + (step.β * step.L_light + step.β1 * step.L_bsdf), so_far.L_caustic
     if plan.caustic:
         L_caustic = L_caustic + step.β * step.L_caustic
-    if plan.manifold:
-        L = L + step.β1 * step.L_followed
     offsets = next_steps(scene, plan, step, so_far.offsets, first)
     shared = so_far.shared
     if known:
         path, tail, caustic_tail, error = end(plan, known, path, offsets)
         L, L_caustic, shared = L + tail, L_caustic + caustic_tail, shared + error
-    return path, Traced(L, so_far.Le, L_caustic, shared, offsets, path.chain)
+    return path, Traced(L, so_far.Le, L_caustic, shared, offsets)
 
 
 @dr.syntax

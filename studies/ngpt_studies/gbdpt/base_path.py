@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.holes import Edge
-from data_gen.paths.manifold import event
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.paths.walk import Sky, roulette
 from data_gen.samplers.bdpt import mis
@@ -18,6 +17,7 @@ from data_gen.samplers.bdpt import plan as both_ends
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import emission_at, to_light
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, context, cosine, reverse_density, scatters_smoothly
+from ngpt_studies.gbdpt.manifold import event
 from ngpt_studies.gbdpt.pairs import difference
 
 

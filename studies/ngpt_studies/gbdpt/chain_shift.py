@@ -6,7 +6,7 @@ r"""Camera paths that go through mirrors or glass directly after the vertex x1 b
     F, P      products of the events' reflectances, and of the probabilities to sample them
     J         dω' / dω at a fixed y
 
-The copy walks to y (``data_gen.paths.manifold``) and shares all vertices behind y, whichever strategy completes the
+The copy walks to y (``ngpt_studies.gbdpt.manifold``) and shares all vertices behind y, whichever strategy completes the
 path there. For each path that ends at y or goes on from there:
 
     b' / b    f'(ω') F' J / (f(ω) F)
@@ -34,13 +34,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths.manifold import Target, add_event, follow, shoot
 from data_gen.paths.vertex import SMOOTH, seen_from
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import emission_at
 from data_gen.samplers.bdpt.vertex import RADIANCE, cosine, evaluate
 from ngpt_studies.gbdpt.base_path import Plan, Step, known_met
+from ngpt_studies.gbdpt.manifold import Target, add_event, follow, shoot
 
 
 @dataclass

@@ -15,12 +15,12 @@ import mitsuba as mi
 from data_gen.film.splats import Splats
 from data_gen.paths.eye import Sight
 from data_gen.paths.light_ends import LightRay
-from data_gen.paths.manifold import event, has_room
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.samplers.bdpt.light_path import End, Seen, begin, go_on
 from data_gen.samplers.bdpt.plan import Plan
 from data_gen.samplers.bdpt.vertex import record, record_class
+from ngpt_studies.gbdpt.manifold import event, has_room
 from ngpt_studies.gbdpt.pairs import weighted
 
 

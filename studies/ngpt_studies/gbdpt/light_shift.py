@@ -15,7 +15,6 @@ from data_gen.film import SHIFTS
 from data_gen.film.splats import Splats
 from data_gen.paths.eye import Eye, Sight
 from data_gen.paths.light_ends import LightRay
-from data_gen.paths.manifold import Target, follow, walk
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Partial
@@ -23,6 +22,7 @@ from data_gen.samplers.bdpt.strategies import to_camera
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, cosine, evaluate, recall, scatters_smoothly
 from ngpt_studies.gbdpt.base_path import Plan
 from ngpt_studies.gbdpt.light_again import light_again
+from ngpt_studies.gbdpt.manifold import Target, follow, walk
 from ngpt_studies.gbdpt.pairs import difference, difference_of_one
 
 

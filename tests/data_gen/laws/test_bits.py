@@ -3,7 +3,6 @@
 import drjit as dr
 import numpy as np
 import pytest
-from data_gen_scenes import caustics
 from media_scenes import wisps
 from registered import cases, quick, scene_for, slow
 from unbiased import load, same
@@ -14,7 +13,6 @@ from data_gen.samplers import SAMPLERS
 
 # What has kernels or rounds of its own: sampler, scene, samples, options
 MORE = [
-    ("gpt", caustics, 48, {"shift": "manifold"}),
     ("gpt", "glossy", 40, {"tails": "shared"}),
     ("primal", "diffuse", 40, {"tails": "shared"}),
     slow("gpt", "diffuse", 70, {"reuse": True}),

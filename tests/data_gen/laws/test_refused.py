@@ -45,9 +45,6 @@ TABLE = [
     ("gpt-simple", hidden_lamp, {}, "hides emitters; use --sampler gpt"),
     ("bre", endless, {}, "infinitely far away comes through a medium without end"),
     ("gpt", media_scenes.haze, {"shift": "half-vector"}, "gpt: shift 'half-vector' does not go through media"),
-    ("gpt", media_scenes.haze, {"shift": "manifold"}, "gpt: shift 'manifold' does not go through media"),
-    ("gpt", "diffuse", {"shift": "manifold", "reuse": True}, r"^gpt: shift 'manifold' needs the layer 'caustic'"),
-    ("gpt", "diffuse", {"shift": "manifold", "caustic": False}, r"^gpt: shift 'manifold' needs the layer 'caustic'"),
 ]
 
 

@@ -83,7 +83,6 @@ QUICK = [
     Case("gpt", "few_edges", (FAR,), size=SMALL, spp=64),
     # All that is not a mirror is connectable: paths reconnect where they hardly can.
     Case("gpt", "plenty", (1,), {"roughness_threshold": 0.0}),
-    Case("gpt", "caustics", (FAR,), {"shift": "manifold"}),
     # And either shift where nothing is.
     moved(PLACES[0], {"shift": "half-vector"} | UNCONNECTABLE, spp=64),
     moved(PLACES[-1]),
@@ -101,7 +100,6 @@ SLOW = [
     *(Case("gpt", scene, **LONG) for scene in (*BUILTIN, "glass", "hidden_lamp", "plenty")),
     Case("gpt", "plenty", options=UNCONNECTABLE),
     *(moved(place) for place in PLACES),
-    *(Case("gpt", scene, options={"shift": "manifold"}) for scene in ("under_the_sky", "glass")),
     *(
         Case("gpt", scene, options={"shift": "half-vector", "roughness_threshold": 0.35})
         for scene in ("plenty", "glass", "environment")

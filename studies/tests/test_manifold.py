@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from data_gen.paths import manifold
-from data_gen.paths.manifold import MAX_EVENTS, REFLECT, REFRACT, Target, add_event, event, follow, shoot, walk
+from ngpt_studies.gbdpt import manifold
+from ngpt_studies.gbdpt.manifold import MAX_EVENTS, REFLECT, REFRACT, Target, add_event, event, follow, shoot, walk
 
 LANES = 4096
 
