@@ -2,12 +2,14 @@
 
     python -m bench.gallery --folder SCENES --cache out/gallery
     python -m bench.gallery --wipe glossy --size 640 360 --cache out/gallery
+    python -m bench.gallery --which --folder SCENES --cache out/gallery
 
 SCENES has the scenes that are files. Each row of SCENES_SHOWN is rendered with the command that the page gives, and
 denoised by the default method of `ngpt denoise`; the reference is rendered without shared paths, in two halves of other
 seeds. Renders are kept in the cache. It writes docs/images/gallery, bench/results/gallery.json, and the table between
 the marks of the page. With --wipe it writes docs/images/wipe.webp: a line that moves over the noisy image and leaves
-the result.
+the result. With --which it writes docs/images/which-sampler.webp: the scenes and samplers of WHICH beside path tracing,
+each image rendered for WHICH_SECONDS of processor time.
 """
 
 import argparse
@@ -18,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+import data_gen
 import ngpt
 from bench.common import kept, metadata, save, write_page
 from bench.judging import RIVAL, timed
@@ -62,12 +65,21 @@ SCENES_SHOWN = (
     Shown("bathroom/scene.xml", 4),
 )
 
+WHICH = {
+    "living-room/scene.xml": "auto",
+    "veach-bidir/scene.xml": "bdpt",
+    "bench/scenes/mirror-caustic/scene.xml": "vcm",
+    "haze": "auto",
+}
+WHICH_SECONDS = 20
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, default=Path(), help="of the scenes that are files")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="scenes to make anew")
     parser.add_argument("--wipe", metavar="NAME", help="writes the moving picture of one scene instead")
+    parser.add_argument("--which", action="store_true", help="writes the picture of which-sampler.md instead")
     parser.add_argument("--size", type=int, nargs=2, default=(320, 180), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--cache", type=Path, required=True, help="folder for what is rendered")
     args = parser.parse_args()
@@ -77,6 +89,9 @@ def main() -> None:
         result = ngpt.denoise(stack)
         shown = [to_srgb8(image, auto_exposure(result)) for image in (stack["primal"], result)]
         write_wipe(ROOT / "docs" / "images" / "wipe.webp", *shown)
+        return
+    if args.which:
+        write_which(args, ROOT / "docs" / "images" / "which-sampler.webp")
         return
     before = json.loads(RESULT.read_text()) if args.only else {"rows": {}}
     rows = {}
@@ -131,8 +146,6 @@ def rendered(
     file = args.cache / f"{name_of(row)}-{made_by}-{spp}-{seed}-{args.size[0]}x{args.size[1]}.exr"
 
     def make() -> GradientStack:
-        import data_gen
-
         path = args.folder / row.scene if (args.folder / row.scene).exists() else row.scene
         how = {"size": tuple(args.size), "unbiased": unbiased}
         made, seconds = timed(lambda: data_gen.render_scene(path, spp, seed, sampler, **how, **options))
@@ -168,6 +181,25 @@ def write_wipe(path: Path, before: np.ndarray, after: np.ndarray) -> None:
         frames.append(frame)
     waits = [REST_MS if i in (0, WIPE_FRAMES) else WIPE_MS for i in range(len(frames))]
     written(path, frames, duration=waits, loop=0, quality=70)
+
+
+def write_which(args: argparse.Namespace, path: Path) -> None:
+    """A row for each scene of WHICH: Mitsuba's path tracing, the same with OIDN, and the sampler with its method."""
+    rows = []
+    for name, sampler in WHICH.items():
+        scene = args.folder / name if (args.folder / name).exists() else name
+        how = {"cpu_seconds": WHICH_SECONDS, "size": tuple(args.size)}
+        paths, _ = data_gen.render_scene(scene, sampler="primal", unbiased=True, **how, **RIVAL)
+        stack, _ = data_gen.render_scene(scene, sampler=sampler, **how)
+        result = ngpt.reconstruct(stack)
+        shown = paths["primal"], ngpt.denoise(paths, "oidn"), result.image
+        heads = ("Path tracing", "Path tracing, OIDN", f"{stack.attributes['ngpt:sampler']}, {result.method}")
+        exposure = auto_exposure(result.image)
+        rows.append(beside({head: to_srgb8(image, exposure) for head, image in zip(heads, shown, strict=True)}))
+    canvas = Image.new("RGB", (rows[0].width, sum(row.height for row in rows)), PAPER)
+    for i, row in enumerate(rows):
+        canvas.paste(row, (0, i * row.height))
+    written(path, [canvas], quality=88)
 
 
 def beside(tiles: dict[str, np.ndarray]) -> Image.Image:
