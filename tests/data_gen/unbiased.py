@@ -50,10 +50,17 @@ def far_shifts(pixels):
 
 def render_ours(scene, sampler, batches=16, spp=64, pixels=1, seed=0, **options):
     """Layers of independent stacks, of seeds from ``seed`` on, whose gradients are differences over so many pixels."""
-    from data_gen.render import render_stack
-
     with far_shifts(pixels):
-        return [render_stack(scene, spp, seed + i, sampler, unbiased=True, **options).layers for i in range(batches)]
+        return [stack.layers for stack in stacks_of(scene, sampler, batches, spp, seed, **options)]
+
+
+def stacks_of(scene, sampler, batches, spp, seed=0, **options):
+    """Independent unbiased stacks, of seeds from ``seed`` on. Their kernels are recorded once."""
+    from data_gen.render import render_stack
+    from data_gen.samplers.reused import Made
+
+    options |= {"unbiased": True, "made": Made()}
+    return [render_stack(scene, spp, seed + i, sampler, **options) for i in range(batches)]
 
 
 def render_references(mi, scene, batches=24, spp=256):
