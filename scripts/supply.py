@@ -77,7 +77,7 @@ def closure(extras: set[str]) -> dict[str, Distribution]:
 def runtime() -> dict[str, Distribution]:
     """What users of ngpt may have to install: everything but the tools of its developers."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    return closure(set(project["optional-dependencies"]) - {"dev", "docs", "fuzz"})
+    return closure(set(project["optional-dependencies"]) - {"dev", "docs"})
 
 
 def licence(package: Distribution) -> str:

@@ -15,7 +15,6 @@ ALLOWED = {
     r"strace may not trace here": "some containers forbid it",
     r"the compiler has no ": "sanitizers that a compiler comes without",
     r"clang has no libFuzzer": "the same",
-    r"could not import 'atheris'": "it has no wheel for every Python",
 }
 
 

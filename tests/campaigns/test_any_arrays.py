@@ -114,7 +114,7 @@ def options_of(method, options):
 
 
 QUICK = settings(
-    max_examples=25, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
+    max_examples=10, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
 )
 # Studies promise it of stacks as samplers make them.
 FOR_USE = ["auto", *(name for name, method in METHODS.items() if method.standing != "study")]

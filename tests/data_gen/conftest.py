@@ -17,10 +17,11 @@ def command(command):
 
 @pytest.fixture(scope="module")
 def small_images_share():
-    """Small images have a cache from the first sample on."""
-    from data_gen.tails import schedule
+    """Small images have a cache from the first sample on. It is small, since to read all its cells takes long."""
+    from data_gen.tails import cache, schedule
 
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cache, "CELLS", 1 << 17)
         patch.setattr(schedule, "BEGIN", 1)
         patch.setattr(schedule, "FIRST", 1 << 13)
         yield

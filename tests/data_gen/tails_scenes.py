@@ -5,7 +5,6 @@ import numpy as np
 
 from data_gen.scenes.builtin import _box, _camera, _diffuse, _light, _rgb, _room, _sphere, _wall
 
-SIZE = (32, 24)
 OPEN = {"origin": [0, 1.25, 3.9], "target": [0, 1.1, 0], "fov": 50}
 
 
@@ -80,17 +79,6 @@ def shade():
         **_walls(1.2, 2.2, -1.2, 1.7),
         bulb=bulb | {"emitter": {"type": "area", "radiance": _rgb(60, 50, 40)}},
         tube=tube | {"to_world": mi.ScalarTransform4f(), "bsdf": _grey(0.7)},
-    )
-
-
-def corner_box():
-    """A box in a corner with a gap of 2 cm to both walls."""
-    return _place(
-        (0.6, 1.3, 1.0),
-        (-0.9, 0.4, -0.9),
-        **_walls(1.2, 2.2, -1.2, 1.5),
-        lamp=_light([0.3, 2.19, 0.2], [0, -1, 0], (0.7, 0.7), (8, 8, 8)),
-        box=_box([-0.88, 0.35, -0.88], [0.6, 0.7, 0.6], 0, _grey(0.7)),
     )
 
 
@@ -229,23 +217,4 @@ def of_material(material):
     )
     for part in ("floor", "back"):
         scene[part]["bsdf"] = material
-    return scene
-
-
-def first_sunset():
-    """A closed room with a window, lit by a sun 2 degrees high: its blue is negative, and the sky's red is little."""
-    wall, place = _grey(0.7), mi.ScalarTransform4f()
-    room = {
-        "floor": _wall([0, 0, 0], [0, 0, 1], (4, 4), wall),
-        "ceiling": _wall([0, 0, 3], [0, 0, -1], (4, 4), wall),
-        "back": _wall([-2, 0, 1.5], [1, 0, 0], (3, 4), wall),
-        "near": _wall([0, -2, 1.5], [0, 1, 0], (4, 3), wall),
-        "far": _wall([0, 2, 1.5], [0, -1, 0], (4, 3), wall),
-    }
-    around = {"left": (-1.4, 1.5, 1.2, 3), "right": (1.4, 1.5, 1.2, 3), "low": (0, 0.45, 1.6, 0.9)}
-    for name, (y, z, wide, high) in (around | {"high": (0, 2.6, 1.6, 0.8)}).items():
-        room[f"window {name}"] = _wall([2, y, z], [-1, 0, 0], (high, wide), wall)
-    sky = {"type": "sunsky", "sun_direction": [0.999391, 0.15, 0.0348995], "turbidity": 3.0}
-    scene = _place((0, 0, 0), (1, 0, 0), 75, **room, sky=sky)
-    scene["sensor"]["to_world"] = place.look_at([1.7, -1.6, 1.5], [-1.5, 1.2, 1.2], [0, 0, 1])
     return scene

@@ -3,8 +3,6 @@
 import argparse
 import json
 import signal
-import socket
-import subprocess
 import sys
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +13,6 @@ import pytest
 import ngpt
 from data_gen.cli.render_arguments import frames, targets
 from data_gen.pattern import filled
-from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.system.console import Console
 from ngpt.system.interrupts import Interrupt
@@ -191,35 +188,12 @@ def test_ctrl_c_interrupts_a_cluster_at_once_and_no_render_that_is_done(renderer
 
 
 @pytest.mark.slow
-def test_the_example_of_dask_with_two_workers(renderer, tmp_path):
-    """As docs/use/farm.md has it: scheduler, workers and `ngpt render` are programs of their own. Bits are those of
-    one process."""
-    pytest.importorskip("distributed")
-    port, started = free_port(), []
-
-    def dask(*words):
-        command = [sys.executable, "-m", "distributed.cli.dask_" + words[0], *words[1:]]
-        started.append(subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
-
-    scheduler = f"tcp://127.0.0.1:{port}"
-    words = ["diffuse", "--frames", "0:17", "--size", "16x12", "--spp", "2", "--sampler", "gpt"]
-    try:
-        dask("scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
-        dask("worker", scheduler, "--nworkers", "2", "--nthreads", "1", "--no-dashboard")
-        command = [sys.executable, "-m", "ngpt", "render", *words, "-o", "farm", "--cluster", scheduler]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=400, check=False)
-        assert done.returncode == 0, done.stderr
-    finally:
-        for process in reversed(started):
-            process.terminate()
-            process.wait(60)
-    assert main(["render", *words, "-o", str(tmp_path / "alone")]) == 0
+def test_workers_of_a_real_cluster_render_the_bits_of_one_process(renderer, command):
+    distributed = pytest.importorskip("distributed")
+    line = "render diffuse --frames 0:17 --size 16x12 --spp 2 --sampler gpt -o"
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        command(f"{line} farm --cluster {cluster.scheduler_address}")
+    command(f"{line} alone")
     for frame in range(17):
-        ours, theirs = (ngpt.read(tmp_path / f / f"diffuse.{frame:04d}.exr") for f in ("farm", "alone"))
+        ours, theirs = (ngpt.read(f"{folder}/diffuse.{frame:04d}.exr") for folder in ("farm", "alone"))
         assert all(np.array_equal(ours[name], theirs[name], equal_nan=True) for name in theirs.names)
-
-
-def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]

@@ -4,13 +4,14 @@ How large the bias is where light may leak is in ``test_tails_leaks``.
 """
 
 import logging
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from media_scenes import milk, nested
+from media_scenes import nested
+from shared_tails import blocks, kept, whole_paths
 from tails_scenes import bulb, mirrors, slit
 from unbiased import light_of_gradients, load
 
@@ -135,19 +136,14 @@ def test_half_the_difference_is_a_sample_of_the_error(renderer):
 @pytest.mark.parametrize(("parts", "times"), [(200, cache.MOST), (2, N / 2)])
 def test_one_record_cannot_bring_most_of_the_light(renderer, monkeypatch, parts, times):
     monkeypatch.setattr(cache, "PARTS", parts)
-    values = np.ones(N, np.float32)
-    values[5] = 1e6
-    place = flat(dr.full(mi.Float, 0.5, N), 0.5)
-    (red, green, _), *_ = known([(place, [mi.Float(values), mi.Float(0.5 * values), mi.Float(0)], None)], place)
-    most = max(times, N / parts) * values.mean()
-    assert red[0] == pytest.approx((N - 1 + most) / N, rel=1e-3) and green[0] == pytest.approx(0.5 * red[0], rel=1e-3)
-
-
-def test_light_that_is_cut_is_counted(renderer):
     filled, values = cache.Cache(FINENESS), np.ones(N, np.float32)
     values[5] = 1e6
-    filled.add(flat(dr.full(mi.Float, 0.5, N), 0.5), dr.arange(mi.UInt32, N) & 1, [mi.Float(values)] * 3)
-    kept = N - 1 + max(cache.MOST, N / cache.PARTS) * values.mean()
+    place = flat(dr.full(mi.Float, 0.5, N), 0.5)
+    filled.add(place, dr.arange(mi.UInt32, N) & 1, [mi.Float(values), mi.Float(0.5 * values), mi.Float(0)])
+    filled.settle(FINENESS)
+    ((red, green, _),), *_ = filled.known.look(place, LEAST, mi.Bool(True))
+    kept = N - 1 + max(times, N / parts) * values.mean()
+    assert red[0] == pytest.approx(kept / N, rel=1e-3) and green[0] == pytest.approx(0.5 * red[0], rel=1e-3)
     assert filled.cut / filled.light == pytest.approx(1 - kept / values.sum(), rel=1e-3)
 
 
@@ -219,28 +215,23 @@ def test_records_of_earlier_rounds_fade(renderer, monkeypatch):
 
 
 def test_paths_that_feed_have_random_numbers_of_their_own(renderer, monkeypatch):
-    """Else a path of the image would end in the light that the same path has found."""
-    seeds = {}
-    for module in (passes, rounds):
+    """Otherwise a path of the image would end in the light that the same path has found.
 
-        def camera(sensor, seed, *args, name=module.__name__, real=module.CameraSamples, **named):
-            seeds.setdefault(name, set()).add(seed)
+    They go by ``tails_seed``, and so do the borders of cells.
+    """
+    seeds, grids, grid = {passes: set(), rounds: set()}, set(), rounds.grid
+    for module, its in seeds.items():
+
+        def camera(sensor, seed, *args, its=its, real=module.CameraSamples, **named):
+            its.add(seed)
             return real(sensor, seed, *args, **named)
 
         monkeypatch.setattr(module, "CameraSamples", camera)
-    render_stack(load(renderer, "diffuse", (32, 24)), 16, 5, "primal", tails="shared")
-    assert len(seeds) == 2 and not set.intersection(*seeds.values())
-
-
-def test_the_noise_of_the_cache_is_of_its_own_seed(renderer):
-    """The layer ``shared`` says what it is: less changes where only the paths of the image are others."""
-    scene = load(renderer, slit, (32, 24))
-
-    def changes(tails_seed):
-        stacks = [render_stack(scene, 16, i, "primal", tails="shared", tails_seed=tails_seed) for i in range(8)]
-        return np.std([np.mean(stack["shared"], dtype=float) for stack in stacks])
-
-    assert changes(1) < 0.6 * changes(None)
+    monkeypatch.setattr(rounds, "grid", lambda sensor, seed: grids.add(seed) or grid(sensor, seed))
+    for seed in (5, 6):
+        render_stack(load(renderer, "diffuse", (16, 12)), 16, seed, "primal", tails="shared", tails_seed=5)
+    assert len(seeds[passes]) == 2 and len(seeds[rounds]) == 1 and grids == {5}
+    assert not set.intersection(*seeds.values())
 
 
 def test_frames_have_one_cache(renderer, monkeypatch):
@@ -290,23 +281,25 @@ def test_a_full_cache_says_so_and_goes_on(renderer, caplog, monkeypatch):
     assert "the cache of tails is full" in line and "--unbiased" in line
 
 
+def layers_of(scene, tails, spp):
+    """Layers of eight images by ``gpt``."""
+    scene = load(mi, scene, (32, 24))
+    return [render_stack(scene, spp, seed, "gpt", tails=tails).layers for seed in range(8)]
+
+
 @pytest.fixture(scope="module")
-def renders(renderer):
-    """Stacks of a scene by a sampler, of eight seeds: the layers of each."""
-
-    @lru_cache
-    def rendered(scene, sampler, tails):
-        scene = load(mi, scene, (32, 24))
-        return [render_stack(scene, 32, seed, sampler, tails=tails).layers for seed in range(8)]
-
-    return rendered
+def shared(renderer):
+    return lru_cache(partial(layers_of, tails="shared", spp=32))
 
 
-# A room without mirrors shows nothing that the others do not.
-@pytest.mark.parametrize("scene", [pytest.param("diffuse", marks=pytest.mark.slow), "glossy", bulb, mirrors, nested])
-def test_differences_are_those_of_the_image(renders, scene):
+# A room without mirrors shows nothing that the others do not. In the ball of glass nothing but caustics is new.
+ROOMS = [*(pytest.param(scene, marks=pytest.mark.slow) for scene in ("diffuse", bulb)), "glossy", mirrors, nested]
+
+
+@pytest.mark.parametrize("scene", ROOMS)
+def test_differences_are_those_of_the_image(shared, scene):
     """In the mean over blocks, within four standard errors and a little for places where but one of two paths ends."""
-    stacks = renders(scene, "gpt", "shared")
+    stacks = shared(scene)
     assert all(np.isfinite(stack["primal"]).all() for stack in stacks)
     lights = np.array([light_of_gradients(stack) for stack in stacks], np.float64)
     for axis, layer in enumerate(("dx", "dy")):
@@ -317,28 +310,20 @@ def test_differences_are_those_of_the_image(renders, scene):
         assert (np.abs(each.mean(axis=0)) < 4 * doubt + 2e-3 * lights.mean()).all(), layer
 
 
-@pytest.mark.parametrize(
-    ("sampler", "scene"),
-    [
-        ("primal", "glossy"),
-        ("primal", milk),
-        ("gpt", "glossy"),
-        ("gpt", bulb),
-        ("gpt", mirrors),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in (("primal", bulb), ("primal", mirrors), ("gpt", milk))
-        ),
-    ],
-)
-def test_no_light_is_lost_or_counted_twice(renders, sampler, scene):
+def light_and_caustics(stacks):
+    """The means of both, of each image: (images, 2)."""
+    parts = [(stack["primal"] - stack["direct"], stack.get("caustic", np.zeros(1))) for stack in stacks]
+    return np.array([[np.mean(part, dtype=np.float64) for part in each] for each in parts])
+
+
+@pytest.mark.parametrize("scene", ROOMS)
+def test_no_light_is_lost_or_counted_twice(shared, scene):
     """Also not light that comes through glass or off a mirror, which ``gpt`` keeps in a layer of its own."""
-    both = [renders(scene, sampler, tails) for tails in ("shared", "paths")]
-    for part, rel in ((lambda s: s["primal"] - s["direct"], 0.01), (lambda s: s.get("caustic", np.zeros(1)), 0)):
-        each = np.array([[np.mean(part(s), dtype=np.float64) for s in stacks] for stacks in both])
-        (shared, whole), doubt = each.mean(axis=1), np.hypot(*each.std(axis=1, ddof=1)) / np.sqrt(each.shape[1])
-        assert abs(shared - whole) <= 3.5 * doubt + rel * whole
-    assert (whole > 0) == (shared > 0) == (sampler == "gpt")
+    ours = light_and_caustics(shared(scene))
+    whole = kept(scene, (32, 24), "light, caustics", lambda: light_and_caustics(layers_of(scene, "paths", 128)))
+    doubt = np.sqrt((ours.var(axis=0, ddof=1) + whole.var(axis=0, ddof=1)) / len(ours))
+    ours, whole = ours.mean(axis=0), whole.mean(axis=0)
+    assert (ours[1] > 0) == (scene is not nested) and (np.abs(ours - whole) <= 3.5 * doubt + [0.01 * whole[0], 0]).all()
 
 
 def test_where_nothing_is_diffuse_paths_go_on(renderer):
@@ -358,8 +343,8 @@ PLUGINS = {"open": {"max_depth": 8}, "whole": {"max_depth": 8, "tails": "paths"}
 
 def test_who_shares(renderer, monkeypatch, tmp_path):
     """Renders that are large enough, by whichever door, and none that is to be unbiased."""
-    monkeypatch.setattr(schedule, "BEGIN", 1 << 14)
-    scene = load(renderer, "diffuse", (96, 88))
+    monkeypatch.setattr(schedule, "BEGIN", 1 << 11)
+    scene = load(renderer, "diffuse", (32, 24))
     plugins = {how: renderer.load_dict({"type": "gpt", **how_of}) for how, how_of in PLUGINS.items()}
     images = {how: np.array(plugin.render(scene, spp=8))[..., :3] for how, plugin in plugins.items()}
     assert {how: plugin.options["tails"] for how, plugin in plugins.items()} == {"open": "shared", "whole": "paths"}
@@ -420,13 +405,17 @@ def test_light_below_zero_is_light(renderer):
     assert whole[2] < 0 and shared == pytest.approx(whole, rel=0.02)
 
 
-def test_claims_hold_for_pixels_blocks_and_images(renderer):
-    """Real over claimed variance in a room lit through a gap. 32 seeds know the ratio of blocks within a fifth."""
-    scene, size = load(renderer, slit, (32, 24)), 8
+@pytest.fixture(scope="module")
+def rare(renderer):
+    """Layers of 32 images of a room lit through a gap: each (32, 24, 32, 3)."""
+    scene = load(renderer, slit, (32, 24))
     stacks = [render_stack(scene, 32, seed, "primal", tails="shared") for seed in range(32)]
-    primal, shared, variance = (
-        np.array([s[name] for s in stacks], np.float64) for name in ("primal", "shared", "primal_var")
-    )
+    return {name: np.array([s[name] for s in stacks], np.float64) for name in ("primal", "shared", "primal_var")}
+
+
+def test_claims_hold_for_pixels_blocks_and_images(rare):
+    """Real over claimed variance. 32 seeds know the ratio of blocks within a fifth."""
+    (primal, shared, variance), size = rare.values(), 8
     own = np.maximum(variance - np.array([shared_variance(each) for each in shared]), 0)
 
     def ratio(side):
@@ -443,30 +432,21 @@ def test_claims_hold_for_pixels_blocks_and_images(renderer):
     assert 0.4 < means / claimed < 2.3
 
 
-@pytest.mark.parametrize(
-    ("scene", "options", "reason"),
-    [
-        ("diffuse", {"reuse": True}, "reuse needs whole paths"),
-    ],
-)
-def test_what_cannot_share_says_why(renderer, scene, options, reason):
-    with pytest.raises(WrongUse, match=reason):
-        render_stack(load(renderer, scene, (8, 8)), 4, 0, "gpt", tails="shared", **options)
-    # Where nobody asks for it in so many words, such renders are as before.
-    stack = render_stack(load(renderer, scene, (96, 88)), 8, 0, "gpt", unbiased=False, **options)
-    assert "tails" not in stack.attributes.get("ngpt:samplerOptions", "")
+def test_rare_light_is_found_no_worse(rare):
+    """Squared errors of blocks, in the mean and in the worst of the images. Whole paths have 0.0148 and 0.038."""
+    errors = np.square(blocks(rare["primal"]) - whole_paths(slit).mean(axis=0)).mean(axis=(1, 2, 3))
+    assert errors.mean() < 0.0148 and errors.max() < 0.038
 
 
-def test_the_plugin_refuses_what_it_cannot(renderer):
+def test_what_cannot_share_says_why(renderer):
+    scene = load(renderer, "diffuse", (16, 12))
+    with pytest.raises(WrongUse, match="reuse needs whole paths"):
+        render_stack(scene, 4, 0, "gpt", tails="shared", reuse=True)
     with pytest.raises((NgptError, RuntimeError), match="tails=shared"):
-        plugin = renderer.load_dict({"type": "gpt", "tails": "shared", "reuse": True})
-        plugin.render(load(renderer, "diffuse", (8, 8)), spp=4)
-
-
-def test_kernels_are_recorded_once(renderer, recordings):
-    render_stack(load(renderer, "glossy", (24, 16)), 40, 3, "gpt", tails="shared")
-    # The cache's arrays are replaced between rounds, and have their widths.
-    assert set(recordings.of) == {"samples", "paths"} and recordings.total() <= 4
+        renderer.load_dict({"type": "gpt", "tails": "shared", "reuse": True}).render(scene, spp=4)
+    # Without the option ``tails`` such renders do not share.
+    stack = render_stack(scene, 8, 0, "gpt", unbiased=False, reuse=True)
+    assert "tails" not in stack.attributes.get("ngpt:samplerOptions", "")
 
 
 def test_samples_that_are_shared_out(renderer, caplog):
@@ -479,7 +459,7 @@ def test_samples_that_are_shared_out(renderer, caplog):
     assert all(np.array_equal(one[layer], other[layer], equal_nan=True) for layer in one.names) and not caplog.messages
 
 
-@pytest.mark.parametrize(("scene", "most"), [("diffuse", 0.8), ("haze", 0.7)])
+@pytest.mark.parametrize(("scene", "most"), [("diffuse", 0.8), pytest.param("haze", 0.7, marks=pytest.mark.slow)])
 def test_fewer_rays_find_more(renderer, scene, most):
     """Variance of the image at equal samples, in a room without mirrors and in fog. Measured in fog: .5."""
     scene, noise = load(renderer, scene, (48, 32)), {}

@@ -1,14 +1,12 @@
-"""Paths that end in the cache within media: which may, and that no light is lost."""
+"""Paths that end in the cache within media: which may, and how they scatter there."""
 
-import gc
 import math
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from kept_light import keeps_its_light
-from media_scenes import coloured_smoke, colours, filled, hovering, milk, nested, wisps
+from media_scenes import filled, hovering
 from unbiased import load
 
 from data_gen.paths import media
@@ -18,14 +16,6 @@ from data_gen.tails import matt
 from data_gen.tails.cache import Trail
 from data_gen.tails.table import INSIDE, octahedral
 from ngpt.errors import WrongUse
-
-pytestmark = pytest.mark.usefixtures("small_images_share")
-
-
-@pytest.fixture(autouse=True)
-def no_others():
-    """Kernels call the phase functions of all scenes in memory, and cannot be recorded where some are of no scene."""
-    gc.collect()
 
 
 def hg(g):
@@ -111,20 +101,6 @@ def test_the_first_segment_counts_as_a_whole(renderer):
     x = dr.zeros(mi.SurfaceInteraction3f, 1)
     x.p, x.t = mi.Point3f(0, 0, 4), mi.Float(0.5)
     assert Filled(scene).length(mi.Point3f(0, 3, 0), x)[0] == 5
-
-
-KEPT = {name: filled({"albedo": 0.95, "sigma_t": 0.6, "phase": phase}) for name, (phase, _) in PHASES.items()}
-KEPT |= {scene.__name__: scene for scene in (nested, milk, hovering, coloured_smoke, wisps)} | {"colours": colours}
-SLOW = ("rayleigh", "a little forward", "table", "hovering", "coloured_smoke")
-MARKS = {name: [pytest.mark.slow] for name in SLOW}
-# Mitsuba hides the table from Dr.Jit, also where paths are whole.
-MARKS["table"].append(pytest.mark.recorded_anew)
-
-
-@pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, ())) for name in KEPT])
-def test_each_medium_keeps_its_light(renderer, monkeypatch, name):
-    monkeypatch.setattr("data_gen.samplers.gpt.rounds._PAYS", 0)
-    keeps_its_light(load(mi, KEPT[name], (32, 24)), deviations=3)
 
 
 def test_who_cannot_share_in_media_says_so(renderer):

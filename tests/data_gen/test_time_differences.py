@@ -51,7 +51,7 @@ class Estimates:
     ("scene", "camera", "moved"),
     [
         pytest.param("diffuse", 0.05, {}, marks=pytest.mark.slow),
-        ("diffuse", 0.0, {"lamp": (0.3, 0, 0), "ball": (-0.1, 0, 0)}),
+        pytest.param("diffuse", 0.0, {"lamp": (0.3, 0, 0), "ball": (-0.1, 0, 0)}, marks=pytest.mark.slow),
         ("glossy", 0.02, {"lamp": (-0.2, 0, 0)}),
     ],
 )
@@ -84,7 +84,7 @@ def test_of_a_camera_at_rest_it_is_that_of_the_pixels(renderer, monkeypatch):
     ("scene", "camera", "moved", "most"),
     [
         ("diffuse", 0.02, {}, 0.05),
-        ("diffuse", 0.0, {"lamp": (0.04, 0, 0)}, 0.05),
+        pytest.param("diffuse", 0.0, {"lamp": (0.04, 0, 0)}, 0.05, marks=pytest.mark.slow),
         pytest.param("glossy", 0.02, {}, 0.5, marks=pytest.mark.slow),
         pytest.param("glossy", 0.0, {"gold": (0.03, 0, 0)}, 0.5, marks=pytest.mark.slow),
     ],

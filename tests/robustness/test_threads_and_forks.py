@@ -55,11 +55,15 @@ def measured(i):
 
 WORK = {name: lambda i, name=name: ngpt.denoise(stack(i), name) for name in USABLE}
 WORK |= {"Denoiser": by_denoiser, "Temporal": over_time, "metrics": measured}
+# These have all that other methods share: solvers, graphs, OIDN, and state between frames.
+QUICK = ("l2", "wcv", "oidn", "ngpt-fast", "Denoiser", "Temporal", "metrics")
 
 
 @needs_forks
 @no_warning_of_forks
-@pytest.mark.parametrize("name", WORK)
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in WORK]
+)
 def test_threads_and_children_get_the_bits_of_one_thread(name):
     """A child that is forked after all this use works as its parent does, and the parent goes on after it."""
     work = WORK[name]

@@ -1,11 +1,10 @@
-"""What broken inputs are given to: a function of the input's number and a folder to work in, for each target.
+"""What broken files are given to: a function of a ``random.Random`` and a folder to work in, for each target.
 
-A target returns where the input is accepted and handled, raises NgptError where it is refused, and anything else is a
-failure. Number -1 is a whole input.
+A target returns where the file is accepted and handled, raises NgptError where it is refused, and anything else is a
+failure. With None in place of the random numbers the file is whole.
 """
 
 import io
-import random
 import struct
 import tempfile
 import tomllib
@@ -14,10 +13,11 @@ from collections.abc import Callable
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+from random import Random
 
 import numpy as np
-from data_mutations import bytes_changed, safetensors_changed, to_json, to_toml, value_changed
-from exr_mutations import mutate, seeds
+from broken_data import bytes_changed, safetensors_changed, to_json, value_changed
+from broken_exr import exr_changed, seeds
 from full_stack import full_stack
 
 import ngpt
@@ -25,13 +25,13 @@ from ngpt.io.exr import read, write
 from ngpt.methods import reconstruct
 from ngpt.network.shipped import WEIGHTS
 
-CONFIGS = Path(__file__).resolve().parents[3] / "configs"
+CONFIGS = Path(__file__).parents[2] / "configs"
 
 
-def exr(number: int, folder: Path) -> None:
+def exr(rng: Random | None, folder: Path) -> None:
     """What `ngpt denoise` does with a file: reads, reconstructs, writes; what is written can be read again."""
     path, result = folder / "stack.exr", folder / "result.exr"
-    path.write_bytes(seeds()[0] if number < 0 else mutate(number))
+    path.write_bytes(exr_changed(rng) if rng else seeds()[0])
     stack = read(path)
     method = "l2" if "dx" in stack and "dy" in stack else "primal"
     image = reconstruct(stack, method).image
@@ -82,12 +82,10 @@ def _with_checksums(data: bytes) -> bytes:
     return out
 
 
-def foreign(number: int, folder: Path) -> None:
+def foreign(rng: Random | None, folder: Path) -> None:
     """PFM, Radiance HDR, PNG, TIFF and JPEG: read as a stack and as a picture."""
-    seeds = _foreign()
-    name, data = seeds[max(number, 0) % len(seeds)]
-    if number >= 0:
-        rng = random.Random(number)
+    name, data = rng.choice(_foreign()) if rng else _foreign()[0]
+    if rng:
         data = bytes_changed(rng, data)
         data = _with_checksums(data) if name.endswith("png") and rng.random() < 0.8 else data
     path = folder / name
@@ -130,18 +128,18 @@ def _read_dataset(folder: Path, manifest: bytes, shard: bytes) -> None:
     assert problems(folder) == summary(folder)["problems"]
 
 
-def manifest(number: int, folder: Path) -> None:
-    (value, shard), rng = _dataset(), random.Random(number)
+def manifest(rng: Random | None, folder: Path) -> None:
+    value, shard = _dataset()
     data = to_json(value)
-    if number >= 0:
+    if rng:
         data = to_json(value_changed(rng, value)) if rng.random() < 0.8 else bytes_changed(rng, data)
     _read_dataset(folder, data, shard)
 
 
-def shard(number: int, folder: Path) -> None:
+def shard(rng: Random | None, folder: Path) -> None:
     """With the checksum of the broken shard in the manifest, so that it is not refused for that alone."""
     value, data = _dataset()
-    data = data if number < 0 else safetensors_changed(random.Random(number), data)
+    data = safetensors_changed(rng, data) if rng else data
     entry = value["shards"][0] | {"sha256": sha256(data).hexdigest(), "bytes": len(data)}
     _read_dataset(folder, to_json(value | {"shards": [entry]}), data)
 
@@ -188,90 +186,76 @@ def _trainer(folder: Path):
     return Trainer(settings, Images(settings, [_Crop()], [], loss), folder, say=lambda text: None)
 
 
-def weights(number: int, folder: Path) -> None:
+def weights(rng: Random | None, folder: Path) -> None:
     path, data = folder / "weights.safetensors", _weights()[0]
-    path.write_bytes(data if number < 0 else safetensors_changed(random.Random(number), data))
+    path.write_bytes(safetensors_changed(rng, data) if rng else data)
     image = ngpt.denoise(full_stack(9, 7), "ngpt", weights=str(path))
     assert np.isfinite(image).all()
 
 
-def checkpoint(number: int, folder: Path) -> None:
+def checkpoint(rng: Random | None, folder: Path) -> None:
     data = _weights()[1]
     run = _trainer(folder)
-    run.checkpoint.write_bytes(data if number < 0 else safetensors_changed(random.Random(number), data))
+    run.checkpoint.write_bytes(safetensors_changed(rng, data) if rng else data)
     run.resume()
 
 
-def settings(number: int, folder: Path) -> None:
-    """Configurations of training and of data generation."""
-    from data_gen.dataset.config import read_config
-    from ngpt.training.settings import read_settings
+def settings(rng: Random | None, folder: Path) -> None:
+    """Configurations of training and of data generation: other values, or other bytes."""
+    from data_gen.dataset.config import Config, read_config
+    from ngpt.system.records import from_table
+    from ngpt.training.settings import from_dict, read_settings
 
-    rng = random.Random(number)
-    name = rng.choice(("fast.toml", "data-cpu.toml", "paper.toml"))
-    data = (CONFIGS / name).read_bytes()
-    if number >= 0:
+    name = rng.choice(("fast.toml", "data-cpu.toml", "paper.toml")) if rng else "fast.toml"
+    path, data = folder / name, (CONFIGS / name).read_bytes()
+    if rng and rng.random() < 0.8:
         value = tomllib.loads(data.decode())
         if name == "data-cpu.toml":
             value["files"] = [{"pattern": str(folder / "*.xml"), "crops": 2, "boxes": {"a": [[0, 0, 0], [1, 1, 1]]}}]
         changed = value_changed(rng, value)
-        data = (
-            to_toml(changed if isinstance(changed, dict) else {"x": changed})
-            if rng.random() < 0.8
-            else bytes_changed(rng, data)
-        )
-    path = folder / "settings.toml"
-    path.write_bytes(data)
+        changed = changed if isinstance(changed, dict) else {"x": changed}
+        from_table(Config, changed, str(path)) if name == "data-cpu.toml" else from_dict(changed, str(path))
+        return
+    path.write_bytes(bytes_changed(rng, data) if rng else data)
     if name == "data-cpu.toml":
         read_config(path)
     else:
         read_settings(path)
 
 
-def network(number: int, folder: Path) -> None:
+def network(rng: Random | None, folder: Path) -> None:
     """ONNX files that users pass as weights."""
     path, data = folder / "network.onnx", (WEIGHTS / "ngpt-fast.onnx").read_bytes()
-    path.write_bytes(data if number < 0 else _onnx_changed(random.Random(number), data))
+    path.write_bytes(_onnx_changed(rng, data) if rng else data)
     image = ngpt.denoise(full_stack(9, 7), "ngpt-fast", weights=str(path))
     assert np.isfinite(image).all()
 
 
-def _onnx_changed(rng: random.Random, data: bytes) -> bytes:
-    """Its metadata, nodes, inputs and initializers, or its bytes."""
+def _onnx_changed(rng: Random, data: bytes) -> bytes:
+    """Its metadata, nodes, inputs and initializers, or its bytes. ``hostile_networks`` has networks that lie."""
     import onnx
 
-    if rng.random() < 0.4:
+    if rng.random() < 0.5:
         # The graph's own bytes stand before and after the numbers.
         return bytes_changed(rng, data[:40_000]) + data[40_000:] if rng.random() < 0.7 else bytes_changed(rng, data)
     model = onnx.load_from_string(data)
     graph = model.graph
-    match rng.randrange(7):
+    match rng.randrange(5):
         case 0:
-            entry = rng.choice(model.metadata_props)
-            entry.value = rng.choice(
-                ("", "0", "-1", "x", "1e9", str(2**70), "primal", "primal, primal", "l3", "primal, base")
-            )
+            rng.choice(model.metadata_props).value = rng.choice(("", "0", "-1", "x", "1e9", str(2**70), "primal, base"))
         case 1:
             rng.choice(graph.input).name = rng.choice(("x", "", "base"))
         case 2:
-            del graph.node[rng.randrange(len(graph.node))]
-        case 3:
             rng.choice(graph.node).op_type = rng.choice(("Loop", "Sub", "Conv", "Nothing", "Sin"))
+        case 3:
+            tensor = rng.choice([tensor for tensor in graph.initializer if tensor.dims])
+            tensor.dims[rng.randrange(len(tensor.dims))] = rng.choice((0, 1, -1, 2**31, 2**62))
         case 4:
-            tensor = rng.choice(graph.initializer)
-            tensor.data_location = onnx.TensorProto.EXTERNAL
-            for key, value in (("location", rng.choice(("/etc/passwd", "../x", "network.onnx"))), ("offset", "0")):
-                tensor.external_data.add(key=key, value=value)
-            tensor.ClearField("raw_data")
-        case 5:
-            tensor = rng.choice(graph.initializer)
-            if tensor.dims:
-                tensor.dims[rng.randrange(len(tensor.dims))] = rng.choice((0, 1, -1, 2**31, 2**62))
-        case 6:
-            del graph.input[rng.randrange(len(graph.input))]
+            part = rng.choice((graph.node, graph.input))
+            del part[rng.randrange(len(part))]
     return model.SerializeToString()
 
 
-TARGETS: dict[str, Callable[[int, Path], None]] = {
+TARGETS: dict[str, Callable[[Random | None, Path], None]] = {
     target.__name__: target for target in (exr, foreign, manifest, shard, weights, checkpoint, settings, network)
 }
