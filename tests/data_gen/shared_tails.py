@@ -1,21 +1,16 @@
 """Shared tails beside whole paths: images of both, and the bias of one against the other.
 
-Images by whole paths are rendered once and kept, as means over blocks. A test that does not find its images renders
-them, as slow tests do. With ``NGPT_KEEP=1`` it also adds them to the file.
+Images by whole paths are rendered once, and kept as means over blocks.
 """
-
-import os
-from functools import cache
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from references import REFERENCES, key
+from references import REFERENCES
+from rendered_once import rendered_once
 from unbiased import load
 
 from data_gen.render import render_stack
 
-STORE = Path(__file__).with_name("tails_references.npz")
 SIZE = (32, 24)
 BLOCK = 4
 
@@ -40,27 +35,7 @@ def whole_paths(description, size=SIZE, spp=1536):
     def render():
         return blocks(images(load(mi, description, size), "paths", spp, range(REFERENCES, REFERENCES + 4)))
 
-    return kept(description, size, "whole paths", render)
-
-
-def kept(description, size, what, make):
-    """The array that ``make`` once returned for this scene, or that it returns now."""
-    name = key(mi, description, size, what)
-    if name in stored():
-        return stored()[name].astype(np.float64)
-    made = make()
-    if os.environ.get("NGPT_KEEP"):
-        stored()[name] = made.astype(np.float32)
-        np.savez_compressed(STORE, **stored())
-    return made
-
-
-@cache
-def stored():
-    if not STORE.exists():
-        return {}
-    with np.load(STORE) as file:
-        return dict(file)
+    return rendered_once(description, size, "whole paths", render)
 
 
 class Bias:

@@ -11,7 +11,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from media_scenes import nested
-from shared_tails import blocks, kept, whole_paths
+from rendered_once import rendered_once
+from shared_tails import blocks, whole_paths
 from tails_scenes import bulb, mirrors, slit
 from unbiased import light_of_gradients, load
 
@@ -320,7 +321,9 @@ def light_and_caustics(stacks):
 def test_no_light_is_lost_or_counted_twice(shared, scene):
     """Also not light that comes through glass or off a mirror, which ``gpt`` keeps in a layer of its own."""
     ours = light_and_caustics(shared(scene))
-    whole = kept(scene, (32, 24), "light, caustics", lambda: light_and_caustics(layers_of(scene, "paths", 128)))
+    whole = rendered_once(
+        scene, (32, 24), "light, caustics", lambda: light_and_caustics(layers_of(scene, "paths", 128))
+    )
     doubt = np.sqrt((ours.var(axis=0, ddof=1) + whole.var(axis=0, ddof=1)) / len(ours))
     ours, whole = ours.mean(axis=0), whole.mean(axis=0)
     assert (ours[1] > 0) == (scene is not nested) and (np.abs(ours - whole) <= 3.5 * doubt + [0.01 * whole[0], 0]).all()

@@ -56,7 +56,18 @@ MEDIA = {name: filled({"albedo": 0.95, "sigma_t": 0.6, "phase": phase}) for name
 MEDIA |= {scene.__name__: scene for scene in (nested, milk, hovering, coloured_smoke, wisps)} | {"colours": colours}
 
 # The others scatter like one of these.
-QUICK = {"plastic", "leaf", "mirror and grey", "mask", "normals", "backward", "nested", "milk", "colours", "wisps"}
+QUICK = {
+    "plastic",
+    "leaf",
+    "mirror and grey",
+    "black and white checks",
+    "normals",
+    "backward",
+    "nested",
+    "milk",
+    "colours",
+    "wisps",
+}
 MARKS = {name: [] if name in QUICK else [pytest.mark.slow] for name in [*MATERIALS, *MEDIA]}
 # Mitsuba hides the table from Dr.Jit. Whole paths have the same problem.
 MARKS["table"].append(pytest.mark.recorded_anew)

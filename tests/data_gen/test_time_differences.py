@@ -3,6 +3,8 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from rendered_once import rendered_once
+from shared_tails import blocks
 
 from data_gen.frames.motion import motion_vectors
 from data_gen.render import render_stack
@@ -28,23 +30,28 @@ def moving(scene, camera=0.0, **moved):
 
 
 class Estimates:
-    """dt of frame 1 with ``count`` seeds, its variances, the frame's light, and the same dt of samples in no pairs."""
+    """dt of frame 1 with ``count`` seeds, its variances, and the frame's light.
 
-    def __init__(self, shot, count, pairs, unpaired=False):
+    ``apart``  what the seeds of the frame before differ by: samples are in pairs if it is 0
+    """
+
+    def __init__(self, shot, count, pairs, first=0, apart=0):
         from data_gen.frames.time_differences import difference, light
 
         before, now = shot.snapshot(0), shot.snapshot(1)
         motion = motion_vectors(shot.at(1), now, before)
-        here = [light(shot.at(1), seed, pairs) for seed in range(count)]
-        alone = [light(shot.at(1), 2000 + seed, pairs) for seed in range(count * unpaired)]
+        here = [light(shot.at(1), first + seed, pairs) for seed in range(count)]
         shot.at(0)
-        there = [light(shot.at(0), seed, pairs, motion) for seed in range(count)]
-        other = [light(shot.at(0), 1000 + seed, pairs, motion) for seed in range(count * unpaired)]
+        there = [light(shot.at(0), first + apart + seed, pairs, motion) for seed in range(count)]
         paired = [difference(a, b) for a, b in zip(here, there, strict=True)]
         self.dt, self.variances = (np.stack(each) for each in zip(*paired, strict=True))
-        self.apart = np.array([difference(a, b)[0] for a, b in zip(alone, other, strict=True)])
         values = [np.average([m for _, m in one], axis=0, weights=[n for n, _ in one]) for one in here]
         self.light = np.stack(values)
+
+    @property
+    def blocks(self):
+        """Blocks of dt, which is taken for 0 where it is not known."""
+        return blocks(np.nan_to_num(self.dt))
 
 
 @pytest.mark.parametrize(
@@ -57,27 +64,34 @@ class Estimates:
 )
 def test_the_mean_is_the_difference_of_the_frames(renderer, monkeypatch, scene, camera, moved):
     monkeypatch.setattr("data_gen.frames.time_differences.BATCHES", 2)
-    found = Estimates(moving(scene, camera, **moved), 16, 16, unpaired=True)
-    known = np.isfinite(found.dt[0]).all(axis=-1)
-    assert known.mean() > 0.85
-    paired, apart = (np.where(known[..., None], each, 0) for each in (found.dt, found.apart))
-    result = z_test(paired, apart, block=4)
+
+    def estimates(**seeds):
+        return Estimates(moving(scene, camera, **moved), 16, 16, **seeds)
+
+    paired = estimates()
+    assert np.isfinite(paired.dt[0]).all(axis=-1).mean() > 0.85
+    what = f"dt of samples in no pairs, {camera} {moved}"
+    apart = rendered_once(scene, SIZE, what, lambda: estimates(first=2000, apart=1000).blocks)
+    result = z_test(paired.blocks, apart, block=1)
     assert result.passed, str(result)
     if "lamp" in moved:  # It could have failed: the difference is large, and the other sign of it is found out.
-        assert not z_test(-paired, apart, block=4).passed
+        assert not z_test(-paired.blocks, apart, block=1).passed
 
 
 def test_of_a_camera_at_rest_it_is_that_of_the_pixels(renderer, monkeypatch):
     monkeypatch.setattr("data_gen.frames.time_differences.BATCHES", 2)
     shot = moving("diffuse", lamp=(0.3, 0, 0))
-    paired = Estimates(shot, 16, 16).dt
 
-    def frames(frame, seed):
+    def light(frame, seed):
         layers = render_stack(shot.at(frame), 64, seed, "gpt-basic", points="independent", unbiased=True).layers
-        return layers["primal"] - layers["direct"]
+        return blocks(layers["primal"] - layers["direct"])
 
-    later, earlier = (np.stack([frames(i, seed) for seed in range(8 * i, 8 * i + 8)]) for i in (1, 0))
-    assert z_test(paired, later - earlier, block=4).passed
+    def differences():
+        later, earlier = (np.stack([light(i, seed) for seed in range(8 * i, 8 * i + 8)]) for i in (1, 0))
+        return later - earlier
+
+    of_pixels = rendered_once("diffuse", SIZE, "the lamp moves by 0.3", differences)
+    assert z_test(Estimates(shot, 16, 16).blocks, of_pixels, block=1).passed
 
 
 @pytest.mark.parametrize(
