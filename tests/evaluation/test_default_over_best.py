@@ -23,8 +23,3 @@ def test_the_default_is_over_the_least_error_of_all_pipelines():
     # oidn, the second of primal's methods, is best in the room; wcv, the first of gpt's, in the yard.
     assert rows["room"] == ["1.50, 1.00"] * len(SECONDS) and rows["yard"] == ["3.00, 1.00"] * len(SECONDS)
     assert rows["both"] == ["2.12, 1.00"] * len(SECONDS)
-
-
-def test_no_default_is_known_where_no_cell_says_it():
-    cells = [cell("room", "primal", spp, 1.0) for spp in (4, 64)]
-    assert default_over_best(cells, "shared", {}) == [["room", *["-, -"] * len(SECONDS)]]

@@ -44,9 +44,6 @@ def test_scenes_need_a_folder_of_references(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         parsed(command("doc", "test", "8x6", (4,)))
     assert "give the folder of --references" in capsys.readouterr().err
-    monkeypatch.setattr(sys, "argv", ["bench"])
-    args = parsed(command("doc", "test", "8x6", (4,)))
-    assert args.pixels == (8, 6) and args.spp == [4] and args.output.name == "test.json"
 
 
 @pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())

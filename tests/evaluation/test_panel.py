@@ -50,28 +50,6 @@ def test_the_page_has_the_tables_of_the_numbers_in_git():
     assert panel.text(cells) in panel.PAGE.read_text()
 
 
-def test_a_scene_is_called_alike_in_the_panel_and_where_it_is_opened():
-    for name, case in panel.CASES.items():
-        if not case.scene.startswith("generator:"):  # which takes long to make
-            with panel.opened(case.scene) as (shown, _):
-                assert shown == name
-
-
-def test_other_scenes_have_tables_of_their_own(tmp_path, monkeypatch, capsys):
-    asked = []
-
-    def measured(names, cache, seeds, size):
-        asked.append((list(names), list(seeds), size))
-        yield from (cells(name, seeds) for name in ("hall", "yard"))
-
-    monkeypatch.setattr(panel, "measured", measured)
-    monkeypatch.setattr(sys, "argv", ["panel", "--files", "hall.xml", "yard.xml", "--size", "32x18"])
-    assert panel.main() == 0 and asked == [(["hall.xml", "yard.xml"], [1, 2, 3], (32, 18))]
-    lines = capsys.readouterr().out.splitlines()
-    assert any(line.startswith("| hall | 4 |") for line in lines)
-    assert "| files | gpt+ngpt-combine | 1.00, 0.50 | 1.00, 0.50 | ~1.00, ~0.50 |" in lines
-
-
 @pytest.mark.parametrize(("factors", "status"), [({}, 0), ({"auto+auto": 1.3}, 1), ({"primal+oidn": 1.02}, 0)])
 def test_a_worsened_number_ends_with_1(factors, status, tmp_path, monkeypatch, capsys):
     asked = []

@@ -10,23 +10,14 @@ from ngpt.measure.averages import geometric_mean
 CLOCKS = ("render", "reconstruct", "total", "reconstruct wall")
 
 
-def method_entry(name: str) -> dict:
-    kind = {"primal": "path", "oidn": "features"}.get(name, "gradients")
-    return {"stack": kind, "render": kind, "family": name, "absent": None}
-
-
 def make_results(errors: dict[str, list[float]]) -> dict:
     """Two scenes, one spp, with these errors by method, one for each seed; the second scene's are a hundred times."""
     results = {
-        "title": "Title",
-        "command": "command",
-        "date": "today",
-        "metadata": {"versions": {}, "threads": 1, "cpu": "cpu", "commit": None},
         "primary": "relMSE",
-        "metrics": {"relMSE": {"formula": "f", "better": "lower"}, "PSNR": {"formula": "p", "better": "higher"}},
-        "settings": {"spp": [16], "seeds": 3, "size": [8, 8]},
-        "methods": {m: method_entry(m) for m in errors},
-        "scenes": {s: {"reference": {"noise": 1e-6, "doubt": 3e-6}, "cost": {}, "absent": None} for s in ("a", "b")},
+        "metrics": {"relMSE": {"better": "lower"}, "PSNR": {"better": "higher"}},
+        "settings": {"spp": [16], "seeds": 3},
+        "methods": {m: {} for m in errors},
+        "scenes": {"a": {}, "b": {}},
         "cells": [],
     }
     for scene, factor in (("a", 1), ("b", 100)):
@@ -53,12 +44,9 @@ def test_medians_and_means():
 
 
 def test_csv_has_a_line_for_each_cell():
-    lines = as_csv(make_results({"l1": [0.01, 0.02]})).splitlines()
-    assert (
-        lines[0]
-        == "scene,spp,method,seed,spp used,render s,reconstruct s,total s,reconstruct wall s,relMSE,PSNR,absent"
-    )
-    assert lines[1] == "a,16,l1,0,20,2.0,1.0,3.0,0.5,0.01,10.0," and len(lines) == 5
+    head, line, *others = as_csv(make_results({"l1": [0.01, 0.02]})).splitlines()
+    assert head == "scene,spp,method,seed,spp used,render s,reconstruct s,total s,reconstruct wall s,relMSE,PSNR,absent"
+    assert line == "a,16,l1,0,20,2.0,1.0,3.0,0.5,0.01,10.0," and len(others) == 3
 
 
 def test_the_pareto_set():

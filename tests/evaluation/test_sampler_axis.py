@@ -1,19 +1,15 @@
 """The sampler as an axis: columns, equal time, tables; of folders of stacks, and of a scene that is rendered."""
 
-import xml.etree.ElementTree as ElementTree
-from pathlib import Path
-
 import numpy as np
 import pytest
 from folders import evaluated, read, write_scene
 
 import ngpt
-from bench.frontier import Point, draw
 from data_gen import service
 from ngpt.denoisers import oidn
 from ngpt.errors import NgptError
 from ngpt.evaluation import cells
-from ngpt.evaluation.config import Config, read_config
+from ngpt.evaluation.config import Config
 from ngpt.evaluation.stacks import SceneStacks
 from ngpt.methods import reconstruct
 from ngpt.report.evaluation import write_evaluation_report
@@ -68,8 +64,7 @@ def test_tables_of_samplers_are_their_options(tmp_path):
         radius = 1
         photons = 2
     """
-    (tmp_path / "eval.toml").write_text(text)
-    config = read_config(tmp_path / "eval.toml")
+    config = read(text, tmp_path)
     assert {column.name: (column.render.name, column.sampler) for column in config.columns()} == {
         "primal (primal)": ("path", "primal"),
         "primal (ppm)": ("features ppm radius=1 photons=2", "ppm"),
@@ -77,12 +72,10 @@ def test_tables_of_samplers_are_their_options(tmp_path):
         "wcv (gpt-half)": ("gradients gpt shift=half-vector", "gpt-half"),
     }
     assert config.render("path", "ppm").options == {"sampler": "ppm", "radius": "1", "photons": "2"}
-    (tmp_path / "eval.toml").write_text(text.replace("radius = 1", "radius = -1"))
     with pytest.raises(NgptError, match=r"samplers\.ppm: sampler 'ppm', option 'radius': '-1' is not allowed"):
-        read_config(tmp_path / "eval.toml")
-    (tmp_path / "eval.toml").write_text(text.replace('sampler = "gpt"', 'sampler = "gtp"'))
+        read(text.replace("radius = 1", "radius = -1"), tmp_path)
     with pytest.raises(NgptError, match=r"samplers\.gpt-half: unknown sampler 'gtp'; did you mean 'gpt'"):
-        read_config(tmp_path / "eval.toml")
+        read(text.replace('sampler = "gpt"', 'sampler = "gtp"'), tmp_path)
 
 
 SUBPIXELS = """
@@ -110,24 +103,10 @@ def test_subpixels_are_part_of_what_a_column_is_given(tmp_path):
     assert renders["fine"].options == {"sampler": "primal", "subpixels": "2"}
     one = read(text.replace("= 2", "= 1"), tmp_path).columns()
     assert one[1].render == renders["primal"] and "subpixels" not in renders["primal"].options
-    for wrong, message in (
-        ("= 3", r"samplers\.fine: '3' subpixels cannot be kept; write 1, 2, 4, or auto"),
-        ("= true", r"samplers\.fine: 'True' subpixels cannot be kept"),
-        ("= 2\nradius = 2", r"samplers\.fine: sampler 'primal' has no option 'radius'"),
-    ):
-        with pytest.raises(NgptError, match=message):
-            read(text.replace("= 2", wrong), tmp_path)
+    with pytest.raises(NgptError, match=r"samplers\.fine: '3' subpixels cannot be kept; write 1, 2, 4, or auto"):
+        read(text.replace("= 2", "= 3"), tmp_path)
     with pytest.raises(NgptError, match=r"samplers\.fine: sampler 'bdpt' puts light on any pixel and has no subpixels"):
         read(text.replace('"primal"\nsub', '"bdpt"\nsub'), tmp_path)
-
-
-def test_kernels_with_and_without_subpixels_are_compiled_before_time_counts(monkeypatch):
-    rendered = []
-    monkeypatch.setattr(service, "render", lambda *given, **seconds: rendered.append(given[1].get("subpixels")))
-    for options in ({"subpixels": "auto"}, {"subpixels": "2"}, {}):
-        service.warm_up(None, {"sampler": "primal"} | options)
-    service.warm_up(None, {"sampler": "gpt", "subpixels": "auto"})
-    assert rendered == ["auto", 2, "2", None, "auto"]
 
 
 def test_folders_of_stacks_have_samplers_without_a_renderer(tmp_path, rng, monkeypatch):
@@ -144,20 +123,6 @@ def test_folders_of_stacks_have_samplers_without_a_renderer(tmp_path, rng, monke
     entry = results["methods"]["l2 (theirs)"]
     assert (entry["family"], entry["method"], entry["stack"], entry["sampler"]) == ("l2", "l2", "gradients", "theirs")
     assert (tmp_path / "out" / "images" / "room" / "16-l2-theirs-seed1.exr").is_file()
-    points = [Point(r["method"], r["spp"], 1.0, r["error"], r["method"][:2]) for r in results["summary"] if r["scene"]]
-    plot = ElementTree.ElementTree(ElementTree.fromstring(draw(points, "room", "relMSE")))
-    texts = [element.text for element in plot.iter("{http://www.w3.org/2000/svg}text")]
-    assert set(names) <= set(texts)
-    looks = {}
-    for group in plot.iter("{http://www.w3.org/2000/svg}g"):
-        if group.get("id", "").startswith("line "):
-            path = next(group.iter("{http://www.w3.org/2000/svg}path"))
-            looks[group.get("id")[5:]] = dict(entry.split(": ") for entry in path.get("style").split("; "))
-    assert set(looks) == set(names)
-    ours, theirs = looks["l2 (ours)"], looks["l2 (theirs)"]
-    # One colour for l2, dashes by sampler
-    assert ours["stroke"] == theirs["stroke"] != looks["primal"]["stroke"]
-    assert ours.get("stroke-dasharray") != theirs.get("stroke-dasharray")
     page = write_evaluation_report(tmp_path / "out", tmp_path / "report.html").read_text()
     assert "l2 (theirs)" in page and "equal rendering time to 4 spp of sampler auto" in page
     # A single sampler that is not the usual one: names are those of the methods.
@@ -222,8 +187,6 @@ def test_two_samplers_at_equal_time(renderer, tmp_path, monkeypatch):
     assert [path.name for path in references] == ["reference-128spp-a.exr", "reference-128spp-b.exr"]
     seeds = {ngpt.read(path).attributes["ngpt:seed"] for path in references}
     assert len(seeds) == 2 and results["scenes"]["diffuse"]["reference"]["spp"] == 128
-    page = write_evaluation_report(out, tmp_path / "report.html").read_text()
-    assert "Milliseconds a sample" in page and "gradients gpt-basic" in page
     # Another clock: the nominal samples are those of gpt-basic, of which gpt has more.
     slow = evaluated(read(SETTINGS + 'clock = "gpt-basic"\n', tmp_path), out)
     assert next(c["spp used"] for c in slow["cells"] if c["method"] == "wcv") == 16
@@ -239,9 +202,7 @@ def test_a_column_with_subpixels_is_its_method_on_stacks_with_them(renderer, tmp
         return reconstruct(*given, **options)
 
     monkeypatch.setattr(cells, "reconstruct", counted)
-    text = (
-        SETTINGS.replace('methods = ["primal", "wcv"]', "").replace("[8]", "[4, 32]").replace("seeds = 2", "seeds = 1")
-    )
+    text = SETTINGS.replace('methods = ["primal", "wcv"]', "").replace("[8]", "[4, 32]").replace("= 2", "= 1")
     text += SUBPIXELS.replace('points = "independent"', "").replace('"oidn"', '"clean"')
     text += '[variants.clean]\nmethod = "oidn"\nauxiliary = "clean"\n'
     results = evaluated(read(text, tmp_path), tmp_path)
@@ -258,14 +219,3 @@ def test_a_column_with_subpixels_is_its_method_on_stacks_with_them(renderer, tmp
         assert found["clean (by-default)", spp]["metrics"] == found[f"clean ({same})", spp]["metrics"]
     # OIDN begins for images of either size, before its time counts.
     assert len(calls) == 6 + 2
-    names = {path.name for path in tmp_path.glob("cache/diffuse-*/features*")}
-    assert {
-        "features-8-0.exr",
-        "features-primal-subpixels=2-8-0.exr",
-        "features-primal-subpixels=auto-64-0.exr",
-    } < names
-
-
-def test_the_tiny_configuration_has_a_column_for_each_method():
-    columns = read_config(Path(__file__).parents[2] / "configs" / "eval-tiny.toml").columns()
-    assert {column.name: column.render.name for column in columns}["primal-gpt"] == "gradients" and len(columns) == 9

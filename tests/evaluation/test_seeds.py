@@ -1,11 +1,8 @@
 """The arithmetic of ``bench.seeds``: real over claimed noise, and its table."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from bench.judging import opened
 from bench.seeds import HEAD, errors, noise, rows, spread
 from ngpt.shared import shared_variance
 
@@ -27,16 +24,13 @@ def stacks_of(rng, own=0.3, shared=0.1, claimed=1.0):
     return stacks
 
 
-def test_noise_that_is_as_claimed(rng):
+def test_noise_that_is_as_claimed_by_half_or_not_at_all(rng):
+    """All of it; half the deviation, in blocks larger than a cell; and only the white noise."""
     found = noise(stacks_of(rng))
     assert found["deviation"] == pytest.approx(1, abs=0.15)
     for side in ("8", "32"):
         assert found["blocks"][side]["sum"] == pytest.approx(1, abs=0.12)
         assert found["blocks"][side]["median"] == pytest.approx(1, abs=0.12)
-
-
-def test_noise_that_is_claimed_by_half_or_not_at_all(rng):
-    """A deviation that is twice the claimed, in all that is larger than a cell; and white noise alone claimed."""
     half = noise(stacks_of(rng, own=0.01, claimed=0.5))
     assert half["deviation"] == pytest.approx(2, rel=0.15) and half["blocks"]["32"]["sum"] == pytest.approx(4, rel=0.15)
     stacks = [{"primal": s["primal"], "primal_var": np.full(SHAPE, 0.3**2)} for s in stacks_of(rng)]
@@ -61,10 +55,3 @@ def test_errors_are_over_those_of_whole_paths_at_the_same_time():
     assert found["shared"]["worst / median"] == "16.00" and found["shared"]["8x8, median"] == "1, 2"
     assert found["shared"]["least .. most"] == "0.500 .. 1.200" and found["shared"]["light"] == "0.9000"
     assert rows(cells[1:])[-1][-1] == "-"
-
-
-def test_made_scenes_have_the_one_sight():
-    with opened("generator:3:mirrors") as (name, file):
-        assert name == "generator-3-mirrors" and "conductor" in Path(file).read_text()
-    with opened("rooms/kitchen/scene.xml") as (name, file):
-        assert (name, file) == ("kitchen", "rooms/kitchen/scene.xml")

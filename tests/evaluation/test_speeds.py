@@ -10,6 +10,7 @@ from bench.onnx import bench_size, half_precision, stack_of
 from ngpt.denoisers import oidn
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())
 def test_all_rows_of_the_runtimes_run(tmp_path):
     rows = bench_size(stack_of(32, 24), half_precision(tmp_path), 1)

@@ -76,8 +76,8 @@ def test_stacks_of_known_worth(tmp_path, rng):
     assert ["rooms (1)", "64", f"~{best[2]['W']:.2f}", "1.00"] == means[3][:4]
 
 
-def of_known_costs(costs: dict[str, tuple[float, float]], worth: float = WORTH) -> dict:
-    """Results of one scene: errors 1/n, with gradients 1/(worth n); whole seconds of a method by (begin, a sample)."""
+def rows_of(**costs: tuple[float, float]) -> dict:
+    """Rows of one scene: errors 1/n, with gradients 1/(WORTH n); whole seconds of a method by (begin, a sample)."""
     results = {
         "settings": {"spp": [4, 16], "groups": {}},
         "methods": {m: {"stack": "gradients" if "ours" in m else "features", "sampler": "any"} for m in costs},
@@ -90,13 +90,9 @@ def of_known_costs(costs: dict[str, tuple[float, float]], worth: float = WORTH) 
             place = {"scene": "room", "method": method, "spp": n}
             seconds = {"render": n * sample, "reconstruct": begins, "total": begins + n * sample}
             results["cells"].append(place | {"spp used": n, "seconds": seconds, "absent": None})
-            error = 1 / n / (worth if "ours" in method else 1)
+            error = 1 / n / (WORTH if "ours" in method else 1)
             results["summary"].append(place | {"error": error, "seconds": seconds})
-    return results
-
-
-def rows_of(**costs):
-    return {(row["method"], row["spp"]): row for row in worth_of_gradients(of_known_costs(costs))["rows"]}
+    return {(row["method"], row["spp"]): row for row in worth_of_gradients(results)["rows"]}
 
 
 @pytest.mark.parametrize(("begins", "ratio"), [(0, 1), (48.0, 0.5)])
@@ -105,17 +101,13 @@ def test_the_whole_time_makes_the_difference(begins, ratio):
     rows = rows_of(ours=(begins, 3.0), theirs=(0, 1.0))
     assert (rows["ours", 16]["W"], rows["ours", 16]["C"], rows["ours", 16]["W/C"]) == pytest.approx((3, 3, ratio))
     assert rows["ours", 4]["W/C"] == pytest.approx(12 / (begins + 12)) and rows["ours", 4]["seconds"] == begins + 12
-
-
-def test_of_two_rivals_the_one_that_is_done_first_counts():
-    """The quick samples of the one wait for a slow method."""
+    # Of two rivals the one that is done first counts: the quick samples of the other wait for a slow method.
     row = rows_of(ours=(0, 3.0), slow_begin=(100.0, 0.5), slow_samples=(0.0, 1.0))["ours", 4]
     assert row["rival"] == "slow_samples" and row["rival seconds"] == pytest.approx(12)
 
 
 def test_means_over_scenes_are_geometric_and_carry_marks():
-    results = of_known_costs({"ours": (0, 1.0), "primal": (0, 1.0)})
-    results["settings"]["groups"] = {"rooms": ["b", "c"]}
+    results = {"settings": {"spp": [4], "groups": {"rooms": ["b", "c"]}}, "methods": {"ours": {}}}
     row = {"spp": 4, "method": "ours", "sampler": "gpt", "best": True, "error": 1.0, "rival": "primal", "C": 2.0}
     rows = [row | {"scene": s, "W": w, "W/C": w / 2, "mark": m} for s, w, m in (("a", 1.0, ""), ("b", 4.0, ">"))]
     one, best = [mean for mean in _means(results, rows) if mean["method"] is None]
