@@ -28,9 +28,10 @@ PYRAMID = {"start": ("primal",), "kernel": 3, "scales": 3, "demodulate": True}
 OF_TWO = {"start": ("primal", "base"), "kernel": 5, "scales": 2}
 # Those that ONNX graphs are made of; the name says what others have not.
 GRAPHED = {
-    "with a base": dense((*ALL, "base", "primal_se", "dx_se", "dy_se"), "wcv"),
-    "with a choice": dense(
-        ("primal", "denoised", *features.SOURCES), "wcv", start=("base", "denoised", "denoised_base")
+    "with all": dense(
+        (*ALL, "base", "primal_se", "dx_se", "dy_se", "denoised", *features.SOURCES),
+        "wcv",
+        start=("base", "denoised", "denoised_base"),
     ),
     "relative to its base": dense(
         ("primal", "base", "primal_change", "dx_base", "dy_base", "dx_noise"), "wcv", start=("primal", "base")

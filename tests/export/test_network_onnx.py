@@ -3,7 +3,6 @@
 import json
 from functools import cache
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -46,32 +45,20 @@ def fast():
     return session(WEIGHTS / "ngpt-fast.onnx")
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory):
-    """Files of untrained weights, none of which is zero."""
-    folder = tmp_path_factory.mktemp("weights")
-    for name, config in GRAPHED.items():
-        save_weights(folder / f"{name}.safetensors", untrained(config), {})
-    return folder
-
-
 @cache
 def exported(path):
-    # How far a network sees is measured on one example: it takes most of the time.
-    with patch("ngpt.export.reach.EXAMPLES", 1):
-        return network_model(path, path.stem)
+    return network_model(path, path.stem)
 
 
-# What others have parts of
-MORE = ("relative to its base", "converging", "halved by maxima", "halved by lines", "primal alone")
-MORE += ("by a pyramid of kernels", "drawn to gradients", "a choice drawn to gradients", "by kernels of two")
-MORE += ("halved by averages",)
+# Together they have all inputs. The heads of the others are tested in test_graphs.py.
+QUICK = ("with all", "as published")
 
 
-@pytest.fixture(scope="module", params=[pytest.param(n, marks=pytest.mark.slow) if n in MORE else n for n in GRAPHED])
-def pair(request, weights):
-    """A file of weights and its ONNX session."""
-    path = weights / f"{request.param}.safetensors"
+@pytest.fixture(scope="module", params=[n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in GRAPHED])
+def pair(request, tmp_path_factory):
+    """A file of untrained weights, none of which is zero, and its ONNX session."""
+    path = tmp_path_factory.mktemp("weights") / f"{request.param}.safetensors"
+    save_weights(path, untrained(GRAPHED[request.param]), {})
     return path, session(exported(path))
 
 
@@ -128,9 +115,9 @@ def run(session, layers, **more):
 
 
 def assert_close(ours, theirs, tolerance=1e-4):
-    assert np.isfinite(ours).all()
-    # Relative to each value, and for the darkest to a hundredth of the largest.
-    assert (np.abs(ours - theirs) <= tolerance * (np.abs(theirs) + 1e-2 * np.abs(theirs).max())).all()
+    """Relative to each value, and for the darkest to a hundredth of the largest."""
+    least = 1e-2 * tolerance * np.abs(theirs).max()
+    np.testing.assert_allclose(ours, theirs, rtol=tolerance, atol=least, equal_nan=False)
 
 
 @pytest.fixture
@@ -155,7 +142,7 @@ def other_denoiser(monkeypatch):
 TOLERANCE = {"a pyramid drawn to gradients": 1e-3}
 
 
-@pytest.mark.parametrize(("made", "size"), [(noisy, (1, 1)), (damaged, (1, 9)), (noisy, (17, 16)), (damaged, (37, 53))])
+@pytest.mark.parametrize(("made", "size"), [(noisy, (1, 1)), (damaged, (37, 53))])
 def test_the_same_as_in_torch(pair, size, made, other_denoiser):
     path, onnx_session = pair
     # What a network does not read, its graph cannot see, and in Python it would set surfaces apart.
@@ -167,8 +154,8 @@ def test_the_same_as_in_torch(pair, size, made, other_denoiser):
 
 @pytest.mark.parametrize(
     ("layers", "tolerance"),
-    [(noisy(1, 1), 1e-4), (noisy(64, 48), 1e-4), (damaged(90, 75), 1e-4), (extreme(40, 33), 1e-3)],
-    ids=["one pixel", "noisy", "damaged", "extreme"],
+    [(noisy(1, 1), 1e-4), (damaged(90, 75), 1e-4), (extreme(40, 33), 1e-3), (noisy(19, 24, 1e12), 1e-3)],
+    ids=["one pixel", "damaged", "extreme", "bright"],
 )
 def test_the_shipped_file_is_that_of_the_shipped_weights(fast, layers, tolerance):
     assert_close(run(fast, layers), in_torch(layers, FAST), tolerance)
@@ -185,37 +172,33 @@ def test_an_export_of_today_gives_what_the_shipped_file_gives(name):
     assert np.abs(today - shipped).max() <= 1e-6 * shipped.max()
 
 
-@pytest.mark.parametrize("value", [0.0, 1e-12, 65504.0, 1e12])
-def test_extremes(fast, value):
-    assert np.isfinite(run(fast, noisy(19, 24, value))).all()
-
-
 @pytest.mark.parametrize("k", [2.0**-30, 2.0**30])
 def test_images_follow_the_exposure(fast, k):
     scaled = run(fast, damaged(19, 24, k, holes=False))
     assert_close(scaled / np.float32(k), run(fast, damaged(19, 24, holes=False)), 1e-3)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("name", ["primal", "dx", "dy", "albedo", "normal", "depth", "primal_var", "dx_var", "dy_var"])
-def test_values_that_are_not_finite_stay_where_they_are(fast, name, bad):
-    layers = noisy(160, 24)
-    whole = run(fast, layers)
-    layers[name][0, 0, 3, 4] = bad
-    harmed = run(fast, layers)
-    assert np.isfinite(harmed).all()
-    assert np.abs(harmed - whole)[0, :, 130:].max() <= 0.02 * whole.mean()
+def test_values_that_are_not_finite_stay_where_they_are(fast):
+    whole = run(fast, noisy(160, 24))
+    for name in ("primal", "dx", "dy", "albedo", "normal", "depth", "primal_var", "dx_var", "dy_var"):
+        for bad in (np.nan, np.inf, -np.inf):
+            layers = noisy(160, 24)
+            layers[name][0, 0, 3, 4] = bad
+            harmed = run(fast, layers)
+            assert np.isfinite(harmed).all(), (name, bad)
+            assert np.abs(harmed - whole)[0, :, 130:].max() <= 0.02 * whole.mean(), (name, bad)
 
 
 # Tiles
 
 
-@pytest.mark.parametrize("pair", ["with a base", "as published"], indirect=True)
-def test_tiles_of_a_host_make_the_whole(pair):
+@pytest.mark.parametrize("pair", ["with all"], indirect=True)
+def test_tiles_of_a_host_make_the_whole(pair, other_denoiser):
     """What CONTRACT.md tells a host to do, literally."""
     path, onnx_session = pair
     tell = told(exported(path))
     alignment, margin, layers = int(tell["alignment"]), int(tell["overlap"]), noisy(50, 290)
+    layers |= other_denoiser(layers, GRAPHED[path.stem])
     shared = run(session(statistics_model(path, "m")), layers)
     whole, tiled = run(onnx_session, layers), np.zeros((1, 3, 50, 290), np.float32)
     step = 20 * alignment
