@@ -68,23 +68,19 @@ STRIDES = [
     (PTRDIFF.min, 0, 0),
     (PTRDIFF.max, PTRDIFF.max, PTRDIFF.max),
     (0, 0, PTRDIFF.max // 22),
-    (0, 2**60, 2**58),
 ]
 
 
-@pytest.mark.parametrize("strides", STRIDES, ids=str)
 @pytest.mark.parametrize("name", ["albedo", "image"])
-def test_strides_that_lead_out_of_memory(fast, strides, name):
+def test_strides_that_lead_out_of_memory(fast, name):
     job = Job(fast, those(fast, example()))
     address, form, channels, *_ = place(job.layers.get(name, job.image))
     function = job.set_output if name == "image" else job.set_layer
-    assert function(name, address, form, channels, *strides) == OK
-    assert job.run() == BAD_ARGUMENT
-    assert job.message() == f"{name}: its strides lead out of memory for 29x23 pixels"
-
-
-def test_strides_that_lead_below_the_first_address(fast):
-    job = Job(fast, those(fast, example()))
+    for strides in STRIDES:
+        assert function(name, address, form, channels, *strides) == OK
+        assert job.run() == BAD_ARGUMENT, strides
+        assert job.message() == f"{name}: its strides lead out of memory for 29x23 pixels"
+    # Below the first address
     assert job.set_layer("albedo", 4096, 0, 3, 0, 0, -4096) == OK
     assert job.run() == BAD_ARGUMENT and "albedo: its strides" in job.message()
 
@@ -98,6 +94,7 @@ def test_messages_cut_no_letter(library, fast, tmp_path, letter):
         message = ctypes.create_string_buffer(b"?" * 300)
         assert library.ngpt_open(str(path).encode(), 1, message, size) is None
         assert whole.startswith(message.value.decode()) and size - 4 <= len(message.value) + 1 <= size
+        assert message.raw[size:300] == b"?" * (300 - size)
     job = Job(fast, {"primal": example()["primal"]})
     for shift in range(4):
         name = "x" * shift + letter * 30

@@ -3,7 +3,8 @@
 import ctypes
 import re
 import shutil
-import threading
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 import pytest
@@ -92,25 +93,14 @@ def refused(status, expected, job, words):
     assert (job.image == -7).all()
 
 
-@pytest.mark.parametrize(("calls", "words"), REFUSALS, ids=[words for _, words in REFUSALS])
-def test_what_a_job_refuses(fast, calls, words):
-    layers = those(fast, example())
-    job = Job(fast, layers)
-    for name, *arguments in calls:
-        status = getattr(job, name)(*arguments)
-    refused(status, BAD_ARGUMENT if len(calls) == 1 else MISSING_LAYER, job, words)
-    job.set(layers)
+def test_what_a_job_refuses(fast):
+    job = Job(fast, those(fast, example()))
+    for calls, words in REFUSALS:
+        for name, *arguments in calls:
+            status = getattr(job, name)(*arguments)
+        refused(status, BAD_ARGUMENT if len(calls) == 1 else MISSING_LAYER, job, words)
+        job.set(job.layers)
     assert job.run() == OK and job.message() == ""
-
-
-def test_networks_with_random_bytes(library, tmp_path):
-    data, rng = np.frombuffer(FAST.read_bytes(), np.uint8), np.random.default_rng(5)
-    for _ in range(20):
-        damaged = data.copy()
-        damaged[rng.integers(0, len(data), 50)] = rng.integers(0, 256, 50)
-        (tmp_path / "mutant.onnx").write_bytes(damaged.tobytes())
-        network = Network(library, tmp_path / "mutant.onnx")
-        assert (network.handle is None) == bool(network.message)
 
 
 def test_tiles_need_the_statistics_of_their_network(library, tmp_path):
@@ -127,24 +117,11 @@ def test_tiles_need_the_statistics_of_their_network(library, tmp_path):
     refused(job.run(30), BAD_NETWORK, job, "belongs to another network, it reads dx")
 
 
-def test_paths_of_any_letters(library, tmp_path):
-    folder = tmp_path / "Größe 大"
-    folder.mkdir()
-    shutil.copy(PRIMAL, folder / "network")
-    network = Network(library, folder / "network")
-    assert network.handle, network.message
-
-
 def test_devices_and_threads(library, fast):
     assert Network(library, FAST, threads=-1).message == "the number of threads is -1; it must be 0 to 1024"
     assert Network(library, device="gpu").message.startswith("device 'gpu': no, this ONNX Runtime has: cpu")
     assert Network(library, device="").message.startswith("device '': no, ")
     assert Network(library, device="cpu").names == fast.names
-    import onnxruntime
-
-    for name, provider in (("cuda", "CUDAExecutionProvider"), ("tensorrt", "TensorrtExecutionProvider")):
-        if provider not in onnxruntime.get_available_providers():
-            assert Network(library, device=name).message.startswith(f"device '{name}': no, this ONNX Runtime has: cpu")
 
 
 # --- progress, threads, life -----------------------------------------------------------------------------------------
@@ -165,31 +142,16 @@ def test_cancelled_after_so_many_tiles(fast, after):
 
 def test_threads_share_a_network(fast):
     inputs = [those(fast, example(40 + 3 * i, 90)) for i in range(4)]
-    expected, wrong = [result(fast, layers) for layers in inputs], []
-
-    def work(layers, image):
-        for _ in range(5):
-            if not np.array_equal(result(fast, layers), image):
-                wrong.append(layers)
-
-    threads = [threading.Thread(target=work, args=pair) for pair in zip(inputs, expected, strict=True)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not wrong
+    expected = [result(fast, layers) for layers in inputs]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(partial(result, fast), 5 * inputs))
+    assert all(map(np.array_equal, found, 5 * expected))
 
 
-def test_a_job_outlives_its_network(library):
-    network = Network(library, PRIMAL)
+def test_a_job_outlives_its_network(library, tmp_path):
+    path = tmp_path / "Größe 大"
+    shutil.copy(PRIMAL, path)
+    network = Network(library, path)
     job = Job(network, those(network, example()))
     network.close()
     assert job.run() == OK and (job.image != -7).any()
-
-
-@pytest.mark.parametrize("size", [0, 1, 2, 20])
-def test_messages_fit_where_they_go(library, tmp_path, size):
-    message = ctypes.create_string_buffer(b"?" * 30)
-    assert library.ngpt_open(str(tmp_path / "none.onnx").encode(), 0, message, size) is None
-    assert message.raw[max(size - 1, 0) : size] == b"\0" * min(size, 1)
-    assert message.raw[size:30] == b"?" * (30 - size)

@@ -13,7 +13,7 @@ from onnx.reference import ReferenceEvaluator
 from onnx.reference.op_run import OpRun
 
 from ngpt.classical.leastsquares import robust_mean
-from ngpt.export.builder import FLOAT, Graph, choose, op, repeat
+from ngpt.export.builder import Graph, op
 from ngpt.export.graphs import transfer, variances
 from ngpt.export.graphs.model import _OperatorsOfHeads
 from ngpt.network import transfer as torch_transfer
@@ -26,16 +26,10 @@ def evaluate(function, *arrays):
     """What a graph of values makes of arrays, in ONNX Runtime."""
     graph = Graph("test")
     values = [graph.input(f"x{i}", [f"d{i}_{axis}" for axis in range(a.ndim)]) for i, a in enumerate(arrays)]
-    result = function(*values)
-    results = result if isinstance(result, tuple) else (result,)
     # An output must have a shape, which tests need not know before.
-    for i, value in enumerate(results):
-        graph.output(f"values{i}", op.Reshape(value, [-1]), (f"count{i}",))
-        graph.output(f"shape{i}", op.Cast(op.Shape(value), to=FLOAT), (f"axes{i}",))
+    graph.output("values", op.Reshape(function(*values), [-1]), ("count",))
     session = onnxruntime.InferenceSession(graph.model({}).SerializeToString(), providers=["CPUExecutionProvider"])
-    made = session.run(None, {f"x{i}": np.asarray(a, np.float32) for i, a in enumerate(arrays)})
-    shaped = tuple(values.reshape(shape.astype(int)) for values, shape in zip(made[::2], made[1::2], strict=True))
-    return shaped if isinstance(result, tuple) else shaped[0]
+    return session.run(None, {f"x{i}": np.asarray(a, np.float32) for i, a in enumerate(arrays)})[0]
 
 
 @pytest.mark.parametrize("name", ["signed_log", "signed_exp"])
@@ -80,8 +74,7 @@ HEADS = [
     Mixture(("primal", "base")),
     Poisson(("base",), Residual(("base",)), 1),
     Poisson(("primal", "base"), Mixture(("primal", "base")), 3),
-    Poisson(("primal",), Pyramid(("primal",), 3, 3, True), 2),
-    Poisson(("primal", "base"), Pyramid(("primal", "base"), 3, 2, True), 2),
+    Poisson(("primal", "base"), Pyramid(("primal", "base"), 3, 3, True), 2),
 ]
 
 
@@ -103,35 +96,7 @@ def test_heads_are_the_same_as_graphs(head):
     expected = head.forward(prediction, images).numpy()
     made = evaluate(lambda first, *others: head.graph(_OperatorsOfHeads(), first, list(others)), prediction, *images)
     near = 1e-4 if sweeps else 1e-5
-    assert np.allclose(made, expected, rtol=near, atol=near)
-
-
-def test_expressions():
-    x, y = np.float32([[1, -2], [3, 4]]), np.float32([[5, 6], [7, 8]])
-    assert np.array_equal(evaluate(lambda a, b: -a * b + abs(a) / b - 2.0, x, y), -x * y + np.abs(x) / y - 2)
-    assert np.array_equal(evaluate(lambda a: op.Concat(a, np.float32([[9, 9]]), axis=0), x), [[1, -2], [3, 4], [9, 9]])
-
-
-@pytest.mark.parametrize(("given", "chosen", "doubled"), [([1, 2], [1, 2], 24), ([-1, -2], [-4, -5], -1536)])
-def test_choices_and_loops_read_what_is_around_them(given, chosen, doubled):
-    def graph(x):
-        total = op.ReduceSum(x, keepdims=0)
-        loop = repeat(9, lambda n, s: (s * 2.0 + total * 0.0, op.Less(s, 10.0)), total, ())
-        return loop, choose(op.Greater(total, 0.0), lambda: x, lambda: x + total, ("n",))
-
-    made = evaluate(graph, np.float32(given))
-    assert made[0] == doubled and np.array_equal(made[1], chosen)
-
-
-def test_what_no_output_needs_is_left_out_and_equal_constants_are_one():
-    graph = Graph("small")
-    x = graph.input("x", ("n",))
-    unused = (x * 7.0) / 5.0
-    graph.output("y", (x + 3.0) * 3.0, ("n",))
-    model = graph.model({"method": "small"})
-    assert [node.op_type for node in model.graph.node] == ["Add", "Mul", "Identity"] and unused.name
-    assert len(model.graph.initializer) == 1
-    assert {item.key: item.value for item in model.metadata_props} == {"ngpt.method": "small"}
+    assert np.allclose(made, expected.ravel(), rtol=near, atol=near)
 
 
 @pytest.mark.parametrize("path", sorted(WEIGHTS.glob("*.onnx")), ids=lambda path: path.stem)

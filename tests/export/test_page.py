@@ -16,7 +16,6 @@ from exr_files import noise, same_bits, window, write_raw
 from hosts import HOSTS, VECTOR, agree, node, node_modules, read_layers, repeated, stack_of
 
 import ngpt
-from ngpt.cli import main
 from ngpt.methods import reconstruct
 from ngpt.subpixels import means
 
@@ -66,25 +65,22 @@ def test_the_reader_gives_the_bits_that_were_written(tmp_path, rng):
     zeros = dict.fromkeys("RGB", np.zeros((37, 29), np.float32))  # so that blocks do become smaller
     parts = ((zeros, {}, "ngpt"), (channels("primal", primal, "") | channels("dx", dx), {}, "beauty"))
     paths.append(write_raw(tmp_path / "parts.exr", *parts, (dict(zip("RGB", half, strict=True)), {}, "albedo")))
-    for answer in read_in_node(*paths):
+    fine = rng.random((10, 14, 3)).astype(np.float32)
+    stack = ngpt.GradientStack({"primal": means(fine, 2)}, fine={"primal": fine})
+    *answers, coarse = read_in_node(*paths, ngpt.write(tmp_path / "subpixels.exr", stack))
+    for answer in answers:
         assert (answer["width"], answer["height"]) == (29, 37) and set(answer["layers"]) == {"primal", "dx", "albedo"}
         assert same_bits(answer["layers"]["primal"], primal) and same_bits(answer["layers"]["dx"], dx)
         np.testing.assert_array_equal(answer["layers"]["albedo"], half.astype(np.float32))
-
-
-def test_the_reader_ignores_subpixels(tmp_path, rng):
-    fine = rng.random((10, 14, 3)).astype(np.float32)
-    stack = ngpt.GradientStack({"primal": means(fine, 2)}, fine={"primal": fine})
-    (answer,) = read_in_node(ngpt.write(tmp_path / "a.exr", stack))
-    assert set(answer["layers"]) == {"primal"} and same_bits(
-        answer["layers"]["primal"], stack["primal"].transpose(2, 0, 1)
-    )
+    # Subpixels are ignored.
+    assert set(coarse["layers"]) == {"primal"}
+    assert same_bits(coarse["layers"]["primal"], stack["primal"].transpose(2, 0, 1))
 
 
 def test_the_reader_says_what_it_cannot_read(tmp_path, rng):
     image = dict(zip("RGB", rng.random((3, 40, 24)).astype(np.float32), strict=True))
     words = {}
-    for name in ("RLE", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB"):
+    for name in ("RLE", "PIZ", "DWAB"):
         compression = {"compression": getattr(OpenEXR, f"{name}_COMPRESSION")}
         words[write_raw(tmp_path / f"{name}.exr", (image, compression))] = f"compression is {name};"
     tiles = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
@@ -92,7 +88,6 @@ def test_the_reader_says_what_it_cannot_read(tmp_path, rng):
     smooth = {name: np.round(plane) for name, plane in image.items()}  # so that blocks are compressed
     good = write_raw(tmp_path / "good.exr", (smooth,)).read_bytes()
     for name, data, word in (
-        ("no.exr", b"", "not an OpenEXR"),
         ("text.exr", b"not an image at all", "not an OpenEXR"),
         ("cut.exr", good[: len(good) // 2], "cut"),
         ("head.exr", good[:99], "cut"),
@@ -240,13 +235,3 @@ def test_the_page_says_what_is_wrong_and_goes_on(page, tmp_path):
     assert page.ask("$('problem').hidden") is True and page.ask("root.dataset.error ?? null") is None
     agree(page.pixels("clean"), layers["image"])
     assert page.complaints == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scene", ["diffuse", "glossy", "environment", "lens"])
-def test_the_page_on_the_stacks_of_the_demo(page, renderer, scene, tmp_path):
-    stack = tmp_path / "stack.exr"
-    words = ["render", scene, "--sampler", "gpt", "--spp", "16", "--size", "240x160"]
-    assert main([*words, "-o", str(stack), "--quiet"]) == 0
-    page.give(stack)
-    agree(page.pixels("clean"), reconstruct(ngpt.read(stack), "ngpt-fast").image.transpose(2, 0, 1)[None])
