@@ -10,40 +10,29 @@ from ngpt.errors import NgptError
 from ngpt.network.run_onnx import Network
 
 onnx = pytest.importorskip("onnx")
-from onnx import TensorProto, helper  # noqa: E402
 
 KNOWN = {"ngpt.inputs": "primal", "ngpt.alignment": "1", "ngpt.base": "", "ngpt.overlap": "0"}
 KNOWN |= {"ngpt.bytes per pixel": "64", "ngpt.method": "theirs"}
-SIZE, SEQUENCE = ["n", 3, "h", "w"], "sequence"
+SEQUENCE = "seq(float[n,3,h,w])"
+# Number in ONNX of a type of elements
+NUMBERS = {"float": 1, "uint8": 2, "int32": 6, "float16": 10, "double": 11}
 
 
-def network(path, kind=TensorProto.FLOAT, made=TensorProto.FLOAT, **metadata):
+def network(path, kind="float", made="float", **metadata):
     """A file whose image is twice the primal, of an input of one type and an output of another."""
-
-    def value(name, kind):
-        if kind == SEQUENCE:
-            return helper.make_tensor_sequence_value_info(name, TensorProto.FLOAT, SIZE)
-        return helper.make_tensor_value_info(name, kind, SIZE)
-
-    nodes = [
-        helper.make_node("Cast", ["primal"], ["single"], to=TensorProto.FLOAT),
-        helper.make_node("Add", ["single", "single"], ["twice"]),
-    ]
-    if made == SEQUENCE:
-        nodes.append(helper.make_node("SequenceConstruct", ["twice"], ["image"]))
-    else:
-        nodes.append(helper.make_node("Cast", ["twice"], ["image"], to=made))
-    inputs = [value("primal", TensorProto.FLOAT if kind == SEQUENCE else kind)]
-    inputs += [value("more", SEQUENCE)] if kind == SEQUENCE else []
-    inputs.append(helper.make_tensor_value_info("statistics", TensorProto.FLOAT, None))
-    graph = helper.make_graph(nodes, "theirs", inputs, [value("image", made)])
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    helper.set_model_props(model, KNOWN | metadata)
+    given = f"float[n,3,h,w] primal, {kind} more" if kind == SEQUENCE else f"{kind}[n,3,h,w] primal"
+    result = f"{made}[n,3,h,w]" if made in NUMBERS else made
+    last = f"Cast<to={NUMBERS[made]}>(twice)" if made in NUMBERS else "SequenceConstruct(twice)"
+    model = onnx.parser.parse_model(f"""<ir_version: 9, opset_import: ["": 17]>
+        theirs ({given}, float[5] statistics) => ({result} image) {{
+            single = Cast<to=1>(primal)  twice = Add(single, single)  image = {last}
+        }}""")
+    onnx.helper.set_model_props(model, KNOWN | metadata)
     onnx.save(model, path)
     return path
 
 
-@pytest.mark.parametrize("kind", [TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.DOUBLE])
+@pytest.mark.parametrize("kind", ["float", "float16", "double"])
 def test_other_floats_are_converted(tmp_path, kind):
     path, stack = network(tmp_path / "a.onnx", kind, kind), full_stack(12, 16)
     image = Network(path).reconstruct({"primal": stack["primal"]})
@@ -55,7 +44,7 @@ def test_other_floats_are_converted(tmp_path, kind):
 
 
 @pytest.mark.parametrize("place", ["kind", "made"])
-@pytest.mark.parametrize("kind", [TensorProto.UINT8, TensorProto.INT32, SEQUENCE])
+@pytest.mark.parametrize("kind", ["uint8", "int32", SEQUENCE])
 def test_whole_numbers_and_sequences_are_refused_by_name(tmp_path, kind, place, capsys):
     path = network(tmp_path / "a.onnx", **{place: kind})
     with pytest.raises(NgptError, match=r"a.onnx: its (input|output) '(primal|image|more)' is (tensor|seq)\(.*one of"):

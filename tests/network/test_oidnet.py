@@ -1,7 +1,6 @@
 """Networks of OIDN's shape: what PyTorch makes of their weights, OIDN makes of the exported file."""
 
 import struct
-from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 import torch
 from full_stack import full_stack, hidden_oidn
 from hosts import agree
-from processes import in_a_child, needs_forks, no_warning_of_forks
 
 import ngpt
 from ngpt.cli import main
@@ -91,23 +89,6 @@ def test_oidn_gives_the_pixels_of_pytorch(files, name):
     assert by_oidn.method == f"own network {name}.tza"
     base = ngpt.denoise(stack, "primal" if name == "primal" else "wcv")
     assert np.abs(by_oidn.image - base).mean() > 1e-3 * base.mean()
-
-
-@needs_forks
-@no_warning_of_forks
-@pytest.mark.parametrize("ending", ["safetensors", "tza"])
-def test_own_weights_in_threads_and_forked_children(files, ending):
-    pytest.importorskip("mitsuba_oidn")
-
-    def work(i):
-        return ngpt.denoise(full_stack(40, 40, seed=i), weights=str(files / f"small.{ending}"))
-
-    expected = [work(i) for i in range(4)]
-    with ThreadPoolExecutor(4) as pool:
-        assert all(np.array_equal(*pair) for pair in zip(pool.map(work, range(4)), expected, strict=True))
-    child = np.frombuffer(in_a_child(work), np.float32).reshape(expected[0].shape)
-    # PyTorch has one thread there, and other sums.
-    agree(child, expected[0])
 
 
 @pytest.mark.parametrize("k", [2**-10, 2**10])

@@ -85,15 +85,3 @@ def test_what_the_gradients_agree_with_stays_as_it_is(noise):
     gradients[2:] = [torch.full_like(layer, noise) for layer in gradients[2:]]
     logits = torch.randn(1, 3 * poisson.SCALES, H, W)
     assert torch.allclose(solved(truth, gradients, logits=logits), truth, atol=2e-5)
-
-
-@pytest.mark.parametrize("axis", [poisson._X, poisson._Y])
-def test_coarser_differences_are_those_of_the_coarser_image(axis):
-    truth, _, gradients = scene()
-    difference, plain = gradients[axis == poisson._Y], torch.ones(1, 1, H, W)
-    coarse, weight = poisson._coarser(poisson._Torch, difference, poisson._Torch.inside(plain, axis), axis)
-    kept = [slice(None)] * 4
-    kept[axis] = slice(0, -1)
-    assert torch.allclose(coarse[tuple(kept)], avg_pool2d(truth, 2).diff(dim=axis), atol=1e-5)
-    # Two rows of variance 1/4 + 1 + 1/4 each; nothing in the last place, which has no next one.
-    assert torch.allclose(weight[tuple(kept)], torch.tensor(2 / 1.5)) and weight.select(axis, -1).max() < 1e-10

@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from full_stack import full_layers, full_stack
+from full_stack import full_layers
 from processes import complete
 
 from ngpt.errors import NgptError
-from ngpt.methods import reconstruct
 from ngpt.network.run_onnx import Cancelled, Network
 from ngpt.network.shipped import WEIGHTS
 
@@ -41,10 +40,7 @@ def least(network):
 
 
 # The smallest tiles are mostly overlap, and take long.
-SMALLEST = [pytest.param(1, 1, marks=pytest.mark.slow), pytest.param(1.3, 2, marks=pytest.mark.slow)]
-
-
-@pytest.mark.parametrize(("tiles", "batch"), [(1.3, 1), (1.3, 3), *SMALLEST])
+@pytest.mark.parametrize(("tiles", "batch"), [(1.3, 1), (1.3, 3), pytest.param(1, 1, marks=pytest.mark.slow)])
 def test_tiles_do_not_show_and_tell_how_far_they_are(network, image, least, tiles, batch):
     """In memory for so many of the smallest tiles."""
     layers, whole = image
@@ -57,8 +53,8 @@ def test_tiles_do_not_show_and_tell_how_far_they_are(network, image, least, tile
     assert batch > 1 or len(calls) == len(tiles) + 1
 
 
-@pytest.mark.parametrize("size", [(1, 1), (7, 900), (1080, 1920), (333, 1001), (4320, 8192)])
-@pytest.mark.parametrize("memory", [220, 300, 2048])
+@pytest.mark.parametrize("size", [(1, 1), (7, 900), (333, 1001), (1080, 1920)])
+@pytest.mark.parametrize("memory", [220, 2048])
 def test_plans_cover_every_pixel_once_with_all_it_needs(network, size, memory):
     tiles, (rows, columns) = network.plan(*size, memory)
     count = np.zeros(size, np.uint8)
@@ -82,16 +78,12 @@ def test_it_stops_when_asked_to(network, image, least):
 BOUNDED = """
 layers = full_layers(410, 520)
 layers["base"] = layers["primal"]
-network = Network(FILE)
-layers |= {name: layers["primal"] for name in network.inputs if name not in layers}
-network.reconstruct({name: layer[:8, :8] for name, layer in layers.items()})
+network = Network({file!r})
+layers |= {{name: layers["primal"] for name in network.inputs if name not in layers}}
+network.reconstruct({{name: layer[:8, :8] for name, layer in layers.items()}})
 begin()
-network.reconstruct(layers, memory=BOUND)
+network.reconstruct(layers, memory=400)
 """
-
-
-def bounded(file, memory):
-    return BOUNDED.replace("FILE", repr(str(file))).replace("BOUND", str(memory))
 
 
 # Beside the stack itself, which takes 3.4 GiB: repair, base, tiles and the result.
@@ -126,12 +118,11 @@ print(mebibytes("VmHWM") - before)
 @pytest.mark.parametrize(
     ("program", "most"),
     [
-        pytest.param(bounded(FAST, 220), 220 + 410 * 520 * 3 * 4 / 2**20, marks=pytest.mark.slow),
-        pytest.param(bounded(FAST, 400), 400 + 410 * 520 * 3 * 4 / 2**20),
-        pytest.param(bounded(COMBINE, 400), 400 + 410 * 520 * 3 * 4 / 2**20),
+        pytest.param(BOUNDED.format(file=str(FAST)), 400 + 410 * 520 * 3 * 4 / 2**20, marks=pytest.mark.slow),
+        (BOUNDED.format(file=str(COMBINE)), 400 + 410 * 520 * 3 * 4 / 2**20),
         pytest.param(LARGE, 4096, marks=pytest.mark.slow),
     ],
-    ids=["220 MiB", "400 MiB", "ngpt-combine, 400 MiB", "8192x4320 in 4 GiB"],
+    ids=["ngpt-fast, 400 MiB", "ngpt-combine, 400 MiB", "8192x4320 in 4 GiB"],
 )
 def test_memory_stays_within_the_bound(program, most):
     """In a process of its own, by the largest size it ever had; the result is beside the bound of a network."""
@@ -153,11 +144,3 @@ def test_devices_and_files_that_are_not_there_are_named_not_replaced(file, devic
     """Damaged files: tests/cli/test_refusals.py."""
     with pytest.raises(NgptError, match=message):
         Network(file, device)
-
-
-def test_the_method_takes_files_of_both_kinds():
-    pytest.importorskip("torch")
-    stack = full_stack(20, 30)
-    twin = Path(__file__).parents[2] / "export" / "weights" / "ngpt-fast.safetensors"
-    images = [reconstruct(stack, "ngpt-fast", weights=str(path)).image for path in (FAST, twin)]
-    assert np.allclose(*images, rtol=1e-4, atol=1e-5)
