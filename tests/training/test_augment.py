@@ -47,7 +47,7 @@ def anything(seed):
 
 
 TRANSFORMS = {t.__name__: t for t in (augment.flip_x, augment.flip_y, augment.transpose, repainted)}
-TRANSFORMS |= {f"anything {seed}": anything(seed) for seed in range(8)}
+TRANSFORMS |= {f"anything {seed}": anything(seed) for seed in range(4)}
 
 
 @pytest.mark.parametrize("name", TRANSFORMS)
@@ -130,7 +130,7 @@ def test_rarer_light_keeps_its_mean_and_says_its_variance(share):
     assert rarer(bare, k, share, rng).names == ("primal",)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 7), (2, 3), (5, 4), (16, 24)])
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (16, 24)])
 def test_padding_reflects_and_keeps_the_differences(size):
     layers = {name: layer[None] for name, layer in example(*size).items()}
     pads = padding.pads(*size, 8)

@@ -123,17 +123,6 @@ def test_frames_are_crops_with_motion_in_their_order(shots, motions):
     assert problems(shots.folder) == [] and summary(shots.folder)["shots"] == 3
 
 
-def test_info_verifies(folder, capsys):
-    assert main(["info", str(folder)]) == 0
-    assert "crops: 3" in capsys.readouterr().out
-    shard = folder / "shards" / "a.safetensors"
-    data = bytearray(shard.read_bytes())
-    data[-5] ^= 1
-    shard.write_bytes(data)
-    assert main(["info", str(folder)]) == 1
-    assert "a.safetensors: its sha256" in capsys.readouterr().out
-
-
 def tampered(folder, change):
     manifest = json.loads((folder / "manifest.json").read_text())
     change(manifest, manifest["shards"][0])
@@ -168,18 +157,14 @@ def test_of_two_writers_of_a_shard_the_first_stays(tmp_path, given, monkeypatch)
     ("change", "message"),
     [
         (lambda m, e: e.update(file="/etc/passwd"), "lists '/etc/passwd', which is not in its folder"),
-        (lambda m, e: e.update(file="shards/../../x"), "which is not in its folder"),
         (lambda m, e: e.pop("sha256"), r"manifest\.json: 'shards'\[0\]: lacks 'sha256'"),
         (lambda m, e: e["crops"][0].update(spp="many"), r"'crops'\[0\]: 'spp' is 'many'; it must be a list"),
         (lambda m, e: e.update(bytes=10**400), r"'bytes' is 1000.*; it must be int"),
-        (lambda m, e: e.update(bytes=True), "'bytes' is True; it must be int"),
         (lambda m, e: m.update(shards={}), "'shards' is {}; it must be a list"),
         (lambda m, e: m.update(version=9), "version 9"),
         (lambda m, e: m.pop("format"), "not the manifest"),
-        *(
-            (lambda m, e, frame=frame: e["crops"][0].update(frame=frame), "'frame' of a crop of .* is .*int")
-            for frame in ("first", 1.5, True, None, 10**400)
-        ),
+        (lambda m, e: e["crops"][0].update(frame=1.5), "'frame' of a crop of .* is .*int"),
+        (lambda m, e: e["crops"][0].update(frame=None), "'frame' of a crop of .* is .*int"),
     ],
 )
 def test_manifests_that_cannot_be_used_are_refused(folder, change, message):
@@ -201,21 +186,19 @@ def test_manifests_that_are_none(tmp_path, text, message):
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [
-        (lambda data: data[:-1] + b"x", "its sha256 is"),
-        (lambda data: data[:500], "its sha256 is"),
-        (lambda data: None, "is missing"),
-    ],
+    [(lambda data: data[:-1] + b"x", "its sha256 is"), (lambda data: None, "is missing")],
 )
-def test_changed_shards_are_not_trained_on(folder, change, message):
+def test_changed_shards_are_not_trained_on(folder, capsys, change, message):
     shard = folder / "shards" / "a.safetensors"
+    assert main(["info", str(folder)]) == 0 and "crops: 3" in capsys.readouterr().out
     data = change(shard.read_bytes())
     shard.unlink()
     if data:
         shard.write_bytes(data)
     with pytest.raises(NgptError, match=rf"a\.safetensors: {message}"):
         Dataset(folder)[0]
-    assert Dataset(folder)[2].stack(0) and any(message in line for line in problems(folder))
+    assert Dataset(folder)[2].stack(0)
+    assert main(["info", str(folder)]) == 1 and f"a.safetensors: {message}" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -244,13 +227,6 @@ def test_shards_with_other_tensors_are_refused(shots, name, change, message):
     tampered(shots.folder, lambda manifest, entry: entry.update(sha256=digest))
     with pytest.raises(NgptError, match=message):
         Dataset(shots.folder)[0]
-
-
-def test_a_record_that_cannot_be_read_is_refused(folder):
-    shard = folder / "shards" / "a.safetensors"
-    save_file(load_file(shard), shard, {"ngpt": "[" * 100_000})
-    with pytest.raises(NgptError, match="its record: cannot be read: its brackets are nested"):
-        Shard(shard)
 
 
 def test_a_shard_that_is_cut_while_it_is_read_is_named(folder):

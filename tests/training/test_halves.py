@@ -15,6 +15,10 @@ from ngpt.training.halves import halves
 from ngpt.training.loss import make_loss
 
 
+def slow(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 def examples_of(*crops, augmentation=None, size=32, cache=0):
     return Examples(crops, settings().model, augmentation or Augmentation(), size, seed=0, cache=cache)
 
@@ -37,7 +41,7 @@ def the_least(other):
 
 
 @pytest.mark.parametrize(
-    ("share", "best", "worse"), [(0.5, 1, 1), (0.1, 1, 0.96), (0.03, 0.99, 0.69), (0.01, 0.88, 0.52)]
+    ("share", "best", "worse"), [slow(0.5, 1, 1), slow(0.1, 1, 0.96), (0.03, 0.99, 0.69), slow(0.01, 0.88, 0.52)]
 )
 def test_the_least_is_at_the_truth_however_rare_light_is(share, best, worse):
     """Docs/train/losses.md has these numbers. Weights of the half that judges are small where it is bright."""

@@ -60,7 +60,7 @@ def test_a_distance_is_zero_for_equal_images_positive_else_and_symmetric(distanc
     assert distance(a, a + 0.1 * (b - a)).item() < distance(a, b).item()
 
 
-@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("value", [0.0, 1.0, 1e6])
 def test_slopes_are_finite_on_flat_images(distance, value):
     for other in (torch.full((1, 3, 40, 40), value), images(1, 3, 40, 40)):
         flat = torch.full((1, 3, 40, 40), value, requires_grad=True)
@@ -78,7 +78,7 @@ def test_slopes_are_those_of_the_value(distance):
     assert (a.grad * direction).sum().item() == pytest.approx(numeric, rel=0.06, abs=1e-4)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 40), (17, 9), (200, 180)])
+@pytest.mark.parametrize("size", [(1, 1), (5, 40), (200, 180)])
 def test_the_structural_distance_takes_every_size(size):
     a, b = images(1, 3, *size), images(1, 3, *size, seed=1)
     assert 0 < structural_distance(a, b) <= 2 and structural_distance(a, a).abs() < 1e-6
@@ -132,10 +132,9 @@ def test_the_largest_over_exposures_counts():
     reference = 8 * picture(2)
     alone = [flip.flip(1.2 * reference, reference, (e,)) for e in (0.01, 0.25)]
     assert max(alone) <= flip.flip(1.2 * reference, reference, (0.01, 0.25)) <= sum(alone)
-    assert flip.flip(reference, reference, (0.25,)) < 1e-3
 
 
-@pytest.mark.parametrize("value", [0.0, 1e-20, 1.0, 1e12])
+@pytest.mark.parametrize("value", [0.0, 1e-20, 1e12])
 def test_slopes_of_flip_are_finite_where_images_agree_and_at_extremes(value):
     image = torch.full((1, 3, 24, 24), value, requires_grad=True)
     flip.flip(image, image.detach().clone(), (0.25, 0.01)).backward()
@@ -167,9 +166,7 @@ def test_transforms_have_the_published_distributions():
     assert agrees(np.histogram(factors, 16, (0.2, 1))[0], np.ones(16))
     phases = [t.phase for t in every if t.scale == 2]
     assert agrees(np.bincount([2 * y + x for y, x in phases]), np.ones(4))
-
-
-def test_draws_are_stratified_over_the_batch():
+    # Draws are stratified over a batch.
     for transform in draws(50, batch=12):
         assert np.bincount(transform.flip, minlength=4).tolist() == [3, 3, 3, 3]
         strata = ((transform.factor - 0.2) / 0.8 * 12).int().sort(0).values
@@ -189,17 +186,6 @@ def test_a_transform_moves_pixels_and_scales_colours():
 
 
 # The composite
-
-
-@pytest.mark.parametrize("value", [0.0, 1.0, 1e6])
-def test_the_loss_is_finite_at_the_extremes(value):
-    loss = make_loss({"relative": 1.0, "logarithmic": 1.0})
-    for target in (torch.full((2, 3, 40, 40), value), images(2, 3, 40, 40)):
-        prediction = torch.full((2, 3, 40, 40), value, requires_grad=True)
-        total, parts = loss(prediction, target, generator())
-        total.backward()
-        assert torch.isfinite(total) and torch.isfinite(prediction.grad).all()
-        assert set(parts) == {"perceptual", "l1", "gradient", "relative", "logarithmic"}
 
 
 @pytest.mark.parametrize(
@@ -286,7 +272,6 @@ def test_elpips_trains_when_its_files_are_there(files):
         ({"backbone": "a.pth"}, r"checksum is not b8a52dc0.*convert other weights to \.safetensors"),
         ({"backbone": "empty.safetensors"}, r"'features.0.weight' should be \[64, 3, 3, 3\], is missing"),
         ({"backbone": "damaged.safetensors"}, "'features.0.bias' holds values that are not finite"),
-        ({"backbone": "lin.safetensors"}, r"'features.0.weight' should be \[64, 3, 3, 3\], is missing"),
         ({"kind": "elpips-vgg"}, r"vector 'lin2' is of 128 numbers; it should have 64|'lin1[0-3]' is missing"),
     ],
 )
@@ -295,15 +280,6 @@ def test_missing_and_damaged_files_are_explained(files, tmp_path, monkeypatch, c
     monkeypatch.chdir(tmp_path)
     with pytest.raises(NgptError, match=complaint):
         make_loss(files | change)
-
-
-def test_a_damaged_file_in_the_cache_is_explained(files, tmp_path, monkeypatch):
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    cache = tmp_path / "hub" / "checkpoints"
-    cache.mkdir(parents=True)
-    (tmp_path / "a.pth").rename(cache / backbones.SqueezeNet.FILE)
-    with pytest.raises(NgptError, match=r"checksum is not b8a52dc0"):
-        make_loss(files | {"backbone": ""})
 
 
 class Payload:
@@ -348,14 +324,11 @@ def slope(loss, prediction, target):
 def test_noise_of_the_target_does_not_move_the_least_of_huber():
     """Skewed noise, of which the median lies below the mean: an absolute error has its least at the median."""
     target = 2 * torch.from_numpy(np.random.default_rng(0).gamma(20, 1 / 20, (1, 3, 200, 200))).float()
-    best = {}
-    for loss in (pixelwise.huber, pixelwise.l1):
-        values = torch.linspace(1.9, 2.1, 41)
-        # The slope, as training sees it, changes its sign at the least.
-        slopes = [slope(loss, torch.full_like(target, v.item(), requires_grad=True), target).sum() for v in values]
-        best[loss] = values[int(np.argmax(np.array(slopes) > 0))].item()
-    assert best[pixelwise.huber] == pytest.approx(2, abs=0.011)
-    assert best[pixelwise.l1] < 1.98
+
+    def rises(loss, value):
+        return slope(loss, torch.full_like(target, value, requires_grad=True), target).sum() > 0
+
+    assert rises(pixelwise.huber, 2.011) and not rises(pixelwise.huber, 1.989) and rises(pixelwise.l1, 1.98)
 
 
 def test_a_firefly_of_the_target_counts_once_whatever_its_brightness():
