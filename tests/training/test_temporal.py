@@ -63,7 +63,7 @@ def test_a_network_that_says_nothing_has_the_loss_of_the_rules():
 
 
 SETTINGS = {
-    "temporal": {"methods": ["wcv"], "round": 25, "clips": 120},
+    "temporal": {"methods": ["wcv"], "round": 25, "clips": 60},
     "optimizer": {"learning_rate": 2e-3, "schedule": "cosine", "warmup": 0, "clip": 1.0},
     "run": {"steps": 50, "batch": 8, "log": 5, "save": 30, "validate": 50},
 }
@@ -203,5 +203,3 @@ def test_one_command_trains_it_and_goes_on(tmp_path, rng, capsys):
     assert [entry["step"] for entry in log_of(tmp_path / "run") if "loss" in entry] == [1, 2, 3, 4, 5]
     assert "Finished" in (tmp_path / "run" / "run.html").read_text()
     assert main(["info", out]) == 0 and "validations: 2" in capsys.readouterr().out
-    assert main(["train", "--config", "temporal", "--dry-run"]) == 0
-    assert "parameters" in (output := capsys.readouterr().out) and "per step" not in output

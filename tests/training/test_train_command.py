@@ -1,6 +1,5 @@
 """train.py and the configurations that come with it."""
 
-import re
 import runpy
 import subprocess
 from dataclasses import fields
@@ -111,68 +110,34 @@ def test_the_shipped_network_is_fine_tuned_in_one_command(tmp_path, monkeypatch,
     assert 0 < change.mean() < 0.05
 
 
-@pytest.mark.slow
-def test_a_network_trains_on_crops_that_are_being_rendered(renderer, train, tmp_path):
-    changes = sets(data_folders=["configs/data-tiny.toml"], data_crop=32, run_steps=3, run_batch=2, run_log=1)
-    status, output, errors = train("--config", "configs/tiny.toml", "--out", str(tmp_path / "run"), *changes)
-    assert status == 0, errors
-    assert "finished at step 3" in output
-
-
-FIRST_COMMANDS = re.findall(r"^ {4}ngpt (.*?)(?: {2,}#.*)?$", TRAINING.read_text(), re.M)[:3]
-# Light in two parts, which KPCN reads: the smallest set of that kind.
-SPLIT = """
-seed = 41
-size = 64
-inputs = 2
-spp = [2, 4]
-sampler = "split"
-scenes = 2
-crops = 1
-crops_per_shard = 1
-reference_spp = 8
-reference_method = "primal"
-"""
-
-
 @pytest.fixture(scope="module")
 def smallest_set(renderer, tmp_path_factory):
-    """A folder with the set "data" that the first command of docs/train/training.md makes."""
-    folder = tmp_path_factory.mktemp("smallest")
-    assert FIRST_COMMANDS[0] == "dataset --config data-tiny --out data"
-    assert main([*FIRST_COMMANDS[0].split()[:-1], str(folder / "data"), "-q"]) == 0
+    """A folder with the set that the first command of docs/train/training.md makes."""
+    folder = tmp_path_factory.mktemp("smallest") / "data"
+    assert "    ngpt dataset --config data-tiny --out data " in TRAINING.read_text()
+    assert main(["dataset", "--config", "data-tiny", "--out", str(folder), "-q"]) == 0
     return folder
 
 
-@pytest.fixture(scope="module")
-def split_set(renderer, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("split")
-    (folder / "data-split.toml").write_text(SPLIT)
-    assert main(["dataset", "--config", str(folder / "data-split.toml"), "--out", str(folder / "data"), "-q"]) == 0
-    return folder
+# Others read light in two parts, which that set has not.
+TRAINED = [path for path in OF_IMAGES if not {"diffuse", "specular"} & {*read_settings(path).model.inputs}]
 
 
-def on_its_set(path: Path):
-    """A configuration with the set that has the layers it reads. To render split light takes a minute more."""
-    split = '"diffuse"' in path.read_text() or read_settings(path).model.network == "kpcn"
-    # The large ones are others' twins: by their size nothing is tested but patience.
-    marks = pytest.mark.slow if split or path.stem in ("paper", "large", "small") else ()
-    return pytest.param(path, "split_set" if split else "smallest_set", id=path.stem, marks=marks)
-
-
-@pytest.mark.parametrize(("path", "kind"), [on_its_set(path) for path in OF_IMAGES])
-def test_every_configuration_trains_on_a_set_of_our_own_generator(path, kind, train, request, tmp_path, one_thread):
-    """With no more changed of it than its size; one of the two scenes is set aside, and it is said."""
-    folder = request.getfixturevalue(kind)
-    changes = sets(data_folders=[str(folder / "data")], data_crop=48, data_workers=0, run_steps=2)
+# Rendering the set takes twelve processor seconds.
+@pytest.mark.slow
+@pytest.mark.parametrize("path", TRAINED, ids=lambda path: path.stem)
+def test_every_configuration_trains_on_a_set_of_our_own_generator(path, smallest_set, train, tmp_path, one_thread):
+    """Only its size is changed. One of the two scenes is set aside, and the command says so."""
+    changes = sets(data_folders=[str(smallest_set)], data_crop=48, data_workers=0, run_steps=2)
     changes += sets(run_batch=1, run_views=1)
     status, output, errors = train("--config", path.stem, "--out", str(tmp_path / "run"), *changes)
     assert status == 0, errors
     assert "validation: 1 of 2 scenes set aside" in output and "finished at step 2" in output and "relMSE" in output
 
 
-@pytest.mark.parametrize("model", ["fast", "combine", "primal", "temporal"])
-@pytest.mark.parametrize("files", [False, True], ids=["procedural", "scene files"])
+@pytest.mark.parametrize(
+    ("model", "files"), [("fast", False), ("combine", True), ("primal", True), ("temporal", False)]
+)
 def test_models_are_made_anew_with_scene_files_and_without(model, files, tmp_path):
     """The script calls a stand-in for Python, in a folder that has scene files or none."""
     calls, python = tmp_path / "calls", tmp_path / "python"
@@ -197,10 +162,6 @@ def test_models_are_made_anew_with_scene_files_and_without(model, files, tmp_pat
         assert settings.run.steps == 5
         assert settings.data.folders == tuple(each[each.index("--out") + 1] for each in made)
         assert settings.initial == (weights[-1] if weights else "")
-        for name in settings.data.validation:
-            scenes = [f"made-{i:05d}" for i in range(max(source.scenes for source in sources))]
-            scenes += [Path(table.pattern).parent.name for source in sources for table in source.files]
-            assert 0 < sum(scene.startswith(name) for scene in scenes) < len(scenes)
         weights.append(f"{line[line.index('--out') + 1]}/weights.safetensors")
         made = []
     assert len(weights) == (2 if model == "primal" else 1) and not made

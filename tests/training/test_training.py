@@ -67,8 +67,8 @@ BOTH = {"data_pairs": 0.5, "loss": {"kind": "l1", "halves": 0.5}, "run_batch": 4
 
 @pytest.mark.parametrize(
     ("stop", "crops", "changes"),
-    [(1, CROPS[:4], {}), (5, CROPS[:4], {}), (7, CROPS[:4], {}), (2, [CROPS[0], PairedCrop("b", 1)], BOTH)],
-    ids=["at 1", "at 5", "at 7", "with pairs"],
+    [(1, CROPS[:4], {}), (7, CROPS[:4], {}), (2, [CROPS[0], PairedCrop("b", 1)], BOTH)],
+    ids=["at 1", "at 7", "with pairs"],
 )
 def test_a_stopped_run_continues_bit_for_bit(tmp_path, stop, crops, changes):
     chosen = {"crops": crops, "held_out": CROPS[4:], "run_steps": 9, **changes}
@@ -189,8 +189,6 @@ def test_folders_of_stacks_are_crops(tmp_path):
     (read,) = open_crops(tmp_path)
     assert read.inputs == 1 and read.scene == "view" and np.allclose(read.reference, crop.reference)
     assert np.allclose(read.stack(0)["dx"], crop.stack(0)["dx"])
-    with pytest.raises(NgptError, match="no such folder"):
-        open_crops(tmp_path / "nowhere")
     there = Window(2, 0, *read.stack(0).place.data.size)
     moved = GradientStack(crop.stack(0).layers, place=Place(there, Window(0, 0, 99, 99)))
     other = GradientStack({"primal": crop.reference}, place=Place(replace(there, left=3), Window(0, 0, 99, 99)))
@@ -209,23 +207,18 @@ def test_the_papers_schedule(step, rate):
     assert learning_rate(OptimizerSettings(), step, 600_000) == pytest.approx(rate, rel=0.03)
 
 
-@pytest.mark.parametrize("schedule", ("paper", "cosine"))
-def test_a_short_run_reaches_its_learning_rate(schedule):
-    """A run that would end within its warm-up has one of a tenth of its steps; others keep theirs."""
-    s = OptimizerSettings(learning_rate=1.0, schedule=schedule, warmup=100)
-    rates = [learning_rate(s, i, 30) for i in range(30)]
-    assert max(rates[:5]) == 1 and rates[0] < 1
-    assert max(learning_rate(s, i, 101) for i in range(99)) < 1
-
-
 def test_the_cosine_schedule():
+    """A run that would end within its warm-up has one of a tenth of its steps; others keep theirs."""
     s = OptimizerSettings(learning_rate=1.0, schedule="cosine", warmup=10)
     rates = [learning_rate(s, i, 110) for i in range(110)]
     assert rates[0] == pytest.approx(0.1) and max(rates) == 1 and rates[-1] == pytest.approx(0.01)
     assert all(a >= b for a, b in pairwise(rates[10:]))
+    assert [learning_rate(s, i, 10) for i in range(2)] == [1, 1] and learning_rate(s, 8, 11) < 1
 
 
 def test_a_run_says_what_has_changed_since_its_checkpoint(done):
+    with pytest.raises(NgptError, match=r"another \[model\]"):
+        trainer(done, model_units=[2, 1]).resume()
     said = []
     other = trainer(done, run_steps=14, optimizer_learning_rate=0.125)
     other.say = said.append
@@ -264,12 +257,9 @@ def test_settings_are_checked(tmp_path, change, complaint):
     assert read_settings(path, ["run.steps=7", "optimizer.schedule=cosine"]).run.steps == 7
     with pytest.raises(NgptError, match=complaint):
         read_settings(path, [change])
-
-
-def test_settings_that_are_no_toml_are_refused(tmp_path):
-    (tmp_path / "a.toml").write_text("[model\n")
+    path.write_text("[model\n")
     with pytest.raises(NgptError, match=r"a\.toml: cannot be read"):
-        read_settings(tmp_path / "a.toml")
+        read_settings(path)
 
 
 @pytest.mark.parametrize(
@@ -285,11 +275,6 @@ def test_runs_that_cannot_work_are_refused(tmp_path, changes, complaint):
         trainer(tmp_path, **changes).run()
 
 
-def test_checkpoints_of_another_model_are_refused(done):
-    with pytest.raises(NgptError, match=r"another \[model\]"):
-        trainer(done, model_units=[2, 1]).resume()
-
-
 def test_fine_tuning_starts_from_weights(done):
     path = str(done / "weights.safetensors")
     tensors, header = safetensors.read_tensors(path)
@@ -302,7 +287,6 @@ def test_fine_tuning_starts_from_weights(done):
 
 
 BIAS = "network.head.convolution.bias"
-LARGE = {"channels": [1024] * 2, "units": [8, 8]}
 
 
 @pytest.mark.parametrize(
@@ -318,10 +302,8 @@ LARGE = {"channels": [1024] * 2, "units": [8, 8]}
         ({}, {"units": [1, 10**6]}, r"units \[1, 1000000\]: give a positive number, up to 32"),
         ({}, {"channels": [4, 10**9]}, "up to 1024"),
         ({}, {"channels": [4] * 20, "units": [1] * 20}, "at most 8 levels"),
-        ({}, {"channels": [4.0, True]}, "give a positive number"),
         # Allowed, and two gigabytes: refused before they are taken.
-        ({}, LARGE, "is \\[.*the model's is|lacks tensor|unexpected tensor"),
-        ({}, {"network": ["dense"]}, "network"),
+        ({}, {"channels": [1024] * 2, "units": [8, 8]}, "is \\[.*the model's is|lacks tensor|unexpected tensor"),
     ],
 )
 def test_damaged_weights_are_explained(done, tensors, header, complaint):
@@ -348,19 +330,14 @@ def test_weights_that_are_cut_or_not_there_are_explained(done):
     ("moment", "header", "complaint"),
     [
         (lambda tensor: torch.zeros(7), {}, r"is \[7\], the model's is"),
-        (lambda tensor: tensor * torch.nan, {}, "not finite"),
-        (lambda tensor: None, {}, "lacks tensor"),
         (lambda tensor: tensor, {"step": "many"}, "its header: 'step' is 'many'; it must be int"),
-        (lambda tensor: tensor, {"settings": None}, "its header: lacks 'settings'"),
     ],
 )
 def test_checkpoints_that_do_not_fit_are_explained(done, moment, header, complaint):
     path = done / "checkpoint.safetensors"
     tensors, told = safetensors.read_tensors(path)
     name = f"adam2/{BIAS}"
-    tensors, told = tensors | {name: moment(tensors[name])}, told | header
-    tensors, told = ({k: v for k, v in part.items() if v is not None} for part in (tensors, told))
-    safetensors.write_tensors(path, tensors, told, overwrite=True)
+    safetensors.write_tensors(path, tensors | {name: moment(tensors[name])}, told | header, overwrite=True)
     with pytest.raises(NgptError, match=complaint) as caught:
         trainer(done).resume()
     assert str(path) in str(caught.value)
