@@ -1,6 +1,6 @@
-"""The command ``ngpt``: one verb, one module, which is imported only when its verb is called.
+"""The command ``ngpt``. Each verb has a module of its own, which is imported only when the verb is called.
 
-Verbs that render are in ``data_gen.cli``, and are found by an entry point: nothing here imports the renderer.
+The verbs that render are in ``data_gen.cli``. An entry point names them, so that nothing here imports the renderer.
 
 All verbs share these exit statuses: 0 when everything requested was done; 1 when the work failed for at least one file,
 or images differ; 2 for a call that makes no sense (``WrongUse``); 130 after Ctrl-C and 143 after SIGTERM.
@@ -23,8 +23,14 @@ from ngpt.version import __version__
 
 
 class Verb(NamedTuple):
-    """A verb: its summary, the package that holds its module (named after the verb), the extra of ngpt-recon that
-    installs what it needs, the message after an interrupt, and its heading in help, one of ``HEADINGS``."""
+    """A verb of the command line.
+
+    ``summary``      one line for help
+    ``room``         the package that holds its module, which has the name of the verb
+    ``extra``        the extra of ngpt-recon that installs its dependencies; "" if it needs none
+    ``interrupted``  the message after an interrupt
+    ``heading``      the heading in help, one of ``HEADINGS``
+    """
 
     summary: str
     room: str = "ngpt.cli"
@@ -60,9 +66,9 @@ VERBS = {
 
 
 def all_verbs() -> dict[str, Verb]:
-    """Our verbs and the verbs that other packages bring, ordered by their headings.
+    """The verbs of ngpt and of other packages, ordered by their headings.
 
-    A package names its own, a dictionary like ``VERBS``, by an entry point of the group "ngpt.verbs".
+    Another package brings verbs by an entry point of the group "ngpt.verbs" that names a dictionary like ``VERBS``.
     """
     found: dict[str, Verb] = {}
     for verbs in brought("ngpt.verbs"):
@@ -72,7 +78,7 @@ def all_verbs() -> dict[str, Verb]:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Reports a wrong call in one line, like all other errors."""
+    """A parser that reports a wrong call in one line, as all other errors are reported."""
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
@@ -89,7 +95,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 class _Top(_Parser):
-    """The parser of ``ngpt`` itself: its help lists the ``verbs`` under headings."""
+    """The parser of ``ngpt`` itself. Its help lists the ``verbs`` under headings."""
 
     verbs: dict[str, Verb]
 
@@ -112,7 +118,7 @@ class _Top(_Parser):
 
 
 class _Completion(argparse.Action):
-    """Prints the completion script of a shell, and ends."""
+    """Prints the completion script of a shell and exits."""
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, option: str | None = None) -> None:
         from ngpt.cli.completion import script
@@ -122,16 +128,16 @@ class _Completion(argparse.Action):
 
 
 def parsers() -> dict[str, argparse.ArgumentParser]:
+    """The complete parser of each verb, by its name."""
     return {name: _filled(_Parser(prog=f"ngpt {name}"), name, verb) for name, verb in all_verbs().items()}
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs a command line and returns its exit status."""
     words = sys.argv[1:] if arguments is None else arguments
-    # Only one option of ngpt itself takes a value, and that option ends the command. The first word that is not an
-    # option is the verb.
+    # The verb is the first word that is not an option. Only --completion takes a value, and it needs no verb.
     called = "" if words[:1] == ["--completion"] else next((word for word in words if not word.startswith("-")), "")
-    # Looking for verbs of other packages takes time.
+    # A search for the verbs of other packages takes time, so it is made only if needed.
     verbs = VERBS if called in VERBS else all_verbs()
     interrupted = verbs[called].interrupted if called in verbs else "interrupted"
     return run_command(lambda: _work(_parser(called, verbs), verbs, words, "ngpt"), interrupted=interrupted)
@@ -140,9 +146,12 @@ def main(arguments: list[str] | None = None) -> int:
 def door(
     verb: str, program: str, arguments: list[str] | None = None, name: str = "ngpt", verbs: Mapping[str, Verb] = VERBS
 ) -> int:
-    """Runs a script of the repository that does what a verb does: ``python train.py``, ``python -m data_gen``.
+    """Runs a verb for a script of the repository, such as ``train.py``, and returns the exit status.
 
-    Its errors begin with ``name``. ``verbs`` contains the verb, so that its package need not be installed.
+    ``program``    the command as help shows it: "python train.py"
+    ``arguments``  the words after it; None for those of this process
+    ``name``       the beginning of its error messages
+    ``verbs``      a dictionary with the verb, for packages that are not installed
     """
     words = sys.argv[1:] if arguments is None else arguments
     parser = argparse.ArgumentParser(program)
@@ -152,7 +161,7 @@ def door(
 
 
 def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
-    """A parser of all ``verbs``, with the arguments of the one that is called."""
+    """The parser of ``ngpt``, with the names of all ``verbs`` and the arguments of the ``called`` one."""
     if called and called not in verbs:
         meant = did_you_mean(called, verbs)
         if not meant and verbs.keys() == VERBS.keys():
@@ -178,7 +187,7 @@ def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
 
 
 def _filled(parser: argparse.ArgumentParser, name: str, verb: Verb) -> argparse.ArgumentParser:
-    """The parser, with the description and the arguments of its verb."""
+    """The ``parser``, to which the description and the arguments of a verb were added."""
     parser.description = f"{verb.summary[0].upper()}{verb.summary[1:]}."
     parser.set_defaults(verb=name, parser=parser)
     loud = parser.add_mutually_exclusive_group()

@@ -1,4 +1,4 @@
-"""Arguments that several verbs share, and their conversion."""
+"""Arguments that several verbs share, and the conversion of their values."""
 
 import argparse
 import json
@@ -29,7 +29,7 @@ def add_force(parser: argparse._ActionsContainer) -> None:
 
 
 def add_options(parser: argparse._ActionsContainer, owner: str, name: str) -> None:
-    """``-O NAME=VALUE``, an option of the ``owner``; `ngpt info` describes it by the owner's ``name``."""
+    """Adds ``-O NAME=VALUE``, an option of the ``owner`` ("method"). Help refers to ``ngpt info`` and ``name``."""
     parser.add_argument(
         "-O",
         "--option",
@@ -42,10 +42,10 @@ def add_options(parser: argparse._ActionsContainer, owner: str, name: str) -> No
 
 
 def output_file(path: str | Path, args: argparse.Namespace) -> Path:
-    """The path of a file to write; its folder is made. Raises NgptError if the folder cannot be made, or the file
-    exists.
+    """The path of a file to write, after making its folder.
 
-    ``args`` has ``force``. It also has ``skip_existing`` if the verb has that option, which applies to OpenEXR files.
+    ``args`` has ``force``, and ``skip_existing`` if the verb has that option. Raises NgptError if the folder cannot be
+    made, or if the file exists and neither option is given.
     """
     skip = getattr(args, "skip_existing", None)
     make_folder(Path(path).parent)
@@ -55,7 +55,7 @@ def output_file(path: str | Path, args: argparse.Namespace) -> Path:
 
 
 def add_config(parser: argparse.ArgumentParser, kind: str, what: str) -> None:
-    """``--config`` and ``--init``, for one of the kinds of ``ngpt.system.configs``."""
+    """Adds ``--config`` and ``--init`` for one of the kinds of ``ngpt.system.configs``."""
     known = ", ".join(configs.names(kind))
     parser.add_argument("--config", metavar="CONFIG", help=f"{what}: a TOML file, or one of: {known}")
     parser.add_argument(
@@ -67,13 +67,17 @@ def add_config(parser: argparse.ArgumentParser, kind: str, what: str) -> None:
 
 
 def config_of(args: argparse.Namespace, kind: str) -> Path:
-    """The configuration that ``--config`` names. Raises WrongUse where it is missing."""
+    """The configuration that ``--config`` names, or the default start for ``--init``.
+
+    Raises WrongUse if neither option is given, and NgptError if there is no such configuration.
+    """
     if args.config is None and args.init is None:
         raise WrongUse(f"--config is missing: a TOML file, or one of: {', '.join(configs.names(kind))}")
     return configs.find_config(args.config or configs.STARTS[kind], kind)
 
 
 def write_template(args: argparse.Namespace, text: str, verb: str, console: Console) -> int:
+    """Writes a configuration to the file of ``--init`` and returns the exit status."""
     make_folder(Path(args.init).parent)
     target = check_output(args.init)
     write_text(target, text, overwrite=False)
@@ -82,8 +86,9 @@ def write_template(args: argparse.Namespace, text: str, verb: str, console: Cons
 
 
 class Names(Container[str]):
-    """The names of a registry and "auto", as choices of an option. Entries of other packages are listed once they are
-    imported.
+    """The names in a registry and "auto", as choices of an option.
+
+    Iteration leaves out entries of other packages that are not imported yet.
     """
 
     def __init__(self, registry: Registry):
@@ -114,7 +119,7 @@ def add_files(parser: argparse.ArgumentParser) -> None:
 
 
 def given_files(args: argparse.Namespace) -> dict[str, str]:
-    """The files that the options of ``add_files`` name, by layer."""
+    """The files given by the options of ``add_files``, by layer."""
     return {layer: file for layer in FILES if (file := getattr(args, layer))}
 
 
@@ -151,6 +156,7 @@ def size(text: str) -> tuple[int, int]:
 
 
 def natural(text: str, least: int = 0) -> int:
+    """A whole number of ``least`` or more."""
     if not text.isdecimal() or int(text) < least:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of {least} or more")
     return int(text)
@@ -161,11 +167,12 @@ def positive(text: str) -> int:
 
 
 def duration(text: str) -> float:
+    """A positive number of seconds."""
     return number(text, lambda seconds: 0 < seconds < math.inf, "is not a positive number of seconds")
 
 
 def relative(text: str) -> float:
-    """A number. The error for a text such as "5%" suggests the fraction, 0.05."""
+    """A number. The error for "5%" suggests to write 0.05."""
     try:
         return float(text)
     except ValueError:
@@ -175,7 +182,7 @@ def relative(text: str) -> float:
 
 
 def number(text: str, fits: Callable[[float], bool], refusal: str) -> float:
-    """The number in a text. For other texts, and for numbers out of range, the error ends in ``refusal``."""
+    """The number in a text. If there is none, or ``fits`` is False for it, the error is the text and ``refusal``."""
     try:
         found = float(text)
     except ValueError:
@@ -186,25 +193,25 @@ def number(text: str, fits: Callable[[float], bool], refusal: str) -> float:
 
 
 def stack_files(names: list[str]) -> list[Path]:
-    """The files meant by names, folders (every .exr in them) and patterns, in order and without repeats.
+    """The files given by their names, by folders (every .exr in them) or by patterns, in order and without repeats.
 
-    Folders and patterns (``ngpt.io.frames``) leave out results of earlier runs. Raises NgptError for a folder or
-    pattern without a file; a plain name is passed on, and its reader reports errors.
+    Results of earlier runs in folders and patterns are left out (``ngpt.io.frames``). Raises NgptError for a folder or
+    pattern without a file. A file that is named need not exist: its reader reports the error.
     """
     files = [path for name in names for path in (input_files(name) if is_shot(name) else [Path(name)])]
     return list(dict.fromkeys(files))
 
 
 def tell_lacks(lacks: Mapping[str, str], console: Console) -> None:
-    """Says which metrics are left out. The reason, which is always the same, is shown with --verbose."""
-    for lack in lacks.values():
-        _LOG.info(lack)
+    """Prints which metrics are left out. ``lacks`` maps them to reasons, which only --verbose shows."""
+    for reason in lacks.values():
+        _LOG.info(reason)
     if lacks:
         console.say(f"without {' and '.join(lacks)}: --verbose says why")
 
 
 def print_json(value: object) -> None:
-    """Prints strict JSON: numbers that JSON does not have (infinite, NaN) become null, and paths become strings."""
+    """Prints a value as strict JSON: infinite numbers and NaN, which JSON does not have, become null."""
     print(json.dumps(_strict(value), indent=2))
 
 
@@ -221,7 +228,7 @@ def _strict(value):
 
 
 def part(text: str) -> tuple[int, int]:
-    """``i/n``, the part i of n, counted from 0."""
+    """``i/n`` as (i, n): part i of n, counted from 0."""
     match = re.fullmatch(r"(\d+)/(\d+)", text)
     if not match or int(match[1]) >= int(match[2]):
         raise argparse.ArgumentTypeError(f"'{text}' is not i/n with 0 <= i < n, such as 0/4")

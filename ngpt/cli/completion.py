@@ -1,25 +1,23 @@
-"""``ngpt --completion SHELL``: a script, made from the parsers, with which a shell completes verbs, options and
-values.
-"""
+"""``ngpt --completion SHELL``: scripts for the completion of verbs, options and values, made from the parsers."""
 
 import argparse
 import re
 from collections.abc import Iterable
 
-# Options whose value is a file or a folder are recognised by the name of the value in help.
+# The names of values in help by which options that take a file or a folder are recognised
 _FILES = re.compile(r"FILE|OUT|REF|PATH|DIR|FOLDER|PAGE|CONFIG|\.\w+$")
 
 
 def script(shell: str, top: argparse.ArgumentParser, verbs: dict[str, argparse.ArgumentParser]) -> str:
-    """The script for bash, zsh or fish; ``verbs`` are the parsers below ``top``."""
+    """The script for "bash", "zsh" or "fish", from the parser of ngpt and the parsers of its verbs by name."""
     if shell == "fish":
         return _fish(top, verbs)
-    # zsh runs scripts for bash.
+    # zsh can run the script for bash.
     return (_ZSH if shell == "zsh" else "") + _bash(top, verbs)
 
 
 def options(parser: argparse.ArgumentParser) -> Iterable[argparse.Action]:
-    """The options of a parser, without the arguments that have no names."""
+    """The options of a parser, without its positional arguments."""
     return (action for action in parser._actions if action.option_strings)
 
 
@@ -92,6 +90,6 @@ def _fish(top: argparse.ArgumentParser, verbs: dict[str, argparse.ArgumentParser
 
 
 def _quoted(text: str | None) -> str:
-    """The beginning of a help text, as a word of fish."""
+    """The first phrase of a help text, quoted for fish."""
     first = re.split(r"[;:.(]", (text or "").replace("%%", "%"))[0].strip()
     return "'" + first.replace("\\", "\\\\").replace("'", "\\'") + "'"

@@ -13,25 +13,24 @@ from typing import Any
 from ngpt.api import lightgroups
 from ngpt.api.uncertainty import reconstruct_with_error
 from ngpt.cli import arguments
-from ngpt.cli.denoise_files import Frame, describe, output_paths, write_frame
-from ngpt.cli.denoise_shot import motion_hint, one_view_only, way, windowed
-from ngpt.cli.picture import add_look, check_picture
-from ngpt.cli.reference import Reference
+from ngpt.cli.denoise_files import Frame, View, describe, write_frame
+from ngpt.cli.denoise_request import DenoiseRequest, request_of
+from ngpt.cli.denoise_shot import choose_blending, motion_hint, option_of_one_view, windowed
+from ngpt.cli.picture import add_look
 from ngpt.cli.streams import STREAM, as_files
-from ngpt.errors import NgptError, WrongUse
+from ngpt.errors import NgptError
 from ngpt.io.exr import read, read_views
 from ngpt.io.foreign.files import first_attributes
 from ngpt.io.frames import RESULT_SUFFIX, is_shot, remarks
-from ngpt.io.reduced import REDUCED, check_reducible, smaller
+from ngpt.io.reduced import REDUCED, check_reducible
 from ngpt.io.whole import finished
-from ngpt.methods import METHODS, by_standing, check_request, reconstruct
+from ngpt.methods import METHODS, by_standing, reconstruct
 from ngpt.network.identity import identify
 from ngpt.network.run_onnx import MEMORY
 from ngpt.options import as_text, settings, unusual
 from ngpt.panorama import wrapping
 from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import Network
-from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 from ngpt.system.limits import limit_threads
 from ngpt.system.pipeline import overlapped
@@ -150,19 +149,18 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if args.threads is not None:
         limit_threads(args.threads)
     with as_files(args.stacks, args.output) as (args.stacks, args.output):
-        return denoise(args, console)
+        return denoise(request_of(args), args.json, console)
 
 
-def denoise(args: argparse.Namespace, console: Console) -> int:
-    pairs = output_paths(arguments.stack_files(args.stacks), args.output)
-    files, options, reference = asked(args, pairs)
+def denoise(request: DenoiseRequest, as_json: bool, console: Console) -> int:
+    """Makes and writes all results, and reports them as lines or as JSON. Returns the exit status."""
+    pairs, reports = request.pairs, []
     # One stack has no progress to report, but a user who watches sees that it is being denoised.
-    bar = console.progress("denoise", "frames") if len(pairs) > 1 or console.terminal else nullcontext(_unseen)
-    frames = results(args, pairs, files, options, reference, console)
-    reports = []
-    with bar as progress, closing(frames):
+    shows_bar = len(pairs) > 1 or console.terminal
+    bar = console.progress("denoise", "frames") if shows_bar else nullcontext(lambda done, total: None)
+    with bar as progress, closing(results(request, console)) as outcomes:
         progress(0, len(pairs))
-        for i, ((source, _), report) in enumerate(zip(pairs, frames, strict=True), 1):
+        for i, ((source, _), report) in enumerate(zip(pairs, outcomes, strict=True), 1):
             if isinstance(report, NgptError):
                 console.error(report)
                 report = {"input": str(source), "error": str(report)}
@@ -172,7 +170,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
                     console.say(f"{source}: the error of {unknown} pixels is NaN, for their variances are not finite")
             reports.append(report)
             progress(i, len(pairs))
-    if args.temporal and (hint := motion_hint(pairs, reports, args)):
+    if request.temporal and (hint := motion_hint(request, reports)):
         console.say(hint)
     # The result does not show that features went unrecognized.
     overlooked: dict = next((report for report in reports if report.get("proposed")), {"proposed": {}})
@@ -186,105 +184,62 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         console.error(f"{failed} of {len(pairs)} stacks were not reconstructed")
     if skipped:
         console.say(f"{skipped} of {len(pairs)} stacks were skipped: their results are there")
-    if args.json:
+    if as_json:
         arguments.print_json({"ok": failed == 0, "files": reports})
     return 1 if failed else 0
 
 
-def asked(
-    args: argparse.Namespace, pairs: list[tuple[Path, Path]]
-) -> tuple[dict[str, str], dict[str, Any], Reference | None]:
-    """Files of further layers, the method's options, and the reference. Raises an error for requests that cannot be
-    met.
-    """
-    files = arguments.given_files(args)
-    if len(pairs) > 1 and (files or args.halves):
-        of_one = f"--{next(iter(files))} belongs" if files else "--halves belong"
-        raise WrongUse(f"{of_one} to one stack, and {len(pairs)} are given; denoise them one by one")
-    args.error = args.error or bool(args.halves)
-    if args.temporal:
-        for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
-            if given:
-                raise WrongUse(f"--temporal and {option} cannot be combined; leave one out")
-    names = ("alpha", "weights", "device", "memory")
-    options = {name: getattr(args, name) for name in names if getattr(args, name) is not None} | dict(args.option)
-    check_request(args.method, options)
-    reference = Reference.read(args.ref, args.untrusted) if args.ref else None
-    for _, target in pairs:
-        if target.suffix.lower() != ".exr":
-            check_picture(target, args)
-        arguments.output_file(target, args)
-    return files, options, reference
-
-
-def results(
-    args: argparse.Namespace,
-    pairs: list[tuple[Path, Path]],
-    files: dict[str, str],
-    options: dict[str, Any],
-    reference: Reference | None,
-    console: Console,
-) -> Any:
-    """Makes and writes the result of each pair: an iterator over the report, or the error, of each."""
-    missing = [i for i, (_, target) in enumerate(pairs) if not (args.skip_existing and finished(target))]
+def results(request: DenoiseRequest, console: Console) -> Any:
+    """Makes and writes the result of each pair: a generator of the report, or the error, of each."""
+    pairs, again = request.pairs, set[Path]()
+    missing = [i for i, (_, target) in enumerate(pairs) if not (request.skip_existing and finished(target))]
     windows = False
-    if args.temporal and missing:
-        windows, told = way([source for source, _ in pairs], dict(args.layer), args.method == "wcv" and not options)
-        console.say(f"--temporal: {told}")
-        for name in filter(is_shot, args.stacks):
+    if request.temporal and missing:
+        windows, blending = choose_blending(request)
+        console.say(f"--temporal: {blending}")
+        for name in filter(is_shot, request.stacks):
             for remark in remarks(name, arguments.stack_files([name]), results=False):
                 console.say(remark)
-    # These results may exist, but later frames need their history.
-    again = {target for _, target in (pairs if windows else pairs[: missing[-1]])} if args.temporal and missing else ()
-    read = partial(read_frame, args=args, files=files, again=again)
-    # If the disk is full, one of several frames is not kept elsewhere: the next call makes it again.
-    write = partial(write_frame, args=args, keep=len(pairs) == 1)
+        # These results may exist, but later frames need their history.
+        again = {target for _, target in (pairs if windows else pairs[: missing[-1]])}
+    read = partial(read_frame, request=request, again=again)
+    write = partial(write_frame, request=request)
     if windows:
-        return windowed(pairs, read, write, reference)
-    temporal: Any = defaultdict(Temporal) if args.temporal else None
-    compute = partial(compute_frame, args=args, options=options, reference=reference, temporal=temporal)
-    return overlapped(pairs, read, compute, write)
+        return windowed(request, read, write)
+    histories: Any = defaultdict(Temporal) if request.temporal else None
+    return overlapped(pairs, read, partial(compute_frame, request=request, histories=histories), write)
 
 
-def _unseen(done: int, total: int) -> None:
-    """Progress that is not shown."""
-
-
-def read_frame(
-    pair: tuple[Path, Path], args: argparse.Namespace, files: dict[str, str], again: Container[Path]
-) -> Frame:
+def read_frame(pair: tuple[Path, Path], request: DenoiseRequest, again: Container[Path]) -> Frame:
     """Reads a frame. ``again`` contains existing results to make again, because later frames build on them."""
     source, target = pair
     # Checked only now, because several machines may work on one folder.
-    there = args.skip_existing and finished(target)
-    if there and target.suffix.lower() == ".exr":
-        _check_result(source, target, args)
-    if there and target not in again:
-        return Frame(source, target, None, there=True)
-    cut = args.skip_existing and not there and target.exists()
-    stacks = read_views(source, dict(args.layer), args.untrusted, files, args.view)
-    stacks = [wrapping(stack) for stack in stacks] if args.wrap else stacks
-    for stack in stacks if args.reduce > 1 else []:
-        check_reducible(stack, args.reduce)
-    first, *others = (Frame(source, target, stack, there=there, cut=cut) for stack in stacks)
-    if others and (what := one_view_only(target, args, files)):
-        raise NgptError(f"{source}: has several views, and {what}; choose one, as in --view {first.view}")
-    return replace(first, others=tuple(others))
+    exists = request.skip_existing and finished(target)
+    if exists and target.suffix.lower() == ".exr":
+        _check_result(source, target, request)
+    if exists and target not in again:
+        return Frame(source, target, exists=True)
+    stacks = read_views(source, request.layer, request.untrusted, request.files, request.view)
+    stacks = [wrapping(stack) for stack in stacks] if request.wrap else stacks
+    for stack in stacks if request.reduce > 1 else []:
+        check_reducible(stack, request.reduce)
+    views = tuple(View(stack) for stack in stacks)
+    if len(views) > 1 and (what := option_of_one_view(target, request)):
+        raise NgptError(f"{source}: has several views, and {what} is of one; choose one, as in --view {views[0].name}")
+    return Frame(source, target, views, exists, request.skip_existing and not exists and target.exists())
 
 
-def _check_result(source: Path, target: Path, args: argparse.Namespace) -> None:
-    """Raises NgptError if a result was made from another stack, or with settings that differ from the requested
-    ones.
-    """
+def _check_result(source: Path, target: Path, request: DenoiseRequest) -> None:
+    """Raises NgptError if a result was made from another stack, or with other settings than the requested ones."""
     result, stack = first_attributes(target), first_attributes(source)
-    asked: dict[str, Any] = {name: stack.get(name) for name in ("ngpt:spp", "ngpt:seed") if name in stack}
-    asked[REDUCED] = args.reduce if args.reduce > 1 else None
-    asked["ngpt:temporal"] = result.get("ngpt:temporal", "asked for") if args.temporal else None
-    if args.method in METHODS and not args.weights:
-        options = METHODS[args.method].options
-        given = as_text(unusual(options, settings(f"method '{args.method}'", options, dict(args.option))))
-        asked |= {"ngpt:method": args.method, "ngpt:options": given or None}
-    for name, value in asked.items():
+    expected: dict[str, Any] = {name: stack.get(name) for name in ("ngpt:spp", "ngpt:seed") if name in stack}
+    expected[REDUCED] = request.reduce if request.reduce > 1 else None
+    expected["ngpt:temporal"] = result.get("ngpt:temporal", "asked for") if request.temporal else None
+    if request.method in METHODS and "weights" not in request.options:
+        options = METHODS[request.method].options
+        given = as_text(unusual(options, settings(f"method '{request.method}'", options, request.options)))
+        expected |= {"ngpt:method": request.method, "ngpt:options": given or None}
+    for name, value in expected.items():
         if result.get(name) != value:
             what = name.removeprefix("ngpt:")
             raise NgptError(
@@ -293,50 +248,36 @@ def _check_result(source: Path, target: Path, args: argparse.Namespace) -> None:
             )
 
 
-def _halves(frame: Frame, args: argparse.Namespace) -> tuple[GradientStack, GradientStack] | None:
-    """The two stacks of ``--halves``, of the view of this frame."""
-    if not args.halves:
-        return None
-    one, other = (read(path, dict(args.layer), args.untrusted, view=frame.view or None) for path in args.halves)
-    return one, other
+def compute_frame(frame: Frame, request: DenoiseRequest, histories: dict[str, Temporal] | None) -> Frame:
+    """The frame with the results of all its views; ``histories`` has the history of each view by its name."""
+    views = [compute_view(view, request, None if histories is None else histories[view.name]) for view in frame.views]
+    return replace(frame, views=tuple(views))
 
 
-def compute_frame(
-    frame: Frame,
-    args: argparse.Namespace,
-    options: dict,
-    reference: Reference | None,
-    temporal: dict[str, Temporal] | None,
-) -> Frame:
-    """The frame with its result, and its other views with their results; ``temporal`` is the history of each view."""
-    stack = frame.stack
-    if stack is None:
-        return frame
-    others = tuple(compute_frame(other, args, options, None, temporal) for other in frame.others)
-    groups = lightgroups.find(stack, args.group) if args.groups or args.group else {}
-    if args.error:
-        result = reconstruct_with_error(stack, args.method, halves=_halves(frame, args), **options)
+def compute_view(view: View, request: DenoiseRequest, history: Temporal | None) -> View:
+    """The view with its result, blended with its ``history`` if there is one."""
+    stack, method, options = view.stack, request.method, request.options
+    groups = {} if request.groups is None else lightgroups.find(stack, request.groups)
+    over_time, notes = dict[str, Any](), dict[str, Any]()
+    if request.error:
+        halves = [read(path, request.layer, request.untrusted, view=view.name or None) for path in request.halves or ()]
+        result = reconstruct_with_error(stack, method, halves=(halves[0], halves[1]) if halves else None, **options)
     else:
-        result = reconstruct(stack, args.method, **options)
-    over_time: dict[str, Any] = {}
-    told: dict[str, Any] = {}
-    if temporal is not None:
-        begun, history = time.perf_counter(), temporal[frame.view]
+        result = reconstruct(stack, method, **options)
+    if history is not None:
+        begun = time.perf_counter()
         image = history.next(stack, result.image)
         result = replace(result, image=image, seconds=result.seconds + time.perf_counter() - begun)
         over_time = {"ngpt:temporal": "history", "ngpt:history": history.share}
-        told = {"why no history": history.reason} if history.reason else {}
+        notes = {"why no history": history.reason} if history.reason else {}
         if isinstance(history.corrections, Network):
             over_time["ngpt:historyWeights"] = str(identify(history.corrections.path))
-    if reference is not None:
-        image, place = smaller(result.image, stack.place, args.reduce)
-        told |= reference.errors(
-            image, GradientStack({"primal": image}, stack.attributes, path=stack.path, place=place)
-        )
+    if request.reference is not None:
+        notes |= request.reference.errors(result.image, stack, request.reduce)
     if groups:
-        parts = lightgroups.denoised(stack, groups, result.image, args.method, **options)
+        parts = lightgroups.denoised(stack, groups, result.image, method, **options)
         stack = lightgroups.with_groups(stack, parts)
-        told |= {"groups": list(groups)}
+        notes |= {"groups": list(groups)}
     if result.error is not None:
         stack = stack.replace(error=result.error)
-    return replace(frame, stack=stack, result=result, others=others, over_time=over_time, told=told)
+    return View(stack, result, over_time, notes)

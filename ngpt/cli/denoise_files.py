@@ -1,13 +1,12 @@
-"""The files of ``ngpt denoise``: where results go, how they are written, and what is reported about them."""
+"""The files of ``ngpt denoise``: the names of results, how they are written, and the reports about them."""
 
 from __future__ import annotations
 
-import argparse
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,52 +17,73 @@ from ngpt.io.frames import RESULT_SUFFIX
 from ngpt.io.reduced import cut_pixels, smaller
 from ngpt.io.resolution import propose
 from ngpt.methods import METHODS, Result
-from ngpt.result_file import Look, write_result
+from ngpt.result_file import write_result
 from ngpt.stack import GradientStack
 from ngpt.system.files import save
 from ngpt.version import __version__
 
+if TYPE_CHECKING:
+    from ngpt.cli.denoise_request import DenoiseRequest
+
+
+@dataclass(frozen=True)
+class View:
+    """The stack of one view of a file, and its result once it is computed.
+
+    ``over_time``  header attributes about the use of other frames
+    ``notes``      further entries of the report
+    """
+
+    stack: GradientStack
+    result: Result | None = None
+    over_time: Mapping[str, Any] = field(default_factory=dict)
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """ "" in a file without views."""
+        return self.stack.source.view.name if self.stack.source is not None else ""
+
 
 @dataclass(frozen=True)
 class Frame:
-    """A stack, its file and the file for its result; ``there`` says that the result existed already."""
+    """A file to denoise, the file for its result, and its views; without views, the frame is skipped.
+
+    ``exists``               whether the result existed already
+    ``replaces_incomplete``  whether the result replaces an incomplete file
+    """
 
     source: Path
     target: Path
-    stack: GradientStack | None
-    result: Result | None = None
-    there: bool = False
-    cut: bool = False  # whether an incomplete file is in its place
-    over_time: Mapping[str, Any] = field(default_factory=dict)  # use of other frames, as header attributes
-    told: Mapping[str, Any] = field(default_factory=dict)  # further entries of the report
-    others: tuple[Frame, ...] = ()  # the other views of the file
-
-    @property
-    def view(self) -> str:
-        """The name of its view; "" in a file without views."""
-        return self.stack.source.view.name if self.stack is not None and self.stack.source is not None else ""
+    views: tuple[View, ...] = ()
+    exists: bool = False
+    replaces_incomplete: bool = False
 
 
-def write_frame(frame: Frame, args: argparse.Namespace, keep: bool) -> dict:
+def write_frame(frame: Frame, request: DenoiseRequest) -> dict:
     """Writes the result, and returns its report.
 
-    With ``keep``, a result that cannot be written to its place is written elsewhere.
+    If a single result cannot be written to its place, it is written elsewhere. One of several frames is not: the next
+    call makes it again.
     """
-    target, stack, result = frame.target, frame.stack, frame.result
+    target = frame.target
     report: dict[str, Any] = {"input": str(frame.source), "output": str(target)}
-    if frame.there or stack is None or result is None:
+    if frame.exists or not frame.views:
         return report | {"skipped": True}
-    views = [(one.result.image, one.stack) for one in (frame, *frame.others) if one.result and one.stack]
-    made, look = {**result.attributes, **frame.over_time}, Look(args.transform, args.exposure)
+    images = [(view.result.image, view.stack) for view in frame.views if view.result is not None]
+    first, overwrite = frame.views[0], request.force or frame.replaces_incomplete
+    stack, result = first.stack, first.result
+    assert result is not None
+    made = {**result.attributes, **first.over_time}
 
     def save_to(path: Path, overwrite: bool) -> None:
-        write_result(path, views, made, look, overwrite, into=args.into, reduce=args.reduce)
+        write_result(path, images, made, request.look, overwrite, into=request.into, reduce=request.reduce)
 
-    if keep:
-        save(target, save_to, args.force or frame.cut)
+    if len(request.pairs) == 1:
+        save(target, save_to, overwrite)
     else:
-        save_to(target, args.force or frame.cut)
-    image, _ = smaller(result.image, stack.place, args.reduce)
+        save_to(target, overwrite)
+    image, _ = smaller(result.image, stack.place, request.reduce)
     report |= {
         "method": result.method,
         "weights": {"file": result.weights.file, "sha256": result.weights.sha256} if result.weights else None,
@@ -81,57 +101,59 @@ def write_frame(frame: Frame, args: argparse.Namespace, keep: bool) -> dict:
     if result.error is not None:
         report["pixels without standard error"] = int(np.isnan(result.error).any(axis=-1).sum())
     if target.suffix.lower() == ".exr":
-        report["layers"], report["noisy layers"] = layers_of_result(stack, args.into)
+        report["layers"], report["noisy layers"] = layers_of_result(stack, request.into)
     if stack.source is not None:
         found = propose(stack.source.view.parts, stack.source.resolution)
-        report |= {
-            "proposed": {name: found[name] for name in ("albedo", "normal") if name in found and name not in stack}
-        }
-    report |= {"views": [one.view for one in (frame, *frame.others)]} if frame.view else {}
-    if args.reduce > 1:
-        cut = cut_pixels(stack.place, args.reduce)
-        report |= {"reduced by": args.reduce} | ({"cut": cut} if cut else {})
-    report |= {"in place of": "a file that was not whole"} if frame.cut else {}
-    over_time = {name.removeprefix("ngpt:"): value for name, value in frame.over_time.items()}
+        report["proposed"] = {name: found[name] for name in ("albedo", "normal") if name in found.keys() - {*stack}}
+    if first.name:
+        report["views"] = [view.name for view in frame.views]
+    if request.reduce > 1:
+        cut = cut_pixels(stack.place, request.reduce)
+        report |= {"reduced by": request.reduce} | ({"cut": cut} if cut else {})
+    if frame.replaces_incomplete:
+        report["in place of"] = "a file that was not whole"
+    over_time = {name.removeprefix("ngpt:"): value for name, value in first.over_time.items()}
     report |= {name: over_time[name] for name in ("temporal", "history") if name in over_time}
-    return {**report, **frame.told}
+    return {**report, **first.notes}
 
 
 def describe(report: dict) -> str:
+    """The report on one file as a line of text."""
+    names = f"{report['input']} -> {report['output']}: "
     if "skipped" in report:
-        return f"{report['input']} -> {report['output']}: skipped, exists already"
-    text = f"{report['input']} -> {report['output']}: {report['method']}"
+        return f"{names}skipped, exists already"
+    notes = [report["method"]]
     if report["weights"] and report["method"] not in METHODS:
-        text += f", sha256 {report['weights']['sha256'][:12]}"
-    text += f", {report['seconds']:.2f} s"
+        notes.append(f"sha256 {report['weights']['sha256'][:12]}")
+    notes.append(f"{report['seconds']:.2f} s")
     if len(report.get("layers", ())) > 1:
-        text += f", layers {' and '.join(report['layers'])}"
-    if report.get("noisy layers"):
-        name = report["noisy layers"][0]
-        text += f", {name} stays as it was (--into {name.rpartition('.')[2]} replaces it)"
+        notes.append(f"layers {' and '.join(report['layers'])}")
+    for name in report.get("noisy layers", ())[:1]:
+        notes.append(f"{name} stays as it was (--into {name.rpartition('.')[2]} replaces it)")
     if report.get("views"):
-        text += f", views {', '.join(report['views'])}"
+        notes.append(f"views {', '.join(report['views'])}")
     if "reduced by" in report:
-        text += f", {report['reduced by']}x{report['reduced by']} pixels as one: {report['width']}x{report['height']}"
-        text += f" ({report['cut']})" if "cut" in report else ""
+        blocks = f"{report['reduced by']}x{report['reduced by']} pixels as one: {report['width']}x{report['height']}"
+        notes.append(blocks + (f" ({report['cut']})" if "cut" in report else ""))
     if report["repaired"]:
-        text += f", repaired {report['repaired']} pixels"
+        notes.append(f"repaired {report['repaired']} pixels")
     if report["untrusted"]:
-        text += f", left out {report['untrusted']} gradients"
+        notes.append(f"left out {report['untrusted']} gradients")
     if "in place of" in report:
-        text += f", in place of {report['in place of']}"
+        notes.append(f"in place of {report['in place of']}")
     if "history" in report:
-        text += f", {report['history']:.0%} history"
-        text += f" ({report['why no history']})" if "why no history" in report else ""
+        why = f" ({report['why no history']})" if "why no history" in report else ""
+        notes.append(f"{report['history']:.0%} history{why}")
     if report["groups"]:
-        text += f", light groups {', '.join(report['groups'])}"
+        notes.append(f"light groups {', '.join(report['groups'])}")
     if "metrics" in report:
-        text += ", " + ", ".join(f"{name} {report['metrics'][name]:.5g}" for name in ("relMSE", "relMSE trimmed"))
-        text += f" of the pixels that both have: {report['compared']}" if "compared" in report else ""
-    return text
+        notes += [f"{name} {report['metrics'][name]:.5g}" for name in ("relMSE", "relMSE trimmed")]
+        notes[-1] += f" of the pixels that both have: {report['compared']}" if "compared" in report else ""
+    return names + ", ".join(notes)
 
 
 def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Path]]:
+    """Each source with the file for its result, by ``--output``. Raises WrongUse if two would have the same file."""
     if output is None:
         targets = [path.with_name(f"{path.stem}{RESULT_SUFFIX}.exr") for path in sources]
     elif varies(output):

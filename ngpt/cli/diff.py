@@ -1,4 +1,4 @@
-"""``ngpt diff``: every metric between two images; the exit status says whether they agree."""
+"""``ngpt diff``: prints all metrics between two images. The exit status says whether they agree."""
 
 import argparse
 from collections.abc import Sequence

@@ -56,7 +56,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def write(args: argparse.Namespace) -> list[Path]:
-    """Writes what the arguments ask for; returns the files."""
+    """Writes the requested files and returns their paths."""
     if args.output.suffix == ".tza":
         from ngpt.export.weights import oidn_weights
 

@@ -1,4 +1,4 @@
-"""``ngpt info``: what a file holds, what a scene requires, which names are known."""
+"""``ngpt info``: describes a file, a scene, a method or a sampler."""
 
 import argparse
 import shutil
@@ -61,10 +61,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
         show(overview(), args.json)
         return 0
     with standard_input([args.file]) as (args.file,):
-        return told(args, console)
+        return describe_named(args, console)
 
 
-def told(args: argparse.Namespace, console: Console) -> int:
+def describe_named(args: argparse.Namespace, console: Console) -> int:
     """Prints the description of a file, a folder or a name; returns the exit status."""
     path = Path(args.file)
     if is_run(path):
@@ -83,7 +83,10 @@ def told(args: argparse.Namespace, console: Console) -> int:
 
 
 def file(args: argparse.Namespace, console: Console) -> int:
-    """Describes an image file. Lists its contents even if not all of them are understood."""
+    """Prints the description of an image file, and returns the exit status.
+
+    If the file is not a stack, prints the error and the layers that the file holds.
+    """
     views = views_in(args.file)
     names = {"views": [view.name for view in views]} if len(views) > 1 else {}
     try:
@@ -98,6 +101,7 @@ def file(args: argparse.Namespace, console: Console) -> int:
 
 
 def overview() -> dict:
+    """The version, the methods by their standing, and the renderer's samplers and scenes."""
     titles = {"methods": "use", "methods for some stacks": "niche", "methods to compare with": "study"}
     METHODS.load()
     report: dict[str, Any] = {"version": __version__}
@@ -110,19 +114,20 @@ def overview() -> dict:
 
 
 def method(name: str) -> dict:
-    """The description of a method in the registry; nothing if no method has that name."""
+    """The description of a method; an empty dictionary if no method has that name."""
     if name not in METHODS:
         return {}
     entry = METHODS[name]
-    report: dict[str, Any] = {"method": name, "summary": entry.summary}
-    report |= {"standing": entry.standing, "needs": entry.needs}
+    report = {"method": name, "summary": entry.summary, "standing": entry.standing, "needs": entry.needs}
     report |= {"uses": entry.uses} if entry.uses else {}
-    report["options"] = {option: str(value) for option, value in entry.options.items()}
-    return report
+    return report | {"options": {option: str(value) for option, value in entry.options.items()}}
 
 
 def other(name: str, parameters: dict[str, str]) -> dict:
-    """Describes a name that is not one of our files: a method, a sampler, or a scene and how it would be rendered."""
+    """The description of a method, a sampler, or a scene and how it would be rendered.
+
+    Raises NgptError for a name that is none of these.
+    """
     if Path(name).suffix.lower() in (".exr", *NETWORKS):
         raise NgptError(f"{name}: not found; check the name")
     found = {} if Path(name).exists() else method(name)
@@ -142,7 +147,7 @@ def other(name: str, parameters: dict[str, str]) -> dict:
 
 
 def stack(stack: GradientStack) -> dict:
-    """The contents of an image file, the parts that are understood, and what can be done with them."""
+    """The description of a stack from a file: its layers, what it lacks, the methods that can denoise it, its header."""
     assert stack.source is not None
     parts, resolution = stack.source.image.parts, stack.source.resolution
     main = parts[resolution["primal"].part]
@@ -203,23 +208,24 @@ def stack(stack: GradientStack) -> dict:
 
 
 def _noise(stack: GradientStack) -> dict:
-    """The noise of single pixels, and the noise that pixels share; nothing if they share none."""
+    """``noise_of_light`` of the stack; an empty dictionary if its pixels share no noise."""
     if "shared" not in stack or "primal_var" not in stack:
         return {}
     return noise_of_light(stack["primal"], stack["primal_var"], stack["shared"])
 
 
 def _tails(stack: GradientStack) -> str:
-    """A sentence on the cache in which paths end, from the header; "" if the header does not mention one."""
-    told = [str(stack.attributes[TAILS])] if TAILS in stack.attributes else []
+    """A sentence about the cache in which paths end, from the header; "" if the header does not mention one."""
+    sentences = [str(stack.attributes[TAILS])] if TAILS in stack.attributes else []
     if (cut := stack.number(CUT)) is not None:
-        told.append(f"{100 * cut:.3g} % of the cache's light was cut from records that were too bright")
-    return "; ".join(told)
+        sentences.append(f"{100 * cut:.3g} % of the cache's light was cut from records that were too bright")
+    return "; ".join(sentences)
 
 
 def _missing(stack: GradientStack) -> list[str]:
-    """Missing layers that methods could use. A file without gradients comes from another renderer: only features are
-    listed.
+    """The layers that the stack lacks and methods could use.
+
+    A file of another renderer has no gradients, so only features count as missing there.
     """
     wanted = [name for name in LAYERS if name not in _OPTIONAL]
     if "dx" not in stack and "ngpt:sampler" not in stack.attributes:
@@ -228,6 +234,7 @@ def _missing(stack: GradientStack) -> list[str]:
 
 
 def show(report: dict, as_json: bool) -> None:
+    """Prints a description as JSON, or as lines for people."""
     if as_json:
         print_json(report)
         return
@@ -254,9 +261,7 @@ def _shortened(text: str) -> str:
 
 
 def _fitted(line: str, indent: int) -> None:
-    """Prints a line: on a terminal it is broken between words, and further lines are indented; elsewhere it is printed
-    as it is.
-    """
+    """Prints a line. A terminal breaks it between words, and further lines are indented by ``indent`` spaces."""
     if sys.stdout.isatty():
         width, start = shutil.get_terminal_size().columns, len(line) - len(line.lstrip())
         wrapper = textwrap.TextWrapper(width, " " * start, " " * indent, break_long_words=False, break_on_hyphens=False)
@@ -272,5 +277,5 @@ def _number(value: object) -> str:
 
 
 def _plain(value):
-    """A header attribute as something JSON can hold."""
+    """A header attribute as a value that JSON has."""
     return value if isinstance(value, bool | int | float | str) else " ".join(str(value).split())

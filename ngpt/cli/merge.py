@@ -1,4 +1,4 @@
-"""``ngpt merge``: makes one gradient stack from several, with the samples and the pixels of all."""
+"""``ngpt merge``: merges gradient stacks into one that has the samples and the pixels of all."""
 
 import argparse
 
@@ -24,10 +24,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     merged = merge(stacks)
     for stack in stacks:
         if UNFINISHED in stack.attributes:
-            told = (
-                f"{stack.path}: was {stack.attributes[UNFINISHED]} at {stack.attributes['ngpt:spp']} samples per pixel"
-            )
-            console.say(f"{told}; `ngpt render --skip-existing` as before goes on with it")
+            done = f"was {stack.attributes[UNFINISHED]} at {stack.attributes['ngpt:spp']} samples per pixel"
+            console.say(f"{stack.path}: {done}; the same `ngpt render` with --skip-existing continues it")
     save(target, lambda path, overwrite: write(path, merged, overwrite=overwrite), args.force)
     spp, seed = merged.attributes["ngpt:spp"], merged.attributes["ngpt:seed"]
     console.say(f"{len(args.stacks)} stacks -> {target}: {merged.place}, {spp} spp, seeds {seed}")

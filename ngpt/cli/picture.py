@@ -1,6 +1,7 @@
-"""``ngpt picture``: writes images as PNG, JPEG or WebP, and shots as films, through a view transform."""
+"""``ngpt picture``: writes images as PNG, JPEG or WebP, and shots as films, after a view transform."""
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,8 @@ from ngpt.image.transforms import TRANSFORMS, shown
 from ngpt.io.exr import read_picture
 from ngpt.io.framenames import named, number_of, varies
 from ngpt.io.frames import is_shot, remarks, shot_files
-from ngpt.result_file import Look, check_image, in_picture
+from ngpt.result_file import Look, in_picture
 from ngpt.system.console import Console
-from ngpt.system.files import make_folder
 from ngpt.windows import put
 
 
@@ -59,62 +59,37 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 def shot(args: argparse.Namespace, folder: str, target: Path, console: Console) -> int:
     """Writes the frames of a folder or a pattern as one film, or as one picture each."""
-    files = shot_files(folder)
-    each = varies(str(target))
-    film = bool(target.suffix) and not each
-    if film:
-        check_kind(target, SHOTS)
-        output_file(target, args)
-    elif each:
-        check_kind(target, PICTURES)
-        for file in files:
-            output_file(named(str(target), number_of(file, str(target))), args)
+    files, numbered = shot_files(folder), varies(str(target))
+    film = bool(target.suffix) and not numbered
+    targets = [target / f"{file.stem}.png" for file in files]
+    if numbered:
+        targets = [Path(named(str(target), number_of(file, str(target)))) for file in files]
+    elif film:
+        targets = [target]
     elif target.exists() and not target.is_dir():
         raise WrongUse(f"{target}: is a file; name a folder for the pictures, or a film ({' '.join(SHOTS)})")
+    check_kind(targets[0], SHOTS if film else PICTURES)
+    for path in targets:
+        output_file(path, args)
     for remark in remarks(folder, files):
         console.say(remark)
     stops = Look(args.transform, args.exposure).stops(in_picture(*read_picture(files[0], view=args.view)))
 
-    def pictures():
+    def pictures() -> Iterator[np.ndarray]:
         for done, file in enumerate(files):
             progress(done, len(files))
             pixels, place = read_picture(file, view=args.view)
-            whole = squared(put(pixels, place.data, place.display), place.aspect)
-            yield file, shown(whole, args.transform, stops)
+            yield shown(squared(put(pixels, place.data, place.display), place.aspect), args.transform, stops)
         progress(len(files), len(files))
 
     with console.progress("pictures", "frames") as progress:
         if film:
-            write_shot(target, (pixels for _, pixels in pictures()), args.fps, args.force)
+            write_shot(target, pictures(), args.fps, args.force)
         else:
-            write_each(target, pictures(), args.force)
+            for path, picture in zip(targets, pictures(), strict=True):
+                write_picture(path, picture, args.force)
     console.say(f"{folder} -> {target}: {len(files)} frames")
     return 0
-
-
-def write_each(folder: Path, pictures, overwrite: bool) -> None:
-    """Writes a picture for each (file, pixels): a PNG in a folder, which is made if needed, or a file by a name of
-    frames.
-    """
-    each = varies(str(folder))
-    if not each:
-        make_folder(folder)
-    pixels: np.ndarray
-    for file, pixels in pictures:
-        name = named(str(folder), number_of(file, str(folder))) if each else folder / f"{file.stem}.png"
-        write_picture(Path(name), pixels, overwrite)
-
-
-def check_picture(target: Path, args: argparse.Namespace) -> None:
-    """For ``ngpt denoise``: raises an error for files that are not pictures, and for options that pictures cannot
-    have.
-    """
-    check_image(target, args.transform)
-    for option, given in (("--error", args.error), ("--groups", args.groups or args.group), ("--into", args.into)):
-        if given:
-            raise WrongUse(f"{option} makes layers, and {target} can have none; let it end in .exr")
-    if args.skip_existing:
-        raise WrongUse(f"--skip-existing checks only OpenEXR files; leave it out for {target}")
 
 
 def add_look(parser: argparse.ArgumentParser) -> None:
@@ -136,6 +111,7 @@ def add_look(parser: argparse.ArgumentParser) -> None:
 
 
 def stops(text: str) -> float | str:
+    """The value of ``--exposure``: a number of stops, or "auto"."""
     if text == "auto":
         return text
     return number(text, lambda stops: abs(stops) <= 100, "is neither a number of stops, from -100 to 100, nor auto")

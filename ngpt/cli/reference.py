@@ -6,13 +6,14 @@ import numpy as np
 
 from ngpt.io.exr import read_picture
 from ngpt.io.primaries import converted, to_rec709
+from ngpt.io.reduced import smaller
 from ngpt.measure.metrics import compare
 from ngpt.stack import GradientStack
 from ngpt.windows import Place, overlap
 
 
 class Reference(NamedTuple):
-    """A reference image, (H, W, 3) in linear Rec. 709, its file, and where it lies."""
+    """A reference image, (H, W, 3) in linear Rec. 709, its file, and its place in the picture."""
 
     path: str
     pixels: np.ndarray
@@ -22,13 +23,14 @@ class Reference(NamedTuple):
     def read(cls, path: str, isolated: bool) -> "Reference":
         return cls(path, *read_picture(path, isolated))
 
-    def errors(self, image: np.ndarray, stack: GradientStack) -> dict[str, Any]:
-        """The metrics of an image (H, W, 3) made from ``stack``, and which pixels were compared, unless it was all
-        pixels of both.
+    def errors(self, image: np.ndarray, stack: GradientStack, reduce: int = 1) -> dict[str, Any]:
+        """The metrics of the result ``image`` (H, W, 3) of ``stack``, after ``reduce`` x ``reduce`` pixels become one.
 
-        Raises NgptError if the two images have no pixel in common.
+        The entry "compared" names the compared pixels, unless these are all pixels of both images. Raises NgptError if
+        the two images have no pixel in common.
         """
-        both = overlap([stack.path, self.path], [stack.place, self.place])
+        image, place = smaller(image, stack.place, reduce)
+        both = overlap([stack.path, self.path], [place, self.place])
         light = converted(image, to_rec709(stack.attributes))
         metrics = {"metrics": compare(*both.of([light, self.pixels]))}
         return metrics | ({"compared": str(both.common)} if both.line else {})

@@ -122,6 +122,10 @@ def test_results_that_are_there_count_where_they_are_what_is_asked_for(stack, tm
     ngpt.write("s.exr", stack, overwrite=True)
     assert "is another result: spp " in command(f"{line} -m l1", 1).err
     assert (tmp_path / "out.exr").read_bytes() == made
+    soft = "denoise s.exr -o soft.exr -m l2 --alpha 0.3 --skip-existing"
+    command(soft)
+    assert "1 of 1 stacks were skipped" in command(soft).err
+    assert "options alpha=0.3, not alpha=0.5" in command(f"{soft} --alpha 0.5", 1).err
 
 
 def test_a_result_whose_name_is_taken_meanwhile_is_kept(stack, tmp_path, command, monkeypatch):
