@@ -20,15 +20,21 @@ from typing import TYPE_CHECKING
 from ngpt.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from ngpt.api.arrays import Denoiser, denoise
-    from ngpt.api.uncertainty import reconstruct_with_error
-    from ngpt.errors import NgptError
-    from ngpt.io.exr import read, read_image, read_views, write
-    from ngpt.merging import merge
-    from ngpt.methods import METHODS, Result, reconstruct
-    from ngpt.sequence.history import Temporal
-    from ngpt.stack import GradientStack
-    from ngpt.system.limits import limit_threads
+    from ngpt.api.arrays import Denoiser as Denoiser
+    from ngpt.api.arrays import denoise as denoise
+    from ngpt.api.uncertainty import reconstruct_with_error as reconstruct_with_error
+    from ngpt.errors import NgptError as NgptError
+    from ngpt.io.exr import read as read
+    from ngpt.io.exr import read_image as read_image
+    from ngpt.io.exr import read_views as read_views
+    from ngpt.io.exr import write as write
+    from ngpt.merging import merge as merge
+    from ngpt.methods import METHODS as METHODS
+    from ngpt.methods import Result as Result
+    from ngpt.methods import reconstruct as reconstruct
+    from ngpt.sequence.history import Temporal as Temporal
+    from ngpt.stack import GradientStack as GradientStack
+    from ngpt.system.limits import limit_threads as limit_threads
 
 # Official builds of ONNX Runtime send telemetry by themselves (SECURITY.md). ONNX Runtime reads this variable once,
 # when it is loaded. Other code, such as PyTorch's exporters, may load it first.
@@ -37,35 +43,14 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 # Quiet, unless a program asks: logging.getLogger("ngpt").setLevel("INFO"), with a handler of its own.
 logging.getLogger("ngpt").addHandler(logging.NullHandler())
 
-__all__ = [
-    "METHODS",
-    "Denoiser",
-    "GradientStack",
-    "NgptError",
-    "Result",
-    "Temporal",
-    "denoise",
-    "limit_threads",
-    "merge",
-    "read",
-    "read_image",
-    "read_views",
-    "reconstruct",
-    "reconstruct_with_error",
-    "write",
-]
-
-# Imported on first use, so that importing this package does not load NumPy and SciPy. Commands then start, and handle
-# interrupts, at once.
-_HOMES = {"GradientStack": "stack", "NgptError": "errors", "merge": "merging"}
+# The module of each public name. It is imported on first use, so that importing this package does not load NumPy and
+# SciPy. Commands then start, and handle interrupts, at once.
+_HOMES = {"GradientStack": "stack", "NgptError": "errors", "Temporal": "sequence.history", "merge": "merging"}
+_HOMES |= {"limit_threads": "system.limits", "reconstruct_with_error": "api.uncertainty"}
+_HOMES |= dict.fromkeys(("METHODS", "Result", "reconstruct"), "methods")
 _HOMES |= dict.fromkeys(("Denoiser", "denoise"), "api.arrays")
 _HOMES |= dict.fromkeys(("read", "read_image", "read_views", "write"), "io.exr")
-_HOMES |= {
-    "reconstruct_with_error": "api.uncertainty",
-    "Temporal": "sequence.history",
-    "limit_threads": "system.limits",
-}
-_HOMES |= dict.fromkeys(("METHODS", "Result", "reconstruct"), "methods")
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> object:

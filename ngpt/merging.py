@@ -1,4 +1,4 @@
-"""Merging of independent stacks of one image: more samples, or more pixels, without rendering them together.
+"""Merging of independent stacks of one image into a stack with the samples and pixels of all.
 
 With n_i samples per pixel, means m_i and variances of the mean v_i, the stack of all N = Σ n_i samples has
 
@@ -7,14 +7,14 @@ With n_i samples per pixel, means m_i and variances of the mean v_i, the stack o
 
 [Chan, Golub, LeVeque 1983, "Algorithms for computing the sample variance", eq. 2.1]
 
-The expectation of this variance is the variance of m, for any v_i and any weights n_i that do not depend on the
-samples. So the formula also holds for differences, whose two directions may have different numbers of samples.
+The expectation of this variance is the variance of m for any weights n_i that do not depend on the samples. So the
+formula also holds for differences, whose two directions may have different numbers of samples.
 
-Stacks in different places of one picture are tiles: each counts in its own pixels.
+Stacks in different places of one picture are tiles. Each counts only in its own pixels.
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import Any
@@ -26,53 +26,52 @@ from ngpt.io.exr import pass_through, with_channels
 from ngpt.layers import DIFFERENCES, FEATURE_NOISE, GATHERED
 from ngpt.shared import CUT, TAILS, shared_variance
 from ngpt.stack import GradientStack
-from ngpt.subpixels import SUBPIXELS, means, merged, subpixels
+from ngpt.subpixels import SUBPIXELS, means, spread, stored, subpixels, within
 from ngpt.windows import Place, Window
 
 _LOG = logging.getLogger(__name__)
 
-# Layers with a variance, and the layers that hold it.
+# Layers -> the layers that hold their variances
 VARIANCES = {name: f"{name}_var" for name in ("primal", "dx", "dy", "caustic", "diffuse", "specular", "dt")}
-# The prefix of further channels that are means over samples.
+# The prefix of further channels that are means over samples
 DIAGNOSTICS = "diagnostics."
 # Attribute: why a render ended before its request was complete, "interrupted" or "failed"
 UNFINISHED = "ngpt:unfinished"
-# Attribute: the whole request (``data_gen.request``); merged stacks have none
+# Attribute: the request of the render as JSON (``data_gen.request``); merged stacks have none
 REQUEST = "ngpt:request"
-# Attribute: the sampler's options that are not defaults, with commas between
+# Attribute: the sampler's options that are not defaults, separated by commas
 OPTIONS = "ngpt:samplerOptions"
-# The option among these that says how a path finds light after its first steps: in a cache of other paths' light, or by
-# itself, which is the default.
+# Values of the sampler's option ``tails``: after its first steps, a path takes light from a cache that paths share, or
+# finds light itself, which is the default.
 SHARED_TAILS, WHOLE_PATHS = "tails=shared", "tails=paths"
-# The most samples of a pixel: headers count them in 32 bits.
+# The limit for samples of a pixel: headers count them in 32 bits.
 _MOST = 2.0**31
 
 
 def merge(stacks: Sequence[GradientStack]) -> GradientStack:
-    """The stack of all samples of ``stacks``: same scene, camera and sampler, different seeds or different places.
+    """Merges stacks of the same scene, camera and sampler, with different seeds or in different places.
 
-    Means are weighted by ``ngpt:spp``, or by the layer ``samples`` if a stack has it. A mean of differences is weighted
-    by the harmonic mean of the samples of both its pixels, as its variance would be. The merged ``samples`` are sums,
-    and are left out if all pixels have the same number. Variances of the mean come from the pooled sums, so merged
-    stacks of n1 and n2 samples equal the stack of n1 + n2 up to the rounding of float32, with two exceptions. Variances
-    of dx and dy combine two independent directions, which a stack no longer separates: their merged value has the same
-    expectation, and differs by about 1 / N of itself. ``shared`` is averaged like the primal, because samples of
-    independent noise add like the noise itself; a stack without it counts as zero. ``primal_var`` then includes the
-    variance of the merged ``shared``, which has the same expectation as that of the parts. A non-finite sample is
-    missing only in its own pixel; a pixel that lost all samples is NaN and counts nothing. A stack with one sample per
-    pixel has no variances and needs none. ``diagnostics.*`` channels are averaged as layers are. So are subpixels, if
-    all stacks have the same number of them; else they are left out with a warning.
+    Means are weighted by ``ngpt:spp``, or by the layer ``samples`` if a stack has it; means of differences by the
+    harmonic mean of the samples of both pixels. The merged ``samples`` are sums, and are left out if all pixels have
+    the same number. ``diagnostics.*`` channels are averaged like layers. So are subpixels, if all stacks have the same
+    K; otherwise they are left out with a warning. A pixel without any finite sample is NaN. A stack with one sample per
+    pixel needs no variances.
 
-    Tiles (``GradientStack.place``) are merged into the smallest rectangle that holds them all, and must fill it. They
-    may overlap. Tiles that do not overlap may have the same seed. The difference from a tile's last column or row to
-    the pixel beyond it was not sampled: it is NaN if no other tile has it, and counts nothing in a reconstruction.
+    The result of stacks with n1 and n2 samples equals a stack of n1 + n2 samples up to rounding, with two exceptions.
+    Variances of dx and dy combine two independent directions, which a stack no longer separates: the merged value has
+    the same expectation, and differs by about 1 / N of itself. ``shared`` is averaged like the primal, because samples
+    of independent noise add like the noise itself; a stack without it counts as zero. ``primal_var`` includes the
+    variance of the merged ``shared``, which has the same expectation as the variances in the parts.
 
-    The result's ``ngpt:seed`` lists all seeds. ``ngpt:spp`` is the number of samples, averaged over pixels.
-    ``ngpt:seconds`` and ``ngpt:discarded`` are sums. ``ngpt:samplerOptions`` has the options of all stacks, and also
-    tails=paths if only some of them have tails=shared. ``ngpt:tails`` has the sentences of all stacks.
-    ``ngpt:tailsCut`` is the mean over all samples. ``ngpt:gathered`` is 1 if any stack has it. ``ngpt:featureNoise`` is
-    the noise of the merged features if all stacks have it. ``ngpt:unfinished`` and ``ngpt:request`` are left out. All
-    other attributes come from the first stack.
+    Tiles (``GradientStack.place``) must fill the smallest rectangle that holds them all. They may overlap; only then
+    must their seeds differ. The difference from a tile's last column or row to the pixel beyond it was not sampled: it
+    is NaN if no other tile has it, and a reconstruction leaves it out.
+
+    The result's ``ngpt:seed`` lists all seeds. ``ngpt:spp`` and ``ngpt:tailsCut`` are means, ``ngpt:seconds`` and
+    ``ngpt:discarded`` sums. ``ngpt:samplerOptions`` and ``ngpt:tails`` have the entries of all stacks;
+    ``tails=paths`` is added if only some stacks have ``tails=shared``. ``ngpt:gathered`` is 1 if any stack has it.
+    ``ngpt:featureNoise`` is the noise of the merged features if all stacks have it. ``ngpt:unfinished`` and
+    ``ngpt:request`` are left out. All other attributes come from the first stack.
 
     Raises NgptError for fewer than two stacks, stacks that differ in layers, sampler or size of the picture, tiles that
     leave pixels out, a seed that occurs twice in one place, missing ``ngpt:spp`` or ``ngpt:seed``, ``samples`` that are
@@ -88,7 +87,7 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     if hole := _hole(tiles, canvas):
         have = ", ".join(f"{tile.stack.path} {tile.stack.place.data}" for tile in tiles)
         raise NgptError(f"no stack has all pixels of {hole}: {have}; render those too")
-    total = _total(tiles)
+    total = _summed(tiles, lambda tile: tile.counts)
     layers = {}
     for name in stacks[0].names:
         if name not in (*VARIANCES.values(), "samples", "shared"):
@@ -102,7 +101,9 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
         if name in layers and all(variance in tile.stack or tile.spp == 1 for tile in tiles):
             layers[variance] = _variance(tiles, name, variance)
     if "shared" in layers and "primal_var" in layers:
-        own = np.maximum(layers["primal_var"] - _variance_of_shared(tiles, total), 0)
+        # The part of the variance that comes from noise which the pixels of a tile share
+        of_shared = _summed(tiles, lambda tile: np.square(tile.counts) * shared_variance(_shared(tile.stack)))
+        own = np.maximum(layers["primal_var"] - of_shared / np.square(np.maximum(total, 1)), 0)
         layers["primal_var"] = own + shared_variance(layers["shared"])
     if np.ptp(total):
         layers["samples"] = total
@@ -121,7 +122,8 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
         attributes[GATHERED] = 1  # the light of photons is in the mean, whichever stack it comes from
     attributes.pop(FEATURE_NOISE, None)
     if all(FEATURE_NOISE in stack.attributes for stack in stacks):
-        attributes[FEATURE_NOISE] = _feature_noise(tiles, total)
+        noise = _summed(tiles, lambda tile: np.square(tile.counts) * float(_number(tile.stack, FEATURE_NOISE)))
+        attributes[FEATURE_NOISE] = float((noise / np.square(np.maximum(total, 1))).mean())
     place = Place(canvas, stacks[0].place.display)
     layers = {name: layer.astype(np.float32) for name, layer in layers.items()}
     merged = GradientStack(layers, attributes, place=place, fine=fine)
@@ -134,7 +136,7 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
 
 @dataclass(frozen=True, eq=False)
 class _Tile:
-    """A stack of ``spp`` samples per pixel, in the ``canvas`` of all of them."""
+    """A stack of ``spp`` samples per pixel. The ``canvas`` is the rectangle around all stacks."""
 
     stack: GradientStack
     spp: int
@@ -151,8 +153,8 @@ class _Tile:
         return _counts(self.stack, self.spp)
 
     def weights(self, name: str) -> np.ndarray:
-        """The weights of the mean of a layer, (H, W, 1). For a difference, the harmonic mean of the counts of both its
-        pixels, and 0 where the other pixel is beyond the tile but not beyond the canvas."""
+        """The weights (H, W, 1) of a layer in means: the counts of samples, or for differences the harmonic mean of the
+        counts of both pixels. They are 0 where the second pixel is outside the tile and inside the canvas."""
         if name not in DIFFERENCES:
             return self.counts
         x, y, _ = DIFFERENCES[name]
@@ -169,7 +171,7 @@ class _Tile:
 
 
 def _counts(stack: GradientStack, spp: int) -> np.ndarray:
-    """Samples of each pixel, (H, W, 1) double precision."""
+    """Samples of each pixel, (H, W, 1) double precision. Raises NgptError if the layer ``samples`` makes no sense."""
     if "samples" in stack:
         counts = stack["samples"].astype(np.float64)
         wrong = ~((counts >= 0) & (counts < _MOST))
@@ -185,63 +187,56 @@ def _counts(stack: GradientStack, spp: int) -> np.ndarray:
     return np.full((stack.height, stack.width, 1), float(spp))
 
 
-def _total(tiles: Sequence[_Tile]) -> np.ndarray:
-    """Samples of all tiles in each pixel of the canvas, (H, W, 1)."""
-    total = np.zeros((tiles[0].canvas.height, tiles[0].canvas.width, 1))
-    for tile in tiles:
-        total[tile.part] += tile.counts
+def _summed(tiles: Sequence[_Tile], values: Callable[[_Tile], np.ndarray]) -> np.ndarray:
+    """The sum over all tiles of their values (h, w, C), in each pixel of the canvas, (H, W, C)."""
+    parts = [values(tile) for tile in tiles]
+    total = np.zeros((tiles[0].canvas.height, tiles[0].canvas.width, parts[0].shape[2]))
+    for tile, part in zip(tiles, parts, strict=True):
+        total[tile.part] += part
     return total
 
 
-def _mean(tiles: Sequence[_Tile], values: Mapping[_Tile, np.ndarray], name: str = "") -> np.ndarray:
-    """Mean of layers (h, w, C), or channels (h, w), over the values that are not NaN; in double precision.
+def _mean(tiles: Sequence[_Tile], values: Mapping[_Tile, np.ndarray], name: str = "", k: int = 1) -> np.ndarray:
+    """The mean, on the whole canvas, of layers (h, w, C), or channels (h, w), of K x K subpixels; double precision.
 
-    Weighted as layer ``name``; of the whole canvas.
+    NaNs do not count. The weights are those of the layer ``name``.
     """
     canvas = tiles[0].canvas
-    total = np.zeros((canvas.height, canvas.width, *values[tiles[0]].shape[2:]))
+    total = np.zeros((k * canvas.height, k * canvas.width, *values[tiles[0]].shape[2:]))
     weight = np.zeros(total.shape)
     for tile in tiles:
-        layer, n = values[tile], tile.weights(name)
+        layer, n, part = values[tile], spread(tile.weights(name), k), within(tile.part, k)
         w = (n if layer.ndim == 3 else n[..., 0]) * ~np.isnan(layer)
         # Products of infinite values and zero weights are left out, not added.
-        total[tile.part] += np.where(w > 0, w * layer.astype(np.float64), 0)
-        weight[tile.part] += w
+        total[part] += np.where(w > 0, w * layer.astype(np.float64), 0)
+        weight[part] += w
     with np.errstate(invalid="ignore", divide="ignore"):
         return total / weight
 
 
 def _subpixels(tiles: Sequence[_Tile]) -> dict[str, np.ndarray]:
-    """The subpixels of all tiles: means weighted by the samples of their pixels. None where not all have the same."""
+    """The subpixels on the whole canvas; none, with a warning, if the stacks have different numbers of them."""
     each = {tile.stack.path: subpixels(tile.stack.fine, tile.stack.width) for tile in tiles}
-    ks = {subpixels(tile.stack.fine, tile.stack.width) for tile in tiles}
+    ks = {*each.values()}
     if ks == {1}:
         return {}
     names = [name for name in tiles[0].stack.fine if all(name in tile.stack.fine for tile in tiles)]
     if len(ks) > 1 or "primal" not in names:
-        told = ", ".join(f"{path} has {f'{k}x{k}' if k > 1 else 'none'}" for path, k in each.items())
-        _LOG.warning("the subpixels are left out, since not all stacks have the same: %s", told)
+        numbers = ", ".join(f"{path} has {f'{k}x{k}' if k > 1 else 'none'}" for path, k in each.items())
+        _LOG.warning("the subpixels are left out, since not all stacks have the same: %s", numbers)
         return {}
-    return merged([(tile.stack.fine, tile.counts, tile.part) for tile in tiles], names, tiles[0].canvas.size)
+    k = ks.pop()
+    return {name: stored(name, _mean(tiles, {tile: tile.stack.fine[name] for tile in tiles}, k=k)) for name in names}
 
 
 def _shared(stack: GradientStack) -> np.ndarray:
-    """The layer ``shared``, (h, w, 3); zeros where paths share nothing."""
+    """The layer ``shared``, (h, w, 3); zeros if the stack has none."""
     return stack["shared"] if "shared" in stack else np.zeros((stack.height, stack.width, 3))
 
 
-def _variance_of_shared(tiles: Sequence[_Tile], total: np.ndarray) -> np.ndarray:
-    """How much of the merged ``primal_var`` comes from the noise that the pixels of each tile share, (H, W, 3)."""
-    variance = np.zeros((*total.shape[:2], 3))
-    for tile in tiles:
-        if "shared" in tile.stack:
-            variance[tile.part] += np.square(tile.counts) * shared_variance(tile.stack["shared"])
-    return variance / np.square(np.maximum(total, 1))
-
-
 def _options(stacks: Sequence[GradientStack]) -> dict[str, str]:
-    """The attribute that has the options of all stacks; none where all are defaults."""
-    # An option of one stack holds for the merged stack too: shared tails, for example, bias both.
+    """The attribute with the options of all stacks; none if all options are defaults."""
+    # An option of one stack counts for the merged stack too: shared tails, for example, bias it.
     each = [[option for option in str(stack.attributes.get(OPTIONS, "")).split(", ") if option] for stack in stacks]
     options = dict.fromkeys(option for part in each for option in part)
     if SHARED_TAILS in options and not all(SHARED_TAILS in part for part in each):
@@ -250,28 +245,20 @@ def _options(stacks: Sequence[GradientStack]) -> dict[str, str]:
 
 
 def _tails(stacks: Sequence[GradientStack], spp: Sequence[int]) -> dict[str, Any]:
-    """The attributes that say how the cache of shared tails was used, where any stack has them."""
+    """The attributes about the cache of shared tails, if any stack has them."""
     found: dict[str, Any] = {}
-    # A merged stack may be merged again, so a text may hold several sentences. Each sentence is kept once.
+    # The text of a merged stack may hold several sentences. Each sentence is kept once.
     each = (str(stack.attributes.get(TAILS, "")).split("; ") for stack in stacks)
-    if told := dict.fromkeys(sentence for part in each for sentence in part if sentence):
-        found[TAILS] = "; ".join(told)
+    if sentences := dict.fromkeys(sentence for part in each for sentence in part if sentence):
+        found[TAILS] = "; ".join(sentences)
     if any(CUT in stack.attributes for stack in stacks):
         cut = [_number(stack, CUT) if CUT in stack.attributes else 0.0 for stack in stacks]
         found[CUT] = float(np.average(cut, weights=spp))
     return found
 
 
-def _feature_noise(tiles: Sequence[_Tile], total: np.ndarray) -> float:
-    """The mean over pixels of the variance of merged features: independent means, weighted by samples."""
-    variance = np.zeros(total.shape)
-    for tile in tiles:
-        variance[tile.part] += np.square(tile.counts) * float(_number(tile.stack, FEATURE_NOISE))
-    return float((variance / np.square(np.maximum(total, 1))).mean())
-
-
 def _varies(stack: GradientStack, name: str) -> np.ndarray:
-    """The values that a layer's variance describes (double precision); for the primal, the part not in ``caustic``."""
+    """The values that the variance belongs to, in double precision: for the primal, its light outside ``caustic``."""
     values = stack[name].astype(np.float64)
     if name == "primal" and "caustic" in stack:
         with np.errstate(invalid="ignore"):
@@ -280,7 +267,7 @@ def _varies(stack: GradientStack, name: str) -> np.ndarray:
 
 
 def _variance(tiles: Sequence[_Tile], name: str, variance: str) -> np.ndarray:
-    """The variance of the mean of a layer over all tiles, of the whole canvas."""
+    """The variance of the merged mean of a layer, on the whole canvas."""
     means = {tile: _varies(tile.stack, name) for tile in tiles}
     mean = _mean(tiles, means, name)
     squares, total = np.zeros(mean.shape), np.zeros(mean.shape)
@@ -295,8 +282,8 @@ def _variance(tiles: Sequence[_Tile], name: str, variance: str) -> np.ndarray:
 
 
 def _hole(tiles: Sequence[_Tile], canvas: Window) -> Window | None:
-    """The rectangle around the pixels that no tile has; None where there are none."""
-    # Tiles may be so far apart that no memory holds the space between them.
+    """The rectangle around the pixels that no tile has; None if the tiles fill the canvas."""
+    # Tiles may be so far apart that the space between them does not fit into memory.
     if canvas.width * canvas.height > 4 * sum(tile.stack.width * tile.stack.height for tile in tiles):
         return canvas
     empty = np.ones((canvas.height, canvas.width), bool)
@@ -310,6 +297,7 @@ def _hole(tiles: Sequence[_Tile], canvas: Window) -> Window | None:
 
 
 def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
+    """Raises NgptError for stacks that cannot be merged; ``counts`` are their samples per pixel."""
     first = stacks[0]
     seen: dict[str, list[GradientStack]] = {}
     for stack, n in zip(stacks, counts, strict=True):
@@ -360,6 +348,7 @@ def _means(stack: GradientStack) -> set[str]:
 
 
 def _samples(stack: GradientStack) -> int:
+    """The attribute ``ngpt:spp``. Raises NgptError if it is missing or no positive number."""
     spp = stack.attributes.get("ngpt:spp")
     if not isinstance(spp, int | np.integer) or spp < 1:
         what = "has no attribute 'ngpt:spp'" if spp is None else f"attribute 'ngpt:spp' is {spp!r}"
@@ -368,7 +357,7 @@ def _samples(stack: GradientStack) -> int:
 
 
 def _number(stack: GradientStack, name: str) -> Any:
-    """The attribute, whole where it is a whole number."""
+    """An attribute, int or float. Raises NgptError if it is negative or no finite number."""
     given, value = stack.attributes[name], stack.number(name)
     if value is None or value < 0:
         raise NgptError(f"{stack.path}: attribute '{name}' is {given!r}, and no number that can be merged; remove it")

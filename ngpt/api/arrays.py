@@ -1,4 +1,4 @@
-"""Reconstruction of arrays in memory: NumPy, PyTorch, Dr.Jit, Mitsuba's bitmaps.
+"""Reconstruction of images in memory: arrays of NumPy, PyTorch and Dr.Jit, and Mitsuba's bitmaps.
 
 clean = ngpt.denoise(noisy, albedo=albedo, normal=normal)        # the same kind comes back
 denoiser = ngpt.Denoiser(size, albedo=True, normals=True)        # or called as mi.OptixDenoiser is
@@ -23,29 +23,28 @@ from ngpt.stack import GradientStack
 
 T = TypeVar("T")
 
-# Further layers that methods take beside the image; Mitsuba's denoiser does not have them.
+# Layers that methods read and Mitsuba's denoiser does not
 _FURTHER = ("depth", "dx", "dy", "direct", "caustic", "primal_var", "dx_var", "dy_var", "caustic_var")
 _BESIDE = ("albedo", "normal", *_FURTHER)
-# Inputs that a denoiser takes only if they were announced -> the keyword that announces them.
+# Inputs of a Denoiser that its constructor must announce -> the keyword for that
 _ANNOUNCED = {"albedo": "albedo", "normals": "normals", "flow": "temporal", "previous_denoised": "temporal"}
 # From Mitsuba's sensor (+x left, +y up, +z forward) to the camera of the contract (+x right, +y up, +z backward).
 _TO_CAMERA = np.array([-1, 1, -1], np.float32)
 
 
 def methods_in_words() -> str:
-    """The methods: what they are, what they need beside the image, and their options with defaults."""
+    """The methods as text: their summaries, the layers that they need, and their options with defaults."""
     lines = []
     for name, method in by_standing("use", "niche").items():
-        beside = [layer for layer in method.needs if layer != "primal"]
-        told = f"needs {', '.join(beside)}" if beside else "needs the image alone"
-        told += f"; uses {', '.join(method.uses)}" if method.uses else ""
+        needs = f"needs {', '.join(layer for layer in method.needs if layer != 'primal') or 'only the image'}"
+        needs += f"; uses {', '.join(method.uses)}" if method.uses else ""
         options = ", ".join(f"{name}={option.default!r}" for name, option in method.options.items())
-        lines += [f"{name:<14}{method.summary}", f"{'':<14}{told}", f"{'':<14}options: {options or 'none'}"]
+        lines += [f"{name:<14}{method.summary}", f"{'':<14}{needs}", f"{'':<14}options: {options or 'none'}"]
     return "\n".join(f"    {line}" for line in lines)
 
 
 def _with_methods(thing: T) -> T:
-    """The same, with the registry at the end of what ``help`` shows."""
+    """The ``thing``, with a list of all methods at the end of its docstring."""
     thing.__doc__ = f"{inspect.cleandoc(thing.__doc__ or '')}\n\nMethods:\n\n{methods_in_words()}"
     return thing
 
@@ -75,47 +74,30 @@ def denoise(
 ) -> Kind: ...
 
 
-# In the first form, ``layers_and_options`` has the layers that are named here.
 @_with_methods  # type: ignore[misc]
 def denoise(
-    image: Image | GradientStack,
-    method: str = "auto",
-    *,
-    albedo: Image | None = None,
-    normal: Image | None = None,
-    depth: Image | None = None,
-    dx: Image | None = None,
-    dy: Image | None = None,
-    direct: Image | None = None,
-    caustic: Image | None = None,
-    primal_var: Image | None = None,
-    dx_var: Image | None = None,
-    dy_var: Image | None = None,
-    caustic_var: Image | None = None,
-    wrap: bool = False,
-    **options: Value,
+    image: Image | GradientStack, method: str = "auto", *, wrap: bool = False, **layers_and_options: Any
 ) -> Any:
-    """The reconstruction of an image or a stack, scene-linear.
+    """Reconstructs a scene-linear image or stack.
 
     ``image``    (H, W, 3) or (H, W, 4), floats: an array of NumPy, PyTorch (any device), Dr.Jit, or a Mitsuba bitmap.
-                 The same kind comes back, of the same type and shape; alpha comes back as it is. A bitmap of many
-                 channels is read by their names, as files are, and gives only its colour and alpha. A
-                 ``GradientStack`` gives (H, W, 3) float32.
-    ``method``   "auto", the best for the layers given and the packages installed, or one of those below
+                 The result is of the same kind, type and shape; alpha is not changed. In a bitmap of many channels,
+                 layers are found by their names, as in files; the result has only its colour and alpha. For a
+                 ``GradientStack``, the result is (H, W, 3) float32.
+    ``method``   a method below, or "auto": the best one for the given layers and the installed packages
     ``albedo``, ``normal``, ``depth``  features of the same size, in the units of ``GradientStack``: normals in camera
                  space, +x right, +y up, +z toward the viewer (``Denoiser`` converts Mitsuba's normals)
     ``dx``, ``dy``, ``direct``, ``caustic``, ``primal_var``, ``dx_var``, ``dy_var``, ``caustic_var``  further layers of
                  a gradient stack
-    ``wrap``     whether it is a panorama, whose left and right borders are neighbours; a stack may say so itself
-    ``options``  of the method, see below
+    ``wrap``     whether the image is a panorama, whose left and right borders are neighbours. A stack may be marked as
+                 one (``ngpt:wrap`` or ``envmap`` in its header)
 
-    Raises NgptError for shapes and types that do not fit, unknown names, layers that the method lacks, and an image
-    without any finite pixel.
+    All further keywords are options of the method, which are listed below. Raises NgptError for shapes and types that
+    do not fit, for unknown names, if a layer that the method needs is missing, and for an image without any finite
+    pixel.
     """
-    given = {"albedo": albedo, "normal": normal, "depth": depth, "dx": dx, "dy": dy, "direct": direct}
-    given |= {"caustic": caustic, "primal_var": primal_var, "dx_var": dx_var, "dy_var": dy_var}
-    given |= {"caustic_var": caustic_var}
-    given = {name: value for name, value in given.items() if value is not None}
+    options = {name: value for name, value in layers_and_options.items() if name not in _BESIDE}
+    given = {name: layers_and_options[name] for name in _BESIDE if layers_and_options.get(name) is not None}
     _check_options("denoise", method, options, _BESIDE)
     if isinstance(image, str | os.PathLike):
         raise NgptError(f"denoise: image is the name of a file; pass ngpt.read({os.fspath(image)!r})")
@@ -137,18 +119,17 @@ def denoise(
 
 @_with_methods
 class Denoiser:
-    """Reconstructs images of one size, called as ``mi.OptixDenoiser`` is.
+    """Reconstructs images of one size. It is called like ``mi.OptixDenoiser``.
 
     ``input_size``  (width, height) in pixels
-    ``albedo``, ``normals`` whether they will be given; layers that were not announced are refused
-    ``temporal``    whether the calls are frames of one shot, in order, with ``flow``: each result is blended with those
-                    before it (``ngpt.Temporal``)
-    ``denoise_alpha``  whether an alpha channel is denoised as well, as a grey image; otherwise it comes back as it is,
-                    and where it is 0 and ``noisy`` has no light, the result has none
-    ``method``      as of ``ngpt.denoise``: "auto", the default, takes the best method for the layers each call gives
-    ``options``     of the method
+    ``albedo``, ``normals``  whether each call gives these layers; layers that are not announced are refused
+    ``temporal``    whether the calls are the frames of one shot, in order, with ``flow``: each result is blended with
+                    the results before it (``ngpt.Temporal``)
+    ``denoise_alpha``  whether an alpha channel is denoised too, as a grey image; otherwise it is not changed, and the
+                    result has no light where alpha is 0 and ``noisy`` has no light
+    ``method``      a method as for ``ngpt.denoise``; "auto" chooses one for the layers of each call
 
-    Raises NgptError for an unknown method, option or keyword.
+    All further keywords are options of the method. Raises NgptError for an unknown method, option or keyword.
     """
 
     def __init__(
@@ -198,7 +179,7 @@ class Denoiser:
         **layers: Image,
     ) -> Bitmap: ...
 
-    # In the second form the names of channels stand where arrays do.
+    # In the second form, the arguments are names of channels instead of arrays.
     def __call__(  # type: ignore[misc]
         self,
         noisy: Any,
@@ -215,24 +196,26 @@ class Denoiser:
         previous_denoised_ch: str = "",
         **layers: Any,
     ) -> Any:
-        """The reconstruction of ``noisy``, of its kind (array, tensor on its device, bitmap), type and shape.
+        """Reconstructs ``noisy``. The result has its kind (array, tensor on its device, bitmap), type and shape.
 
-        All (H, W, C), scene-linear. ``noisy`` has 3 channels, or 4: alpha. ``normals`` are in the space of Mitsuba's
-        sensor (+x left, +y up, +z forward), or in the one that ``to_sensor`` leads from: (3, 3) or (4, 4), an array or
-        a transform with a ``matrix``; for normals in world space ``sensor.world_transform().inverse()``. ``layers``
-        are ``dx``, ``dy``, ``depth``, ``direct``, ``caustic``, ``primal_var``, ``dx_var``, ``dy_var`` and
-        ``caustic_var``, with the meaning of the layers of ``GradientStack``; ``depth`` may be (H, W).
+        ``noisy``      (H, W, 3), or (H, W, 4) with alpha, scene-linear
+        ``albedo``     (H, W, 3)
+        ``normals``    (H, W, 3) in the space of Mitsuba's sensor (+x left, +y up, +z forward), or in another space
+        ``to_sensor``  leads from that space to the sensor's: an array (3, 3) or (4, 4), or a transform with a
+                       ``matrix``; for world space ``sensor.world_transform().inverse()``
+        ``flow``       (H, W, 2) as OptiX defines it, the layer ``motion`` times -1: pixels to the right and down, from
+                       the place of this point in the last frame to its place in this one; 0 where it is not known, NaN
+                       where the point was not seen
+        ``previous_denoised``  the last result; only needed if it was changed since then, or made elsewhere. ``noisy``
+                       itself, which OptiX requires in a first frame, begins another shot
+        ``layers``     ``dx``, ``dy``, ``depth``, ``direct``, ``caustic``, ``primal_var``, ``dx_var``, ``dy_var``,
+                       ``caustic_var``: layers as in ``GradientStack``
 
-        ``flow`` (H, W, 2) is OptiX's: pixels to the right and down, from where in the last frame this point was, to
-        here: the layer ``motion`` times -1. Zeros where it is not known, NaN where the point was not there.
-        ``previous_denoised`` is the last result, and need be given only if it was changed since, or made elsewhere.
-        ``noisy`` itself, which OptiX wants in a first frame, begins another shot.
+        A bitmap may hold these as channels. Then their names are given: ``denoiser(bitmap, "albedo", "normals",
+        to_sensor)``, or ``albedo_ch="albedo"`` and so on. ``noisy_ch`` is the layer to denoise, by default the root.
 
-        A bitmap may hold the others as channels: ``denoiser(bitmap, "albedo", "normals", to_sensor)``, or by keyword,
-        ``albedo_ch="albedo", normals_ch="normals"``. ``noisy_ch`` is the layer to denoise, by default the root.
-
-        Raises NgptError for arrays of another size, for what was not announced or is missing though it was, and as
-        ``ngpt.denoise`` does.
+        Raises NgptError for arrays of another size, for layers that were not announced, for announced layers that are
+        missing, and as ``ngpt.denoise`` does.
         """
         if unknown := [name for name in layers if name not in _FURTHER]:
             raise NgptError(
@@ -262,16 +245,16 @@ class Denoiser:
         beside = {name: value for name, value in (given | layers).items() if value is not None}
         arrays = _layers("Denoiser", beside, size)
         if "normals" in arrays:
-            # Normals that are not finite stay so, and are repaired where all layers are.
+            # Normals that are not finite stay so here: ``repair`` replaces them, as it does in all layers.
             with np.errstate(invalid="ignore", over="ignore"):
                 arrays["normal"] = (arrays.pop("normals") @ _rotation(to_sensor).T).astype(np.float32) * _TO_CAMERA
         if self._temporal is not None:
             arrays["motion"] = -arrays.pop("flow")
             if previous is not None and np.array_equal(previous, pixels[..., :3], equal_nan=True):
                 del arrays["motion"]  # a cut
-        # Alpha that is denoised itself is 0 in many pixels by chance: it bounds nothing.
-        given_alpha = pixels[..., :3] if self.denoise_alpha else pixels
-        stack = _stack("Denoiser", given_alpha, arrays, self.method, self.options)
+        # Noisy alpha is 0 in many pixels by chance, so such pixels must not count as empty.
+        noisy_part = pixels[..., :3] if self.denoise_alpha else pixels
+        stack = _stack("Denoiser", noisy_part, arrays, self.method, self.options)
         result = reconstruct(stack, self.method, **self.options).image
         if self._temporal is not None:
             result = self._temporal.next(stack, result, previous)
@@ -284,7 +267,7 @@ class Denoiser:
 def _stack(
     where: str, image: np.ndarray, layers: Mapping[str, np.ndarray], method: str, options: Mapping[str, Any]
 ) -> GradientStack:
-    """What the method needs; ``where`` begins the messages."""
+    """The image and its layers as a stack. Raises NgptError, which begins with ``where``, if the method needs more."""
     alpha = {"alpha": image[..., 3:]} if image.shape[2] > 3 else {}
     stack = GradientStack({"primal": image[..., :3], **alpha, **layers}, path=where)
     needs = METHODS[method].needs if method in METHODS and not options.get("weights") else ()
@@ -295,24 +278,25 @@ def _stack(
 
 
 def _with_alpha(result: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """The result, with the image's alpha as it was."""
+    """The result (H, W, 3) with the alpha of ``image``, if it has any."""
     return np.concatenate([result, image[..., 3:]], axis=-1) if image.shape[2] > 3 else result
 
 
 def _alpha(alpha: np.ndarray, layers: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Coverage (H, W, 1) denoised as a grey image, within its own range."""
+    """Denoises coverage (H, W, 1) as a grey image. The result is clipped to the range of ``alpha``."""
     features = {name: layers[name] for name in ("albedo", "normal") if name in layers}
     grey = reconstruct(_stack("Denoiser: alpha", np.repeat(alpha, 3, axis=-1), features, "auto", {})).image
     return np.clip(grey[..., :1], alpha.min(), alpha.max())
 
 
 def _layers(where: str, given: Mapping[str, Any], size: tuple[int, int]) -> dict[str, np.ndarray]:
+    """The given layers as NumPy arrays of this (height, width)."""
     channels = {"depth": (1,), "flow": (2,)}
     return {name: layer(where, name, value, channels.get(name, (3,)), size) for name, value in given.items()}
 
 
 def _check_options(where: str, method: str, options: Iterable[str], layers: tuple[str, ...]) -> None:
-    """Refuses names that neither the method's options are nor layers, and says which may have been meant."""
+    """Raises NgptError for names that are not options of the method. The message may suggest one of the ``layers``."""
     entries = METHODS.values() if method == "auto" else [METHODS[method]] if method in METHODS else []
     known = list(dict.fromkeys(option for entry in entries for option in entry.options))
     for name in options if entries else ():
@@ -324,36 +308,37 @@ def _check_options(where: str, method: str, options: Iterable[str], layers: tupl
 
 
 def _first(value: Any, channel: str) -> Any:
-    """The argument, an array or the name of a channel; None for "" and for tensors without elements."""
+    """The ``value``, or else the name of a ``channel``; None for "" and for tensors without elements."""
     value = channel if value is None else value
     return None if (isinstance(value, str) and not value) or 0 in getattr(value, "shape", ()) else value
 
 
 def _names(bitmap: Any) -> list[str]:
-    """The names of the channels of a bitmap of many; of a plain image none."""
+    """The names of the channels of a bitmap with many channels; none for a plain image."""
     many = bitmap.pixel_format() == type(bitmap.pixel_format()).MultiChannel
     return [field.name for field in bitmap.struct_()] if many else []
 
 
 def _by_name(bitmap: Any) -> dict[str, np.ndarray]:
-    """The layers of a bitmap of many channels, "image" with alpha among them, known by their names as in files."""
-    names, pixels = _names(bitmap), to_numpy(bitmap, "denoise: image")
-    found = resolve([("", names)], path="denoise: bitmap")
-    layers = {name: pixels[..., [names.index(c) for c in where.channels]] for name, where in found.items()}
-    scaled = {name: np.asarray(where.factors, np.float32) for name, where in found.items() if where.factors}
-    layers |= {name: layers[name] * factors for name, factors in scaled.items()}
+    """The layers of a bitmap with many channels, found by their names as in files; "image" is colour with alpha."""
+    names, pixels, layers = _names(bitmap), to_numpy(bitmap, "denoise: image"), {}
+    for name, found in resolve([("", names)], path="denoise: bitmap").items():
+        layers[name] = pixels[..., [names.index(channel) for channel in found.channels]]
+        if found.factors:
+            layers[name] = layers[name] * np.asarray(found.factors, np.float32)
     image = layers.pop("primal"), layers.pop("alpha", pixels[..., :0])
     return {"image": np.concatenate(image, axis=-1), **layers}
 
 
 def _part(parts: Mapping[str, Any], name: str) -> Any:
+    """The layer of a bitmap by its name. Raises NgptError if there is none."""
     if name not in parts:
         raise NgptError(f"Denoiser: the bitmap has no layer '{name}'; it has: {', '.join(parts)}")
     return parts[name]
 
 
 def _rotation(to_sensor: Any) -> np.ndarray:
-    """What normals are multiplied by, (3, 3): the inverse transpose of a transform, of determinant 1 or -1."""
+    """The matrix (3, 3) for normals: the inverse transpose of a transform, scaled to determinant 1 or -1."""
     if to_sensor is None:
         return np.eye(3)
     matrix = to_numpy(getattr(to_sensor, "matrix", to_sensor), "Denoiser: to_sensor")

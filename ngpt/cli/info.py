@@ -16,7 +16,7 @@ from ngpt.io.aliases import format_aliases
 from ngpt.io.exr import pass_through, read, views_in
 from ngpt.io.resolution import layers_held, propose
 from ngpt.layers import LAYERS
-from ngpt.merging import DIAGNOSTICS
+from ngpt.merging import DIAGNOSTICS, REQUEST
 from ngpt.methods import METHODS, by_standing, choose
 from ngpt.network.describe import SUFFIXES as NETWORKS
 from ngpt.network.describe import describe
@@ -25,6 +25,7 @@ from ngpt.stack import GradientStack
 from ngpt.system.console import Console, tell
 from ngpt.system.install import BROUGHT, study
 from ngpt.system.parts import find_renderer
+from ngpt.system.records import parse_json
 from ngpt.training.dataset import summary
 from ngpt.training.run_summary import is_run
 from ngpt.training.run_summary import summary as run_summary
@@ -147,7 +148,7 @@ def other(name: str, parameters: dict[str, str]) -> dict:
 
 
 def stack(stack: GradientStack) -> dict:
-    """The description of a stack from a file: its layers, what it lacks, the methods that can denoise it, its header."""
+    """The description of a stack that was read from a file: its layers, usable methods and header."""
     assert stack.source is not None
     parts, resolution = stack.source.image.parts, stack.source.resolution
     main = parts[resolution["primal"].part]
@@ -242,8 +243,11 @@ def show(report: dict, as_json: bool) -> None:
         if isinstance(value, dict):
             tell(f"{name}:")
             for key, item in value.items():
+                item = _fields(item) if key == REQUEST else item
                 parts = [f"{k} {_number(v)}" for k, v in item.items()] if isinstance(item, dict) else [_number(item)]
-                text = _shortened("  ".join(parts)) if name == "attributes" else "  ".join(parts)
+                text = "  ".join(parts)
+                if len(text) > _LETTERS and name == "attributes" and key != REQUEST:
+                    text = f"{text[:_LETTERS]}... ({len(text)} letters; --json prints all)"
                 _fitted(f"  {key:16} {text}", indent=4)
         elif isinstance(value, list) and value and isinstance(value[0], str) and max(map(len, value)) > 30:
             tell(f"{name}:")
@@ -254,10 +258,13 @@ def show(report: dict, as_json: bool) -> None:
             _fitted(f"{name}: {text}", indent=2)
 
 
-def _shortened(text: str) -> str:
-    if len(text) <= _LETTERS:
+def _fields(text: str) -> object:
+    """The fields of a render's request in a header that are set; the text itself if it is no such request."""
+    try:
+        fields = parse_json(text, REQUEST)
+    except NgptError:
         return text
-    return f"{text[:_LETTERS]}... ({len(text)} letters; --json prints all)"
+    return {name: value for name, value in fields.items() if value} if isinstance(fields, dict) else text
 
 
 def _fitted(line: str, indent: int) -> None:

@@ -7,11 +7,12 @@ from ngpt.layers import LAYERS
 
 
 class Alias(NamedTuple):
-    """A name under which ``producer`` stores ``layer``; ``""`` is the root.
+    """The ``name`` under which the program ``producer`` stores ``layer``; "" is the root of the file.
 
-    ``only``     the required channel suffixes; those of the layer come first
+    ``note``     a remark for users
+    ``only``     the suffixes that its channels must have, beginning with those of the layer; () for any
     ``factors``  the factors of the channels, if a renderer uses another sign or unit
-    ``writer``   the alias holds only in files by this program, according to ``writer_of``
+    ``writer``   the only program, as returned by ``writer_of``, in whose files the alias counts; "" for all
     """
 
     layer: str
@@ -23,7 +24,7 @@ class Alias(NamedTuple):
     writer: str = ""
 
 
-# Our names that mean something else in other programs' files, and the attributes that show that a file is ours.
+# Names of the contract that other programs use for other layers -> layers that only files of ngpt hold beside them
 OWN: dict[str, set[str]] = {
     "direct": {"dx", "dy"},
     "caustic": {"dx", "dy", "caustic_var"},
@@ -32,9 +33,9 @@ OWN: dict[str, set[str]] = {
     "shared": {"primal_var"},
 }
 
-# The first name that a file holds wins, so order is preference. Some names are absent on purpose. pbrt-v4's `Variance`
-# and Mitsuba's moments are variances of a sample, not of the pixel mean. In half of the other renderers, `diffuse` is
-# light. V-Ray's VRayZDepth is a shade of grey between two distances.
+# The first name that a file holds is taken. Some names are left out on purpose: pbrt-v4's `Variance` and Mitsuba's
+# moments are variances of a sample, not of the pixel mean; `diffuse` is light in half of the other renderers; V-Ray's
+# VRayZDepth is a shade of grey between two distances.
 ALIASES: tuple[Alias, ...] = (
     *(Alias(name, "ngpt", name) for name in LAYERS if name not in (*OWN, "error")),
     Alias("direct", "ngpt", "direct", "in files of ngpt, or beside dx or dy: elsewhere `direct` is direct lighting"),
@@ -59,7 +60,7 @@ ALIASES: tuple[Alias, ...] = (
     Alias("albedo", "Redshift", "DiffuseFilter"),
     Alias("albedo", "Cycles", "Diffuse Color", "diffuse closures only"),
     Alias("albedo", "Cycles", "DiffCol", "before Blender 5.0"),
-    Alias("albedo", "LuxCore", "ALBEDO", "in Blender's files; alone, each buffer has a file of its own"),
+    Alias("albedo", "LuxCore", "ALBEDO", "in Blender's files; LuxCore itself writes each buffer to a file of its own"),
     Alias("normal", "Cycles", "Denoising Normal", "camera space, but +z away from the viewer"),
     Alias("normal", "pbrt-v4", "Ns", "shading normal, camera space unless the film says otherwise"),
     Alias("normal", "Redshift", "BumpNormals", "bump included"),
@@ -84,8 +85,8 @@ ALIASES: tuple[Alias, ...] = (
     Alias("alpha", "RenderMan", "a"),
 )
 
-# If a layer's name contains one of these parts (lower case, no blanks or underscores), it may be a layer of the
-# contract. Only the user knows the direction and unit of most motion vectors.
+# Parts of names (in lower case without blanks and underscores) by which a layer is proposed to the user. Only the user
+# knows the direction and unit of most motion vectors.
 LOOKS = {
     "albedo": ("albedo", "diffusefilter", "diffusecol", "basecol", "diffcol", "reflectance"),
     "normal": ("normal",),
@@ -94,14 +95,14 @@ LOOKS = {
     "dy": ("gradienty", "grady"),
     "motion": ("motionvec", "velocity", "vector"),
 }
-# Parts of names that rule these layers out: V-Ray's depth is a shade of grey between two distances.
+# Parts of names for which these layers are not proposed
 NOT_LOOKS = {"depth": ("zdepth",)}
-# Parts of names that show that a layer is not light, whatever its channels.
+# Parts of the names of layers that are not light although their channels are R G B
 NO_LIGHT = ("crypto", "position", "matte", "mask", "noise", "samples")
-# The ends of names of variances and errors.
+# The ends of the names of variances and errors
 NOISE = ("var", "variance", "mse", "error")
 
-# Attributes with these prefixes show who wrote a file.
+# Prefixes of attributes -> the program that writes them
 _WRITERS = {"ngpt:sampler": "ngpt", "vrayInfo": "V-Ray", "generatedBy": "Mitsuba"}
 
 
@@ -123,7 +124,7 @@ def writer_of(attributes: Iterable[str]) -> str:
 
 
 def format_aliases() -> str:
-    """Returns the alias table as text, one alias a line, in order of preference within each layer."""
+    """The table of aliases as text: one alias a line, in order of preference within each layer."""
     rows = [("layer", "written by", "layer name in the file", "channels", "note")]
     for layer in LAYERS.values():
         for alias in (alias for alias in ALIASES if alias.layer == layer.name):

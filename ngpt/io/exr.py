@@ -1,9 +1,9 @@
 """Gradient stacks and results in OpenEXR files: `read` and `write`.
 
-Images of other formats (``ngpt.io.foreign``) are read like an OpenEXR file with the same light.
+Images of other formats (``ngpt.io.foreign``) are read as if they were OpenEXR files with the same light.
 
-Layers are found by their names, those of the contract or of other renderers (``ngpt.io.aliases``). Everything else in a
-file, including layers that the toolkit does not know, passes through as ``ngpt.io.openexr`` describes.
+Layers are found by the names of the contract or of other renderers (``ngpt.io.aliases``). All other contents of a file,
+including unknown layers, are kept on writing, as ``ngpt.io.openexr`` describes.
 """
 
 import logging
@@ -47,29 +47,23 @@ def read(
 ) -> GradientStack:
     """Reads a gradient stack, or any render that contains an image.
 
-    Layers are found by their names in the contract or in other renderers (``ngpt.io.aliases``). ``layers`` maps names
-    of the contract to names in the file, ``{"albedo": "ViewLayer.Denoising Albedo"}``, or to channels with signs and
-    factors, ``{"motion": "-velocity.R,velocity.G"}``. Half and uint channels are converted to float32; layers the
-    toolkit does not know stay in ``stack.source`` and come back on writing. In a result file primal is the kept input,
-    so that reconstructing a result gives the result again.
+    ``layers``    the names of layers in the file, by their names in the contract: {"albedo": "ViewLayer.Denoising
+                  Albedo"}; or channels with signs and factors: {"motion": "-velocity.R,velocity.G"}. Layers that are
+                  not named here are found by their usual names (``ngpt.io.aliases``)
+    ``isolated``  whether to decode the file in a separate process: a hostile file that crashes the decoder then raises
+                  NgptError (``ngpt.io.isolated``)
+    ``files``     separate files by names of the contract, {"albedo": "albedo.exr"}, which replace layers of ``path``.
+                  In a file of several layers, the one with a known name is read, or else the root
+    ``view``      the name of a view of a stereo file (``ngpt.io.views``); None: the first
 
-    ``view`` names a view of a stereo file (``ngpt.io.views``); by default, it is the first.
-
-    ``files`` maps names of the contract to separate files, ``{"albedo": "albedo.exr"}``. These win over layers of that
-    name in ``path``. If such a file has several layers, the one with a known name is read, else the root.
-
-    ``isolated`` decodes the file in a separate process: a file from a stranger that crashes the decoder then raises
-    NgptError (``ngpt.io.isolated``).
-
-    Colours stay in the primaries of the file, which its header names (``ngpt.io.primaries``).
-
-    Light that is encoded for displays, as in PNG, is made scene-linear (``ngpt.io.foreign.files``).
-
-    A layer whose data window differs from the primal's is put onto the pixels of the primal. Pixels outside its own
-    window are 0.
+    Half and uint channels become float32. Unknown layers stay in ``stack.source`` and are written with the stack. The
+    primal of a result file is its noisy input, so that a result can be reconstructed again. Colours stay in the
+    primaries that the header names (``ngpt.io.primaries``). Light that is encoded for displays, as in PNG, becomes
+    scene-linear (``ngpt.io.foreign.files``). A layer whose data window differs from the primal's is put onto the pixels
+    of the primal, and is 0 outside its own window.
 
     Raises NgptError if the file cannot be read, holds no primal, or holds layers without a pixel in common with the
-    primal; and if the size or place of a layer in ``files`` is not that of the primal.
+    primal; and if the size or place of a layer in ``files`` differs from the primal's.
     """
     image, subpixels = _opened(path, isolated)
     stack = _stack(image, _one_view(image, view, str(path)), layers, isolated, files, str(path))
@@ -92,7 +86,7 @@ def read_views(
 
 
 def _opened(path: str | os.PathLike, isolated: bool) -> tuple[ExrImage, ExrPart | None]:
-    """The contents of a file except its subpixels, and the part with the subpixels."""
+    """The contents of a file without its subpixels, and the part with the subpixels, None if it has none."""
     return fine.apart(read_exr_isolated(path) if isolated else read_file(path))
 
 
@@ -104,17 +98,17 @@ def _one_view(image: ExrImage, wanted: str | None, path: str) -> View:
     """The view of that name, or the first; logs a warning if the file has others."""
     found = choose_views(file_views(image), wanted, path)
     if len(found) > 1:
-        _LOG.warning("%s: of the views %s, %s is taken", path, ", ".join(view.name for view in found), found[0].name)
+        _LOG.warning("%s: has the views %s; %s is read", path, ", ".join(view.name for view in found), found[0].name)
     return found[0]
 
 
 def _resolved(
     view: View, layers: Mapping[str, str] | None, attributes: Iterable[Mapping[str, Any]], path: str
 ) -> Resolution:
-    """The places of the layers of a view; ``attributes`` are the headers of the parts."""
+    """The places of the layers of a view in its file; ``attributes`` are the headers of the parts."""
     headers, wanted = list(attributes), {name: view.without(text) for name, text in (layers or {}).items()}
     origin = next((str(header["ngpt:pass"]) for header in headers if "ngpt:pass" in header), "")
-    # In a result file, the input is no longer at its first place.
+    # A result file keeps the input in another layer than the one that it came from.
     if origin and f".{origin}".endswith(f".{wanted.get('primal')}"):
         del wanted["primal"]
     writer = writer_of(name for header in headers for name in header)
@@ -144,22 +138,22 @@ def _stack(
     attributes = {name: value for name, value in main.header.items() if name not in STRUCTURE}
     stack = GradientStack(arrays, attributes, StackSource(image, resolution, view), path, place_of(main))
     alone = {name: _read_alone(file, name, stack, main, isolated) for name, file in (files or {}).items()}
-    told = ", ".join(f"{name} ({' '.join(found.channels)})" for name, found in resolution.items())
-    _LOG.info("%s: %dx%d, %s", path, stack.width, stack.height, told)
+    places = ", ".join(f"{name} ({' '.join(found.channels)})" for name, found in resolution.items())
+    _LOG.info("%s: %dx%d, %s", path, stack.width, stack.height, places)
     return stack.replace(**alone) if alone else stack
 
 
 def layers_in(path: str | os.PathLike, layers: Mapping[str, str] | None = None) -> frozenset[str]:
-    """The names of the layers that ``read`` would find, from the file's header. Raises the errors of ``read`` about
-    layers."""
+    """The names of the layers that ``read`` would find, from the header of the file.
+
+    Raises NgptError as ``read`` does for missing and ambiguous layers.
+    """
     views, texts = _views_in(path)
     return frozenset(_resolved(views[0], layers, texts, str(path)))
 
 
 def views_in(path: str | os.PathLike) -> list[View]:
-    """The views of a file, and the names of their layers, from its header; raises NgptError for a file that is not an
-    image.
-    """
+    """The views of a file with the names of their layers, from its header. Raises NgptError if it is no image."""
     return _views_in(path)[0]
 
 
@@ -173,8 +167,10 @@ def _views_in(path: str | os.PathLike) -> tuple[list[View], list[dict[str, str]]
 
 
 def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: ExrPart, isolated: bool) -> np.ndarray:
-    """Layer ``name`` (H, W, C) from a separate file. It must have the size and place of ``main``, the part with the
-    primal."""
+    """Layer ``name`` (H, W, C) from a separate file.
+
+    Raises NgptError unless it has the size of the ``stack`` and the place of ``main``, the part with the primal.
+    """
     if name not in LAYERS or name == "primal":
         raise NgptError(f"{file}: layer '{name}' cannot be read from a separate file")
     parts = (read_exr_isolated(file) if isolated else read_file(file)).parts
@@ -197,31 +193,30 @@ def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: 
 
 
 class Picture(NamedTuple):
-    """The picture that a viewer shows for a file, (H, W, 3) float32, and where it lies."""
+    """The picture that a viewer shows for a file, (H, W, 3) float32, and its place."""
 
     pixels: np.ndarray
     place: Place
 
 
 def read_image(path: str | os.PathLike, isolated: bool = False, view: str | None = None) -> np.ndarray:
-    """Reads the picture that a viewer would show for a file, (H, W, 3) float32: the pixels of ``read_picture``."""
+    """Reads the picture that a viewer shows for a file, (H, W, 3) float32, as ``read_picture`` does."""
     return read_picture(path, isolated, view).pixels
 
 
 def read_picture(path: str | os.PathLike, isolated: bool = False, view: str | None = None) -> Picture:
-    """Reads the picture that a viewer would show: the root R G B of the first part.
+    """Reads the picture that a viewer shows: the root R G B of the first part.
 
-    That is the reconstruction in a result file and the primal in a stack; in a file without a root image, it is the
-    layer that ``read`` takes as the primal. ``view`` names a view of a stereo file; by default, it is the first. Unlike
-    ``read``, it converts light of other primaries to linear Rec. 709 (``ngpt.io.primaries``), because pictures are
-    looked at and compared.
+    In a result file, this is the reconstruction; in a stack, the primal; in a file without a root image, the layer that
+    ``read`` takes as the primal. The picture is converted to linear Rec. 709 (``ngpt.io.primaries``). ``isolated`` and
+    ``view`` are as for ``read``.
     """
     image, _ = _opened(path, isolated)
     part, chosen = image.parts[0], _one_view(image, view, str(path))
     if view is None and all(name in part.channels for name in RGB):
         return Picture(converted(gather(part, RGB), to_rec709(part.header)), place_of(part))
     stack = _stack(image, chosen, None, isolated, None, str(path))
-    # The picture of a result lies in the file beside its input.
+    # In a result file, the picture is the root beside the input.
     for place in (stack.source.resolution["primal"].part, chosen.first):
         like = channels_like(stack.source.resolution["primal"])
         part, root = image.parts[place], tuple(chosen.channel(place, name) for name in like)
@@ -240,34 +235,32 @@ def write(
     *,
     reduce: int = 1,
 ) -> Path:
-    """Writes a stack, a result or an image, and returns its path.
+    """Writes a stack, a result or an image as OpenEXR, and returns its path.
 
-    The subpixels of a stack or a result become one more part, ``fine`` (``ngpt.io.fine``).
+    ``image``       a ``GradientStack``; or an image (H, W, 3), which is a result if ``like`` is given; or a list of the
+                    results of all views of a file
+    ``like``        the stack that the result was made from; or a list of the stacks of the views (``read_views``)
+    ``attributes``  header attributes, which are added to those of the stack; for a result, ``Result.attributes``
+    ``into``        the layer that a result replaces beside the root; "root" for none
+    ``reduce``      K: each K x K pixels of a result become one, by the rules of ``ngpt.io.reduced``
 
-    A stack that was read from a file is written as that file, with its layers and attributes brought up to date; none
-    are removed. Any other stack is written as one scanline part at its ``place``, compressed with ZIP, with primal in
-    the root R G B.
+    A stack that was read from a file is written as that file, with its layers and attributes brought up to date. Any
+    other stack becomes one scanline part at its ``place``, compressed with ZIP, with primal in the root R G B.
+    Subpixels become one more part (``ngpt.io.fine``). An image without ``like`` is written as float R G B.
 
-    A result is an ``image`` (H, W, 3), with the stack that it was made from as ``like``. It is written as the file of
-    that stack, with ``image`` in the root R G B of its first part, which viewers show, and the input in primal.R/G/B.
-    If the first part does not hold primal, or shows another layer in its root, it stays as it is, and a new part goes
-    in front. Alpha is copied into the root if the file has it elsewhere. ``image`` also replaces the layer that the
-    input was read from (``ViewLayer.Combined``), which the attribute ``ngpt:pass`` then names; a ``Noisy Image`` stays.
-    ``into`` names another layer to replace, or "root" for none.
+    A result is written as the file of its stack, with ``image`` in the root R G B of the first part, which viewers
+    show, and with the input in primal.R/G/B. If the first part does not hold primal, or shows another layer in its
+    root, it is not changed, and a new part goes in front. Alpha is copied into the root if the file has it elsewhere.
+    By default, ``image`` also replaces the layer that the input was read from, such as ``ViewLayer.Combined``, unless
+    its name says that it is noisy; the attribute ``ngpt:pass`` then names that layer. If the stack is itself a result,
+    its attributes on how it was made (``MADE_BY``) and its layer ``error`` are left out. A new layer ``error``
+    (``like=stack.replace(error=...)``) is written.
 
-    Results of the views of one file are written together, as a list of images and a list of their stacks
-    (``read_views``). Each image is then the root of its view.
+    Channels keep their type, half or float, and become float if half cannot hold the values (above 65504, or all below
+    6.1e-5). Gradients, variances and depth are written as float.
 
-    Channels keep their type, half or float, and become float where half cannot hold the values (above 65504, or all
-    below 6.1e-5). Gradients, variances and depth are written as float. An ``image`` without ``like`` is written as
-    float R G B.
-
-    With ``reduce`` K, each K x K pixels of a result become one (``ngpt.io.reduced`` has the rules).
-
-    ``attributes`` go into the header beside the attributes of the stack; ``Result.attributes`` say what made a result.
-    If the stack is itself a result, the attributes on how it was made (``MADE_BY``) are left out of the new result, and
-    so is the layer ``error`` that was read with it. A new layer ``error`` (``like=stack.replace(error=...)``) is
-    written.
+    Raises NgptError if the file cannot be written, if it exists and ``overwrite`` is False, and for an image whose size
+    differs from its stack's.
     """
     if structural := STRUCTURE & (attributes or {}).keys():
         raise NgptError(f"{path}: attribute '{min(structural)}' is OpenEXR's own; give it another name")
@@ -303,8 +296,7 @@ def write(
 
 
 def layers_of_result(stack: GradientStack, into: str | None = None) -> tuple[list[str], list[str]]:
-    """The layers that ``write`` replaces by a result, the root first; and other layers named like images, which stay
-    noisy."""
+    """The layers that ``write`` replaces by a result, the root first; and layers named like images that stay noisy."""
     if stack.source is None:
         return ["root"], []
     origin, source = str(stack.attributes.get("ngpt:pass", "")), stack.source
@@ -322,7 +314,7 @@ def _result(
     into: str | None,
     path: str,
 ) -> ExrImage:
-    """The file of a stack, with the results of other views as in ``base``, and ``pixels`` (H, W, 3) as its result."""
+    """The file of a stack with ``pixels`` (H, W, 3) as its result. ``base`` has the results of other views, if any."""
     found, resolution, main = image_of(stack, path, base)
     leave_out_old_error(stack, found)
     view = stack.source.view if stack.source else file_views(found)[0]
@@ -335,10 +327,10 @@ def _result(
 
 
 def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> GradientStack:
-    """Returns ``stack`` with further channels, (H, W) each, which ``write`` writes beside its layers.
+    """The ``stack``, which must not come from a file, with further channels, (H, W) each, that ``write`` writes too.
 
-    ``stack`` must not come from a file. The names of channels are outside the contract, for example
-    ``diagnostics.discarded``. They are kept like the unknown channels of a file, and ``pass_through`` returns them.
+    Their names, such as ``diagnostics.discarded``, are outside the contract. ``pass_through`` returns these channels
+    like the unknown channels of a file.
     """
     stack.require("primal", why="carrying further channels")
     part, found = ExrPart("", new_header(stack), {}), {}
@@ -352,7 +344,7 @@ def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> G
 
 
 def pass_through(stack: GradientStack) -> dict[str, np.ndarray]:
-    """The channels that a stack keeps besides the layers of the contract: name -> (H, W), as in the file."""
+    """The channels of a stack's file that belong to no layer of the contract: name -> (H, W)."""
     if stack.source is None:
         return {}
     known = {(found.part, channel) for found in stack.source.resolution.values() for channel in found.channels}
@@ -365,13 +357,13 @@ def pass_through(stack: GradientStack) -> dict[str, np.ndarray]:
 
 
 def channels_alone(stack: GradientStack) -> dict[str, np.ndarray]:
-    """The channels of ``pass_through`` that belong to no layer of ``layers_of_light``."""
+    """The channels of ``pass_through`` without those of ``layers_of_light``."""
     light = {id(part.channels[name]) for part, names in _light(stack).values() for name in names}
     return {name: channel for name, channel in pass_through(stack).items() if id(channel) not in light}
 
 
 def layers_of_light(stack: GradientStack) -> dict[str, np.ndarray]:
-    """The layers of colour that a stack holds besides the layers of the contract: name -> (H, W, 3) float32."""
+    """The layers of colour in a stack's file that are not in the contract: name -> (H, W, 3) float32."""
     return {
         name: put(gather(part, names), data_window(part), stack.place.data)
         for name, (part, names) in _light(stack).items()
@@ -379,7 +371,7 @@ def layers_of_light(stack: GradientStack) -> dict[str, np.ndarray]:
 
 
 def replace_layers_of_light(stack: GradientStack, layers: Mapping[str, np.ndarray]) -> GradientStack:
-    """The stack with some of its ``layers_of_light`` replaced by ``layers``, (H, W, 3); half stays half if possible."""
+    """The stack with some of its ``layers_of_light`` replaced by ``layers``, (H, W, 3)."""
     image = ExrImage([replace(part, channels=dict(part.channels)) for part in stack.source.image.parts])
     changed = replace(stack, source=replace(stack.source, image=image))
     places = _light(changed)
@@ -390,7 +382,7 @@ def replace_layers_of_light(stack: GradientStack, layers: Mapping[str, np.ndarra
 
 
 def _light(stack: GradientStack) -> dict[str, tuple[ExrPart, tuple[str, ...]]]:
-    """Where the file of a stack holds its layers of light."""
+    """The part and the channels of each of the ``layers_of_light``, by its name."""
     if stack.source is None:
         return {}
     parts = stack.source.image.parts

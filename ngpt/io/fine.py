@@ -1,8 +1,8 @@
 """Subpixels in files: one more part, ``fine``, which other readers may ignore.
 
-It holds R G B, ``albedo.R/G/B`` and ``normal.X/Y/Z``. Its data window is K times the data window of the pixels; the
-attribute ``ngpt:subpixels`` holds K. Its display window is that of the pixels: OpenEXR requires the same one in all
-parts of a file.
+It holds R G B, ``albedo.R/G/B`` and ``normal.X/Y/Z``. Its data window is K times the data window of the pixels, and the
+attribute ``ngpt:subpixels`` holds K. Its display window is not multiplied, because OpenEXR requires the same display
+window in all parts of a file.
 """
 
 import logging
@@ -22,7 +22,7 @@ from ngpt.windows import Window
 _LOG = logging.getLogger(__name__)
 
 PART = "fine"
-# The name that the part with the pixels gets if it has none: in files with several parts, each needs a name.
+# The name for the part with the pixels if it has none, since each part of several needs one
 _PIXELS = "stack"
 # Attributes that OpenEXR requires to be the same in all parts of a file
 _COMMON = ("displayWindow", "pixelAspectRatio", "timeCode", "chromaticities")
@@ -34,7 +34,7 @@ def is_fine(name: str, attributes: Mapping) -> bool:
 
 
 def apart(image: ExrImage) -> tuple[ExrImage, ExrPart | None]:
-    """A file without the part with its subpixels, and that part; None if there is none."""
+    """The file without its subpixels, and the part with the subpixels, None if it has none."""
     fine = next((part for part in image.parts[1:] if is_fine(part.name, part.header)), None)
     if fine is None:
         return image, None
@@ -42,8 +42,7 @@ def apart(image: ExrImage) -> tuple[ExrImage, ExrPart | None]:
 
 
 def subpixels_of(part: ExrPart, stack: GradientStack) -> dict[str, np.ndarray]:
-    """The subpixels in a part, by layer. If they do not match the pixels of the stack, logs a warning and returns
-    none."""
+    """The subpixels in a part, by layer; none, with a warning, if they do not match the pixels of the stack."""
     data, window = stack.place.data, data_window(part)
     k = part.header[SUBPIXELS]
     if not isinstance(k, int) or k < 2 or window != _window(data, k):
@@ -58,7 +57,7 @@ def subpixels_of(part: ExrPart, stack: GradientStack) -> dict[str, np.ndarray]:
 
 
 def with_subpixels(image: ExrImage, main: int, stack: GradientStack) -> ExrImage:
-    """The file of a stack, whose pixels are in part ``main``, with its subpixels, if it has any."""
+    """The file of a stack with its subpixels added, if it has any; ``main`` is the index of the part with pixels."""
     header = image.parts[main].header
     if not stack.fine:
         header.pop(SUBPIXELS, None)

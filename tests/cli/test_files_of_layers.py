@@ -45,6 +45,6 @@ def test_info_lists_layers_and_views_even_where_one_is_ambiguous(tmp_path, comma
     right = json.loads(command("info both.exr --view right --json").out)
     assert right["layers"]["primal"]["channels"] == "right.R right.G right.B"
     assert json.loads(command("info both.exr --layer albedo=x --json", 1).out)["layers of right"] == {"root": "R G B"}
-    assert command("report both.exr -o page.html").err.count("of the views left, right, left is taken") == 1
+    assert command("report both.exr -o page.html").err.count("has the views left, right; left is read") == 1
     for line in ("picture both.exr --view right -o right.png", "denoise both.exr --view right -m primal -o a.png"):
         command(line)

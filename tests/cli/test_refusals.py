@@ -93,7 +93,7 @@ ROWS = [
     ("denoise missing.exr", 1, "missing.exr: not found"),
     ("denoise empty", 1, "no .exr files to denoise there"),
     ("denoise 'empty/*.exr'", 1, "no .exr files to denoise there"),
-    ("denoise no.%04d.exr", 1, "no.%04d.exr: no frames of that name are there; check the name"),
+    ("denoise no.%04d.exr", 1, "no.%04d.exr: no frames of that name exist; check the name"),
     ("denoise plain.exr -o x.%04d.exr", 2, "plain.exr: has no number, which x.%04d.exr asks for"),
     ("denoise notes.exr -o out/o.exr", 1, "notes.exr: not an OpenEXR file"),
     ("denoise cut.exr -o out/o.exr", 1, "cut.exr"),

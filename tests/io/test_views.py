@@ -78,7 +78,7 @@ def test_one_view_of_several_is_told(source, caplog):
     for reads in (read, read_image):
         caplog.clear()
         reads(source)
-        assert "of the views left, right, left is taken" in caplog.text
+        assert "has the views left, right; left is read" in caplog.text
         caplog.clear()
         reads(source, view="right")
         assert not caplog.text
