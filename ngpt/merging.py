@@ -302,26 +302,19 @@ def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
     seen: dict[str, list[GradientStack]] = {}
     for stack, n in zip(stacks, counts, strict=True):
         if stack.place.display != first.place.display:
-            raise NgptError(
-                f"{stack.path} is {stack.place} but {first.path} is {first.place}; only stacks of one image can be "
-                "merged: its tiles, or its seeds"
-            )
+            places = f"{stack.path} is {stack.place} but {first.path} is {first.place}"
+            raise NgptError(f"{places}; merge seeds or tiles of one image")
         # As text, because files of other programs may hold anything under our names.
         ours, theirs = (str(s.attributes.get("ngpt:sampler")) for s in (stack, first))
         if ours != theirs:
-            raise NgptError(
-                f"{stack.path} was made by sampler '{ours}' and {first.path} by '{theirs}'; their variances cannot be "
-                "merged: name one with --sampler"
-            )
+            made = f"{stack.path} was made by sampler '{ours}' and {first.path} by '{theirs}'"
+            raise NgptError(f"{made}; their variances cannot be merged: name one with --sampler")
         for name in (_means(stack) ^ _means(first)) - {"shared"}:
             has, lacks = (stack, first) if name in _means(stack) else (first, stack)
             raise NgptError(f"{has.path} has '{name}' and {lacks.path} has not; merge stacks with the same layers")
         ours, theirs = (str(s.attributes.get("ngpt:frame")) for s in (stack, first))
         if ours != theirs:
-            raise NgptError(
-                f"{stack.path} is frame {ours} and {first.path} is frame {theirs}; only stacks of one frame can be "
-                "merged"
-            )
+            raise NgptError(f"{stack.path} is frame {ours} and {first.path} frame {theirs}; merge stacks of one frame")
         for mean, name in VARIANCES.items():
             if n > 1 and mean in stack and name not in stack and any(name in other for other in stacks):
                 raise NgptError(f"{stack.path} has no '{name}' though it has {n} samples per pixel; render it again")
@@ -368,6 +361,6 @@ def _seeds(stack: GradientStack) -> list[str]:
     seed = str(stack.attributes.get("ngpt:seed", "")).split()
     if not seed:
         raise NgptError(
-            f"{stack.path}: has no attribute 'ngpt:seed', so its samples might be those of another; render it with ngpt"
+            f"{stack.path}: has no attribute 'ngpt:seed' to tell its samples from others; render it with ngpt"
         )
     return seed

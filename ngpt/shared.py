@@ -36,9 +36,8 @@ def noise_of_light(primal: np.ndarray, primal_var: np.ndarray, shared: np.ndarra
     root mean squares over channels and blocks, relative to the mean light of the image. Values that are not finite
     count as zero.
     """
-    light, variance, sample = (
-        np.where(np.isfinite(layer), layer, 0).astype(np.float64) for layer in (primal, primal_var, shared)
-    )
+    layers = (np.where(np.isfinite(layer), layer, 0) for layer in (primal, primal_var, shared))
+    light, variance, sample = (layer.astype(np.float64) for layer in layers)
     own, scale = np.maximum(variance - shared_variance(sample), 0), abs(light.mean()) or np.nan
     found = {}
     for name, (height, width) in (("whole image", own.shape[:2]), (f"blocks of {_BLOCK}x{_BLOCK}", (_BLOCK, _BLOCK))):

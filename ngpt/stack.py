@@ -156,9 +156,8 @@ class GradientStack(Mapping[str, np.ndarray]):
             if "primal_var" in missing:
                 remedy += "; if its renderer writes none, several seeds do: 'With variances' in from-your-renderer.md"
             if {"dx", "dy"} & {*missing} and "ngpt:sampler" in self.attributes:
-                remedy = (
-                    f"sampler {self.attributes['ngpt:sampler']} renders no gradients: `ngpt render --sampler gpt` does"
-                )
+                by = self.attributes["ngpt:sampler"]
+                remedy = f"sampler {by} renders no gradients: `ngpt render --sampler gpt` does"
             raise NgptError(f"{self.path}: {needs} {what}; the stack holds {', '.join(self.names)}; {remedy}")
 
     def replace(self, **layers: ArrayLike) -> "GradientStack":

@@ -99,8 +99,6 @@ def belong(fine: Mapping[str, np.ndarray], layers: Mapping[str, np.ndarray], pat
     for name, layer in fine.items():
         k = layer.shape[1] // layers[name].shape[1] if name in layers else 0
         if not k or not np.array_equal(means(layer, k), layers[name], equal_nan=True):
-            _LOG.warning(
-                "%s: the subpixels are of another image, since '%s' is not their mean; they are left out", path, name
-            )
+            _LOG.warning("%s: the subpixels are left out, since their means differ from the pixels of '%s'", path, name)
             return False
     return True

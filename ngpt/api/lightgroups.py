@@ -1,11 +1,12 @@
-"""Light groups, denoised so that they still add up to the image, for relighting in compositing.
+"""Light groups that are denoised so that they still add up to the image, for relighting in compositing.
 
-Each group is denoised by itself, since it has shadows of its own. The difference between the reconstruction of the
-whole and their sum is divided among them, in each pixel in proportion to the light that they have there:
+Each group is denoised by itself, since it has shadows of its own. Let d_i be the denoised groups and D the denoised
+image. The difference between D and the sum of the groups is divided among them, in each pixel in proportion to their
+light there:
 
     o_i = d_i + (D - Σ d_j) |d_i| / Σ |d_j|
 
-so Σ o_i = D whatever the method, and groups of no negative light stay so. Light in no group counts as one more group.
+So Σ o_i = D for any method, and no group becomes negative. Light in no group counts as one more group.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,21 +21,21 @@ from ngpt.methods import METHODS, choose, reconstruct
 from ngpt.panorama import WRAP, wraps
 from ngpt.stack import GradientStack
 
-# How renderers name the image of a group: their own names, the group's in place of the star.
+# Renderer -> the name of a group's layer, with * in place of the group's own name
 PATTERNS = {"Cycles": "Combined_*", "Arnold": "RGBA_*"}
 # The header's list of groups of a result.
 ATTRIBUTE = "ngpt:groups"
-# Light in no group, as a share of all light, that may be due to rounding.
+# The largest share of light in no group that may be due to rounding
 NEGLIGIBLE = 2e-3
 
 
 def find(stack: GradientStack, patterns: Sequence[str] = ()) -> dict[str, np.ndarray]:
-    """The groups in the file of a stack: name -> (H, W, 3) float32.
+    """The light groups in the file of a stack: name -> (H, W, 3) float32.
 
-    ``patterns``  patterns of layer names, such as "Combined_*"; the default is ``PATTERNS``
+    ``patterns``  patterns of layer names, such as "Combined_*"; by default ``PATTERNS``
 
-    If a file has several view layers, the groups are taken from the one that holds the primal. Raises NgptError if
-    there are no groups, or if they were denoised before.
+    If a file has several view layers, only groups in the view layer of the primal count. Raises NgptError if there are
+    no groups, or if they are denoised already.
     """
     if ATTRIBUTE in stack.attributes:
         raise NgptError(f"{stack.path}: its light groups are denoised already; give the file of the renderer")
@@ -56,10 +57,10 @@ def find(stack: GradientStack, patterns: Sequence[str] = ()) -> dict[str, np.nda
 def denoised(
     stack: GradientStack, groups: Mapping[str, np.ndarray], whole: np.ndarray, method: str = "auto", **options
 ) -> dict[str, np.ndarray]:
-    """The groups (H, W, 3) float32, denoised, which add up to ``whole``, the reconstruction of the stack's primal.
+    """The denoised groups (H, W, 3) float32, which add up to ``whole``, the reconstruction of the stack's primal.
 
-    ``method``, ``options``  those that made ``whole``. Groups have neither gradients nor variances; a method that
-    needs them is replaced by the one that "auto" takes for an image with the stack's features.
+    ``method`` and ``options`` are those that made ``whole``. Groups have neither gradients nor variances. If the method
+    needs these, "auto" chooses another one for an image with the stack's features.
     """
     features = {name: stack[name] for name in ("albedo", "normal", "depth", "alpha") if name in stack}
     if method == "auto" or not set(METHODS[method].needs) <= {"primal", *features}:
@@ -69,13 +70,12 @@ def denoised(
     if np.nansum(np.abs(rest)) > NEGLIGIBLE * np.nansum(np.abs(stack["primal"]), dtype=np.float64):
         light[""] = rest.astype(np.float32)
     wrap = {WRAP: 1} if wraps(stack) else {}
-    stacks = {
-        name: GradientStack({"primal": group, **features}, wrap, path=f"{stack.path}, {name}")
+    stacks = [
+        GradientStack({"primal": group, **features}, wrap, path=f"{stack.path}, {name}")
         for name, group in light.items()
-    }
-    parts = {name: reconstruct(one, method, **options) for name, one in stacks.items()}
-    shared = shares([part.image for part in parts.values()], whole)
-    return {name: image for name, image in zip(parts, shared, strict=True) if name}
+    ]
+    images = shares([reconstruct(one, method, **options).image for one in stacks], whole)
+    return {name: image for name, image in zip(light, images, strict=True) if name}
 
 
 def shares(parts: Sequence[np.ndarray], whole: np.ndarray) -> list[np.ndarray]:
@@ -83,12 +83,12 @@ def shares(parts: Sequence[np.ndarray], whole: np.ndarray) -> list[np.ndarray]:
     images = np.asarray(parts, np.float64)
     weights = np.abs(images)
     total = weights.sum(axis=0)
-    # Where no part has light, all get the same.
+    # Where no part has light, all parts get the same share.
     weights = np.where(total > 0, weights / np.where(total > 0, total, 1), 1 / len(images))
     return list((images + weights * (whole - images.sum(axis=0))).astype(np.float32))
 
 
 def with_groups(stack: GradientStack, groups: Mapping[str, np.ndarray]) -> GradientStack:
-    """The stack with these groups in place of those in its file, and their names in its header."""
+    """The stack with ``groups`` in place of its file's layers of these names, and a list of them in its header."""
     changed = replace_layers_of_light(stack, groups)
     return replace(changed, attributes=changed.attributes | {ATTRIBUTE: ", ".join(groups)})

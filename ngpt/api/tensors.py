@@ -129,9 +129,7 @@ def layer(
     if array.size == 0:
         raise NgptError(f"{where}: {name} is {array.shape[1]}x{array.shape[0]}; it has no pixels to work on")
     if array.dtype.kind in "iu":
-        raise NgptError(
-            f"{where}: {name} is of type {array.dtype}: integers hold what displays show; pass scene-linear floats"
-        )
+        raise NgptError(f"{where}: {name} is of type {array.dtype}; pass scene-linear floats, not integers")
     return array
 
 

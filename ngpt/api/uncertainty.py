@@ -59,16 +59,11 @@ def _check_halves(stack: GradientStack, halves: tuple[GradientStack, GradientSta
     for half in halves:
         known = half.place.known and stack.place.known
         if half.place.data != stack.place.data if known else half.place.data.size != stack.place.data.size:
-            raise NgptError(
-                f"a half of the samples is {half.place} and the stack {stack.place}; give two stacks of the same view, "
-                "such as those that it was merged from"
-            )
+            places = f"a half of the samples is {half.place} and the stack {stack.place}"
+            raise NgptError(f"{places}; give two stacks of the same view, such as those that it was merged from")
     one, other = (set(str(half.attributes.get("ngpt:seed", "")).split()) for half in halves)
     if both := one & other:
-        raise NgptError(
-            f"both halves were rendered with seed {min(both)}, so they hold the same samples; give "
-            "two stacks of different seeds"
-        )
+        raise NgptError(f"both halves have seed {min(both)}, and so the same samples; give stacks of different seeds")
 
 
 def known_noise(stack: GradientStack) -> np.ndarray:

@@ -49,9 +49,8 @@ def output_file(path: str | Path, args: argparse.Namespace) -> Path:
     """
     skip = getattr(args, "skip_existing", None)
     make_folder(Path(path).parent)
-    return check_output(
-        path, args.force or bool(skip), may_skip=skip is not None and Path(path).suffix.lower() == ".exr"
-    )
+    is_exr = Path(path).suffix.lower() == ".exr"
+    return check_output(path, args.force or bool(skip), may_skip=skip is not None and is_exr)
 
 
 def add_config(parser: argparse.ArgumentParser, kind: str, what: str) -> None:
@@ -106,11 +105,8 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 
 
 def add_untrusted(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--untrusted",
-        action="store_true",
-        help="decode files in a separate process, so that a damaged or hostile file cannot crash this one",
-    )
+    what = "decode files in a separate process, so that a damaged or hostile file cannot crash this one"
+    parser.add_argument("--untrusted", action="store_true", help=what)
 
 
 def add_files(parser: argparse.ArgumentParser) -> None:

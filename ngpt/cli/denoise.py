@@ -65,21 +65,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--alpha", help="weight of the noisy image in l2 and l1: a number, or auto")
     parser.add_argument("--weights", metavar="FILE", help="your own network: .onnx, .safetensors or .tza")
     parser.add_argument(
-        "--device", help="device for networks: cpu (default), cuda, tensorrt, openvino, directml, coreml"
+        "--device", help="device for networks: cpu (default), cuda, tensorrt, openvino, directml or coreml"
     )
-    parser.add_argument(
-        "--memory",
-        type=int,
-        metavar="MIB",
-        help=f"memory limit for networks; larger images are computed in tiles (default: {MEMORY})",
-    )
+    what = f"memory limit for networks; larger images are computed in tiles (default: {MEMORY})"
+    parser.add_argument("--memory", type=int, metavar="MIB", help=what)
     parser.add_argument("--threads", type=int, metavar="N", help="number of threads (default: all cores)")
     arguments.add_options(parser, "method", "METHOD")
-    parser.add_argument(
-        "--error",
-        action="store_true",
-        help="also write the layer 'error', the standard error of each pixel; takes twice the time",
-    )
+    what = "also write the layer 'error', the standard error of each pixel; takes twice the time"
+    parser.add_argument("--error", action="store_true", help=what)
     parser.add_argument(
         "--halves",
         nargs=2,
@@ -91,13 +84,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--groups", action="store_true", help=f"also denoise light groups, so that they add up to the result: {names}"
     )
-    parser.add_argument(
-        "--group",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="also a light group of this name; * stands for any letters; may be repeated",
-    )
+    what = "also a light group of this name; * stands for any letters; may be repeated"
+    parser.add_argument("--group", action="append", default=[], metavar="NAME", help=what)
     parser.add_argument(
         "--temporal",
         action="store_true",
@@ -138,7 +126,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     existing = parser.add_mutually_exclusive_group()
     arguments.add_force(existing)
     existing.add_argument(
-        "--skip-existing", action="store_true", help="skip stacks whose results exist, to continue a folder"
+        "--skip-existing", action="store_true", help="leave existing results alone, to continue a folder"
     )
     arguments.add_json(parser)
 
@@ -175,9 +163,8 @@ def denoise(request: DenoiseRequest, as_json: bool, console: Console) -> int:
     # The result does not show that features went unrecognized.
     overlooked: dict = next((report for report in reports if report.get("proposed")), {"proposed": {}})
     for name, layer in overlooked["proposed"].items():
-        console.say(
-            f"{overlooked['input']}: '{layer}' looks like {name} and was not used; --layer {name}=\"{layer}\" takes it"
-        )
+        hint = f"'{layer}' looks like {name} and was not used; --layer {name}=\"{layer}\" takes it"
+        console.say(f"{overlooked['input']}: {hint}")
     failed = sum("error" in report for report in reports)
     skipped = sum("skipped" in report for report in reports)
     if failed and len(pairs) > 1:

@@ -1,19 +1,14 @@
-"""The files of ``ngpt denoise``: the names of results, how they are written, and the reports about them."""
+"""The files of ``ngpt denoise``: how results are written, and the reports about them."""
 
-from __future__ import annotations
-
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from ngpt.errors import WrongUse
+from ngpt.cli.denoise_request import DenoiseRequest
 from ngpt.io.exr import layers_of_result
-from ngpt.io.framenames import named, number_of, varies
-from ngpt.io.frames import RESULT_SUFFIX
 from ngpt.io.reduced import cut_pixels, smaller
 from ngpt.io.resolution import propose
 from ngpt.methods import METHODS, Result
@@ -21,9 +16,6 @@ from ngpt.result_file import write_result
 from ngpt.stack import GradientStack
 from ngpt.system.files import save
 from ngpt.version import __version__
-
-if TYPE_CHECKING:
-    from ngpt.cli.denoise_request import DenoiseRequest
 
 
 @dataclass(frozen=True)
@@ -150,24 +142,3 @@ def describe(report: dict) -> str:
         notes += [f"{name} {report['metrics'][name]:.5g}" for name in ("relMSE", "relMSE trimmed")]
         notes[-1] += f" of the pixels that both have: {report['compared']}" if "compared" in report else ""
     return names + ", ".join(notes)
-
-
-def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Path]]:
-    """Each source with the file for its result, by ``--output``. Raises WrongUse if two would have the same file."""
-    if output is None:
-        targets = [path.with_name(f"{path.stem}{RESULT_SUFFIX}.exr") for path in sources]
-    elif varies(output):
-        targets = [Path(named(output, number_of(path, output))) for path in sources]
-    elif len(sources) == 1 and Path(output).suffix and not Path(output).is_dir() and not output.endswith(("/", os.sep)):
-        targets = [Path(output)]
-    else:
-        folder = Path(output)
-        named_file = folder.suffix.lower() == ".exr" and not output.endswith(("/", os.sep))
-        if not folder.is_dir() and (folder.exists() or named_file):
-            kind = "is a file" if folder.exists() else "is the name of a file"
-            raise WrongUse(f"{folder}: {kind}; the results of {len(sources)} stacks need a folder")
-        targets = [folder / (path.name if path.suffix.lower() == ".exr" else f"{path.stem}.exr") for path in sources]
-    repeated = next((t for i, t in enumerate(targets) if t in targets[:i]), None)
-    if repeated:
-        raise WrongUse(f"{repeated}: would be the result of two stacks of that name; denoise them one by one")
-    return list(zip(sources, targets, strict=True))

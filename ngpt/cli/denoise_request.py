@@ -1,15 +1,17 @@
 """The request of ``ngpt denoise``: a frozen record, made once from the command line and passed down whole."""
 
 import argparse
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from ngpt.cli import arguments
-from ngpt.cli.denoise_files import output_paths
 from ngpt.cli.reference import Reference
 from ngpt.errors import WrongUse
+from ngpt.io.framenames import named, number_of, varies
+from ngpt.io.frames import RESULT_SUFFIX
 from ngpt.methods import check_request
 from ngpt.result_file import Look, check_image
 
@@ -77,3 +79,24 @@ def request_of(args: argparse.Namespace) -> DenoiseRequest:
     given |= {"layer": dict(args.layer), "error": bool(makes_layers["--error"])}
     given |= {"look": Look(args.transform, args.exposure)}
     return DenoiseRequest(**{field.name: given[field.name] for field in fields(DenoiseRequest)})
+
+
+def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Path]]:
+    """Each source with the file for its result, by ``--output``. Raises WrongUse if two would have the same file."""
+    if output is None:
+        targets = [path.with_name(f"{path.stem}{RESULT_SUFFIX}.exr") for path in sources]
+    elif varies(output):
+        targets = [Path(named(output, number_of(path, output))) for path in sources]
+    elif len(sources) == 1 and Path(output).suffix and not Path(output).is_dir() and not output.endswith(("/", os.sep)):
+        targets = [Path(output)]
+    else:
+        folder = Path(output)
+        named_file = folder.suffix.lower() == ".exr" and not output.endswith(("/", os.sep))
+        if not folder.is_dir() and (folder.exists() or named_file):
+            kind = "is a file" if folder.exists() else "is the name of a file"
+            raise WrongUse(f"{folder}: {kind}; the results of {len(sources)} stacks need a folder")
+        targets = [folder / (path.name if path.suffix.lower() == ".exr" else f"{path.stem}.exr") for path in sources]
+    repeated = next((t for i, t in enumerate(targets) if t in targets[:i]), None)
+    if repeated:
+        raise WrongUse(f"{repeated}: would be the result of two stacks of that name; denoise them one by one")
+    return list(zip(sources, targets, strict=True))

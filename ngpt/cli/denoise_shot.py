@@ -74,9 +74,7 @@ def windowed(
             try:
                 frames[number] = read(pair)
                 if len(frames[number].views) > 1:
-                    raise NgptError(
-                        f"{pair[0]}: has several views, and --temporal -m wcv takes one; choose it with --view"
-                    )
+                    raise NgptError(f"{pair[0]}: has several views; --temporal -m wcv takes one: choose it with --view")
             except NgptError as error:
                 errors[number] = error
                 yield None

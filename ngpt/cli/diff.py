@@ -14,16 +14,10 @@ from ngpt.windows import overlap
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "Images are compared in the pixels that both have, according to their data windows."
-    parser.add_argument(
-        "image", metavar="A", help="image to compare: its root R G B, which in a result file is the result"
-    )
+    parser.add_argument("image", metavar="A", help="image to compare: its root R G B, in a result file the result")
     parser.add_argument("reference", metavar="B", help="image to compare it with")
     parser.add_argument(
-        "--tolerance",
-        type=float,
-        default=1e-6,
-        metavar="RELMSE",
-        help="the images agree up to this relMSE (default: 1e-6)",
+        "--tolerance", type=float, default=1e-6, metavar="RELMSE", help="images agree up to this relMSE (1e-6)"
     )
     add_json(parser)
 

@@ -18,12 +18,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config(parser, configs.EVALUATION, "scenes, methods and metrics")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
     parser.add_argument("--scenes", nargs="+", default=[], metavar="SCENE", help="more scenes: files or patterns")
-    parser.add_argument(
-        "--cache",
-        type=Path,
-        metavar="DIR",
-        help="folder for stacks and measurements, to share between runs (default: OUT/cache)",
-    )
+    what = "folder for stacks and measurements, to share between runs (default: OUT/cache)"
+    parser.add_argument("--cache", type=Path, metavar="DIR", help=what)
 
 
 def run(args: argparse.Namespace, console: Console) -> int:

@@ -19,9 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.safetensors",
         help="network that `ngpt train` made; several files are averaged into a .safetensors file",
     )
-    source.add_argument(
-        "--method", choices=["l2"], help="a method instead of a network: l2 (default), screened Poisson"
-    )
+    source.add_argument("--method", choices=["l2"], help="a method, not a network: l2 (default), screened Poisson")
     parser.add_argument(
         "--alpha", type=float, default=DEFAULT_ALPHA, help=f"weight of the noisy image in l2 (default: {DEFAULT_ALPHA})"
     )
@@ -31,9 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="float32",
         help="precision of the network; its output is always float32",
     )
-    parser.add_argument(
-        "--vector", type=Path, metavar="FOLDER", help="also write an example of inputs and output to this folder"
-    )
+    parser.add_argument("--vector", type=Path, metavar="FOLDER", help="also write an example of input and output here")
     what = (
         "model to write: .onnx, and for a network beside it .statistics.onnx, which hosts need for tiles; "
         ".tza for OIDN; or .safetensors: weights in 16 bits"
@@ -79,9 +75,7 @@ def write(args: argparse.Namespace) -> list[Path]:
         weights = args.weights[0]
         if read_tensors(weights)[1].get("kind") == "temporal":
             if args.vector:
-                raise NgptError(
-                    f"{weights}: this network blends frames, and has no example to write; leave --vector out"
-                )
+                raise NgptError(f"{weights}: a network that blends frames has no example to write; leave --vector out")
             write_bytes(args.output, temporal_model(weights).SerializeToString(), args.force)
             return [args.output]
         name, beside = weights.stem, output_file(args.output.with_suffix(".statistics.onnx"), args)

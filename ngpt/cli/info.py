@@ -38,12 +38,8 @@ _OPTIONAL = ("error", "motion", "samples", "shared", "dt", "dt_var")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "file",
-        nargs="?",
-        metavar="FILE",
-        help="image (-: standard input), weights, training set, training run, scene, method or sampler",
-    )
+    kinds = "image (-: standard input), weights, training set, training run, scene, method or sampler"
+    parser.add_argument("file", nargs="?", metavar="FILE", help=kinds)
     parser.add_argument("--aliases", action="store_true", help="print the names that other renderers give to layers")
     parser.add_argument(
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
@@ -152,9 +148,8 @@ def stack(stack: GradientStack) -> dict:
     assert stack.source is not None
     parts, resolution = stack.source.image.parts, stack.source.resolution
     main = parts[resolution["primal"].part]
-    data, display = (
-        [[int(n) for n in corner] for corner in main.header[f"{name}Window"]] for name in ("data", "display")
-    )
+    windows = (main.header[name] for name in ("dataWindow", "displayWindow"))
+    data, display = ([[int(n) for n in corner] for corner in window] for window in windows)
     further = pass_through(stack)
     METHODS.load()
     rates = {name: channel for name, channel in further.items() if name.startswith(DIAGNOSTICS)}

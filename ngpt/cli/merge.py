@@ -11,7 +11,7 @@ from ngpt.system.files import save
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "stacks", nargs="+", metavar="STACK", help="stacks of one image with different seeds, or its tiles"
+        "stacks", nargs="+", metavar="STACK", help="stacks of one image: with different seeds, or tiles"
     )
     parser.add_argument("-o", "--output", metavar="FILE", required=True, help="stack to write")
     add_force(parser)

@@ -102,11 +102,7 @@ def add_look(parser: argparse.ArgumentParser) -> None:
         help="view transform of the picture: standard (sRGB, default), filmic (AgX), aces (needs OpenColorIO)",
     )
     parser.add_argument(
-        "--exposure",
-        type=stops,
-        default=0.0,
-        metavar="STOPS",
-        help="exposure of the picture: a number (default: 0), or auto",
+        "--exposure", type=stops, default=0.0, metavar="STOPS", help="a number of stops (default: 0), or auto"
     )
 
 

@@ -57,11 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="images of any renderer with the same resolution (-: standard input); or shots: folders, patterns, "
         "shot.%%04d.exr; or folders of training runs",
     )
-    parser.add_argument(
-        "--ref",
-        metavar="REF.exr",
-        help="reference image, or for folders a folder of references: adds errors, SSIM, FLIP and maps",
-    )
+    what = "reference image, or for folders a folder of references: adds errors, SSIM, FLIP and maps"
+    parser.add_argument("--ref", metavar="REF.exr", help=what)
     parser.add_argument(
         "-o", "--output", default="report.html", metavar="PAGE.html", help="page to write (default: report.html)"
     )

@@ -45,9 +45,7 @@ def as_files(stacks: list[str], output: str | None) -> Iterator[tuple[list[str],
     if output == STREAM and len(stacks) > 1:
         raise NgptError(f"'{STREAM}' is one result, and {len(stacks)} stacks are given; denoise them one by one")
     if stacks == [STREAM] and output is None:
-        raise NgptError(
-            "standard input has no name to go by: name the result, -o FILE.exr, or -o - for standard output"
-        )
+        raise NgptError("standard input has no name: name the result, -o FILE.exr, or write to standard output, -o -")
     if output == STREAM and sys.stdout.isatty():
         raise NgptError("standard output is a terminal: send it into a file or a program, or name a file with -o")
     with standard_input(stacks) as inputs:

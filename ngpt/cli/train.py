@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config(parser, configs.TRAINING, "settings")
     parser.add_argument("--out", help="folder of the run: checkpoint, weights, log")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="change a setting, for example run.steps=1000"
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="change a setting, such as run.steps=1000"
     )
     parser.add_argument("--dry-run", action="store_true", help="only print size and cost of the network")
 

@@ -31,9 +31,7 @@ def check_kind(path: Path, kinds: tuple[str, ...]) -> None:
     """Raises NgptError for a file of another kind, or of a kind that cannot be written on this machine."""
     kind = path.suffix.lower()
     if kind not in kinds:
-        raise NgptError(
-            f"{path}: pictures of this kind cannot be written; let the name end in one of {' '.join(kinds)}"
-        )
+        raise NgptError(f"{path}: ngpt cannot write this kind of file; let the name end in one of {' '.join(kinds)}")
     if kind not in (".png", ".mp4") and find_spec("PIL") is None:
         raise NgptError(f"{path}: JPEG and WebP need Pillow: {package_command('pillow')}")
     if kind == ".mp4":

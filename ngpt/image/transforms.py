@@ -59,9 +59,8 @@ def _aces() -> Any:
     try:
         config = ocio.Config.CreateFromFile(_CONFIGURATION)
     except ocio.Exception as error:
-        raise NgptError(
-            f"--transform aces: OpenColorIO {ocio.__version__} has no ACES 1.3 in it; take 2.3 or newer"
-        ) from error
+        version = ocio.__version__
+        raise NgptError(f"--transform aces: OpenColorIO {version} has no ACES 1.3; install 2.3 or newer") from error
     view = ("Linear Rec.709 (sRGB)", "sRGB - Display", "ACES 1.0 - SDR Video", ocio.TRANSFORM_DIR_FORWARD)
     return config.getProcessor(*view).getDefaultCPUProcessor()
 

@@ -179,15 +179,14 @@ def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: 
     found = resolve_alone([(part.name, list(part.channels)) for part in parts], name, str(file))
     layer = gather(parts[found.part], found.channels)
     if layer.shape[:2] != (stack.height, stack.width):
+        size = f"{layer.shape[1]}x{layer.shape[0]}"
         raise NgptError(
-            f"{file}: {name} is {layer.shape[1]}x{layer.shape[0]} but {stack.path} is {stack.width}x{stack.height}; "
-            "render them at one size"
+            f"{file}: {name} is {size} but {stack.path} {stack.width}x{stack.height}; render them at one size"
         )
     here, there = main.header["dataWindow"], parts[found.part].header["dataWindow"]
     if not np.array_equal(here, there):
         raise NgptError(
-            f"{file}: {name} starts at pixel {_corner(there)} but {stack.path} at {_corner(here)}; "
-            "render them with one data window"
+            f"{file}: {name} starts at pixel {_corner(there)}, {stack.path} at {_corner(here)}; crop them alike"
         )
     return layer
 

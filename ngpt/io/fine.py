@@ -46,10 +46,8 @@ def subpixels_of(part: ExrPart, stack: GradientStack) -> dict[str, np.ndarray]:
     data, window = stack.place.data, data_window(part)
     k = part.header[SUBPIXELS]
     if not isinstance(k, int) or k < 2 or window != _window(data, k):
-        _LOG.warning(
-            "%s: part '%s' has %s and '%s' %s, which are no subpixels of %s; they are left out",
-            *(stack.path, PART, window, SUBPIXELS, k, data),
-        )
+        found = (stack.path, PART, window, SUBPIXELS, k, data)
+        _LOG.warning("%s: part '%s' has %s and '%s' %s, which do not fit the pixels at %s; it is left out", *found)
         return {}
     names = {name: _channels(name) for name in FINE}
     held = {name: gather(part, its) for name, its in names.items() if all(c in part.channels for c in its)}

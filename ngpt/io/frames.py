@@ -49,9 +49,7 @@ def shot_files(name: str) -> list[Path]:
 def input_files(name: str) -> list[Path]:
     """The files to denoise: ``shot_files`` without any results of ``ngpt denoise``."""
     found = [path for path in _files(name) if not path.stem.endswith(RESULT_SUFFIX)]
-    return in_order(
-        found or _none(name, "no .exr files to denoise there; other formats by their names, such as '*.pfm'")
-    )
+    return in_order(found or _none(name, "no .exr files to denoise there; name other formats, such as '*.pfm'"))
 
 
 def without_results(files: Sequence[Path]) -> list[Path]:

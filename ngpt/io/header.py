@@ -159,9 +159,7 @@ def _string(file: BinaryIO) -> bytes:
     text = bytearray()
     while (byte := file.read(1)) != b"\0":
         if not byte or len(text) == 255:
-            raise _Damage(
-                "its header ends early" if not byte else f"a name begins {bytes(text[:16])!r} and does not end"
-            )
+            raise _Damage(f"a name begins {bytes(text[:16])!r} and does not end" if byte else "its header ends early")
         text += byte
     return bytes(text)
 
@@ -234,10 +232,7 @@ def check_size(parts: list[PartHeader], length: int, path: str) -> None:
             )
     channels = sum(len(part.channels) for part in parts)
     if channels > MAX_CHANNELS:
-        raise NgptError(
-            f"{path}: has {channels} channels in {len(parts)} parts, and {MAX_CHANNELS} are read at most; "
-            "remove those that are not needed"
-        )
+        raise NgptError(f"{path}: has {channels} channels, and {MAX_CHANNELS} are read at most; keep those you need")
     if any(part.deep for part in parts):
         return
     # The least length of the file: 16 bytes for each chunk (its entry in a table, and its size and place), and the data

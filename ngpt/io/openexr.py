@@ -32,14 +32,7 @@ from ngpt.system.forks import hold_while_forking
 from ngpt.system.limits import free_address_space, processors
 from ngpt.system.reading import regular_file
 
-_LOSSY = (
-    OpenEXR.PXR24_COMPRESSION,
-    OpenEXR.B44_COMPRESSION,
-    OpenEXR.B44A_COMPRESSION,
-    OpenEXR.DWAA_COMPRESSION,
-    OpenEXR.DWAB_COMPRESSION,
-    OpenEXR.LJ2K_COMPRESSION,
-)
+_LOSSY = {getattr(OpenEXR, f"{name}_COMPRESSION") for name in ("PXR24", "B44", "B44A", "DWAA", "DWAB", "LJ2K")}
 _PIXEL_TYPES = (np.float16, np.float32, np.uint32)
 _ATTRIBUTE_TYPES = (
     str,
@@ -94,15 +87,11 @@ def read_exr(path: str | os.PathLike) -> ExrImage:
         headers = read_headers(file, str(path))
         for header in headers:
             if header.deep:
-                raise NgptError(
-                    f"{path}: {header.label} is a deep image; flatten it first, or render without deep output"
-                )
+                raise NgptError(f"{path}: {header.label} is a deep image; flatten it, or render without deep output")
             for name, (_, step) in header.channels.items():
                 if step != (1, 1):
-                    raise NgptError(
-                        f"{path}: channel '{name}' of {header.label} is subsampled {step[0]}x{step[1]}; "
-                        "save the image as R G B at full size"
-                    )
+                    where = f"{path}: channel '{name}' of {header.label}"
+                    raise NgptError(f"{where} is subsampled {step[0]}x{step[1]}; save R G B at full size")
         try:
             parts = _decode(file, path, headers)
         finally:
@@ -295,9 +284,8 @@ def _fits(value: Any) -> bool:
         case tuple():
             return all(map(_fits, value))
         case list():
-            return all(isinstance(item, str) for item in value) or all(
-                isinstance(item, float) and _fits(item) for item in value
-            )
+            texts = all(isinstance(item, str) for item in value)
+            return texts or all(isinstance(item, float) and _fits(item) for item in value)
         case np.ndarray():
             floating = value.dtype in (np.float32, np.float64)
             vector = value.shape in ((2,), (3,)) and (floating or value.dtype == np.int32)

@@ -104,13 +104,8 @@ def reduced(image: ExrImage, k: int, stacks: Sequence[GradientStack]) -> ExrImag
             for name, found in stack.source.resolution.items():
                 part = stack.source.image.parts[found.part]
                 known |= {id(part.channels[channel]): name for channel in found.channels if channel in part.channels}
-    headers = [part.header for part in image.parts]
-    listed = [
-        str(header[key])
-        for header in headers
-        for key in header
-        if key.startswith("cryptomatte/") and key.endswith("/name")
-    ]
+    attributes = [(key, value) for part in image.parts for key, value in part.header.items()]
+    listed = [str(value) for key, value in attributes if re.fullmatch("cryptomatte/.*/name", key)]
     return ExrImage([_reduced_part(part, k, known, listed, stacks[0].path) for part in image.parts])
 
 

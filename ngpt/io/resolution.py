@@ -88,7 +88,7 @@ def resolve(
         if name not in LAYERS:
             meant = did_you_mean(name, LAYERS)
             raise NgptError(
-                f"{path}: --layer {name}=...: no layer is called '{name}'; {meant}use one of {', '.join(LAYERS)}"
+                f"{path}: --layer {name}=...: there is no layer '{name}'; {meant}use one of {', '.join(LAYERS)}"
             )
     found: Resolution = {}
     home = _Home(None)
@@ -136,9 +136,8 @@ def resolve_alone(parts: Parts, name: str, path: str) -> Found:
             return found
     candidates = list(_distinct(layer, sorted(groups, key=lambda group: group.name != "")))
     if not candidates:
-        raise NgptError(
-            f"{path}: no layer with channels {' '.join(layer.channels)} for '{name}'; the file holds {_listing(groups)}"
-        )
+        channels = " ".join(layer.channels)
+        raise NgptError(f"{path}: no layer for '{name}' with channels {channels}; the file holds {_listing(groups)}")
     if len(candidates) > 1 and candidates[0].name:
         names = ", ".join(f'"{candidate.name}"' for candidate in candidates)
         raise NgptError(f"{path}: layer '{name}' could be any of {names}; write a file with one of them")
@@ -261,10 +260,8 @@ def _chosen(layer: Layer, text: str, groups: list[_Group], home: _Home, path: st
             factors = tuple(float((term[1] or "") + (term[2] or "1")) for term in terms if term)
             return Found(part, channels, text, factors)
     wanted, meant = f'--layer {layer.name}="{text}"', did_you_mean(text, {group.name for group in groups} - {text})
-    raise NgptError(
-        f"{path}: {wanted} fits no layer with channels {' '.join(layer.channels)}; "
-        f"{meant}the file holds {_listing(groups)}"
-    )
+    needed = " ".join(layer.channels)
+    raise NgptError(f"{path}: {wanted} fits no layer with channels {needed}; {meant}the file holds {_listing(groups)}")
 
 
 def _places(channel: str, groups: list[_Group]) -> set[tuple[int, str]]:
@@ -352,7 +349,7 @@ def _channels(layer: Layer, group: _Group, only: tuple[str, ...], path: str) -> 
         twice = next((channels for channels in held if len(channels) > 1), None)
         if twice:
             raise NgptError(
-                f"{path}: layer '{layer.name}' has one channel twice, {' and '.join(twice)}; remove or rename one"
+                f"{path}: layer '{layer.name}' has one channel twice, {' and '.join(twice)}; remove one of them"
             )
         return tuple(channels[0] for channels in held)
     return ()

@@ -105,9 +105,8 @@ def replaced_layer(resolution: Resolution, view: View, origin: str, into: str | 
     Raises NgptError unless ``into`` fits one layer of colour.
     """
     primal, others = resolution["primal"], layers_of_light(view.parts, resolution)
-    root, kept = (
-        tuple(view.channel(view.first, start + c) for c in channels_like(primal)) for start in ("", "primal.")
-    )
+    names = channels_like(primal)
+    root, kept = (tuple(view.channel(view.first, start + c) for c in names) for start in ("", "primal."))
     moved = primal.part == view.first and primal.channels == kept
     own = {} if moved or (primal.part, primal.channels) == (view.first, root) else {primal.name: primal}
     if into == "root":

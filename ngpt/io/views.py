@@ -78,9 +78,7 @@ def choose_views(views: Sequence[View], wanted: str | None, path: str) -> list[V
     if found := [view for view in views if view.name == wanted]:
         return found
     names = ", ".join(view.name for view in views)
-    raise NgptError(
-        f"{path}: has no view '{wanted}'; " + (f"it has {names}" if names else "it has one view of no name")
-    )
+    raise NgptError(f"{path}: has no view '{wanted}'; it has {names or 'only one, without a name'}")
 
 
 def _eyes(parts: Sequence[Part]) -> list[str]:

@@ -40,9 +40,8 @@ def write_evaluation_report(folder: str | os.PathLike, output: str | os.PathLike
         raise NgptError(f"{folder / 'results.json'}: no cell has a picture, so there is nothing to show")
     versions = results["metadata"].get("versions", {})
     footer = {"date": results["date"], **{key: str(value) for key, value in versions.items()}}
-    footer |= {
-        key: str(results["metadata"][key]) for key in ("cpu", "threads", "commit") if results["metadata"].get(key)
-    }
+    metadata = results["metadata"]
+    footer |= {key: str(metadata[key]) for key in ("cpu", "threads", "commit") if metadata.get(key)}
     footer["pictures"] = f"first seed; {', '.join(map(str, shown))} spp of {', '.join(map(str, counts))}"
     overview = Overview(_tables(results), _formulas(results))
     title, command = results["title"], results["command"]

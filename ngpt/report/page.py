@@ -158,9 +158,8 @@ def _check(path: Path, scene: Scene) -> None:
     for entry in scene.entries:
         for name, values in entry.maps.items():
             if values.shape != size:
-                raise NgptError(
-                    f"{path}: scene '{scene.name}', map '{name}' of '{entry.name}' is {values.shape}, expected {size}"
-                )
+                where = f"scene '{scene.name}', map '{name}' of '{entry.name}'"
+                raise NgptError(f"{path}: {where} is {values.shape}, expected {size}")
     for name, layer in scene.layers.items():
         if layer.shape not in (size, (*size, 1), (*size, 3)):
             raise NgptError(f"{path}: scene '{scene.name}', layer '{name}' is {layer.shape}, expected {size} pixels")

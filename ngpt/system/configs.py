@@ -36,6 +36,4 @@ def find_config(name: str, kind: str) -> Path:
     if os.path.isdir(name):
         raise NgptError(f"{name}: is a directory; name a file in it, or one of: {', '.join(known)}")
     meant = did_you_mean(stem, known)
-    raise NgptError(
-        f"{name}: cannot be read: no such file; {meant}configurations that come with ngpt: {', '.join(known)}"
-    )
+    raise NgptError(f"{name}: cannot be read: no such file; {meant}ngpt has the configurations: {', '.join(known)}")

@@ -78,9 +78,7 @@ def _check_address_space() -> None:
     """Raises NgptError for a limit (``ulimit -v``) at which the libraries we load hang or abort, OpenBLAS first."""
     limit = address_space()
     if limit is not None and limit < FEWEST_MIB << 20:
-        raise NgptError(
-            f"the address space is limited to {limit >> 20} MiB (ulimit -v); ngpt needs at least {FEWEST_MIB}"
-        )
+        raise NgptError(f"the address space has only {limit >> 20} MiB (ulimit -v); ngpt needs at least {FEWEST_MIB}")
 
 
 def tell(line: str) -> None:
