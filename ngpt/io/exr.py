@@ -178,15 +178,13 @@ def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: 
         raise NgptError(f"{file}: {name} is not a colour to display, and this is {kind}; save it as .exr or .pfm")
     found = resolve_alone([(part.name, list(part.channels)) for part in parts], name, str(file))
     layer = gather(parts[found.part], found.channels)
+    here, there = data_window(main), data_window(parts[found.part])
     if layer.shape[:2] != (stack.height, stack.width):
-        size = f"{layer.shape[1]}x{layer.shape[0]}"
+        size, expected = f"{layer.shape[1]}x{layer.shape[0]}", f"{stack.width}x{stack.height}"
+        raise NgptError(f"{file}: {name} is {size} but {stack.path} is {expected}; render them at one size")
+    if here != there:
         raise NgptError(
-            f"{file}: {name} is {size} but {stack.path} {stack.width}x{stack.height}; render them at one size"
-        )
-    here, there = main.header["dataWindow"], parts[found.part].header["dataWindow"]
-    if not np.array_equal(here, there):
-        raise NgptError(
-            f"{file}: {name} starts at pixel {_corner(there)}, {stack.path} at {_corner(here)}; crop them alike"
+            f"{file}: {name} starts at pixel {there.corner} but {stack.path} at {here.corner}; crop them alike"
         )
     return layer
 
@@ -387,7 +385,3 @@ def _light(stack: GradientStack) -> dict[str, tuple[ExrPart, tuple[str, ...]]]:
     parts = stack.source.image.parts
     found = find_light(stack.source.view.parts, stack.source.resolution)
     return {name: (parts[place.part], place.channels) for name, place in found.items()}
-
-
-def _corner(window: tuple[np.ndarray, np.ndarray]) -> str:
-    return f"({window[0][0]}, {window[0][1]})"

@@ -1,4 +1,4 @@
-"""Files of frames in a folder or by a pattern, in the order of their numbers."""
+"""The frames of a shot in a folder or by a pattern, in the order of their numbers."""
 
 import glob
 import os
@@ -12,12 +12,12 @@ from ngpt.io.framenames import NUMBER, frames_named, varies
 from ngpt.io.header import read_headers
 from ngpt.system.reading import regular_file
 
-# The suffix that `ngpt denoise` appends to the name of its input. Files with it are results, not frames to denoise.
+# The suffix that `ngpt denoise` appends to the name of its input. Files with this suffix are results.
 RESULT_SUFFIX = "_denoised"
 
 
 class Series(NamedTuple):
-    """Files whose names differ in one number: ``name`` has # in its place; ``files`` are in order."""
+    """Files whose names differ in one number, in order, and these numbers. ``name`` has # in place of the number."""
 
     name: str
     files: list[Path]
@@ -25,50 +25,54 @@ class Series(NamedTuple):
 
 
 def natural(name: object) -> tuple:
-    """A key that sorts names as people do: numbers as numbers, f.2 before f.10, f.-2 before f.-1."""
+    """A sort key that compares numbers in names as numbers: f.2 comes before f.10, and f.-2 before f.-1."""
     path = Path(str(name))
     texts = NUMBER.split(str(path.with_suffix("")))
     return tuple(int(text) if i % 2 else text for i, text in enumerate(texts)), path.suffix, str(path)
 
 
 def is_shot(name: str) -> bool:
-    """Whether a name means several files: a folder, a name of frames, or a pattern that is not the name of a file."""
+    """Whether a name stands for several files: a folder, a name with a field for frames, or a pattern.
+
+    A pattern that is also the name of a file stands for that file.
+    """
     return Path(name).is_dir() or varies(name) or (glob.has_magic(name) and not Path(name).exists())
 
 
 def shot_files(name: str) -> list[Path]:
-    """The frames of a folder (its .exr files) or a pattern, in order, without hidden files such as macOS's ``._*``.
+    """The frames of a folder (its .exr files) or of a pattern, in order.
 
-    Patterns are shell patterns or names of frames (``ngpt.io.framenames``). Folders and files with exactly that name
-    win, also within a pattern: ``dir[1]/*.exr``. Results in the folder of their inputs (``*_denoised``) are left out.
-    Raises NgptError where there are none.
+    Patterns are shell patterns or names with fields (``ngpt.io.framenames``). A folder that exists is taken literally,
+    also in a pattern: ``dir[1]/*.exr``. Hidden files such as macOS's ``._*``, and results in the folder of their inputs
+    (``*_denoised``), are left out. Raises NgptError if there are no frames.
     """
-    return in_order(without_results(_files(name)) or _none(name, "no .exr files there"))
+    if found := without_results(_files(name)):
+        return in_order(found)
+    raise NgptError(f"{name}: no .exr files there")
 
 
 def input_files(name: str) -> list[Path]:
-    """The files to denoise: ``shot_files`` without any results of ``ngpt denoise``."""
-    found = [path for path in _files(name) if not path.stem.endswith(RESULT_SUFFIX)]
-    return in_order(found or _none(name, "no .exr files to denoise there; name other formats, such as '*.pfm'"))
+    """The files to denoise: like ``shot_files``, but without any results of ``ngpt denoise``."""
+    if found := [path for path in _files(name) if not path.stem.endswith(RESULT_SUFFIX)]:
+        return in_order(found)
+    raise NgptError(f"{name}: no .exr files to denoise there; name other formats, such as '*.pfm'")
 
 
 def without_results(files: Sequence[Path]) -> list[Path]:
-    """The files, without results in the folder of their inputs."""
-    known = set(files)
-    inputs = {path: path.with_name(frame_name(path) + path.suffix) for path in files}
-    return [path for path in files if inputs[path] == path or inputs[path] not in known]
+    """The files, without results whose inputs are also among them."""
+    results = {path.with_name(f"{path.stem}{RESULT_SUFFIX}{path.suffix}") for path in files}
+    return [path for path in files if path not in results]
 
 
 def frame_name(path: Path) -> str:
-    """The name that the files of one frame share: without the ending and without a result's suffix."""
+    """The name of a file without its ending and without the suffix of results: all files of a frame share it."""
     return path.stem.removesuffix(RESULT_SUFFIX)
 
 
 def in_order(files: Iterable[Path]) -> list[Path]:
-    """Files in the order of their frames: by the attribute ``ngpt:frame`` if all have different ones, else by their
-    names.
+    """Files in the order of their frames: by the attribute ``ngpt:frame`` if all differ in it, else by their names.
 
-    Frames of several series, whose names differ in more than one number, come one series after the other.
+    If the names differ in more than one number, the files form several series, which follow one another.
     """
     given = list(files)
     frames = {path: frame for path in given if (frame := _frame(path)) is not None} if len(given) > 1 else {}
@@ -84,7 +88,7 @@ def in_order(files: Iterable[Path]) -> list[Path]:
 def series(files: Iterable[Path]) -> list[Series]:
     """The series among files, in natural order of their first names.
 
-    If a name has several numbers, the last one that differs among similar names counts the frames: ``take2.0007``.
+    If a name has several numbers, like ``take2.0007``, the last one that differs among similar names is the frame's.
     """
     alike: dict[str, list[Path]] = {}
     for path in sorted(files, key=natural):
@@ -106,9 +110,9 @@ def series(files: Iterable[Path]) -> list[Series]:
 
 
 def remarks(name: str, files: Sequence[Path], results: bool = True) -> list[str]:
-    """Warnings about the frames of a shot, one line each, before they are shown or blended; none if all is well.
+    """Warnings about the frames of a shot, one line each: omitted results, several series, missing numbers.
 
-    ``results``  whether to say how many results were left out
+    ``name`` is the folder or pattern, ``files`` are its frames. ``results`` is whether omitted results are counted.
     """
     said = []
     if left := len(set(_files(name)) - set(files)) if results else 0:
@@ -141,7 +145,7 @@ def _files(name: str) -> list[Path]:
 
 
 def _with_literals(path: Path) -> str:
-    """A pattern whose leading folders are taken literally where they exist: ``dir[1]/*.exr``."""
+    """A pattern in which leading folders that exist are escaped: ``dir[1]/*.exr``."""
     known, parts = Path(), []
     for part in path.parts:
         if not (known / part).exists():
@@ -151,13 +155,8 @@ def _with_literals(path: Path) -> str:
     return os.path.join(*parts, *path.parts[len(parts) :])
 
 
-def _none(name: str, what: str) -> list[Path]:
-    raise NgptError(f"{name}: {what}")
-
-
 def _frame(path: Path) -> float | None:
-    """The attribute ``ngpt:frame`` of a file; None if it has none or cannot be read: the code that reads the file later
-    reports that."""
+    """The attribute ``ngpt:frame`` of a file; None if it has none, or if its header cannot be read."""
     try:
         with regular_file(path) as file:
             numbers = [part.number("ngpt:frame") for part in read_headers(file, str(path))]

@@ -1,7 +1,7 @@
-"""Headers of OpenEXR files, read without OpenEXR, to limit the size of a file before it is decoded.
+"""Reads headers of OpenEXR files without the library OpenEXR, to check their sizes before pixels are decoded.
 
-A header of some hundred bytes can ask for a terabyte, or for a hundred thousand channels. Limits here are far above
-what renderers write. Layout of the format: https://openexr.com/en/latest/OpenEXRFileLayout.html
+A header of some hundred bytes can announce a terabyte, or a hundred thousand channels. The limits are far above the
+sizes that renderers write. Layout of the format: https://openexr.com/en/latest/OpenEXRFileLayout.html
 """
 
 import os
@@ -22,9 +22,8 @@ MAX_TILE = 2**20  # pixels of a tile that is larger than its image
 MAGIC = b"\x76\x2f\x31\x01"
 _DEEP, _MULTIPART = 0x800, 0x1000
 _TYPES = {0: 4, 1: 2, 2: 4}  # uint, half, float: bytes
-# Number of the compression -> lines in a chunk, and the most bytes that a byte of a file can stand for. The bound is
-# 1032 for deflate and 64 for run lengths. Other compressions store blocks without detail in very few bytes, so their
-# bounds are generous.
+# Number of the compression -> lines in a chunk, and the most bytes of an image that one byte of the file can hold: 1032
+# for deflate, 64 for run lengths, and generous bounds for others, which store flat blocks in very few bytes.
 _COMPRESSIONS = {
     **{0: (1, 1), 1: (1, 64), 2: (1, 1032), 3: (16, 1032), 4: (32, 2**12), 5: (16, 2**11), 6: (32, 12), 7: (32, 12)},
     **{8: (32, 2**16), 9: (256, 2**16), 10: (256, 2**16), 11: (32, 2**16)},
@@ -34,17 +33,17 @@ _COMPRESSIONS = {
 
 @dataclass(frozen=True)
 class PartHeader:
-    """The entries of a part's header that determine its size.
+    """The header of a part of a file.
 
-    ``name``      "" if it has none
+    ``name``      its name; "" if it has none
     ``label``     "part 0 'left'", for messages
-    ``size``      (width, height) of the data window
+    ``size``      (width, height) of the data window in pixels
     ``channels``  name -> (bytes of a value, x and y step of its subsampling)
     ``deep``      whether pixels hold lists of samples
-    ``chunks``    pieces that its full-size image is stored in
-    ``table``     number of entries in the table of offsets of pieces, including those of smaller levels if known
-    ``tiled``     whether pieces are tiles
-    ``ratio``     the most bytes of image that one byte of the file can stand for
+    ``chunks``    number of chunks of the full-size image
+    ``table``     number of entries in the table of offsets, which may also have the chunks of smaller levels
+    ``tiled``     whether chunks are tiles
+    ``ratio``     the most bytes of an image that one byte of the file can hold
     ``attributes``  name -> type and data, as they are in the file
     """
 
@@ -60,18 +59,18 @@ class PartHeader:
     attributes: dict[str, tuple[str, bytes]]
 
     def number(self, attribute: str) -> float | None:
-        """An attribute that is a number; None if it is absent."""
+        """The value of an attribute; None if it is absent or no number."""
         kind, data = self.attributes.get(attribute, ("", b""))
         code = {"int": "<i", "float": "<f", "double": "<d"}.get(kind)
         return struct.unpack(code, data)[0] if code and len(data) == struct.calcsize(code) else None
 
     def text(self, attribute: str) -> str:
-        """An attribute that is a string; "" if it is absent."""
+        """The value of an attribute; "" if it is absent or no string."""
         kind, data = self.attributes.get(attribute, ("", b""))
         return data.decode(errors="replace") if kind == "string" else ""
 
     def texts(self, attribute: str) -> list[str]:
-        """The complete strings of an attribute that is a list of strings; none if it is absent."""
+        """The strings of an attribute; none if it is absent or no list of strings."""
         kind, data = self.attributes.get(attribute, ("", b""))
         found = []
         while kind == "stringvector" and len(data) >= 4:
@@ -87,10 +86,10 @@ class PartHeader:
 
 
 def read_headers(file: BinaryIO, path: str) -> list[PartHeader]:
-    """The headers of an open file's parts, after checks that the file is small enough to be decoded.
+    """The headers of the parts of an open file.
 
-    Raises NgptError if the file is not OpenEXR, if a header is damaged or contradicts itself or the file's length, if
-    it exceeds a limit above, and if the pixels need more than half of the memory.
+    Raises NgptError if the file is not OpenEXR, if a header is damaged or does not fit the length of the file, if it
+    exceeds a limit above, and if the pixels would need more than half of the memory.
     """
     magic = file.read(4)
     if not magic:
@@ -120,11 +119,11 @@ def read_headers(file: BinaryIO, path: str) -> list[PartHeader]:
 
 
 class _Damage(Exception):
-    """The damage of a header, in a few words."""
+    """A damaged header; the message is a phrase."""
 
 
 class _Excess(Exception):
-    """The size that exceeds a limit, in a few words."""
+    """A size beyond a limit; the message is a phrase."""
 
 
 def _headers(file: BinaryIO, flags: int) -> Iterator[dict[bytes, tuple[bytes, bytes]]]:
@@ -149,7 +148,7 @@ def _headers(file: BinaryIO, flags: int) -> Iterator[dict[bytes, tuple[bytes, by
             attributes[name] = kind, data
         if attributes:
             yield attributes
-        # Headers of several parts end with an empty one.
+        # In a file of several parts, an empty header follows the last one.
         if not (flags & _MULTIPART and attributes):
             return
 
@@ -165,6 +164,8 @@ def _string(file: BinaryIO) -> bytes:
 
 
 def _part(index: int, attributes: dict[bytes, tuple[bytes, bytes]], flags: int) -> PartHeader:
+    """The header of part number ``index``, from its attributes and the flags of the file."""
+
     def data(name: str, kind: str) -> bytes:
         if attributes.get(name.encode(), (b"",))[0] != kind.encode():
             raise _Damage(f"part {index} has no '{name}' of type {kind}")
@@ -187,7 +188,7 @@ def _part(index: int, attributes: dict[bytes, tuple[bytes, bytes]], flags: int) 
         across, down = struct.unpack_from("<2I", data("tiles", "tiledesc"))
         if not (0 < across < 2**31 and 0 < down < 2**31):
             raise _Damage(f"{label} has tiles of {across}x{down} pixels")
-        # OpenEXR allocates whole tiles, even if the image covers only a corner of one.
+        # OpenEXR allocates memory for whole tiles, even if the image covers only a corner of one.
         if across * down > max(MAX_TILE, 4 * width * height):
             raise _Excess(f"{label} is {width}x{height} pixels in tiles of {across}x{down}")
         chunks = -(-width // across) * -(-height // down)
@@ -220,7 +221,7 @@ def _channels(data: bytes, label: str) -> Iterator[tuple[str, tuple[int, tuple[i
 
 
 def check_size(parts: list[PartHeader], length: int, path: str) -> None:
-    """Raises NgptError for parts that a file of ``length`` bytes cannot hold, and for parts beyond the limits above."""
+    """Raises NgptError for parts beyond the limits above, and for parts that a file of ``length`` bytes cannot hold."""
     if not parts:
         raise NgptError(f"{path}: damaged or incomplete (it has no parts); render or copy it again")
     for part in parts:
@@ -235,8 +236,8 @@ def check_size(parts: list[PartHeader], length: int, path: str) -> None:
         raise NgptError(f"{path}: has {channels} channels, and {MAX_CHANNELS} are read at most; keep those you need")
     if any(part.deep for part in parts):
         return
-    # The least length of the file: 16 bytes for each chunk (its entry in a table, and its size and place), and the data
-    # of all pixels, compressed as far as possible.
+    # The least length of the file: 16 bytes for each chunk (its entry in the table, its size and its place), and the
+    # data of all pixels at the highest compression.
     least = sum(16 * part.chunks + (part.bytes // part.ratio) for part in parts)
     wanted = sum(part.bytes for part in parts)
     if least > length:

@@ -1,10 +1,7 @@
-"""Decodes images from strangers in a separate process, so that a file that crashes or stalls the decoder does no harm
-here.
+"""Decodes untrusted images in another process, so that a file that crashes or stalls the decoder does no harm here.
 
-The other process reads the file and writes an uncompressed copy to a folder that only this user can read; this process
-reads the copy. The memory (on Linux) and the time of the other process are limited. If it dies, NgptError is raised.
-
-    python -P -m ngpt.io.isolated FILE COPY BYTES         the other process
+The other process, which runs this module, reads the file and writes an uncompressed copy into a folder that only this
+user can read. This process reads the copy. The time of the other process is limited, and on Linux also its memory.
 """
 
 import json
@@ -30,16 +27,16 @@ _REFUSED = 3
 
 
 def read_exr_isolated(path: str | os.PathLike) -> ExrImage:
-    """Returns the same as ``read_file``, except that headers of mipmaps become headers of tiles with one level.
+    """Returns the same as ``read_file``, except that mipmaps have only one level in their headers.
 
-    Raises NgptError where ``read_file`` does, and if the decoder crashes, runs out of memory or takes too long.
+    Raises NgptError as ``read_file`` does, and if the decoder crashes, runs out of memory or takes too long.
     """
     path = Path(path)
     with regular_file(path) as file:
         size = sum(header.bytes for header in file_headers(file, str(path)))
     with tempfile.TemporaryDirectory(prefix="ngpt-") as folder:
         copy = Path(folder) / "copy.exr"
-        # -P keeps the current folder out of the module path: a folder of strangers' files may hold a numpy.py.
+        # -P keeps the current folder out of the module path: a folder of untrusted files may hold a numpy.py.
         command = [sys.executable, "-P", "-m", "ngpt.io.isolated", str(path), str(copy), str(_BASE + 3 * size)]
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in map(os.path.abspath, sys.path) if p)}
         seconds = _SECONDS + size / 10e6
@@ -52,14 +49,15 @@ def read_exr_isolated(path: str | os.PathLike) -> ExrImage:
         if done.returncode:
             raise NgptError(f"{path}: decoding it failed ({_cause(done)}); it is damaged or an attack: do not use it")
         image = read_exr(copy)
-        told = json.loads(done.stdout)
+        headers = json.loads(done.stdout)
     tell_conversion(path)
-    for part, (compression, order) in zip(image.parts, told, strict=True):
+    for part, (compression, order) in zip(image.parts, headers, strict=True):
         part.header.update(compression=OpenEXR.Compression(compression), lineOrder=OpenEXR.LineOrder(order))
     return image
 
 
 def _cause(done: subprocess.CompletedProcess) -> str:
+    """The signal that ended the other process, or the last line of its messages."""
     if done.returncode < 0:
         return f"killed by {signal.Signals(-done.returncode).name}"
     lines = done.stderr.decode(errors="replace").strip().splitlines()
@@ -67,17 +65,18 @@ def _cause(done: subprocess.CompletedProcess) -> str:
 
 
 def _main(path: str, copy: str, limit: str) -> int:
+    """The other process: writes a copy of ``path``, using ``limit`` bytes of memory at most, and prints its headers."""
     limit_address_space(int(limit))
     try:
         image = read_file(path)
-        told = [(int(part.header["compression"]), int(part.header["lineOrder"])) for part in image.parts]
+        headers = [(int(part.header["compression"]), int(part.header["lineOrder"])) for part in image.parts]
         for part in image.parts:
             part.header.update(compression=OpenEXR.NO_COMPRESSION, lineOrder=OpenEXR.INCREASING_Y)
         write_exr(copy, image)
     except NgptError as error:
         sys.stdout.buffer.write(os.fsencode(str(error).replace(copy, path)))
         return _REFUSED
-    print(json.dumps(told))
+    print(json.dumps(headers))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Layers in a file: where the layers of a stack are, how they become arrays, and how arrays become channels."""
+"""Layers in a file: their places, and the conversion between layers (H, W, C) and channels (H, W)."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ _ROWS = 16  # gathered at a time
 
 @dataclass(frozen=True)
 class StackSource:
-    """The file that a stack was read from, the places of the layers in it, and the view that the stack shows."""
+    """The file that a stack was read from, the places of its layers there, and the view of the file that it shows."""
 
     image: ExrImage
     resolution: Resolution
@@ -35,17 +35,16 @@ def file_views(image: ExrImage) -> list[View]:
 
 
 def place_of(part: ExrPart) -> Place:
-    """The place of a part: where its pixels lie."""
+    """The data window, the display window and the pixels' aspect of a part."""
     display = Window.of_box(part.header["displayWindow"])
     return Place(data_window(part), display, float(part.header.get("pixelAspectRatio", 1.0)))
 
 
 def gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:
-    """Returns the channels ``names`` as one array (H, W, C) float32."""
+    """The channels ``names`` as one array (H, W, C) float32."""
     channels = [part.channels[name] for name in names]
     layer = np.empty((*channels[0].shape, len(channels)), np.float32)
-    # Some rows at a time: the values of one channel are then still in the cache when the next channel is written
-    # between them.
+    # Some rows at a time, so that these rows are still in the cache when the next channel is written.
     for top in range(0, len(layer), _ROWS):
         rows = slice(top, top + _ROWS)
         for index, channel in enumerate(channels):
@@ -54,7 +53,7 @@ def gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:
 
 
 def taken(image: ExrImage, found: Found, main: int) -> np.ndarray:
-    """A layer of a file, (H, W, C) float32, on the pixels of part ``main``: 0 where the layer's part has no pixels."""
+    """A layer of a file, (H, W, C) float32, on the pixels of the part ``main``; 0 where the layer has no pixels."""
     layer = gather(image.parts[found.part], found.channels)
     layer = put(layer, data_window(image.parts[found.part]), data_window(image.parts[main]))
     return layer * np.asarray(found.factors, np.float32) if found.factors else layer
@@ -65,24 +64,23 @@ def data_window(part: ExrPart) -> Window:
 
 
 def as_stored(image: ExrImage, found: Found, main: int) -> bool:
-    """Whether ``taken`` leaves the channels of a layer unchanged: they have no factors and lie on the same pixels."""
+    """Whether ``taken`` returns the channels of a layer unchanged: it has no factors and lies on the same pixels."""
     return not found.factors and data_window(image.parts[found.part]) == data_window(image.parts[main])
 
 
 def holds(part: ExrPart, names: tuple[str, ...], values: np.ndarray) -> bool:
     """Whether the channels ``names``, as float32, are bit for bit the float32 ``values`` (H, W, C)."""
-    if values.dtype != np.float32:
+    if values.dtype != np.float32 or values.shape[:2] != part.channels[names[0]].shape:
         return False
-    return values.shape[:2] == part.channels[names[0]].shape and all(
-        np.array_equal(part.channels[name].astype(np.float32, copy=False).view(np.uint32), bits)
-        for name, bits in zip(names, np.moveaxis(values.view(np.uint32), -1, 0), strict=True)
-    )
+    held = (part.channels[name].astype(np.float32, copy=False) for name in names)
+    bits = np.moveaxis(values.view(np.uint32), -1, 0)
+    return all(np.array_equal(one.view(np.uint32), other) for one, other in zip(held, bits, strict=True))
 
 
 def scatter(part: ExrPart, names: tuple[str, ...], values: np.ndarray, half: bool) -> None:
-    """Puts ``values`` (H, W, C) into the channels ``names``: as half if asked to and half can hold them, else float.
+    """Puts ``values`` (H, W, C) into the channels ``names``, as float, or as ``half`` if half can hold them.
 
-    Raises NgptError for colours if one channel stands for all three.
+    Raises NgptError for colours if the file has one channel for all three.
     """
     grey = np.broadcast_to(values[..., :1], values.shape)
     if len({*names}) < len(names) and not np.array_equal(values, grey, equal_nan=True):
@@ -90,8 +88,7 @@ def scatter(part: ExrPart, names: tuple[str, ...], values: np.ndarray, half: boo
     if half:
         peak = np.abs(values[np.isfinite(values)]).max(initial=0.0)
         half = peak <= _HALF_MAX and not 0.0 < peak < _HALF_NORMAL_MIN
-    # Variances in double precision may exceed the range of float. They become infinite in files, which counts as
-    # unknown.
+    # Variances in double precision that float cannot hold become infinite in files, which counts as unknown.
     with np.errstate(over="ignore"):
         for index, name in enumerate(names):
             part.channels[name] = np.ascontiguousarray(values[..., index], dtype=np.float16 if half else np.float32)

@@ -1,13 +1,13 @@
-"""OpenEXR files, verbatim.
+"""Reads and writes OpenEXR files without changing their contents.
 
-A read and a write keep the contents of a file: parts, channels of every type, attributes of every type that Python's
-OpenEXR knows, data and display windows, tiles, line order. The exceptions, as docs/use/gradient-stack.md lists them:
-lossy compression becomes ZIP, only the full-size level of a mipmap is kept, attributes that are empty lists are
-dropped, and rationals are reduced (48/2 becomes 24/1).
+Parts, channels of all types, attributes of all types that Python's OpenEXR knows, data and display windows, tiles and
+line order are kept. There are four exceptions (docs/use/gradient-stack.md): lossy compression becomes ZIP, only the
+full-size level of a mipmap is kept, attributes that are empty lists are dropped, and rationals are reduced (48/2
+becomes 24/1).
 
-Deep images and subsampled channels are refused. OpenEXR holds whole files in memory. It returns the readable parts of a
-damaged file as if there were no others; here a damaged file is an error. While a file is read, output of other threads
-to stdout or stderr is lost, because OpenEXR's own messages are suppressed there.
+Deep images and subsampled channels are refused. OpenEXR holds whole files in memory. It would return only the readable
+parts of a damaged file; here a damaged file is an error. While a file is read, output of other threads to stdout or
+stderr is lost, because OpenEXR's own messages are suppressed there.
 """
 
 import contextlib
@@ -47,13 +47,13 @@ _ATTRIBUTE_TYPES = (
     OpenEXR.TileDescription,
     OpenEXR.TimeCode,
 )
-# The folder where Linux names open files by their number; opening such a name opens the file again. Only Linux has it.
+# The folder where Linux names open files by their numbers: opening such a name opens the same file again
 _NUMBERS = Path("/proc/self/fd")
-# Two calls at once would end each other's threads, and restore each other's stdout and stderr instead of the program's.
-# OpenEXR keeps Python's lock anyway.
+# Two calls at once would end each other's threads and mix up stdout and stderr. Since OpenEXR holds Python's lock, they
+# would not be faster either.
 _one_at_a_time = threading.Lock()
 hold_while_forking(_one_at_a_time)
-# MiB of address space that a thread may reserve, for its stack and its share of the heap.
+# MiB of address space that a thread may reserve for its stack and its part of the heap
 _THREAD = 256
 _FLOAT_MAX = float(np.finfo(np.float32).max)
 openexr_copies.register()
@@ -61,7 +61,7 @@ openexr_copies.register()
 
 @dataclass(frozen=True)
 class ExrPart:
-    """One part: its name ("" if it has none), its header as OpenEXR gives it, and its channels as (H, W) arrays."""
+    """One part: its name ("" if it has none), its header as OpenEXR returns it, and its channels (H, W)."""
 
     name: str
     header: dict[str, Any]
@@ -70,15 +70,15 @@ class ExrPart:
 
 @dataclass(frozen=True)
 class ExrImage:
-    """An OpenEXR file, verbatim."""
+    """The contents of an OpenEXR file."""
 
     parts: list[ExrPart]
 
 
 def read_exr(path: str | os.PathLike) -> ExrImage:
-    """Reads the whole contents of a file. Its size is checked before its pixels are decoded (``ngpt.io.header``).
+    """Reads a file. Its size is checked before its pixels are decoded (``ngpt.io.header``).
 
-    Raises NgptError if the file is missing, not a regular file, damaged, too large, deep or subsampled, and if it
+    Raises NgptError if the file is missing, not a regular file, damaged, too large, deep or subsampled, or if it
     changes while it is read.
     """
     path = Path(path)
@@ -95,7 +95,7 @@ def read_exr(path: str | os.PathLike) -> ExrImage:
         try:
             parts = _decode(file, path, headers)
         finally:
-            # The change explains any other error.
+            # A change is the cause of any other error, so it is reported instead.
             if _state(file) != before:
                 raise NgptError(f"{path}: changed while it was read; wait until its writer is done, and read it again")
     return ExrImage(
@@ -107,7 +107,10 @@ def read_exr(path: str | os.PathLike) -> ExrImage:
 
 
 def read_header(path: str | os.PathLike) -> tuple[dict[str, Any], tuple[int, int]]:
-    """The attributes of a file's first part and its (width, height), without its pixels; raises NgptError."""
+    """The attributes of the first part and its (width, height), without decoding pixels.
+
+    Raises NgptError if the file is missing, damaged or too large.
+    """
     path = Path(path)
     with regular_file(path) as file:
         size = read_headers(file, str(path))[0].size
@@ -116,16 +119,16 @@ def read_header(path: str | os.PathLike) -> tuple[dict[str, Any], tuple[int, int
             with _without_native_stderr():
                 return dict(OpenEXR.File(name, header_only=True).parts[0].header), size
         except Exception as error:
-            reason = (str(error).splitlines() or [type(error).__name__])[0].replace(name, path.name)
-            raise NgptError(f"{path}: cannot be read ({reason}); render or copy it again") from error
+            raise NgptError(f"{path}: cannot be read ({_reason(error, name, path)}); copy it again") from error
 
 
 def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False) -> Path:
     """Writes ``image`` to ``path``, complete or not at all, and returns the path.
 
-    Channels are float16, float32 or uint32 arrays (H, W) in any memory layout. Attributes are str, int (32 bit), float
-    (stored with 32 bit), fractions.Fraction, lists of str or float, tuples and arrays as OpenEXR reads them, and
-    OpenEXR's own types. Raises NgptError for anything that a read could not return unchanged.
+    Channels are float16, float32 or uint32 arrays (H, W) in any memory layout. Attributes are str, int (32 bits), float
+    (stored with 32 bits), fractions.Fraction, lists of str or float, tuples and arrays as OpenEXR reads them, and
+    OpenEXR's own types. Raises NgptError for values that a reader would not get back unchanged, and if the file cannot
+    be written, or exists and ``overwrite`` is False.
     """
     if Path(path).suffix.lower() != ".exr":
         raise NgptError(f"{path}: ngpt writes OpenEXR; let the name end in .exr")
@@ -135,22 +138,23 @@ def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False)
             with _one_at_a_time, _all_cores():
                 OpenEXR.File([OpenEXR.Part(*part) for part in parts]).write(name)
         except Exception as error:
-            reason = (str(error).splitlines() or [type(error).__name__])[0].replace(name, Path(path).name)
-            raise NgptError(f"{path}: cannot be written as OpenEXR: {reason}") from error
+            raise NgptError(f"{path}: cannot be written as OpenEXR: {_reason(error, name, Path(path))}") from error
     return Path(path)
 
 
+def _reason(error: Exception, name: str, path: Path) -> str:
+    """The first line of an error of OpenEXR, which knows the file ``path`` by ``name``."""
+    return (str(error).splitlines() or [type(error).__name__])[0].replace(name, path.name)
+
+
 def _numbered(file: BinaryIO) -> str:
-    """A name for an open file: its own may belong to another file by now, or OpenEXR may be unable to encode it."""
+    """A name for an open file. Its own may belong to another file by now, or OpenEXR may be unable to encode it."""
     return str(_NUMBERS / str(file.fileno())) if _NUMBERS.is_dir() else str(file.name)
 
 
 @contextlib.contextmanager
 def _name_to_write(path: Path) -> Iterator[str]:
-    """``_numbered`` for a file to write.
-
-    Without numbered names, the file stays closed, because an open file may count as in use.
-    """
+    """``_numbered`` for a file to write; on systems without numbers, the file's own name, and the file stays closed."""
     if _NUMBERS.is_dir():
         with open(path, "r+b") as file:
             yield _numbered(file)
@@ -159,12 +163,13 @@ def _name_to_write(path: Path) -> Iterator[str]:
 
 
 def _state(file: BinaryIO) -> tuple[int, int]:
+    """The size of a file and the time of its last change."""
     status = os.fstat(file.fileno())
     return status.st_size, status.st_mtime_ns
 
 
 def _decode(file: BinaryIO, path: Path, headers: list[PartHeader]) -> list[Any]:
-    """The parts as OpenEXR reads them; raises NgptError unless they hold all that ``headers`` announce."""
+    """The parts as OpenEXR reads them. Raises NgptError unless they have the channels and sizes in ``headers``."""
     name = _numbered(file)
     # OpenEXR skips a part whose pixels it cannot read, and only prints a warning to Python's stdout.
     printed = io.StringIO()
@@ -175,9 +180,9 @@ def _decode(file: BinaryIO, path: Path, headers: list[PartHeader]) -> list[Any]:
         size = sum(header.bytes for header in headers) / 2**20
         raise NgptError(f"{path}: out of memory: its channels take {size:.0f} MiB; free some, or cut it up") from error
     except Exception as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0].replace(name, path.name)
+        reason = _reason(error, name, path)
         raise NgptError(f"{path}: cannot be read ({reason}); it may be damaged: render or copy it again") from error
-    # If the two readers of a header disagree, the limits were checked on other sizes.
+    # If OpenEXR reads other sizes than ``ngpt.io.header``, the limits were not checked for these.
     expected = [({*header.channels}, {header.size[::-1]}) for header in headers]
     got = [({*part.channels}, {channel.pixels.shape for channel in part.channels.values()}) for part in parts]
     if got != expected:
@@ -189,7 +194,7 @@ def _decode(file: BinaryIO, path: Path, headers: list[PartHeader]) -> list[Any]:
 
 @contextlib.contextmanager
 def _without_native_stderr() -> Iterator[None]:
-    """Hides text that OpenEXR's C core writes to file descriptor 2: the same text comes as an exception."""
+    """Hides text that OpenEXR's C core writes to file descriptor 2, since an exception has the same text."""
     try:
         kept = os.dup(2)
     except OSError:  # the process has no stderr
@@ -207,10 +212,10 @@ def _without_native_stderr() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _all_cores() -> Iterator[None]:
-    """Lets OpenEXR decode and encode on all cores, which is not its default, with threads that end with the call.
+    """Lets OpenEXR use all cores in the block, which is not its default. Its threads end with the block.
 
-    A forked process would lack threads that outlive the call, and would wait for them for ever. If address space is
-    short, no threads are made. If the caller has set a number of threads, it stays.
+    A process that was forked later would wait for them forever. If address space is short, no threads are made. A
+    number of threads that the program has set is not changed.
     """
     short = free_address_space() < processors() * _THREAD
     if short or OpenEXR.global_thread_count():
@@ -224,7 +229,7 @@ def _all_cores() -> Iterator[None]:
 
 
 def _writable(part: ExrPart, path: str) -> tuple[dict[str, Any], dict[str, Any], str]:
-    """Returns header, channels and name for an OpenEXR.Part that is written unchanged."""
+    """The arguments of OpenEXR.Part, header, channels and name, for a part that is written unchanged."""
     header = {}
     for name, value in part.header.items():
         # OpenEXR makes `channels` itself, trusts a `chunkCount` even if it is outdated, and cannot write empty lists.
@@ -253,7 +258,7 @@ def _writable(part: ExrPart, path: str) -> tuple[dict[str, Any], dict[str, Any],
 
 
 def _attribute(name: str, value: Any, path: str) -> Any:
-    """Returns ``value`` in a form that OpenEXR stores unchanged; it silently wraps, drops or transposes other forms."""
+    """The ``value`` in a form that OpenEXR stores unchanged; it silently wraps, drops or transposes other forms."""
     value = _plain(value)
     if not _fits(value):
         raise NgptError(
@@ -264,7 +269,7 @@ def _attribute(name: str, value: Any, path: str) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Returns NumPy scalars as Python's, and arrays in memory order."""
+    """The value, with NumPy's scalars as Python's, and with contiguous arrays."""
     if isinstance(value, tuple | list):
         return type(value)(_plain(item) for item in value)
     if isinstance(value, np.generic):

@@ -1,39 +1,34 @@
-"""Lets pickle and copy handle OpenEXR's own kinds of header values: stacks that were read from files hold them."""
+"""Lets pickle and copy handle OpenEXR's own types of header values, which stacks from files hold."""
 
 import copyreg
 from typing import Any
 
 import OpenEXR
 
-_TIME = ("hours", "minutes", "seconds", "frame")
-_TIME_CODE = (*_TIME, "dropFrame", "colorFrame", "fieldPhase", "bgf0", "bgf1", "bgf2", "userData")
-
-# The arguments of the constructor, and the attributes that are set afterwards.
-_FIELDS: dict[type, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    OpenEXR.Bytes: (("data", "type_hint"), ()),
-    OpenEXR.Channel: (("name", "xSampling", "ySampling", "pLinear"), ()),  # as in headers, without pixels
-    OpenEXR.KeyCode: (
-        (),
-        ("filmMfcCode", "filmType", "prefix", "count", "perfOffset", "perfsPerFrame", "perfsPerCount"),
-    ),
-    OpenEXR.OpaqueAttribute: (("data", "typeName"), ()),
-    OpenEXR.PreviewImage: (("pixels",), ()),
-    OpenEXR.TileDescription: ((), ("xSize", "ySize", "mode", "roundingMode")),
-    OpenEXR.TimeCode: ((), _TIME_CODE),
+# Types -> the attributes that their constructors take; all other attributes can be set afterwards.
+_CONSTRUCTED: dict[type, tuple[str, ...]] = {
+    OpenEXR.Bytes: ("data", "type_hint"),
+    OpenEXR.Channel: ("name", "xSampling", "ySampling", "pLinear"),  # as in headers, without pixels
+    OpenEXR.KeyCode: (),
+    OpenEXR.OpaqueAttribute: ("data", "typeName"),
+    OpenEXR.PreviewImage: ("pixels",),
+    OpenEXR.TileDescription: (),
+    OpenEXR.TimeCode: (),
 }
 
 
 def register() -> None:
-    for kind in _FIELDS:
+    for kind in _CONSTRUCTED:
         copyreg.pickle(kind, _reduced)
 
 
 def _reduced(value: Any) -> tuple:
-    given, later = ({name: getattr(value, name) for name in names} for names in _FIELDS[type(value)])
-    return _again, (type(value), tuple(given.values()), later)
+    given = _CONSTRUCTED[type(value)]
+    later = [] if given else [name for name, entry in vars(type(value)).items() if getattr(entry, "fset", None)]
+    return _again, (type(value), [getattr(value, name) for name in given], {n: getattr(value, n) for n in later})
 
 
-def _again(kind: type, given: tuple, later: dict[str, Any]) -> Any:
+def _again(kind: type, given: list, later: dict[str, Any]) -> Any:
     value = kind(*given)
     for name, field in later.items():
         setattr(value, name, field)

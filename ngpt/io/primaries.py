@@ -1,6 +1,6 @@
-"""The primaries of a file, from its header, and the conversion to linear Rec. 709, in which it is shown.
+"""The primaries of a file, from its header, and the conversion to linear Rec. 709, which displays need.
 
-These attributes are read, and the first one present wins: ``acesImageContainerFlag`` (SMPTE ST 2065-4),
+The first of these attributes that is present counts: ``acesImageContainerFlag`` (SMPTE ST 2065-4),
 ``colorInteropID`` (the names of the Color Interop Forum), ``chromaticities`` and ``oiio:ColorSpace`` (OpenImageIO). By
 OpenEXR's rule a file without them has the primaries of Rec. 709:
 https://openexr.com/en/latest/TechnicalIntroduction.html
@@ -17,7 +17,7 @@ from ngpt.stack import GradientStack
 
 _LOG = logging.getLogger(__name__)
 
-# x, y of red, green, blue and white.
+# x, y of red, green, blue and white
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 REC2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
 P3_D65 = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
@@ -25,7 +25,7 @@ ADOBE_RGB = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
 XYZ_D65 = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.3127, 0.3290)  # the name for CIE X, Y, Z themselves
 ACES_AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
 ACES_AP1 = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
-# Names of linear spaces, in lower-case letters and digits only.
+# Names of linear spaces, reduced to lower-case letters and digits
 _NAMES = {
     REC709: "linrec709scene linrec709 linsrgb linearrec709 linearrec709srgb linearsrgb utilitylinearrec709",
     REC2020: "linrec2020scene linrec2020 linearrec2020 utilitylinearrec2020",
@@ -36,19 +36,19 @@ _NAMES = {
     ACES_AP1: "linap1scene linap1 acescg acesacescg",
 }
 _SPACES = {name: primaries for primaries, names in _NAMES.items() for name in names.split()}
-# Names that say nothing about primaries.
+# Names that do not say which primaries are used
 _NO_SPACE = ("", "unknown", "data", "raw", "linear", "scenelinear")
-# Bradford's cone responses, in which one white is adapted to another.
+# Bradford's matrix from CIE XYZ to cone responses, for the adaptation of one white to another
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-BEYOND = 0.01  # from this share of pixels outside Rec. 709 on, an image is denoised in wider primaries
-_SAME = 1e-4  # of a coordinate; files hold 32-bit floats, and standards four digits
+BEYOND = 0.01  # with a larger share of pixels outside Rec. 709, an image is denoised in wider primaries
+_SAME = 1e-4  # the tolerance of coordinates: standards give four digits
 
 
 def to_rec709(attributes: Mapping[str, Any]) -> np.ndarray | None:
-    """The matrix (3, 3) that takes colours of a file with such header attributes to linear Rec. 709.
+    """The matrix (3, 3) that converts colours of a file with these header attributes to linear Rec. 709.
 
-    Returns None if the file is in Rec. 709 already, if its header names no primaries, or if they make no sense, which
-    is logged as a warning. If the two whites differ, Bradford's adaptation maps one to the other.
+    Returns None if the file is in Rec. 709 or its header names no primaries; or, with a warning, if they make no sense.
+    If the whites differ, one is adapted to the other by Bradford's method.
     """
     found = _primaries(attributes)
     if found is None:
@@ -58,17 +58,17 @@ def to_rec709(attributes: Mapping[str, Any]) -> np.ndarray | None:
     try:
         values = np.asarray(found, np.float64).ravel()
         if values.shape != (8,) or not np.isfinite(values).all():
-            raise ValueError("they are no eight numbers")
+            raise ValueError("these are not eight numbers")
         if np.abs(values - REC709).max() <= _SAME:
             return None
         return _conversion(values)
     except (ValueError, TypeError, np.linalg.LinAlgError) as error:
-        _LOG.warning("chromaticities %s are left out of account: %s", found, error)
+        _LOG.warning("chromaticities %s are ignored: %s", found, error)
         return None
 
 
 def _primaries(attributes: Mapping[str, Any]) -> Any:
-    """x, y of the primaries and white in a header, unchecked; None if it has none."""
+    """x, y of the primaries and white in a header, not yet checked; None if it has none."""
     if attributes.get("acesImageContainerFlag") == 1:
         return ACES_AP0
     for name in ("colorInteropID", "chromaticities", "oiio:ColorSpace"):
@@ -79,14 +79,14 @@ def _primaries(attributes: Mapping[str, Any]) -> Any:
         if plain in _SPACES:
             return _SPACES[plain]
         if plain not in _NO_SPACE:
-            _LOG.warning("%s '%s' is left out of account: ngpt knows no linear space of that name", name, said)
+            _LOG.warning("%s '%s' is ignored: ngpt knows no linear space of that name", name, said)
     return None
 
 
 def inside_rec709(stack: GradientStack) -> np.ndarray | None:
     """``to_rec709`` of a stack if nearly all of its light is within Rec. 709, else None.
 
-    Light outside Rec. 709 has negative components in it. They cost OIDN more accuracy than other primaries do
+    Light outside Rec. 709 would get negative components, which cost OIDN more accuracy than other primaries do
     (docs/use/pictures.md).
     """
     matrix = to_rec709(stack.attributes)
@@ -110,6 +110,7 @@ def converted(image: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
 
 
 def _conversion(chromaticities: np.ndarray) -> np.ndarray:
+    """The matrix (3, 3) from these primaries and white to Rec. 709. Raises ValueError if they make no sense."""
     theirs, ours = _to_xyz(chromaticities), _to_xyz(np.array(REC709))
     white, aim = (_BRADFORD @ matrix.sum(axis=1) for matrix in (theirs, ours))
     if (white <= 0).any():
@@ -122,7 +123,7 @@ def _conversion(chromaticities: np.ndarray) -> np.ndarray:
 
 
 def _to_xyz(chromaticities: np.ndarray) -> np.ndarray:
-    """Columns: red, green and blue in CIE XYZ, scaled so that their sum is white with Y = 1."""
+    """The matrix (3, 3) to CIE XYZ. Its columns are red, green and blue, scaled so that white has Y = 1."""
     x, y = chromaticities.reshape(4, 2).T
     if (np.abs(y[3]) < 1e-6) or abs(np.linalg.det(np.stack([x, y, 1 - x - y])[:, :3])) < 1e-6:
         raise ValueError("they span no colours")
@@ -130,5 +131,5 @@ def _to_xyz(chromaticities: np.ndarray) -> np.ndarray:
     return columns[:, :3] * np.linalg.solve(columns[:, :3], columns[:, 3] / y[3])
 
 
-# Takes Rec. 709 to ACES AP0, in which no visible colour has negative components.
+# The matrix from Rec. 709 to ACES AP0, in which no visible colour has negative components
 TO_WIDE = np.linalg.inv(_conversion(np.array(ACES_AP0)))

@@ -1,7 +1,7 @@
-"""Layers as raw files that any language reads in three lines, for programs that run networks, and for their tests.
+"""Layers as raw files, which programs in any language can read, for hosts of networks and their tests.
 
-A folder holds NAME.f32 for each layer, float32, little-endian, (1, C, height, width) in C order, and ``layers.json``,
-which lists their shapes and SHA-256 sums.
+A folder holds NAME.f32 for each layer: float32, little-endian, (1, C, H, W) in C order. ``layers.json`` lists their
+shapes and SHA-256 sums.
 """
 
 import hashlib
@@ -20,9 +20,9 @@ LISTING = "layers.json"
 
 
 def write_layers(folder: Path, layers: Mapping[str, np.ndarray], overwrite: bool = False) -> None:
-    """Writes layers (1, C, H, W) into a folder, which is made if there is none; the listing comes last.
+    """Writes layers (1, C, H, W) into a folder, which is made if it does not exist, and the listing last.
 
-    Raises NgptError if the folder cannot be made, or a file exists and may not be overwritten.
+    Raises NgptError if the folder cannot be made, or if a file exists and ``overwrite`` is False.
     """
     if folder.exists() and not folder.is_dir():
         raise NgptError(f"{folder}: is a file; give a folder for the layers")

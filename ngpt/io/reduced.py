@@ -1,19 +1,19 @@
-"""Files made smaller: each K x K pixels become one, by rules that keep the meaning of every channel.
+"""Makes files smaller: each K x K pixels become one, by rules that keep the meaning of each channel.
 
 | channels | rule |
 |---|---|
 | colours, light, albedo, alpha, masks, mist, all others | mean of the values that are finite |
-| normals | mean, as ours are: not of length 1 on edges |
+| normals | mean, so the length is below 1 on edges |
 | depth | least value above 0, or 0 if all are 0: a mean would lie between two surfaces |
-| positions, texture coordinates | those of the pixel with that depth, or the first if their part has no depth |
-| ids: whole numbers, and ``IndexOB``, ``IndexMA`` and the like | the most frequent; of equal ones the first |
+| positions, texture coordinates | value of the pixel with that depth, or of the first if the part has no depth |
+| ids: whole numbers, ``IndexOB``, ``IndexMA`` and similar | most frequent value; the first of equally frequent ones |
 | Cryptomatte | coverages are added up by id and divided by K²; the existing ranks keep the largest |
 | motion vectors | mean divided by K, because their unit is the pixel |
 | variances of the pixel mean (``*_var``) | mean divided by K² |
 | ``samples`` | sum |
 
-Gradients are refused, because differences between small pixels are not differences between large ones. Motion vectors
-of unknown unit are refused too, and so is Cryptomatte in half floats, which has lost its ids.
+Gradients are refused, because differences between small pixels are not differences between large ones. So are motion
+vectors of unknown unit, and Cryptomatte in half floats, which has lost its ids.
 """
 
 import re
@@ -42,8 +42,10 @@ _DEEPEST = "Z"
 
 
 def reduced_window(window: Window, k: int) -> Window:
-    """The window in large pixels, each of K x K pixels of ``window``. Large pixels that its borders cut are left out.
-    Raises NgptError if none is whole."""
+    """The ``window`` in large pixels of K x K pixels each, without large pixels that its borders cut.
+
+    Raises NgptError if no large pixel is whole.
+    """
     left, top = -(-window.left // k), -(-window.top // k)
     width, height = (window.left + window.width) // k - left, (window.top + window.height) // k - top
     if width < 1 or height < 1:
@@ -52,32 +54,33 @@ def reduced_window(window: Window, k: int) -> Window:
 
 
 def reduced_place(place: Place, k: int) -> Place:
+    """The place in large pixels. Raises NgptError as ``reduced_window`` does."""
     return Place(reduced_window(place.data, k), reduced_window(place.display, k), place.aspect)
 
 
 def cut_pixels(place: Place, k: int) -> str:
-    """A message about windows that are no multiple of K, where rows or columns at borders are left out; "" if none."""
-    told: list[str] = []
+    """A message about rows and columns that are left out, since a window is no multiple of K; "" if none are."""
+    lines: list[str] = []
     for name, window in (("data", place.data), ("display", place.display)):
         small = reduced_window(window, k)
         whole = Window(k * small.left, k * small.top, k * small.width, k * small.height)
-        if whole != window and f"window {window}" not in " ".join(told):
-            told.append(f"{name} window {window} is no multiple of {k}: {whole} of it is taken")
-    return "; ".join(told)
+        if whole != window and f"window {window}" not in " ".join(lines):
+            lines.append(f"{name} window {window} is no multiple of {k}: {whole} of it is taken")
+    return "; ".join(lines)
 
 
 def smaller(image: np.ndarray, place: Place, k: int) -> tuple[np.ndarray, Place]:
-    """An image (H, W, 3) at a place, with each K x K pixels as one, and the place of the smaller image."""
+    """An image (H, W, 3) after each K x K pixels have become one, and its place in large pixels."""
     return (image, place) if k == 1 else (reduced_layer(image, place.data, k), reduced_place(place, k))
 
 
 def reduced_layer(layer: np.ndarray, window: Window, k: int) -> np.ndarray:
-    """Means over K x K pixels of the finite values of a layer (H, W, C) of that window, float32."""
+    """A layer (H, W, C) on ``window`` in large pixels, float32: the means of the finite values of K x K pixels."""
     return np.stack([_mean(_blocks(layer[..., c], window, k)) for c in range(layer.shape[-1])], axis=-1)
 
 
 def check_reducible(stack: GradientStack, k: int) -> None:
-    """Raises NgptError for a stack that cannot be made K times smaller."""
+    """Raises NgptError for a stack that cannot be made K times smaller: if it has gradients or is too small."""
     if k < 2:
         raise WrongUse(f"images are reduced by 2 or more, not by {k}")
     if gradients := [name for name in ("dx", "dy", "dt") if name in stack]:
@@ -92,10 +95,9 @@ def check_reducible(stack: GradientStack, k: int) -> None:
 
 
 def reduced(image: ExrImage, k: int, stacks: Sequence[GradientStack]) -> ExrImage:
-    """The file with each K x K pixels as one. ``stacks`` are the stacks of its views. Raises NgptError for channels
-    without a rule.
+    """The file after each K x K pixels have become one; ``stacks`` are the stacks of its views.
 
-    Tiles keep their size in pixels.
+    Tiles keep their size in pixels. Raises NgptError for channels without a rule.
     """
     known: dict[int, str] = {}
     for stack in stacks:
@@ -111,14 +113,14 @@ def reduced(image: ExrImage, k: int, stacks: Sequence[GradientStack]) -> ExrImag
 
 @dataclass(frozen=True)
 class _Part:
-    """Blocks of the channels of a part, and the names of their layers in the contract."""
+    """The channels of a part as blocks (h, w, K²), and the names of their layers in the contract, "" if none."""
 
     blocks: dict[str, np.ndarray]
     layers: dict[str, str]
     k: int
 
     def nearest(self) -> np.ndarray:
-        """Which pixel of each block is nearest, (h, w); the first where there is no depth."""
+        """The index (h, w) of the nearest pixel in each block; 0 where there is no depth."""
         depth = next((self.blocks[name] for name in self.blocks if _kind(name, self.layers[name]) == "depth"), None)
         if depth is None:
             return np.zeros(next(iter(self.blocks.values())).shape[:2], int)
@@ -162,7 +164,7 @@ def _reduced_part(part: ExrPart, k: int, known: dict[int, str], listed: list[str
 
 
 def _blocks(channel: np.ndarray, window: Window, k: int) -> np.ndarray:
-    """(h, w, K²): the values of each block, row by row."""
+    """The values of each block of K x K pixels, row by row, (h, w, K²), from a channel (H, W) on ``window``."""
     small = reduced_window(window, k)
     x, y = k * small.left - window.left, k * small.top - window.top
     inside = channel[y : y + k * small.height, x : x + k * small.width]
@@ -170,7 +172,7 @@ def _blocks(channel: np.ndarray, window: Window, k: int) -> np.ndarray:
 
 
 def _kind(channel: str, layer: str) -> str:
-    """The rule that reduces a channel; ``layer`` is its layer's name in the contract, "" if it has none."""
+    """The name of the rule for a channel. ``layer`` is the name of its layer in the contract, "" if it has none."""
     if layer in ("depth", "motion", "samples"):
         return layer
     if layer.endswith("_var"):
@@ -208,7 +210,7 @@ def _depth(blocks: np.ndarray) -> np.ndarray:
 
 
 def _most_frequent(blocks: np.ndarray) -> np.ndarray:
-    """The value that most pixels of each block have, bit for bit; of equal ones the first."""
+    """The most frequent value of each block; the first of equally frequent ones."""
     votes = (blocks[..., :, None] == blocks[..., None, :]).sum(axis=-1)
     return np.take_along_axis(blocks, np.argmax(votes, axis=-1)[..., None], axis=-1)[..., 0]
 
@@ -224,9 +226,9 @@ _RULES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 def _cryptomattes(part: ExrPart, listed: list[str]) -> dict[str, list[str]]:
-    """Name of each Cryptomatte in a part -> its channels, id and coverage in turn, by rank.
+    """The name of each Cryptomatte in a part -> its channels by rank, ids and coverages alternating.
 
-    They are the Cryptomattes ``listed`` in headers, and channels whose names contain "crypto".
+    A Cryptomatte is ``listed`` in headers, or its name contains "crypto".
     """
     found: dict[str, dict[tuple[int, int], str]] = {}
     for channel in part.channels:
@@ -237,14 +239,14 @@ def _cryptomattes(part: ExrPart, listed: list[str]) -> dict[str, list[str]]:
 
 
 def _ranks(names: Sequence[str], blocks: dict[str, Any]) -> dict[str, np.ndarray]:
-    """The ids and coverages of a Cryptomatte: coverages of each block are added up by id; the largest come first.
+    """The channels of a Cryptomatte: the coverages in each block are added up by id, and the largest come first.
 
-    Ids are compared and kept as bits. Coverage beyond the existing ranks is lost, as in any Cryptomatte.
+    Ids are compared as bits. Coverage beyond the existing ranks is lost, as in any Cryptomatte.
     """
     ids = np.concatenate([blocks[name].view(np.uint32) for name in names[::2]], axis=-1)
     coverage = np.concatenate([blocks[name] for name in names[1::2]], axis=-1).astype(np.float64)
     pixels = blocks[names[0]].shape[-1]
-    # An id may occur several times in a block. After sorting by id, its coverages are added up at its last place.
+    # An id may occur several times in a block. After sorting by id, each id is a run, whose sum is put at its end.
     order = np.argsort(ids, axis=-1, kind="stable")
     ids, coverage = (np.take_along_axis(each, order, axis=-1) for each in (ids, coverage))
     starts = np.ones(ids.shape, bool)
@@ -252,7 +254,7 @@ def _ranks(names: Sequence[str], blocks: dict[str, Any]) -> dict[str, np.ndarray
     total = coverage.cumsum(axis=-1)
     ends = np.ones(ids.shape, bool)
     ends[..., :-1] = starts[..., 1:]
-    # The sum of a run, at its end: the running total minus the total before the run.
+    # The sum of a run is the running total at its end minus the total before it.
     before = np.maximum.accumulate(np.where(starts, total - coverage, -np.inf), axis=-1)
     each = np.where(ends, total - before, 0.0) / pixels
     order = np.argsort(-each, axis=-1, kind="stable")[..., : len(names) // 2]

@@ -1,8 +1,8 @@
-"""Where the layers of the contract (``ngpt.layers``) are in a file, by the names in it (``ngpt.io.aliases``).
+"""Finds the layers of the contract (``ngpt.layers``) among the channel names of a file (``ngpt.io.aliases``).
 
-Everything here works on channel *names*; no file is opened. OpenEXR calls channel ``C`` of layer ``L`` ``L.C``, layers
-nest with dots, and layer names may hold spaces: ``ViewLayer.Denoising Albedo.R`` is channel ``R`` of the layer
-``ViewLayer.Denoising Albedo``. A name matches a layer when it is the layer's name or its tail after a dot.
+No file is opened here. OpenEXR calls channel ``C`` of layer ``L`` ``L.C``. Names of layers may contain dots and spaces:
+``ViewLayer.Denoising Albedo.R`` is channel ``R`` of the layer ``ViewLayer.Denoising Albedo``. A name fits a layer if it
+is the whole name of the layer or its end after a dot.
 """
 
 import re
@@ -13,14 +13,14 @@ from ngpt.errors import NgptError, did_you_mean
 from ngpt.io.aliases import ALIASES, LOOKS, NO_LIGHT, NOISE, NOT_LOOKS, OWN, Alias, plain
 from ngpt.layers import LAYERS, RGB, XY, XYZ, Layer
 
-# The name of each part of a file, and its channels. If the names to match differ from those in the file, the channels
-# are a mapping from names to match to names in the file (``ngpt.io.views``).
+# The name of each part of a file, and its channels: their names, or a mapping from the names to search to the names in
+# the file (``ngpt.io.views``)
 Parts = Sequence[tuple[str, Sequence[str] | Mapping[str, str]]]
 
 _COLOUR = (("R", "r", "red"), ("G", "g", "green"), ("B", "b", "blue"))
 _SPELLINGS = {
     RGB: (_COLOUR,),
-    # Tools that write an (H, W, 3) array name its channels R G B whatever it holds.
+    # Some tools name the channels of any (H, W, 3) array R G B.
     XYZ: ((("X", "x"), ("Y", "y"), ("Z", "z")), _COLOUR),
     XY: ((("X", "x"), ("Y", "y")),),
     ("Z",): ((("Z", "z", "V", "v", "T", "t", "Y", "y", "D", "d", "R", "r", ""),),),
@@ -32,9 +32,9 @@ _TERM = re.compile(r"\s*([+-]?)(?:([0-9.]+(?:e[+-]?[0-9]+)?)\*)?(.+?)\s*")
 
 
 class Found(NamedTuple):
-    """Where a file holds a layer: part index, channel names in canonical order, and the layer's name in the file.
+    """The place of a layer in a file: index of the part, channels in the order of the contract, and its name there.
 
-    ``factors`` multiply the channels, one each; an empty tuple means 1 for all.
+    ``factors`` has a factor for each channel; () means 1 for all.
     """
 
     part: int
@@ -55,7 +55,7 @@ class _Group(NamedTuple):
 
 
 class _Home(NamedTuple):
-    """Where the primal is: its part, the prefix of its name, and the prefixes of its rivals."""
+    """The part of the primal, the prefix of its name, and the prefixes of other layers that could be the primal."""
 
     part: int | None
     prefix: str = ""
@@ -67,20 +67,22 @@ def resolve(
 ) -> Resolution:
     """Finds the layers of the contract among the channel names of a file.
 
-    ``parts`` lists each part's name and its channel names. ``overrides`` maps names of the contract to the name of a
-    layer in the file (whole or its tail), or to channels with signs and factors, "-velocity.R,velocity.G". It wins over
-    the aliases. ``path`` is for messages. ``writer`` is the program that wrote the file, by ``writer_of``. In a file by
-    "ngpt", ``direct`` and ``caustic`` have the meaning of the contract; in others they do only beside layers that no
-    other program writes. ``origin`` is the layer that the input of a result was read from.
+    ``parts``      each part's name and its channel names
+    ``overrides``  names of the contract -> the name of a layer in the file, whole or its end after a dot; or channels
+                   with signs and factors, "-velocity.R,velocity.G". These layers are not searched by aliases
+    ``path``       the name of the file for messages
+    ``writer``     the program that wrote the file, by ``writer_of``. Unless it is "ngpt", ``direct``, ``caustic`` and
+                   the other names in ``OWN`` only count beside layers that no other program writes
+    ``origin``     in a result file, the layer that the input was read from
 
     A channel without a dot belongs to the root, and in a file of several parts to the layer named like its part. In
-    such a file, other layers can also be called ``part.layer``. If a name fits several layers, the layer whose name
-    begins like the primal's name wins (``Near.Combined``, ``Near.Depth``), then the layer whose whole name it is, then
-    the layer in the primal's part. A layer whose name begins like that of another possible primal belongs to that
-    image. If no name is known, the only layer of colour is the primal.
+    such a file, other layers can also be called ``part.layer``. If a name fits several layers, a layer is preferred
+    whose name begins like the primal's (``Near.Combined``, ``Near.Depth``), then one with exactly this name, then one
+    in the primal's part. A layer whose name begins like that of another possible primal belongs to that image. If no
+    name of a primal is known, the only layer of colour is the primal.
 
-    Raises NgptError if there is no primal, a name fits several layers, a layer lacks channels or has one twice, or an
-    override names something that is not there.
+    Raises NgptError if there is no primal, a name fits several layers, a layer lacks channels or has one twice, or no
+    layer fits an override.
     """
     groups = _group(parts)
     overrides = dict(overrides or {})
@@ -123,12 +125,10 @@ def resolve(
 
 
 def resolve_alone(parts: Parts, name: str, path: str) -> Found:
-    """Finds layer ``name`` in a file of its own, ``parts`` as for ``resolve``.
+    """Finds layer ``name`` in a separate file; ``parts`` is as for ``resolve``.
 
-
-
-    This is the layer in the file under one of the known names of ``name``, else the root of the first part, else the
-    only layer with such channels. Raises NgptError if there is none, or there are several and none has a known name.
+    It is the layer with one of the known names of ``name``, or else the root of the first part, or else the only layer
+    with such channels. Raises NgptError if there is no such layer, or more than one.
     """
     groups, layer = _group(parts), LAYERS[name]
     for alias in (alias for alias in ALIASES if alias.layer == name and not alias.writer):
@@ -145,10 +145,11 @@ def resolve_alone(parts: Parts, name: str, path: str) -> Found:
 
 
 def propose(parts: Parts, found: Resolution) -> dict[str, str]:
-    """Layers of a file that look like ones of the contract that ``found`` lacks: layer -> its name in the file.
+    """Guesses layers of the contract that ``found`` lacks: layer -> its name in the file.
 
-    A guess from names, for the user to judge: ``--layer albedo="NAME"`` takes it. Each layer is proposed once. Motion
-    is proposed by its channels. The proposal assumes vectors to the next frame with y up, as most renderers write.
+    The guesses are made from names, and the user decides: ``--layer albedo="NAME"`` accepts one. Each layer of the file
+    is proposed once. Motion is proposed by its channels, as vectors to the next frame with y up, which most renderers
+    write.
     """
     taken = {(layer.part, channel) for layer in found.values() for channel in layer.channels}
     proposed: dict[str, str] = {}
@@ -175,7 +176,7 @@ def propose(parts: Parts, found: Resolution) -> dict[str, str]:
 
 
 def layers_of_light(parts: Parts, found: Resolution) -> dict[str, Found]:
-    """The layers of colour that are not in the contract: name -> where they are."""
+    """The layers of colour that are not in ``found``: name -> place."""
     taken = {(layer.part, channel) for layer in found.values() for channel in layer.channels}
     light = {}
     for group in _group(parts):
@@ -186,12 +187,12 @@ def layers_of_light(parts: Parts, found: Resolution) -> dict[str, Found]:
 
 
 def holds_colour(parts: Parts) -> bool:
-    """Whether there is a layer with channels R G B."""
+    """Whether any layer has channels R G B."""
     return any(_complete(LAYERS["primal"], group) for group in _group(parts))
 
 
 def _group(parts: Parts) -> list[_Group]:
-    """Sorts channels into layers; a channel without a dot also becomes a layer with the channel's name."""
+    """The channels by layers. A channel without a dot also is a layer of its own, with the channel's name."""
     filled = [index for index, (_, channels) in enumerate(parts) if channels]
     several = len(filled) > 1
     groups: dict[tuple[int, str], dict[str, str]] = {}
@@ -202,7 +203,7 @@ def _group(parts: Parts) -> list[_Group]:
             if several and part and layer != part and not layer.startswith(f"{part}."):
                 layer = f"{part}.{layer}" if dot else part
             held = groups.setdefault((index, layer), {})
-            # If a layer has a channel twice (R and beauty.R in the part beauty), the channel that names the layer wins.
+            # If a layer has a channel twice (R and beauty.R in the part beauty), the one with the layer's name counts.
             held[suffix] = own if dot else held.get(suffix, own)
             if not dot:
                 groups.setdefault((index, f"{layer}.{suffix}" if layer else suffix), {})[""] = own
@@ -212,7 +213,7 @@ def _group(parts: Parts) -> list[_Group]:
 
 
 def _match(alias: Alias, layer: Layer, groups: list[_Group], home: _Home, path: str) -> Found | None:
-    """Returns the one place where the file holds ``layer`` under ``alias``, None if there is none."""
+    """The place of ``layer`` under the name of ``alias``; None if there is none. Raises NgptError for several."""
     complete: dict[tuple[int, tuple[str, ...]], Found] = {}
     partial: NgptError | None = None
     for group in groups:
@@ -247,7 +248,7 @@ def _named(group: _Group, alias: Alias) -> bool:
 
 
 def _chosen(layer: Layer, text: str, groups: list[_Group], home: _Home, path: str) -> Found:
-    """The layer that the user named by its name or by its channels."""
+    """The place of a layer that the user chose by its name or its channels."""
     wide = home._replace(rivals=frozenset())
     if match := _match(Alias(layer.name, "the user", text), layer, groups, wide, path):
         return match
@@ -265,14 +266,14 @@ def _chosen(layer: Layer, text: str, groups: list[_Group], home: _Home, path: st
 
 
 def _places(channel: str, groups: list[_Group]) -> set[tuple[int, str]]:
-    """The parts and names of channels that have this name, whole or as their tail after a dot; whole names win."""
+    """The parts and names of the channels with this whole name; if there are none, of those whose name ends in it."""
     names = {(g.part, own): f"{g.name}.{suffix}".strip(".") for g in groups for suffix, own in g.channels.items()}
     whole = {place for place, name in names.items() if channel in (name, place[1])}
     return whole or {place for place, name in names.items() if name.endswith(f".{channel}")}
 
 
 def _distinct(layer: Layer, groups: Sequence[_Group]) -> Iterator[Found]:
-    """The places that have the channels of ``layer``, without repeats."""
+    """The places among ``groups`` with the channels that ``layer`` needs, without repeats."""
     seen = set()
     for group in groups:
         channels = _complete(layer, group)
@@ -282,7 +283,7 @@ def _distinct(layer: Layer, groups: Sequence[_Group]) -> Iterator[Found]:
 
 
 def _features(groups: list[_Group]) -> set[tuple[int, tuple[str, ...]]]:
-    """The places of colours that have the name of a layer other than the primal."""
+    """The places with channels R G B that have the name of a layer other than the primal."""
     others = [alias for alias in ALIASES if alias.layer not in ("primal", "alpha")]
     named = [group for group in groups if any(_named(group, alias) for alias in others)]
     return {found[:2] for found in _distinct(LAYERS["primal"], named)}
@@ -292,10 +293,10 @@ def _of_other_channels(groups: list[_Group], writer: str) -> Found | None:
     """The image of a file without R G B: luminance, one channel Y that stands for all three, or Mitsuba's X Y Z."""
     for name in ("primal", ""):
         for group in (group for group in groups if group.name == name):
-            there = group.channels.keys() & {*RGB, *XYZ, "RY", "BY"}
-            if there == {"Y"}:
+            suffixes = group.channels.keys() & {*RGB, *XYZ, "RY", "BY"}
+            if suffixes == {"Y"}:
                 return Found(group.part, 3 * (group.channels["Y"],), name)
-            if there == {*XYZ} and writer == "Mitsuba":
+            if suffixes == {*XYZ} and writer == "Mitsuba":
                 return Found(group.part, tuple(group.channels[suffix] for suffix in XYZ), name)
     return None
 
@@ -317,7 +318,7 @@ def _lone(groups: list[_Group]) -> Found | None:
 
 
 def _home(groups: list[_Group], primal: Found, origin: str) -> _Home:
-    """Where the primal is. Its rivals are layers that are named as primals usually are, or as this one is."""
+    """The home of the primal. Its rivals are layers named like this primal, or like primals of known renderers."""
     name = origin or primal.name
     prefix, _, tail = name.rpartition(".")
     tails = {alias.name for alias in ALIASES if alias.layer == "primal"} - {"primal"} | {tail}
@@ -327,13 +328,13 @@ def _home(groups: list[_Group], primal: Found, origin: str) -> _Home:
 
 
 def _channels(layer: Layer, group: _Group, only: tuple[str, ...], path: str) -> tuple[str, ...]:
-    """Returns the channels of ``group`` in canonical order, or () if it has none of those that ``layer`` needs.
+    """The channels of ``group`` in the order of ``layer``; () if it has none of them, or lacks one of ``only``.
 
-    If ``only`` is given, a group that lacks one of these channels counts as another layer.
+    Raises NgptError if it has some of the channels, or one twice.
     """
     if only:
-        there = all(suffix in group.channels for suffix in only)
-        return tuple(group.channels[suffix] for suffix in only[: len(layer.channels)]) if there else ()
+        channels = [group.channels.get(suffix, "") for suffix in only]
+        return tuple(channels[: len(layer.channels)]) if all(channels) else ()
     for spelling in _SPELLINGS[layer.channels]:
         held = [[group.channels[suffix] for suffix in names if suffix in group.channels] for names in spelling]
         if not any(held):
@@ -356,7 +357,7 @@ def _channels(layer: Layer, group: _Group, only: tuple[str, ...], path: str) -> 
 
 
 def _complete(layer: Layer, group: _Group) -> tuple[str, ...]:
-    """``_channels``, or () if one is missing or there twice."""
+    """Like ``_channels``, but () also if the group has some of the channels, or one twice."""
     try:
         return _channels(layer, group, (), "")
     except NgptError:
@@ -385,7 +386,7 @@ def _held(groups: list[_Group]) -> dict[str, str]:
 
 
 def _listing(groups: list[_Group], limit: int = 24) -> str:
-    """Names the layers of a file and their channel suffixes, at most ``limit`` of them."""
+    """The layers of a file and the suffixes of their channels as text, at most ``limit`` layers."""
     layers = _held(groups)
     names = [f'"{name}" ({channels})' for name, channels in list(layers.items())[:limit]]
     return ", ".join(names) + (f" and {len(layers) - limit} more" if len(layers) > limit else "")

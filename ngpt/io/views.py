@@ -6,7 +6,7 @@
 | OpenEXR's, many parts | ``R`` in a part of its own | that part's attribute ``view`` |
 | others | ``right.albedo.R`` | ``multiView``, or ``left`` and ``right`` in names that are otherwise equal |
 
-The layers of a view are named without the view's name, ``albedo.R``, so that all layouts are searched in one way.
+Here the layers of a view are named without the view's name, ``albedo.R``, so that one search serves all layouts.
 https://openexr.com/en/latest/MultiViewOpenEXR.html
 """
 
@@ -17,13 +17,12 @@ from typing import NamedTuple
 from ngpt.errors import NgptError
 from ngpt.io.resolution import holds_colour
 
-# Views that need no attribute if both have the same channels.
+# Views that are recognised without an attribute if both have the same channels
 _EYES = ("left", "right")
 
 
 class Part(NamedTuple):
-    """The names in a part of a file: its own name, its channels, its view, and the views that its channels belong
-    to."""
+    """A part of a file: its name, its channels, and its attributes ``view`` and ``multiView``."""
 
     name: str
     channels: Sequence[str]
@@ -32,10 +31,12 @@ class Part(NamedTuple):
 
 
 class View(NamedTuple):
-    """One view: its name, "" in a file without views, and for each part of the file its name and channels.
+    """One view of a file.
 
-    Channels map their name without the view's name to their name in the file; parts of other views have none.
-    ``infix`` is put into the names of new channels; it is "" in the first view, and for a view with its own parts.
+    ``name``   "" in a file without views
+    ``parts``  the name of each part of the file, and its channels: names without the view -> names in the file. Parts
+               of other views have no channels
+    ``infix``  the word to insert into the names of new channels; "" for the first view and for views with own parts
     """
 
     name: str
@@ -48,12 +49,12 @@ class View(NamedTuple):
         return next(index for index, (_, channels) in enumerate(self.parts) if channels)
 
     def without(self, name: str) -> str:
-        """A layer's name, or names of channels, without the name of this view: "right.albedo" becomes "albedo"."""
+        """The name of a layer, or of channels, without the name of this view: "right.albedo" becomes "albedo"."""
         word = re.escape(self.name)
         return re.sub(rf"\b{word}\.|\.{word}\b", "", name) if self.name else name
 
     def channel(self, part: int, name: str) -> str:
-        """The name of a channel of this view in a part of the file, whether it exists or not."""
+        """The name in the file of a channel of this view, which need not exist."""
         known = self.parts[part][1] if part < len(self.parts) else {}
         layer, dot, suffix = name.rpartition(".")
         inserted = ".".join([*([layer] if dot else []), self.infix, suffix]) if self.infix else name
@@ -61,7 +62,7 @@ class View(NamedTuple):
 
 
 def views_of(parts: Sequence[Part]) -> list[View]:
-    """The views of a file that hold colour, in order; one view without a name if there are none."""
+    """The views of a file that hold colour, in order; a single view without a name if the file names none."""
     names = list(dict.fromkeys([*(view for part in parts for view in part.views), *(p.view for p in parts if p.view)]))
     names = names or _eyes(parts)
     plain = View("", [(part.name, {channel: channel for channel in part.channels}) for part in parts])
@@ -82,7 +83,7 @@ def choose_views(views: Sequence[View], wanted: str | None, path: str) -> list[V
 
 
 def _eyes(parts: Sequence[Part]) -> list[str]:
-    """Left and right, if each has a part of its own, or a channel that the other has too."""
+    """("left", "right") if each has a part of its own, or if both have the same channel; otherwise none."""
     left, right = _EYES
     if {left, right} <= {part.name for part in parts}:
         return list(_EYES)
@@ -103,7 +104,7 @@ def _of_view(part: Part, view: str, names: Sequence[str]) -> tuple[str, dict[str
         place = next((i for i in reversed(range(len(words) - 1)) if words[i] in names), None)
         if (words[place] if place is not None else names[0]) == view:
             name = ".".join(word for i, word in enumerate(words) if i != place)
-            # If two channels get the same name, the one that names the view wins.
+            # If two channels get the same name, the one with the view in its name counts.
             found[name] = channel if place is not None else found.get(name, channel)
     return bare, found
 

@@ -1,5 +1,4 @@
-"""Whether a file is a complete OpenEXR image, without decoding it: interrupted copies and full disks leave incomplete
-files.
+"""Checks whether an OpenEXR file is complete, without decoding it. Interrupted copies and full disks leave fragments.
 
 Layout of the format: https://openexr.com/en/latest/OpenEXRFileLayout.html
 """
@@ -17,11 +16,10 @@ _MULTIPART = 0x1000
 
 
 def finished(path: str | os.PathLike) -> bool:
-    """Whether ``path`` exists and is complete: its headers make sense, and all chunks in its tables end within the
-    file.
+    """Whether ``path`` exists, its headers make sense, and all its chunks end within the file.
 
-    Some kilobytes are read. Damage within a chunk is not seen. A folder or a device counts as finished, because it must
-    not be replaced.
+    Only some kilobytes are read, so damage within a chunk is not noticed. A folder or a device counts as finished,
+    because it must not be replaced.
     """
     path = Path(path)
     if not path.is_file():
@@ -34,10 +32,10 @@ def finished(path: str | os.PathLike) -> bool:
 
 
 def _ends(file: BinaryIO, parts: list[PartHeader]) -> int:
-    """Where the last chunk ends in an open file whose headers have been read; raises struct.error if the file ends
-    earlier.
+    """The end of the last chunk in an open file whose headers have been read, in bytes.
 
-    Each chunk begins with the number of its part (in files of several), its place, and the size of what follows.
+    Each chunk begins with the number of its part (in files of several parts), its place, and its size. Raises
+    struct.error if the file ends before the size of a chunk, or if a chunk was not written.
     """
     tables = [struct.unpack(f"<{part.table}Q", file.read(8 * part.table)) for part in parts]
     begin = file.tell()
