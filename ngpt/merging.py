@@ -361,6 +361,6 @@ def _seeds(stack: GradientStack) -> list[str]:
     seed = str(stack.attributes.get("ngpt:seed", "")).split()
     if not seed:
         raise NgptError(
-            f"{stack.path}: has no attribute 'ngpt:seed' to tell its samples from others; render it with ngpt"
+            f"{stack.path}: has no attribute 'ngpt:seed', so its samples might be those of another; render it with ngpt"
         )
     return seed

@@ -1,7 +1,7 @@
-"""The reconstruction methods: one registry, one way to call them.
+"""The registry of reconstruction methods, and the function that runs them.
 
-A new method is one more entry in ``_OURS``; the command line, the reports and the tables find it in ``METHODS``. Other
-packages bring theirs by entry points of the group "ngpt.methods" (docs/methods/add-a-method.md).
+A method of ngpt is an entry in ``_OURS``. Other packages bring methods by entry points of the group "ngpt.methods"
+(docs/methods/add-a-method.md). The command line, the reports and the tables find all of them in ``METHODS``.
 """
 
 import logging
@@ -33,20 +33,20 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Method:
-    """How to call one reconstruction.
+    """A reconstruction method.
 
     ``summary``  one line for the user
     ``needs``    layers that the stack must hold
     ``run``      (Repaired, options) -> (H, W, 3) float32, a reconstruction of the light in Repaired's ``image``
     ``options``  the options it takes
-    ``standing`` one of ``ngpt.options.STANDINGS``: which methods help shows first
-    ``missing``  why it cannot be used here ("" if it can): the package or file that is not installed
+    ``standing`` one of ``ngpt.options.STANDINGS``; help shows the methods by it
+    ``missing``  returns the package or file that it lacks on this machine; "" if it can be used
     ``uses``     further layers that it uses if the stack has them
     ``estimates``  layers that it estimates from the others if the stack lacks them
-    ``variant``  the method that it runs with other options; "" for a method of its own
+    ``variant``  the method that it runs with other defaults; "" if it is not a variant
     ``apart``    whether the light of photons is taken out of the image and denoised by ``ngpt.denoisers.caustic``
-    ``rec709``   whether it was made for colours of Rec. 709: other colours are converted for it if they lie in that
-                 gamut
+    ``rec709``   whether it was made for colours of Rec. 709, so that colours of other primaries within the gamut of
+                 Rec. 709 are converted for it
     """
 
     summary: str
@@ -67,12 +67,12 @@ class Result:
     """A reconstruction and the facts about its making.
 
     ``image``      (H, W, 3) float32, scene-linear, in the units of the stack's primal
-    ``method``     the method that made it ("auto" resolved); "own network FILE" for weights that are not ours
+    ``method``     the method that made it, also for "auto"; "own network FILE" for weights that do not come with ngpt
     ``seconds``    wall time of repair and reconstruction, without file access
     ``repaired``   pixels of the primal that were not finite and were replaced
     ``untrusted``  differences that were left out because they, or one of their two pixels, were not finite
-    ``weights``    the file of the network that ran, None for methods without one
-    ``options``    the options that are not the method's defaults, except ``weights``
+    ``weights``    the file of the network that ran; None for methods without one
+    ``options``    the options with other values than the method's defaults, except ``weights``
     ``estimated``  layers that the stack lacks and the method estimated
     ``error``      (H, W, 3) float32, the standard error of the image if it was requested (``ngpt.api.uncertainty``)
     """
@@ -89,7 +89,7 @@ class Result:
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """Header attributes on how the image was made: ``ngpt.write(path, image, like=stack, attributes=...)``."""
+        """Header attributes that say how the image was made, for ``ngpt.write(..., attributes=...)``."""
         made: dict[str, Any] = {"ngpt:method": self.method, "ngpt:reconstructSeconds": self.seconds}
         if self.weights:
             made["ngpt:weights"] = str(self.weights)
@@ -127,7 +127,7 @@ def _network(
 
 
 def _variant(method: str, summary: str, **options: Any) -> Method:
-    """The method with other defaults, under a name of its own: every row of a table has a name that can be used."""
+    """The method with other defaults, as a method of its own, so that tables can name it."""
     entry = _OURS[method]
     other = {name: replace(entry.options[name], default=value) for name, value in options.items()}
     return replace(entry, summary=summary, options=entry.options | other, variant=method)
@@ -183,8 +183,8 @@ _OURS = {
     ),
 }
 _OURS |= {
-    "oidn-clean": _variant("oidn", "OIDN that takes the features for clean", auxiliary="clean"),
-    "oidn-noisy": _variant("oidn", "OIDN that is told the features are noisy", auxiliary="noisy"),
+    "oidn-clean": _variant("oidn", "OIDN that treats the features as clean", auxiliary="clean"),
+    "oidn-noisy": _variant("oidn", "OIDN that treats the features as noisy", auxiliary="noisy"),
     "oidn-fast": _variant(
         "oidn", "OIDN's quickest network, with the features as they are", auxiliary="clean", quality="fast"
     ),
@@ -193,17 +193,17 @@ METHODS = Registry("ngpt.methods", "method", Method, _OURS)
 
 
 def by_standing(*standings: str) -> dict[str, Method]:
-    """The methods of these standings, by name, without variants of other methods."""
+    """The methods of these standings, by name, without variants."""
     return {name: entry for name, entry in METHODS.items() if entry.standing in standings and not entry.variant}
 
 
 def unknown_method(name: str) -> WrongUse:
-    """The error for a name that no method has."""
+    """The error for an unknown method."""
     return METHODS.unknown(name, ("auto", *METHODS), f"auto, {', '.join(by_standing('use', 'niche'))}")
 
 
 def runnable(name: str) -> Method:
-    """The method of that name. Raises WrongUse where there is none, and NgptError where it does not run here."""
+    """The method of that name. Raises WrongUse if there is none, and NgptError if it lacks a package or a file."""
     if name not in METHODS:
         raise unknown_method(name)
     if lack := METHODS[name].missing():
@@ -211,18 +211,16 @@ def runnable(name: str) -> Method:
     return METHODS[name]
 
 
-# The best first, by the errors in docs/lab/RESULTS.md for the layers of a stack. ngpt-primal is left out: in the same
-# total time, its error equals OIDN's in blind rooms, and is larger in simple scenes.
+# The methods that "auto" chooses from, the best first (docs/lab/RESULTS.md, "By the layers of a stack"). ngpt-primal is
+# left out: in the same total time, its error equals OIDN's in blind rooms, and is larger in simple scenes.
 ORDER = ("ngpt-combine", "oidn", "ngpt-fast", "wcv", "l1", "nfor")
 
 
 def choose(layers: Container[str], usable: Callable[[str], bool] | None = None) -> str:
-    """The method that ``auto`` stands for: the best of those that the layers and this machine's packages allow.
+    """The name of the method that "auto" runs: the best one for these layers and the installed packages.
 
-    ``layers``  a stack, or names of its layers. A stack may say what it was rendered for (``ngpt:for``)
-    ``usable``  whether a method can be used, by its name; None asks this machine
-
-    The errors behind ``ORDER`` are in docs/lab/RESULTS.md, "By the layers of a stack".
+    ``layers``  a stack, or the names of its layers. The method in a stack's attribute ``ngpt:for`` is preferred
+    ``usable``  whether the method of a name can be used; None: if it lacks nothing on this machine
     """
     usable = usable or (lambda name: not METHODS[name].missing())
     made_for = str(layers.attributes.get("ngpt:for")) if isinstance(layers, GradientStack) else ""
@@ -233,16 +231,16 @@ def choose(layers: Container[str], usable: Callable[[str], bool] | None = None) 
 
 
 def check_request(method: str, options: Mapping[str, Any]) -> None:
-    """Raises NgptError for a request that no stack can meet; ``method`` and ``options`` are as in ``reconstruct``.
+    """Raises NgptError if ``reconstruct`` would refuse this method and these options for any stack.
 
-    Such a request has a method that does not run here, an unknown option, a value that the option does not allow,
-    weights that cannot be loaded, or a device that cannot be used.
+    The method may lack a package, an option may be unknown or have a wrong value, weights may be unreadable, or a
+    device may be unusable.
     """
     own = options.get("weights")
     if own:
         identify(own)
     if method != "auto":
-        # A method without shipped weights runs by the user's.
+        # A method whose own weights are missing can run with the user's.
         entry = METHODS[method] if own else runnable(method)
         _check_network(method, settings(f"method '{method}'", entry.options, options))
         return
@@ -261,7 +259,7 @@ def check_request(method: str, options: Mapping[str, Any]) -> None:
 
 
 def _check_value(owners: Mapping[str, dict[str, Option]], name: str, value: Any) -> None:
-    """Raises WrongUse if none of the methods in ``owners`` allows this value of the option."""
+    """Raises WrongUse if none of the methods in ``owners``, which have the option ``name``, allows this value."""
     refusals = []
     for owner, options in owners.items():
         try:
@@ -280,35 +278,34 @@ def _check_network(method: str, values: dict[str, Any]) -> None:
 def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result:
     """Runs a method on a stack. The left and right borders of panoramas count as neighbours (``ngpt.panorama``).
 
-    ``method`` is ``auto`` or a name in ``METHODS``; ``options`` are the method's own: for l2 and l1 ``alpha``, a number
-    or "auto" to derive it from the variances. Raises NgptError for an unknown method or option, missing layers, and a
-    primal without any finite pixel.
+    ``method`` is "auto" or a name in ``METHODS``, and ``options`` are options of the method: for l2 and l1 ``alpha``, a
+    number, or "auto" to derive it from the variances. Raises NgptError for an unknown method or option, for missing
+    layers, and for a primal without any finite pixel.
     """
     if wraps(stack):
-        result, alone = reconstruct(continued(stack), method, **options), repair(stack)
+        result, data = reconstruct(continued(stack), method, **options), repair(stack)
         image = np.ascontiguousarray(middle(result.image))
-        return replace(result, image=image, repaired=alone.pixels, untrusted=alone.gradients)
+        return replace(result, image=image, repaired=data.pixels, untrusted=data.gradients)
     start = time.perf_counter()
     own = options.get("weights")
     name = method
     if method == "auto":
-        # Weights say what they need: any method that runs them will do.
+        # Weights name the layers that they need, so any method that runs networks can run them.
         name = "ngpt" if own else choose(stack)
     if name not in METHODS:
         raise unknown_method(name)
     entry = METHODS[name]
     if method == "auto":
-        # Device and memory concern only some of the methods that "auto" may stand for.
-        idle = {"device", "memory"} - entry.options.keys()
-        options = {option: value for option, value in options.items() if option not in idle}
+        # Not all methods that "auto" may choose have these options.
+        unused = {"device", "memory"} - entry.options.keys()
+        options = {option: value for option, value in options.items() if option not in unused}
     try:
         values = settings(f"method '{name}'", entry.options, options)
     except WrongUse as error:
-        # For another stack, `auto` may choose a method that has the option, so this is no wrong use.
+        # For another stack, "auto" may choose a method with this option, so the call itself is not wrong.
         raise error if method == name else NgptError(str(error)) from None
     if entry.missing() and not own:
         raise NgptError(f"method '{name}': {entry.missing()}")
-    # The weights of a network say what they need.
     stack.require(*(("primal",) if own else entry.needs), why=f"weights {own}" if own else f"method '{name}'")
     reads = Shipped(name).reads(**values) if "weights" in entry.options else entry.needs
     given, matrix = stack, inside_rec709(stack) if entry.rec709 else None
@@ -323,7 +320,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         data = replace(data, empty=empty_pixels(stack))
     if set(DENOISED) & set(reads):
         data = replace(data, by_oidn=Oidn(data))
-    # Extreme values may leave the range of float32 on the way; the result is checked.
+    # Extreme values may leave the range of float32 in between. The result is checked below.
     with np.errstate(over="ignore", invalid="ignore"):
         image = _run(name, entry, data, values, stack.path) + data.direct
         if data.caustic is not None:
@@ -360,7 +357,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
 
 
 def _run(name: str, entry: Method, data: Repaired, values: Mapping[str, Any], path: str) -> np.ndarray:
-    """The result of the method. Exceptions of other packages' methods become an NgptError."""
+    """The result of the method. Any exception of another package's method becomes an NgptError."""
     try:
         return entry.run(data, **values)
     except Exception as error:
@@ -370,10 +367,9 @@ def _run(name: str, entry: Method, data: Repaired, values: Mapping[str, Any], pa
 
 
 def _equal_channels_kept(image: np.ndarray, primal: np.ndarray) -> np.ndarray:
-    """The image (H, W, 3), where channels that are equal in the primal are equal: grey stays grey.
+    """The image (H, W, 3), in which channels that are equal in the primal are made equal, so that grey stays grey.
 
-    Methods that look at the three colours together give equal channels different values, since their noise is not what
-    they expect. The mean of such channels has less noise than each.
+    Methods that read the three colours together may give equal channels different results. Their mean has less noise.
     """
     first = [next(b for b in range(a + 1) if np.array_equal(primal[..., a], primal[..., b], True)) for a in range(3)]
     if first == [0, 1, 2]:
@@ -382,7 +378,7 @@ def _equal_channels_kept(image: np.ndarray, primal: np.ndarray) -> np.ndarray:
 
 
 def _known(stack: GradientStack, estimates: tuple[str, ...]) -> GradientStack:
-    """The stack without the layers of ``estimates`` that have no finite value; the method then estimates them."""
+    """The stack without layers of ``estimates`` that have no finite value, so that the method estimates them."""
     unknown = [name for name in estimates if name in stack and not np.isfinite(stack[name]).any()]
     layers = {name: stack[name] for name in stack.names if name not in unknown}
     return replace(stack, layers=layers) if unknown else stack

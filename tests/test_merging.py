@@ -159,7 +159,10 @@ def error_cases(rng):
         "a hole": (hole, r"no stack has all pixels of 7x4 at \(5, 5\): tile0.exr 5x9 at \(0, 0\), tile1"),
         "overlapping": (overlapping, "both rendered with seed 3"),
         "far apart": (far, r"no stack has all pixels of 1073741836x1073741833 at \(0, 0\)"),
-        "a whole": ([tile, two], r"2.exr is 4x5 but tile0.exr is 4x5 at \(0, 0\) of 12x9; only stacks of one image"),
+        "a whole": (
+            [tile, two],
+            r"2.exr is 4x5 but tile0.exr is 4x5 at \(0, 0\) of 12x9; merge seeds or tiles of one",
+        ),
     }
 
 

@@ -230,7 +230,7 @@ class Denoiser:
                 raise NgptError(f"Denoiser: {name} is given, but was not announced: Denoiser(size, {keyword}=True)")
             if given[name] is None and self.announced[keyword] and name != "previous_denoised":
                 raise NgptError(
-                    f"Denoiser: {keyword}=True, and {name} is missing: pass {name}=..., or leave {keyword} out"
+                    f"Denoiser: {keyword}=True announced {name}, which is not given: pass {name}=..., or leave it out"
                 )
         image = noisy
         if is_bitmap(noisy):

@@ -1,9 +1,9 @@
-"""How far a reconstruction may be from the converged image: a standard error for each pixel, for any method.
+"""Estimates the standard error of each pixel of a reconstruction, for any method.
 
-The method runs a second time, with more noise added to primal, dx, dy and caustic, of the variances of the stack. Noise
-that pixels share is added as the layer ``shared`` has it: a denoiser leaves it in, and removes white noise. The
-change of the image over about 9x9 pixels, times a factor that is measured for each method, is the standard error.
-docs/use/uncertainty.md says how good that is, and where it fails.
+The method runs a second time on a stack with added noise, which has the variances of the stack. Noise that pixels share
+is added from the layer ``shared``, because a denoiser removes white noise but not this noise. The standard error is the
+change of the image over about 9x9 pixels, times a factor that was measured for each method. docs/use/uncertainty.md
+says how good the estimate is, and where it fails.
 """
 
 from dataclasses import replace
@@ -21,9 +21,10 @@ from ngpt.stack import GradientStack
 from ngpt.subpixels import means, spread, subpixels
 from ngpt.system.late import ndimage
 
-SPREAD = 2.6  # pixels, the standard deviation of the window over which the change is averaged: as large as 9x9 pixels
+SPREAD = 2.6  # standard deviation, in pixels, of the window over which the change is averaged: as large as 9x9 pixels
 SEED = 20261122
-# By bench/uncertainty.py of commit e61ee6f3, on scenes named there. Other methods have the most frequent factor.
+# Measured by bench/uncertainty.py of commit e61ee6f3 on the scenes named there. All other methods have the most frequent
+# factor, FACTOR.
 FACTORS = {"primal": 0.9, "l2": 0.9, "l1": 1.7, "cv": 0.85, "wcv": 1.1, "wl2": 1.4}
 FACTOR = 1.2
 
@@ -31,15 +32,15 @@ FACTOR = 1.2
 def reconstruct_with_error(
     stack: GradientStack, method: str = "auto", *, halves: tuple[GradientStack, GradientStack] | None = None, **options
 ) -> Result:
-    """As ``ngpt.reconstruct``, with ``Result.error``: the standard error of the image, (H, W, 3) float32, in its unit.
+    """Like ``ngpt.reconstruct``, but with ``Result.error``: the standard error (H, W, 3) float32, in the image's unit.
 
-    It takes twice the time. ``halves`` are two stacks of independent halves of the samples, such as those that
-    ``stack`` was merged from: 0.4 to 0.75 times as many values are then more than five standard errors off, in four
-    times the time.
+    It takes twice the time. ``halves`` are two stacks of independent halves of the samples, such as the ones that
+    ``stack`` was merged from. They reduce the number of values that are more than five standard errors off to 0.4 to
+    0.75 times, in four times the time.
 
-    The error is NaN in pixels where a variance is not finite, since their noise is unknown. The same stacks
-    give the same bits. Raises NgptError where the stack has no variances, where a half is of another size or place,
-    or both halves have the same seed, and as ``reconstruct`` does.
+    The error is NaN in pixels where a variance is not finite. The same stacks give the same bits. Raises NgptError if
+    the stack has no variances, if a half is of another size or place, if both halves have the same seed, and as
+    ``reconstruct`` does.
     """
     result = reconstruct(stack, method, **options)
     again = reconstruct(noisier(stack), method, **options)
@@ -55,7 +56,7 @@ def reconstruct_with_error(
 
 
 def _check_halves(stack: GradientStack, halves: tuple[GradientStack, GradientStack]) -> None:
-    """Raises NgptError where they cannot be halves of the samples of the stack."""
+    """Raises NgptError if these cannot be halves of the samples of the stack."""
     for half in halves:
         known = half.place.known and stack.place.known
         if half.place.data != stack.place.data if known else half.place.data.size != stack.place.data.size:
@@ -67,9 +68,7 @@ def _check_halves(stack: GradientStack, halves: tuple[GradientStack, GradientSta
 
 
 def known_noise(stack: GradientStack) -> np.ndarray:
-    """Where all variances that images depend on are finite, (H, W) booleans. Differences beyond the border do not exist
-    and do not count. Differences that are not finite are left out and do not count either.
-    """
+    """Where all variances are finite, (H, W) booleans. Border differences and non-finite differences do not count."""
     known = np.ones((stack.height, stack.width), bool)
     inside: Any
     for name, inside in (("primal", np.s_[:]), ("caustic", np.s_[:]), ("dx", np.s_[:, :-1]), ("dy", np.s_[:-1])):
@@ -82,8 +81,11 @@ def known_noise(stack: GradientStack) -> np.ndarray:
 
 
 def noisier(stack: GradientStack) -> GradientStack:
-    """The stack with added noise of the variances that it holds, and none where they are not finite; raises NgptError
-    where it lacks them. The layer ``shared`` is added as it is, and its variance is not added once more."""
+    """The stack with added noise of its variances; no noise is added where these are not finite.
+
+    The layer ``shared`` is added as it is, and white noise of the other part of the variance. Raises NgptError if the
+    stack lacks variances.
+    """
     stack.require("primal_var", why="an estimate of the error")
     for name in ("dx", "dy"):
         if name in stack:
@@ -91,7 +93,7 @@ def noisier(stack: GradientStack) -> GradientStack:
     rng = np.random.default_rng(SEED)
     layers = {}
     for name, variance in VARIANCES.items():
-        # Drawn for all, so that one layer more or less does not change the others.
+        # Drawn also for missing layers, so that these do not change the noise of others.
         drawn = rng.standard_normal(stack["primal"].shape, np.float32)
         if name in stack and variance in stack:
             known = np.maximum(np.nan_to_num(stack[variance], posinf=0.0), 0)
@@ -99,13 +101,14 @@ def noisier(stack: GradientStack) -> GradientStack:
                 known = np.where(empty_pixels(stack)[..., None], 0, known)
             noise = np.sqrt(known) * drawn
             if name == "primal" and "shared" in stack:
-                own = np.maximum(known - shared_variance(stack["shared"]), 0)
-                noise = np.sqrt(own) * drawn + np.where(
-                    known > 0, np.nan_to_num(stack["shared"], posinf=0, neginf=0), 0
+                own, shared = (
+                    known - shared_variance(stack["shared"]),
+                    np.nan_to_num(stack["shared"], posinf=0, neginf=0),
                 )
+                noise = np.sqrt(np.maximum(own, 0)) * drawn + np.where(known > 0, shared, 0)
             layers[name] = stack[name] + noise
     if "caustic" in layers:
-        # The caustic is part of the primal; the noise above covers only the rest of it.
+        # The caustic is part of the primal, whose noise above is only that of its other light.
         layers["primal"] = layers["primal"] + (layers["caustic"] - stack["caustic"])
     if not stack.fine or "primal" not in layers:
         return stack.replace(**layers)
@@ -120,12 +123,12 @@ def _noisier_subpixels(
 ) -> dict[str, np.ndarray]:
     """The subpixels with the ``noise`` of their pixels, plus noise of their own whose mean over each pixel is 0.
 
-    The variance of a subpixel is K² times its pixel's, without what pixels share.
+    The variance of a subpixel is K² times the variance of its pixel, without the noise that pixels share.
     """
-    variance = np.maximum(np.nan_to_num(stack["primal_var"], posinf=0.0), 0)
+    variance = np.nan_to_num(stack["primal_var"], posinf=0.0)
     if "shared" in stack:
-        variance = np.maximum(variance - shared_variance(stack["shared"]), 0)
-    variance = np.where(empty_pixels(stack)[..., None], 0, variance)
+        variance = variance - shared_variance(stack["shared"])
+    variance = np.where(empty_pixels(stack)[..., None], 0, np.maximum(variance, 0))
     drawn = rng.standard_normal(stack.fine["primal"].shape, np.float32)
     drawn -= spread(means(drawn, k), k)
     own = spread(k * np.sqrt(variance), k) * drawn
@@ -133,9 +136,9 @@ def _noisier_subpixels(
 
 
 def change(image: np.ndarray, other: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
-    """Root of the mean square of their difference, in a Gaussian window, (H, W, 3) double precision.
+    """The root of the mean squared difference of two images in a Gaussian window, (H, W, 3) double precision.
 
-    Where there are ``known`` pixels, (H, W) booleans, the mean is over those, and the others are NaN.
+    Pixels that are not ``known`` (H, W) do not count, and are NaN in the result.
     """
     difference = other.astype(np.float64) - image
     if known is None or known.all():

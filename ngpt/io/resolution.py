@@ -90,7 +90,7 @@ def resolve(
         if name not in LAYERS:
             meant = did_you_mean(name, LAYERS)
             raise NgptError(
-                f"{path}: --layer {name}=...: there is no layer '{name}'; {meant}use one of {', '.join(LAYERS)}"
+                f"{path}: --layer {name}=...: no layer is called '{name}'; {meant}use one of {', '.join(LAYERS)}"
             )
     found: Resolution = {}
     home = _Home(None)
@@ -350,7 +350,7 @@ def _channels(layer: Layer, group: _Group, only: tuple[str, ...], path: str) -> 
         twice = next((channels for channels in held if len(channels) > 1), None)
         if twice:
             raise NgptError(
-                f"{path}: layer '{layer.name}' has one channel twice, {' and '.join(twice)}; remove one of them"
+                f"{path}: layer '{layer.name}' has one channel twice, {' and '.join(twice)}; remove or rename one"
             )
         return tuple(channels[0] for channels in held)
     return ()

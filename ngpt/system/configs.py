@@ -1,32 +1,31 @@
-"""The configurations that come with ngpt, by name, wherever it is installed."""
+"""Finds the configurations that come with ngpt by their names."""
 
 import os
 from pathlib import Path
 
 from ngpt.errors import NgptError, did_you_mean
 
-# They are inside an installed package, and beside the package in the repository.
+# Inside the package if it is installed, and beside it in the repository
 _PACKAGE = Path(__file__).parents[1]
 FOLDER = next((f for f in (_PACKAGE / "configs", _PACKAGE.parent / "configs") if f.is_dir()), _PACKAGE / "configs")
 
-# The prefixes of the names of the three kinds; configurations of training have neither of the other prefixes.
+# The prefixes of the names of configurations, by kind; names for training have neither of the other prefixes.
 DATASET, EVALUATION, TRAINING = "data-", "eval-", ""
-# The configurations that a user's own one starts from by default
+# The configurations that --init writes by default
 STARTS = {DATASET: "data-cpu", EVALUATION: "eval-tiny", TRAINING: "fast"}
 
 
 def names(kind: str) -> list[str]:
-    """The configurations of one kind: ``DATASET``, ``EVALUATION`` or ``TRAINING``."""
+    """The names of the configurations of one kind: ``DATASET``, ``EVALUATION`` or ``TRAINING``."""
     found = sorted(path.stem for path in FOLDER.glob("*.toml"))
-    if kind == TRAINING:
-        return [name for name in found if not name.startswith((DATASET, EVALUATION))]
-    return [name for name in found if name.startswith(kind)]
+    others = {DATASET, EVALUATION} - {kind}
+    return [name for name in found if name.startswith(kind) and not name.startswith(tuple(others))]
 
 
 def find_config(name: str, kind: str) -> Path:
-    """The file called ``name``; if there is none, the configuration of that name that comes with ngpt.
+    """The file called ``name``, or else the configuration of that name and ``kind`` that comes with ngpt.
 
-    Raises NgptError if there is neither; the message lists the configurations of that kind.
+    Raises NgptError if there is neither.
     """
     if os.path.exists(name) and not os.path.isdir(name):
         return Path(name)

@@ -18,24 +18,24 @@ from ngpt.system.interrupts import raised
 from ngpt.system.limits import address_space
 from ngpt.system.text import printable
 
-# Without a terminal, lines of progress are at least this many seconds apart, and at least 1 / LINES of the elapsed
-# time: a log should show life, not fill up.
+# Without a terminal, the time between two lines of progress is at least this number of seconds, and at least 1 / LINES
+# of the elapsed time, so that logs stay short.
 SECONDS_BETWEEN_LINES = 5.0
 LINES = 50
 
-# Columns that a bar takes in addition to its label: with all of its parts; for a rate; and with only numbers and time
-# left. The first form is used if at least LABEL columns are left for the label.
+# The columns of a terminal that a bar takes beside its label: in the wide form, for a rate in addition, and in the
+# narrow form, which has only numbers and the time left. It is used if fewer than LABEL columns remain for the label.
 WIDE, RATE, NARROW, LABEL = 58, 14, 22, 12
 
-# The least address space that ngpt needs, in MiB.
+# The least address space that ngpt needs, in MiB
 FEWEST_MIB = 512
 
 
 def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "interrupted") -> int:
-    """Runs a command and returns its exit status: that of ``run``, or after an error, with a one-line message:
+    """Runs a command and returns its exit status, which ``run`` returns.
 
-    1 for an error, and if standard output has no reader any more; 2 for ``WrongUse``; 130 after Ctrl-C; 143 after
-    SIGTERM. ``interrupted`` is the message after an interrupt.
+    After an error, prints a line and returns 1, or 2 for ``WrongUse``. After an interrupt, prints the message
+    ``interrupted`` and returns 130 (Ctrl-C) or 143 (SIGTERM). If standard output has no reader any more, returns 1.
     """
     _open_standard_streams()
     console = Console(name=name)
@@ -45,14 +45,14 @@ def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "
             try:
                 return run()
             finally:
-                # Errors of flushing are handled here: at its end, Python would report them in its own way.
+                # Flushed here, because at its end Python would report an error in its own way.
                 sys.stdout.flush()
         except SystemExit:
             raise
         except BaseException as error:
             if isinstance(error, OSError):
                 _close(sys.stdout)
-            # A library that is interrupted, mainly while it is imported, may raise any exception.
+            # A library that is interrupted may raise any exception, mainly while it is imported.
             if interrupt() or isinstance(error, KeyboardInterrupt):
                 console.error(interrupted)
                 return interrupt.status
@@ -63,7 +63,7 @@ def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "
 
 
 def _explanation(error: BaseException) -> str:
-    """The message of an error that users can act on; raises all other errors again."""
+    """The message of an error that users can act on. Raises any other error again."""
     match error:
         case NgptError() | OSError():
             return str(error)
@@ -75,7 +75,7 @@ def _explanation(error: BaseException) -> str:
 
 
 def _check_address_space() -> None:
-    """Raises NgptError for a limit (``ulimit -v``) at which the libraries we load hang or abort, OpenBLAS first."""
+    """Raises NgptError for a limit (``ulimit -v``) at which OpenBLAS and other libraries would hang or abort."""
     limit = address_space()
     if limit is not None and limit < FEWEST_MIB << 20:
         raise NgptError(f"the address space has only {limit >> 20} MiB (ulimit -v); ngpt needs at least {FEWEST_MIB}")
@@ -87,26 +87,25 @@ def tell(line: str) -> None:
 
 
 def print_line(text: str, stream: TextIO) -> None:
-    """Prints a message without buffering. Failure to write it, as on a full disk, does not stop the work."""
+    """Prints a message without buffering. If it cannot be written, as on a full disk, the work goes on."""
     try:
         print(printable(text), file=stream, flush=True)
     except RuntimeError:
-        # A signal handler interrupted another line of ours: the buffer is not reentrant.
+        # This is a signal handler that interrupted another line, and the buffer is not reentrant.
         os.write(stream.fileno(), f"{printable(text)}\n".encode(errors="backslashreplace"))
     except OSError:
         _close(stream)
 
 
 def _close(stream: TextIO) -> None:
-    """Discards what the stream holds and all further output."""
+    """Discards the contents of the stream's buffer and all further output."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, stream.fileno())
     os.close(null)
 
 
 def _open_standard_streams() -> None:
-    """Opens standard streams that are closed: otherwise the next opened file would take the place of one of them, and
-    get the printed text."""
+    """Opens standard streams that are closed. Otherwise an opened file would get their number, and the printed text."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -114,17 +113,16 @@ def _open_standard_streams() -> None:
             os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", closefd=False))
-    # Text from files may have letters that standard output cannot encode: on Windows, pipes use a local code page.
+    # Standard output may not be able to encode all text from files: on Windows, pipes use a local code page.
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
 @contextmanager
 def _own_stderr() -> Iterator[None]:
-    """Gives messages a descriptor of their own: while any thread reads an OpenEXR file, descriptor 2 is redirected to
-    nowhere."""
+    """Gives messages a descriptor of their own, because descriptor 2 is closed while any thread reads OpenEXR."""
     stream = sys.stderr
-    if type(stream) is not io.TextIOWrapper or stream.fileno() != 2:  # a test's, or a notebook's
+    if type(stream) is not io.TextIOWrapper or stream.fileno() != 2:  # the stream of a test or a notebook
         yield
         return
     with open(os.dup(2), "w", buffering=1, encoding=stream.encoding, errors=stream.errors) as sys.stderr:
@@ -135,10 +133,7 @@ def _own_stderr() -> Iterator[None]:
 
 
 class _Handler(logging.Handler):
-    """Prints log records to the current standard error, above a progress bar if there is one.
-
-    Each warning is printed only once, however often its file is read.
-    """
+    """Prints log records to the current standard error, above a progress bar if there is one; each warning once."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -154,7 +149,7 @@ class _Handler(logging.Handler):
 
 @contextmanager
 def logged(verbose: bool, quiet: bool = False) -> Iterator[None]:
-    """Prints messages of the logger "ngpt": warnings; with ``verbose``, all details; with ``quiet``, only errors."""
+    """In the block, prints warnings of the logger "ngpt"; all its messages if ``verbose``, only errors if ``quiet``."""
     logger, handler = logging.getLogger("ngpt"), _Handler()
     handler.setFormatter(logging.Formatter("%(relativeCreated)7.0f ms  %(name)s: %(message)s" if verbose else None))
     before = logger.level
@@ -168,7 +163,7 @@ def logged(verbose: bool, quiet: bool = False) -> Iterator[None]:
 
 
 class Console:
-    """Messages and progress for one command. ``quiet`` leaves only errors; error messages begin with ``name``."""
+    """Prints messages and progress of a command; only errors if ``quiet``. Messages of errors begin with ``name``."""
 
     def __init__(self, quiet: bool = False, name: str = "ngpt"):
         self.quiet, self.name = quiet, name
@@ -189,9 +184,9 @@ class Console:
     def progress(
         self, label: str, unit: str, rate: bool = False, begins: str = ""
     ) -> Iterator[Callable[[int, int], None]]:
-        """Yields ``update(done, total)``. Its first call gives the units done before, and starts the clock.
+        """Yields ``update(done, total)``. Its first call starts the clock; ``done`` is then the work of earlier runs.
 
-        ``rate``: units per second are shown, too. ``begins``: a phrase that is shown until the second call.
+        ``rate`` is whether units per second are shown. ``begins`` is a phrase that is shown until the second call.
         """
         if self.quiet:
             yield lambda done, total: None
@@ -203,13 +198,12 @@ class Console:
 
 
 class _Pace:
-    """Estimates the time left from the pace in the later half of the elapsed time, so that units that came quickly from
-    a cache soon stop counting."""
+    """Estimates the time left from the pace in the later half of the elapsed time: cached units soon stop counting."""
 
     def __init__(self, unit: str, rate: bool, begins: str):
         self.unit, self.rate, self.begins = unit, rate, begins
         self.start, self.elapsed = 0.0, 0.0
-        # (seconds, done); the first entry is at half of the elapsed time or earlier.
+        # Pairs (seconds, done). The first pair is from half of the elapsed time or earlier.
         self.past: deque[tuple[float, int]] = deque()
 
     def __call__(self, done: int, total: int) -> list[str]:
@@ -232,12 +226,12 @@ class _Pace:
 
 
 def brief(value: float) -> str:
-    """A positive number with two digits, or with all digits before the point: 0.35, 4.2, 126."""
+    """A positive number with two digits, or as a whole number from 10 on: 0.35, 4.2, 126."""
     return f"{value:.2g}" if value < 10 else f"{value:.0f}"
 
 
 def span(seconds: float) -> str:
-    """A duration, roughly."""
+    """A rough duration: "40 s", "12 min", "2.5 h"."""
     for unit, size in (("s", 1), ("min", 60)):
         if seconds < 100 * size:
             return f"{seconds / size:.0f} {unit}"
@@ -246,7 +240,7 @@ def span(seconds: float) -> str:
 
 @contextmanager
 def _bar(label: str, unit: str, pace: _Pace) -> Iterator[Callable[[int, int], None]]:
-    # Imported only here: a pipeline without a terminal does not pay for it.
+    # Imported only here, so that commands without a terminal start faster.
     from rich.console import Console as Terminal
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
 
@@ -265,7 +259,7 @@ def _bar(label: str, unit: str, pace: _Pace) -> Iterator[Callable[[int, int], No
         # A narrow terminal shows only the progress and the time left.
         columns, phrase, taken = [columns[0], columns[2], columns[5]], _last, NARROW
     label = _shortened(label, terminal.width - taken)
-    # Lines on standard output go above the bar, unless they go into a file.
+    # Lines on standard output are shown above the bar, unless they go into a file.
     with Progress(*columns, console=terminal, redirect_stdout=sys.stdout.isatty()) as progress:
         task = progress.add_task(label, total=None, pace="", start=False)
 
@@ -277,30 +271,30 @@ def _bar(label: str, unit: str, pace: _Pace) -> Iterator[Callable[[int, int], No
 
 
 def _shortened(text: str, most: int) -> str:
-    """The text, shortened to at most ``most`` letters by a cut at its start, since names differ at their ends."""
+    """The text with at most ``most`` letters. It is cut at its start, because names differ at their ends."""
     return text if len(text) <= most else f"…{text[len(text) - most + 1 :]}" if most > 1 else ""
 
 
 def _last(words: list[str]) -> str:
-    """The time left: the last of the phrases about the pace."""
+    """The last phrase about the pace, which is the time left."""
     return words[-1].removeprefix("about ") if words else ""
 
 
 class _Lines:
-    """Progress as lines of text: the first, the last, and some between."""
+    """Prints progress as lines of text: the first, the last, and some between them."""
 
     def __init__(self, console: Console, label: str, unit: str, pace: _Pace):
         self.console, self.label, self.unit, self.pace = console, label, unit, pace
         self.first: int | None = None
-        self.last, self.told = 0.0, (-1, -1)
+        self.last, self.printed = 0.0, (-1, -1)
 
     def __call__(self, done: int, total: int) -> None:
         words, elapsed = self.pace(done, total), self.pace.elapsed
         begun, self.first = self.first is not None, done if self.first is None else self.first
         if begun and done != total and elapsed - self.last < max(SECONDS_BETWEEN_LINES, elapsed / LINES):
             return
-        if done == total and (done, total) == self.told:
+        if done == total and (done, total) == self.printed:
             return
-        self.last, self.told = elapsed, (done, total)
+        self.last, self.printed = elapsed, (done, total)
         times = [f"{elapsed:.1f} s"] if done > self.first else []
         self.console.say(", ".join([f"{self.label}: {done}/{total} {self.unit}", *times, *words]))

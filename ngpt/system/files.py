@@ -1,4 +1,4 @@
-"""Output files: complete under their final name, or not there at all."""
+"""Writes output files so that an incomplete file never has the final name."""
 
 import os
 import re
@@ -20,10 +20,10 @@ try:
 except ImportError:  # Windows, where a lock would keep its own holder from writing the file
     fcntl = None  # type: ignore[assignment]
 
-# Temporary files have recognisable names, so that those that killed processes leave behind can be found.
+# Temporary files have recognisable names, so that files of killed processes can be found.
 _PREFIX = ".ngpt-"
 _LEFTOVER = re.compile(r"\.ngpt-[a-z0-9_]{8}(\.[^.]*)?")
-_MOST = 99  # names that are tried for a file that cannot be written under its own
+_MOST = 99  # other names that are tried for a file that cannot be written
 _one_at_a_time = Lock()
 hold_while_forking(_one_at_a_time)
 # Seconds since the last change after which temporary files are removed on systems without locks
@@ -40,10 +40,10 @@ def make_folder(folder: str | os.PathLike) -> Path:
 
 
 def check_output(path: str | os.PathLike, overwrite: bool = False, may_skip: bool = False) -> Path:
-    """Returns ``path`` as a Path if a file may be written there, else raises NgptError.
+    """Returns ``path`` as a Path. Raises NgptError if no file may be written there.
 
-    Called before long work starts, so that an hour of rendering is not lost to a typing error. ``may_skip``: the error
-    also names the option that leaves existing files out.
+    It is called before long work starts, so that an hour of rendering is not lost to a typing error. With ``may_skip``,
+    the message also names the option that leaves existing files out.
     """
     path = Path(path)
     if path.is_dir():
@@ -61,14 +61,14 @@ def check_output(path: str | os.PathLike, overwrite: bool = False, may_skip: boo
 def save(
     path: str | os.PathLike, write: Callable[[Path, bool], object], overwrite: bool = False, *, alike: bool = False
 ) -> None:
-    """Calls ``write(path, overwrite)``. If that fails, writes the file elsewhere, and raises NgptError that says where.
+    """Calls ``write(path, overwrite)``. If it fails, writes the file elsewhere, and raises NgptError that says where.
 
-    This is for results that took long to make. Places, in order: another name beside ``path``, "a.kept.exr" for
-    "a.exr"; the working directory; the folder for temporary files. Nothing is overwritten there. ``write`` is called
-    again for each place; it writes complete files or none, as ``atomic_output`` does.
+    This is for results that took long to make. The other places, in order, are another name beside ``path``
+    ("a.kept.exr" for "a.exr"), the working directory, and the folder for temporary files. Nothing is overwritten there.
+    ``write`` must write a complete file or none, as ``atomic_output`` does.
 
-    ``alike`` is for folders that several processes write to, where every file counts. All of them would write the same
-    file, so an existing one is accepted, and no other file is put beside it.
+    ``alike`` means that several processes write the same file to this folder, in which each file counts. Then an
+    existing file is accepted, and no file is put beside it.
     """
     path = Path(path)
     try:
@@ -86,7 +86,7 @@ def save(
 
 
 def _other_places(path: Path, beside: bool) -> Iterator[Path]:
-    """Free paths, one in each fallback folder, for a file that cannot be written to ``path``."""
+    """A free path in each of the other folders for a file that cannot be written to ``path``."""
     names = [f"{path.stem}.kept{f'-{n}' if n > 1 else ''}{path.suffix}" for n in range(1, _MOST + 1)]
     folders: list[Callable[[], str | Path]] = [Path.cwd, tempfile.gettempdir]
     for find in [lambda: path.parent, *folders] if beside else folders:
@@ -100,12 +100,12 @@ def _other_places(path: Path, beside: bool) -> Iterator[Path]:
 def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Path]:
     """Yields a temporary path beside ``path`` and renames it to ``path`` when the block succeeds.
 
-    The temporary file keeps the suffix of ``path`` (writers choose the format by it), is flushed to disk before the
-    rename, and is removed when the block fails. So an incomplete file never has the final name. The block must write
-    into that file, not replace it. A link stays a link: its target is written. A killed process leaves a hidden
-    temporary file behind; the next process that writes into the folder removes it (on Windows, when it is a day old).
+    The temporary file has the suffix of ``path``, is flushed to disk before the rename, and is removed if the block
+    fails. The block must write into that file, not replace it. If ``path`` is a link, its target is written. A killed
+    process leaves a hidden temporary file. The next process that writes into the folder removes it, on Windows when it
+    is a day old.
 
-    Raises NgptError if the file cannot be written, and if another writer has made the same new file first.
+    Raises NgptError if the file cannot be written, or if another writer has made the same new file first.
     """
     path = check_output(path, overwrite)
     path = Path(os.path.realpath(path)) if path.is_symlink() else path
@@ -116,7 +116,7 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
         yield temporary
         with open(temporary, "r+b") as file:  # Windows flushes only what may be written
             os.fsync(file.fileno())
-        # mkstemp makes private files; give the result the permissions that open() would have given it.
+        # mkstemp makes private files, and open() would not.
         os.chmod(temporary, 0o666 & ~_umask())
         _publish(temporary, path, overwrite)
         _sync_folder(path.parent)
@@ -131,8 +131,7 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
 
 
 def _umask() -> int:
-    """The umask of the process. It can be read only by setting it: two threads that do so at once could leave it at
-    0."""
+    """The umask of the process. It can only be read by setting it, and two threads at once could leave it at 0."""
     with _one_at_a_time:
         umask = os.umask(0)
         os.umask(umask)
@@ -140,8 +139,9 @@ def _umask() -> int:
 
 
 def _temporary(path: Path) -> tuple[Path, int | None]:
-    """A new file beside ``path``, and a handle. Where the system has locks, its lock shows other processes that the
-    writer is alive.
+    """A new file beside ``path``, and a handle whose lock shows other processes that the writer is alive.
+
+    On systems without locks, the handle is None.
     """
     while True:
         handle, name = tempfile.mkstemp(prefix=_PREFIX, suffix=path.suffix, dir=path.parent)
@@ -158,7 +158,7 @@ def _temporary(path: Path) -> tuple[Path, int | None]:
 
 @lru_cache(maxsize=1024)
 def _sweep(folder: Path) -> None:
-    """Removes temporary files of dead writers; once per process and folder, since a folder may hold very many files."""
+    """Removes temporary files of dead writers, once per process and folder, since a folder may hold many files."""
     with suppress(OSError):  # a folder that cannot be listed
         for name in filter(_LEFTOVER.fullmatch, os.listdir(folder)):
             with suppress(OSError):
@@ -166,7 +166,7 @@ def _sweep(folder: Path) -> None:
 
 
 def _remove_abandoned(path: Path) -> None:
-    """Removes a temporary file; raises OSError if its writer lives."""
+    """Removes a temporary file. Raises OSError if its writer is alive."""
     if fcntl is None:
         if time.time() - path.lstat().st_mtime > _FORGOTTEN:
             path.unlink()
@@ -180,7 +180,7 @@ def _remove_abandoned(path: Path) -> None:
 
 
 def _publish(temporary: Path, path: Path, overwrite: bool) -> None:
-    """Gives a finished file its name. Raises NgptError if another writer was faster and ``overwrite`` is not set."""
+    """Gives a finished file its name. Raises NgptError if another writer was faster and ``overwrite`` is False."""
     if not overwrite:
         try:
             os.link(temporary, path)  # unlike a rename, it fails if the name is taken
@@ -204,27 +204,24 @@ def _sync_folder(folder: Path) -> None:
 
 @contextmanager
 def exclusive(folder: str | os.PathLike, wait: bool = False) -> Iterator[None]:
-    """Keeps other processes out of ``folder`` for the length of the block.
+    """Keeps other processes that call this function for ``folder`` waiting during the block.
 
-    Raises NgptError if another process is at work there; with ``wait``, waits until it is done. The lock ends with the
-    process, however it ends, even if processes that it forked go on.
+    If another process is in its block, raises NgptError, or waits if ``wait`` is True. The lock ends with the process,
+    even if processes that it forked go on.
     """
     with warnings.catch_warnings():
-        # filelock warns if the system cannot lock files, and it uses a file with the process number instead.
+        # filelock warns if the system cannot lock files, and uses a file with the process number instead.
         warnings.simplefilter("ignore")
-        # Imported only here: denoising locks no folder.
-        from filelock import FileLock, Timeout
+        from filelock import FileLock, Timeout  # only here, since denoising locks no folder
 
-    lock = FileLock(Path(folder) / ".lock", blocking=wait)
-    try:
-        os.stat(folder)  # raises if the folder does not exist; FileLock would make it
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        lock = FileLock(Path(folder) / ".lock", blocking=wait)
+        try:
+            os.stat(folder)  # raises if the folder does not exist; FileLock would make it
             lock.acquire()
-    except Timeout as error:
-        raise NgptError(f"{folder}: another process is writing there; wait for it, or name another folder") from error
-    except OSError as error:
-        raise NgptError(f"{folder}: cannot be written: {error.strerror or error}; name another folder") from error
+        except Timeout as error:
+            raise NgptError(f"{folder}: another process is writing there; wait, or name another folder") from error
+        except OSError as error:
+            raise NgptError(f"{folder}: cannot be written: {error.strerror or error}; name another folder") from error
     try:
         yield
     finally:

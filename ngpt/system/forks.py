@@ -1,8 +1,7 @@
-"""Objects that own threads, such as pools, in processes that fork.
+"""Drops objects that own threads, such as pools, before a process forks.
 
 A forked child has the memory of its parent but none of its threads. An inherited pool of threads never answers, and
-even destroying it may hang. So objects that own threads are dropped before a fork; parent and child make new ones when
-they need them.
+its destruction may hang. Parent and child make new objects when they need them.
 """
 
 import os
@@ -16,10 +15,9 @@ Made = TypeVar("Made")
 
 
 def hold_while_forking(lock: Lock, drop: Callable[[], object] = lambda: None) -> None:
-    """From now on, no fork happens while another thread holds ``lock``. Before each fork, ``drop`` is called with the
-    lock held.
+    """Makes each fork wait until no other thread holds ``lock``, and calls ``drop`` before it, with the lock held.
 
-    The thread that forks must not hold the lock itself.
+    The thread that forks must not hold the lock.
     """
 
     def before() -> None:
@@ -31,9 +29,9 @@ def hold_while_forking(lock: Lock, drop: Callable[[], object] = lambda: None) ->
 
 
 def until_fork(most: int) -> Callable[[Callable[Given, Made]], Callable[Given, Made]]:
-    """A decorator: keeps the ``most`` last results, as ``lru_cache`` does, for results that own threads.
+    """A decorator like ``lru_cache(most)``, for functions whose results own threads.
 
-    Threads that ask for the same result at the same time get the same object. Before a fork all results are dropped.
+    Two threads that need the same result at once get the same object. Before a fork, all results are dropped.
     """
 
     def decorate(make: Callable[Given, Made]) -> Callable[Given, Made]:
@@ -53,9 +51,9 @@ def until_fork(most: int) -> Callable[[Callable[Given, Made]], Callable[Given, M
 
 @cache
 def in_children(call: Callable[[], object]) -> None:
-    """From now on ``call`` runs in every forked child, in the thread that forked; once, even if registered repeatedly.
+    """Makes each forked child run ``call`` once, in the thread that forked.
 
-    It is for pools that cannot be dropped, such as OpenMP's: a child that is set to one thread does not use the pool.
+    It is for pools that cannot be dropped, such as OpenMP's: a child that is set to one thread does not use its pool.
     """
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=call)

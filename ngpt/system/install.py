@@ -1,4 +1,4 @@
-"""The commands that install extras of ngpt-recon, for all messages that name one."""
+"""The commands that install missing packages, as messages show them."""
 
 import re
 import shlex
@@ -6,12 +6,12 @@ import shutil
 import sys
 from pathlib import Path
 
-# Whether the package index has ngpt-recon. The first release sets this to True, and the table in README then names the
-# index (tests/system/test_install.py checks that).
+# Whether the package index has ngpt-recon. The first release sets this to True, and then the table in README must name
+# the index, which a test checks.
 PUBLISHED = False
 
 NAME, STUDIES = "ngpt-recon", "ngpt-studies"
-# The entries that ngpt-studies adds, by the word that their registry uses for an entry
+# The entries of registries that ngpt-studies adds, by the word of the registry for an entry
 _PHOTONS = ("beams", "gbeams", "gbre", "gplanes", "gpm", "gvcm", "gvpm", "planes", "vpm")
 _SAMPLERS = ("gbdpt", "gmlt", "gpt-tiles", "restir", "split", *_PHOTONS)
 BROUGHT = {"method": ("nlm",), "network": ("kpcn",), "sampler": _SAMPLERS}
@@ -19,17 +19,17 @@ CHECKOUT = Path(__file__).parents[2]
 
 
 def install_command(extra: str) -> str:
-    """The command for an extra: from the index, from this checkout, or else for the packages of the extra."""
+    """The command that installs an ``extra`` of ngpt-recon, from the index or this checkout, or else its packages."""
     if PUBLISHED:
         return f"{_pip()} install '{NAME}[{extra}]'"
     if (CHECKOUT / "pyproject.toml").is_file():
         return f"{_pip()} install -e {shlex.quote(f'{CHECKOUT}[{extra}]')}"
-    # The wheel's own file may be gone by now.
+    # The file of the installed wheel may be gone by now.
     return f"{_pip()} install {shlex.join(packages_of(extra))}"
 
 
 def package_command(package: str) -> str:
-    """The command for a package of the index."""
+    """The command that installs a package from the index."""
     return f"{_pip()} install {shlex.quote(package)}"
 
 
@@ -48,7 +48,7 @@ def study(what: str, name: str) -> str:
 
 
 def packages_of(extra: str) -> list[str]:
-    """The packages of an extra with their required versions, from the installed metadata."""
+    """The packages of an extra with their required versions, from the metadata of the installed ngpt-recon."""
     from importlib.metadata import PackageNotFoundError, requires  # takes 50 ms
 
     try:
@@ -59,7 +59,7 @@ def packages_of(extra: str) -> list[str]:
 
 
 def _pip() -> str:
-    """The command of the pip that installs for this Python; the shell's pip may belong to another Python."""
+    """The command of this Python's pip, which may not be the pip that the shell finds."""
     found = shutil.which("pip")
     beside = found is not None and Path(found).parent == Path(sys.executable).parent
     return "pip" if beside else f"{shlex.quote(sys.executable)} -m pip"

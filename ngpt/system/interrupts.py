@@ -1,4 +1,4 @@
-"""Ctrl-C (SIGINT) and SIGTERM, which service managers, containers and queues send: both end a command the same way."""
+"""Handles Ctrl-C (SIGINT) and SIGTERM in the same way. Service managers, containers and queues send SIGTERM."""
 
 import signal
 import threading
@@ -7,12 +7,12 @@ from contextlib import contextmanager
 
 from ngpt.errors import Interrupted
 
-# Signals and their default handlers.
+# Signals and their default handlers
 _SIGNALS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
 
 
 class Interrupt:
-    """The number of the first signal that has arrived, 0 before. Calling the object returns whether one has arrived."""
+    """Records the number of the first signal, 0 if none has arrived. A call returns whether one has arrived."""
 
     def __init__(self) -> None:
         self.signal = 0
@@ -30,8 +30,7 @@ class Interrupt:
 def raised() -> Iterator[Interrupt]:
     """In the block, both signals are recorded and raise ``Interrupted``, so that everything is cleaned up.
 
-    A signal that other code handles or has switched off is left as it is. Outside of the main thread, both signals are
-    left as they are.
+    Signals that other code handles or ignores are not changed. Outside of the main thread, nothing is changed.
     """
     found = Interrupt()
 
@@ -39,18 +38,17 @@ def raised() -> Iterator[Interrupt]:
         found.signal = found.signal or number
         raise Interrupted
 
-    # Python's own handlers show that no other code has set one. In background jobs of a script, SIGINT is ignored.
-    ours = [number for number, usual in _SIGNALS.items() if signal.getsignal(number) is usual]
-    with _handled(ours, note):
+    # Other code has set a handler if it is not Python's default. In background jobs of a script, SIGINT is ignored.
+    free = [number for number, usual in _SIGNALS.items() if signal.getsignal(number) is usual]
+    with _handled(free, note):
         yield found
 
 
 @contextmanager
-def noted(told: Callable[[], None] = lambda: None) -> Iterator[Interrupt]:
-    """In the block, the first signal is only recorded; any further one has its previous effect.
+def noted(notify: Callable[[], None] = lambda: None) -> Iterator[Interrupt]:
+    """In the block, the first signal is only recorded, and ``notify`` is called. A second one has its usual effect.
 
-    ``told`` is called as soon as the signal arrives. A signal that is switched off stays switched off. Outside of the
-    main thread, no signal arrives.
+    Ignored signals stay ignored. Outside of the main thread, nothing is changed.
     """
     found = Interrupt()
 
@@ -58,9 +56,9 @@ def noted(told: Callable[[], None] = lambda: None) -> Iterator[Interrupt]:
         found.signal = number
         for other, handler in before.items():
             signal.signal(other, handler)
-        told()
+        notify()
 
-    # None means a handler of a C program that embeds Python.
+    # None is the handler of a C program that embeds Python.
     before = {number: old for number in _SIGNALS if (old := signal.getsignal(number)) not in (signal.SIG_IGN, None)}
     with _handled(list(before), note):
         yield found
@@ -68,7 +66,7 @@ def noted(told: Callable[[], None] = lambda: None) -> Iterator[Interrupt]:
 
 @contextmanager
 def _handled(numbers: Sequence[int], handler: Callable) -> Iterator[None]:
-    """Handles these signals in the block, then restores the handlers. Only in the main thread, where signals arrive."""
+    """Sets a handler for these signals in the block. Does nothing outside of the main thread, where none arrive."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,11 +1,11 @@
-"""SciPy, imported at its first use: the import takes a quarter of a second, and most commands do not need it."""
+"""Imports SciPy at its first use, because the import takes a quarter of a second and most commands do not need it."""
 
 from importlib import import_module
 from typing import Any
 
 
 class Late:
-    """A module of that name, imported when one of its attributes is first used."""
+    """Stands for the module ``name``, and imports it when one of its attributes is first used."""
 
     def __init__(self, name: str):
         self.name = name

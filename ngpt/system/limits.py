@@ -1,4 +1,4 @@
-"""What this process may use: memory, address space, processors. Systems without such limits are not queried."""
+"""The memory, address space and processors that this process may use."""
 
 import ctypes
 import math
@@ -14,27 +14,24 @@ try:
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
-# MiB of address space that mean "no limit": far more than any machine has.
+# MiB of address space that stand for "no limit"
 UNLIMITED = 2**40
 
-# The most threads of one pool, set by ``limit_threads``; None without a limit.
+# The largest number of threads of a pool, set by ``limit_threads``; None without a limit
 _most: int | None = None
 
-# Assumed bytes of memory if the system does not say how much it has.
+# Bytes of memory to assume if the system does not tell
 _ASSUMED = 2**34
 
-
-# Where Linux shows the control groups of containers, and which of them this process is in.
+# The folder where Linux shows the control groups of containers, and the file that lists those of this process
 _GROUPS, _OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
 def processors() -> int:
-    """The number of processors that this process may use, at most ``limit_threads``.
+    """The number of threads for NumPy, SciPy, ONNX Runtime, OIDN and OpenEXR.
 
-    It is the number of processors that the process may run on, or that the machine has if the system does not say. The
-    time quota of a container lowers it.
-
-    NumPy, SciPy, ONNX Runtime, OIDN and OpenEXR use this number of threads.
+    It is the number of processors that this process may run on. The time quota of a container and ``limit_threads``
+    lower it.
     """
     own = _visible()
     return min(own, _most or own, _quota() or own)
@@ -46,7 +43,7 @@ def _visible() -> int:
 
 @cache
 def _quota() -> int | None:
-    """The number of processors whose time the control groups allow, rounded up; None without a limit."""
+    """The number of processors, rounded up, whose time the control groups allow; None without a limit."""
     found = [(quota, period) for quota, period in map(str.split, _of_groups("cpu.max", ""))]  # microseconds, or "max"
     found += zip(_of_groups("cpu.cfs_quota_us", "cpu"), _of_groups("cpu.cfs_period_us", "cpu"), strict=False)
     limits = [int(quota) / int(period) for quota, period in found if quota.isdecimal()]
@@ -54,9 +51,9 @@ def _quota() -> int | None:
 
 
 def _of_groups(name: str, controller: str) -> list[str]:
-    """The contents of the files ``name`` in all control groups of this process, from its own group up.
+    """The contents of the files ``name`` in the control group of this process and in all groups above it.
 
-    ``controller``  the controller of version 1, where each has its own tree; "" for version 2
+    ``controller``  a controller of cgroup version 1, which has a tree for each; "" for version 2
     """
     try:
         lines = [line.split(":", 2) for line in _OWN_GROUPS.read_text(encoding="utf-8", errors="replace").splitlines()]
@@ -66,17 +63,17 @@ def _of_groups(name: str, controller: str) -> list[str]:
     if own is None:
         return []
     root = _GROUPS / controller
-    # In a container the path may be the host's, and the group is the root itself.
+    # In a container, the path may be the host's; then only the root exists.
     folders = [root / own.strip("/"), *(root / own.strip("/")).parents]
     files = [folder / name for folder in folders if folder == root or root in folder.parents]
     return [file.read_text(encoding="ascii").strip() for file in files if file.is_file()]
 
 
 def limit_threads(most: int) -> None:
-    """From now on this package uses at most this number of threads. A later call replaces the limit of an earlier.
+    """Limits the number of threads that ngpt uses from now on. A later call replaces the limit.
 
-    PyTorch and renderers have limits of their own, and so has BLAS (OPENBLAS_NUM_THREADS and the like), which no
-    reconstruction needs. Raises WrongUse unless ``most`` is a whole number of at least 1.
+    PyTorch, renderers and BLAS have limits of their own; no reconstruction needs BLAS. Raises WrongUse unless ``most``
+    is a whole number of at least 1.
     """
     global _most
     if isinstance(most, bool) or not isinstance(most, int) or most < 1:
@@ -90,7 +87,7 @@ def limited() -> bool:
 
 
 def memory() -> int:
-    """Bytes of memory that this process may use: the machine's, or less by its own limits or its container's."""
+    """Bytes of memory that this process may use: the least of the machine's, the container's and its own limit."""
     texts = _of_groups("memory.max", "") + _of_groups("memory.limit_in_bytes", "memory")
     limits = [int(text) for text in texts if text.isdecimal()]
     own = address_space()
@@ -102,7 +99,7 @@ def _physical() -> int:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     kibibytes = ctypes.c_ulonglong()
     with suppress(AttributeError):  # neither POSIX nor Windows
-        # It returns False, and sets nothing, on virtual machines that lack the firmware tables of a real machine.
+        # It sets nothing on virtual machines without the firmware tables of a real machine.
         ctypes.windll.kernel32.GetPhysicallyInstalledSystemMemory(ctypes.byref(kibibytes))  # type: ignore[attr-defined]
     return kibibytes.value * 1024 or _ASSUMED
 
@@ -128,8 +125,7 @@ def free_address_space() -> int:
 
 
 def limit_address_space(limit: int) -> None:
-    """Limits the bytes that this process may map, if the system can. If the process crashes, it writes no memory to
-    disk."""
+    """Limits the bytes that this process may map, if the system can, and turns core dumps off."""
     if resource is None:
         return
     own = resource.getrlimit(resource.RLIMIT_AS)[1]

@@ -1,4 +1,4 @@
-"""The machine and the versions of packages that made a result, for its record."""
+"""Describes the machine and the installed packages, for records of results."""
 
 import platform
 import subprocess
@@ -44,7 +44,7 @@ def _cpu() -> str:
 
 
 def _commit() -> str | None:
-    """The commit of the source; None if it is no checkout, or git is not installed."""
+    """The commit of the source; None if it is not a checkout or git is not installed."""
     command = ["git", "rev-parse", "--short", "HEAD"]
     try:
         found = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parent)

@@ -1,7 +1,7 @@
-"""Parts that other packages add by entry points.
+"""Finds parts that other packages add by entry points.
 
-These are the renderer, which nothing in ngpt imports, and verbs that render; and the entries of each ``Registry``:
-methods, samplers, losses, metrics and networks.
+Such parts are the renderer, verbs of the command line, and entries of a ``Registry``: methods, samplers, losses,
+metrics and networks. Nothing in ngpt imports the renderer directly.
 """
 
 import sys
@@ -29,7 +29,7 @@ def warn(text: str) -> None:
 
 
 def points(group: str) -> Iterator[Any]:
-    """The entry points of a ``group`` whose packages are still installed; nothing is imported."""
+    """The entry points of a ``group`` whose packages are still installed. Nothing is imported."""
     for point in _listed(tuple(sys.path)).select(group=group):
         if find_spec(point.module.partition(".")[0]):
             yield point
@@ -52,16 +52,15 @@ def loaded(point: Any) -> Any:
 
 
 def blamed(error: Exception) -> str:
-    """An error by a function of another package as text, with the last line in the function's own file."""
-    own = traceback.extract_tb(error.__traceback__)[1:]
-    last = next((frame for frame in reversed(own) if frame.filename == own[0].filename), None)
+    """An error of another package's function as text, with the last line in the file of that function."""
+    frames = traceback.extract_tb(error.__traceback__)[1:]
+    last = next((frame for frame in reversed(frames) if frame.filename == frames[0].filename), None)
     where = f" ({last.filename}, line {last.lineno})" if last else ""
     return f"{type(error).__name__}: {' '.join(str(error).split())}{where}"
 
 
 def brought(group: str) -> Iterator[Any]:
-    """The objects that the entry points of a ``group`` name. Packages that cannot be imported are left out, with a
-    warning."""
+    """The objects of the entry points of a ``group``. Objects that cannot be imported are left out with a warning."""
     for point in points(group):
         try:
             yield loaded(point)
@@ -70,12 +69,12 @@ def brought(group: str) -> Iterator[Any]:
 
 
 def find_renderer() -> Any:
-    """The renderer, see ``ngpt.renderer.Renderer``. Raises NgptError if none is installed, or it is broken."""
+    """The installed renderer (``ngpt.renderer.Renderer``). Raises NgptError if there is none, or it is broken."""
     return _only("ngpt.renderers")
 
 
 def find_crops() -> Any:
-    """The renderer of crops for training, see ``ngpt.renderer.Crops``. Raises NgptError as ``find_renderer`` does."""
+    """The installed ``ngpt.renderer.Crops``. Raises NgptError if there is none, or it is broken."""
     return _only("ngpt.crops")
 
 
@@ -86,15 +85,15 @@ def _only(group: str) -> Any:
 
 
 class Registry(dict[str, T]):
-    """Entries by name: ours, and those that other packages bring by entry points of a ``group``.
+    """Entries by name: those of ngpt, and those that other packages bring by entry points of a ``group``.
 
-    An entry of another package is imported when it is requested by name. Iteration covers our entries and the imported
-    entries of other packages; call ``load`` first to cover all. A search for one of ours does not look at other
-    packages.
+    An entry of another package is imported when it is requested by name. Iteration leaves out entries that are not
+    imported yet; ``load`` imports all.
 
     ``what``   the word for an entry in messages: "method"
     ``kind``   the class of an entry, or ``Callable``
-    ``taken``  further names that no other package's entry may have
+    ``ours``   the entries of ngpt
+    ``taken``  further names that entries of other packages must not have
     """
 
     def __init__(self, group: str, what: str, kind: Any, ours: dict[str, T], taken: Container[str] = ()):
@@ -126,12 +125,11 @@ class Registry(dict[str, T]):
             return default
 
     def names(self) -> list[str]:
-        """The names of all entries; nothing is imported."""
+        """The names of all entries. Nothing is imported."""
         return list(dict.fromkeys([*self, *(point.name for point in self._others())]))
 
     def load(self) -> list[str]:
-        """Imports the entries of all other packages and returns their names. Broken ones are left out, with a
-        warning."""
+        """Imports the entries of other packages and returns their names. Broken ones are left out with a warning."""
         for point in points(self.group):
             if self._is_taken(point):
                 warn(f"{_owner(point)} is left out: ngpt has a {self.what} of that name; its package must rename it")
@@ -143,8 +141,8 @@ class Registry(dict[str, T]):
         return [name for name in self if name in self._imported]
 
     def unknown(self, name: str, names: Iterable[str], choices: str) -> WrongUse:
-        """The error for an unknown name: how to install the study of that name; or else a similar one of ``names``, and
-        the ``choices``."""
+        """The error for an unknown name. It says how to install the study of that name, or suggests a similar one of
+        ``names`` and lists the ``choices``."""
         if line := study(self.what, name):
             return WrongUse(line)
         return WrongUse(f"unknown {self.what} '{name}'; {did_you_mean(name, names)}choose one of: {choices}")

@@ -1,4 +1,4 @@
-"""Reads, computes and writes at the same time, so that computing never waits for a disk or a decoder."""
+"""Reads, computes and writes items at the same time, so that computing does not wait for a disk or a decoder."""
 
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -10,21 +10,24 @@ from ngpt.errors import NgptError, WrongUse
 Item = TypeVar("Item")
 Read = TypeVar("Read")
 Made = TypeVar("Made")
-Told = TypeVar("Told")
+Written = TypeVar("Written")
 
 
 def overlapped(
-    items: Sequence[Item], read: Callable[[Item], Read], compute: Callable[[Read], Made], write: Callable[[Made], Told]
-) -> Generator[Told | NgptError, None, None]:
-    """Yields ``write(compute(read(item)))`` of each item, in order; for an item that fails, its NgptError.
+    items: Sequence[Item],
+    read: Callable[[Item], Read],
+    compute: Callable[[Read], Made],
+    write: Callable[[Made], Written],
+) -> Generator[Written | NgptError, None, None]:
+    """Yields ``write(compute(read(item)))`` for each item in order, or the NgptError of an item that fails.
 
-    ``read`` is one item ahead and ``write`` one behind, each in its own thread; ``compute`` runs in the caller's.
-    So at most three items are held at once. Any other error is raised when its item's turn comes, and so is WrongUse,
-    which concerns all items. If an interrupt or ``close()`` ends the work early, the threads finish what they have
-    begun and start nothing else. A single item needs no threads. Raises MemoryError if there is no room for two.
+    ``read`` is one item ahead and ``write`` one item behind, each in its own thread; ``compute`` runs in the caller's
+    thread. At most three items are held at once. WrongUse, which concerns all items, and any other error are raised in
+    the turn of their item. If an interrupt or ``close()`` ends the work early, the threads finish their current items.
+    A single item needs no threads. Raises MemoryError if the threads cannot be started.
     """
     if len(items) == 1:
-        yield _told(_attempt(write, _attempt(compute, _attempt(read, items[0]))))
+        yield _outcome(_attempt(write, _attempt(compute, _attempt(read, items[0]))))
         return
     with ThreadPoolExecutor(1, "read") as reader, ThreadPoolExecutor(1, "write") as writer:
         try:
@@ -39,17 +42,17 @@ def overlapped(
             coming = _begun(reader, read, items[i + 1]) if i + 1 < len(items) else None
             value = _attempt(compute, value)
             if going:
-                yield _told(going.get())
+                yield _outcome(going.get())
             going = _begun(writer, write, value)
-            del value  # only the writer keeps it, so that it is freed once written
+            del value  # so that it is freed once it is written
         if going:
-            yield _told(going.get())
+            yield _outcome(going.get())
 
 
 def _begun(thread: ThreadPoolExecutor, stage: Callable[[Any], Any], value: Any) -> SimpleQueue:
-    """Begins a stage; its result or error will be in the queue.
+    """Begins a stage in a thread. Its result or error will be in the returned queue.
 
-    An interrupt while one waits for a future may leave its lock held, and the thread would wait for that lock for ever.
+    A future is not used: an interrupt during a wait for it may leave its lock held, so that the thread waits forever.
     """
     outcome: SimpleQueue = SimpleQueue()
     thread.submit(lambda: outcome.put(_attempt(stage, value)))
@@ -57,7 +60,7 @@ def _begun(thread: ThreadPoolExecutor, stage: Callable[[Any], Any], value: Any) 
 
 
 def _attempt(stage: Callable[[Any], Any], value: Any) -> Any:
-    """The result of a stage, or its error; errors of earlier stages are passed through."""
+    """The result of a stage, or its error. An error of an earlier stage is returned as it is."""
     if isinstance(value, Exception):
         return value
     try:
@@ -66,8 +69,8 @@ def _attempt(stage: Callable[[Any], Any], value: Any) -> Any:
         return error
 
 
-def _told(outcome: Any) -> Any:
-    """The outcome of an item, unless it is an error that concerns all of them."""
+def _outcome(outcome: Any) -> Any:
+    """The outcome of an item. Raises an error that is not the item's own."""
     if isinstance(outcome, Exception) and (isinstance(outcome, WrongUse) or not isinstance(outcome, NgptError)):
         raise outcome
     return outcome

@@ -1,4 +1,4 @@
-"""Input files: only regular files, and only up to a sensible size."""
+"""Opens input files, which must be regular files, and reads them up to a sensible size."""
 
 import os
 import stat
@@ -14,13 +14,13 @@ MOST_TEXT = 2**28  # bytes of a configuration or a record
 
 @contextmanager
 def regular_file(path: Path) -> Iterator[BinaryIO]:
-    """The file, opened for reading. Raises NgptError for pipes and devices, which may keep a reader waiting forever."""
+    """Opens a file for reading. Raises NgptError if it is missing or unreadable, and for pipes, devices and folders."""
     try:
         file = open(path, "rb", opener=_open_at_once)  # noqa: SIM115
     except FileNotFoundError:
         raise NgptError(f"{path}: not found; check the name") from None
     except (OSError, ValueError) as error:  # ValueError: a name with a zero in it
-        if os.path.isdir(path):  # not every system says so in its error
+        if os.path.isdir(path):  # not every system's error tells
             raise NgptError(f"{path}: is a directory; name a file in it") from None
         raise NgptError(f"{path}: cannot be read: {getattr(error, 'strerror', '') or error}") from error
     with file:
@@ -33,6 +33,7 @@ def regular_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def _open_at_once(name: str, flags: int) -> int:
+    """Opens a file without waiting, as a pipe without a writer would make it wait."""
     return os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
 
 

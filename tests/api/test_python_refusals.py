@@ -10,7 +10,7 @@ from ngpt.errors import NgptError
 LAYERS = full_layers(18, 26)
 IMAGE = LAYERS["primal"]
 RGBA = np.concatenate([IMAGE, IMAGE[..., :1]], axis=-1)
-INTEGERS = "is of type {}: integers hold what displays show; pass"
+INTEGERS = "is of type {}; pass scene-linear floats"
 PAST = ("previous_denoised", "temporal")
 UNANNOUNCED = "{} is given, but was not announced: Denoiser(size, {}=True)"
 

@@ -69,7 +69,7 @@ def test_halves_are_of_one_place_and_of_different_seeds(stack):
     assert ngpt.reconstruct_with_error(whole, "wcv", halves=(half("1"), half("2 3"))).error is not None
     with pytest.raises(NgptError, match=r"48x32 at \(48, 0\) .* and the stack 48x32 at \(0, 0\)"):
         ngpt.reconstruct_with_error(whole, "wcv", halves=(half("1"), half("2", left=48)))
-    with pytest.raises(NgptError, match="both halves were rendered with seed 2"):
+    with pytest.raises(NgptError, match="both halves have seed 2"):
         ngpt.reconstruct_with_error(whole, "wcv", halves=(half("1 2"), half("2 3")))
 
 

@@ -198,7 +198,7 @@ def test_a_layer_in_a_file_of_its_own(name, parts, channels):
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ([("", names("uv.UV"))], "a.exr: no layer with channels R G B for 'albedo'; the file holds \"uv\" (U V)"),
+        ([("", names("uv.UV"))], "a.exr: no layer for 'albedo' with channels R G B; the file holds \"uv\" (U V)"),
         ([("", names("a.RGB", "b.RGB"))], 'a.exr: layer \'albedo\' could be any of "a", "b"'),
     ],
 )

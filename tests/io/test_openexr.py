@@ -210,7 +210,7 @@ def subsampled(path):
         ),
         (lambda path: path.write_bytes(b"\x76\x2f"), "not an OpenEXR file"),
         (lambda path: path.write_bytes(b"\x76\x2f\x31\x01\x02\0\0\0nonsense"), "its header ends early"),
-        (deep, "part 0 is a deep image; flatten it first"),
+        (deep, "part 0 is a deep image; flatten it, or"),
         (subsampled, "channel 'RY' of part 0 is subsampled 2x2"),
     ],
 )

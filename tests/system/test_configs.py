@@ -21,6 +21,6 @@ def test_what_is_neither_is_told_what_there_is(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(
         NgptError,
-        match=r"no such file; (did you mean .*\? )?configurations that come with ngpt: .*combine, .*fast, .*tiny",
+        match=r"no such file; (did you mean .*\? )?ngpt has the configurations: .*combine, .*fast, .*tiny",
     ):
         find_config(name, TRAINING)
