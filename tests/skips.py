@@ -14,7 +14,6 @@ ALLOWED = {
     r"this machine may have room for them": "images of 16 TiB",
     r"strace may not trace here": "some containers forbid it",
     r"the compiler has no ": "sanitizers that a compiler comes without",
-    r"clang has no libFuzzer": "the same",
 }
 
 

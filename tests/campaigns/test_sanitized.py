@@ -25,9 +25,7 @@ STATUSES = ("OK", "BAD_ARGUMENT", "MISSING_LAYER", "BAD_NETWORK", "OUT_OF_MEMORY
 
 def has(compiler, flags, folder) -> bool:
     probe = [compiler, *flags.split(), "-x", "c", "-", "-o", folder / "probe"]
-    text = "int main(void) { return 0; }" if "fuzzer" not in flags else (
-        "int LLVMFuzzerTestOneInput(const char *data, unsigned long size) { return !data && size; }"
-    )  # fmt: skip
+    text = "int main(void) { return 0; }"
     return not subprocess.run(list(map(str, probe)), input=text, text=True, capture_output=True).returncode
 
 
@@ -100,27 +98,6 @@ def test_arguments_at_random(sanitized, networks):
         sum(counts),
         dict(zip(STATUSES, counts, strict=True)),
         seconds=round(time.monotonic() - clock),
-    )
-
-
-def test_arguments_that_cover_more(toolchain, networks, tmp_path):
-    """libFuzzer looks for bytes that lead to code which no bytes have led to."""
-    flags = ADDRESS.replace("address", "fuzzer-no-link,address")
-    if not has(tool("clang"), ADDRESS.replace("address", "fuzzer,address"), tmp_path):
-        pytest.skip("clang has no libFuzzer")
-    made = Sanitized(flags, tmp_path, toolchain, f"-DCMAKE_CXX_COMPILER={tool('clang++')}")
-    program, prefix = tmp_path / "fuzzer", made.prefix
-    options = ["-DLIBFUZZER", "-x", "c", HERE / "front.c", "-x", "none", "-o", program]
-    options += [f"-I{prefix}/include", f"-L{prefix}/lib"]
-    flags = ADDRESS.replace("address", "fuzzer,address").split()
-    command(tool("clang++"), *flags, *options, f"-Wl,-rpath,{prefix}/lib", "-lngpt")
-    environment = os.environ | {"FRONT_NETWORKS": "\n".join(map(str, networks))}
-    run = [str(program), "-max_total_time=60", "-max_len=4000", f"-artifact_prefix={tmp_path}/", "-print_final_stats=1"]
-    outcome = subprocess.run(run, capture_output=True, text=True, timeout=300, env=environment)
-    assert outcome.returncode == 0, outcome.stderr[-6000:]
-    (runs,) = re.findall(r"stat::number_of_executed_units:\s*(\d+)", outcome.stderr)
-    record(
-        "Coverage-guided bytes: calls of the C library", int(runs), {"named error or accepted": int(runs)}, seconds=60
     )
 
 

@@ -82,18 +82,6 @@ def shade():
     )
 
 
-def sheet():
-    """Two sheets whose backs are black, one seen from its front and one from its back."""
-    return _place(
-        (0, 1.1, 1.6),
-        (0, 1.0, -1.2),
-        **_walls(1.2, 2.2, -1.2, 1.7),
-        lamp=_light([0, 2.19, 0.2], [0, -1, 0], (0.8, 0.8), (8, 8, 8)),
-        facing=_wall([-0.6, 0.9, -1.1], [0, 0, 1], (0.8, 1.2), _diffuse(0.7, 0.7, 0.7)),
-        averted=_wall([0.6, 0.9, -1.1], [0, 0, -1], (0.8, 1.2), _diffuse(0.7, 0.7, 0.7)),
-    )
-
-
 def contact():
     """A box 5 mm above the floor, and a ball that touches it."""
     return _place(
@@ -131,11 +119,6 @@ def foggy(scene, sigma_t=0.4):
 def foggy_sheet():
     """The sheet without thickness between bright fog and dark fog."""
     return foggy(thin_wall())
-
-
-def foggy_slit():
-    """The lamp behind a slit, in fog: a bright sheet of light in the air."""
-    return foggy(slit())
 
 
 def half_fog():

@@ -4,14 +4,17 @@ from pathlib import Path
 
 import pytest
 
+import data_gen
 import ngpt
-from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, Sampler, check_options, find, register
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, Sampler, check_options, choose, find, register
 from ngpt.errors import NgptError
 
 pytest.importorskip("mitsuba")
 
+from data_gen.dataset.config import read_config
+from data_gen.dataset.crops import render_input
 from data_gen.samplers.__main__ import table
-from data_gen.scenes.facts import scene_facts
+from data_gen.scenes.facts import Facts, scene_facts
 
 ENTRIES = {**SAMPLERS, **FRAME_SAMPLERS}
 OPTIONS = [(name, option) for name, entry in ENTRIES.items() for option in entry.options]
@@ -77,3 +80,15 @@ def test_light_paths_refuse_hair(renderer):
         refused = {name for name, sampler in SAMPLERS.items() if "'hair'" in sampler.refuses(facts(bsdf))}
         assert {name for name in refused if SAMPLERS[name].standing != "study"} == {"bdpt", "vcm", "ppm"}
     assert not facts({"type": "mask", "opacity": 0.5, "within": {"type": "diffuse"}}).hair
+
+
+def test_the_first_in_rank_that_does_not_refuse_is_chosen():
+    assert choose(Facts("path", ("air",))) == ("gpt-basic", SAMPLERS["gpt"].refuses(Facts("path", ("air",))))
+    assert choose(Facts("volpath", ("air",)))[0] == choose(Facts("path", ()))[0] == "gpt"
+    assert choose(Facts("spectral", ()))[0] == "gpt-basic"
+
+
+def test_options_of_a_training_set_reach_its_renders(renderer, tmp_path):
+    (tmp_path / "data.toml").write_text("scenes = 1\nsampler = 'gpt'\n[samplers.gpt]\ncaustic = false\n")
+    stack = render_input(read_config(tmp_path / "data.toml"), data_gen.load_scene("diffuse", (6, 4)), 4, 0, False)
+    assert "caustic=false" in stack.attributes["ngpt:samplerOptions"] and "caustic" not in stack

@@ -10,10 +10,8 @@ from tails_scenes import (
     contact,
     door,
     foggy_sheet,
-    foggy_slit,
     half_fog,
     shade,
-    sheet,
     shelf,
     slit,
     thin_wall,
@@ -37,11 +35,9 @@ MOST = {
     thin_wall: (0.600, 0.004),  # 0.305, -0.0007
     door: (0.060, 0.020),  # 0.020, -0.002
     shade: (0.060, 0.030),  # -, -0.006
-    sheet: (0.006, 0.004),  # 0.002, 0.0002
     contact: (0.006, 0.006),  # 0.0023, -0.0028
     slit: (0.150, 0.150),  # 0.075, -0.073
     foggy_sheet: (0.020, 0.008),  # -, 0.0012
-    foggy_slit: (0.100, 0.080),  # 0.033, 0.027
     half_fog: (0.020, 0.014),  # -, 0.003
 }
 # Edges, walls and light that is found by luck are tested in other ways below and in test_tails.py, too.

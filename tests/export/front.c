@@ -1,7 +1,6 @@
-/* Calls of the C library with arguments at random: 4000 of libFuzzer's bytes are a session, or of a generator's.
+/* Calls of the C library with arguments at random.
  *
- *     front SEED CALLS NETWORK...          prints how often each status came
- *     clang -fsanitize=fuzzer -DLIBFUZZER  the networks come from FRONT_NETWORKS, one a line
+ *     front SEED CALLS NETWORK...  prints how often each status came
  *
  * The library may be given anything but addresses that are not ours. So before each run it is worked out where the
  * pixels would be: a run that would leave its buffer must be one that the library refuses, or is not called.
@@ -35,11 +34,8 @@ static const char *paths[NETWORKS];
 static char *buffers[2];
 static long statuses[STATUSES], calls;
 static uint64_t state;
-static const unsigned char *bytes;
-static size_t left;
 
 static unsigned byte(void) {
-    if (bytes) return left ? (left--, *bytes++) : 0;
     state ^= state << 13, state ^= state >> 7, state ^= state << 17;
     return (unsigned)(state >> 32) & 255;
 }
@@ -154,7 +150,7 @@ static void session(void) {
     at.job = ngpt_job_new(at.network ? at.network : opened[index]);
     assert(at.job);
     if (chance(2)) ngpt_close(at.network), at.network = NULL;
-    for (turns = 0; turns < 64 && (!bytes || left); turns++) {
+    for (turns = 0; turns < 64; turns++) {
         if (chance(3))
             run(&at);
         else
@@ -174,21 +170,6 @@ static void prepare(void) {
     for (i = 0; i < 2; i++) assert((buffers[i] = (char *)calloc(1, BUFFER)));
 }
 
-#ifdef LIBFUZZER
-int LLVMFuzzerTestOneInput(const uint8_t *data, size_t length) {
-    static int ready;
-    if (!ready) {
-        char *list = strdup(getenv("FRONT_NETWORKS"));
-        int i;
-        for (i = 0; i < NETWORKS; i++) paths[i] = strtok(i ? NULL : list, "\n");
-        prepare();
-        ready = 1;
-    }
-    bytes = data, left = length;
-    session();
-    return 0;
-}
-#else
 int main(int count, char **arguments) {
     int i;
     assert(count == 3 + NETWORKS);
@@ -201,4 +182,3 @@ int main(int count, char **arguments) {
     for (i = 0; i < STATUSES; i++) printf("%ld%c", statuses[i], i + 1 < STATUSES ? ' ' : '\n');
     return 0;
 }
-#endif
