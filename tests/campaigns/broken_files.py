@@ -145,59 +145,22 @@ def shard(rng: Random | None, folder: Path) -> None:
 
 
 @cache
-def _weights() -> tuple[bytes, bytes]:
-    """Weights of a tiny network, and the checkpoint of its training after one step."""
+def _weights() -> bytes:
+    """Weights of a tiny network."""
+    from networks import ALL, dense, untrained
+
+    from ngpt.network.safetensors import save_weights
+
     with tempfile.TemporaryDirectory() as folder:
-        run = _trainer(Path(folder))
-        run.run()
-        return (Path(folder) / "weights.safetensors").read_bytes(), run.checkpoint.read_bytes()
-
-
-SETTINGS = {
-    "model": {"network": "dense", "channels": [2, 3], "units": [1, 1], "inputs": ["primal", "dx", "dy", "albedo"]},
-    "data": {"crop": 16},
-    "run": {"steps": 1, "batch": 1, "log": 1, "save": 1, "validate": 1},
-}  # fmt: skip
-
-
-class _Crop:
-    scene, inputs, spp, paired, reference_halves = "a", 1, (4,), False, ()
-    reference = full_stack(16, 16)["primal"]
-    reference_direct = reference_caustic = np.zeros_like(reference)
-
-    def stack(self, k: int) -> ngpt.GradientStack:
-        return full_stack(16, 16)
-
-
-def _trainer(folder: Path):
-    import torch
-
-    from ngpt.training.images import Images
-    from ngpt.training.settings import from_dict
-    from ngpt.training.trainer import Trainer
-
-    torch.set_num_threads(1)
-
-    def loss(prediction, target, generator):
-        value = (prediction - target).abs().mean()
-        return value, {"l1": value}
-
-    settings = from_dict(SETTINGS, "test")
-    return Trainer(settings, Images(settings, [_Crop()], [], loss), folder, say=lambda text: None)
+        save_weights(Path(folder) / "weights.safetensors", untrained(dense(ALL)), {})
+        return (Path(folder) / "weights.safetensors").read_bytes()
 
 
 def weights(rng: Random | None, folder: Path) -> None:
-    path, data = folder / "weights.safetensors", _weights()[0]
+    path, data = folder / "weights.safetensors", _weights()
     path.write_bytes(safetensors_changed(rng, data) if rng else data)
     image = ngpt.denoise(full_stack(9, 7), "ngpt", weights=str(path))
     assert np.isfinite(image).all()
-
-
-def checkpoint(rng: Random | None, folder: Path) -> None:
-    data = _weights()[1]
-    run = _trainer(folder)
-    run.checkpoint.write_bytes(safetensors_changed(rng, data) if rng else data)
-    run.resume()
 
 
 def settings(rng: Random | None, folder: Path) -> None:
@@ -257,5 +220,5 @@ def _onnx_changed(rng: Random, data: bytes) -> bytes:
 
 
 TARGETS: dict[str, Callable[[Random | None, Path], None]] = {
-    target.__name__: target for target in (exr, foreign, manifest, shard, weights, checkpoint, settings, network)
+    target.__name__: target for target in (exr, foreign, manifest, shard, weights, settings, network)
 }

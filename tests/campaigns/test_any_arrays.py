@@ -188,10 +188,6 @@ def test_a_converged_image_of_any_range_keeps_its_range(method):
 
 DENOISER = ngpt.Denoiser((4, 3))
 REFUSALS = {
-    "size of three": (lambda a: ngpt.Denoiser((1, 2, 3)), r"input_size is \(1, 2, 3\)"),
-    "complex": (lambda a: DENOISER(a.astype(complex)), "layer 'primal' is of type complex128"),
-    "objects": (lambda a: DENOISER(a.astype(object)), "layer 'primal' is of type object"),
-    "too large": (lambda a: DENOISER(a * 1e39), "36 values that float32 cannot hold"),
     "a number": (lambda a: DENOISER(1.0), r"noisy has shape \(\)"),
     "nothing": (lambda a: DENOISER(None), r"noisy has shape \(\)"),
     "matrix": (

@@ -25,7 +25,6 @@ TEXTS = {
     "shard": ("Shards of training sets, mutated, with a checksum that fits", 5000, ("safetensors",)),
     "settings": ("Settings of training and data generation, mutated", 5000, ("torch",)),
     "weights": ("Weights, mutated", 5000, ("torch", "safetensors")),
-    "checkpoint": ("Checkpoints of training, mutated", 5000, ("torch", "safetensors")),
     "network": ("ONNX networks given by users, mutated", 1000, ("onnx",)),
 }
 # Processor time and memory that one file of some kB may take

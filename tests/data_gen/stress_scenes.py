@@ -1,4 +1,4 @@
-"""Ten scenes of what users have and nobody tuned anything to: materials, shapes, lamps and media in odd company.
+"""Eight scenes of what users have and nobody tuned anything to: materials, shapes and lamps in odd company.
 
 Every one has a camera from near by and light that Mitsuba's own integrator finds within a few hundred samples. Where
 there are lamps without area, nothing is of clear glass or a mirror: ``path`` cannot see their caustics.
@@ -10,7 +10,6 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from media_scenes import density
 
 from data_gen.scenes.builtin import _box, _camera, _diffuse, _light, _rgb, _sphere, _transform, _wall
 
@@ -29,11 +28,11 @@ def two(bsdf):
     return {"type": "twosided", "nested": bsdf}
 
 
-def stage(depth=8, integrator="path", origin=(0.2, 1.1, 3.2), target=(0, 0.5, 0), fov=50, **things):
+def stage(depth=8, origin=(0.2, 1.1, 3.2), target=(0, 0.5, 0), fov=50, **things):
     """A floor, a wall at the back and a lamp above, which ``things`` may replace."""
     return {
         "type": "scene",
-        "integrator": {"type": integrator, "max_depth": depth, "rr_depth": 4},
+        "integrator": {"type": "path", "max_depth": depth, "rr_depth": 4},
         "sensor": _camera(list(origin), list(target), fov),
         "floor": _wall([0, 0, 0], [0, 1, 0], (6, 6), two(_diffuse(0.6, 0.5, 0.4))),
         "back": _wall([0, 1.5, -1.5], [0, 0, 1], (6, 3), two(_diffuse(0.4, 0.5, 0.6))),
@@ -242,50 +241,4 @@ def lamps():
     )
 
 
-def boxes():
-    """Coloured fogs in boxes that stand on the floor and touch each other, one of them with a ball of milk inside."""
-
-    def fog(albedo, sigma_t, **phase):
-        return {"type": "homogeneous", "albedo": _rgb(*albedo), "sigma_t": _rgb(*sigma_t), "scale": 3.0, **phase}
-
-    null = {"type": "null"}
-    red = fog((0.9, 0.5, 0.4), (0.3, 0.4, 0.5)) | {"id": "red"}
-    blue = fog((0.5, 0.7, 0.95), (0.5, 0.35, 0.25), phase={"type": "hg", "g": -0.4})
-    milk = fog((0.95, 0.9, 0.8), (1.0, 0.85, 0.7), phase={"type": "hg", "g": 0.6})
-    around = {"exterior": {"type": "ref", "id": "red"}}
-    return {"type": "scene", "red": red} | stage(
-        6,
-        "volpath",
-        left=_box([-0.4, 0.5, 0], [0.8, 1.0, 0.8], 0, null) | {"interior": {"type": "ref", "id": "red"}},
-        right=_box([0.4, 0.4, 0], [0.8, 0.8, 0.8], 0, null) | {"interior": blue},
-        milk=_sphere([-0.4, 0.55, 0.05], 0.25, null) | {"interior": milk, **around},
-        stone=_sphere([0.45, 0.25, 0.1], 0.2, _diffuse(0.8, 0.4, 0.2)) | {"exterior": blue},
-    )
-
-
-def cellar():
-    """The camera in mist, with a cloud of a grid before it and a coloured liquid in frosted glass, under a spot."""
-    mist = {"type": "homogeneous", "id": "mist", "albedo": 0.85, "sigma_t": 0.12}
-    air = {"exterior": {"type": "ref", "id": "mist"}}
-    placed = {"to_world": _transform().translate([0.0, 0.05, -0.4]).scale(0.9)}
-    smoke = {
-        "type": "heterogeneous",
-        "albedo": 0.9,
-        "sigma_t": {"type": "gridvolume", "grid": density(1, 0.0, 1.0, 5), **placed},
-        "scale": 3.0,
-    }
-    liquid = {"type": "homogeneous", "albedo": _rgb(0.2, 0.6, 0.9), "sigma_t": _rgb(1.0, 0.5, 0.2), "scale": 3.0}
-    toward = _transform().look_at([1.4, 2, 1.4], [0.2, 0.3, 0], [0, 1, 0])
-    scene = stage(
-        6,
-        "volpath",
-        cloud=_box([0.45, 0.5, 0.05], [0.92, 0.92, 0.92], 0, {"type": "null"}) | {"interior": smoke, **air},
-        cup=_sphere([-0.6, 0.4, 0.3], 0.4, {"type": "roughdielectric", "alpha": 0.3}) | {"interior": liquid, **air},
-        spot={"type": "spot", "to_world": toward, "intensity": _rgb(8, 7, 5), "cutoff_angle": 25},
-    )
-    scene["sensor"]["medium"] = {"type": "ref", "id": "mist"}
-    del scene["sky"]
-    return {"type": "scene", "mist": mist} | scene
-
-
-SCENES = [panes, principled, bumps, brushed, hair, solids, facets, lamps, boxes, cellar]
+SCENES = [panes, principled, bumps, brushed, hair, solids, facets, lamps]

@@ -5,7 +5,7 @@ import pytest
 from unbiased import load, same
 
 import ngpt
-from ngpt.errors import NgptError, WrongUse
+from ngpt.errors import WrongUse
 from ngpt.subpixels import FEWEST, FINE, means
 
 pytest.importorskip("mitsuba")
@@ -16,7 +16,7 @@ from data_gen.film import GradientFilm
 from data_gen.paths.camera import CameraSamples
 from data_gen.render import render_stack
 from data_gen.samplers import find
-from data_gen.session import render_frames, render_scene
+from data_gen.session import render_frames
 
 SIZE = (13, 9)
 
@@ -179,19 +179,7 @@ def test_a_render_goes_on_with_its_subpixels(command, tmp_path, renderer):
     assert not ngpt.read(tmp_path / "b.exr").fine and not ngpt.read(tmp_path / "c.exr").fine
 
 
-def test_the_command_takes_only_numbers_that_there_are(command):
-    assert "'3' subpixels cannot be kept; write 1, 2, 4, or auto" in command("render diffuse --subpixels 3", 2)
-
-
 def test_shots_have_subpixels(renderer):
     frames = render_frames("diffuse", [0, 1], 16, sampler="primal", size=(8, 6), subpixels=2)
     for _, stack in frames:
         assert "motion" in stack and np.array_equal(means(stack.fine["primal"], 2), stack["primal"])
-
-
-def test_the_image_of_a_file_is_that_of_the_stack(renderer, tmp_path):
-    stack, _ = render_scene("diffuse", 16, size=(16, 12), sampler="primal", subpixels=2)
-    back = ngpt.read(ngpt.write(tmp_path / "a.exr", stack))
-    assert np.array_equal(ngpt.denoise(back, "oidn"), ngpt.denoise(stack, "oidn"))
-    with pytest.raises(NgptError):
-        ngpt.read(tmp_path / "b.exr")

@@ -12,7 +12,6 @@ pytest.importorskip("mitsuba")
 
 import data_gen
 from data_gen.pattern import filled
-from data_gen.scenes.geometry import VERTICES
 
 XML = """<scene version="3.0.0"><default name="angle" value="0"/><integrator type="path"/>
 <sensor type="perspective"><transform name="to_world"><lookat origin="0,1,4" target="0,0,0" up="0,1,0"/></transform>
@@ -131,17 +130,6 @@ def test_a_twin_looks_through_the_same_camera(renderer, tmp_path):
     wanted, other = (Shot(lambda frame: (str(path), {}), sensor=number) for number in (1, 0))
     films = [each.snapshot(0).film for each in (wanted, wanted.twin(), other)]
     assert np.array_equal(films[0], films[1]) and not np.array_equal(films[0], films[2])
-
-
-def test_parameters_can_be_set_in_place(renderer, tmp_path):
-    def update(params, frame):
-        key = next(filter(lambda name: name.endswith(VERTICES), params.keys()))
-        start.setdefault(key, np.array(params[key]))
-        params[key] = start[key] + 0.1 * frame
-
-    start = {}
-    stacks = rendered(shot(tmp_path, update=update, moving=False), range(2))
-    assert np.nanmax(np.abs(stacks[1]["motion"])) > 0.2
 
 
 def test_a_first_frame_with_nothing_before_it_has_no_motion(renderer, tmp_path):

@@ -1,4 +1,4 @@
-"""Samplers on ten scenes of odd things: their means, and what their gradients are worth there.
+"""Samplers on eight scenes of odd things: their means, and what their gradients are worth there.
 
 All that are neither studies nor biased. The means of the primal and of differences over 1 and over 8 pixels are those
 of Mitsuba's own integrator. Each p-value is held against a level for all scenes, samplers, layers and blocks together.
@@ -60,7 +60,7 @@ def gain(stacks):
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("name", NAMES)
-def test_ten_stress_scenes(renderer, name):
+def test_stress_scenes(renderer, name):
     clock, found, wrong, outcomes = time.monotonic(), {}, [], Counter()
     for scene in SCENES:
         try:

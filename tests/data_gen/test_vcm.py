@@ -34,13 +34,10 @@ def ends_of(η):
     return Ends(scene, η, Materials(scene, 0.05).connectable, spp=64)
 
 
-def test_weights_of_bdpt_are_those_of_all_densities(renderer):
-    """Brute force in float64, on stored paths: no z-test sees every wrong term."""
-    check_weights(ends_of(0.0))
-
-
-def test_weights_count_merging_too(ends):
-    check_weights(ends)
+@pytest.mark.parametrize("η", [0.0, ETA])
+def test_weights_are_those_of_all_densities(ends, η):
+    """Brute force in float64, on stored paths, without merging and with it: no z-test sees every wrong term."""
+    check_weights(ends if η else ends_of(η))
 
 
 def test_weights_of_merging_are_those_of_all_densities(ends):
