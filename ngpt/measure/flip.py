@@ -1,7 +1,4 @@
-"""HDR-FLIP, computed by its authors' package: the difference that a viewer sees when flipping between two images.
-
-``ngpt.measure.distances.flip`` is its differentiable twin, for training.
-"""
+"""HDR-FLIP, computed by its authors' package: the difference that a viewer sees when flipping between two images."""
 
 import ctypes
 import math

@@ -34,9 +34,6 @@ class Augmentation:
     ``quieter``     range of a factor, log-uniform, one for each crop: adds the crop's best input with its noise
                     multiplied by the factor (``quieter``). So networks learn to use more samples than training sets
                     have. [] for none
-    ``rarer``       range of k, log-uniform, one for each crop: adds the crop's best input as if one path in k found
-                    most of its light (``rarer``). So networks learn from rooms lit through curtains, bulbs and gaps,
-                    which take too long to render for training. [] for none
     """
 
     geometry: bool = True
@@ -44,13 +41,9 @@ class Augmentation:
     brightness: float = 1.0
     depth: tuple[float, float] = (0.1, 1.1)
     quieter: tuple[float, ...] = ()
-    rarer: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "quieter", tuple(self.quieter))
-        object.__setattr__(self, "rarer", tuple(self.rarer))
-        if self.rarer and not (len(self.rarer) == 2 and 1 <= self.rarer[0] <= self.rarer[1]):
-            raise NgptError(f"[augmentation]: rarer = {list(self.rarer)}: must be two numbers, 1 <= least <= most")
         if self.quieter and not (len(self.quieter) == 2 and 0 < self.quieter[0] <= self.quieter[1] <= 1):
             raise NgptError(
                 f"[augmentation]: quieter = {list(self.quieter)}: must be two factors, 0 < least <= most <= 1"
@@ -91,33 +84,6 @@ def quieter(
     }
     layers = {name: factor * stack[name] + (1 - factor) * truth[name] for name in truth if name in stack}
     layers |= {name: factor**2 * stack[name] for name in _VARIANCES if name in stack}
-    return stack.replace(**layers)
-
-
-def rarer(stack: GradientStack, k: float, share: float, rng: np.random.Generator) -> GradientStack:
-    """The stack as if ``share`` of the light in each pixel were found by one path in ``k``, and were then k times as
-    bright.
-
-    In each pixel B = 1 with probability 1/k, else 0. Its light is multiplied by w = 1 - share + share k B, with mean 1.
-    A gradient comes from the paths of both its pixels, so its factor is the mean of their factors. Expectations stay
-    the same. Variances become those of such a stack: if an estimate X has the variance V, w X has the variance
-    E[w²] V + Var[w] E[X]². Directly visible emission, the layer ``caustic`` and features stay as they are.
-    """
-    height, width = stack["primal"].shape[:2]
-    found = np.float32(rng.random((height, width, 1)) * k < 1)
-    kept = sum(stack[name] for name in ("direct", "caustic") if name in stack)
-    parts = {"primal": found} | {name: (found + np.roll(found, -1, axis)) / 2 for name, axis in (("dx", 1), ("dy", 0))}
-    layers = {}
-    for name, hits in parts.items():
-        if name not in stack:
-            continue
-        beside = kept if name == "primal" else 0
-        factor, light = 1 - share + share * k * hits, stack[name] - beside
-        layers[name] = factor * light + beside
-        if f"{name}_var" in stack:
-            # Var[w] is share² (k - 1), and half of that for a mean of two. Only pixels where light was found show it.
-            spread = share**2 * (k - 1) * (1 if name == "primal" else 0.5)
-            layers[f"{name}_var"] = factor**2 * stack[f"{name}_var"] + k * hits * spread * light**2
     return stack.replace(**layers)
 
 

@@ -16,7 +16,7 @@ from ngpt.network.config import ModelConfig
 from ngpt.network.run_torch import layers_of
 from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
-from ngpt.training.augment import Augmentation, Layers, quieter, rarer
+from ngpt.training.augment import Augmentation, Layers, quieter
 from ngpt.training.crops import Crop
 
 # The prefix of the names of layers from the other half of a pair.
@@ -28,7 +28,7 @@ JITTER = 7
 class Examples(TorchDataset):
     """Endless training examples. Each is a function of its index and the seed, in any process and order.
 
-    Example ``i`` is a random crop with one of its inputs (or one by ``Augmentation.quieter`` or ``rarer``), normalised,
+    Example ``i`` is a random crop with one of its inputs (or one by ``Augmentation.quieter``), normalised,
     augmented and padded: a dict of layers (C, size + 16, size + 16) and the "target" (3, size - 14, size - 14). The
     target covers the middle, which no jitter of the padding reaches [NGPT's code]. Crops larger than ``size`` are cut
     at random. Prepared layers are cached in memory, up to ``cache`` bytes.
@@ -51,9 +51,6 @@ class Examples(TorchDataset):
         kinds = {crop.paired for crop in crops}
         self.pairs = pairs if len(kinds) > 1 else None
         self.crops, self.config, self.augmentation, self.size, self.seed = crops, config, augmentation, size, seed
-        # Functions that make further inputs of a crop from its rendered ones.
-        made = {self._quieter: augmentation.quieter, self._rarer: augmentation.rarer}
-        self._made = [make for make, asked in made.items() if asked]
         self._cache: OrderedDict[tuple[Crop, int], tuple[Layers, Layers]] = OrderedDict()
         self._free = cache
 
@@ -63,7 +60,7 @@ class Examples(TorchDataset):
     def __getitem__(self, index: int) -> Layers:
         rng = np.random.default_rng((self.seed, index))
         which, crop = self._drawn(rng)
-        k = int(rng.integers(crop.inputs + (0 if crop.paired else len(self._made))))
+        k = int(rng.integers(crop.inputs + (bool(self.augmentation.quieter) and not crop.paired)))
         parts = _scaled(*self._cut(*self._layers(which, crop, k), rng))
         # The target gets the same augmentation as the input.
         same = copy.deepcopy(rng)
@@ -91,7 +88,7 @@ class Examples(TorchDataset):
         if (crop, k) in self._cache:
             self._cache.move_to_end((crop, k))
             return self._cache[crop, k]
-        stack = crop.stack(k) if k < crop.inputs else self._made[k - crop.inputs](which, crop)
+        stack = crop.stack(k) if k < crop.inputs else self._quieter(which, crop)
         data = repair(stack, self.config.reads_gradients)
         layers = layers_of(data, self.config)
         if crop.paired:
@@ -112,12 +109,6 @@ class Examples(TorchDataset):
         factor = float(np.exp(np.random.default_rng((self.seed, which)).uniform(low, high)))
         best = crop.stack(int(np.argmax(crop.spp)))
         return quieter(best, crop.reference, crop.reference_direct, crop.reference_caustic, factor)
-
-    def _rarer(self, which: int, crop: Crop) -> GradientStack:
-        """The input of the crop with the most samples, as if its light were harder to find."""
-        rng = np.random.default_rng((self.seed, which, 1))
-        k = float(np.exp(rng.uniform(*np.log(self.augmentation.rarer))))
-        return rarer(crop.stack(int(np.argmax(crop.spp))), k, float(rng.uniform(0.5, 1)), rng)
 
     def _cut(self, layers: Layers, judge: Layers, rng: np.random.Generator) -> tuple[Layers, ...]:
         height, width = layers["primal"].shape[-2:]

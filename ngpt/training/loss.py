@@ -25,25 +25,21 @@ _OURS: dict[str, Term] = {
     "l1": pixelwise.l1,
     "gradient": pixelwise.gradient_l1,
     "relative": pixelwise.relative,
-    "logarithmic": pixelwise.logarithmic,
     "huber": pixelwise.huber,
     "pyramid": pixelwise.pyramid,
-    "flip": pixelwise.flip,
 }
-KINDS = (*perceptual.KINDS, "pu")
 
 
 @dataclass(frozen=True)
 class LossSettings:
     """The table [loss] of a configuration.
 
-    ``kind``         the perceptual part: "structural" (no weights needed), "elpips-squeeze" (NGPT's), "elpips-vgg" or
-                     "pu" (OIDN's); or, without a perceptual part, the name of a term such as "l1", which then has the
-                     weight 1
+    ``kind``         the perceptual part: "structural" (no weights needed), "elpips-squeeze" (NGPT's) or "elpips-vgg";
+                     or, without a perceptual part, the name of a term such as "l1", which then has the weight 1
     ``evaluations``  draws of the random transforms that are averaged in each step
     ``scales``       largest downscaling among the transforms; NGPT trains with 2
-    ``l1``, ``gradient``, ``relative``, ``logarithmic``, ``huber``, ``pyramid``, ``flip``
-                     weights of the pixelwise parts; NGPT has 0.01, 0.01, 0, 0, 0, 0, 0
+    ``l1``, ``gradient``, ``relative``, ``huber``, ``pyramid``
+                     weights of the pixelwise parts; NGPT has 0.01, 0.01, 0, 0, 0
     ``halves``       weight of the loss of pairs, ``ngpt.training.halves``; 0.25 has about the effect of the weights in
                      combine.toml
     ``backbone``, ``weights``  files of E-LPIPS (docs/train/losses.md); "" looks for the backbone in PyTorch's cache
@@ -55,17 +51,15 @@ class LossSettings:
     l1: float = 0.01
     gradient: float = 0.01
     relative: float = 0.0
-    logarithmic: float = 0.0
     huber: float = 0.0
     pyramid: float = 0.0
-    flip: float = 0.0
     halves: float = 0.25
     backbone: str = ""
     weights: str = ""
 
 
 # Weights of terms from other packages also go into [loss], by the terms' names.
-_TAKEN = (*KINDS, *(field.name for field in fields(LossSettings)))
+_TAKEN = (*perceptual.KINDS, *(field.name for field in fields(LossSettings)))
 TERMS: Registry[Term] = Registry("ngpt.losses", "loss", Callable, _OURS, _TAKEN)
 
 
@@ -112,14 +106,11 @@ class Loss:
     def _by_reference(
         self, prediction: Tensor, target: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        s, parts = self.settings, {}
+        parts: dict[str, Tensor] = {}
         total = prediction.new_zeros(())
         if self._distance is not None:
             parts["perceptual"] = self._distance(prediction, target, generator)
             total = total + parts["perceptual"]
-        if s.kind == "pu":
-            parts["pu"] = pixelwise.pu(prediction, target)
-            total = total + parts["pu"]
         for name, weight, term in self._terms:
             parts[name] = term(prediction, target)
             if parts[name].shape != ():
@@ -140,8 +131,8 @@ def make_loss(settings: dict[str, Any]) -> Loss:
             raise NgptError(f"[loss]: {name} = {value!r}: must be a number, the weight of that term")
         if number and not 0 <= value < math.inf:
             raise NgptError(f"[loss]: {name} = {value!r}: must be finite and not negative")
-    if result.kind not in KINDS and result.kind not in TERMS:
-        raise NgptError(f"[loss]: kind = '{result.kind}': choose one of: {', '.join((*KINDS, *TERMS))}")
+    if result.kind not in perceptual.KINDS and result.kind not in TERMS:
+        raise NgptError(f"[loss]: kind = '{result.kind}': choose one of: {', '.join((*perceptual.KINDS, *TERMS))}")
     if result.evaluations < 1 or result.scales < 1:
         raise NgptError("[loss]: evaluations and scales must be at least 1")
     return Loss(result, others)

@@ -170,10 +170,9 @@ def _check(settings: Settings, path: str) -> None:
     if settings.temporal is not None:
         _check_temporal(settings, settings.temporal, path)
     parts = [name for name in PARTS if settings.model is not None and name in settings.model.layers]
-    made = [name for name in ("quieter", "rarer") if getattr(settings.augmentation, name)]
-    if parts and made:
+    if parts and settings.augmentation.quieter:
         raise NgptError(
-            f"{path}: augmentation.{made[0]}: makes no {' and '.join(parts)} light, which the network reads, since "
+            f"{path}: augmentation.quieter: makes no {' and '.join(parts)} light, which the network reads, since "
             "references are not split; leave it out"
         )
     for name in ("steps", "batch", "log", "save", "validate"):

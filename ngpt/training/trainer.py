@@ -97,7 +97,9 @@ class Trainer:
         if header.get("kind") != "checkpoint":
             raise NgptError(f"{self.checkpoint}: holds {header.get('kind')}, not a checkpoint")
         check(header, {"settings": dict, "step": int, "seconds": (int, float)}, f"{self.checkpoint}: its header")
-        header["settings"].get("run", {}).pop("wandb", None)  # a setting of earlier versions
+        # Settings of earlier versions
+        header["settings"].get("run", {}).pop("wandb", None)
+        header["settings"].get("augmentation", {}).pop("rarer", None)
         before = from_dict(header["settings"], str(self.checkpoint))
         if before.model != self.settings.model:
             raise NgptError(f"{self.checkpoint}: was trained with another [model]; give the run another folder")

@@ -57,16 +57,7 @@ def test_networks_that_cannot_be(right, change, message):
         ModelConfig(**right | change)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        *(({"rarer": numbers}, "two numbers") for numbers in ((4,), (0.5, 4), (8, 4))),
-        *(
-            ({"quieter": factors}, "two factors")
-            for factors in ((0.1,), (0, 0.5), (0.5, 0.1), (0.5, 2), (0.1, 0.2, 0.3))
-        ),
-    ],
-)
-def test_augmentations_that_cannot_be(change, message):
-    with pytest.raises(NgptError, match=message):
-        Augmentation(**change)
+@pytest.mark.parametrize("factors", [(0.1,), (0, 0.5), (0.5, 0.1), (0.5, 2), (0.1, 0.2, 0.3)])
+def test_augmentations_that_cannot_be(factors):
+    with pytest.raises(NgptError, match="two factors"):
+        Augmentation(quieter=factors)

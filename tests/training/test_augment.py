@@ -7,7 +7,7 @@ import torch
 from ngpt.network import padding
 from ngpt.stack import GradientStack
 from ngpt.training import augment
-from ngpt.training.augment import Augmentation, quieter, rarer
+from ngpt.training.augment import Augmentation, quieter
 
 
 def differences(image):
@@ -96,38 +96,6 @@ def test_a_quieter_stack_has_a_part_of_the_noise():
     assert np.array_equal(result["albedo"], albedo) and np.array_equal(stack["primal"], noisy["primal"])
     bare = GradientStack.from_arrays(primal=noisy["primal"])
     assert quieter(bare, whole, direct, caustic, 0.1).names == ("primal",)
-
-
-@pytest.mark.parametrize("share", [0.6, 1.0])
-def test_rarer_light_keeps_its_mean_and_says_its_variance(share):
-    """Over many draws of the same estimates, errors are what the layers of variances say, in the mean."""
-    rng, k = np.random.default_rng(5), 6.0
-    direct, caustic = np.zeros((2, 40, 40, 3))
-    direct[2, 3], caustic[4, 5] = 7, 3
-    truth = {"primal": np.full((40, 40, 3), 2.0) + direct + caustic, "dx": np.full((40, 40, 3), 1.5)}
-    truth["dy"] = np.full((40, 40, 3), -0.5)
-    scale = {"primal": 0.3, "dx": 0.2, "dy": 0.1}
-    drawn, told = {name: [] for name in truth}, {name: [] for name in truth}
-    for _ in range(100):
-        noisy = {name: layer + scale[name] * rng.standard_normal(layer.shape) for name, layer in truth.items()}
-        variances = {f"{name}_var": np.full((40, 40, 3), scale[name] ** 2) for name in truth}
-        stack = GradientStack.from_arrays(**noisy, **variances, direct=direct, caustic=caustic)
-        result = rarer(stack, k, share, rng)
-        assert np.array_equal(result["direct"], stack["direct"]) and np.array_equal(result["caustic"], stack["caustic"])
-        for name in truth:
-            drawn[name].append(result[name])
-            told[name].append(result[f"{name}_var"].mean())
-    for name, layer in truth.items():
-        errors = np.array(drawn[name]) - layer
-        # The mean of 480,000 draws; a column and a row have no neighbour on one side.
-        assert abs(errors.mean()) < 4 * errors.std() / errors.size**0.5
-        # The noise of X itself counts in the variance that B adds: in the square of what is found.
-        assert (errors**2).mean() == pytest.approx(np.mean(told[name]), rel=0.05)
-    # A pixel without light found has 1 - share of it.
-    found = np.array(drawn["primal"]).mean(-1) - direct.mean(-1) - caustic.mean(-1)
-    assert np.mean(found < 2 * (1 - share) + 0.5) == pytest.approx(1 - 1 / k, abs=0.01)
-    bare = GradientStack.from_arrays(primal=truth["primal"])
-    assert rarer(bare, k, share, rng).names == ("primal",)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (16, 24)])

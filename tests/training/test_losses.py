@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
-from scipy.ndimage import gaussian_filter
 from scipy.stats import chisquare
 
 from ngpt.errors import NgptError
-from ngpt.measure.distances import backbones, elpips, ensemble, flip
-from ngpt.measure.distances.structural import ms_ssim, structural_distance
-from ngpt.network.transfer import srgb
+from ngpt.measure.distances import backbones, elpips, ensemble
+from ngpt.measure.distances.structural import structural_distance
 from ngpt.training import pixelwise
 from ngpt.training.loss import make_loss
 
@@ -43,7 +41,6 @@ DISTANCES = {
     "l1": lambda: pixelwise.l1,
     "gradient": lambda: pixelwise.gradient_l1,
     "relative": lambda: pixelwise.relative,
-    "logarithmic": lambda: pixelwise.logarithmic,
 }
 
 
@@ -82,63 +79,6 @@ def test_slopes_are_those_of_the_value(distance):
 def test_the_structural_distance_takes_every_size(size):
     a, b = images(1, 3, *size), images(1, 3, *size, seed=1)
     assert 0 < structural_distance(a, b) <= 2 and structural_distance(a, a).abs() < 1e-6
-
-
-def windows_of_7(image):
-    """Windows of 7x7 pixels, every third, (N, 49)."""
-    starts = range(0, image.shape[0] - 6, 3)
-    return np.array([image[y : y + 7, x : x + 7].ravel() for y in starts for x in starts])
-
-
-def test_ms_ssim_is_the_product_over_the_scales_by_brute_force():
-    rng = np.random.default_rng(4)
-    a = rng.random((14, 14))
-    b = np.clip(a + 0.1 * rng.standard_normal(a.shape), 0, 1)
-    images_at = [(a, b), tuple(image.reshape(7, 2, 7, 2).mean((1, 3)) for image in (a, b))]
-    expected, weights = 1.0, np.array([0.0448, 0.2856]) / (0.0448 + 0.2856)
-    for scale, weight in enumerate(weights):
-        x, y = (windows_of_7(image) for image in images_at[scale])
-        covariance = (x * y).mean(1) - x.mean(1) * y.mean(1)
-        similarity = (2 * covariance + 0.03**2) / (x.var(1) + y.var(1) + 0.03**2)
-        if scale == 1:
-            mx, my = x.mean(1), y.mean(1)
-            similarity *= (2 * mx * my + 0.01**2) / (mx**2 + my**2 + 0.01**2)
-        expected *= similarity.mean() ** weight
-    value = ms_ssim(*(torch.tensor(image)[None, None] for image in (a, b)))
-    assert value.shape == (1, 1) and value.item() == pytest.approx(expected, rel=1e-5)
-
-
-# FLIP
-
-
-def picture(blur, size=(48, 64)):
-    rng = np.random.default_rng(0)
-    image = np.clip(1.2 * gaussian_filter(rng.random((*size, 3)), (blur, blur, 0)) - 0.1, 0, 1)
-    return torch.from_numpy(image.astype(np.float32).transpose(2, 0, 1)[None].copy())
-
-
-@pytest.mark.parametrize("blur", [0, 1, 4])
-def test_maps_of_flip_are_those_of_the_reference_implementation(blur):
-    flip_evaluator = pytest.importorskip("flip_evaluator")
-    reference = picture(blur)
-    image = (reference + 0.1 * torch.randn(reference.shape, generator=generator(1))).clamp(0, 1)
-    ours = flip.ldr_flip(image, reference)[0, 0].numpy()
-    encoded = [np.ascontiguousarray(srgb(i)[0].permute(1, 2, 0).numpy()) for i in (reference, image)]
-    theirs, mean, _ = flip_evaluator.evaluate(*encoded, "LDR", applyMagma=False)
-    assert mean > 0.05 and np.abs(ours - np.asarray(theirs).reshape(ours.shape)).max() < 1e-3
-
-
-def test_the_largest_over_exposures_counts():
-    reference = 8 * picture(2)
-    alone = [flip.flip(1.2 * reference, reference, (e,)) for e in (0.01, 0.25)]
-    assert max(alone) <= flip.flip(1.2 * reference, reference, (0.01, 0.25)) <= sum(alone)
-
-
-@pytest.mark.parametrize("value", [0.0, 1e-20, 1e12])
-def test_slopes_of_flip_are_finite_where_images_agree_and_at_extremes(value):
-    image = torch.full((1, 3, 24, 24), value, requires_grad=True)
-    flip.flip(image, image.detach().clone(), (0.25, 0.01)).backward()
-    assert torch.isfinite(image.grad).all()
 
 
 # The ensemble
@@ -186,6 +126,17 @@ def test_a_transform_moves_pixels_and_scales_colours():
 
 
 # The composite
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, 1e6])
+def test_the_loss_is_finite_at_the_extremes(value):
+    loss = make_loss({"relative": 1.0})
+    for target in (torch.full((2, 3, 40, 40), value), images(2, 3, 40, 40)):
+        prediction = torch.full((2, 3, 40, 40), value, requires_grad=True)
+        total, parts = loss(prediction, target, generator())
+        total.backward()
+        assert torch.isfinite(total) and torch.isfinite(prediction.grad).all()
+        assert set(parts) == {"perceptual", "l1", "gradient", "relative"}
 
 
 @pytest.mark.parametrize(
@@ -335,16 +286,6 @@ def test_a_firefly_of_the_target_counts_once_whatever_its_brightness():
     prediction, targets = torch.ones(1, 3, 8, 8, requires_grad=True), torch.ones(2, 1, 3, 8, 8)
     targets[0, 0, :, 3, 3], targets[1, 0, :, 3, 3] = 10.0, 1e6
     assert torch.allclose(*(slope(pixelwise.huber, prediction, target) for target in targets))
-
-
-def test_the_loss_of_oidn_is_zero_for_equal_images_and_looks_at_them_at_their_own_exposure():
-    a, b = 8 * images(2, 3, 48, 40), 8 * images(2, 3, 48, 40, seed=1)
-    loss = make_loss({"kind": "pu", "l1": 0.0, "gradient": 0.0})
-    assert loss(a, a, generator())[0].item() == pytest.approx(0, abs=1e-5)
-    value = loss(a, b, generator())[0].item()
-    assert 0.1 < value < 1
-    # The exposure is that of the target: an image a hundred times as bright looks the same.
-    assert loss(100 * a, 100 * b, generator())[0].item() == pytest.approx(value, rel=1e-4)
 
 
 @pytest.mark.parametrize(("lit", "expected"), [((1, 1, 1), (1, 1, 1)), ((1, 0, 0), (3, 0, 0))])

@@ -246,7 +246,6 @@ def test_a_run_says_what_has_changed_since_its_checkpoint(done):
         ("model.inputs=['primal', 'x']", "input 'x'"),
         # References are not split, so inputs that are made up would have no parts.
         ("augmentation.quieter=[1.0, 1.0]", "augmentation.quieter: makes no diffuse and specular light"),
-        ("augmentation.rarer=[1.0, 1.0]", "augmentation.rarer: makes no diffuse and specular light"),
     ],
 )
 def test_settings_are_checked(tmp_path, change, complaint):

@@ -33,26 +33,6 @@ def structural_distance(a: Tensor, b: Tensor) -> Tensor:
     return total + weights[-1] * (1 - luminance).mean()
 
 
-def ms_ssim(a: Tensor, b: Tensor) -> Tensor:
-    """MS-SSIM of images (N, C, H, W) of range 1, (N, C) each, 1 for equal ones [Wang et al. 2003].
-
-        L_S^w_S  Π_s CS_s^w_s
-
-    L and CS are means over the image. Means below 1e-4 count as 1e-4, so that the product has a gradient.
-    """
-    a, b = a.float(), b.float()
-    weights = _weights(a)
-    product = a.new_ones(a.shape[:2])
-    for scale, weight in enumerate(weights):
-        if scale:
-            a, b = avg_pool2d(a, 2), avg_pool2d(b, 2)
-        luminance, structure = ssim_parts(a, b)
-        last = scale == len(weights) - 1
-        similarity = (luminance * structure if last else structure).mean((-2, -1))
-        product = product * similarity.clamp(min=1e-4) ** weight
-    return product
-
-
 def _weights(image: Tensor) -> Tensor:
     """The weights of the scales that are large enough for a window; their sum is 1."""
     scales = 1
