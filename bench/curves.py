@@ -1,12 +1,12 @@
-"""Errors over samples or seconds as curves, interpolated between the measured points and extrapolated a little.
+"""Curves of errors over samples or seconds: interpolated between measured points, and extrapolated a little.
 
-A curve is the running minimum of its points, with straight lines between them on logarithmic axes. Beyond the points
-the nearest falling slope continues, no steeper than ``STEEPEST`` and for at most a factor of ``REACH``. A mark tells
-how a value was found:
+A curve is the running minimum of its points, with straight lines between them on logarithmic axes. Beyond the points,
+the nearest falling slope continues, but no steeper than ``STEEPEST``, and at most for a factor of ``REACH``. A mark
+says how a value was found:
 
     ""      between measured points
-    "~"     outside, by the nearest slope
-    "<" ">" farther outside: read at the factor, so that the truth is below or above
+    "~"     extrapolated by the nearest slope
+    "<" ">" beyond the factor ``REACH``: the value is the one at this factor, and the true value is below or above it
 """
 
 import math
@@ -15,21 +15,21 @@ from itertools import pairwise
 
 from ngpt.measure.averages import geometric_mean
 
-REACH = 4.0  # how far a slope is trusted past the measured points
-# Squared errors fall as 1/samples. Two short renders may take nearly the same time; then the slope is mostly noise.
+REACH = 4.0
+# Squared errors fall as 1/samples. Steeper slopes are noise, as of two short renders that took nearly the same time.
 STEEPEST = -1.0
 
 # (samples or seconds, error)
 Points = Sequence[tuple[float, float]]
-Ratio = tuple[float, str]  # with its mark
+Ratio = tuple[float, str]  # (value, mark)
 _Segment = tuple[tuple[float, float], tuple[float, float]]
 
 
 def first_at(error: float, points: Points) -> Ratio | None:
-    """The place where a curve first falls to ``error``, and its mark.
+    """The samples or seconds at which a curve first falls to ``error``, and the mark.
 
-    A curve that never falls gives its first point as an upper bound if its error is low enough, and None otherwise. All
-    numbers must be positive.
+    For a curve that never falls, it is the first point, as an upper bound, if its error is low enough; otherwise None.
+    All numbers must be positive.
     """
     curve, falls = _curve(points)
     target, reach = math.log(error), math.log(REACH)
@@ -49,9 +49,10 @@ def first_at(error: float, points: Points) -> Ratio | None:
 
 
 def error_at(x: float, points: Points) -> Ratio | None:
-    """The error of a curve at ``x``, and the mark of what is divided by it: ">" where the error is below that.
+    """The error of a curve at ``x``, and the mark of a ratio with this error as the divisor.
 
-    None where there are fewer than two points. All numbers must be positive.
+    So the mark is ">" if the true error is below the returned one. None for fewer than two points. All numbers must be
+    positive.
     """
     curve, falls = _curve(points)
     if len(curve) < 2:
@@ -69,13 +70,13 @@ def error_at(x: float, points: Points) -> Ratio | None:
 
 
 def over_least(error: float, x: float, curves: Iterable[Points]) -> Ratio | None:
-    """An error over the least one that a curve has at ``x``, with its mark; None where no curve has two points."""
+    """An error over the least error of all curves at ``x``, with its mark; None if no curve has two points."""
     least = min((answer for points in curves if (answer := error_at(x, points))), default=None)
     return (error / least[0], least[1]) if least else None
 
 
 def joined(marks: Iterable[str]) -> str:
-    """The mark of a mean: "<" or ">" if all bounds have that side; else "~" if there is any mark; else ""."""
+    """The mark of a mean: "<" or ">" if all bounds are on that side; else "~" if there is any mark; else ""."""
     found = set(marks) - {""}
     bounds = found & {"<", ">"}
     return bounds.pop() if len(bounds) == 1 else "~" if found else ""
@@ -87,7 +88,7 @@ def marked(value: Ratio | None) -> str:
 
 
 def over(values: Sequence[Ratio | None]) -> str:
-    """The geometric mean of the values as text, with its mark, if none is missing."""
+    """The geometric mean of the values, with its mark, as text; "-" if a value is missing."""
     known = [value for value in values if value]
     if len(known) < len(values):
         return "-"
@@ -100,17 +101,17 @@ def _curve(points: Points) -> tuple[list[tuple[float, float]], list[_Segment]]:
     for x, error in sorted(points):
         lowest = min(math.log(error), curve[-1][1] if curve else math.inf)
         if curve and math.log(x) == curve[-1][0]:
-            continue  # the least of those at one place came first
+            continue  # Of several points at one place, the least error comes first.
         curve.append((math.log(x), lowest))
     return curve, [(a, b) for a, b in pairwise(curve) if b[1] < a[1]]
 
 
 def _outside(segment: _Segment) -> float:
-    """The slope that goes on past a segment."""
+    """The slope of the extrapolation beyond a segment."""
     return max(_slope(segment), STEEPEST)
 
 
 def _slope(segment: _Segment) -> float:
-    """Error over samples or seconds, both logarithms."""
+    """The slope of a segment, whose coordinates are logarithms."""
     (x0, e0), (x1, e1) = segment
     return (e1 - e0) / (x1 - x0)

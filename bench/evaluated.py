@@ -1,10 +1,10 @@
-"""The tables of a folder of `ngpt evaluate`: rivals at equal whole time, and what gradients are worth.
+"""Prints tables of the results of `ngpt evaluate`: rivals at equal whole time, and the worth of gradients.
 
     python -m bench.evaluated DIR
 
-The tables are printed as Markdown. A plot, DIR/frontier-GROUP.svg, is written for each group of scenes. It shows error
-over whole seconds, and each rival has its best setting. The configuration names rivals and groups. ``bench.curves``
-explains the marks.
+The tables are in Markdown. For each group of scenes, the plot DIR/frontier-GROUP.svg shows error over whole seconds, of
+each rival at its best setting. The configuration of the evaluation names rivals and groups. ``bench.curves`` explains
+the marks.
 """
 
 import sys

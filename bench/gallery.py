@@ -1,14 +1,14 @@
-"""The pictures of docs/gallery.md: twelve scenes, each noisy, denoised and converged, side by side.
+"""Makes the pictures of docs/gallery.md: twelve scenes, each noisy, denoised and converged, side by side.
 
     python -m bench.gallery --folder SCENES --cache out/gallery
     python -m bench.gallery --wipe glossy --size 640 360 --cache out/gallery
     python -m bench.gallery --which --folder SCENES --cache out/gallery
 
-SCENES has the scenes that are files. Each row of SCENES_SHOWN is rendered with the command that the page gives, and
-denoised by the default method of `ngpt denoise`; the reference is rendered without shared paths, in two halves of other
-seeds. Renders are kept in the cache. It writes docs/images/gallery, bench/results/gallery.json, and the table between
-the marks of the page. With --wipe it writes docs/images/wipe.webp: a line that moves over the noisy image and leaves
-the result. With --which it writes docs/images/which-sampler.webp: the scenes and samplers of WHICH beside path tracing,
+SCENES is the folder of scene files. Each row of SCENES_SHOWN is rendered with the command on the page, and denoised by
+the default method of `ngpt denoise`. References are rendered with whole paths, in two halves with other seeds. Renders
+are kept in the cache. The program writes docs/images/gallery, bench/results/gallery.json, and the table between the
+marks of the page. With --wipe it writes docs/images/wipe.webp: a line moves over the noisy image and uncovers the
+result. With --which it writes docs/images/which-sampler.webp: the scenes and samplers of WHICH beside path tracing,
 each image rendered for WHICH_SECONDS of processor time.
 """
 
@@ -35,13 +35,17 @@ PAGE = ROOT / "docs" / "gallery.md"
 RESULT = ROOT / "bench" / "results" / "gallery.json"
 MARKS = ("<!-- python -m bench.gallery: rows -->", "<!-- rows ends -->")
 REFERENCE_SEED = 1 << 20
-PAPER, INK, GAP, HEADING = (255, 255, 255), (20, 20, 20), 8, 30  # the latter in pixels
+PAPER, INK, GAP, HEADING = (255, 255, 255), (20, 20, 20), 8, 30  # colours, then pixels
 HEADINGS = ("Noisy", "Denoised", "Reference")
-WIPE_FRAMES, WIPE_MS, REST_MS = 24, 60, 1400  # of the moving line; milliseconds of a frame, and at each end
+WIPE_FRAMES, WIPE_MS, REST_MS = (
+    24,
+    60,
+    1400,
+)  # frames of one way; milliseconds of a frame, and at each end
 
 
 class Shown(NamedTuple):
-    """A row: a scene, its command's options, and how its reference is rendered."""
+    """A row of the gallery: a scene, the options of its command, and the sampler and samples of its reference."""
 
     scene: str
     spp: int = 16
@@ -76,12 +80,12 @@ WHICH_SECONDS = 20
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--folder", type=Path, default=Path(), help="of the scenes that are files")
-    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="scenes to make anew")
-    parser.add_argument("--wipe", metavar="NAME", help="writes the moving picture of one scene instead")
-    parser.add_argument("--which", action="store_true", help="writes the picture of which-sampler.md instead")
+    parser.add_argument("--folder", type=Path, default=Path(), help="folder of the scene files")
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only make these scenes again")
+    parser.add_argument("--wipe", metavar="NAME", help="write only the moving picture of this scene")
+    parser.add_argument("--which", action="store_true", help="write only the picture of which-sampler.md")
     parser.add_argument("--size", type=int, nargs=2, default=(320, 180), metavar=("WIDTH", "HEIGHT"))
-    parser.add_argument("--cache", type=Path, required=True, help="folder for what is rendered")
+    parser.add_argument("--cache", type=Path, required=True, help="folder for renders")
     args = parser.parse_args()
     if args.wipe:
         row = next(row for row in SCENES_SHOWN if name_of(row) == args.wipe)
@@ -118,9 +122,9 @@ def options(row: Shown) -> str:
 
 
 def images(args: argparse.Namespace, row: Shown) -> tuple[list[np.ndarray], dict[str, Any]]:
-    """Noisy image, result and reference, (H, W, 3) scene-linear, and their values in the table."""
+    """[noisy image, result, reference], (H, W, 3) scene-linear, and the entries of the table's row."""
     stack = rendered(args, row, row.sampler, row.spp, 0, unbiased=False)
-    ngpt.reconstruct(stack)  # loads what the method needs
+    ngpt.reconstruct(stack)  # a warm-up
     result, seconds = timed(lambda: ngpt.reconstruct(stack))
     rival = rendered(args, row, "primal", row.spp, 0, unbiased=True, **RIVAL)
     reference = (args, row, row.reference, row.reference_spp)
@@ -141,7 +145,7 @@ def images(args: argparse.Namespace, row: Shown) -> tuple[list[np.ndarray], dict
 def rendered(
     args: argparse.Namespace, row: Shown, sampler: str, spp: int, seed: int, unbiased: bool, **options: str
 ) -> GradientStack:
-    """A stack, from the cache if it is there; the attribute gallery:seconds is processor time, kernels included."""
+    """A stack, from the cache if it is there. Its attribute gallery:seconds is processor time with compilation."""
     made_by = "-".join([sampler, *options.values()])
     file = args.cache / f"{name_of(row)}-{made_by}-{spp}-{seed}-{args.size[0]}x{args.size[1]}.exr"
 
@@ -166,7 +170,7 @@ def table(found: dict[str, Any]) -> str:
 
 
 def write_wipe(path: Path, before: np.ndarray, after: np.ndarray) -> None:
-    """An animated WebP, (H, W, 3) uint8 images: a white line leaves ``after`` to its left and goes back."""
+    """Writes an animated WebP of (H, W, 3) uint8 images: a white line uncovers ``after`` and then goes back."""
     height, width = before.shape[:2]
     places = [round(width * (1 - np.cos(np.pi * i / WIPE_FRAMES)) / 2) for i in range(WIPE_FRAMES + 1)]
     frames = []
@@ -203,7 +207,7 @@ def write_which(args: argparse.Namespace, path: Path) -> None:
 
 
 def beside(tiles: dict[str, np.ndarray]) -> Image.Image:
-    """(H, W, 3) uint8 images of one size in a row, each below its heading."""
+    """One picture of (H, W, 3) uint8 images of the same size, side by side, each below its heading."""
     height, width = next(iter(tiles.values())).shape[:2]
     canvas = Image.new("RGB", (len(tiles) * (width + GAP) - GAP, HEADING + height), PAPER)
     for i, (text, tile) in enumerate(tiles.items()):
@@ -213,7 +217,7 @@ def beside(tiles: dict[str, np.ndarray]) -> Image.Image:
 
 
 def written(path: Path, frames: list[Image.Image], **options: Any) -> None:
-    """Writes a picture or a moving one, as WebP."""
+    """Writes one picture, or an animation of several frames, as WebP."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_output(path, overwrite=True) as temporary:
         frames[0].save(temporary, "WEBP", save_all=len(frames) > 1, append_images=frames[1:], **options)

@@ -1,6 +1,7 @@
-"""What benchmarks that render share: command line, file of cells, scenes, references, errors and seconds."""
+"""Functions of benchmarks that render: command line, file of cells, scenes, references, errors and seconds."""
 
 import argparse
+import gc
 import json
 import resource
 import tempfile
@@ -12,26 +13,26 @@ from typing import Any
 import numpy as np
 
 import ngpt
-from bench.common import kept, metadata, save
+from bench.common import kept, metadata, renderer, save
 from ngpt.cli.arguments import size as pixels
 from ngpt.evaluation.config import scene_name
 from ngpt.evaluation.references import HALVES, Reference, read_reference
 from ngpt.measure.metrics import EPSILON, scores, squared_error, trimmed_mean
 
-# Mitsuba as it is
+# Options that make our samplers use Mitsuba's own points and lamps.
 RIVAL = {"points": "independent", "lamps": "uniform"}
-# Far from the seeds of images
+# The seed of the first half of a reference, far from the seeds of images.
 REFERENCE_SEED = 1 << 20
-# With this number of samples a render reaches its second round, so that all kernels are compiled.
+# With this number of samples a render has two rounds, so all its kernels are compiled.
 WARM_SPP = 9
 
 
 def command(doc: str | None, name: str, size: str, spp: Sequence[int]) -> argparse.ArgumentParser:
-    """The arguments of a benchmark of scenes; the description is ``doc``."""
+    """A parser of the arguments that benchmarks of scenes share; ``doc`` is its description."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="*", metavar="SCENE", help="files or built-in names; none: only the tables")
+    parser.add_argument("scenes", nargs="*", metavar="SCENE", help="file or built-in name; none: only print the tables")
     parser.add_argument("--references", type=Path, metavar="FOLDER")
-    parser.add_argument("--reference-spp", type=int, default=256, help="of each half that is made")
+    parser.add_argument("--reference-spp", type=int, default=256, help="samples of each half that is rendered")
     parser.add_argument("--size", default=size)
     parser.add_argument("--spp", type=int, nargs="+", default=list(spp))
     parser.add_argument("-o", "--output", type=Path, default=Path(f"bench/results/{name}.json"))
@@ -47,7 +48,7 @@ def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
 
 
 class Cells(list[dict[str, Any]]):
-    """The cells of a file; ``key`` names what tells them apart."""
+    """The measured cells in a file. The entries named by ``key`` identify a cell."""
 
     def __init__(self, path: Path, name: str, key: Sequence[str]):
         super().__init__(json.loads(path.read_text())["cells"] if path.exists() else [])
@@ -57,7 +58,10 @@ class Cells(list[dict[str, Any]]):
         return tuple(cell[name] for name in self.key)
 
     def measure(self, scenes: Iterable[str], measured: Callable[[str, set[tuple]], Iterator[dict[str, Any]]]) -> None:
-        """Adds what ``measured`` gives for a scene and the known places; writes and prints each cell at once."""
+        """Adds the cells that ``measured(scene, known)`` yields for each scene; writes and prints each cell at once.
+
+        ``known`` holds the places of the cells in the file. A new cell replaces an old one at the same place.
+        """
         about = metadata("mitsuba", "drjit", "mitsuba-oidn", "onnxruntime")
         for scene in scenes:
             for cell in measured(scene, set(map(self.place, self))):
@@ -69,10 +73,10 @@ class Cells(list[dict[str, Any]]):
 
 @contextmanager
 def opened(scene: str) -> Iterator[tuple[str, str]]:
-    """The name of a scene in tables and files, and the argument that loads it.
+    """The name of a scene in tables and files, and the file or built-in name to load.
 
-    A scene is a file, a built-in name, or generator:SEED:SIGHT: a made scene with one sight of
-    ``data_gen.scenes.procedural.variety.SHARES``.
+    ``scene`` is a file, a built-in name, or generator:SEED:SIGHT. The last is a generated scene with one sight of
+    ``data_gen.scenes.procedural.variety.SHARES``; its file exists only within the context.
     """
     kind, *parts = scene.split(":")
     if kind != "generator" or len(parts) != 2:
@@ -88,27 +92,31 @@ def opened(scene: str) -> Iterator[tuple[str, str]]:
 
 
 class Judge:
-    """Errors by two halves of a reference: NAME-WxH-a.exr and -b.exr of a folder, rendered there where they are not."""
+    """Errors relative to a reference of two halves: NAME-WxH-a.exr and NAME-WxH-b.exr in a folder.
+
+    Files that do not exist are rendered with whole paths and ``spp`` samples per pixel, and written there.
+    """
 
     def __init__(self, loaded: Any, name: str, folder: Path, size: str, spp: int):
         files = [folder / f"{name}-{size}{half}.exr" for half in HALVES]
         for i, file in enumerate(files):
             kept(file, lambda seed=REFERENCE_SEED + i: _whole_paths(loaded, spp, seed))
         self.reference: Reference = read_reference(files)
-        # The denoised reference, in double precision
+        # The denoised reference, in double precision.
         halves = [ngpt.reconstruct(half, "oidn").image for half in self.reference.stacks]
         self.clean = np.mean(halves, axis=0, dtype=np.float64)
 
     def steady(self, image: np.ndarray) -> float:
-        """relMSE by both halves, relative to the clean reference, without the 0.1 % that are worst by it.
+        """relMSE by both halves, relative to the denoised reference, without the worst 0.1 % of the pixels.
 
-        Most pixels of a noisy reference are too dark, so an error relative to it would favour dark images.
+        The worst pixels are those that differ most from the denoised reference. Most pixels of a noisy reference are
+        too dark, so an error relative to it would favour dark images.
         """
         each = (squared_error(image, *h) / (self.clean**2 + EPSILON) for h in (self.reference.images, (self.clean,)))
         return trimmed_mean(*each, share=0.001)
 
     def scores(self, image: np.ndarray, *names: str) -> dict[str, float]:
-        """Metrics by name; FLIP is over the mean of the halves."""
+        """Metrics by name. FLIP compares the image to the mean of the halves."""
         return scores(names, image, *self.reference.images)
 
     def light(self, image: np.ndarray) -> float:
@@ -119,18 +127,32 @@ class Judge:
         return {"error": self.steady(image), **self.scores(image, "FLIP")}
 
 
+def open_judged(scene: str, size: str, folder: Path, spp: int) -> tuple[str, Any, Judge]:
+    """The name of a scene, the loaded scene, and the judge of its images.
+
+    ``scene`` is as for ``opened``, ``size`` is "WIDTHxHEIGHT", ``folder`` and ``spp`` are as for ``Judge``.
+    """
+    load_scene, _ = renderer()
+    # A kernel contains the shapes of all scenes in memory, so scenes of earlier benchmarks are removed.
+    gc.collect()
+    with opened(scene) as (name, file):
+        loaded = load_scene(file, pixels(size))
+    return name, loaded, Judge(loaded, name, folder, size, spp)
+
+
 def _whole_paths(loaded: Any, spp: int, seed: int) -> ngpt.GradientStack:
-    from data_gen.render import render_stack  # of the variant that is set
+    from data_gen.render import render_stack  # after the variant is set
 
     return render_stack(loaded, spp, seed, "primal", tails="paths")
 
 
 def processor_seconds() -> float:
+    """The processor time of this process, of all threads."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 
 
 def timed(call: Callable[[], Any]) -> tuple[Any, float]:
-    """What a call returns, and its processor seconds."""
+    """The result of a call, and its processor seconds."""
     start = processor_seconds()
     return call(), processor_seconds() - start

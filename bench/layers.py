@@ -1,17 +1,19 @@
-"""What `auto` takes of the layers of a stack, and the error it leaves: the tables of docs/lab/RESULTS.md ("By the
-layers of a stack") and docs/use/from-your-renderer.md ("What auto takes").
+"""The method that `auto` chooses by the layers of a stack, and its error.
+
+The tables are in docs/lab/RESULTS.md ("By the layers of a stack") and docs/use/from-your-renderer.md ("What auto
+takes").
 
     python -m bench.layers --cache /tmp/stacks --scenes diffuse glossy environment lens SCENE.xml ...
 
-Renders stacks with gradients and references (kept in the cache folder). Measures which method `auto` takes for every
-choice of their layers, with OIDN and without, and for files with the layer names of each renderer. Writes
-bench/results/layers.json and prints both tables as Markdown. Errors are geometric means of the trimmed relMSE over the
-scenes.
+renders stacks with gradients, and references, which are kept in the cache folder. It measures the method that `auto`
+chooses for every choice of their layers, with OIDN and without, and for files with the layer names of each renderer. It
+writes bench/results/layers.json and prints both tables as Markdown. Errors are geometric means of the trimmed relMSE
+over the scenes.
 """
 
 import argparse
 import tempfile
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Sequence
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -33,11 +35,11 @@ from ngpt.system.writing import markdown_table, write_json
 
 TABLE = Path(__file__).parent / "results" / "layers.json"
 SPP, SIZE, REFERENCE_SPP = (4, 16, 64), (192, 108), 2048
-# Layers that a renderer gives together
+# Groups of layers that a renderer writes together or not at all.
 GROUPS = (("albedo",), ("normal",), ("depth",), ("primal_var",), ("dx", "dy"), ("dx_var", "dy_var"))
 SAMPLER = "gpt"  # whose stacks have all layers
 NEED_OIDN = ("ngpt-combine", "ngpt-primal", "oidn")
-# Samples per pixel for the table of renderers
+# Samples per pixel for the table of renderers.
 RENDERER_SPP = 16
 
 # Renderer -> layer -> the names of its channels: the prefix, and the letters after its dot.
@@ -66,7 +68,7 @@ RENDERERS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "Karma": {"primal": ("C", "RGB"), "albedo": ("albedo", "RGB"), "normal": ("N", "XYZ")},
 }
-# Our own names, which any renderer may write.
+# Our own names of layers, which any renderer may use.
 OWN = {name: (name, "".join(layer.channels)) for name, layer in LAYERS.items()}
 FEATURES, GRADIENTS, VARIANCES = ("albedo", "normal", "depth"), ("dx", "dy"), ("primal_var", "dx_var", "dy_var")
 CHOICES: tuple[tuple[str, ...], ...] = (
@@ -86,10 +88,12 @@ Judged = tuple[GradientStack, np.ndarray]  # a stack and its reference
 
 
 class Row(NamedTuple):
-    """A renderer's file with some layers in addition to the colour: the method of `auto`, and mean errors over scenes.
+    """The result for a file with the layer names of a renderer, and with these ``layers`` in addition to the colour.
 
-    ``oidn``   whether OIDN was available
-    ``error``  of what `auto` gave; ``by_oidn``: of `oidn` on the same file, None without it; ``before``: of the input
+    ``oidn``     whether OIDN was available
+    ``method``   the method that `auto` chose
+    ``error``    its error; ``by_oidn`` is the error of `oidn` on the same file, None without OIDN; ``before`` is the
+                 error of the input. All are means over the scenes
     """
 
     renderer: str
@@ -128,58 +132,47 @@ def main() -> None:
 
 
 def cases() -> dict[tuple[str, tuple[str, ...]], None]:
-    """Each method that ``auto`` chooses for some layers, and the layers that it uses; with OIDN and without."""
+    """Each method that `auto` chooses for a choice of ``GROUPS``, and the layers that it uses; with OIDN or not."""
     found: dict[tuple[str, tuple[str, ...]], None] = {}
-    for added in choices():
-        layers = {"primal", *added}
+    for groups in (groups for size in range(len(GROUPS) + 1) for groups in combinations(GROUPS, size)):
+        layers = {"primal", *(name for group in groups for name in group)}
         for oidn in (True, False):
             method = choose(layers, usable(oidn))
             found[method, used(method, layers)] = None
     return found
 
 
-def choices() -> Iterator[list[str]]:
-    """The layers of every choice of ``GROUPS``."""
-    for size in range(len(GROUPS) + 1):
-        for groups in combinations(GROUPS, size):
-            yield [name for group in groups for name in group]
-
-
 def usable(oidn: bool) -> Callable[[str], bool]:
-    """Which methods ``choose`` may take where all packages are installed, with OIDN or without."""
+    """The second argument of ``choose`` if all packages are installed, with OIDN or without."""
     return lambda name: oidn or name not in NEED_OIDN
 
 
 def used(method: str, layers: Container[str]) -> tuple[str, ...]:
-    """The given layers that a method uses, in the order of ``LAYERS``."""
+    """Those of the ``layers`` that a method uses, in the order of ``LAYERS``."""
     entry = METHODS[method]
     return tuple(name for name in LAYERS if name in layers and name in (*entry.needs, *entry.uses, *entry.estimates))
 
 
 def error_of(scenes: Sequence[Judged], method: str, layers: Sequence[str] = ()) -> float:
-    """The geometric mean over the scenes of a method's error, with these layers only if there are any."""
+    """The geometric mean over the scenes of a method's error; with only these ``layers``, unless they are empty."""
     given = ((part(stack, layers) if layers else stack, truth) for stack, truth in scenes)
     return geometric_mean(relmse_trimmed(reconstruct(stack, method).image, truth) for stack, truth in given)
 
 
 def part(stack: GradientStack, layers: Sequence[str]) -> GradientStack:
-    """The stack with these layers only; the light that samplers of gradients keep apart stays with gradients."""
+    """The stack with only these layers. With gradients, it keeps the light that gradients exclude."""
+    apart = [name for name in ("direct", "caustic", "caustic_var") if "dx" in layers and name in stack]
     whole = {"primal_var": variance_of_primal(stack)} if "primal_var" in layers and "dx" not in layers else {}
-    return GradientStack({name: stack[name] for name in (*layers, *apart(stack, layers))} | whole)
-
-
-def apart(stack: GradientStack, layers: Sequence[str]) -> tuple[str, ...]:
-    """The light that a stack keeps apart from its gradients, if they are among the layers."""
-    return tuple(name for name in ("direct", "caustic", "caustic_var") if "dx" in layers and name in stack)
+    return GradientStack({name: stack[name] for name in (*layers, *apart)} | whole)
 
 
 def renderers(scenes: Sequence[Judged], folder: Path) -> list[Row]:
-    """A row for each renderer, each choice of layers that it writes, and with and without OIDN."""
+    """A row for each renderer and each of ``CHOICES`` that it can write, with OIDN and without."""
     rows, known = [], {}
     for name, names in {**RENDERERS, "any, by our names": OWN}.items():
         for layers in CHOICES:
             held = ("primal", *layers)
-            # Layers of any renderer are measured by the names of one.
+            # Layers that some renderer writes are measured only with its names.
             if not set(held) <= names.keys() or (names is OWN and "dx" not in layers and "primal_var" not in layers):
                 continue
             files = [(written(folder / "stack.exr", stack, names, held), truth) for stack, truth in scenes]
@@ -196,7 +189,7 @@ def renderers(scenes: Sequence[Judged], folder: Path) -> list[Row]:
 def written(
     path: Path, stack: GradientStack, names: dict[str, tuple[str, str]], layers: Sequence[str]
 ) -> GradientStack:
-    """These layers as they come back from a file with the names of a renderer."""
+    """These layers, written to a file with a renderer's names, and read again."""
     channels, held = {}, part(stack, layers)
     for layer in held.names:
         prefix, suffixes = names[layer]
@@ -207,13 +200,13 @@ def written(
 
 
 def measured(files: Sequence[Judged], oidn: bool) -> tuple[str, float, float | None, float]:
-    """The method that `auto` chose, its error, the error of `oidn` if it is installed, and the error of the input."""
+    """The entries of a ``Row`` from ``method`` on."""
     method = choose(files[0][0], lambda name: not METHODS[name].missing() and (oidn or name not in NEED_OIDN))
     return method, error_of(files, method), error_of(files, "oidn") if oidn else None, error_of(files, "primal")
 
 
 def by_layers(rows: list[dict]) -> str:
-    """Markdown: each method with the fewest and with the most layers; ``rows`` are in the order of their numbers."""
+    """Markdown: each method with the fewest and with the most layers. ``rows`` are sorted by the number of layers."""
     heads = ["layers that it takes", "method", *(f"{n} spp" for n in SPP)]
     ends: dict[str, list[dict]] = {}
     for row in rows:
@@ -224,7 +217,7 @@ def by_layers(rows: list[dict]) -> str:
 
 
 def by_renderer(rows: list[Row]) -> str:
-    """Markdown: renderers whose files gave the same share a line."""
+    """Markdown. Renderers with the same results share a line."""
     heads = ["layers beside colour", "with OIDN", "error", "of `oidn`", "without", "error", "of the input", "names of"]
     lines: dict[str, list[str]] = {}
     for row in (row for row in rows if not row.oidn):

@@ -1,49 +1,39 @@
-"""Speed of the networks in their runtimes, and of OIDN beside them: bench/results/onnx.json.
+"""Speed of the networks in ONNX Runtime, and of OIDN: bench/results/onnx.json.
 
     python -m bench.onnx
 
-Per size, on synthetic stacks with features and variances, all in this process and in turn, warm:
+Seconds for each size, on synthetic stacks with features and variances. All rows run in this process, in turn:
 
     ngpt-fast       as ngpt.reconstruct() runs it: repair, base (NumPy), network (ONNX Runtime)
     repair, base    only these first two steps
     network         only the network in ONNX Runtime, with the base as input
     float16         the network in half precision, which this provider computes in float32
-    graph alone     the network with the base computed inside the graph, as a host without ngpt runs it
-    torch, torch bf16   the network in PyTorch, in float32 and under autocast
-    oidn high, oidn fast   Open Image Denoise with albedo and normal, which people use today
-    oidn prefiltered    oidn high with denoised features: `--method oidn`
+    graph alone     the network and its base in one graph, as a host without ngpt runs it
+    oidn high, oidn fast   Open Image Denoise with albedo and normal
+    oidn prefiltered    oidn high with denoised features, as `--method oidn` runs it
     ngpt-combine    as ngpt.reconstruct() runs it: base, OIDN of the primal and of the base, network
-
-Two more values are measured in separate processes: the peak memory, and the seconds from the command to the end of
-`ngpt denoise` for a stack of 64x64 pixels.
 """
 
 import argparse
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import mitsuba_oidn
 import numpy as np
-import torch
 
-import ngpt
 from bench.common import measure, metadata, save
 from ngpt.classical.gradients import forward_differences
 from ngpt.export.network import network_model
 from ngpt.methods import METHODS, reconstruct
 from ngpt.network.run_onnx import Network, planes
-from ngpt.network.run_torch import layers_of
-from ngpt.network.safetensors import load_weights
 from ngpt.network.shipped import WEIGHTS
 from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
 
 SIZES = ("1280x720", "1920x1080")
 FAST = WEIGHTS / "ngpt-fast.onnx"
-# The file of weights that the network was exported from.
+# The weights that the network was exported from.
 TWIN = Path(__file__).parents[1] / "export" / "weights" / "ngpt-fast.safetensors"
 
 
@@ -53,22 +43,20 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/onnx.json"))
     args = parser.parse_args()
-    packages = ("onnxruntime", "torch", "mitsuba-oidn")
-    result = {"benchmark": "onnx", "repeats": args.repeats, "sizes": {}, "metadata": metadata(*packages)}
+    about = metadata("onnxruntime", "mitsuba-oidn")
+    result = {"benchmark": "onnx", "repeats": args.repeats, "sizes": {}, "metadata": about}
     with tempfile.TemporaryDirectory() as folder:
         half = half_precision(Path(folder))
         for size in args.sizes:
             width, height = map(int, size.split("x"))
             result["sizes"][size] = bench_size(stack_of(width, height), half, args.repeats)
             print(size, {name: round(row["median"], 3) for name, row in result["sizes"][size].items()}, flush=True)
-        result["start-up"] = start_up(Path(folder), args.repeats)
-        result["peak MiB"] = {size: peak(size) for size in args.sizes}
         result["bytes"] = {"float32": FAST.stat().st_size, "float16": half.stat().st_size}
     save(args.output, result)
 
 
 def synthetic(width: int, height: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """(primal, dx, dy) and their variances: shading with edges, noise that varies tenfold, fireflies, all seeded."""
+    """The layers (primal, dx, dy) of a picture with edges, noise and fireflies, and their variances."""
     random = np.random.default_rng(0)
     y, x = (np.mgrid[:height, :width] / height).astype(np.float32)
     boxes = sum(((x - a) % 0.31 < 0.13) * ((y - b) % 0.23 < 0.1) for a, b in ((0, 0), (0.1, 0.05), (0.2, 0.15)))
@@ -106,31 +94,19 @@ def bench_size(stack: GradientStack, half: Path, repeats: int) -> dict:
     layers |= dict(zip(("primal_var", "dx_var", "dy_var"), data.variances, strict=True))
     base = METHODS["wcv"].run(data)
     feed = {name: planes(layer)[None] for name, layer in layers.items()}
-    # The graph wants layers that these stacks do not have, such as the light that is kept apart.
+    # The graph has inputs that these stacks lack, such as ``caustic``.
     zero = np.zeros_like(feed["primal"])
     feed = {entry.name: zero for entry in network.session.get_inputs()} | feed
+    in_half = Network(half)
     calls = {
         "ngpt-fast": lambda: reconstruct(stack, "ngpt-fast"),
         "repair": lambda: repair(stack),
         "base": lambda: METHODS["wcv"].run(data),
         "network": lambda: network.reconstruct(layers, base),
         "graph alone": lambda: network.session.run(None, feed),
+        "float16": lambda: in_half.reconstruct(layers, base),
     }
-    in_half = Network(half)
-    calls["float16"] = lambda: in_half.reconstruct(layers, base)
-    calls |= torch_calls(data) | oidn_calls(stack, data)
-    return measure(calls, repeats)
-
-
-def torch_calls(data: Repaired) -> dict[str, Callable[[], object]]:
-    model, _ = load_weights(TWIN)
-    layers = {name: layer[None] for name, layer in layers_of(data, model.config).items()}
-
-    def run(half: bool) -> None:
-        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=half):
-            model(layers)
-
-    return {"torch": lambda: run(False), "torch bf16": lambda: run(True)}
+    return measure(calls | oidn_calls(stack, data), repeats)
 
 
 def oidn_calls(stack: GradientStack, data: Repaired) -> dict[str, Callable[[], object]]:
@@ -145,32 +121,6 @@ def oidn_calls(stack: GradientStack, data: Repaired) -> dict[str, Callable[[], o
         "oidn prefiltered": lambda: reconstruct(stack, "oidn"),
         "ngpt-combine": lambda: reconstruct(stack, "ngpt-combine"),
     }
-
-
-def start_up(folder: Path, repeats: int) -> dict:
-    """Seconds of wall clock of the whole command on a small stack."""
-    ngpt.write(folder / "small.exr", stack_of(64, 64))
-    command = [sys.executable, "-m", "ngpt", "denoise", str(folder / "small.exr"), "-m", "ngpt-fast", "--force"]
-    command += ["-o", str(folder / "clean.exr")]
-    return measure({"": lambda: subprocess.run(command, check=True, capture_output=True)}, repeats)[""]
-
-
-def peak(size: str) -> float:
-    """The peak memory of ngpt-fast in MiB, beyond the stack, in a process of its own."""
-    code = f"""
-from bench.onnx import stack_of
-from ngpt.methods import reconstruct
-def mebibytes(field):
-    return int(dict(line.split(":") for line in open("/proc/self/status"))[field].split()[0]) / 1024
-stack = stack_of({size.replace("x", ", ")})
-reconstruct(stack_of(32, 32), "ngpt-fast")
-before = mebibytes("VmRSS")
-open("/proc/self/clear_refs", "w").write("5")
-reconstruct(stack, "ngpt-fast")
-print(mebibytes("VmHWM") - before)
-"""
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    return float(done.stdout)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,13 @@
-"""Writes the tables of the main evaluation, at one size or several, into the pages that quote it.
+"""Writes the tables of the main evaluation into the pages that quote it.
 
     python eval.py --config configs/eval-main.toml --out out/eval --scenes ...
     python eval.py --config configs/eval-640.toml --out out/eval-640 --scenes ...
     python -m bench.pages out/eval out/eval-640
 
-stores the numbers of the tables in bench/results/main.json, and puts each table between its marks: in the README,
-docs/lab/RESULTS.md, docs/methods/methods.md, docs/samplers/points.md and the model cards; plots go to docs/images. A
-folder replaces the stored numbers of its size. Without folders the tables are written again from that file.
+stores the numbers of the tables in bench/results/main.json, and writes each table between its marks in a page: README,
+docs/lab/RESULTS.md, docs/methods/methods.md, docs/samplers/points.md and the model cards. Plots are written to
+docs/images. The numbers of a folder replace stored numbers of the same image size. Without folders, the tables are
+written from the stored numbers.
 """
 
 import argparse
@@ -23,7 +24,7 @@ from bench.curves import over_least
 from bench.frontier import draw, points_against
 from bench.tables import RIVALS
 from bench.wholetime import against_rivals, groups_of, ratio
-from bench.worth import marked, worth_of_gradients
+from bench.worth import worth_of_gradients
 from ngpt.measure.averages import geometric_mean
 from ngpt.system.writing import markdown_table
 
@@ -31,21 +32,21 @@ ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "bench" / "results" / "main.json"
 IMAGES = ROOT / "docs" / "images"
 OURS = ("ngpt-combine", "ngpt-primal", "ngpt-fast")
-# With shared tails, as `ngpt render` renders by default; all others are unbiased
+# Columns with shared tails, the default of `ngpt render`, and their names in tables. All other columns are unbiased.
 SHARED = {"ngpt-primal-shared": "`ngpt-primal`, shared tails", "oidn-shared": "`oidn-clean`, shared tails"}
 COMPARED = ("l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal")
-# Groups whose frontiers are shown
+# The groups of scenes that have plots.
 DRAWN = ("blind", "all")
-# Scenes that influenced the choice of a constant of points or lamps
+# Scenes on which a constant of points or lamps was chosen.
 TUNED = ("diffuse", "glossy", "coffee", "living-room", "staircase")
-# Ratios over OIDN from which a loss is listed by name
+# The least ratio to OIDN's error at which a scene is listed as a loss.
 LOSS = 1.1
 VALUES = ("error", "FLIP")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folders", type=Path, nargs="*", help="of evaluations; default: the tables of before")
+    parser.add_argument("folders", type=Path, nargs="*", help="results of evaluations; default: stored numbers")
     args = parser.parse_args()
     if args.folders:
         before = json.loads(RESULT.read_text()).get("sizes", []) if RESULT.is_file() else []
@@ -74,7 +75,7 @@ def picture(size: dict[str, Any], group: str) -> str:
 
 
 def kept(results: dict[str, Any]) -> dict[str, Any]:
-    """The numbers of an evaluation for the tables: medians over seeds, ratios at equal whole time, worth over cost."""
+    """The numbers of an evaluation for the tables: medians over seeds, ratios at equal time, worth of gradients."""
     facts = {name: results[name] for name in ("command", "date", "metadata")}
     settings = {name: results["settings"][name] for name in ("size", "spp", "groups", "against")}
     cells = [
@@ -83,7 +84,7 @@ def kept(results: dict[str, Any]) -> dict[str, Any]:
         for row in results["summary"]
         if row["scene"]
     ]
-    # Gradients are compared to unbiased rivals only.
+    # Gradients are compared with unbiased rivals only.
     unbiased = [row for row in results["summary"] if row["method"] not in SHARED]
     tables = {"against": against_rivals(results), "worth": worth_of_gradients(results | {"summary": unbiased})}
     settings["rivals"] = settings.pop("against")
@@ -91,7 +92,7 @@ def kept(results: dict[str, Any]) -> dict[str, Any]:
 
 
 def blocks(result: dict[str, Any]) -> dict[tuple[str, str], str]:
-    """(page, name of its marks) -> Markdown."""
+    """(page, name of the marks) -> the text between these marks, in Markdown."""
     sizes = [Size(kept) for kept in result["sizes"]]
     card = "docs/methods/ngpt-{}.md".format
     results, readme = "docs/lab/RESULTS.md", "README.md"
@@ -114,7 +115,7 @@ def blocks(result: dict[str, Any]) -> dict[tuple[str, str], str]:
 
 
 class Size:
-    """An evaluation at one size: ratios and means by place."""
+    """The numbers of an evaluation at one image size, by place."""
 
     def __init__(self, kept: dict[str, Any]):
         self.kept = kept
@@ -129,17 +130,17 @@ class Size:
         found = {group for group, *_ in self.means}
         self.groups = [name for name in (*kept["groups"], "all") if name in found]
         if "blind" in self.groups and self.members("blind") == self.scenes:
-            self.groups.remove("all")  # it would repeat the only group
+            self.groups.remove("all")  # It would be the same group.
 
     def members(self, group: str) -> list[str]:
         return [scene for scene in self.scenes if group == "all" or scene in self.kept["groups"][group]]
 
     def both(self, row: dict[str, Any] | None) -> str:
-        """Error and FLIP over a rival's."""
+        """Error and FLIP over a rival's, as text."""
         return ", ".join(filter(None, (ratio(row, "error"), ratio(row, "FLIP"))))
 
     def won(self, group: str, method: str, rival: str, key: str = "") -> str:
-        """The number of cells, over all numbers of samples, in which a method has less error or FLIP than the rival."""
+        """In how many cells, over all numbers of samples, a method has less error (or ``key``) than the rival."""
         rows = [row for n in self.counts if (row := self.means.get((group, n, method, rival)))]
         return f"{sum(row[f'less{key}'] for row in rows)} of {sum(row[f'scenes{key}'] for row in rows)}"
 
@@ -155,7 +156,7 @@ def table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def of_groups(sizes: list[Size], *groups: str, methods: tuple[str, ...] = (*SHARED, *OURS)) -> str:
-    """Error and FLIP over both rivals' for each group and size, and in how many cells they are less."""
+    """Error and FLIP over both rivals', for each group and size, and the number of cells in which they are less."""
     tables = []
     for size in sizes:
         rows = []
@@ -187,7 +188,7 @@ def settings(size: Size) -> str:
 
 
 def by_scene(size: Size) -> str:
-    """Error and FLIP over both rivals' in each scene; and the seconds of the first of our networks."""
+    """Error and FLIP over both rivals' in each scene, and the whole seconds of ``OURS[0]``."""
     rows = []
     for scene, n in product(size.scenes, size.counts):
         cells = [size.both(size.rows.get((scene, n, m, rival))) for m in OURS for rival in size.rivals]
@@ -199,13 +200,13 @@ def by_scene(size: Size) -> str:
 
 
 def worth(sizes: list[Size]) -> str:
-    """W/C of the best pipelines, a line for each group and size."""
+    """C and W/C of the best pipelines with gradients, for each group and size."""
     counts, rows = sorted({n for size in sizes for n in size.counts}), []
     for size in sizes:
         found = {(row["group"], row["spp"]): row for row in size.kept["worth"]["means"] if row["method"] is None}
         for group in (group for group in dict.fromkeys(group for group, _ in found) if group in size.groups):
             first = next(row for (name, _), row in found.items() if name == group)
-            cells = [marked(first, "C"), *(marked(found.get((group, n)), "W/C") for n in counts)]
+            cells = [ratio(first, "C"), *(ratio(found.get((group, n)), "W/C") for n in counts)]
             rows.append([f"{group} ({first['scenes']}), {size.name}", *cells])
     return table(["W / C, geometric means", "C", *(f"{n} spp" for n in counts)], rows)
 
@@ -214,14 +215,14 @@ def worth_by_scene(size: Size) -> str:
     found = {(row["scene"], row["spp"]): row for row in size.kept["worth"]["rows"] if row["best"]}
     first = {scene: row for (scene, _), row in reversed(found.items())}
     rows = [
-        [scene, marked(first[scene], "C"), *(marked(found.get((scene, n)), "W/C") for n in size.counts)]
+        [scene, ratio(first[scene], "C"), *(ratio(found.get((scene, n)), "W/C") for n in size.counts)]
         for scene in dict.fromkeys(scene for scene, _ in found)
     ]
     return table([f"{size.name}: scene", "C", *(f"W / C at {n} spp" for n in size.counts)], rows)
 
 
 def by_method(sizes: list[Size]) -> str:
-    """Errors over Mitsuba's with OIDN, over all scenes, and what each method takes after the render."""
+    """Errors over those of OIDN on Mitsuba's samples, over all scenes, and the seconds of each reconstruction."""
     size, rows = sizes[0], []
     for method in COMPARED:
         cells = [ratio(size.means.get((size.groups[-1], n, method, "mitsuba")), "error") for n in size.counts]
@@ -238,7 +239,7 @@ def mean(values: Iterable[float]) -> str:
 
 
 def better(sizes: list[Size]) -> str:
-    """OIDN on our samples over OIDN on Mitsuba's, each at its best setting: means, and the worst scene in brackets."""
+    """OIDN on our samples over OIDN on Mitsuba's, both at their best settings: means (worst scene)."""
     size, rows = sizes[0], []
     for group, scenes in {"all": size.scenes, "apart": [s for s in size.scenes if s not in TUNED]}.items():
         cells = []
@@ -252,7 +253,7 @@ def better(sizes: list[Size]) -> str:
 
 
 def over_primal(sizes: list[Size]) -> str:
-    """Error of ngpt-combine over ngpt-primal's at the same whole time."""
+    """The error of ngpt-combine over the error of ngpt-primal after the same whole time."""
     size = sizes[0]
     ratios: dict[tuple[str, int], float] = {}
     known = {place: cell for place, cell in size.cells.items() if (cell["error"] or 0) > 0}
@@ -270,7 +271,7 @@ def over_primal(sizes: list[Size]) -> str:
 
 
 def losses(size: Size, method: str) -> str:
-    """The scenes in which it has more than ``LOSS`` times OIDN's error somewhere, the worst first."""
+    """The scenes in which a method has more than ``LOSS`` times OIDN's error in a cell, the worst first."""
     found = {scene: [size.rows.get((scene, n, method, "oidn")) for n in size.counts] for scene in size.scenes}
     worst = {scene: max((row["error"] for row in rows if row), default=-math.inf) for scene, rows in found.items()}
     lost = sorted((scene for scene in found if worst[scene] > LOSS), key=lambda scene: -worst[scene])

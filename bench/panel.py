@@ -1,25 +1,24 @@
-"""A panel of 16 scenes of all kinds: are the default and the shipped methods still as good as the numbers in git?
+"""A panel of 16 scenes of all kinds: compares the default and the shipped methods to the numbers in git.
 
-    python -m bench.panel                          measures, compares to bench/results/panel.json, exits with 1 if worse
-    python -m bench.panel --scenes diffuse haze    only these
-    python -m bench.panel --baseline               measures three seeds, which become the numbers in git and the page's
-    python -m bench.panel --table                  prints the tables of docs/lab/panel.md and measures nothing
-    python -m bench.panel --files a/scene.xml      the same tables of other scenes, with three seeds; compares nothing
+    python -m bench.panel                          compares to bench/results/panel.json; exits with 1 if worse
+    python -m bench.panel --scenes diffuse haze    compares only these scenes
+    python -m bench.panel --baseline               measures three seeds, and writes panel.json and docs/lab/panel.md
+    python -m bench.panel --table                  prints the tables of docs/lab/panel.md, without measuring
+    python -m bench.panel --files a/scene.xml      prints these tables for other scenes, with three seeds
 
 A cell is a scene, a number of samples and a pipeline, named SAMPLER+METHOD:
 
     auto+auto        the defaults of `render_scene` and `reconstruct`
     mitsuba+oidn     the rival: OIDN on Mitsuba's own points and lamps and whole paths (``bench.judging.RIVAL``)
     primal+oidn      the rival of pipelines with gradients: OIDN on our samples
-    all others       the methods that ship
+    all others       methods that ship
 
-The error is ``bench.judging.Judge.steady``, by two halves of a reference; FLIP is over their mean. Seconds are
-of processors, of render and method, with compiled kernels. References are kept in the folder --cache, and made there
-where they are missing. What is worse than before, and why noise is not, is in ``bench.verdict``.
+The error is ``bench.judging.Judge.steady``; FLIP is relative to the mean of the reference's halves. Seconds are
+processor seconds of render and method, with compiled kernels. References are kept in the folder --cache, and rendered
+if they are not there. ``bench.verdict`` decides which values are worse than before, beyond noise.
 """
 
 import argparse
-import gc
 import json
 import sys
 import time
@@ -30,9 +29,9 @@ from typing import Any, NamedTuple
 
 import ngpt
 from bench import verdict
-from bench.common import metadata, renderer, save, write_page
+from bench.common import metadata, save, write_page
 from bench.curves import Ratio, marked, over, over_least
-from bench.judging import RIVAL, WARM_SPP, Judge, opened, processor_seconds, timed
+from bench.judging import RIVAL, WARM_SPP, Judge, open_judged, processor_seconds, timed
 from ngpt.cli.arguments import size
 from ngpt.errors import NgptError
 from ngpt.measure.averages import geometric_mean
@@ -56,14 +55,14 @@ OURS = [f"{sampler}+{method}" for sampler in ("gpt", "primal") for method in MET
 PIPELINES = [DEFAULT, *OURS, "mitsuba+oidn"]
 SEEDS = tuple(range(1, 1 + verdict.LEAST_SEEDS))
 EQUAL = ("samples", "seconds")
-# Pipelines that the default is divided by one by one, after equal seconds
+# Pipelines that the default is compared with one by one, after equal seconds.
 RIVALS = ("mitsuba+oidn", "gpt+ngpt-combine")
-# Where the error is too small for the halves of the reference to measure
+# The least error: smaller ones cannot be measured by the halves of a reference.
 _LEAST_ERROR = 1e-6
 
 
 class Case(NamedTuple):
-    """The purpose of a scene in the panel, its group, how to open it, and the samples of each half of its reference."""
+    """A scene of the panel: kind, group, the argument of ``judging.opened``, samples of each half of a reference."""
 
     kind: str
     group: str
@@ -122,7 +121,7 @@ def main() -> int:
     cells = [cell for found in measured(args.scenes, args.cache, SEEDS[:1]) for cell in found]
     judged = verdict.compare(cells, before)
     if worse := [each for each in judged if each.worse]:
-        print(f"{len(worse)} ratios are worse with one seed; measuring these scenes with all", flush=True)
+        print(f"{len(worse)} ratios are worse with one seed; measuring these scenes with all seeds", flush=True)
         scenes = args.scenes if any(each.key[0] == verdict.MEAN for each in worse) else {e.key[0] for e in worse}
         for found in measured([name for name in args.scenes if name in scenes], args.cache, SEEDS[1:]):
             cells = verdict.joined(cells, found)
@@ -139,34 +138,21 @@ def main() -> int:
 def measured(
     names: Sequence[str], cache: Path, seeds: Sequence[int], size: tuple[int, int] = SIZE
 ) -> Iterator[list[dict[str, Any]]]:
-    """The cells of each scene; then the time of all, without references, is printed."""
+    """Yields the cells of each scene, a name of ``CASES`` or a file. Prints the time so far, without references."""
     seconds = used = 0.0
     for scene in names:
-        name, loaded, judge = opened_with_judge(scene, cache, size)
+        case = CASES.get(scene) or Case("", "", scene)
+        name, loaded, judge = open_judged(case.scene, "{}x{}".format(*size), cache, case.reference_spp)
         start, start_used = time.perf_counter(), processor_seconds()
         yield cells_of(name, loaded, judge, seeds)
         seconds, used = seconds + time.perf_counter() - start, used + processor_seconds() - start_used
         print(f"{name}: {seconds:.0f} s in all, {used:.0f} s of processors", flush=True)
 
 
-def opened_with_judge(scene: str, cache: Path, size: tuple[int, int]) -> tuple[str, Any, Judge]:
-    """The name of a scene in tables, the loaded scene, and its reference, which is rendered where the folder lacks it.
-
-    ``scene`` is one of ``CASES``, or a file.
-    """
-    load_scene, _ = renderer()
-    # A kernel knows the shapes of all scenes in memory.
-    gc.collect()
-    case = CASES.get(scene) or Case("", "", scene)
-    with opened(case.scene) as (name, file):
-        loaded = load_scene(file, size)
-    return name, loaded, Judge(loaded, name, cache, "{}x{}".format(*size), case.reference_spp)
-
-
 def cells_of(name: str, loaded: Any, judge: Judge, seeds: Sequence[int]) -> list[dict[str, Any]]:
     """The cells of a scene, with error, FLIP and seconds by seed."""
     for sampler, methods in METHODS.items():
-        # The default has subpixels, and so other kernels, from FEWEST samples on.
+        # From FEWEST samples on, the default has subpixels, and so other kernels.
         for few in (WARM_SPP, FEWEST):
             stack = render(loaded, sampler, few, 0)
             for method in methods:
@@ -183,7 +169,7 @@ def cells_of(name: str, loaded: Any, judge: Judge, seeds: Sequence[int]) -> list
 
 
 def of_seed(loaded: Any, spp: int, seed: int, judge: Judge) -> dict[str, dict[str, float]]:
-    """Values by pipeline. The pipeline that the default chooses is neither rendered nor denoised a second time."""
+    """Pipeline -> values. The pipeline that the default chooses is not rendered and denoised a second time."""
     found: dict[str, dict[str, float]] = {}
     stacks: dict[str, tuple[GradientStack, float]] = {}
     for sampler, methods in METHODS.items():
@@ -203,7 +189,7 @@ def of_seed(loaded: Any, spp: int, seed: int, judge: Judge) -> dict[str, dict[st
 
 
 def render(loaded: Any, sampler: str, spp: int, seed: int) -> GradientStack:
-    """The stack as `ngpt render` makes it, or as Mitsuba would."""
+    """A stack by the sampler, with the defaults of `ngpt render`, or with Mitsuba's own points and lamps."""
     from data_gen import render_scene
 
     options: dict[str, Any] = RIVAL | {"tails": "paths", "subpixels": 1} if sampler == "mitsuba" else {}
@@ -211,7 +197,11 @@ def render(loaded: Any, sampler: str, spp: int, seed: int) -> GradientStack:
 
 
 def text(cells: list[dict[str, Any]]) -> str:
-    """Tables of errors and FLIP, and of the default over two rivals and over the best of our pipelines."""
+    """The tables as Markdown.
+
+    They show error and FLIP of all pipelines; the default over two rivals; our other pipelines over the default; and
+    the default over the best of our other pipelines.
+    """
     of = {verdict.key_of(cell): cell for cell in cells}
     scenes = list(dict.fromkeys(cell["scene"] for cell in cells))
     rows = []
@@ -248,7 +238,7 @@ def mean_of(cell: dict[str, Any], value: str) -> float:
 
 
 def rows_by_group(of: dict[verdict.Key, dict[str, Any]], scenes: Sequence[str]) -> Iterator[list[str]]:
-    """Below 1, a pipeline is better than the default in this kind of scene. Means are geometric."""
+    """Rows of our other pipelines over the default, by kinds of scenes: geometric means of error and FLIP."""
     groups: dict[str, list[str]] = {}
     for scene in scenes:
         groups.setdefault(CASES[scene].group if scene in CASES else "files", []).append(scene)
@@ -256,7 +246,7 @@ def rows_by_group(of: dict[verdict.Key, dict[str, Any]], scenes: Sequence[str]) 
         for pipeline in OURS:
             places = [(scene, str(spp)) for scene in members for spp in SPP]
             if all(of[*place, pipeline]["error"] == of[*place, DEFAULT]["error"] for place in places):
-                continue  # it is the default
+                continue  # The default has chosen this pipeline everywhere.
             by_spp = ([over_best(of, scene, spp, "seconds", [DEFAULT], pipeline) for scene in members] for spp in SPP)
             yield [
                 group,
@@ -273,8 +263,10 @@ def over_best(
     others: Sequence[str] = OURS,
     pipeline: str = DEFAULT,
 ) -> list[Ratio | None]:
-    """Error and FLIP of the ``pipeline`` over the least of the ``others``, at as many samples or after as many seconds;
-    with the marks of ``bench.curves``."""
+    """Error and FLIP of the ``pipeline`` over the least of the ``others``, with the marks of ``bench.curves``.
+
+    ``equal``  "samples" compares at the same number of samples, "seconds" after the same seconds
+    """
     this, found = of[scene, str(spp), pipeline], []
     for value in verdict.LIMITS:
         error = mean_of(this, value)
@@ -288,7 +280,7 @@ def over_best(
 
 
 def ratio_table(judged: list[verdict.Judged]) -> list[str]:
-    """Lines of a table of ratios to the earlier error and FLIP. Ratios that are worse beyond noise are bold."""
+    """The lines of a table: error and FLIP over those in git. Ratios that are worse beyond noise are bold."""
     shown: dict[tuple[str, str], dict[str, list[str]]] = {}
     for each in judged:
         scene, spp, pipeline = each.key

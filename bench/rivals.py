@@ -1,26 +1,26 @@
-"""The default and its rivals at equal whole time: Mitsuba itself with OIDN, and OIDN on our own samples.
+"""The default and its rivals at equal whole time: Mitsuba's own renderer with OIDN, and OIDN on our samples.
 
     python -m bench.rivals kitchen/scene.xml product glass-caustic --references FOLDER
 
 A scene is rendered by each of RENDERS:
 
-    default      what `ngpt render -o image` does: sampler, features, subpixels and method by default
+    default      as `ngpt render -o image` renders: sampler, features, subpixels and method are the defaults
     ours         `primal` with whole paths
-    mitsuba      Mitsuba's own renderer: the scene's integrator, box filter, `independent` points, and its `albedo` and
-                 `sh_normal`; also at twice the size with a quarter of the samples per pixel
+    mitsuba      Mitsuba's own renderer: the scene's integrator, a box filter, `independent` points, and the features
+                 `albedo` and `sh_normal`; also at twice the size with a quarter of the samples per pixel
     multijitter  the same with Mitsuba's best points
 
-OIDN denoises the renders of rivals in each of the WAYS: at K times the size, with features that are declared as
-prefiltered (it denoises them first), clean or noisy. An image at twice the size is then scaled down. "1 and 2" is what
-ngpt does with subpixels (``ngpt.denoisers.oidn.of_both``): the mean of an image of each size. Each cell has, by
-way:
+OIDN denoises the renders of rivals in each of the WAYS: at K times the size, with features that it prefilters, takes as
+clean, or takes as noisy. An image at twice the size is then scaled down. "1 and 2" is the mean of the images at both
+sizes, which ngpt computes from subpixels (``ngpt.denoisers.oidn.of_both``). A cell has, for each way:
 
-    seconds  of processors, of the render and of OIDN, both warmed up
-    error    ``bench.judging.Judge.steady``, since references of some rooms are noisy; FLIP is over their mean
+    seconds  processor seconds of the render and of OIDN, after a warm-up
+    error    ``bench.judging.Judge.steady``, because references of some rooms are noisy
+    FLIP     relative to the mean of the reference's halves
 
-The table divides the error and FLIP of the default by those of each of RIVALS at the default's whole time. Values are
-geometric means over seeds. At each time, a rival has its best way. ``bench.curves`` explains the marks.
-``bench.judging`` opens scenes and makes references. Cells that the file has are not measured again.
+The table divides the error and FLIP of the default by the values of each of RIVALS after the same time. Values are
+geometric means over seeds. At each time, a rival has its best way. ``bench.curves`` explains the marks, and
+``bench.judging`` opens scenes and makes references. Cells in the file are not measured again.
 """
 
 import argparse
@@ -39,7 +39,7 @@ from ngpt.stack import GradientStack
 from ngpt.subpixels import FEWEST, means
 
 RENDERS = ("default", "ours", "mitsuba", "multijitter")
-# Name -> K, and how the features are declared to OIDN
+# Name -> K, and how OIDN uses the features.
 WAYS = {
     "1 prefiltered": (1, "prefiltered"),
     "2 noisy": (2, "noisy"),
@@ -48,8 +48,8 @@ WAYS = {
     "1 and 2": (2, "auto"),
 }
 OWN = "1 and 2"
-KNOWN = tuple(way for way in WAYS if way != OWN)  # what people can do without ngpt
-# Name -> renders and ways that a rival may choose from
+KNOWN = tuple(way for way in WAYS if way != OWN)  # ways that need no ngpt
+# Name -> the renders and the ways that the rival may choose from.
 RIVALS = {
     "Mitsuba + OIDN": (("mitsuba",), ("1 prefiltered",)),
     "Mitsuba + OIDN, K = 1 or 2": (("mitsuba",), KNOWN),
@@ -80,17 +80,17 @@ def main() -> None:
     args = parsed(parser)
     cells = Cells(args.output, "rivals", CELL)
     cells.measure(args.scenes, lambda scene, known: measured(scene, args, known))
-    table(["scene", "spp", "whole s", *RIVALS], list(rows(cells)))
+    table(["scene", "spp", "whole s", *RIVALS], rows(cells))
 
 
 def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterator[dict[str, Any]]:
-    """The cells of a scene that are not ``known``, one after the other."""
+    """Yields the cells of a scene that are not ``known``."""
     load_scene, _ = renderer()
     size = args.pixels
     with opened(scene) as (name, file):
         judge = Judge(load_scene(file, size), name, args.references, args.size, args.reference_spp)
         for render in args.renders:
-            gc.collect()  # a kernel knows the shapes of all scenes in memory
+            gc.collect()  # a kernel contains the shapes of all scenes in memory
             make = by_default(file, size) if render == "default" else by_ways(images_of(file, size, render), args.ways)
             warm = False
             for spp in args.spp:
@@ -99,14 +99,14 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterato
                     if place in known:
                         continue
                     if not warm:
-                        # The default has subpixels, and so other kernels, from FEWEST samples on.
+                        # From FEWEST samples on, the default has subpixels, and so other kernels.
                         warm = bool([make(few, 0) for few in (WARM_SPP, FEWEST)])
                     made = make(spp, seed).items()
                     ways = {way: {"seconds": seconds} | judge.values(image) for way, (image, seconds) in made}
                     yield dict(zip(CELL, place, strict=True)) | {"ways": ways}
 
 
-Made = dict[str, tuple[np.ndarray, float]]  # by way: the image and its whole seconds
+Made = dict[str, tuple[np.ndarray, float]]  # way -> the image, and the seconds to render and denoise it
 
 
 def by_default(file: str, size: tuple[int, int]) -> Callable[[int, int], Made]:
@@ -147,7 +147,7 @@ def by_ways(images: Callable[[int, int, int], Images], ways: Sequence[str]) -> C
 
 
 def images_of(file: str, size: tuple[int, int], render: str) -> Callable[[int, int, int], Images]:
-    """A function of (samples per pixel, seed, K) that renders at K times the size."""
+    """A function of (samples per pixel, seed, K) that renders a scene at K times the size."""
     if render in POINTS:
         return mitsubas(file, size, POINTS[render])
     load_scene, render_stack = renderer()
@@ -161,7 +161,7 @@ def images_of(file: str, size: tuple[int, int], render: str) -> Callable[[int, i
 
 
 def mitsubas(file: str, size: tuple[int, int], points: str) -> Callable[[int, int, int], Images]:
-    """As ``images_of``, by Mitsuba itself."""
+    """``images_of`` for Mitsuba's own renderer."""
     import mitsuba as mi
 
     scenes = {k: mitsuba_scene(file, (k * size[0], k * size[1]), points) for k in (1, 2)}
@@ -170,14 +170,14 @@ def mitsubas(file: str, size: tuple[int, int], points: str) -> Callable[[int, in
         scene = scenes[k]
         integrator = mi.load_dict({"type": "aov", "aovs": AOVS, "image": scene.integrator()})
         layers = np.array(mi.render(scene, integrator=integrator, spp=max(spp // k**2, 1), seed=seed), np.float32)
-        # AOVs follow the film's own channels: RGB, and alpha if there is any.
+        # The film's own channels come first: RGB, and perhaps alpha.
         return Images(*(np.ascontiguousarray(each) for each in (layers[..., :3], layers[..., -6:-3], layers[..., -3:])))
 
     return images
 
 
 def _set_part(state: Any, owner: Any, kind: Any, plugin: str) -> None:
-    """Every node of the type ``owner`` gets one part of this ``kind``, whether it had one or not."""
+    """Gives every node of the type ``owner`` the part ``plugin``, in place of its parts of this ``kind``."""
     import mitsuba as mi
 
     from data_gen.scenes.nodes import added, parts_of
@@ -188,13 +188,13 @@ def _set_part(state: Any, owner: Any, kind: Any, plugin: str) -> None:
             for name, part in parts_of(props):
                 if state.nodes[part].type == kind:
                     del props[name]
-            # The list of nodes may move when one is added.
+            # Adding a node may move the list of nodes, so references to its entries are not kept.
             reference = added(state, kind, mi.Properties(plugin))
             state.nodes[number].props["ngpt_part"] = reference
 
 
 def mitsuba_scene(file: str, size: tuple[int, int], points: str) -> Any:
-    """A scene as Mitsuba reads it, with these ``points`` and a box filter."""
+    """A scene for Mitsuba's own renderer, with these ``points`` and a box filter."""
     import mitsuba as mi
 
     from data_gen.scenes.bounds import mend_bounds
@@ -212,7 +212,7 @@ def mitsuba_scene(file: str, size: tuple[int, int], points: str) -> Any:
             config, state = parsed(file)
             _set_part(state, mi.ObjectType.Sensor, mi.ObjectType.Sampler, points)
             _set_part(state, mi.ObjectType.Film, mi.ObjectType.ReconstructionFilter, "box")
-            # Else Mitsuba would be slow where a scene has many meshes.
+            # Mitsuba is slow in scenes with many meshes, so meshes are merged.
             merge(config, state)
             scene = mi.parser.instantiate(config, state)
     mend_bounds(scene)
@@ -221,7 +221,7 @@ def mitsuba_scene(file: str, size: tuple[int, int], points: str) -> Any:
 
 
 def rows(cells: list[dict[str, Any]]) -> Iterator[list[str]]:
-    """A line for each scene and number of samples of the default."""
+    """The lines of the table: one for each scene and number of samples of the default."""
     for scene, size, spp in sorted({(c["scene"], c["size"], c["spp"]) for c in cells if c["render"] == "default"}):
         here = [c for c in cells if (c["scene"], c["size"]) == (scene, size)]
         mine = [c["ways"]["default"] for c in here if c["render"] == "default" and c["spp"] == spp]
@@ -231,7 +231,7 @@ def rows(cells: list[dict[str, Any]]) -> Iterator[list[str]]:
 
 
 def over(mine: list[dict], cells: list[dict], renders: tuple[str, ...], ways: tuple[str, ...]) -> list:
-    """The default's error and FLIP, each divided by the rival's at the same whole time, with its mark."""
+    """The default's error and FLIP, divided by the rival's at the same whole time; with marks."""
     seconds, found = geometric_mean([each["seconds"] for each in mine]), []
     for value in VALUES:
         curves = [points(cells, render, way, value) for render in renders for way in ways]
@@ -240,7 +240,7 @@ def over(mine: list[dict], cells: list[dict], renders: tuple[str, ...], ways: tu
 
 
 def points(cells: list[dict], render: str, way: str, value: str) -> list[tuple[float, float]]:
-    """Whole seconds and errors of a way by number of samples, geometric means over seeds."""
+    """(whole seconds, error) of a way for each number of samples: geometric means over seeds."""
     of = [c for c in cells if c["render"] == render and way in c["ways"]]
     by_spp = [[c["ways"][way] for c in of if c["spp"] == spp] for spp in sorted({c["spp"] for c in of})]
     return [(geometric_mean([e["seconds"] for e in each]), geometric_mean([e[value] for e in each])) for each in by_spp]

@@ -1,30 +1,25 @@
-"""Shared tails over many seeds: how often an image is far off, and whether the noise is as large as claimed.
+"""Shared tails over many seeds: how far single images are off, and whether their noise is as large as claimed.
 
     python -m bench.seeds kitchen/scene.xml generator:3:partition --references FOLDER
 
-The sampler is `primal`; ``bench.judging`` opens the scenes. A cell, of a scene, number of samples and ``tails``, has:
+The sampler is `primal`; ``bench.judging`` opens the scenes. There is a cell for each scene, number of samples and value
+of ``tails``:
 
-    light      mean of the image over the mean of the reference: mean, least and most of the seeds
-    deviation  real over claimed standard deviation of the image's light. The claim is the sum of the pixels' own
-               variances, and the square of the mean of the layer ``shared`` as a mean over seeds
-    blocks     real over claimed variance of 8x8 and of 32x32 pixels: of the sums over all blocks, and the median. It is
-               below 1 for whole paths, because points in Z order let neighbours make up for each other
-    error      after `oidn`, ``bench.judging.Judge.steady``: geometric mean, median and worst of the seeds
-    seconds    of processors, of the render and of OIDN
+    light      the mean of the image over the mean of the reference: mean, least and largest value of the seeds
+    deviation  the real over the claimed standard deviation of the image's light. The claimed variance is the sum of the
+               pixels' own variances plus the square of the mean of the layer ``shared``, averaged over the seeds
+    blocks     the real over the claimed variance of blocks of 8x8 and of 32x32 pixels: the ratio of the sums over all
+               blocks, and the median of the ratios. For whole paths it is below 1, because with points in Z order the
+               errors of neighbouring pixels partly cancel
+    error      ``bench.judging.Judge.steady`` after `oidn`: geometric mean, median and worst of the seeds
+    seconds    processor seconds of the render and of OIDN
 
-In the table the error at equal whole time is over the curve of whole paths, geometric means over seeds; marks are those
-of ``bench.curves``. ``--against`` names the folder of
-another version of the code, which renders shared tails too. Cells that are measured again replace the old ones.
+The table divides the error by the error of whole paths after the same time; both are geometric means over seeds.
+``bench.curves`` explains the marks. Cells that are measured again replace the old ones.
 """
 
 import argparse
-import gc
-import os
-import subprocess
-import sys
-import tempfile
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,69 +27,51 @@ import numpy as np
 import ngpt
 from bench.common import blocks, digits, renderer, table
 from bench.curves import marked, over_least
-from bench.judging import WARM_SPP, Cells, Judge, command, opened, parsed, timed
+from bench.judging import WARM_SPP, Cells, command, open_judged, parsed, timed
 from bench.tails import TAILS
 from ngpt.measure.averages import geometric_mean
+from ngpt.shared import shared_variance
 
 SIDES = (8, 32)
 CELL = ("scene", "size", "spp", "tails")
 HEAD = ["scene", "spp", "tails", "light", "least .. most", "deviation", *(f"{n}x{n}, median" for n in SIDES)]
 HEAD += ["error", "median", "worst", "worst / median", "whole s", "error at equal time"]
-ROOT = Path(__file__).parents[1]
 
 
 def main() -> None:
     parser = command(__doc__, "seeds", "320x180", (16, 64))
-    parser.add_argument("--variant")
-    parser.add_argument("--seeds", type=int, default=32, help="of shared tails")
-    parser.add_argument("--paths-seeds", type=int, default=8, help="of whole paths")
-    parser.add_argument("--against", type=Path, metavar="DIR", help="another version of the code")
-    parser.add_argument("--code", default="", help=argparse.SUPPRESS)
+    parser.add_argument("--seeds", type=int, default=32, help="number of seeds for shared tails")
+    parser.add_argument("--paths-seeds", type=int, default=8, help="number of seeds for whole paths")
     args = parsed(parser)
     if args.scenes and min(args.seeds, args.paths_seeds) < 2:
         parser.error("give two seeds or more")
     cells = Cells(args.output, "seeds", CELL)
     cells.measure(args.scenes, lambda scene, _: measured(scene, args))
-    if args.code:
-        return
-    if args.against and args.scenes:
-        with tempfile.TemporaryDirectory() as ours:
-            # These benchmarks, and all else of the other version
-            (Path(ours) / "bench").symlink_to(ROOT / "bench")
-            path = os.pathsep.join([ours, str(args.against.resolve()), os.environ.get("PYTHONPATH", "")])
-            given = [sys.executable, "-P", "-m", "bench.seeds", *sys.argv[1:], "--code", args.against.resolve().name]
-            subprocess.run(given, check=True, env=os.environ | {"PYTHONPATH": path})
-        cells = Cells(args.output, "seeds", CELL)
     table(HEAD, rows(cells))
 
 
 def measured(scene: str, args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """The cells of a scene, one after the other."""
-    load_scene, render_stack = renderer(args.variant)
-    # A kernel knows the shapes of all scenes in memory.
-    gc.collect()
-    with opened(scene) as (name, file):
-        loaded = load_scene(file, args.pixels)
-        judge = Judge(loaded, name, args.references, args.size, args.reference_spp)
+    """Yields the cells of a scene."""
+    _, render_stack = renderer()
+    name, loaded, judge = open_judged(scene, args.size, args.references, args.reference_spp)
 
-        def made(spp: int, seed: int, tails: str) -> tuple[ngpt.GradientStack, np.ndarray]:
-            stack = render_stack(loaded, spp, seed, "primal", tails=tails)
-            return stack, ngpt.reconstruct(stack, "oidn").image
+    def made(spp: int, seed: int, tails: str) -> tuple[ngpt.GradientStack, np.ndarray]:
+        stack = render_stack(loaded, spp, seed, "primal", tails=tails)
+        return stack, ngpt.reconstruct(stack, "oidn").image
 
-        for tails in ["shared"] if args.code else TAILS:
-            made(WARM_SPP, 0, tails)
-            label = f"{tails}, {args.code}" if args.code else tails
-            for spp in args.spp:
-                layers, found, seconds = [], [], []
-                for seed in range(1, 1 + (args.seeds if tails == "shared" else args.paths_seeds)):
-                    (stack, image), taken = timed(lambda n=spp, s=seed, t=tails: made(n, s, t))
-                    seconds.append(taken)
-                    found.append(judge.steady(image))
-                    layers.append({each: stack[each] for each in ("primal", "primal_var", "shared") if each in stack})
-                light = [judge.light(each["primal"]) for each in layers]
-                cell = {"scene": name, "size": args.size, "spp": spp, "tails": label, "seeds": len(seconds)}
-                cell |= {"seconds": float(np.mean(seconds)), "light": spread(light), "error": errors(found)}
-                yield cell | noise(layers)
+    for tails in TAILS:
+        made(WARM_SPP, 0, tails)
+        for spp in args.spp:
+            layers, found, seconds = [], [], []
+            for seed in range(1, 1 + (args.seeds if tails == "shared" else args.paths_seeds)):
+                (stack, image), taken = timed(lambda n=spp, s=seed, t=tails: made(n, s, t))
+                seconds.append(taken)
+                found.append(judge.steady(image))
+                layers.append({each: stack[each] for each in ("primal", "primal_var", "shared") if each in stack})
+            light = [judge.light(each["primal"]) for each in layers]
+            cell = {"scene": name, "size": args.size, "spp": spp, "tails": tails, "seeds": len(seconds)}
+            cell |= {"seconds": float(np.mean(seconds)), "light": spread(light), "error": errors(found)}
+            yield cell | noise(layers)
 
 
 def spread(values: list[float]) -> dict[str, float]:
@@ -106,23 +83,21 @@ def errors(values: list[float]) -> dict[str, float]:
 
 
 def noise(stacks: list[dict[str, np.ndarray]]) -> dict[str, Any]:
-    """Real over claimed noise: ``deviation`` of the image's light, and ``blocks`` of variances by side of the block.
+    """The entries ``deviation`` and ``blocks`` of a cell.
 
-    ``stacks`` are two seeds or more with ``primal``, ``primal_var`` and, if paths share their tails, ``shared``,
-    (H, W, 3) each. Values without a claim are None.
+    ``stacks`` are the stacks of two seeds or more, with ``primal``, ``primal_var`` and, if paths share their tails,
+    ``shared``, (H, W, 3) each. Where no noise is claimed, the deviation is None and the ratios of a block are {}.
     """
     primal, own = (np.array([stack[name] for stack in stacks], np.float64) for name in ("primal", "primal_var"))
     shared = np.zeros_like(primal)
     if all("shared" in stack for stack in stacks):
-        from ngpt.shared import shared_variance  # other versions of the code may not have it
-
         shared = np.array([stack["shared"] for stack in stacks], np.float64)
         own = np.maximum(own - np.array([shared_variance(layer) for layer in shared]), 0)
 
     def ratios(means, pixels: int) -> dict[str, float | None]:
         real, claimed = means(primal).var(axis=0, ddof=1), (means(own) / pixels + means(shared) ** 2).mean(axis=0)
-        told = claimed.mean(axis=-1) > 0
-        each = real.mean(axis=-1)[told] / claimed.mean(axis=-1)[told]
+        known = claimed.mean(axis=-1) > 0
+        each = real.mean(axis=-1)[known] / claimed.mean(axis=-1)[known]
         return {"sum": float(real.sum() / claimed.sum()), "median": float(np.median(each))} if each.size else {}
 
     whole = ratios(lambda layers: layers.mean(axis=(1, 2)), primal[0, ..., 0].size)
@@ -131,7 +106,7 @@ def noise(stacks: list[dict[str, np.ndarray]]) -> dict[str, Any]:
 
 
 def rows(cells: list[dict[str, Any]]) -> list[list[str]]:
-    """A line of the table for each cell, by scene, number of samples and tails."""
+    """The lines of the table, one for each cell, sorted by scene, size, number of samples and tails."""
     lines = []
     for cell in sorted(cells, key=lambda cell: tuple(cell[name] for name in CELL)):
         paths = [c for c in cells if (c["scene"], c["size"], c["tails"]) == (cell["scene"], cell["size"], "paths")]

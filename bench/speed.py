@@ -1,16 +1,17 @@
-"""The time of reconstructions compared to OIDN and to an earlier commit: bench/results/speed.json.
+"""The time of reconstructions relative to OIDN, and at an earlier commit: bench/results/speed.json.
 
     python -m bench.speed --before f72936e
 
-Stacks are synthetic, with features and variances. Each row runs once per turn, so that other work on the machine
-affects all rows alike. The rows of the commit run in a separate process, which takes its turn like the others.
+Stacks are synthetic, with features and variances. The rows run in turn, so that other work on the machine affects all
+of them alike. The rows of the earlier commit run in a separate process, which waits for its turn.
 
-    oidn            Open Image Denoise with unfiltered albedo and normal, at its highest quality: compared to all rows
+    oidn            Open Image Denoise with unfiltered albedo and normal, at its highest quality
     wcv, ngpt-fast, ngpt-primal, ngpt-combine   as ``ngpt denoise`` runs them, with features that are known to be clean
-    ..., caustic    with the layer ``caustic``, which rooms with a mirror or glass have
-    ..., noisy      with features whose noise is unknown or large
-    oidn-small, oidn-default   networks of that shape, random weights, on wcv: ``ngpt denoise --weights NET.tza``
-    before: ...     the row at the commit
+    ..., caustic    on stacks with the layer ``caustic``, as of rooms with a mirror or glass
+    ..., noisy      on stacks whose features have unknown noise
+    oidn-small, oidn-default   networks of OIDN's shapes with random weights, as ``ngpt denoise --weights NET.tza`` runs
+                    them on the result of wcv
+    before: ...     the same row at the earlier commit
 
 Results are medians and quartiles of wall-clock seconds, of processor seconds, and of processor seconds relative to
 "oidn" in the same turn. On a busy machine only processor time is meaningful.
@@ -39,7 +40,8 @@ from ngpt.network import tza
 from ngpt.network.oidnet import SHAPES, OidnUNet
 from ngpt.stack import GradientStack
 
-# Runs at the earlier commit, so it uses what every version has: a line of a method and a file gives seconds.
+# The program of the earlier commit's process: reads lines "METHOD FILE", prints seconds. It uses only functions that
+# every version has.
 WORKER = """
 import sys, time
 import ngpt
@@ -53,7 +55,7 @@ for line in sys.stdin:
     reconstruct(given[file], name)
     print(time.perf_counter() - clock, time.process_time() - cpu, flush=True)
 """
-# Row -> the method that runs, and the kind of stack that it runs on.
+# Method -> the kinds of stacks that it runs on; "" has neither light in ``caustic`` nor noisy features.
 ROWS = {
     "wcv": ("", "caustic"),
     "ngpt-fast": ("", "caustic"),
@@ -68,7 +70,6 @@ def main() -> None:
     parser.add_argument("--before", metavar="COMMIT", required=True)
     parser.add_argument("--size", default="1280x720")
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--without", nargs="*", default=[], help="rows that are left out")
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/speed.json"))
     args = parser.parse_args()
     result = {"benchmark": "speed", **vars(args), "metadata": metadata("onnxruntime", "mitsuba-oidn")}
@@ -86,7 +87,6 @@ def main() -> None:
             for row, (name, kind) in CALLS.items():
                 line = f"{name} {folder / (kind or 'clean')}.exr"
                 calls[f"before: {row}"] = lambda line=line: ask(worker, line)
-            calls = {name: call for name, call in calls.items() if name not in args.without}
             result["rows"] = measured(calls, args.repeats)
             worker.kill()
             worker.wait()
@@ -121,10 +121,10 @@ def rows(given: dict[str, GradientStack], folder: Path) -> dict[str, Callable[[]
 
 
 def stacks(size: str) -> dict[str, GradientStack]:
-    """The stacks of the rows by what sets them apart; half a percent of the pixels have light in ``caustic``."""
+    """Kind -> stack; in "caustic", half a percent of the pixels have light in that layer."""
     noisy = stack_of(*map(int, size.split("x")))
     clean = noisy.replace()
-    # Marks the features as clean, as stacks by ngpt do; earlier commits do not read it.
+    # Features are known to be free of noise. Earlier commits may ignore this attribute.
     clean.attributes["ngpt:featureNoise"] = 0.0
     random = np.random.default_rng(2)
     lit = random.random(noisy["depth"].shape) < 0.005
@@ -137,28 +137,28 @@ def measured(calls: dict[str, Callable[[], tuple[float, float]]], repeats: int) 
     runs: dict[str, list[tuple[float, float]]] = {name: [] for name in calls}
     for repeat in range(repeats + 1):
         for name, call in calls.items():
-            told = call()
+            seconds = call()
             if repeat:
-                runs[name].append(told)
+                runs[name].append(seconds)
     return {
         name: {
-            "clock": summary([clock for clock, _ in told]),
-            "processors": summary([cpu for _, cpu in told]),
-            "over oidn": summary([a / b for (_, a), (_, b) in zip(told, runs["oidn"], strict=True)]),
+            "clock": summary([clock for clock, _ in seconds]),
+            "processors": summary([cpu for _, cpu in seconds]),
+            "over oidn": summary([a / b for (_, a), (_, b) in zip(seconds, runs["oidn"], strict=True)]),
         }
-        for name, told in runs.items()
+        for name, seconds in runs.items()
     }
 
 
 def timed(call: Callable[[], object]) -> tuple[float, float]:
-    """Seconds by the clock and of the processor."""
+    """Wall-clock and processor seconds of a call."""
     clock, cpu = time.perf_counter(), time.process_time()
     call()
     return time.perf_counter() - clock, time.process_time() - cpu
 
 
 def start(folder: Path) -> subprocess.Popen:
-    """A process that runs the methods of ``folder``."""
+    """A process that runs the methods of the version of ngpt in ``folder``."""
     how: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "cwd": folder}
     return subprocess.Popen([sys.executable, "-c", WORKER], env=os.environ | {"PYTHONPATH": str(folder)}, **how)
 

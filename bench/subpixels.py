@@ -1,21 +1,21 @@
-"""The value of subpixels: errors and seconds of OIDN on K x K subpixels of each pixel, relative to pixels.
+"""Errors and seconds of OIDN on K x K subpixels of each pixel, relative to OIDN on pixels.
 
     python -m bench.subpixels product lens living-room/scene.xml --references FOLDER
 
-The sampler is `primal`, with shared tails where they work. A scene, number of samples and seed is rendered once, with
-as many subpixels as any way needs; fewer are their means. Ways that need more subpixels than a pixel has samples are
-skipped. A scene is a name of `bench.panel`, or one that ``bench.judging`` opens. Each of WAYS is the mean of one or
-more images, given by K and by how OIDN is to use the features. "auto" is the default of `oidn` with subpixels. Each
-cell has, for each way:
+The sampler is `primal`, with shared tails where they work. A scene is a name of ``bench.panel``, or one that
+``bench.judging`` opens. For each scene, number of samples and seed, one stack is rendered, with the most subpixels that
+a way needs; stacks with fewer subpixels are means of it. Ways that need more subpixels than a pixel has samples are
+skipped. Each of WAYS is the mean of one or more images of OIDN, each with its K and its use of the features; "auto" is
+the default of `oidn` with subpixels. A cell has, for each way:
 
-    seconds  of processors, warmed up
-    error    ``bench.judging.Judge.steady``; FLIP is over the mean of the reference's halves
+    seconds  processor seconds of OIDN, after a warm-up
+    error    ``bench.judging.Judge.steady``
+    FLIP     relative to the mean of the reference's halves
 
-The table shows the ratio of each value to the value of ``BASE``: the median over seeds.
+The table shows medians over seeds of the ratio of each value to the value of ``BASE``.
 """
 
 import argparse
-import gc
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -25,13 +25,13 @@ import pandas as pd
 
 import ngpt
 from bench.common import renderer
-from bench.judging import Cells, Judge, command, opened, parsed, timed
+from bench.judging import Cells, command, open_judged, parsed, timed
 from bench.panel import CASES
 from ngpt.measure.averages import geometric_mean
 from ngpt.stack import GradientStack
 from ngpt.subpixels import means, subpixels
 
-# Name -> the images whose mean it is: K, and how features are declared
+# Name -> the images that are averaged: K, and how OIDN uses the features.
 WAYS: dict[str, tuple[tuple[int, str], ...]] = {
     "1 prefiltered": ((1, "prefiltered"),),
     "1 noisy": ((1, "noisy"),),
@@ -58,13 +58,11 @@ def main() -> None:
 
 
 def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterator[dict[str, Any]]:
-    """The cells of a scene that are not ``known``, one after the other."""
-    load_scene, render_stack = renderer()
-    gc.collect()  # a kernel knows the shapes of all scenes in memory
-    with opened(CASES[scene].scene if scene in CASES else scene) as (name, file):
-        name = scene if scene in CASES else name
-        loaded = load_scene(file, args.pixels)
-    judge, warm = Judge(loaded, name, args.references, args.size, args.reference_spp), False
+    """Yields the cells of a scene that are not ``known``."""
+    _, render_stack = renderer()
+    file = CASES[scene].scene if scene in CASES else scene
+    name, loaded, judge = open_judged(file, args.size, args.references, args.reference_spp)
+    warm = False
 
     def rendered(spp: int, seed: int, k: int) -> GradientStack:
         return render_stack(loaded, spp, seed, "primal", unbiased=False, subpixels=k)
@@ -89,7 +87,7 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterato
 
 
 def denoised(stack: GradientStack, k: int, auxiliary: str) -> tuple[np.ndarray, float]:
-    """OIDN's image of K x K subpixels, and its seconds at the second call."""
+    """OIDN's image of K x K subpixels, and the seconds of a second, warm call."""
     has = subpixels(stack.fine, stack.width)
     fine = {name: means(layer, has // k) for name, layer in stack.fine.items()} if k > 1 else {}
     given = replace(stack, fine=fine)
@@ -99,7 +97,7 @@ def denoised(stack: GradientStack, k: int, auxiliary: str) -> tuple[np.ndarray, 
 
 
 def show(cells: list[dict]) -> None:
-    """A line for each size, number of samples and way: ratios of errors by scene, and means of all values."""
+    """Prints a table for each size and number of samples: for each way, means, worst values, and errors by scene."""
     values = ["error", "FLIP", "seconds"]
     lines = [
         {name: cell[name] for name in CELL} | {"way": way} | {v: found[v] / cell["ways"][BASE][v] for v in values}

@@ -1,16 +1,16 @@
-"""Tables of evaluations in the pages that quote them.
+"""Writes tables of evaluations into the pages that quote them.
 
     python eval.py --config configs/eval-bidirectional.toml --out out/bidirectional --scenes 'scenes/*/scene.xml'
-    python -m bench.tables bidirectional out/bidirectional   # keeps its numbers, puts the table into its page
-    python -m bench.tables                                   # all tables again, from the numbers that are kept
+    python -m bench.tables bidirectional out/bidirectional   # stores the numbers, and writes the table into its page
+    python -m bench.tables                                   # writes all tables, from the stored numbers
 
-Numbers are kept in bench/results/NAME.json: medians over seeds of the primary metric and of FLIP, cell by cell, and
-the cost of a sample of each sampler. ``PAGES`` gives the page of each table, and its kind, one of three:
+bench/results/NAME.json holds the stored numbers: for each cell, medians over seeds of the primary metric and of FLIP;
+and the cost of a sample of each sampler. ``PAGES`` has the page and the kind of each table:
 
-    by_scene   errors over the least error of the scene, which is bold; below, the least error itself, and the cost of a
-               sample relative to `primal`
+    by_scene   errors over the least error of the scene, which is bold; then the least errors, and the cost of a sample
+               relative to `primal`
     means      geometric means over the scenes at each number of samples; the least is bold
-    rivals     errors relative to OIDN on our samples and on Mitsuba's, means over all cells
+    rivals     errors over those of OIDN on our samples and on Mitsuba's; geometric means over all cells
 """
 
 import argparse
@@ -30,12 +30,12 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "bench" / "results"
 
 
-# Columns of evaluations and their names in tables: OIDN on our own samples, and the usual alternative of a user
+# Columns of rivals and their names in tables: OIDN on our samples, and OIDN on Mitsuba's.
 RIVALS = {"oidn": "OIDN", "mitsuba": "Mitsuba + OIDN"}
 
 
 def pivoted(result: dict[str, Any], value: str = "error") -> pd.DataFrame:
-    """A row for each scene and number of samples, a column for each method, as the cells are ordered."""
+    """A row for each scene and number of samples, and a column for each method, in the order of the cells."""
     return pd.DataFrame(result["cells"]).pivot_table(value, ["scene", "spp"], "method", sort=False, observed=True)
 
 
@@ -47,7 +47,7 @@ def by_scene(result: dict[str, Any]) -> str:
     rows = []
     for method in dict.fromkeys(cell["method"] for cell in result["cells"]):
         shown = ["" if math.isnan(r) else "**1**" if r == 1 else short(r) for r in ratios[method]]
-        # A mean needs all scenes: means over different scenes could not be compared.
+        # Only methods that have all scenes have a mean, because means over different scenes cannot be compared.
         rows.append([f"`{method}`", *shown, "" if "" in shown else short(geometric_mean(ratios[method]))])
     rows.append(["*least error*", *(f"{error:.2g}" for error in errors.min(axis=1)), ""])
     costs = pd.DataFrame(result.get("costs", {})).reindex(columns=errors.index.get_level_values("scene"))
@@ -101,7 +101,7 @@ PAGES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", nargs="?", choices=PAGES)
-    parser.add_argument("folder", type=Path, nargs="?", help="of the evaluation; default: the numbers of before")
+    parser.add_argument("folder", type=Path, nargs="?", help="results of the evaluation; default: stored numbers")
     args = parser.parse_args()
     if args.folder:
         save(RESULTS / f"{args.name}.json", kept(json.loads((args.folder / "results.json").read_text())))
@@ -118,7 +118,7 @@ def marks(name: str) -> tuple[str, str]:
 
 
 def kept(results: dict[str, Any]) -> dict[str, Any]:
-    """The part of an evaluation's results.json that the tables use."""
+    """The numbers of an evaluation's results.json that the tables need."""
     facts = {name: results[name] for name in ("title", "command", "date", "metadata", "settings")}
     costs = {
         scene: {cost["sampler"]: cost["median"] for cost in entry["cost"].values()}
@@ -129,7 +129,7 @@ def kept(results: dict[str, Any]) -> dict[str, Any]:
 
 
 def cells_of(results: dict[str, Any]) -> list[dict[str, Any]]:
-    """Medians over seeds, a row for each scene, number of samples and column."""
+    """Medians over seeds for each scene, number of samples and column."""
     return [
         {
             "scene": row["scene"],

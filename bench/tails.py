@@ -1,26 +1,27 @@
-"""The value of shared tails: seconds and errors with tails=shared relative to tails=paths.
+"""Seconds and errors with shared tails (tails=shared) relative to whole paths (tails=paths).
 
     python -m bench.tails kitchen/scene.xml bedroom/scene.xml --references FOLDER --groups rooms=kitchen,bedroom
 
-Samplers are `primal`, `gpt`, and `mitsuba`: `primal` with Mitsuba's own points and lamps and whole paths, denoised by
-`oidn`. Methods are in METHODS. Each cell has:
+Samplers are `primal`, `gpt`, and `mitsuba`: `primal` with Mitsuba's own points and lamps and whole paths. METHODS has
+the methods of each. A cell has, for each method:
 
-    seconds    of processors, of the render and of the reconstruction, both warmed up; whole: both together
-    error      relMSE by two halves of a reference, without the worst 0.1 % of the pixels; FLIP is over their mean
-    steady     the same error, relative to the denoised reference, which also selects the worst pixels. Most pixels of a
+    seconds    processor seconds of the render, and of the reconstruction, after a warm-up; "whole" is their sum
+    error      relMSE by two halves of a reference, without the worst 0.1 % of the pixels
+    steady     the same error relative to the denoised reference (``bench.judging.Judge.steady``). Most pixels of a
                noisy reference are too dark, so ``error`` rewards images that are too dark
-    blocks     root of the same error of means over 8x8 pixels; none if it is too small for the halves to measure
-    energy     mean of the image over the mean of the reference
-    auto       the method that the stack gets by default, in cells of the sampler that `ngpt render` takes by default
+    FLIP       relative to the mean of the halves
+    blocks     the root of the relMSE of means over 8x8 pixels; None if it is too small for the halves to measure
+    energy     the mean of the image over the mean of the reference
 
-References are NAME-WxH-a.exr and -b.exr of the folder; missing ones are rendered there, without shared tails. A cell
-with shared tails is compared at equal whole time: its error is divided by the error of the same sampler and method with
-tails=paths. ``bench.curves`` explains the marks. W, C and W/C of gradients are against `primal` with the same tails.
-Cells that the file has are not measured again. Values are medians over seeds, means over scenes geometric.
+Cells of the sampler that `ngpt render` takes by default also have ``auto``, the method that it takes by default.
+
+``bench.judging`` opens scenes and makes references. An error with shared tails is divided by the error of the same
+sampler and method with whole paths, after the same samples and after the same whole time. ``bench.curves`` explains the
+marks, and ``bench.worth`` explains W, C and W/C of gradients. Cells in the file are not measured again. Values are
+medians over seeds; means over scenes are geometric.
 """
 
 import argparse
-import gc
 import os
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -32,9 +33,8 @@ import pandas as pd
 import ngpt
 from bench.common import blocks, digits, renderer, table
 from bench.curves import Ratio, error_at, joined, marked, over, over_least
-from bench.judging import RIVAL, WARM_SPP, Cells, Judge, command, parsed, timed
+from bench.judging import RIVAL, WARM_SPP, Cells, Judge, command, open_judged, parsed, timed
 from bench.worth import worth_tables
-from ngpt.evaluation.config import scene_name
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import choose
 
@@ -51,7 +51,7 @@ ERRORS = VALUES[:-1]
 RATIOS = ("seconds", *(f"{name}, {at}" for at in ("samples", "time") for name in ERRORS))
 CELL = ("scene", "size", "sampler", "tails", "spp", "seed")
 PIPELINE = ["scene", "size", "sampler", "method"]
-# Columns of an evaluation; `oidn` reads no gradients.
+# Our pipelines, as columns of an evaluation. `gpt` with `oidn` is left out, because `oidn` reads no gradients.
 PIPELINES = {
     f"{sampler}+{method}": {"sampler": sampler, "stack": "gradients" if sampler == "gpt" else "primal"}
     for sampler in ("primal", "gpt")
@@ -66,7 +66,9 @@ def main() -> None:
     parser.add_argument("--tails", nargs="+", default=list(TAILS), choices=list(TAILS))
     parser.add_argument("--samplers", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
-    parser.add_argument("--groups", nargs="*", default=[], metavar="NAME=SCENE,...", help="scenes to take means over")
+    parser.add_argument(
+        "--groups", nargs="*", default=[], metavar="NAME=SCENE,...", help="means are taken over these scenes"
+    )
     args = parsed(parser)
     cells = Cells(args.output, "tails", CELL)
     cells.measure(args.scenes, lambda scene, known: measured(scene, args, known))
@@ -75,15 +77,12 @@ def main() -> None:
 
 
 def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterator[dict[str, Any]]:
-    """The cells of a scene that are not ``known``, one after the other."""
-    load_scene, render_stack = renderer()
+    """Yields the cells of a scene that are not ``known``."""
+    _, render_stack = renderer()
     from data_gen.choosing.plans import plan_sampler
     from data_gen.request import RenderRequest
 
-    # A kernel knows the shapes of all scenes in memory.
-    gc.collect()
-    loaded = load_scene(scene, args.pixels)
-    judge = Judge(loaded, scene_name(scene), args.references, args.size, args.reference_spp)
+    scene, loaded, judge = open_judged(scene, args.size, args.references, args.reference_spp)
     chosen = plan_sampler(loaded, RenderRequest(loaded, min(args.spp)))
     for sampler in args.samplers:
         warm: set[str] = set()
@@ -91,7 +90,7 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]) -> Iterato
         for spp in args.spp:
             for seed in args.seeds:
                 for tails in args.tails if sampler != "mitsuba" else ["paths"]:
-                    values = (scene_name(scene), args.size, sampler, tails, spp, seed)
+                    values = (scene, args.size, sampler, tails, spp, seed)
                     if values in known:
                         continue
                     if tails not in warm:
@@ -113,7 +112,7 @@ def image_of(stack: ngpt.GradientStack, method: str) -> np.ndarray:
 
 
 def judged(stack: ngpt.GradientStack, method: str, judge: Judge) -> dict[str, float | None]:
-    """Seconds of the reconstruction, and ``VALUES``; no FLIP of the raw primal."""
+    """Seconds of the reconstruction, and ``VALUES``. The raw primal has no FLIP."""
     image, seconds = timed(lambda: image_of(stack, method))
     found = judge.scores(image, "relMSE trimmed", *(["FLIP"] if method != RAW else []))
     coarse = relmse_trimmed(*(blocks(each.astype(np.float64)) for each in (image, *judge.reference.images)))
@@ -128,7 +127,7 @@ def judged(stack: ngpt.GradientStack, method: str, judge: Judge) -> dict[str, fl
 
 
 def medians(cells: list[dict]) -> dict[tuple, pd.DataFrame]:
-    """Pipeline -> medians over seeds of ``VALUES``, ``render`` and ``whole`` seconds, by samples and tails."""
+    """Pipeline -> medians over seeds: columns ``render``, ``whole`` and ``VALUES``, indexed by samples and tails."""
     lines = [
         {name: cell[name] for name in CELL}
         | {"method": method, "render": cell["seconds"], "whole": cell["seconds"] + values["seconds"]}
@@ -144,7 +143,7 @@ def medians(cells: list[dict]) -> dict[tuple, pd.DataFrame]:
 
 
 def with_tails(here: pd.DataFrame, tails: str) -> pd.DataFrame:
-    """The rows with these tails, by samples."""
+    """The rows with these tails, indexed by samples."""
     return here[here.index.get_level_values("tails") == tails].droplevel("tails")
 
 
@@ -154,7 +153,7 @@ def points(here: pd.DataFrame, value: str) -> list[tuple[float, float]]:
 
 
 def ratios(here: pd.DataFrame, spp: int) -> dict[str, Ratio]:
-    """Shared over paths, with marks: ``seconds``, and errors at equal samples and at equal whole time."""
+    """Values with shared tails over values with whole paths: ``RATIOS``, with marks; {} if either is missing."""
     if any((spp, tails) not in here.index for tails in TAILS):
         return {}
     paths, shared = (here.loc[spp, tails] for tails in TAILS)
@@ -172,21 +171,20 @@ def show(cells: list[dict], groups: dict[str, list[str]]) -> None:
     lines = []
     for (scene, size, sampler, method), here in medians(cells).items():
         for spp in here.index.unique("spp"):
-            told = ratios(here, spp)
-            found.setdefault((size, sampler, method, str(spp)), {})[scene] = told
+            found_here = ratios(here, spp)
+            found.setdefault((size, sampler, method, str(spp)), {})[scene] = found_here
             pair = here.loc[spp].reindex(TAILS)
             values = [" / ".join(map(digits, pair[name])) for name in ("render", "whole", *VALUES)]
-            lines.append(
-                [f"{scene} {size}", sampler, method, str(spp), *values, *(marked(told.get(r)) for r in RATIOS)]
-            )
+            cells_of_ratios = (marked(found_here.get(r)) for r in RATIOS)
+            lines.append([f"{scene} {size}", sampler, method, str(spp), *values, *cells_of_ratios])
     print("\ntails=paths / tails=shared, and the second over the first; seconds of processors")
     table(["scene", "sampler", "method", "spp", "render s", "whole s", *VALUES, *RATIOS], lines)
     lines = []
     for name, members in groups.items():
         for (size, *place), by_scene in found.items():
-            here = [told for scene, told in by_scene.items() if scene in members and told]
+            here = [each for scene, each in by_scene.items() if scene in members and each]
             if here:
-                means = [over([told.get(key) for told in here]) for key in RATIOS]
+                means = [over([each.get(key) for each in here]) for key in RATIOS]
                 lines.append([f"{name} ({len(here)}) {size}", *place, *means])
     print("\ngeometric means over scenes")
     table(["scenes", "sampler", "method", "spp", *RATIOS], lines)
@@ -206,7 +204,7 @@ def show(cells: list[dict], groups: dict[str, list[str]]) -> None:
 
 
 def curves_of(cells: list[dict], tails: str) -> dict[str, dict[str, pd.DataFrame]]:
-    """Scene -> pipeline -> medians by samples, of all ``PIPELINES`` and of Mitsuba."""
+    """Scene -> pipeline -> medians indexed by samples, for all ``PIPELINES`` and for ``MITSUBA``."""
     curves: dict[str, dict[str, pd.DataFrame]] = {}
     for (scene, _, sampler, method), here in medians(cells).items():
         if (name := f"{sampler}+{method}") in (*PIPELINES, MITSUBA):
@@ -215,18 +213,18 @@ def curves_of(cells: list[dict], tails: str) -> dict[str, dict[str, pd.DataFrame
 
 
 def groups_of(curves: dict[str, Any], groups: dict[str, list[str]]) -> list[tuple[str, list[str]]]:
-    """Each scene, and each group that has any, with the scenes that were measured."""
+    """(name, measured scenes): each scene by itself, then each group that has any."""
     known = [(name, [scene for scene in members if scene in curves]) for name, members in groups.items()]
     return [*((scene, [scene]) for scene in curves), *((name, members) for name, members in known if members)]
 
 
 def both(scenes: list[str], ratio: Callable[[str, str], Ratio | None]) -> str:
-    """Means of a ratio of error and of FLIP, a function of scene and value."""
+    """The means over scenes of ``ratio(scene, value)``, for the error and for FLIP, as text."""
     return ", ".join(over([ratio(scene, value) for scene in scenes]) for value in ("error", "FLIP"))
 
 
 def against_oidn(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> list[list[str]]:
-    """A row for each scene and group, and each of ``SECONDS``: error and FLIP of all ``PIPELINES`` and of Mitsuba."""
+    """Rows for each scene and group, and each of ``SECONDS``: pipelines over `primal` with `oidn`."""
     curves = curves_of(cells, tails)
 
     def ratio(name: str, seconds: float, scene: str, value: str) -> Ratio | None:
@@ -242,7 +240,7 @@ def against_oidn(cells: list[dict], tails: str, groups: dict[str, list[str]]) ->
 
 
 def default_over_best(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> list[list[str]]:
-    """A row for each scene and group: error and FLIP of the default pipeline over the best, at each of ``SECONDS``."""
+    """Rows for each scene and group: the default pipeline over the best of ``PIPELINES`` at each of ``SECONDS``."""
     curves = curves_of(cells, tails)
     taken = {cell["scene"]: f"{cell['sampler']}+{cell['auto']}" for cell in cells if "auto" in cell}
 
@@ -261,7 +259,7 @@ def default_over_best(cells: list[dict], tails: str, groups: dict[str, list[str]
 
 
 def evaluated(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> dict[str, Any]:
-    """The cells with these ``tails`` as results of `ngpt evaluate`, as far as ``worth_of_gradients`` reads them."""
+    """The cells with these ``tails``, with those entries of a results.json that ``bench.worth`` reads."""
     summary, renders = [], []
     for (scene, _, sampler, method), here in medians(cells).items():
         if (name := f"{sampler}+{method}") in PIPELINES:

@@ -1,19 +1,19 @@
-"""Decides which errors are worse than before, beyond noise: the rule of ``bench.panel``, which needs no render.
+"""Decides which errors are worse than before, beyond noise, for ``bench.panel``.
 
-A cell is a dict with "scene", "spp", "pipeline" and, of each name of LIMITS, a dict from seeds (as text) to values.
-The ratio of a cell is the geometric mean over the seeds that both runs have, of the new value over the old one.
+A cell is a dict with "scene", "spp", "pipeline" and, for each name in LIMITS, a dict from seeds (as text) to values.
+The ratio of a cell is the geometric mean of the new values over the old ones, over the seeds that both runs have.
 
-Noise is the spread of a cell: the standard deviation of the logarithm over three seeds or more of the baseline. Few
-seeds may lie close together by chance. So it is at least the usual spread of the same pipeline and number of samples,
-which is the median over scenes of the variances, corrected for the number of seeds. A change of samplers gives the same
-seed other noise, so the logarithm of a ratio over n seeds has a deviation of spread * sqrt(2 / n). A change that keeps
-the samples has a smaller deviation.
+The spread of a cell is the standard deviation of the logarithm of its values, over three seeds or more of the baseline.
+Few seeds may lie close together by chance. So the spread is at least the usual spread of the same pipeline and number
+of samples: the root of the median, over scenes, of the variances, corrected for the number of seeds. A change of
+samplers gives the same seed other noise, so the logarithm of a ratio over n seeds has the standard deviation
+spread * sqrt(2 / n). A change that keeps the samples has a smaller one.
 
-The rule judges all cells, and means: over scenes for each pipeline and number of samples, and over numbers of samples
-for each scene and pipeline. Means have smaller deviations, so they show small changes that occur everywhere. A ratio is
-worse if it is above its limit and beyond DEVIATIONS deviations. Chance passes three deviations once in 740 ratios, and
-a panel has 804. So before it fails, ``bench.panel`` measures ratios that are worse with one seed again, with all seeds
-of the baseline.
+Cells are judged, and also two kinds of means: over scenes for each pipeline and number of samples, and over numbers of
+samples for each scene and pipeline. Means have smaller deviations, so they show small changes that occur everywhere. A
+ratio is worse if it exceeds its limit and DEVIATIONS standard deviations. By chance, one ratio in 740 exceeds three
+standard deviations, and a panel has 804. So ``bench.panel`` measures ratios that are worse with one seed again, with
+all seeds of the baseline, before it fails.
 """
 
 import math
@@ -30,7 +30,8 @@ DEVIATIONS = 3.0
 LEAST_SEEDS = 3
 MEAN = "mean"
 
-Key = tuple[str, str, str]  # scene, number of samples, pipeline; MEAN for a mean over them
+# (scene, number of samples, pipeline). MEAN stands in place of the entry that a mean is taken over.
+Key = tuple[str, str, str]
 
 
 class Judged(NamedTuple):
@@ -52,7 +53,7 @@ class Judged(NamedTuple):
 
 
 def joined(cells: Sequence[dict[str, Any]], further: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The cells, with the ``further`` seeds of those that have any."""
+    """The cells, with the seeds of the cells with the same keys in ``further`` added."""
     more = {key_of(cell): cell for cell in further}
     together = []
     for cell in cells:
@@ -66,7 +67,7 @@ def key_of(cell: dict[str, Any]) -> Key:
 
 
 def compare(cells: Sequence[dict[str, Any]], before: Sequence[dict[str, Any]]) -> list[Judged]:
-    """The cells of scenes that were measured, over those ``before``, then the means.
+    """The ratios of the cells to the cells of the same scenes in ``before``; then the means.
 
     Raises NgptError if only one run has a cell, if runs share no seed, or if the earlier run has too few seeds.
     """
@@ -105,7 +106,7 @@ def mean_of(value: str, key: Key, group: Sequence[Judged]) -> Judged:
 
 
 def spreads(cells: Sequence[dict[str, Any]], value: str) -> dict[Key, float]:
-    """Standard deviations of the logarithm over seeds, at least the usual one of the same pipeline and samples."""
+    """The spread of each cell; see the description of this module."""
     own: dict[Key, float] = {}
     others: dict[tuple[str, str], list[float]] = {}
     for cell in cells:
@@ -117,7 +118,7 @@ def spreads(cells: Sequence[dict[str, Any]], value: str) -> dict[Key, float]:
             )
         variance = float(np.var(np.log(list(cell[value].values())), ddof=1))
         own[key] = math.sqrt(variance)
-        # With Gaussian noise, variance * (seeds - 1) follows a chi-squared distribution, so this divides by its median.
+        # With Gaussian noise, variance * (seeds - 1) has a chi-squared distribution. It is divided by its median.
         others.setdefault(key[1:], []).append(variance * (seeds - 1) / float(chdtri(seeds - 1, 0.5)))
     usual = {place: math.sqrt(np.median(variances)) for place, variances in others.items()}
     return {key: max(each, usual[key[1:]]) for key, each in own.items()}

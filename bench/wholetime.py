@@ -1,9 +1,9 @@
-"""Ratios of a method's error to a rival's error after the same whole time: rendering plus reconstruction.
+"""Ratios of a method's error to a rival's error after the same whole time (render and reconstruction).
 
-A rival is a family of columns, the settings of one denoiser on the samples of one renderer (``against`` in the
-configuration). Each setting has a curve of errors over whole seconds (``bench.curves``). At each time the rival gets
-the least error of all its settings, and separately the least FLIP, as if its user knew the best setting. A setting
-counts from the time of its quickest cell on, unless no setting was measured in so little time.
+A rival is a group of columns, which are settings of one denoiser on the samples of one renderer (``against`` in the
+configuration). Each setting has a curve of errors over whole seconds (``bench.curves``). At each time the rival has the
+least error of all its settings, and separately the least FLIP, as if its user knew the best setting. A setting does not
+count before the time of its quickest cell, unless no setting has so quick a cell.
 """
 
 import math
@@ -15,30 +15,34 @@ from bench.curves import Points, error_at, joined
 from ngpt.measure.averages import geometric_mean
 
 FLIP = "FLIP"
-# The number of steps of an envelope in a plot
+# The number of points of an envelope in a plot.
 _STEPS = 17
 
 
 def against_rivals(results: dict[str, Any]) -> dict[str, Any]:
-    """``rows`` for each scene, number of samples, column and rival (except the column's own rival), and ``means``.
+    """``rows`` for each scene, number of samples, column and rival, and their geometric ``means`` over scenes.
 
-    ``error`` is the primary metric divided by the rival's at the column's ``seconds``; ``setting`` is the rival's
-    column with that error. FLIP has the same fields. Means are geometric, over the scenes of each group and over all.
-    ``less`` and ``less FLIP`` count the scenes where the column is better, out of ``scenes`` and ``scenes FLIP``.
-    Values that are missing, not positive or without a time make no row.
+    A row has these entries, apart from its place:
+
+    ``seconds``  the whole time of the column
+    ``error``    the primary metric over the rival's after this time, with ``mark``; ``setting`` is the rival's column
+    ``FLIP``     the same for FLIP, with ``FLIP mark``; None if it is not known
+
+    The settings of a rival have no rows for this rival. Values that are missing, not positive or without a time have no
+    rows. Means are over each group of scenes and over all. ``less`` and ``less FLIP`` count the scenes where the column
+    is better, of ``scenes`` and ``scenes FLIP``.
     """
     rows = []
+    counts, rivals = results["settings"]["spp"], results["settings"]["against"]
     for scene in results["scenes"]:
         here = _timed(results, scene)
-        curves = {name: _curves(results, here, name) for name in results["settings"]["against"]}
-        for row in here:
-            if row["spp"] in results["settings"]["spp"] and (row["error"] or 0) > 0:
-                for rival, columns in results["settings"]["against"].items():
-                    found = _over(row, results["primary"], curves[rival]) if row["method"] not in columns else None
-                    if found:
-                        place = {name: row[name] for name in ("scene", "spp", "method")}
-                        rows.append(place | {"seconds": row["seconds"]["total"], "rival": rival} | found)
-    keys = {"spp": results["settings"]["spp"], "method": results["methods"], "rival": results["settings"]["against"]}
+        curves = {name: _curves(results, here, name) for name in rivals}
+        for row, (rival, columns) in product(here, rivals.items()):
+            counted = row["spp"] in counts and (row["error"] or 0) > 0 and row["method"] not in columns
+            if counted and (found := _over(row, results["primary"], curves[rival])):
+                place = {name: row[name] for name in ("scene", "spp", "method")}
+                rows.append(place | {"seconds": row["seconds"]["total"], "rival": rival} | found)
+    keys = {"spp": counts, "method": results["methods"], "rival": rivals}
     return {"rows": rows, "means": [entry | _mean(here) for entry, here in grouped(results, rows, **keys)]}
 
 
@@ -48,16 +52,15 @@ def _timed(results: dict[str, Any], scene: str) -> list[dict[str, Any]]:
 
 
 def _curves(results: dict[str, Any], rows: list[dict[str, Any]], rival: str) -> dict[str, dict[str, Points]]:
-    """Metric -> setting -> points of seconds and error, on one scene."""
-    found: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    """Metric -> setting of the rival -> points (seconds, error), of the rows of one scene."""
+    found: dict[str, dict[str, Any]] = {}
     for row in rows:
         if row["method"] in results["settings"]["against"][rival]:
             for metric in dict.fromkeys((results["primary"], FLIP)):
-                value = _value(row, metric)
-                if value:
+                if value := _value(row, metric):
                     points = found.setdefault(metric, {}).setdefault(row["method"], [])
                     points.append((row["seconds"]["total"], value))
-    return {metric: dict(settings) for metric, settings in found.items()}
+    return found
 
 
 def _value(row: dict[str, Any], metric: str) -> float | None:
@@ -66,14 +69,14 @@ def _value(row: dict[str, Any], metric: str) -> float | None:
 
 
 def _least(seconds: float, settings: dict[str, Points]) -> tuple[float, str, str] | None:
-    """The least error of all settings at a time, its mark and its setting."""
+    """The least error of all settings at a time, its mark and its setting; None without any."""
     found = [(*answer, name) for name, points in settings.items() if (answer := error_at(seconds, points))]
     begun = [answer for answer in found if min(settings[answer[2]])[0] <= seconds]
     return min(begun or found, default=None)
 
 
 def _over(row: dict[str, Any], primary: str, curves: dict[str, dict[str, Points]]) -> dict[str, Any] | None:
-    """The column's values over the rival's at its time; None without an error of the rival."""
+    """The entries of a row that compare it with a rival; None if the rival has no error."""
     least = _least(row["seconds"]["total"], curves.get(primary, {}))
     if least is None:
         return None
@@ -99,16 +102,17 @@ def _mean(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def envelope(results: dict[str, Any], rival: str, scenes: list[str]) -> list[tuple[float, float]]:
-    """The curve of a rival: (seconds, error) from its quickest to its slowest cell, geometric means over the scenes.
+    """The curve of a rival as points (seconds, error), from its quickest to its slowest cell.
 
-    Each point is at the same fraction between these two cells in every scene, on a logarithmic axis. A rival that was
-    not measured on all scenes has no points.
+    A point is a geometric mean over the scenes. In each scene it lies at the same fraction between these two cells, on
+    a logarithmic axis. A rival that was not measured on all scenes has no points.
     """
     parts = []
     for scene in scenes:
         settings = _curves(results, _timed(results, scene), rival).get(results["primary"], {})
         times = [math.log(seconds) for points in settings.values() for seconds, _ in points]
-        if not times:  # a mean over the other scenes could not be compared with the other curves
+        if not times:
+            # A mean over the other scenes could not be compared with other curves.
             return []
         at = [math.exp(min(times) + i / (_STEPS - 1) * (max(times) - min(times))) for i in range(_STEPS)]
         parts.append([(seconds, _least(seconds, settings)) for seconds in at])
@@ -121,7 +125,7 @@ def envelope(results: dict[str, Any], rival: str, scenes: list[str]) -> list[tup
 
 
 def against_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
-    """Title -> rows of text, the header first: means of groups, then each scene; columns of rivals are left out."""
+    """Title -> rows of text, the header first: means of groups, then each scene. Settings of rivals have no rows."""
     tables: dict[str, list[list[str]]] = {}
     rivals = results["settings"]["against"]
     settings = {column for columns in rivals.values() for column in columns}
@@ -147,10 +151,10 @@ def against_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
 
 
 def ratio(row: dict[str, Any] | None, key: str) -> str:
-    """A ratio with its mark, key "error" or "FLIP"; "" where there is none."""
+    """The entry ``key`` of a row with its mark, as text; "" if there is none. C (``bench.worth``) has no mark."""
     if row is None or row[key] is None:
         return ""
-    return f"{row['mark' if key == 'error' else 'FLIP mark']}{row[key]:.2f}"
+    return f"{'' if key == 'C' else row.get(f'{key} mark', row['mark'])}{row[key]:.2f}"
 
 
 def _count(row: dict[str, Any] | None, key: str) -> str:
@@ -160,7 +164,7 @@ def _count(row: dict[str, Any] | None, key: str) -> str:
 def grouped(
     results: dict[str, Any], rows: list[dict[str, Any]], **keys: Iterable
 ) -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
-    """The rows of each group of scenes with each combination of ``keys``, where there are any."""
+    """(place, rows) for each group of scenes and each combination of values of ``keys`` that has rows."""
     for group, members in groups_of(results, [row["scene"] for row in rows]).items():
         for values in product(*keys.values()):
             place = dict(zip(keys, values, strict=True))
@@ -169,7 +173,7 @@ def grouped(
 
 
 def groups_of(results: dict[str, Any], scenes: Iterable[str]) -> dict[str, list[str]]:
-    """The ``scenes`` of each group of the configuration, and all of them as "all" if they are several."""
+    """Group -> those of the ``scenes`` that are in it. If there are several scenes, "all" holds all of them."""
     found = list(dict.fromkeys(scenes))
     groups = {name: [s for s in found if s in listed] for name, listed in results["settings"]["groups"].items()}
     return groups | ({"all": found} if len(found) > 1 else {})

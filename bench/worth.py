@@ -1,29 +1,29 @@
-"""The value of gradients in whole time: the time without them divided by the time with them, for the same error.
+"""The worth of gradients: the whole time without them over the whole time with them, for the same error.
 
-    n, e    samples of a pipeline with gradients (a sampler and a method), and its error
+    n, e    the samples and the error of a pipeline with gradients (a sampler and a method)
     T       its whole time: seconds to render and to reconstruct
-    T'      the whole time after which a pipeline without gradients first has the error e, and m its samples then
-    W / C   T' / T of the pipeline without gradients that is first: gradients pay above 1
-    W       m / n: how many times more samples that pipeline needs
-    C       the seconds of a further sample with gradients over the seconds of a further sample of that pipeline
+    T', m   the whole time and the samples with which a pipeline without gradients first reaches the error e
+    W / C   T' / T, for the pipeline without gradients of the least T'. Gradients pay if it is above 1
+    W       m / n, for this pipeline
+    C       the seconds of one more sample with gradients over the seconds of one more sample of this pipeline
 
-T' and m come from curves of errors (``bench.curves``, which explains the marks; W has the mark of W / C).
-C compares the renders with the least and the most samples, so that it excludes the start of a render.
+T' and m are read from curves of errors. ``bench.curves`` explains the marks; W has the mark of W / C. The seconds of
+one more sample come from the renders with the fewest and the most samples, so they exclude the start of a render.
 """
 
 from collections.abc import Sequence
 from typing import Any
 
 from bench.curves import first_at, joined
-from bench.wholetime import grouped
+from bench.wholetime import grouped, ratio
 from ngpt.measure.averages import geometric_mean, median
 
 
 def worth_of_gradients(results: dict[str, Any]) -> dict[str, Any]:
-    """``rows`` for each scene, number of samples and column with gradients; ``means`` of them over scenes.
+    """``rows`` for each scene, number of samples and column with gradients, and their ``means`` over scenes.
 
-    ``best`` marks the column of least error among those with gradients. Both lists are empty where a column of either
-    kind is missing. A method without a time, as stacks from elsewhere may have none, has no row.
+    ``best`` is true for the column with gradients that has the least error. Without columns of both kinds, there are no
+    rows. A column without times has no rows: stacks of other renderers may lack them.
     """
     rows = [row for scene in results["scenes"] for row in _scene_rows(results, scene)]
     return {"rows": rows, "means": _means(results, rows)}
@@ -49,7 +49,7 @@ def _scene_rows(results: dict[str, Any], scene: str) -> list[dict[str, Any]]:
 
 
 def _renders(results: dict[str, Any], scene: str, method: str) -> dict[int, tuple[int, float]]:
-    """Nominal samples -> (samples that were used, median seconds of their render)."""
+    """Nominal samples -> (samples that were rendered, median seconds of the renders)."""
     found: dict[int, list[dict[str, Any]]] = {}
     for cell in results["cells"]:
         if (cell["scene"], cell["method"]) == (scene, method) and not cell["absent"]:
@@ -66,7 +66,7 @@ def _against(
     rivals: dict[str, list[dict[str, Any]]],
     of_all: dict[str, dict[int, tuple[int, float]]],
 ) -> dict[str, Any] | None:
-    """The rival that is the first to have that error, and W, C, W/C against it."""
+    """The entries of a row: the rival that reaches the error of ``ours`` first, and W, C, W/C; None without a rival."""
     answers = []
     for name, rows in rivals.items():
         if answer := first_at(ours["error"], [(row["seconds"]["total"], row["error"]) for row in rows]):
@@ -84,13 +84,13 @@ def _against(
 
 
 def _of_a_sample(renders: Sequence[tuple[int, float]]) -> float:
-    """Seconds of a further sample, from the renders (samples, seconds) with the least and the most samples."""
+    """Seconds of one more sample, from the renders (samples, seconds) with the fewest and the most samples."""
     (few, short), (many, long) = min(renders), max(renders)
     return (long - short) / (many - few) if many > few and long > short else long / many
 
 
 def _means(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Geometric means over each group of scenes and over all: of each column, and with method None of the best ones."""
+    """Geometric means over each group of scenes: of each column, and, with the method None, of the best columns."""
     both = [*rows, *(row | {"method": None} for row in rows if row["best"])]
     means = []
     for entry, here in grouped(results, both, spp=results["settings"]["spp"], method=(None, *results["methods"])):
@@ -103,7 +103,7 @@ def _means(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str
 
 
 def worth_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
-    """Title -> rows of text, the header first: W/C of the means, and all values of each scene."""
+    """Title -> rows of text, the header first: means over groups, then each scene."""
     worth, keys = worth_of_gradients(results), ("W", "C", "W/C")
     columns = [name for name in results["methods"] if any(row["method"] == name for row in worth["rows"])]
     heads = [*keys, *(f"W/C {name}" for name in columns)]
@@ -111,8 +111,8 @@ def worth_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
     rows = {(row["scene"], row["spp"], row["method"]): row for row in worth["rows"]}
 
     def cells(best: dict[str, Any], of: dict[tuple, dict[str, Any]], name: str) -> list[str]:
-        others = [marked(of.get((best[name], best["spp"], column)), "W/C") for column in columns]
-        return [*(marked(best, key) for key in keys), *others]
+        others = [ratio(of.get((best[name], best["spp"], column)), "W/C") for column in columns]
+        return [*(ratio(best, key) for key in keys), *others]
 
     by_group = [["scenes", "spp", *heads]]
     for best in (row for row in worth["means"] if row["method"] is None):
@@ -125,10 +125,3 @@ def worth_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
         "Worth of gradients, scene by scene": by_scene,
     }
     return {title: lines for title, lines in tables.items() if len(lines) > 1}
-
-
-def marked(row: dict[str, Any] | None, key: str) -> str:
-    """A number with its mark; C is measured, whatever W is."""
-    if row is None or row[key] is None:
-        return ""
-    return f"{'' if key == 'C' else row['mark']}{row[key]:.2f}"
