@@ -23,7 +23,8 @@ from torch import Tensor, nn
 from ngpt.errors import NgptError
 from ngpt.network.config import Kind, ModelConfig, check_layers, last_of
 from ngpt.network.features import CHANNELS, PARTS
-from ngpt.network.heads import Head, averaged
+from ngpt.network.heads import Head
+from ngpt.network.operations import averaged
 from ngpt.network.transfer import signed_exp, signed_log
 from ngpt.network.unet import Convolution, LastConvolution
 

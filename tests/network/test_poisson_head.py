@@ -8,6 +8,7 @@ from scipy.sparse.linalg import spsolve
 from torch.nn.functional import avg_pool2d
 
 from ngpt.network import poisson
+from ngpt.network.operations import Tensors
 
 H, W = 16, 24
 
@@ -25,7 +26,7 @@ def scene(height=H, width=W):
 def solved(image, gradients, sweeps=4, logits=None):
     if logits is None:
         logits = torch.zeros(1, 3 * poisson.SCALES, *image.shape[-2:])
-    return poisson.solved(poisson._Torch, image, logits, gradients, sweeps)
+    return poisson.solved(Tensors, image, logits, gradients, sweeps)
 
 
 def direct(image, dx, dy, weights):
