@@ -1,7 +1,7 @@
-"""The configuration of a network: the table [model] of a TOML file, which is also in the header of its weights.
+"""The configuration of a network: the table [model] of a TOML file, which is also in the header of weights.
 
-``ModelConfig`` is the record, with the checks for all kinds. Each kind of network has a ``Kind``, which checks the
-fields of such a network and makes it.
+``ModelConfig`` holds its fields, and makes the checks that all kinds of networks share. Each kind of network has a
+``Kind``, which makes further checks, and creates the network.
 """
 
 import math
@@ -18,9 +18,9 @@ from ngpt.network.heads import Head, head_of
 from ngpt.network.unet import POOLING, DenseUNet, PlainUNet
 from ngpt.system.parts import Registry
 
-# The largest sizes that a file may ask for: far more than networks have, and far less than would exhaust a machine.
+# Limits of what a file may contain: far more than networks need, and far too little to exhaust a machine.
 MAX_LEVELS, MAX_CHANNELS, MAX_UNITS = 8, 1024, 32
-# Kernels reach no further than the padding.
+# Kernels must not reach beyond the padding.
 MAX_KERNEL = 2 * padding.MARGIN + 1
 MAX_SWEEPS = 64
 
@@ -29,29 +29,29 @@ MAX_SWEEPS = 64
 class ModelConfig:
     """The configuration of a reconstruction.
 
-    ``network``   "dense" or "plain", see ``ngpt.network.unet``; "oidn", see ``ngpt.network.oidnet``; or the name of
-                  another package's kind, whose documentation says how it uses the fields below
+    ``network``   "dense" or "plain" (``ngpt.network.unet``), "oidn" (``ngpt.network.oidnet``), or a kind of network
+                  from another package, whose documentation says how it uses the fields below
     ``channels``  for each level, finest first: the channels that each unit adds (dense), the width (plain), or the
                   channels of OIDN's small or default network (oidn)
-    ``units``     for each level, units on the way down and again on the way up (dense); none for plain and oidn
-    ``inputs``    the layers it reads, in order; names of ``ngpt.network.features.CHANNELS``
+    ``units``     for each level, the units on the way down, and again on the way up (dense); none for plain and oidn
+    ``inputs``    the layers that the network reads, in order; names of ``ngpt.network.features.CHANNELS``
     ``base``      the classical method whose result is the layer "base"; "" for none
-    ``start``     the images among its inputs that it starts from: it predicts a weight for each of them in each pixel,
-                  and corrects the logarithm of their mean. The default is the base. Without any image it predicts the
-                  image itself, as NGPT does
+    ``start``     the images among the inputs that the network starts from: it predicts a weight for each of them in
+                  each pixel, and corrects the logarithm of their mean. The default is the base. Without any image, the
+                  network predicts the image itself, as NGPT does
     ``quiet``     the relative standard error of the primal, over 15x15 pixels, below which the result is blended with
                   the base. The blend is linear in the error and in the logarithm: as noise vanishes, the result
-                  converges to the base, whatever the network says. Pixels whose variance is 0 or unknown are not
+                  converges to the base, whatever the network predicts. Pixels whose variance is 0 or unknown are not
                   blended. 0: no pixels are blended
-    ``kernel``    the side, in pixels, of the kernels that average the weighted mean of the images in ``start``, see
-                  ``ngpt.network.heads.Pyramid``; odd. 0: the network weighs and corrects them pixel by pixel
+    ``kernel``    the side, in pixels, of the kernels that average the weighted mean of the images in ``start``
+                  (``ngpt.network.heads.Pyramid``); odd. 0: the network weights and corrects each pixel by itself
     ``scales``    the number of resolutions that have kernels, each half as fine as the last; 1 without kernels
     ``demodulate``  whether the kernels average the image divided by the albedo, and the result is multiplied by it
                   again; needs the input albedo, and ``scales``
     ``sweeps``    the number of steps, at each of several resolutions, that draw the image toward the gradients with
-                  predicted weights, see ``ngpt.network.poisson``; needs the inputs dx_noise and dy_noise. 0: none
+                  predicted weights (``ngpt.network.poisson``); needs the inputs dx_noise and dy_noise. 0: none
     ``pooling``   how the network halves and doubles sizes: "convolution", as NGPT does, or by 1x1 convolutions and
-                  "average", "maximum" or "bilinear", see ``ngpt.network.unet``
+                  "average", "maximum" or "bilinear" (``ngpt.network.unet``)
     """
 
     network: str
@@ -93,25 +93,27 @@ class ModelConfig:
 
     @property
     def head(self) -> Head:
-        """The head, which makes an image from the network's prediction."""
+        """The head, which makes an image from the prediction of the network."""
         return self.kind.head(self)
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """The layers that the inputs are or are computed from; a stack holds them, or ``ngpt.network.inputs`` makes
-        them."""
+        """The layers that the inputs are, or are computed from.
+
+        A stack holds them, or ``ngpt.network.inputs`` makes them.
+        """
         names = features.sources(self.inputs)
         # The exposure is computed from the primal.
         return names if "primal" in names else ("primal", *names)
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The layers a stack must hold, by the names of the contract."""
+        """The names of the layers that a stack must hold."""
         return inputs.needs(self.layers, self.base)
 
     @property
     def reads_gradients(self) -> bool:
-        """Whether the network works on the light whose differences the gradients are; see ``ngpt.repair``."""
+        """Whether the network reads gradients. Then it works on the light that they describe (``ngpt.repair``)."""
         return "dx" in self.needs
 
     def to_dict(self) -> dict[str, Any]:
@@ -119,13 +121,13 @@ class ModelConfig:
 
 
 class Kind(ABC):
-    """A kind of network. ``goes_without``: the fields of ``ModelConfig`` that must be left out."""
+    """A kind of network. ``goes_without`` are the fields of ``ModelConfig`` that it does not use."""
 
     goes_without: tuple[str, ...] = ()
 
     @abstractmethod
     def check(self, config: ModelConfig) -> None:
-        """Raises NgptError for a configuration that such a network cannot have."""
+        """Raises NgptError for an invalid configuration of such a network."""
 
     @abstractmethod
     def head(self, config: ModelConfig) -> Head:
@@ -133,11 +135,11 @@ class Kind(ABC):
 
     @abstractmethod
     def network(self, config: ModelConfig) -> nn.Module:
-        """The network, untrained."""
+        """An untrained network."""
 
 
 class Plain(Kind):
-    """``ngpt.network.unet.PlainUNet``, and all heads."""
+    """``ngpt.network.unet.PlainUNet``, with any head."""
 
     has_units = False
 
@@ -156,11 +158,7 @@ class Plain(Kind):
         if type(config.demodulate) is not bool or (config.demodulate and not pyramid):
             raise NgptError(f"demodulate = {config.demodulate!r}: true or false; needs scales and the input albedo")
         self._check_sweeps(config)
-        if (
-            not isinstance(config.quiet, int | float)
-            or isinstance(config.quiet, bool)
-            or not 0 <= config.quiet < math.inf
-        ):
+        if type(config.quiet) not in (int, float) or not 0 <= config.quiet < math.inf:
             raise NgptError(f"quiet = {config.quiet!r}: must be a finite relative standard error, 0 for none")
         if config.quiet and not {"base", "primal_se"} <= set(config.layers):
             raise NgptError(
@@ -201,7 +199,7 @@ class Dense(Plain):
 
 
 class Oidn(Kind):
-    """``ngpt.network.oidnet.OidnUNet``, which has OIDN's transfer functions instead of a head."""
+    """``ngpt.network.oidnet.OidnUNet``. OIDN's transfer functions take the place of a head."""
 
     goes_without = ("quiet", "kernel", "scales", "demodulate", "sweeps", "pooling")
 
@@ -223,12 +221,12 @@ class Oidn(Kind):
 
 
 _OURS: dict[str, Kind] = {"dense": Dense(), "plain": Plain(), "oidn": Oidn()}
-# Other packages register theirs by entry points (docs/train/add-a-network.md).
+# Other packages register kinds of networks by entry points (docs/train/add-a-network.md).
 KINDS: Registry[Kind] = Registry("ngpt.networks", "network", Kind, _OURS)
 
 
 def check_layers(config: ModelConfig, units: bool) -> None:
-    """Raises NgptError unless inputs, levels, base and start are valid for our networks, with ``units`` or not."""
+    """Raises NgptError unless inputs, levels, base and start are valid; ``units``: whether the network has units."""
     names, levels = ", ".join(config.inputs), len(config.channels)
     if "primal" not in config.inputs or len(set(config.inputs)) < len(config.inputs):
         raise NgptError(f"inputs {names}: each once, and 'primal' among them")
@@ -253,7 +251,7 @@ def check_layers(config: ModelConfig, units: bool) -> None:
 
 
 def last_of(config: ModelConfig) -> dict[str, Any]:
-    """The arguments of ``ngpt.network.unet.LastConvolution`` that the head of the network requires."""
+    """The arguments for ``ngpt.network.unet.LastConvolution`` that the head needs."""
     return {"outputs": config.head.outputs, "zero": config.head.neutral, "normalise": config.head.normalise}
 
 

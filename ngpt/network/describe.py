@@ -1,4 +1,4 @@
-"""Description of a file of weights, for ``ngpt info``."""
+"""Describes a file of weights, for ``ngpt info``."""
 
 from collections.abc import Collection
 from importlib.util import find_spec
@@ -13,10 +13,10 @@ from ngpt.system.records import parse_json
 from ngpt.version import __version__
 
 SUFFIXES = (".onnx", ".safetensors", ".tza")
-# The key in the metadata of a network that blends frames (``ngpt.sequence.network``).
+# The key of the inputs in the metadata of a network that blends frames (``ngpt.sequence.network``).
 FRAMES = "ngpt.temporal inputs"
 
-# The settings of a training that are shown, by table.
+# The settings of the training that are shown, by table.
 _SETTINGS = {
     "data": ("folders", "validation"),
     "loss": ("kind",),
@@ -26,9 +26,9 @@ _SETTINGS = {
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """A table of a network's origin, inputs, requirements and training, for people and for JSON.
+    """The origin, inputs, requirements and training of a network, as a table for people and for JSON.
 
-    Raises NgptError for a file that is no network of ngpt, and for .safetensors if PyTorch is not installed.
+    Raises NgptError for a file that holds no network of ngpt, and for .safetensors if PyTorch is not installed.
     """
     path = Path(path)
     readers = {".safetensors": _safetensors, ".tza": _tza}
@@ -45,8 +45,8 @@ def _onnx(path: Path) -> dict[str, Any]:
     training = parse_json(metadata.get("ngpt.training", "{}"), f"{path}: its record of the training")
     claims = f"method '{metadata.get('ngpt.method', '')}', written by ngpt {metadata.get('ngpt.version', '?')}"
     if FRAMES in metadata:
-        told = {"inputs": metadata[FRAMES].split(", "), "needs packages": ["ONNX Runtime"]}
-        return _whose(path, claims) | told | {"training": _training(training)}
+        reads = {"inputs": metadata[FRAMES].split(", "), "needs packages": ["ONNX Runtime"]}
+        return _whose(path, claims) | reads | {"training": _training(training)}
     network = run_onnx.Network(path)
     names = (*network.inputs, "base") if network.base else network.inputs
     return (
@@ -100,7 +100,7 @@ def _reads(names: Collection[str], base: str, runtime: str) -> dict[str, Any]:
 
 
 def _training(record: Any) -> dict[str, Any]:
-    """The facts of a record that anybody may have written. Entries that are not in our form are left out."""
+    """Facts of the record of a training. Anybody may have written it, so entries of another form are left out."""
     if not isinstance(record, dict):
         return {}
     facts = {name: value for name, value in record.items() if isinstance(value, int | float | str)}

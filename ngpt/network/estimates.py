@@ -1,4 +1,4 @@
-"""Estimates of the variances that a stack with gradients lacks, from an image with little noise."""
+"""Estimates variances that a stack with gradients lacks, from an image with little noise."""
 
 from dataclasses import replace
 
@@ -9,16 +9,16 @@ from ngpt.system.late import ndimage
 
 
 def with_variances(data: Repaired, image: np.ndarray) -> Repaired:
-    """The stack with variances of image, dx and dy; missing ones are estimated.
+    """The stack with variances of image, dx and dy; those that it lacks are estimated.
 
     ``image`` (H, W, 3) is a reconstruction with little noise, without direct emission. The estimate is the squared
-    difference between a layer and this image (or its pixel differences), averaged twice over 3 x 3 pixels. Where the
-    reconstruction blurs, the lost detail counts as noise of the gradients, which is on the safe side
+    difference between a layer and this image (or its pixel differences), averaged twice over 3 x 3 pixels. Detail that
+    the reconstruction blurs counts as noise of the gradients: then they are trusted too little rather than too much
     (docs/lab/log/2026-W47.md, "what auto takes").
     """
     noise = data.noise
     if noise is None:
-        # As in stacks that hold variances, they are unknown where the camera sees an emitter.
+        # The variance is unknown where the camera sees an emitter, as in stacks that hold variances.
         seen = data.direct.any(axis=-1, keepdims=True)
         noise = np.where(seen, np.float32(np.nan), _around(data.image, image))
     variances = data.variances
@@ -34,7 +34,7 @@ def with_variances(data: Repaired, image: np.ndarray) -> Repaired:
 
 
 def _around(layer: np.ndarray, smooth: np.ndarray) -> np.ndarray:
-    """The mean squared difference between a layer and ``smooth`` around each pixel, (H, W, 3) float32."""
+    """The squared difference between a layer and ``smooth``, averaged around each pixel, (H, W, 3) float32."""
     squares = (layer.astype(np.float64) - smooth) ** 2
     for _ in range(2):
         squares = ndimage.uniform_filter(squares, (3, 3, 1), mode="nearest")

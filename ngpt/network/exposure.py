@@ -1,24 +1,24 @@
-"""Statistics of a whole image, which all of its tiles share when a network reconstructs them."""
+"""Statistics of an image that all of its tiles share when a network reconstructs them."""
 
 from collections.abc import Mapping
 
 import numpy as np
 
-# The typical radiance of an image after exposure. 4 becomes ln(5) = 1.6 after compression, so that the logarithm still
-# compresses radiance that is 40 times darker.
+# The typical radiance of an image after exposure. Its logarithm is ln(1 + 4) = 1.6, so radiance that is 40 times darker
+# is still compressed.
 KEY = 4.0
+# The side, in pixels, of the blocks that are averaged for the exposure.
 BLOCK = 16
-# Rows that are processed together; a multiple of BLOCK.
+# The number of rows that are processed at a time, a multiple of BLOCK.
 _BAND = 256
 
 
 def statistics(layers: Mapping[str, np.ndarray]) -> np.ndarray:
-    """(5,) float32: exposure, largest depth, least (at most 0) and largest (at least 0) radiance, 0 for the mean
-    variance.
+    """(5,) float32: exposure, largest depth, least radiance (at most 0), largest radiance (at least 0), and 0.
 
-    ``layers`` (H, W, C): ``primal``, and ``depth`` where there is one; values that are not finite count as 0. The
-    exposure is computed as in ``ngpt.network.features.exposure``. The mean variance is needed only if the graph
-    makes the base, see export/CONTRACT.md.
+    ``layers`` (H, W, C) are ``primal``, and ``depth`` if there is one. Values that are not finite count as 0. The
+    exposure is the same as by ``ngpt.network.features.exposure``. The last entry stands for the mean variance, which
+    only a graph that makes the base itself needs (export/CONTRACT.md).
     """
     primal, low, high, means = layers["primal"], 0.0, 0.0, []
     for top in range(0, len(primal), _BAND):

@@ -1,30 +1,30 @@
-"""From the layers of a stack to the channels a network reads. The only place that knows their order and scaling.
+"""Turns the layers of a stack into the channels that a network reads. Their order and scaling are defined only here.
 
     primal       3   ln(1 + max(0, x))
     dx, dy       3   sgn(x) ln(1 + |x|)
-    albedo       3   as it is, [0, 1]
-    normal       3   as it is, camera space, [-1, 1]
+    albedo       3   unchanged, [0, 1]
+    normal       3   unchanged, camera space, [-1, 1]
     diffuse, specular
                  3   as primal: light by the lobe of its first scattering event
-    depth        1   over the image's largest, [0, 1]; 0 where the path escapes
-    base         3   as primal: a classical reconstruction the network starts from
+    depth        1   divided by the largest depth of the image, [0, 1]; 0 where the path escapes
+    base         3   as primal: a classical reconstruction that the network starts from
     denoised, denoised_base
-                 3   as primal: another denoiser's image of the primal, and of the base, see ``ngpt.network.inputs``
+                 3   as primal: another denoiser's images of the primal and of the base (``ngpt.network.inputs``)
     primal_se, dx_se, dy_se, diffuse_se, specular_se
                  1   ln(1 + standard error of the layer of that name, mean over RGB)
 
-The following are relative to an image D, and enlarged so that small differences survive in 16 bits. L is the signed
-log. D is the base if "base" is among the inputs, the denoised image otherwise:
+The following channels are relative to an image D, and enlarged so that 16 bits can hold small differences. L is the
+signed log. D is the base if "base" is among the inputs, otherwise the denoised image:
 
     primal_change, base_change, denoised_base_change
                  3   L(20 (L(x) - L(D)))
     dx_base, dy_base, dx_denoised, dy_denoised, dx_denoised_base, dy_denoised_base
-                 3   L(20 (dx - ΔX) / (1 + |D|)), X is the image in the name; not 0 where X contradicts the gradients
+                 3   L(20 (dx - ΔX) / (1 + |D|)), with X the image in the name: 0 where X agrees with the gradients
     primal_noise, dx_noise, dy_noise
                  1   ln(1 + 100 standard error / (1 + |D|)), means over RGB
 
-[Kettunen et al. 2019, section 4.2 and their code; base and standard errors are ours.] Radiance is divided by the
-exposure before. The network sees only the layers that its configuration lists: absent layers are never filled with
+[Kettunen et al. 2019, section 4.2 and their code; the base and standard errors are not in the paper.] Before, radiance
+is divided by the exposure. A network gets only the layers in its configuration: missing layers are never replaced by
 zeros.
 """
 
@@ -50,34 +50,34 @@ CHANNELS = {
     )
 }
 
-# Factors on differences to an image and on relative noise; the number added to the divisor of depth.
+# Factors of differences to an image and of relative noise; a number that is added to the divisor of depth.
 ENLARGED, NOISE_ENLARGED, LEAST_DEPTH = 20, 100, 1e-10
 
-# Added to albedo before radiance is divided by it, for the gloss that dark surfaces reflect too.
+# Added to the albedo before radiance is divided by it, because dark surfaces have gloss, too.
 GLOSS = 0.1
 
-# The layers that are computed, and the layers that they are computed from, in addition to ``compared``.
+# Computed layer -> the layers that it is computed from, in addition to ``compared``.
 SOURCES = {
     **{f"{name}_change": (name,) for name in ("primal", "base", "denoised_base")},
     **{f"{axis}_{name}": (axis, name) for axis in ("dx", "dy") for name in ("base", *DENOISED)},
     **{f"{name}_noise": (f"{name}_se",) for name in ("primal", "dx", "dy")},
 }
 
-# The layers that grow with the light of the scene.
+# The layers that are proportional to the light of the scene.
 RADIANCE = frozenset(
     {"primal", "dx", "dy", "base", "denoised", "denoised_base", "primal_se", "dx_se", "dy_se"}
     | {"diffuse", "specular", "diffuse_se", "specular_se"}
 )
 
-# The layers that are images of the scene: a network may start from them.
+# The images of the scene that a network may start from.
 IMAGES = ("primal", *MADE)
 
-# Images of parts of the scene's light.
+# The images of parts of the scene's light.
 PARTS = ("diffuse", "specular")
 
 
 def channels(inputs: tuple[str, ...]) -> int:
-    """The number of channels of these layers together."""
+    """The number of channels of all these layers."""
     return sum(CHANNELS[name] for name in inputs)
 
 
@@ -90,12 +90,12 @@ def sources(inputs: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def compared(inputs: tuple[str, ...]) -> str:
-    """The image that computed inputs are relative to."""
+    """The name of the image D that computed inputs are relative to."""
     return "base" if "base" in inputs else "denoised"
 
 
 def completed(layers: Mapping[str, Tensor], inputs: tuple[str, ...]) -> dict[str, Tensor]:
-    """Normalised layers, and those ``inputs`` that are computed from them; before any padding."""
+    """The normalised layers, with the ``inputs`` that are computed from them; before any padding."""
     return dict(layers) | {name: _computed(name, layers, compared(inputs)) for name in inputs if name in SOURCES}
 
 
@@ -113,15 +113,15 @@ def _computed(name: str, layers: Mapping[str, Tensor], compared_with: str) -> Te
 
 
 def reflectance(albedo: Tensor) -> Tensor:
-    """The divisor of radiance (N, 3, H, W) for demodulation: albedo + ``GLOSS``; constant where the albedo is unknown.
+    """The divisor of radiance (N, 3, H, W) for demodulation: albedo + ``GLOSS``.
 
-    It is a continuous function of the albedo, so a noisy albedo between 0 and 0.1 changes the demodulated light little.
+    Because of the addend, a noisy albedo between 0 and 0.1 changes the demodulated light little.
     """
     return albedo + GLOSS
 
 
 def encode(layers: Mapping[str, Tensor], inputs: tuple[str, ...]) -> Tensor:
-    """(N, channels, H, W) from layers (N, C, H, W), with radiance divided by exposure and depth by its maximum."""
+    """The channels (N, channels, H, W) of normalised and completed layers (N, C, H, W)."""
     return torch.cat([_encoded(name, layers[name]) for name in inputs], 1)
 
 
@@ -140,10 +140,11 @@ def _encoded(name: str, layer: Tensor) -> Tensor:
 
 
 def exposure(primal: Tensor) -> Tensor:
-    """The typical radiance of images (N, 3, H, W), over ``KEY``: (N, 1, 1, 1), positive; 1 for black images.
+    """The typical radiance of images (N, 3, H, W) divided by ``KEY``: (N, 1, 1, 1), positive; 1 for black images.
 
-    The median of the means of blocks of 16x16 pixels that are not black. It is proportional to the image's brightness,
-    the same at any sample count except for noise, and unaffected by a few pixels. ``primal`` must be finite.
+    The typical radiance is the median of the means of blocks of 16x16 pixels that are not black. It is proportional to
+    the brightness of the image. Neither a few pixels nor the number of samples change it, except for noise. ``primal``
+    must be finite.
     """
     size = min(BLOCK, primal.shape[-2]), min(BLOCK, primal.shape[-1])
     blocks = avg_pool2d(primal.float().clamp(min=0).mean(1, keepdim=True), size, ceil_mode=True).flatten(1)
@@ -154,16 +155,17 @@ def exposure(primal: Tensor) -> Tensor:
 
 
 def normalised(layers: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
-    """The layers, radiance over exposure, depth over its maximum, albedo in [0, 1]; and the exposure (N, 1, 1, 1).
+    """The normalised layers, and the exposure (N, 1, 1, 1).
 
-    Exposure and maximum depth belong to the whole image: normalise before cutting tiles.
+    Radiance is divided by the exposure, depth by its maximum, and albedo is clamped to [0, 1]. Exposure and maximum are
+    those of the given layers: normalise whole images, not tiles.
     """
     scale = exposure(layers["primal"])
     result = dict(layers)
     for name in RADIANCE & result.keys():
         result[name] = result[name] / scale
     if "albedo" in result:
-        # Some renderers write the brightness of lamps there.
+        # Some renderers write the brightness of lamps as their albedo.
         result["albedo"] = result["albedo"].clamp(0, 1)
     if "depth" in result:
         result["depth"] = result["depth"] / (LEAST_DEPTH + torch.amax(result["depth"], (1, 2, 3), keepdim=True))

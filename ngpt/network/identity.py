@@ -12,11 +12,11 @@ from ngpt.system.reading import regular_file
 
 @dataclass(frozen=True)
 class Identity:
-    """A file of weights.
+    """The identity of a file of weights.
 
     ``file``     its name, without the folder
-    ``sha256``   of its contents, 64 hexadecimal digits
-    ``shipped``  the method whose network this package ships with the same bytes; "" for any other file
+    ``sha256``   the hash of its contents, 64 hexadecimal digits
+    ``shipped``  the method that it belongs to, if this package ships the same bytes; "" for any other file
     """
 
     file: str
@@ -28,7 +28,7 @@ class Identity:
 
     @property
     def method(self) -> str:
-        """The name of the result's method: a method of ngpt for shipped networks, "own network FILE" for all others."""
+        """The name of the method in results: a method of ngpt, or "own network FILE" if the network is not shipped."""
         return self.shipped or f"own network {self.file}"
 
 
@@ -45,6 +45,6 @@ def identify(path: str | Path) -> Identity:
 
 @lru_cache(maxsize=32)
 def _digest(path: str, _modified: int) -> str:
-    """The digest of a file; computed again when the file has changed."""
+    """The SHA-256 of a file; computed again after the file has changed."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

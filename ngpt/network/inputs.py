@@ -1,16 +1,16 @@
-"""The inputs of networks, gathered from a repaired stack: the same arrays for PyTorch and for ONNX Runtime.
+"""Gathers the inputs of networks from a repaired stack: the same arrays for PyTorch and for ONNX Runtime.
 
     primal, dx, dy, albedo, normal, depth      layers of the stack
-    diffuse, specular                          the same: light by the lobe of its first scattering event
-    primal_var, dx_var, dy_var                 variances of its layers, NaN where not known (ONNX graphs read these)
-    primal_se, dx_se, dy_se                    standard errors: roots of the variances, 0 where not known (for PyTorch)
-    diffuse_se, specular_se                    the same
+    diffuse, specular                          layers of the stack: light by the lobe of its first scattering event
+    primal_var, dx_var, dy_var                 variances of the layers, NaN where unknown (for ONNX graphs)
+    primal_se, dx_se, dy_se, diffuse_se, specular_se
+                                               standard errors: roots of the variances, 0 where unknown (for PyTorch)
     base                                       a classical reconstruction of ``ngpt.classical.bases``
     denoised, denoised_base                    OIDN's images of the primal and of the base
 
-Radiance excludes directly visible emission. OIDN removes less noise from the base than from the primal, so its two
+Radiance excludes directly visible emission. OIDN removes less noise from the base than from the primal. So its two
 images have different errors, and a network can combine them [after Back et al. 2020, "Deep Combiner for Independent and
-Correlated Pixel Estimates"; a denoiser's image of the correlated estimate takes the place of their kernel].
+Correlated Pixel Estimates"; here a denoised image of the correlated estimate takes the place of their kernel].
 """
 
 from collections.abc import Collection
@@ -26,29 +26,26 @@ from ngpt.errors import NgptError
 from ngpt.network.estimates import with_variances
 from ngpt.repair import Repaired
 
-# The layers of a stack that networks know, in the order in which they are listed.
+# The layers of a stack that networks may read, in the order in which they are listed.
 LAYERS = (
     *("primal", "dx", "dy", "albedo", "normal", "depth", "primal_var", "dx_var", "dy_var"),
     *("diffuse", "specular", "diffuse_var", "specular_var"),
 )
 
-# Images made by another denoiser: of the primal, and of the base.
+# Another denoiser's images of the primal and of the base.
 DENOISED = ("denoised", "denoised_base")
-
-# How features are judged to be clean enough for use without prefiltering
-CLEAN, _DARK = clean.CLEAN, clean.DARK
 
 # The inputs that are made from the layers of a stack.
 MADE = ("base", *DENOISED)
 
-# Variances that are estimated if a stack with gradients lacks them.
+# The variances that can be estimated if a stack with gradients lacks them.
 ESTIMATED = ("primal_var", "dx_var", "dy_var")
 
 
 def needs(names: Collection[str], base: str) -> tuple[str, ...]:
-    """The layers a stack must hold so that ``gather`` can give these inputs, in the order of ``LAYERS``.
+    """The layers that a stack must hold for these inputs of ``gather``, in the order of ``LAYERS``.
 
-    Unknown names come last. So does "base", if an input is made from the base and ``base`` is "".
+    Unknown names come last, as does "base" if an input is made from the base but ``base`` is "".
     """
     wanted = {"primal"} | {_layer(name) for name in names if name not in MADE}
     if set(DENOISED) & set(names):
@@ -66,14 +63,14 @@ def gather(
     """The inputs ``names`` of a network that starts from ``base`` ("" for none): arrays (H, W, C) by name.
 
     ``reader``    the subject of the message about missing layers
-    ``estimate``  whether variances that a stack with gradients lacks are estimated, see ``ngpt.network.estimates``
+    ``estimate``  whether to estimate variances that a stack with gradients lacks (``ngpt.network.estimates``)
 
-    Raises NgptError if the stack lacks layers that the inputs need, or if OIDN is needed and not installed.
+    Raises NgptError if the stack lacks layers for the inputs, or if they need OIDN and it is not installed.
     """
     wanted = needs(names, base)
     by_oidn = data.by_oidn or Oidn(data)
     if estimate and data.dx is not None and set(ESTIMATED) & set(wanted) - data.known_variances().keys():
-        # OIDN's image is the better guide, but it is computed only for networks that read it anyway.
+        # OIDN's image is the better guide, but is only used if the network reads it anyway.
         guide = by_oidn.of_primal if set(DENOISED) & set(names) else CLASSICAL["l1"](data)
         data = with_variances(data, guide)
     held = {"primal": data.image, **data.features, **data.parts, **data.known_variances()}
@@ -89,20 +86,20 @@ def gather(
 
 
 def base_image(data: Repaired, base: str) -> np.ndarray:
-    """The reconstruction a network starts from, (H, W, 3) float32, without direct emission."""
-    # Intermediate results of extreme values may exceed the range of float32.
+    """The reconstruction that a network starts from, (H, W, 3) float32, without direct emission."""
+    # For extreme values, intermediate results may exceed the range of float32.
     with np.errstate(over="ignore", invalid="ignore"):
         return BASES[base](data).astype(np.float32, copy=False)
 
 
 class Oidn:
-    """OIDN's images of one frame. Its features are prefiltered once, unless they are clean already.
+    """OIDN's images of one frame. The features are prefiltered once, unless they are clean.
 
-    OIDN sees all light of the primal, as in its training. Networks get its image minus its image of ``caustic``, which
-    is added to their result again. So caustics in the result are as sharp as in OIDN's image.
+    OIDN denoises the primal with all of its light, as in its training. Networks get this image minus OIDN's image of
+    ``caustic``, which is added to their result again. So caustics in the result are as sharp as in OIDN's image.
 
-    The primal is denoised by OIDN's largest network: the combination then has 8 % less error than with smaller ones.
-    The base is denoised by the smallest: larger ones change the combination by less than 1 % in rooms (docs/lab/log).
+    OIDN's largest network denoises the primal: with smaller ones, ngpt-combine has 8 % more error. Its smallest network
+    denoises the base: larger ones change the error of ngpt-combine by less than 1 % in rooms (docs/lab/log).
     """
 
     def __init__(self, data: Repaired):
@@ -110,13 +107,13 @@ class Oidn:
 
     @cached_property
     def of_primal(self) -> np.ndarray:
-        """(H, W, 3) float32 without direct emission and ``of_caustic``."""
+        """OIDN's image of the primal, (H, W, 3) float32, without direct emission and ``of_caustic``."""
         image = self._of_all_light
         return image if self._data.caustic is None else image - self.of_caustic
 
     @cached_property
     def of_caustic(self) -> np.ndarray:
-        """The denoised ``caustic``, (H, W, 3) float32, which is added to a reconstruction of the data's ``image``."""
+        """The denoised ``caustic``, (H, W, 3) float32, to be added to a reconstruction of the data's ``image``."""
         light = self._data.caustic
         assert light is not None
         alone = replace(self._with_clean_features, image=light, direct=np.zeros_like(light), fine={})
@@ -124,7 +121,7 @@ class Oidn:
 
     def of_base(self, base: np.ndarray) -> np.ndarray:
         """OIDN's image of a reconstruction, (H, W, 3) float32; both without direct emission."""
-        # A base may overshoot below zero beside edges. There it is clamped to 0, or to the primal's least value.
+        # Beside edges, a base may be negative. It is clamped to 0, or to the least value of the primal.
         least = min(float(self._data.image.min()), 0) - self._data.direct
         return oidn(replace(self._with_clean_features, image=np.maximum(base, least), fine={}), "clean", "fast")
 
@@ -143,7 +140,7 @@ class Oidn:
 
 
 def denoised(by_oidn: Oidn, base: np.ndarray | None, names: Collection[str]) -> dict[str, np.ndarray]:
-    """The layers of ``DENOISED`` that are among ``names`` and have a source: (H, W, 3) without direct emission.
+    """The layers of ``DENOISED`` among ``names``, (H, W, 3) without direct emission; without a base, not its image.
 
     Raises NgptError where OIDN is not installed.
     """
@@ -154,10 +151,10 @@ def denoised(by_oidn: Oidn, base: np.ndarray | None, names: Collection[str]) -> 
 
 
 def _layer(name: str) -> str:
-    """The layer of a stack that equals an input, or whose square root the input is."""
+    """The layer of a stack that an input equals, or is the square root of."""
     return name.replace("_se", "_var")
 
 
 def _standard_error(variance: np.ndarray) -> np.ndarray:
-    # Variances are unknown where the camera sees an emitter; the other light of such a pixel hardly matters.
+    # Where the camera sees an emitter, the variance is unknown. The other light of such a pixel hardly matters.
     return np.sqrt(np.nan_to_num(np.maximum(variance, 0), nan=0, posinf=0))

@@ -11,20 +11,20 @@ from ngpt.network import features, padding
 from ngpt.network.config import ModelConfig
 from ngpt.network.transfer import signed_exp, signed_log
 
-# For ``quiet``: the side, in pixels, of the window over which noise is averaged, since the variance of one pixel is too
-# noisy; a number added to radiance before noise is divided by it; a large number whose square does not overflow.
+# For ``quiet``: the side, in pixels, of the window over which variances are averaged, because variances of single pixels
+# are too noisy; a number that is added to radiance before noise is divided by it; a large number with a finite square.
 WINDOW, DARK, HUGE = 15, 0.01, 1e15
 
 
 class Reconstructor(nn.Module):
-    """Layers (N, C, H, W), scene-linear, to the image (N, 3, H, W), scene-linear.
+    """Makes the image (N, 3, H, W) from layers (N, C, H, W), all scene-linear.
 
         exposure, depth scale -> padding -> channels -> network -> head -> (quiet) -> crop -> bounds -> exp -> exposure
 
-    H and W are arbitrary. An input that is ``k`` times as bright gives a result that is ``k`` times as bright. The
-    result is clamped to the range of the primal and 0. Layers hold finite values; see ``ModelConfig.inputs``.
+    H and W are arbitrary. If the input is k times as bright, so is the result. The result is clamped to the range of
+    the primal and 0. The layers are those of ``ModelConfig.layers``, with finite values.
 
-    A network of OIDN's shape has OIDN's own steps around it instead (``ngpt.network.oidnet``).
+    A network of OIDN's shape has OIDN's own steps before and after it instead (``ngpt.network.oidnet``).
     """
 
     def __init__(self, config: ModelConfig):
@@ -34,14 +34,14 @@ class Reconstructor(nn.Module):
 
     @property
     def alignment(self) -> int:
-        """Both sides of the padded image are divisible by this number of pixels."""
+        """The number of pixels that both sides of the padded image must be divisible by."""
         return self.network.alignment
 
     @property
     def radius(self) -> int:
-        """How far, in pixels, a pixel of an input influences the image, apart from exposure, depth scale and bounds."""
+        """The distance in pixels to which an input pixel influences the image, except by exposure, depth and bounds."""
         head = self.config.head
-        # Kernels at one scale average only input pixels; pyramids and sweeps also average the network's predictions.
+        # Pyramids and sweeps average the predictions of the network; other heads read only pixels of the input.
         moves = self.config.scales > 1 or self.config.sweeps
         own = self.network.radius + head.reach if moves else max(self.network.radius, head.reach)
         return max(own, WINDOW // 2 if self.config.quiet else 0)
@@ -58,10 +58,10 @@ class Reconstructor(nn.Module):
         return signed_exp(torch.minimum(torch.maximum(logarithm, bounds[0]), bounds[1])) * exposure
 
     def predict(self, scaled: Mapping[str, Tensor]) -> Tensor:
-        """The signed log of the image, unbounded, from layers normalised, completed and padded; float32."""
+        """The signed log of the image, unbounded, float32, from normalised, completed and padded layers."""
         if self.config.network == "oidn":
             return signed_log(self.network.image(*(scaled[name] for name in self.config.inputs)))
-        # Convolutions are fastest with channels last, by half on CPUs.
+        # On CPUs, convolutions take half the time with channels last.
         x = features.encode(scaled, self.config.inputs).contiguous(memory_format=torch.channels_last)
         prediction = self.network(x).float()
         head = self.config.head
@@ -75,22 +75,22 @@ class Reconstructor(nn.Module):
         return base + self.share(scaled) * (result - base)
 
     def share(self, scaled: Mapping[str, Tensor]) -> Tensor:
-        """How much the network's result counts beside the base, (N, 1, H, W) in [0, 1], by ``ModelConfig.quiet``."""
+        """The weight of the network's result against the base, (N, 1, H, W) in [0, 1]; see ``ModelConfig.quiet``."""
         noise, light = scaled["primal_se"].clamp(max=HUGE).square(), scaled["base"].abs().clamp(max=HUGE)
         both = torch.cat([layer.mean(1, keepdim=True) for layer in (noise, light)], 1)
         variance, mean = avg_pool2d(both, WINDOW, 1, WINDOW // 2, count_include_pad=False).split(1, 1)
         share = (variance.sqrt() / (self.config.quiet * (mean + DARK))).clamp(max=1)
-        # No noise at all means that it is unknown, or that no sample has met the light yet.
+        # A variance of 0 means that it is unknown, or that no sample has found light yet.
         return torch.where(variance > 0, share, 1)
 
     @staticmethod
     def bounds(primal: Tensor) -> tuple[Tensor, Tensor]:
-        """The least and the largest logarithm that images of such a primal (N, 3, H, W) may have, (N, 1, 1, 1)."""
+        """The least and the largest logarithm of the result for a primal (N, 3, H, W), (N, 1, 1, 1) each."""
         low, high = torch.aminmax(primal.flatten(1), dim=1)
         low, high = low.clamp(max=0), high.clamp(min=0)
         return signed_log(low).reshape(-1, 1, 1, 1), signed_log(high).reshape(-1, 1, 1, 1)
 
 
 def parameters(module: nn.Module) -> int:
-    """The number of trainable numbers."""
+    """The number of parameters."""
     return sum(p.numel() for p in module.parameters())

@@ -1,12 +1,12 @@
-"""A U-Net of the shape that Open Image Denoise runs, and OIDN's steps before and after it.
+"""The U-Net of Open Image Denoise, and OIDN's steps before and after it.
 
-Weights that are trained here run in OIDN: on each device that OIDN supports, in its tiles, by its own tools
+OIDN can run weights that are trained here, on all of its devices, in its tiles, and by its own tools
 (``ngpt.network.tza``). In PyTorch the network gives the same pixels as in OIDN, so training optimises the images that
 users get:
 
     exposure of the colour -> perceptual curve -> zeros up to multiples of 16 -> network -> inverse -> exposure
 
-The inputs are a colour, albedo in [0, 1] and normal in [-1, 1], three channels each. Negative colours count as 0.
+The inputs are colour, albedo in [0, 1] and normal in [-1, 1], three channels each. Negative colours count as 0.
 
 [Intel Open Image Denoise 2.4.1: training/model.py, core/color.h, core/autoexposure.h, core/unet_filter.cpp]
 """
@@ -15,19 +15,19 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, max_pool2d, pad, relu
 
-# Channels of the encoder's levels -> channels of the decoder, in order: OIDN's small network and its default one.
+# Channels of the encoder -> channels of the decoder, for OIDN's small and its default network.
 SHAPES: dict[tuple[int, ...], tuple[int, ...]] = {
     (32, 32, 32, 32, 32): (64, 64, 64, 32, 32, 32),
     (32, 48, 64, 80, 96): (112, 96, 64, 64, 64, 32),
 }
-# The layers that it reads beside the colour.
+# The layers that the network reads in addition to the colour.
 FEATURES = ("albedo", "normal")
 
-# Exposure: the target for the geometric mean of the luminances of bins, the approximate side of a bin in pixels, and
-# the luminance up to which bins do not count.
+# Exposure: the geometric mean of the luminances of bins after exposure, the approximate side of a bin in pixels, and
+# the luminance up to which bins are left out.
 KEY, BIN, LEAST = 0.18, 16, 1e-8
 LUMINANCE = (0.212671, 0.715160, 0.072169)
-# The curve between radiance y and its code x, in three pieces; the largest half-precision y has the code 1.
+# The curve from radiance y to its code x, in three pieces. The largest number in half precision has the code 1.
 A, B, C, D = 1.41283765e03, 1.64593172, 4.31384981e-01, -2.94139609e-03
 E, F, G = 1.92653254e-01, 6.26026094e-03, 9.98620152e-01
 Y0, Y1, X0, X1 = 1.57945760e-06, 3.22087631e-02, 2.23151711e-03, 3.70974749e-01
@@ -72,10 +72,10 @@ def exposure(colour: Tensor) -> Tensor:
 
 
 class OidnUNet(nn.Module):
-    """(N, 9, H, W) to (N, 3, H, W), codes; negative codes count as 0. H and W are divisible by ``alignment``.
+    """(N, 9, H, W) to codes (N, 3, H, W); negative codes count as 0. H and W are divisible by ``alignment``.
 
-    ``channels`` are a key of ``SHAPES``. Without training it returns the first three channels, the colour. Layers have
-    the names that OIDN looks for.
+    ``channels`` is a key of ``SHAPES``. The untrained network returns its first three channels, the colour. Its layers
+    have the names that OIDN expects.
     """
 
     alignment = 16
@@ -104,7 +104,7 @@ class OidnUNet(nn.Module):
         self._pass_on_the_colour(d2b)
 
     def _pass_on_the_colour(self, before: int) -> None:
-        """Makes the untrained network return the image that it is to correct; each channel has its own path."""
+        """Makes the untrained network return the colour: each channel is passed on through a path of its own."""
         with torch.no_grad():
             self.dec_conv0.weight.zero_()
             for i in range(3):
@@ -124,12 +124,12 @@ class OidnUNet(nn.Module):
         x = relu(self.dec_conv3b(relu(self.dec_conv3a(_doubled_beside(x, quarter)))))
         x = relu(self.dec_conv2b(relu(self.dec_conv2a(_doubled_beside(x, half)))))
         x = relu(self.dec_conv1b(relu(self.dec_conv1a(_doubled_beside(x, given)))))
-        # Rounding codes to 16 bits would change radiance by percents.
+        # Rounding codes to 16 bits would change radiance by some per cent.
         with torch.autocast(x.device.type, enabled=False):
             return self.dec_conv0(x.float())
 
     def image(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
-        """The denoised colour, (N, 3, H, W) of any size, as OIDN makes it, clamped to the brightest input colour."""
+        """The denoised colour (N, 3, H, W) of any size, as by OIDN, but clamped to the brightest input colour."""
         height, width = colour.shape[-2:]
         scale = exposure(colour)
         given = [perceptual(colour.clamp(min=0) * scale), albedo.clamp(0, 1), normal.clamp(-1, 1) / 2 + 0.5]
@@ -137,7 +137,7 @@ class OidnUNet(nn.Module):
         codes = self(x.contiguous(memory_format=torch.channels_last))[..., :height, :width]
         light = radiance(codes.clamp(min=0))
         if self.training:
-            # Clamped codes have no gradient: a network that once makes all pixels black would never learn again.
+            # Clamped codes have no gradient, so a network that makes all pixels black could never learn again.
             light = light - relu(-codes)
         largest = colour.amax((1, 2, 3), keepdim=True).clamp(min=0)
         return torch.minimum(light / scale, largest)

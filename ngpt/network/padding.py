@@ -1,4 +1,4 @@
-"""Padding by reflection to sizes that a U-Net accepts, for images and, with the right signs, for their gradients."""
+"""Pads images and their gradients by reflection, to sizes that a U-Net accepts."""
 
 from collections.abc import Mapping
 
@@ -6,24 +6,24 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad as replicated
 
-# The least number of pixels added on every side, so that borders look like the inside of an image [NGPT's code].
+# The least padding in pixels on every side, so that borders look like the inside of an image [NGPT's code].
 MARGIN = 8
 
 Pads = tuple[int, int, int, int]
 
 
 def pads(height: int, width: int, alignment: int, margin: int = MARGIN) -> Pads:
-    """(top, bottom, left, right): ``margin`` all around, and more below and right up to multiples of ``alignment``."""
+    """(top, bottom, left, right): ``margin``, and more at the bottom and right up to multiples of ``alignment``."""
     return (margin, margin + -(height + 2 * margin) % alignment, margin, margin + -(width + 2 * margin) % alignment)
 
 
 def pad(layers: Mapping[str, Tensor], pads: Pads) -> dict[str, Tensor]:
-    """The layers (..., H, W) with reflected borders; the border pixels themselves are not repeated.
+    """The layers (..., H, W), padded by reflection; the border pixels themselves are not repeated.
 
-    dx and dy, and layers whose names begin with dx or dy, become the differences of the reflected image. Across a
-    mirror their sign is flipped; layers whose names end with _se or _noise have no sign. The unused last column of dx
-    (row of dy) is now inside the image, and gets the value of its mirror image. If an image is smaller than the
-    padding, it is reflected back and forth.
+    dx and dy, and layers whose names begin with dx or dy, become the differences of the reflected image. So their sign
+    is flipped in the reflection, except for layers without sign, whose names end with _se or _noise. The unused last
+    column of dx (last row of dy) is inside the padded image, and gets the value of its mirror image. An image that is
+    smaller than the padding is reflected back and forth.
     """
     height, width = next(iter(layers.values())).shape[-2:]
     device = next(iter(layers.values())).device
@@ -41,29 +41,31 @@ def pad(layers: Mapping[str, Tensor], pads: Pads) -> dict[str, Tensor]:
 
 
 def crop(image: Tensor, pads: Pads) -> Tensor:
-    """The image (..., H, W) without its padding; ``image`` is (..., H + top + bottom, W + left + right)."""
+    """The image (..., H, W) without its padding. ``image`` is (..., H + top + bottom, W + left + right)."""
     top, bottom, left, right = pads
     return image[..., top : image.shape[-2] - bottom, left : image.shape[-1] - right]
 
 
 def extended(image: Tensor, radius: int) -> Tensor:
-    """A padded image (N, C, H, W) with ``radius`` more pixels on every side. They influence only pixels that ``crop``
-    removes."""
+    """A padded image (N, C, H, W) with ``radius`` more pixels on every side, which repeat its border.
+
+    They influence only pixels that ``crop`` removes.
+    """
     return replicated(image, 4 * (radius,), "replicate") if radius else image
 
 
 def _mirror(size: int, before: int, after: int, device: torch.device) -> Tensor:
-    """The index of the pixel at each of the places -before, ..., size - 1 + after, and one beyond."""
+    """The index of the pixel at each of the positions -before .. size + after."""
     period = max(2 * (size - 1), 1)
     wave = torch.arange(-before, size + after + 1, device=device) % period
     return torch.where(wave < size, wave, period - wave)
 
 
 def _differences(layer: Tensor, pixels: Tensor, axis: int, signed: bool) -> Tensor:
-    """Differences (or their standard errors) between each of ``pixels`` and the next."""
+    """The differences (or their standard errors) between each of ``pixels`` and the next one."""
     here, there = pixels[:-1], pixels[1:]
     values = layer.index_select(axis, torch.minimum(here, there))
-    # 0 only where the image is one pixel wide.
+    # 1 or -1; 0 where the image is one pixel wide.
     step = (there - here).to(layer.dtype)
     step = step if signed else step.abs()
     return values * (step if axis == -1 else step[:, None])

@@ -1,4 +1,4 @@
-"""Runs networks of OIDN's shape (``ngpt.network.oidnet``) in OIDN's runtime, from .tza files, without PyTorch."""
+"""Runs networks of OIDN's shape (``ngpt.network.oidnet``) from .tza files in OIDN, without PyTorch."""
 
 from pathlib import Path
 
@@ -12,23 +12,25 @@ from ngpt.repair import Repaired
 
 
 def reads(path: Path) -> tuple[tuple[str, ...], str]:
-    """The names of the inputs of a file's network (``inputs.gather``), colour first; and its base, "" for none."""
+    """The names of the network's inputs for ``inputs.gather``, colour first, and of its base ("" for none)."""
     _, colour = tza.read(path)
     return ("primal" if colour == "primal" else "base", "albedo", "normal"), colour.removeprefix("primal")
 
 
 def check_device(device: str) -> None:
-    """Raises NgptError where OIDN is not installed, and for a name that none of its devices has."""
+    """Raises NgptError if OIDN is not installed, and for an unknown device."""
     require_oidn()
     if device not in DEVICES:
         raise NgptError(f"device '{device}' is unknown; OIDN has: {', '.join(DEVICES)}")
 
 
 def run(data: Repaired, path: Path, device: str = "auto", memory: int = 3072) -> np.ndarray:
-    """Reconstructs the light of the data's ``image`` by the weights of a file: (H, W, 3) float32, scene-linear.
+    """Reconstructs the data's ``image`` with the weights in a file: (H, W, 3) float32, scene-linear.
 
-    ``device``  one of ``DEVICES``; ``memory``  MiB that OIDN's tiles may take. The result is clamped to the brightest
-    value of the colour, since OIDN itself has no bound.
+    ``device``  one of ``DEVICES``
+    ``memory``  the MiB that OIDN's tiles may take
+
+    The result is clamped to the brightest value of the colour, because OIDN does not bound it.
     """
     names, base = reads(path)
     layers = inputs.gather(data, names, base, f"weights {path}", estimate=True)

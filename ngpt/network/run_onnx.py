@@ -1,6 +1,6 @@
-"""Runs our networks by ONNX Runtime: without PyTorch, in tiles within a given memory, on a chosen device.
+"""Runs networks of ngpt in ONNX Runtime: without PyTorch, in tiles within a given memory, on a chosen device.
 
-export/CONTRACT.md says what the files expect. This is the host that comes with ngpt.
+export/CONTRACT.md specifies the files.
 """
 
 import logging
@@ -21,8 +21,8 @@ from ngpt.system.limits import free_address_space, processors
 
 _LOG = logging.getLogger(__name__)
 
-# MiB that the network may use in addition to the image's layers. 1280x720 pixels fit in one tile; two would take a
-# quarter longer.
+# MiB that the network may use in addition to the image's layers. An image of 1280x720 pixels fits into one tile; in two
+# tiles it would take a quarter longer.
 MEMORY = 3072
 DEVICES = {
     "cpu": "CPUExecutionProvider",
@@ -32,17 +32,17 @@ DEVICES = {
     "directml": "DmlExecutionProvider",
     "coreml": "CoreMLExecutionProvider",
 }
-# ONNX Runtime's names of types.
+# ONNX Runtime's names of types -> types of NumPy.
 _FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(double)": np.float64}
 
-# Layers that are removed before a network sees the others.
+# Light that is subtracted from the layers before a network reads them, and layers about it.
 _APART = ("direct", "caustic", "caustic_var", "denoised_caustic")
 
 Progress = Callable[[int, int], None]
 
 
 class Cancelled(NgptError):
-    """A reconstruction was ended by the caller's ``stop``."""
+    """The caller's ``stop`` has ended a reconstruction."""
 
 
 class _OutOfMemory(NgptError):
@@ -52,12 +52,11 @@ class _OutOfMemory(NgptError):
 class Network:
     """A loaded network file. It is thread-safe, works in forked children, and can be pickled.
 
-    ``path``     model.onnx, as ``ngpt export`` writes it
+    ``path``     an .onnx file of ``ngpt export``
     ``device``   one of ``DEVICES``; "auto" is "cpu"
     ``threads``  threads of the CPU; 0: one per core, or as many as ``ngpt.limit_threads`` allows
 
-    Raises NgptError for a file that is not one of ours, and for a device that cannot be used: no other device silently
-    takes its place.
+    Raises NgptError for any other file, and for a device that cannot be used. No other device silently takes its place.
     """
 
     def __init__(self, path: str | Path, device: str = "auto", threads: int = 0):
@@ -73,8 +72,8 @@ class Network:
             raise NgptError(
                 f"{path}: lacks the metadata {error} of an ngpt network; write it anew: ngpt export"
             ) from error
-        # Callers have removed separate light and repaired pixels already. The graph does the same for other hosts, so
-        # it gets zeros for this light here. Graphs of earlier versions have fewer such inputs.
+        # For other hosts, the graph subtracts this light itself. Here callers have subtracted it, so it gets zeros.
+        # Graphs of earlier versions have fewer such inputs.
         self.apart = tuple(name for name in names if name in _APART)
         self.inputs = tuple(name for name in names if name not in _APART)
         optional = metadata.get("ngpt.optional", "direct").split(", ")
@@ -84,12 +83,14 @@ class Network:
 
     @property
     def session(self) -> Any:
-        """The session of ONNX Runtime, shared by all networks of the file. No network stores it: it must not outlive a
-        fork."""
+        """The session of ONNX Runtime, which all networks of the file share.
+
+        It is not stored, because it must not survive a fork.
+        """
         return session(self.path, self.device, self.threads)
 
     def _check(self) -> None:
-        """Raises NgptError unless the metadata make sense and match the graph."""
+        """Raises NgptError unless the metadata are valid and match the graph."""
         for name, value, most in (("alignment", self.alignment, 2**12), ("overlap", self.overlap, 2**12)):
             if not (name == "overlap" or value) or not 0 <= value <= most:
                 raise NgptError(f"{self.path}: its {name} is {value}; it must be at most {most}: export it anew")
@@ -97,7 +98,7 @@ class Network:
             raise NgptError(f"{self.path}: {self.bytes} bytes per pixel, base '{self.base}': export it anew")
         own = {*self.inputs, *self.apart, "statistics"} | ({"base"} if self.base else set())
         graph = {given.name for given in self.session.get_inputs()}
-        # Inputs that a host may leave out have a value in the graph.
+        # Inputs that a host may leave out have a default in the graph.
         optional = {given.name for given in self.session.get_overridable_initializers()}
         self.types, self.output = floats(self.session, self.path)
         if not graph <= own <= graph | optional:
@@ -119,14 +120,14 @@ class Network:
         """The image (H, W, 3) float32, scene-linear, without direct emission.
 
         ``layers``    (H, W, C) float32, all of ``inputs``; radiance without direct emission
-        ``base``      (H, W, 3), the reconstruction that the network starts from, if it has one
-        ``memory``    MiB that tiles may take; smaller tiles take longer, and give the same image to 1e-5. If the
-                      machine has less memory, the tiles shrink
-        ``batch``     tiles in one run; several use a GPU better
-        ``progress``  called with (tiles done, tiles)
-        ``stop``      called before each run; True ends the work and raises ``Cancelled``
+        ``base``      (H, W, 3), the reconstruction that the network starts from, if there is one
+        ``memory``    MiB that tiles may take. Smaller tiles take longer, and give the same image to 1e-5. If the
+                      machine has less memory, the tiles become smaller
+        ``batch``     the number of tiles in one run; a GPU is used better with several
+        ``progress``  is called with (tiles done, all tiles)
+        ``stop``      is called before each run; if it returns True, ``Cancelled`` is raised
 
-        Raises NgptError if the smallest tile does not fit into ``memory``, or into the memory of the machine.
+        Raises NgptError if the smallest tile needs more than ``memory``, or more than the machine has.
         """
         memory = min(memory, free_address_space() // 2)
         while True:
@@ -136,7 +137,7 @@ class Network:
                 memory = self._less(layers["primal"].shape[:2], memory, batch, error)
 
     def _less(self, size: tuple[int, int], memory: int, batch: int, error: NgptError) -> int:
-        """Half of the memory, in MiB, of the tiles that were too large; raises ``error`` if they cannot be smaller."""
+        """Half of the MiB of the tiles that were too large; raises ``error`` if the tiles cannot be smaller."""
         _, (rows, columns) = self.plan(*size, memory, batch)
         areas = rows * columns, tiles.smallest(size, self.alignment, self.overlap)
         used, least = (area * self.bytes * batch / 2**20 for area in areas)
@@ -182,7 +183,7 @@ class Network:
         return image
 
     def plan(self, height: int, width: int, memory: int, batch: int = 1) -> tuple[list[tuple], tuple[int, int]]:
-        """The tiles of ``ngpt.network.tiles.plan`` within ``memory`` MiB, and their common size (height, width)."""
+        """The result of ``ngpt.network.tiles.plan`` for ``memory`` MiB. Raises NgptError if no tile fits."""
         size = height, width
         if found := tiles.plan(size, self.alignment, self.overlap, memory * 2**20 // (self.bytes * batch)):
             return found
@@ -193,7 +194,7 @@ class Network:
         )
 
     def _run(self, session, feed: dict[str, np.ndarray], last: bool) -> np.ndarray:
-        """The output of one run. The ``last`` run of an image frees the memory that ONNX Runtime would keep."""
+        """The output of one run. After the ``last`` run of an image, ONNX Runtime frees the memory that it keeps."""
         options = runtime().RunOptions()
         if last and self.device == "cpu":
             options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
@@ -215,10 +216,9 @@ class Network:
 
 
 def floats(session, path: Path) -> tuple[dict[str, type], str]:
-    """The type of each input of a network, and the name of its first output.
+    """The type of each input of a network, by name, and the name of its first output.
 
-    Files of other programs may have any inputs and outputs. Single, half and double precision are converted; NgptError
-    is raised for whole numbers, texts, sequences, maps and all other types of ONNX.
+    Raises NgptError for inputs and outputs that are not floats of half, single or double precision.
     """
     inputs = [*session.get_inputs(), *session.get_overridable_initializers()]
     output = next(iter(session.get_outputs()))
@@ -232,8 +232,8 @@ def floats(session, path: Path) -> tuple[dict[str, type], str]:
 
 
 def session(path: Path, device: str, threads: int):
-    """The session of a file; made again when the file has changed. Raises NgptError if ONNX Runtime cannot load it."""
-    # ONNX Runtime would read a pipe or a device forever.
+    """The session of a file, kept until the file changes. Raises NgptError if ONNX Runtime cannot load it."""
+    # From a pipe or a device, ONNX Runtime would read forever.
     if not path.is_file():
         raise NgptError(f"{path}: no such file; `ngpt export` writes it")
     return _made(str(path), path.stat().st_mtime_ns, device, threads or processors())
@@ -245,7 +245,7 @@ def runtime() -> Any:
         import onnxruntime
     except ModuleNotFoundError as error:
         raise NgptError(f"ONNX Runtime is not installed: {package_command('onnxruntime')}") from error
-    # ngpt/__init__.py has switched it off already, unless a program had loaded ONNX Runtime before ngpt.
+    # ngpt/__init__.py also switches telemetry off, but a program may have loaded ONNX Runtime before.
     onnxruntime.disable_telemetry_events()
     return onnxruntime
 
@@ -261,13 +261,12 @@ def _made(path: str, _modified: int, device: str, threads: int):
         raise NgptError(f"device '{device}': this build of ONNX Runtime has only: {', '.join(have)}; install another")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
-    # Planning the reuse of buffers takes six times as long as the rest of the start. It saves neither time nor memory:
-    # the arena reuses the same buffers anyway.
+    # Planning the reuse of buffers takes six times as long as the rest of loading. It saves neither time nor memory,
+    # because the arena reuses buffers anyway.
     options.enable_mem_reuse = False
-    # Spinning threads keep their cores busy while they wait. This takes a fifth of the processor time of ngpt-fast,
-    # which other work on the machine could use.
+    # Spinning threads keep their cores busy while they wait. This is a fifth of the processor time of ngpt-fast.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # Errors come as exceptions; the log would repeat them.
+    # Errors are raised as exceptions, so the log would only repeat them.
     options.log_severity_level = 4
     try:
         session = onnxruntime.InferenceSession(path, options, providers=[provider])

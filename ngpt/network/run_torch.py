@@ -19,17 +19,17 @@ from ngpt.network.transfer import signed_exp
 from ngpt.repair import Repaired
 from ngpt.system.forks import in_children
 
-# The side of a tile in padded pixels. Larger images are cut, so that memory does not grow with them; 640 holds 480x270.
+# The side of a tile in padded pixels. Larger images are cut into tiles, so that memory does not grow with the image.
 TILE = 640
 
 
 def config_of(path: str | Path, device: str = "auto") -> ModelConfig:
-    """The configuration in a file of weights. The weights are loaded and cached for ``run``."""
+    """The configuration in a file of weights. The loaded model is cached for ``run``."""
     return _loaded(path, device).config
 
 
 def run(data: Repaired, path: str | Path, device: str = "auto", tile: int = TILE) -> np.ndarray:
-    """Reconstructs the light of the data's ``image`` by the weights of a file: (H, W, 3) float32, scene-linear.
+    """Reconstructs the data's ``image`` with the weights in a file: (H, W, 3) float32, scene-linear.
 
     ``device`` is one of PyTorch's, or "auto": a GPU if there is one. Tiles overlap by the network's receptive field, so
     their size does not change the result. Raises NgptError for unreadable weights, and for missing layers.
@@ -52,14 +52,13 @@ def layers_of(
 def reconstruct(model: Reconstructor, layers: dict[str, Tensor], tile: int = TILE) -> Tensor:
     """The result of ``model(layers)``, computed in tiles whose padded side is at most ``tile`` pixels.
 
-    Exposure and bounds are computed from the whole image. Layers may be on another device than the model. A network of
-    OIDN's shape is computed in one piece, since OIDN makes its own tiles.
+    Exposure and bounds are those of the whole image. Layers may be on another device than the model. A network of
+    OIDN's shape is computed in one piece, because in use OIDN cuts its own tiles.
     """
+    device = next(model.parameters()).device
     if model.config.network == "oidn":
-        device = next(model.parameters()).device
         return model({name: layers[name].to(device) for name in model.config.layers})
     height, width = layers["primal"].shape[-2:]
-    device = next(model.parameters()).device
     scaled, exposure = features.normalised({name: layers[name] for name in model.config.layers})
     low, high = model.bounds(scaled["primal"])
     pads = padding.pads(height, width, model.alignment)
@@ -76,8 +75,7 @@ def reconstruct(model: Reconstructor, layers: dict[str, Tensor], tile: int = TIL
 
 
 def _spans(length: int, tile: int, alignment: int, radius: int) -> list[tuple[slice, slice]]:
-    """(pixels that the tile is for, pixels that it shows to the network) of each tile; all divisible by
-    ``alignment``."""
+    """For each tile: the pixels that it is for, and the pixels that the network reads; divisible by ``alignment``."""
     margin = -(-radius // alignment) * alignment
     step = max(tile - 2 * margin, alignment) // alignment * alignment if length > tile else length
     return tiles.spans(length, step, margin)
@@ -89,7 +87,7 @@ def _loaded(path: str | Path, device: str) -> Reconstructor:
 
 @lru_cache(maxsize=4)
 def _model(path: str, _modified: int, device: str) -> Reconstructor:
-    """The model of a file; read again when the file has changed."""
+    """The model in a file; read again after the file has changed."""
     model, _ = load_weights(path)
     in_children(one_thread)
     if device == "auto":
@@ -101,6 +99,5 @@ def _model(path: str, _modified: int, device: str) -> Reconstructor:
 
 
 def one_thread() -> None:
-    """Sets PyTorch to one thread, as in the workers of its ``DataLoader``: a forked child would wait forever for the
-    threads of its parent."""
+    """Sets PyTorch to one thread, for forked children, which would wait forever for the threads of their parent."""
     torch.set_num_threads(1)

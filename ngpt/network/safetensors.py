@@ -1,4 +1,4 @@
-"""Weights on disk: safetensors with the whole configuration in the header. Nothing is ever unpickled."""
+"""Reads and writes weights as safetensors files, with the configuration in the header. Nothing is ever unpickled."""
 
 import json
 import os
@@ -17,8 +17,7 @@ from ngpt.network.model import Reconstructor
 from ngpt.system.records import parse_json
 from ngpt.system.writing import write_bytes
 
-# The shipped networks in PyTorch's form: beside the .onnx files in an installed package, in another folder in the
-# repository
+# The folders of shipped weights for PyTorch: the first in an installed package, the second in the repository.
 _PACKAGE = Path(__file__).parents[1]
 FOLDERS = (_PACKAGE / "weights", _PACKAGE.parent / "export" / "weights")
 FORMAT = 1
@@ -28,21 +27,21 @@ _TYPES = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 def write_tensors(
     path: str | Path, tensors: dict[str, Tensor], header: dict[str, Any], overwrite: bool = False
 ) -> None:
-    """Writes tensors and ``header`` (anything JSON can hold) to one file, completely or not at all."""
+    """Writes tensors and ``header`` (anything that JSON can hold) to one file, completely or not at all."""
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    # Not save_file: it makes a temporary file of its own, which a killed process would leave behind.
+    # ``save_file`` would make a temporary file of its own, which a killed process would leave behind.
     write_bytes(path, save(tensors, metadata={"ngpt": json.dumps({"format": FORMAT} | header)}), overwrite)
 
 
 def shipped() -> dict[str, Path]:
-    """The networks that come with ngpt, by name: "ngpt-fast", ..."""
+    """The files of the networks that come with ngpt, by name: "ngpt-fast", ..."""
     return {path.stem: path for folder in reversed(FOLDERS) for path in sorted(folder.glob("*.safetensors"))}
 
 
 def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """The tensors and the header of a file by ``write_tensors``; ``path`` may be a name of ``shipped``.
+    """The tensors and the header of a file that ``write_tensors`` wrote; ``path`` may be a name of ``shipped``.
 
-    Raises NgptError for any other file.
+    Raises NgptError for other files.
     """
     if not os.path.isfile(path):
         names = shipped()
@@ -67,7 +66,7 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def save_weights(path: str | Path, model: Reconstructor, provenance: dict[str, Any], overwrite: bool = False) -> None:
-    """Writes a model that ``load_weights`` reads back; ``provenance`` says how it was trained."""
+    """Writes a model, for ``load_weights``. ``provenance`` is the record of its training."""
     header = {"kind": "weights", "model": model.config.to_dict(), "training": provenance}
     write_tensors(path, model.state_dict(), header, overwrite)
 
@@ -83,12 +82,12 @@ def load_weights(path: str | Path) -> tuple[Reconstructor, dict[str, Any]]:
         raise NgptError(f"{path}: holds a {header.get('kind', 'something')}, not weights; pass weights.safetensors")
     try:
         fields = dict(header["model"])
-        # Earlier versions had two more fields. Shipped files still have them, with empty values.
+        # Earlier versions had two more fields, which shipped files still have, with empty values.
         fields = {name: value for name, value in fields.items() if value or name not in ("optional", "emission")}
         config = ModelConfig(**fields)
     except (TypeError, KeyError, ValueError) as error:
         raise NgptError(f"{path}: its configuration cannot be read: {error}") from error
-    # A header may claim huge tensors: check the shapes before memory is allocated.
+    # A header may ask for huge tensors, so shapes are checked before memory is allocated.
     with torch.device("meta"):
         check_fit(Reconstructor(config).state_dict(), tensors, str(path))
     model = Reconstructor(config)
@@ -97,13 +96,13 @@ def load_weights(path: str | Path) -> tuple[Reconstructor, dict[str, Any]]:
 
 
 def fill(module: torch.nn.Module, tensors: dict[str, Tensor], path: str) -> None:
-    """Sets all of a module's parameters; ``path`` is for messages."""
+    """Sets all parameters of a module; ``path`` is for messages. Raises NgptError as ``check_fit``."""
     check_fit(module.state_dict(), tensors, path)
     module.load_state_dict(tensors)
 
 
 def check_fit(own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], path: str) -> None:
-    """Raises NgptError unless ``tensors`` have the names and shapes of ``own``, hold floats, and are finite."""
+    """Raises NgptError unless ``tensors`` have the names and shapes of ``own``, and are finite floats."""
     missing, extra = own.keys() - tensors.keys(), tensors.keys() - own.keys()
     if missing or extra:
         what = "lacks" if missing else "has an unexpected"
@@ -123,8 +122,8 @@ def check_fit(own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], path: st
 def in_halves(tensors: Mapping[str, Tensor], path: str) -> dict[str, Tensor]:
     """The tensors in 16 bits; ``path`` is for messages.
 
-    Raises NgptError for numbers beyond 65504, and if the weights of one output are so small that 16 bits change them by
-    more than rounding: their scale may be a parameter of its own, so small weights matter. Small biases do not matter.
+    Raises NgptError for numbers beyond 65504, and if all weights of an output are so small that 16 bits change them by
+    more than rounding. Such weights may matter, because their scale may be a separate parameter. Small biases do not.
     """
     halves = {name: tensor.half() for name, tensor in tensors.items()}
     for name, tensor in tensors.items():

@@ -1,4 +1,4 @@
-"""The networks that come with the package, as reconstructions of a repaired stack."""
+"""Runs the networks that come with the package, or a user's file in their place, on a repaired stack."""
 
 import math
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from ngpt.system.install import install_command, package_command
 
 WEIGHTS = Path(__file__).parents[1] / "weights"
 
-# The options of all networks
+# The options of all networks.
 OPTIONS = {
     "weights": Option("", "a file, .onnx, .safetensors or .tza, instead of the network that is shipped"),
     "device": Option(
@@ -29,9 +29,9 @@ OPTIONS = {
 
 @dataclass(frozen=True)
 class Shipped:
-    """The shipped network of that name; the option ``weights`` puts a file in its place.
+    """The shipped network of this name; the option ``weights`` puts a file in its place.
 
-    ``also_missing``  returns why it cannot be used here, apart from ONNX Runtime and the file; "" if it can
+    ``also_missing``  returns what it lacks on this machine, apart from ONNX Runtime and its file; "" for nothing
     """
 
     name: str
@@ -42,7 +42,7 @@ class Shipped:
         return WEIGHTS / f"{self.name}.onnx"
 
     def missing(self) -> str:
-        """Why it cannot be used here, "" if it can."""
+        """Why it cannot be used on this machine; "" if it can."""
         if find_spec("onnxruntime") is None:
             return f"ONNX Runtime is not installed: {package_command('onnxruntime')}"
         if not self.path.is_file():
@@ -50,7 +50,7 @@ class Shipped:
         return self.also_missing()
 
     def reads(self, weights: str, device: str, memory: int) -> tuple[str, ...]:
-        """The inputs of ``run`` with these options: layers of a stack, and inputs made from them (``inputs.gather``).
+        """The names of the network's inputs (``inputs.gather``), and of the layers that a stack must hold for them.
 
         Raises NgptError for weights that cannot be loaded, and for a device that cannot be used.
         """
@@ -66,26 +66,26 @@ class Shipped:
         return (*config.layers, *config.needs)
 
     def run(self, data: Repaired, weights: str, device: str, memory: int) -> np.ndarray:
-        """Reconstructs the light of the data's ``image``: (H, W, 3) float32, scene-linear.
+        """Reconstructs the data's ``image``: (H, W, 3) float32, scene-linear.
 
-        ``weights``  a file instead of the shipped one: .onnx for ONNX Runtime, .safetensors for PyTorch, .tza for OIDN
-        ``device``   one of the runtime's, or "auto"
-        ``memory``   MiB that tiles may take (ONNX Runtime and OIDN)
+        ``weights``  a file in place of the shipped one: .onnx for ONNX Runtime, .safetensors for PyTorch, .tza for
+                     OIDN; "" for the shipped one
+        ``device``   a device of that runtime, or "auto"
+        ``memory``   the MiB that tiles may take in ONNX Runtime and OIDN
         """
         path = Path(weights or self.path)
         if path.suffix == ".tza":
             return run_oidn.run(data, path, device, memory)
         if path.suffix != ".safetensors":
             network = run_onnx.Network(path, device)
-            # NumPy makes the base several times faster than the graph would.
+            # NumPy computes the base several times faster than the graph.
             names = (*network.inputs, "base") if network.base else network.inputs
-            reader = f"weights {path}"
-            layers = inputs.gather(data, names, network.base, reader, estimate=True)
+            layers = inputs.gather(data, names, network.base, f"weights {path}", estimate=True)
             return network.reconstruct(layers, memory=memory)
         return self._torch(path).run(data, path, device)
 
     def _torch(self, path: Path) -> Any:
-        """``ngpt.network.run_torch``, imported only when needed: importing torch takes seconds."""
+        """The module ``ngpt.network.run_torch``, imported only if it is needed, since importing torch takes seconds."""
         if find_spec("torch") is None or find_spec("safetensors") is None:
             raise NgptError(f"weights {path}: to run them needs PyTorch: {install_command('train')}")
         from ngpt.network import run_torch

@@ -1,18 +1,21 @@
-"""Where images are cut for networks: tiles for ONNX Runtime, spans for PyTorch and for the network that blends frames.
+"""Cuts images for networks: into tiles for ONNX Runtime, into spans for PyTorch and for the network that blends frames.
 
-The result of a pixel depends on all pixels within the network's reach. So each piece has a margin around the pixels
-that it is for, and begins at a multiple of the network's alignment. Then the cuts do not change the result.
+The result of a pixel depends on all pixels within the reach of the network. So each piece has a margin around the
+pixels whose result is taken from it, and begins at a multiple of the network's alignment. Then cutting does not change
+the result.
 """
 
 from itertools import product
 
-# The pieces of one side: the pixels that each piece is for, and where it begins; and the length of all pieces.
+# The pieces of one side, each with its own pixels, whose result is taken from it, and its beginning; and their length.
 Cuts = tuple[list[tuple[slice, int]], int]
 
 
 def spans(length: int, step: int, margin: int) -> list[tuple[slice, slice]]:
-    """Pieces of a side: the pixels that each is for, ``step`` long, and those that it shows, ``margin`` more on both
-    ends."""
+    """The pieces of a side: the own pixels of each, ``step`` of them, and all its pixels, ``margin`` more at both ends.
+
+    At the ends of the side, there are fewer pixels.
+    """
     return [
         (slice(first, min(first + step, length)), slice(max(first - margin, 0), min(first + step + margin, length)))
         for first in range(0, length, step)
@@ -29,8 +32,8 @@ def plan(
 ) -> tuple[list[tuple[slice, slice, int, int]], tuple[int, int]] | None:
     """Tiles (rows, columns, top, left) and their common (height, width), with the least total number of pixels.
 
-    ``size`` is (height, width). A tile is for the pixels ``rows`` and ``columns``, and begins at ``top`` and ``left``.
-    It has at most ``most`` pixels. Returns None if the smallest tile has more.
+    ``size`` is the (height, width) of the image. ``rows`` and ``columns`` are the own pixels of a tile, which begins at
+    ``top`` and ``left``, and has at most ``most`` pixels. None if the smallest tile has more.
     """
     best: tuple | None = None
     down, across = (_cuts(n, alignment, overlap) for n in size)
@@ -48,19 +51,19 @@ def plan(
 
 
 def smallest(size: tuple[int, int], alignment: int, overlap: int) -> int:
-    """Pixels of the smallest tile."""
+    """The number of pixels of the smallest tile."""
     (*_, (_, low)), (*_, (_, narrow)) = (_cuts(n, alignment, overlap) for n in size)
     return low * narrow
 
 
 def _cuts(length: int, alignment: int, overlap: int) -> list[Cuts]:
-    """Ways to cut a side, coarsest first."""
+    """The ways to cut a side into pieces, the longest pieces first."""
     cuts: list[Cuts] = []
     for count in range(1, max(1, length // alignment) + 1):
         step = -(-length // (count * alignment)) * alignment
         starts = range(0, length, step)
-        # All pieces have one size, so the last ones begin earlier; all begin at multiples of the alignment. The first
-        # and the last piece have a neighbour on only one side.
+        # All pieces have the same length, so the last ones begin earlier; all begin at multiples of the alignment. The
+        # first and the last piece have a neighbour on only one side.
         size = min(step + min(len(starts) - 1, 2) * overlap + length % alignment, length)
         pieces = [(slice(n, min(n + step, length)), min(max(n - overlap, 0), length - size)) for n in starts]
         if not cuts or size < cuts[-1][1]:

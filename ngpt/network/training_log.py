@@ -1,4 +1,4 @@
-"""The log of a training run, beside its weights: one line of JSON for each entry."""
+"""Reads the log of a training run: one line of JSON for each entry."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ LOG = "log.jsonl"
 
 
 def entries_of(path: Path) -> list[dict[str, float]]:
-    """The entries of a log. A last line that is still being written is left out."""
+    """The entries of a log. An incomplete last line is left out. Raises NgptError for other lines that are invalid."""
     lines = read_text(path).splitlines()
     entries = []
     for number, line in enumerate(lines, 1):

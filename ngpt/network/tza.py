@@ -1,4 +1,4 @@
-"""Files of weights for Open Image Denoise, .tza: written for its runtime, and their tables read back.
+"""Writes .tza files, the weights of Open Image Denoise, and reads their tables of tensors.
 
     u16 0x41D7, u8 2, u8 0      magic and version
     u64                         the position of the table
@@ -9,8 +9,8 @@
         bytes                   the layout: "oihw" for kernels, "x" for biases
         "f" or "h", u64         32 or 16 bits, and the position of its data
 
-All numbers are little-endian [Intel Open Image Denoise 2.4.1, core/tza.cpp]. OIDN takes only 16 bits.
-OIDN ignores tensors that it does not use. The name of one such tensor says which of our images is the colour.
+All numbers are little-endian [Intel Open Image Denoise 2.4.1, core/tza.cpp]. OIDN accepts only tensors in 16 bits, and
+ignores tensors that it does not use. The name of such a tensor, the mark, says which of our images is the colour.
 """
 
 import struct
@@ -24,14 +24,14 @@ from ngpt.errors import NgptError
 from ngpt.system.reading import read_bytes
 
 MAGIC, VERSION, ALIGNMENT = 0x41D7, 2, 64
-# The prefix of the mark's name; the name of the image follows: "primal", or the base.
+# The beginning of the name of the mark; the name of the image follows: "primal", or the base.
 MARK = "ngpt.colour."
-# Limits for damaged or forged files; no network has more.
+# Limits against damaged or forged files; networks have less.
 MOST_TENSORS, MOST_BYTES = 4096, 2**28
 
 
 def packed(tensors: Mapping[str, np.ndarray], colour: str) -> bytes:
-    """A file of tensors of four or one dimensions, in 16 bits; ``colour`` is "primal" or the name of a base."""
+    """The contents of a file: tensors of four or one dimensions, in 16 bits, with the mark for ``colour``."""
     body, table = bytearray(12), bytearray()
     everything = dict(tensors) | {MARK + colour: np.ones(1)}
     for name, tensor in everything.items():
@@ -46,9 +46,9 @@ def packed(tensors: Mapping[str, np.ndarray], colour: str) -> bytes:
 
 
 def read(path: Path) -> tuple[bytes, str]:
-    """The file's contents, and the image that is its colour: "primal", or the name of a base.
+    """The contents of a file, and the image that is its colour: "primal", or the name of a base.
 
-    Raises NgptError if the file is not of this format, is damaged, or was not written by ngpt.
+    Raises NgptError if the file is of another format, is damaged, or was not written by ngpt.
     """
     data = read_bytes(path, MOST_BYTES)
     shapes = _shapes(data, path)
@@ -61,7 +61,7 @@ def read(path: Path) -> tuple[bytes, str]:
 
 
 def _shapes(data: bytes, path: Path) -> dict[str, tuple[int, ...]]:
-    """Name -> shape of the tensors of a file; raises NgptError if a tensor is not within the file."""
+    """Name -> shape of the tensors in a file. Raises NgptError if the file is damaged or of another format."""
     try:
         magic, version, _, place = struct.unpack_from("<HBBQ", data)
         if magic != MAGIC or version != VERSION:

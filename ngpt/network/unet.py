@@ -1,4 +1,4 @@
-"""The networks: the dense U-Net of NGPT and a plain one of equal capacity.
+"""The dense U-Net of NGPT, and a plain U-Net of equal capacity.
 
     level 0   input ─ units ───────────────────────────────┬─ units ─ head ─ RGB
                          └─ pool                        unpool
@@ -9,9 +9,9 @@
 Every level of the dense U-Net has one growing list of tensors: its input, the outputs of the units on the way down, the
 tensor from the level below, and the outputs of the units on the way up. Each unit, the pool, the unpool and the head
 read the whole list [Kettunen et al. 2019, section 4.1 and figure 5]. Weights are normalised, activations are leaky ReLU
-with slope 0.01, convolutions pad with zeros.
+with slope 0.01, and convolutions pad with zeros.
 
-Both sides of the input must be divisible by 2^(levels - 1); ``ngpt.network.padding`` ensures that.
+Both sides of the input must be divisible by 2^(levels - 1), which ``ngpt.network.padding`` ensures.
 """
 
 import math
@@ -21,16 +21,16 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, conv2d, conv_transpose2d, interpolate, leaky_relu, max_pool2d
 
 SLOPE = 0.01
-# How sizes are halved and doubled; all but the first are the alternatives that the paper tries [section 4.4.5].
+# How sizes are halved and doubled. The paper uses the first way, and compares it with the others [section 4.4.5].
 POOLING = ("convolution", "average", "maximum", "bilinear")
 
 
 class Convolution(nn.Module):
-    """A convolution with normalised weights, w = √2 s v / |v| for each output channel, and a bias.
+    """A convolution with a bias, and with normalised weights: w = √2 s v / |v| for each output channel.
 
-    √2 preserves the variance through leaky ReLUs from the first step on [Salimans and Kingma 2016, eq. 2; He et al.
-    2015]. ``kind`` "1x1", "3x3" and "5x5" keep the size; "pool" is 2x2 with stride 2 and halves it, "unpool" is its
-    transpose and doubles it.
+    The factor √2 makes leaky ReLUs preserve the variance from the first step on [Salimans and Kingma 2016, eq. 2; He et
+    al. 2015]. The kinds "1x1", "3x3" and "5x5" keep the size of the image. "pool" is 2x2 with stride 2, and halves the
+    size; "unpool" is its transpose, and doubles it.
     """
 
     def __init__(self, inputs: int, outputs: int, kind: str, activation: bool = True):
@@ -42,7 +42,7 @@ class Convolution(nn.Module):
         self.v = nn.Parameter(torch.empty(shape))
         self.s = nn.Parameter(torch.ones(outputs))
         self.bias = nn.Parameter(torch.zeros(outputs))
-        # The output depends only on the direction of v, but its length sets how fast Adam rotates it.
+        # The output depends only on the direction of v. Its length determines how fast Adam rotates it.
         std = 1.612 / math.sqrt(inputs * size * size)
         nn.init.trunc_normal_(self.v, std=std, a=-2 * std, b=2 * std)
 
@@ -66,10 +66,11 @@ class Convolution(nn.Module):
 
 
 class Resampling(nn.Module):
-    """A 1x1 convolution, then half or twice the size by a fixed rule [Kettunen et al. 2019, figure 12].
+    """A 1x1 convolution, followed by a fixed rule that halves or doubles the size [Kettunen et al. 2019, figure 12].
 
-    ``pooling``  "average": means of 2x2 pixels; "maximum": the largest of 2x2 pixels; both repeat each pixel on the way
-                 up. "bilinear": bilinear at the centres of pixels, which is the mean of 2x2 on the way down
+    ``pooling``  "average": means of 2x2 pixels; "maximum": the largest of 2x2 pixels; with both, doubling repeats each
+                 pixel. "bilinear": doubling interpolates bilinearly, and halving takes means of 2x2 pixels
+    ``up``       whether the size is doubled
     """
 
     def __init__(self, inputs: int, outputs: int, pooling: str, up: bool):
@@ -84,26 +85,21 @@ class Resampling(nn.Module):
         return max_pool2d(x, 2) if self.pooling == "maximum" else avg_pool2d(x, 2)
 
 
-def halved(inputs: int, outputs: int, pooling: str) -> nn.Module:
-    """The module from one level to the next coarser one; ``pooling`` is one of ``POOLING``."""
+def resampled(inputs: int, outputs: int, pooling: str, up: bool) -> nn.Module:
+    """The module that halves the size of an image, or doubles it if ``up``; ``pooling`` is one of ``POOLING``."""
     if pooling == "convolution":
-        return Convolution(inputs, outputs, "pool")
-    return Resampling(inputs, outputs, pooling, up=False)
-
-
-def doubled(inputs: int, outputs: int, pooling: str) -> nn.Module:
-    """The module from a level to the next finer one, the counterpart of ``halved``."""
-    if pooling == "convolution":
-        return Convolution(inputs, outputs, "unpool")
-    return Resampling(inputs, outputs, pooling, up=True)
+        return Convolution(inputs, outputs, "unpool" if up else "pool")
+    return Resampling(inputs, outputs, pooling, up)
 
 
 class LastConvolution(nn.Module):
     """The 1x1 convolution to ``outputs`` channels: in float32 even under autocast, and without activation.
 
-    It predicts logarithms, where rounding to 16 bits would change radiance by percents. ``zero`` is for predictions
-    where 0 is sensible, such as corrections: the weights start at 0 and are not normalised, since zero weights have no
-    direction. ``normalise``, which needs ``zero``: the input is divided by its root mean square in each pixel.
+    It predicts logarithms: rounding them to 16 bits would change radiance by some per cent.
+
+    ``zero``       whether the weights start at 0, for predictions where 0 is sensible, such as corrections. They are
+                   not normalised then, because a zero vector has no direction
+    ``normalise``  whether the input is divided by its root mean square in each pixel; needs ``zero``
     """
 
     def __init__(self, inputs: int, outputs: int, zero: bool, normalise: bool = False):
@@ -122,8 +118,8 @@ class LastConvolution(nn.Module):
             x = x.float()
             if not self.normalise or isinstance(self.convolution, Convolution):
                 return self.convolution(x)
-            # A convolution of one channel is the fastest mean over channels in ONNX Runtime. The output is divided
-            # instead of the input, because it has fewer channels.
+            # In ONNX Runtime, a convolution to one channel is the fastest mean over channels. The output is divided
+            # in place of the input, because it has fewer channels.
             square = conv2d(x * x, x.new_full((1, x.shape[1], 1, 1), 1 / x.shape[1]))
             bias = self.convolution.bias
             assert bias is not None
@@ -131,7 +127,7 @@ class LastConvolution(nn.Module):
 
 
 class Unit(nn.Module):
-    """A unit of a dense block: 1x1 to 2g channels, 3x3 to the g channels that the unit adds to the list."""
+    """A unit of a dense block: a 1x1 convolution to 2g channels, and a 3x3 convolution to g channels."""
 
     def __init__(self, inputs: int, growth: int):
         super().__init__()
@@ -143,21 +139,23 @@ class Unit(nn.Module):
 
 
 def radius(convolutions: list[int], pooling: str) -> int:
-    """How far, in pixels, a pixel's influence reaches, with this number of 3x3 convolutions at each level.
+    """The radius in pixels of the receptive field, for the number of 3x3 convolutions at each level, finest first.
 
-    Each convolution reaches as far as a pixel of its level is wide. A pixel of the coarsest level spreads values over
-    its whole area; bilinear interpolation at each level spreads them to the next pixel too.
+    A convolution reaches as far as a pixel of its level is wide. A pixel of the coarsest level spreads values over its
+    whole area, and bilinear interpolation also to the next pixel.
     """
     spread = (1 << len(convolutions) - 1) - 1
     return sum(n << level for level, n in enumerate(convolutions)) + spread * (2 if pooling == "bilinear" else 1)
 
 
 class DenseUNet(nn.Module):
-    """(N, inputs, H, W) to (N, outputs, H, W); H and W divisible by ``alignment``.
+    """(N, inputs, H, W) to (N, outputs, H, W), with H and W divisible by ``alignment``.
 
-    ``growth`` and ``units`` have one number for each level: the channels each unit adds, and how many units there are
-    on the way down and again on the way up. ``zero`` and ``normalise`` are as in ``LastConvolution``, ``pooling`` is
-    one of ``POOLING``, ``radius`` is the radius of the receptive field.
+    ``growth``   for each level, the number of channels that each unit adds
+    ``units``    for each level, the number of units on the way down, and again on the way up
+    ``zero``, ``normalise``  see ``LastConvolution``
+    ``pooling``  one of ``POOLING``
+    ``radius``   the radius of the receptive field in pixels
     """
 
     def __init__(
@@ -182,11 +180,11 @@ class DenseUNet(nn.Module):
             dense.append(channels + n * g)
             if level + 1 < levels:
                 channels = 2 * growth[level + 1]
-                self.pool.append(halved(dense[level], channels, pooling))
+                self.pool.append(resampled(dense[level], channels, pooling, up=False))
         for level in reversed(range(levels)):
             g, n = growth[level], units[level]
             if level + 1 < levels:
-                self.unpool.insert(0, doubled(dense[level + 1], 2 * g, pooling))
+                self.unpool.insert(0, resampled(dense[level + 1], 2 * g, pooling, up=True))
                 dense[level] += 2 * g
             self.up.insert(0, nn.ModuleList(Unit(dense[level] + i * g, g) for i in range(n)))
             dense[level] += n * g
@@ -210,9 +208,9 @@ class DenseUNet(nn.Module):
 
 
 class PlainUNet(nn.Module):
-    """The ablation partner: two 3x3 convolutions per level and direction, one skip connection per level.
+    """A U-Net with two 3x3 convolutions for each level and direction, and one skip connection for each level.
 
-    (N, inputs, H, W) to (N, outputs, H, W), as ``DenseUNet``, from the same building blocks.
+    (N, inputs, H, W) to (N, outputs, H, W). ``widths`` are the channels of the levels; all else is as in ``DenseUNet``.
     """
 
     def __init__(
@@ -233,8 +231,8 @@ class PlainUNet(nn.Module):
         for level, width in enumerate(widths):
             self.down.append(nn.Sequential(Convolution(channels, width, "3x3"), Convolution(width, width, "3x3")))
             if level + 1 < len(widths):
-                self.pool.append(halved(width, width, pooling))
-                self.unpool.append(doubled(widths[level + 1], width, pooling))
+                self.pool.append(resampled(width, width, pooling, up=False))
+                self.unpool.append(resampled(widths[level + 1], width, pooling, up=True))
                 self.up.append(nn.Sequential(Convolution(2 * width, width, "3x3"), Convolution(width, width, "3x3")))
             channels = width
         self.head = LastConvolution(widths[0], outputs, zero, normalise)

@@ -7,8 +7,8 @@ import pytest
 from full_stack import full_stack
 from textured_room import error, keeps_texture, textured_room
 
+from ngpt.denoisers import clean, oidn
 from ngpt.denoisers import nfor as nfor_module
-from ngpt.denoisers import oidn
 from ngpt.denoisers.nfor import nfor
 from ngpt.errors import NgptError
 from ngpt.layers import FEATURE_NOISE
@@ -127,11 +127,10 @@ def test_a_combiner_is_given_oidns_images_by_clean_features(noise, scale):
     image = np.full((40, 50, 3), scale, np.float32)
     stack = full_stack(40, 50).replace(primal=image, direct=0 * image, primal_var=0.25 * image**2)
     if noise is not None:
-        stack.attributes[FEATURE_NOISE] = noise * inputs.CLEAN * 0.25 / (1 + inputs._DARK)
+        stack.attributes[FEATURE_NOISE] = noise * clean.CLEAN * 0.25 / (1 + clean.DARK)
     data = repair(stack)
     base = 0.9 * data.image
-    clean = noise in (0.0, 0.99)
-    features = data.features | ({} if clean else oidn.prefiltered(data.features, "balanced"))
+    features = data.features | ({} if noise in (0.0, 0.99) else oidn.prefiltered(data.features, "balanced"))
     images = inputs.denoised(inputs.Oidn(data), base, inputs.DENOISED)
     for name, image, quality in (("denoised", data.image, "high"), ("denoised_base", base, "fast")):
         expected = oidn.oidn(replace(data, image=image, features=features), "clean", quality)
