@@ -7,7 +7,6 @@ import pytest
 from bdpt_scenes import SCENES, corner
 from path_copies import Copies, check_copies_to_the_camera, check_going_straight_and_back, compare_copies, plan_of
 from renders import dr, mi
-from test_holes import assert_connections_go_on_through_many_holes
 from unbiased import FAR, load, render_ours
 
 from data_gen.film.splats import Splats
@@ -19,7 +18,6 @@ from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.light_path import Seen, light_path
 from data_gen.samplers.bdpt.strategies import to_camera
 from data_gen.samplers.bdpt.vertex import cosine
-from data_gen.scenes.builtin import _wall
 from ngpt_studies.gbdpt.same_light import seen_from_elsewhere
 
 
@@ -98,6 +96,7 @@ def test_there_is_no_way_to_what_is_too_smooth_nor_back(renderer):
 # ------------------------- Roulette -------------------------
 
 
+@pytest.mark.slow
 def test_roulette_leaves_differences_as_they_are(renderer, long_passes, monkeypatch):
     """Few shifts survive, of the same paths as without a roulette: so all the noise comes from the roulette."""
     from ngpt_studies.gbdpt import integrator, roulette
@@ -185,33 +184,3 @@ def test_what_the_camera_has_seen_is_found_again(renderer, name):
     assert np.isclose(found, theirs, rtol=1e-3, atol=1e-6).mean() > 0.99
     # What is kept of the vertex before is where the last edge begins.
     assert np.quantile(np.array(beside), 0.99) < 1e-3
-
-
-def test_mirrors_in_front_of_the_camera_are_followed(renderer, long_passes, monkeypatch):
-    """A wall of mirror shows the room as if through a window."""
-    from ngpt_studies.gbdpt import offset_path
-
-    def behind_a_mirror():
-        scene = corner()
-        del scene["mirror"]
-        scene["back"] = _wall([0, 1, -1.2], [0, 0, 1], (6, 3), {"type": "conductor", "material": "Al"})
-        return scene
-
-    def noise():
-        # Independent points: claims of four batches of a net go by few pixels here.
-        layers = render_ours(load(renderer, behind_a_mirror, (24, 24)), "gbdpt", 1, 256, points="independent")[0]
-        return layers["dx_var"].mean() + layers["dy_var"].mean()
-
-    followed = noise()
-
-    def reject(plan, step, y, none, si, bsdf):
-        return none, renderer.Spectrum(0), renderer.Float(0)
-
-    monkeypatch.setattr(offset_path, "replay", reject)
-    # What splats and the rest of the room add is the same in both.
-    assert followed < 0.8 * noise()
-
-
-@pytest.mark.slow
-def test_connections_go_on_through_many_holes(renderer):
-    assert_connections_go_on_through_many_holes(renderer, "gbdpt")

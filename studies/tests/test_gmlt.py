@@ -1,18 +1,14 @@
 """Metropolis chains over the random numbers of paths: their mutations, what they count, and what they find."""
 
-from pathlib import Path
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from unbiased import load, render_references
+from unbiased import load
 
 from data_gen.film import GradientFilm
 from data_gen.paths.camera import CameraSamples
 from data_gen.render import render_stack
-from data_gen.scenes.load import load_scene
-from ngpt.testing import z_test
 
 SIZE = (16, 12)
 
@@ -103,29 +99,3 @@ def test_numbers_that_do_not_change_make_the_same_path(monkeypatch, chains):
     assert steps >= 3 * 8 * SIZE[0] * SIZE[1]
     # Large steps lead to paths of other values, but for some that end with those of a candidate
     assert same / steps == pytest.approx(0.7, abs=0.03)
-
-
-def test_chains_accept_enough(renderer, monkeypatch):
-    """A floor: chains that never move would pass every test of the mean."""
-    from ngpt_studies.gmlt import integrator
-
-    rates, run = [], integrator.run
-
-    def noted(*args, **more):
-        rates.append(run(*args, **more))
-        return rates[-1]
-
-    monkeypatch.setattr(integrator, "run", noted)
-    render_stack(load(mi, "diffuse", SIZE), 8, 0, "gmlt", unbiased=True)
-    assert 0.6 < np.array(rates[0]).mean() < 0.98
-
-
-@pytest.mark.slow
-def test_light_through_a_door_ajar(renderer):
-    """The mean where chains do most of the work, and few candidates find any light."""
-    ajar = Path(__file__).parents[2] / "bench" / "scenes" / "ajar" / "scene.xml"
-    scene = load_scene(str(ajar), (16, 16), {"wall": "2.6"})  # 30 cm
-    references = render_references(renderer, scene, 24, 2048)
-    stacks = [render_stack(scene, 32, seed, "gmlt", unbiased=True)["primal"] for seed in range(16)]
-    result = z_test(np.stack(stacks), references)
-    assert result.passed, result

@@ -121,5 +121,6 @@ def test_pairs_that_merging_completes_are_the_same_from_both_ends(copies, t):
 
 
 @pytest.mark.slow
-def test_connections_go_on_through_many_holes(renderer):
-    assert_connections_go_on_through_many_holes(renderer, "gvcm")
+@pytest.mark.parametrize("sampler", ["gbdpt", "gvcm"])
+def test_connections_go_on_through_many_holes(renderer, sampler):
+    assert_connections_go_on_through_many_holes(renderer, sampler)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from full_stack import full_stack
-from networks import SPLIT, SPOT, STEP, close, image_of, learns, no_graph, wall
+from networks import SPLIT, close, image_of, no_graph
 from torch.nn.functional import avg_pool2d
 
 import ngpt
@@ -34,11 +34,6 @@ WRONG = [
 def test_configurations_that_cannot_be(change, message):
     with pytest.raises(NgptError, match=message):
         ModelConfig(**RIGHT | change)
-
-
-@pytest.mark.slow
-def test_it_learns():
-    assert learns(KPCN, wall(STEP, SPOT, 0.5), 0.35)
 
 
 def test_it_has_no_graph(tmp_path):

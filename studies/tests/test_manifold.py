@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ngpt_studies.gbdpt import manifold
-from ngpt_studies.gbdpt.manifold import MAX_EVENTS, REFLECT, REFRACT, Target, add_event, event, follow, shoot, walk
+from ngpt_studies.gbdpt.manifold import MAX_EVENTS, REFRACT, Target, add_event, event, follow, shoot, walk
 
 LANES = 4096
 
@@ -219,24 +219,3 @@ def test_walks_that_arrive_by_another_way_are_left_out(renderer, monkeypatch):
         back, _, _ = chains.walk(chains.z, dr.normalize(shot.first - chains.z.p))
         shares.append((np.array(dr.norm(back - chains.ω))[np.array(found)] > 1e-3).mean())
     assert shares[0] == 0 and shares[1] > 0.002
-
-
-def test_a_walk_begins_at_the_first_event_of_the_other(renderer):
-    """The same direction from a vertex further away than a small mirror is large would miss it."""
-    chains = Chains(sphere({"type": "conductor"}, radius=0.2), distance=0.25)
-    *_, found = chains.follow()
-    base = np.array(chains.found & chains.base.good)
-    *_, arrives = chains.walk(chains.z1, chains.ω)
-    assert np.array(found)[base].mean() > 0.9 > 0.8 > np.array(arrives)[base].mean()
-
-
-def test_what_is_not_followed(renderer):
-    """Another number of events, a chain that cannot be taken, and a surface whose bumps turn rays."""
-    chains = Chains(sphere(GLASS))
-    chains.events = mi.UInt32(REFLECT) | dr.opaque(mi.UInt32, REFLECT << 2)
-    assert not np.array(chains.shoot(chains.z, chains.ω).good).any()
-    waves = np.sin(np.linspace(0, 60, 256, dtype=np.float32)) * np.ones((32, 1), np.float32)
-    texture = {"type": "bitmap", "bitmap": mi.Bitmap(waves[..., None]), "raw": True}
-    bumps = {"type": "bumpmap", "arbitrary": texture, "scale": 0.05, "bsdf": {"type": "conductor"}}
-    chains = Chains(sphere(bumps))
-    assert np.array(chains.base.good & chains.found).mean() < 0.1

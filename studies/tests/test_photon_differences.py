@@ -16,7 +16,6 @@ from data_gen.paths.walk import Limits
 from data_gen.render import render_stack
 from ngpt.io.exr import pass_through
 from ngpt_studies.photons.gradients.camera import CameraPaths
-from ngpt_studies.photons.gradients.differences import Gathered
 
 
 def without_glass():
@@ -26,23 +25,6 @@ def without_glass():
     return scene
 
 
-@pytest.fixture
-def by_planes_alone(monkeypatch):
-    """What changes a sampler of that name into one without beams."""
-    from ngpt_studies.photons.media.gplanes import GPLANES, NearPlanes
-    from ngpt_studies.photons.media.planes import planes_of
-
-    def near(integrator, passes, traced):
-        yield Gathered(None, NearPlanes(planes_of(passes, traced)))
-
-    def sampler_of(name):
-        if name == "planes alone":
-            monkeypatch.setattr(GPLANES, "near", near)
-        return "gplanes" if name == "planes alone" else name
-
-    return sampler_of
-
-
 # How passes are rendered whose differences are judged
 GRADIENTS = {
     "gpm": {"radius": 0.7, "photons": 2},
@@ -50,7 +32,6 @@ GRADIENTS = {
     "gbre": {"radius": 0.7, "photons": 2},
     "gbeams": {"radius": 0.5, "photons": 1},
     "gplanes": {"radius": 0.5},
-    "planes alone": {"planes": 144},
     "gvcm": {"radius": 0.7},
 }
 IN_FOG = [("colours", 4), ("haze", 1), ("haze", 4), ("forward", 4), ("dense", 4), ("nested", 4), ("milk", 4)]
@@ -65,16 +46,16 @@ ON_SURFACES = [("areas", 4), ("areas", 1), ("glass", 1), ("points", 1), ("points
         [("gpm", "glass", 4, {}), ("gvcm", "glass", 4, {"radius": 0.5})],
         # Where nothing but merging does. Over four pixels no photon is near to both.
         [("gvcm", "seen_through_glass", 1, {"radius": 2.0}), ("gvcm", "caustics", 4, {}), ("gvcm", "areas", 4, {})]
-        + [("gvcm", "glass", 4, {"radius": 0.1}), ("planes alone", "colours", 4, {})]
+        + [("gvcm", "glass", 4, {"radius": 0.1})]
         + [("gpm", *case, {}) for case in ON_SURFACES]
         + [(s, *case, {}) for s in ("gvpm", "gbre", "gbeams", "gplanes") for case in IN_FOG]
         + [("gvpm", *case, {}) for case in IN_GRIDS],
     ),
 )
-def test_differences_are_those_of_the_image(renderer, by_planes_alone, sampler, name, pixels, options):
+def test_differences_are_those_of_the_image(renderer, sampler, name, pixels, options):
     """In one pass after another: with the same photons, so that the noise of both falls out in part."""
     scene = load(renderer, without_glass if name == "sky" else named(name), (12, 12))
-    stacks = passes(scene, 32, pixels, by_planes_alone(sampler), **GRADIENTS[sampler] | options)
+    stacks = passes(scene, 32, pixels, sampler, **GRADIENTS[sampler] | options)
     assert np.mean([stack["primal"].mean() for stack in stacks]) > 0.01
     assert_no_bias(stacks, pixels)
 
@@ -115,16 +96,14 @@ def test_the_primal_is_that_of_the_sampler_without_gradients(renderer, pair, nam
             ("gbeams", "fog", 32, {"radius": 0.5}, 0.15, 3, 5),
             # Where a grid is empty there are none: more fail than in fog.
             ("gvpm", "wisps", 24, {"radius": 0.7, "photons": 8}, 0.2, 6, 15),
-            # Measured, 48x48: 0.02, 66 and 106
-            ("planes alone", "haze", 32, {}, 0.1, 10, 20),
         ],
     ),
 )
 def test_there_are_copies_and_differences_have_little_noise(
-    renderer, by_planes_alone, sampler, name, size, options, fails, mean, median
+    renderer, sampler, name, size, options, fails, mean, median
 ):
     """No z-test asks for that: a sampler that rejects every shift is unbiased."""
-    scene, sampler = load(renderer, named(name), (size, size)), by_planes_alone(sampler)
+    scene = load(renderer, named(name), (size, size))
     if fails:
         stack = render_stack(scene, 2, 0, sampler, diagnostics=True, unbiased=True, **options)
         assert pass_through(stack)["diagnostics.shiftFailures"].mean() < fails

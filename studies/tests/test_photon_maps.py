@@ -90,5 +90,6 @@ def test_photons_are_those_of_maps_without_light_paths(renderer, scene, edges):
             assert np.array_equal(one_of, other_of), name
 
 
+@pytest.mark.slow
 def test_kernels_are_recorded_once_and_make_the_same_bits(renderer, monkeypatch, recordings):
     assert_recorded_once(renderer, monkeypatch, recordings, "gpm", least=8)

@@ -13,10 +13,8 @@ from scipy.spatial import cKDTree
 from unbiased import load
 
 from data_gen.paths import media
-from data_gen.paths.camera import CameraSamples
 from data_gen.paths.light_ends import LightEnds, World
 from data_gen.paths.vertex import Materials
-from data_gen.samplers import find
 from data_gen.samplers.photons.map.fog import Fog
 from ngpt_studies.photons.gradients import shift as shifts
 from ngpt_studies.photons.gradients.copies import LightPaths, copy
@@ -284,32 +282,3 @@ def test_planes_turn_to_and_fro(rays):
         return shifts.about(a, d, e2, g.u + g.e * crossing(a, d, e2, g.o, g.d).u)[0]
 
     assert_told(area_ratio(g, copied, 1e-6), shifts.jacobian_of_planes(at.t, at.volume, t1, there.volume), 1e-5, 0.95)
-
-
-@pytest.mark.parametrize("name", ["forward", *(pytest.param(n, marks=pytest.mark.slow) for n in ("haze", "nested"))])
-def test_copies_of_planes_are_planes_and_their_copies_are_the_planes(renderer, name):
-    """Laws of light paths in a scene: r(T(x)) r(x) = 1, T(T(x)) = x, and Φ'' = Φ."""
-    from ngpt_studies.photons.media.gplanes import copied
-    from ngpt_studies.photons.media.planes import crossing, planes_of
-
-    mi, rng, n = renderer, np.random.default_rng(0), 1 << 12
-    made = find("gplanes").made(load(mi, getattr(media_scenes, name), (8, 8)), planes=n)
-    camera = CameraSamples(made.world.scene.sensors()[0], 0, n // 64)
-    planes = planes_of(made, next(made.integrator.maps(made, camera))).planes
-    k, eye = len(planes), np.array(made.world.fog.eye)
-    middle = rng.normal(size=(3, k)) * 0.4 - eye
-    A, B = (ray(mi, eye, middle + rng.normal(size=(3, k)) * spread, planes.medium) for spread in (0, 0.02))
-    at = crossing(planes.a, planes.d, planes.e, A.o, A.d)
-    met = (at.s > 0) & (at.s < planes.length) & (at.t > 0) & (at.u > 0) & (dr.abs(at.volume) > 1e-3)
-    moved, there, _, r, good = copied(planes, at, B)
-    back, again, _, r_back, good_back = copied(moved, there, A)
-    good &= met & (dr.abs(there.volume) > 1e-3)
-    good, good_back = np.array(good), np.array(good_back)
-    assert good.sum() > 0.85 * np.array(met).sum() > 300 and (good & good_back).sum() > 0.99 * good.sum()
-    good &= good_back
-    error = np.abs(np.array(r * r_back, np.float64) - 1)[good]
-    assert np.median(error) < 1e-4 and np.quantile(error, 0.95) < 1e-2 and np.std(np.log(np.array(r)[good])) > 1e-2
-    away = np.linalg.norm(np.array(back.e) - np.array(planes.e), axis=0)[good]
-    assert np.median(away) < 1e-5 and np.quantile(away, 0.95) < 1e-3
-    assert np.quantile(np.abs(np.array(again.s) - np.array(at.s))[good], 0.9) < 1e-3
-    assert np.allclose(np.array(back.Φ)[:, good], np.array(planes.Φ)[:, good], rtol=1e-2)

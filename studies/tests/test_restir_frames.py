@@ -45,10 +45,6 @@ def test_frames_have_all_layers(frames):
     assert confidence[0] == 1 and confidence[0] < confidence[1] < confidence[2] <= 3
 
 
-def test_one_chain_has_no_variance(renderer):
-    assert not [name for name in rendered(range(2), spp=1)[1].names if name.endswith("_var")]
-
-
 def test_a_shot_is_gone_on_with_after_the_frames_before(frames):
     """With all frames before it, a frame has the same bits; they are not given."""
     later = rendered(skip=lambda frame: frame < 2)
@@ -64,6 +60,7 @@ def test_a_gap_is_bridged_by_so_many_frames_and_no_more(renderer, monkeypatch):
     assert list(found) == [0, 4] and confidence[0] == 1 and 1 < confidence[4] <= 2
 
 
+@pytest.mark.slow
 def test_variances_are_those_over_seeds(renderer):
     """The law of the mean over chains; and differences are not half of themselves."""
     found = [rendered(range(2), spp=16, seed=seed)[1] for seed in range(6)]
@@ -107,26 +104,9 @@ def test_crop_windows_are_of_one_size(renderer, tmp_path):
     assert_sizes_may_not_change(tmp_path, sampler="restir")
 
 
-@pytest.mark.parametrize(
-    ("words", "status", "message"),
-    [
-        ("-o made --time 9", 1, "renders a number of samples, not for a time: use --spp"),
-        ("-o made -O history=0", 2, "sampler 'restir', option 'history': '0' is not allowed"),
-        ("-o a.png --denoise wcv", 2, "sampler 'restir' renders none"),
-    ],
-)
-def test_what_is_refused_prints_a_line_and_leaves_nothing(renderer, command, tmp_path, words, status, message):
-    assert message in command(f"render diffuse --frames 0:2 --sampler restir {words}", status).err
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_change_that_changes_nothing_gives_the_same_frames(renderer, frames):
-    """Two scenes in turn, and all records carried from one to the other."""
-    changing = rendered(update=lambda params, frame: None)
-    for name in ("primal", "dx", "dy", "motion"):
-        same = np.isclose(changing[2][name], frames[2][name], rtol=1e-3, atol=1e-5, equal_nan=True).all(axis=-1)
-        assert same.mean() > 0.95, name
-    assert changing[2].attributes["ngpt:confidence"] == frames[2].attributes["ngpt:confidence"]
+def test_what_is_refused_prints_a_line_and_leaves_nothing(renderer, command, tmp_path):
+    told = command("render diffuse --frames 0:2 --sampler restir -o a.png --denoise wcv", 2).err
+    assert "sampler 'restir' renders none" in told and not list(tmp_path.iterdir())
 
 
 SCENE = """<scene version="3.0.0"><default name="power" value="1"/>
@@ -158,7 +138,6 @@ def test_a_scene_that_is_loaded_anew_in_each_frame_keeps_its_history(renderer, t
 def test_media_are_refused():
     assert "media" in FRAME_SAMPLERS["restir"].refuses(Facts("path", ("fog",)))
     assert "volpath" in FRAME_SAMPLERS["restir"].refuses(Facts("volpath", ()))
-    assert not FRAME_SAMPLERS["restir"].refuses(Facts("path", ()))
 
 
 def test_the_command_renders_a_shot_with_options(renderer, tmp_path):

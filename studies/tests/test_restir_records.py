@@ -1,6 +1,6 @@
 """Records of paths: evaluated in their own pixel they give what was recorded, and there and back is where they were."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from restir_shots import SIZE, Candidates, Room, close, inverse, worth
 
-from data_gen.paths.shift import reconnection_jacobian
 from data_gen.paths.space import Filled
 from data_gen.paths.walk import Limits
 from data_gen.scenes.builtin import _camera, _diffuse, _sphere, _wall
 from ngpt.errors import NgptError
-from ngpt_studies.restir.record import MOST_VERTICES, STUCK, empty, geometry_of, word_of
+from ngpt_studies.restir.record import STUCK
 from ngpt_studies.restir.stage import check
 
 
@@ -48,24 +47,6 @@ def place(record, move):
     return mi.Point2f(record.place + mi.Vector2f(*(dr.opaque(mi.Float, m) for m in move)))
 
 
-def test_kind_and_depth_share_a_word_and_a_record_takes_80_bytes(renderer):
-    for kind, *numbers in (
-        (STUCK, 0, 9, True),
-        (0, MOST_VERTICES, 0, False),
-        (3, 7, MOST_VERTICES, True),
-    ):
-        replayed, behind, sampled = numbers
-        word = word_of(*(mi.UInt32(n) for n in (kind, replayed, behind)), mi.Bool(sampled))
-        record = replace(empty(1), word=word)
-        assert [v[0] for v in (record.kind, record.replayed, record.behind, record.sampled)] == [kind, *numbers]
-
-    def words(value):
-        return sum(map(words, value)) if dr.depth_v(value) > 1 else 1
-
-    record = empty(3)
-    assert 4 * sum(words(getattr(record, f.name)) for f in fields(record)) == 80
-
-
 def test_a_record_is_worth_in_its_own_pixel_what_was_recorded(paths):
     f, J, _ = worth(paths.stage, paths.record)
     for kind in set(paths.kind[paths.lit]) - {STUCK}:
@@ -98,34 +79,8 @@ def test_there_and_back_is_where_it_was(paths, move):
     assert (np.abs(J[exists] - 1) > 1e-3).sum() > 100
 
 
-class Displaced:
-    """The camera samples of ``camera``, ``move`` pixels from where they are."""
-
-    def __init__(self, camera, move):
-        self.pixel, self.random, self.position = camera.pixel, camera.random, camera.position
-        self.rays = lambda: camera.rays(move)
-
-
-@pytest.mark.parametrize("move", [(1, 0), (5, 3)])
-def test_a_walk_from_there_would_reconnect_at_the_same_vertex(paths, move):
-    """What has been replayed must be replayed by the reverse shift: no vertex of it may be joined."""
-    f, _, _ = worth(paths.stage, paths.record, place(paths.record, move))
-    other = paths.walk(Displaced(paths.camera, move))
-    # Of the kinds that tell where the walk from there has its rc
-    tells = (np.array(other.W) > 0) & np.isin(np.array(other.record.kind), (1, 2, 3, 5)) & paths.lit & f.any(axis=0)
-    assert tells.sum() > 100
-    assert (np.array(other.record.replayed) >= np.array(paths.record.replayed))[tells].all()
-
-
 def test_beyond_the_film_there_are_no_paths(paths):
     assert not worth(paths.stage, paths.record, place(paths.record, (SIZE, 0)))[0].any()
-
-
-def test_geometry_makes_the_jacobian_of_a_reconnection(renderer, rng):
-    x, y, target, normal = (rng.normal(size=(3, 64)).astype(np.float32) for _ in range(4))
-    n, at = mi.Normal3f(normal / np.linalg.norm(normal, axis=0)), mi.Point3f(target)
-    J = reconnection_jacobian(mi.Point3f(x), mi.Point3f(y), at, n)
-    assert np.allclose(np.array(geometry_of(n, at, mi.Point3f(y)) / geometry_of(n, at, mi.Point3f(x))), J, rtol=1e-3)
 
 
 @pytest.mark.parametrize("option", ["limits", "space"])

@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from ngpt_studies.restir.reservoir import choose, difference, part, weigh, weight_of
+from ngpt_studies.restir.reservoir import choose, difference, weigh, weight_of
 
 # Of five paths: light in two pixels, of which the second does not have the last; densities of either's candidates.
 LIGHT = np.array([[0.2, 1.5, 0.7, 0.05, 2.0], [0.4, 1.0, 0.1, 0.6, 0.0]])
@@ -39,14 +39,6 @@ def test_what_is_kept_of_all_that_is_offered_is_unbiased(renderer, M, both):
     assert np.sum(probability * estimate) == pytest.approx(here.sum(), rel=3e-3)
 
 
-def test_a_path_is_kept_in_proportion_to_its_weight(renderer, rng):
-    weights = [0.5, 0.0, 1.5, 2.0, 0.0]
-    u = (np.arange(1000) + 0.5) / 1000
-    chosen, total = choose([mi.Float(w) for w in weights], mi.Float(u))
-    assert np.allclose(np.array(total), 4)
-    assert np.allclose(np.bincount(np.array(chosen), minlength=5) / 1000, np.array(weights) / 4, atol=1e-3)
-
-
 def test_of_nothing_comes_nothing(renderer):
     """Paths without light, or with weights that are not finite, add nothing."""
     for W in (0.0, np.inf, np.nan):
@@ -66,10 +58,3 @@ def test_a_difference_counts_each_path_once(renderer, rng):
     assert np.allclose(np.array(sides[0] + sides[1]), b - a, atol=1e-5)
     # What only the first pixel can see, only the first can sample.
     assert np.allclose(np.array(sides[0])[:, :10], -a[:, :10])
-
-
-def test_a_difference_is_its_positive_less_its_negative_part(renderer, rng):
-    values = rng.normal(size=(3, 30)).astype(np.float32)
-    parts = [np.array(part(mi.Spectrum(values), sign)) for sign in (1, -1)]
-    assert all((p >= 0).all() for p in parts)
-    assert np.array_equal(parts[0] - parts[1], values)

@@ -13,7 +13,6 @@ from unbiased import assert_unbiased, load, render_ours
 import ngpt
 from data_gen.render import render_stack
 from ngpt.cli import main
-from ngpt.layers import LAYERS
 from ngpt.merging import merge
 from ngpt.testing import z_test
 
@@ -60,7 +59,7 @@ def test_diffuse_light_is_that_of_the_same_materials_without_gloss(renderer):
 
 
 def shares(mi, description, n=2000):
-    """The share of diffuse lobes at random pairs of directions, f of them alone, of the others alone, of all."""
+    """The share of diffuse lobes at random pairs of directions, f of all lobes, and the cosines of the directions."""
     from ngpt_studies.split import Lobes
 
     scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle", "bsdf": description}})
@@ -70,46 +69,15 @@ def shares(mi, description, n=2000):
     wi, wo = rng.normal(size=(2, 3, n))
     si.wi = dr.normalize(mi.Vector3f(wi[0], wi[1], abs(wi[2])))
     wo = dr.normalize(mi.Vector3f(wo))
-    masks = int(mi.BSDFFlags.Diffuse), ~int(mi.BSDFFlags.Diffuse) & 0xFFFFFFFF, 0xFFFFFFFF
-    contexts = [mi.BSDFContext() for _ in masks]
-    for context, mask in zip(contexts, masks, strict=True):
-        context.type_mask = mask
-    evaluated = [np.nan_to_num(np.array(si.bsdf().eval(context, si, wo))) for context in contexts]
-    share = Lobes(scene).diffuse(si, wo, mi.Bool(True))
-    cosines = np.array(wo.z), np.array(si.wi.z)
-    return np.array(share), *evaluated, cosines
-
-
-@pytest.mark.slow
-def test_materials_hear_the_mask_but_for_those_that_are_known_not_to(renderer):
-    """The day a principled material fails this, it may go from ``lobes.DEAF``."""
-    coated = {"type": "roughplastic", "alpha": 0.2}
-    flat = renderer.Bitmap(np.full((4, 4), 0.5, np.float32))
-    up = renderer.Bitmap(np.full((4, 4, 3), (0.5, 0.5, 1), np.float32))
-    up = {"type": "bitmap", "bitmap": up, "raw": True}
-    hearing = {
-        **coats(),
-        "bump": {"type": "bumpmap", "t": {"type": "bitmap", "bitmap": flat, "raw": True}, "nested": coated},
-        "normals": {"type": "normalmap", "normalmap": up, "nested": coated},
-        "pplastic": {"type": "pplastic", "alpha": 0.2},
-        "metal": {"type": "roughconductor", "alpha": 0.3},
-        "frosted": {"type": "roughdielectric", "alpha": 0.3},
-        "both": {"type": "blendbsdf", "weight": 0.3, "one": {"type": "twosided", "n": coated}, "two": coated},
-    }
-    for name, description in hearing.items():
-        share, diffuse, others, all_of_it, _ = shares(renderer, description)
-        np.testing.assert_allclose(diffuse + others, all_of_it, rtol=1e-4, atol=1e-6, err_msg=name)
-        np.testing.assert_allclose(share * all_of_it, diffuse, rtol=1e-4, atol=1e-6, err_msg=name)
-    for description in (principled(metallic=0.3), {"type": "principledthin", "roughness": 0.4}):
-        _, diffuse, others, all_of_it, _ = shares(renderer, description)
-        assert (diffuse + others).mean() > 1.9 * all_of_it.mean()
+    f = np.nan_to_num(np.array(si.bsdf().eval(mi.BSDFContext(), si, wo)))
+    return np.array(Lobes(scene).diffuse(si, wo, mi.Bool(True))), f, np.array(wo.z), np.array(si.wi.z)
 
 
 @pytest.mark.parametrize(("metallic", "spec_trans"), [(0.3, 0.0), (0.0, 0.0), (1.0, 0.0), (0.2, 0.5)])
 def test_the_diffuse_part_of_principled_materials_is_lamberts(renderer, metallic, spec_trans):
     bare = principled(metallic=metallic, spec_trans=spec_trans)["nested"]
     for description in (bare, principled(metallic=metallic)) if not spec_trans else (bare,):
-        share, _, _, f, (out, into) = shares(renderer, description)
+        share, f, out, into = shares(renderer, description)
         lambert = (1 - metallic) * (1 - spec_trans) * np.array([[0.7], [0.4], [0.2]]) * np.abs(out) / np.pi
         expected = np.where(out * into > 0, np.minimum(lambert, f), 0)
         np.testing.assert_allclose(share * f, expected, rtol=1e-3, atol=1e-6)
@@ -123,12 +91,8 @@ def test_files_and_merged_stacks_hold_the_parts(renderer, tmp_path, capsys):
     assert main(["info", str(path)]) == 0
     told = capsys.readouterr().out
     assert read.names == stacks[0].names
-    for name in (*PARTS, *(f"{name}_var" for name in PARTS)):
+    for name in PARTS:
         one, other = (stack[name] for stack in stacks)
         np.testing.assert_allclose(read[name], one, rtol=1e-3, atol=1e-4)
-        assert name in told and read[name].dtype == np.float32
-        assert LAYERS[name].float_on_disk == name.endswith("_var")
-        if name in PARTS:
-            np.testing.assert_allclose(merged[name], (one + other) / 2, rtol=1e-5, atol=1e-6)
-        else:  # about half of that of either
-            assert 0.3 < merged[name].mean() / np.mean([one, other]) < 0.7
+        np.testing.assert_allclose(merged[name], (one + other) / 2, rtol=1e-5, atol=1e-6)
+        assert name in told and f"{name}_var" in read.names
