@@ -9,7 +9,7 @@ from ngpt.network.config import KINDS
 from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.oidnet import SHAPES
 from ngpt.network.safetensors import save_weights
-from ngpt.network.transfer import signed_exp, signed_log
+from ngpt.network.transfer import signed_exp
 
 ALL = ("primal", "dx", "dy", "albedo", "normal", "depth")
 SPLIT = ("primal", "diffuse", "specular", "diffuse_se", "specular_se", "albedo", "normal")
@@ -86,37 +86,6 @@ def image_of(prediction, given, head):
 
 def close(one, other):
     return torch.allclose(one, other, rtol=1e-4)
-
-
-def wall(light, gloss, noise):
-    """Layers of a wall with paint in light and a highlight, with noise, and what they are without."""
-    torch.manual_seed(0)
-    albedo = 0.05 + 0.9 * torch.rand(1, 3, 32, 32)
-    layers = {name: torch.rand(1, 3, 32, 32) for name in SPLIT} | {"albedo": albedo}
-    for name, part in (("diffuse", albedo * light), ("specular", gloss)):
-        layers[name] = part * (1 + noise * torch.randn(part.shape)).clamp(min=0.1)
-    return layers | {"primal": layers["diffuse"] + layers["specular"]}, albedo * light + gloss
-
-
-STEP, SPOT = torch.ones(1, 3, 32, 32), torch.zeros(1, 3, 32, 32)
-STEP[..., 13:], SPOT[..., 20:, :] = 6, 9
-
-
-def learns(config, scene, bound):
-    """Whether it falls far below the noise of the input, by the factor ``bound``, and below equal kernels."""
-    torch.manual_seed(0)
-    model, (layers, clean) = Reconstructor(config), scene
-    optimizer = torch.optim.Adam(model.parameters(), 1.5e-2)
-
-    def loss(image):
-        return (signed_log(image) - signed_log(clean)).square().mean()
-
-    first = loss(model(layers)).item()
-    for _ in range(60):
-        optimizer.zero_grad()
-        loss(model(layers)).backward()
-        optimizer.step()
-    return loss(model(layers)).item() < min(0.35 * first, bound * loss(layers["primal"]).item())
 
 
 def no_graph(folder, config):

@@ -1,13 +1,12 @@
 """``bench.judging``: cells that go on where a run ended, and errors by references that are known."""
 
 import json
-import sys
 
 import pytest
 from folders import smooth_image
 
 import ngpt
-from bench.judging import Cells, Judge, command, parsed
+from bench.judging import Cells, Judge
 from ngpt.denoisers import oidn
 from ngpt.stack import GradientStack
 
@@ -37,13 +36,6 @@ def test_cells_are_written_one_by_one_and_not_measured_twice(tmp_path, capsys):
         ("room", 4, 1.0),
     ]
     assert capsys.readouterr().out.splitlines()[-1] == "room 4 1.00 s"
-
-
-def test_scenes_need_a_folder_of_references(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["bench", "diffuse"])
-    with pytest.raises(SystemExit):
-        parsed(command("doc", "test", "8x6", (4,)))
-    assert "give the folder of --references" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())

@@ -171,7 +171,6 @@ def test_weights_that_cannot_be_loaded_are_said_before_any_work(tmp_path):
     ("entry", "message"),
     [
         ("colour = 1", "unknown key 'colour'"),
-        ('spp = "4"', "spp = '4': must be a list of whole numbers, like [4, 16, 64]"),
         ("spp = [4.5]", "spp = [4.5]: must be a list of whole numbers"),
         ("seeds = 0", "must be at least 1"),
         ('metrics = ["beauty"]', "no metric 'beauty'"),
@@ -182,7 +181,6 @@ def test_weights_that_cannot_be_loaded_are_said_before_any_work(tmp_path):
         ("[variants.x]\nalpha = 1", "variants.x: method is missing"),
         ('[variants.x]\nmethod = "l1"\nalhpa = 1', "method 'l1' has no option 'alhpa'; did you mean 'alpha'?"),
         ('[variants.x]\nmethod = "l1"\nalpha = "much"', "method 'l1', option 'alpha': 'much' is not allowed"),
-        ("samplers = []", "samplers and rivals must not be empty"),
         ('samplers = ["gpt", "gpt"]', "a sampler is listed twice"),
         ("rivals = [1]", "must be a list of str"),
         (
@@ -192,8 +190,6 @@ def test_weights_that_cannot_be_loaded_are_said_before_any_work(tmp_path):
         ),
         ('[references]\nroom = ["a.exr"]', "references.room = ['a.exr']: must be a file, or a list of two files"),
         ('[against]\noidn = ["oidm"]', "against.oidn: there is no column 'oidm' among: primal, l1, wcv"),
-        ("[against]\noidn = []", "against.oidn is empty"),
-        ('[against]\noidn = "oidn"', "against.oidn = 'oidn': must be a list of columns' names"),
     ],
 )
 def test_errors_of_the_configuration(tmp_path, entry, message):
@@ -214,8 +210,6 @@ def test_a_configuration_may_build_on_another(tmp_path):
         config.scene_files()
     with pytest.raises(NgptError, match=r"none\.toml: not found"):
         read('base = "none.toml"\n', tmp_path)
-    with pytest.raises(NgptError, match=r"config\.toml: base = 'config\.toml': must be the name of another file"):
-        read('base = "config.toml"\n', tmp_path)
     (tmp_path / "main.toml").write_text('base = "config.toml"\n')
     with pytest.raises(NgptError, match=r"main\.toml: base = 'config\.toml': .* which is not built on this one"):
         read('base = "main.toml"\n', tmp_path)

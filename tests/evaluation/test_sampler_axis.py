@@ -177,15 +177,12 @@ def test_two_samplers_at_equal_time(renderer, tmp_path, monkeypatch):
     for old, new in (("primal", "primal (primal)"), ("wcv", "wcv (gpt)")):
         mine = [cell["metrics"] for cell in before["cells"] if cell["method"] == old]
         assert mine == [cells[new, seed]["metrics"] for seed in range(2)]
-    # Stacks of their own, under names of their own; gpt's are the usual ones.
+    # Stacks of their own, and two references
     cache = out / "cache"
     assert "albedo" not in ngpt.read(next(cache.glob("diffuse-*/path-*-0.exr")))
     stack = ngpt.read(next(cache.glob("diffuse-*/gradients-gpt-basic-*-1.exr")))
     assert stack.attributes["ngpt:sampler"] == "gpt-basic"
-    assert not list(cache.glob("*/gradients-gpt-[0-9]*")) and len(list(cache.glob("diffuse-*/gradients-8-1.exr"))) == 1
-    references = sorted(cache.glob("diffuse-*/reference*"))
-    assert [path.name for path in references] == ["reference-128spp-a.exr", "reference-128spp-b.exr"]
-    seeds = {ngpt.read(path).attributes["ngpt:seed"] for path in references}
+    seeds = {ngpt.read(path).attributes["ngpt:seed"] for path in cache.glob("diffuse-*/reference*")}
     assert len(seeds) == 2 and results["scenes"]["diffuse"]["reference"]["spp"] == 128
     # Another clock: the nominal samples are those of gpt-basic, of which gpt has more.
     slow = evaluated(read(SETTINGS + 'clock = "gpt-basic"\n', tmp_path), out)

@@ -1,9 +1,9 @@
-"""The arithmetic of ``bench.seeds``: real over claimed noise, and its table."""
+"""The arithmetic of ``bench.seeds``: real over claimed noise."""
 
 import numpy as np
 import pytest
 
-from bench.seeds import HEAD, errors, noise, rows, spread
+from bench.seeds import noise
 from ngpt.shared import shared_variance
 
 SEEDS, SHAPE, CELL = 64, (64, 64, 3), 16
@@ -38,20 +38,3 @@ def test_noise_that_is_as_claimed_by_half_or_not_at_all(rng):
     assert noise(stacks)["deviation"] == pytest.approx((sum(whole) / whole[0]) ** 0.5, rel=0.2)
     silent = noise([{"primal": np.ones(SHAPE), "primal_var": np.zeros(SHAPE)}] * 2)
     assert silent == {"deviation": None, "blocks": {"8": {}, "32": {}}}
-
-
-def cell(spp, tails, seconds, error, worst=None):
-    place = {"scene": "room", "size": "8x8", "spp": spp, "tails": tails, "seeds": 4}
-    values = {"light": spread([0.5, 1.0, 1.2]), "deviation": None, "blocks": {"8": {"sum": 1, "median": 2}, "32": {}}}
-    return place | values | {"seconds": seconds, "error": errors([error, error, worst or error])}
-
-
-def test_errors_are_over_those_of_whole_paths_at_the_same_time():
-    """Whole paths have an error of 1 / seconds."""
-    cells = [cell(4, "paths", 4.0, 1 / 4), cell(16, "paths", 16.0, 1 / 16), cell(4, "shared", 8.0, 1 / 16, 1.0)]
-    found = {line[2]: dict(zip(HEAD, line, strict=True)) for line in rows(cells) if line[1] == "4"}
-    mean = (1 / 16) ** (2 / 3)
-    assert found["shared"]["error at equal time"] == f"{mean * 8:.2f}" and found["paths"]["error at equal time"] == "-"
-    assert found["shared"]["worst / median"] == "16.00" and found["shared"]["8x8, median"] == "1, 2"
-    assert found["shared"]["least .. most"] == "0.500 .. 1.200" and found["shared"]["light"] == "0.9000"
-    assert rows(cells[1:])[-1][-1] == "-"

@@ -6,7 +6,7 @@ import pytest
 from folders import evaluated, read, write_scene
 
 from bench import evaluated as tables
-from bench.wholetime import against_rivals, envelope
+from bench.wholetime import against_rivals
 from ngpt.evaluation import cells
 
 
@@ -112,15 +112,3 @@ def test_an_evaluation_holds_its_methods_against_rivals(tmp_path, rng, capsys, m
     plot = ElementTree.parse(tmp_path / "out" / "frontier-rooms.svg")
     texts = [element.text for element in plot.iter("{http://www.w3.org/2000/svg}text")]
     assert {"path", "l2", "nfor"} <= set(texts) and "raw" not in texts
-
-
-def test_an_envelope_goes_from_the_quickest_to_the_slowest_setting():
-    results = made({"ours": [(4, 0.7, 0.9)], **RIVALS}, ("a", "b"))
-    points = envelope(results, "oidn", ["a", "b"])
-    quick = [2 * (2 / t) ** 0.5 for t, _ in points]
-    best = [min(q, 8 / t) if t >= 16 else q for q, (t, _) in zip(quick, points, strict=True)]
-    assert [error for _, error in points] == pytest.approx(best)
-    assert envelope(made({"ours": [(4, 0.7, 0.9)]}), "oidn", ["a"]) == []
-    # A mean over one scene is no rival of means over two.
-    results["summary"] = [row for row in results["summary"] if row["scene"] == "a" or row["method"] == "ours"]
-    assert envelope(results, "oidn", ["a", "b"]) == [] != envelope(results, "oidn", ["a"])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from capi import MISSING_LAYER, OK, PRIMAL, WEIGHTS, Job, Network, agree, example, in_python, place, result, those
+from capi import MISSING_LAYER, OK, WEIGHTS, Job, Network, agree, example, in_python, place, result, those
 
 from ngpt.methods import reconstruct
 from ngpt.network.inputs import DENOISED, Oidn, base_image, denoised
@@ -57,18 +57,6 @@ def test_a_network_that_corrects_another_denoiser(library):
     for memory in (0, 60):
         assert job.run(memory) == OK, job.message()
         agree(job.image, expected_image)
-
-
-def test_the_tiles_are_those_of_python(primal):
-    from ngpt.network.run_onnx import Network as InPython
-
-    python = InPython(PRIMAL)
-    # What two thirds of the image take
-    memory = 2 * 200 * 900 * python.bytes // (3 * 2**20)
-    layers, fractions = those(primal, example(200, 900)), []
-    result(primal, layers, memory, progress=lambda fraction: fractions.append(fraction) or 0)
-    assert len(set(fractions)) == len(python.plan(200, 900, memory)[0]) + 1 > 2
-    assert (fractions[0], fractions[-1]) == (0, 1) and fractions == sorted(fractions)
 
 
 def test_tiles_agree_with_the_whole_and_may_be_written_where_a_layer_is(fast):

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from capi import HEADER, PRIMAL, SOURCE, Network, command, example, result, those, tool
+from capi import HEADER, SOURCE, command, tool
 
 import ngpt
 
@@ -119,26 +119,3 @@ def test_python_as_the_docs_show(prefix):
     environment = os.environ | {"LD_LIBRARY_PATH": str(prefix / "lib")}
     outcome = subprocess.run([sys.executable, "-c", shown("python")], env=environment, capture_output=True, text=True)
     assert outcome.stdout == f"{ngpt.__version__}\n", outcome.stderr
-
-
-def resident() -> int:
-    """KiB of this process."""
-    with open("/proc/self/status") as file:
-        return int(re.search(r"VmRSS:\s+(\d+)", file.read())[1])
-
-
-def test_memory_stays_the_same(library):
-    layers = example(40, 40)
-
-    def work(turns):
-        for _ in range(turns):
-            network = Network(library, PRIMAL)
-            for _ in range(5):
-                result(network, those(network, layers))
-            network.close()
-
-    work(3)
-    before = resident()
-    work(8)
-    # A network is 2.7 MB, what it takes to run 3 MB.
-    assert resident() - before < 8 * 1024

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from networks import PYRAMID, SPOT, close, image_of, learns, no_graph, plain, wall
+from networks import close, image_of, no_graph
 from torch.nn.functional import avg_pool2d
 
 from ngpt.network.heads import Mixture, Pyramid, Residual
@@ -69,11 +69,6 @@ def test_texture_of_the_albedo_is_not_averaged():
     assert Pyramid(("primal",), 3, 3, True).reads == ("primal", "reflectance")
     assert close(pyramid(3 * albedo, reflectance=albedo), 3 * albedo)
     assert (pyramid(3 * albedo) - 3 * albedo).abs().mean() > 0.3
-
-
-def test_it_learns():
-    config = plain(("primal", "albedo"), channels=(6, 6, 6), **PYRAMID)
-    assert learns(config, wall(torch.tensor(4.0), 0 * SPOT, 0.6), 0.1)
 
 
 def test_light_of_two_parts_has_no_graph(tmp_path):

@@ -1,7 +1,6 @@
 """Networks of OIDN's shape: what PyTorch makes of their weights, OIDN makes of the exported file."""
 
 import struct
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -57,27 +56,6 @@ def test_untrained_it_gives_the_colour_back(channels, thousands):
     assert torch.allclose(image, base.clamp(min=0), rtol=1e-4, atol=1e-5)
 
 
-def test_the_curve_has_an_inverse():
-    y = torch.logspace(-12, 6, 200)
-    x = oidnet.perceptual(y)
-    assert (x.diff() > 0).all() and float(oidnet.perceptual(torch.tensor(65504.0))) == pytest.approx(1, abs=1e-6)
-    assert torch.allclose(oidnet.radiance(x), y, rtol=2e-4)
-    zero = torch.zeros(1, requires_grad=True)
-    oidnet.radiance(oidnet.perceptual(zero)).sum().backward()
-    assert torch.isfinite(zero.grad).all()
-
-
-def test_exposure_is_that_of_bins():
-    image = np.random.default_rng(0).gamma(0.2, 3, (2, 3, 41, 53)).astype(np.float32)
-    image[1, :, :30] = 0
-    luminance = np.tensordot(np.array(oidnet.LUMINANCE), image.astype(float), (0, 1))
-    for one, scale in zip(luminance, oidnet.exposure(torch.from_numpy(image)), strict=True):
-        rows, columns = ([i * n // -(-n // 16) for i in range(-(-n // 16) + 1)] for n in one.shape)
-        bins = [one[a:b, c:d].mean() for a, b in pairwise(rows) for c, d in pairwise(columns)]
-        assert float(scale) == pytest.approx(0.18 / np.exp(np.mean(np.log([b for b in bins if b > 1e-8]))), rel=1e-5)
-    assert float(oidnet.exposure(torch.zeros(1, 3, 5, 5))) == 1
-
-
 @pytest.mark.parametrize("name", ["small", "primal"])
 def test_oidn_gives_the_pixels_of_pytorch(files, name):
     pytest.importorskip("mitsuba_oidn")
@@ -91,10 +69,9 @@ def test_oidn_gives_the_pixels_of_pytorch(files, name):
     assert np.abs(by_oidn.image - base).mean() > 1e-3 * base.mean()
 
 
-@pytest.mark.parametrize("k", [2**-10, 2**10])
-def test_exposure_changes_nothing(files, k):
+def test_exposure_changes_nothing(files):
     pytest.importorskip("mitsuba_oidn")
-    agree(*(ngpt.denoise(full_stack(40, 40, f), weights=str(files / "small.tza")) / f for f in (k, 1)))
+    agree(*(ngpt.denoise(full_stack(40, 40, k), weights=str(files / "small.tza")) / k for k in (2**10, 1)))
 
 
 def test_wrong_files_end_in_one_line(files, tmp_path):

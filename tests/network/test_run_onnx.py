@@ -16,16 +16,18 @@ FAST, COMBINE = WEIGHTS / "ngpt-fast.onnx", WEIGHTS / "ngpt-combine.onnx"
 SIZE = (305, 341)
 
 
-@pytest.fixture(scope="module")
-def network():
-    return Network(FAST)
+@pytest.fixture(
+    scope="module", params=[FAST, pytest.param(COMBINE, marks=pytest.mark.slow)], ids=lambda path: path.stem
+)
+def network(request):
+    return Network(request.param)
 
 
 @pytest.fixture(scope="module")
 def image(network):
     """Layers, with the base, of an image that takes many tiles, and the whole of it."""
     layers = full_layers(*SIZE)
-    layers["base"] = layers["primal"] * 0.9
+    layers |= {name: layers["primal"] * 0.9 for name in ("base", *network.inputs) if name not in layers}
     return layers, network.reconstruct(layers)
 
 

@@ -204,24 +204,18 @@ def test_changed_shards_are_not_trained_on(folder, capsys, change, message):
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("dx", lambda t: t[:, :1], r"tensor 'dx' is \(6, 1, 8, 8, 3\), it must be \(6, 2, 8, 8, 3\)"),
-        ("indirect", lambda t: t[0], r"tensor 'indirect' is \(2, 8, 8, 3\), and its crops have 2 inputs"),
-        ("albedo", lambda t: t.astype("f8"), "tensor 'albedo' is of type F64"),
-        ("depth", None, "tensors depth are missing"),
-        ("motion", lambda t: t[..., :1], r"tensor 'motion' is \(6, 8, 8, 1\), it must be \(6, 8, 8, 2\)"),
-        ("reference_halves", None, r"'reference_halves' is \(6, 1, 8, 8, 3\), it must be"),
+        ("dx", lambda t: t["dx"][:, :1], r"tensor 'dx' is \(6, 1, 8, 8, 3\), it must be \(6, 2, 8, 8, 3\)"),
+        ("indirect", lambda t: t["indirect"][0], r"tensor 'indirect' is \(2, 8, 8, 3\), and its crops have 2 inputs"),
+        ("albedo", lambda t: t["albedo"].astype("f8"), "tensor 'albedo' is of type F64"),
+        ("motion", lambda t: t["motion"][..., :1], r"tensor 'motion' is \(6, 8, 8, 1\), it must be \(6, 8, 8, 2\)"),
+        ("reference_halves", lambda t: t["indirect"][:, :1], r"'reference_halves' is \(6, 1, 8, 8, 3\), it must be"),
     ],
 )
 def test_shards_with_other_tensors_are_refused(shots, name, change, message):
     """Though their checksum is right."""
     shard = shots.folder / "shards" / "s0.safetensors"
     tensors = load_file(shard)
-    if name == "reference_halves":
-        tensors[name] = tensors["indirect"][:, :1].copy()
-    elif change is None:
-        del tensors[name]
-    else:
-        tensors[name] = np.ascontiguousarray(change(tensors[name]))
+    tensors[name] = np.ascontiguousarray(change(tensors))
     save_file(tensors, shard, {"ngpt": "{}"})
     digest = hashlib.sha256(shard.read_bytes()).hexdigest()
     tampered(shots.folder, lambda manifest, entry: entry.update(sha256=digest))

@@ -56,10 +56,12 @@ def test_the_least_is_at_the_truth_however_rare_light_is(share, best, worse):
 def test_differences_and_not_only_means_are_judged():
     """An image that is right in all means, and not from pixel to pixel."""
     zero, one = torch.zeros(1, 3, 16, 16), torch.ones(1, 1, 16, 16)
-    other = dict.fromkeys(("primal", "dx", "dy", "dx_se", "dy_se"), zero) | {"primal_se": 50 + zero, "counts": one}
     board = zero.clone()
     board[..., ::2, ::2] = board[..., 1::2, 1::2] = 1
-    assert halves(zero, other) == 0 and halves(board, other) > 3
+    other = {"primal": board, "primal_se": 50 + zero, "dx_se": zero, "dy_se": zero, "counts": one}
+    for name, axis in (("dx", -1), ("dy", -2)):
+        other[name] = board.diff(dim=axis, append=board.narrow(axis, -1, 1))
+    assert halves(board, other) == 0 and halves(zero, other) > 3
 
 
 def test_what_does_not_count_changes_nothing():

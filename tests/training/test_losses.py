@@ -65,16 +65,6 @@ def test_slopes_are_finite_on_flat_images(distance, value):
         assert torch.isfinite(flat.grad).all()
 
 
-def test_slopes_are_those_of_the_value(distance):
-    a, b = images(1, 3, 36, 36).requires_grad_(), images(1, 3, 36, 36, seed=1)
-    distance(a, b).backward()
-    direction, step = images(1, 3, 36, 36, seed=2) - 0.5, 1e-3
-    with torch.no_grad():
-        numeric = (distance(a + step * direction, b) - distance(a - step * direction, b)).item() / (2 * step)
-    # The reference's own rounding decides: single precision, piecewise linear networks.
-    assert (a.grad * direction).sum().item() == pytest.approx(numeric, rel=0.06, abs=1e-4)
-
-
 @pytest.mark.parametrize("size", [(1, 1), (5, 40), (200, 180)])
 def test_the_structural_distance_takes_every_size(size):
     a, b = images(1, 3, *size), images(1, 3, *size, seed=1)
@@ -196,20 +186,11 @@ def files(tmp_path):
     save_file(network.state_dict() | {"classifier.1.weight": torch.zeros(1)}, tmp_path / "backbone.safetensors")
     save_file({f"lin{i}": torch.rand(1, c, 1, 1) for i, c in enumerate(network.CHANNELS)}, tmp_path / "lin.safetensors")
     torch.save(network.state_dict(), tmp_path / "a.pth")
-    damaged = {n: t.clone() for n, t in network.state_dict().items()}
-    damaged["features.0.bias"][5] = torch.nan
+    damaged = {n: t * torch.nan for n, t in network.state_dict().items()}
     save_file(damaged, tmp_path / "damaged.safetensors")
-    save_file({"x": torch.zeros(3)}, tmp_path / "empty.safetensors")
     save_file({f"lin{i}": -torch.ones(c) for i, c in enumerate(network.CHANNELS)}, tmp_path / "negative.safetensors")
     named = {"backbone": "backbone.safetensors", "weights": "lin.safetensors"}
     return {"kind": "elpips-squeeze"} | {name: str(tmp_path / file) for name, file in named.items()}
-
-
-def test_elpips_trains_when_its_files_are_there(files):
-    prediction = images(2, 3, 48, 48).requires_grad_()
-    total, parts = make_loss(files)(prediction, images(2, 3, 48, 48, seed=1), generator())
-    total.backward()
-    assert parts["perceptual"] > 0 and torch.isfinite(prediction.grad).all() and prediction.grad.abs().max() > 0
 
 
 @pytest.mark.parametrize(
@@ -221,8 +202,8 @@ def test_elpips_trains_when_its_files_are_there(files):
         ({"weights": "a.pth"}, "not a readable safetensors file"),
         ({"weights": "negative.safetensors"}, "'lin0' holds numbers that are negative"),
         ({"backbone": "a.pth"}, r"checksum is not b8a52dc0.*convert other weights to \.safetensors"),
-        ({"backbone": "empty.safetensors"}, r"'features.0.weight' should be \[64, 3, 3, 3\], is missing"),
-        ({"backbone": "damaged.safetensors"}, "'features.0.bias' holds values that are not finite"),
+        ({"backbone": "lin.safetensors"}, r"'features.0.weight' should be \[64, 3, 3, 3\], is missing"),
+        ({"backbone": "damaged.safetensors"}, "'features.0.(bias|weight)' holds values that are not finite"),
         ({"kind": "elpips-vgg"}, r"vector 'lin2' is of 128 numbers; it should have 64|'lin1[0-3]' is missing"),
     ],
 )
@@ -247,7 +228,8 @@ def test_torchvisions_own_file_is_read_and_no_code_is_run_from_it(files, tmp_pat
     monkeypatch.setattr(backbones.SqueezeNet, "SHA256", digest)
     chosen = files | {"backbone": str(tmp_path / "a.pth")}
     if safe:
-        make_loss(chosen)
+        _, parts = make_loss(chosen)(images(2, 3, 48, 48), images(2, 3, 48, 48, seed=1), generator())
+        assert parts["perceptual"] > 0
         network = backbones.load(backbones.SqueezeNet, chosen["backbone"])
         assert all(torch.equal(tensor, state[name]) for name, tensor in network.state_dict().items())
         return
@@ -280,18 +262,6 @@ def test_noise_of_the_target_does_not_move_the_least_of_huber():
         return slope(loss, torch.full_like(target, value, requires_grad=True), target).sum() > 0
 
     assert rises(pixelwise.huber, 2.011) and not rises(pixelwise.huber, 1.989) and rises(pixelwise.l1, 1.98)
-
-
-def test_a_firefly_of_the_target_counts_once_whatever_its_brightness():
-    prediction, targets = torch.ones(1, 3, 8, 8, requires_grad=True), torch.ones(2, 1, 3, 8, 8)
-    targets[0, 0, :, 3, 3], targets[1, 0, :, 3, 3] = 10.0, 1e6
-    assert torch.allclose(*(slope(pixelwise.huber, prediction, target) for target in targets))
-
-
-@pytest.mark.parametrize(("lit", "expected"), [((1, 1, 1), (1, 1, 1)), ((1, 0, 0), (3, 0, 0))])
-def test_tone_mapping_is_that_of_ngpt(lit, expected):
-    image = 1e9 * torch.tensor(lit, dtype=torch.float32).reshape(1, 3, 1, 1)
-    assert pixelwise.tone_mapped(image).flatten().tolist() == pytest.approx(expected)
 
 
 def test_of_errors_of_one_size_the_pyramid_sees_the_wide_ones():

@@ -14,10 +14,9 @@ from ngpt.errors import NgptError
 from ngpt.network import safetensors
 from ngpt.sequence.network import BANDS, INPUTS, Network
 from ngpt.training import clips as module
-from ngpt.training import temporal
-from ngpt.training.clips import Clip, errors, play
+from ngpt.training.clips import Clip, errors
 from ngpt.training.settings import from_dict
-from ngpt.training.temporal import Blending, as_corrections, load, loss, network
+from ngpt.training.temporal import Blending, as_corrections, load
 from ngpt.training.trainer import Trainer
 
 SIZE = 16
@@ -48,18 +47,6 @@ def test_errors_are_free_of_the_references_noise():
     # An image without noise has no flicker, whatever the noise of the references.
     still = [np.mean(clip.references, axis=0)] * 12
     assert abs(errors(clip, still)[1]) < 0.02 * expected
-
-
-def test_a_network_that_says_nothing_has_the_loss_of_the_rules():
-    clip, model = clip_of(1), network()
-    frames = list(play(clip, as_corrections(model.eval())))
-    assert len(frames) == 4 and all(frame["inputs"].shape == (len(INPUTS), SIZE, SIZE) for frame in frames)
-    batch = {name: torch.from_numpy(np.stack([frame[name] for frame in frames])) for name in frames[0]}
-    value, parts = loss(model(batch["inputs"]), batch)
-    # Frame by frame it is 1 + FLICKER.
-    assert 0.1 < value.item() < 0.8 * (1 + temporal.FLICKER)
-    whole = parts["error"] + temporal.FLICKER * parts["flicker"] + temporal.ENERGY * parts["light"]
-    assert torch.equal(value, whole)
 
 
 SETTINGS = {

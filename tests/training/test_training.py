@@ -124,16 +124,6 @@ def test_a_loss_that_is_not_finite_stops_it_and_keeps_the_batch(done):
     assert run.checkpoint.read_bytes() == before
 
 
-def test_examples_depend_on_nothing_but_their_index():
-    s = settings()
-    forward, backward = (examples.Examples(CROPS, s.model, Augmentation(), 24, seed=3) for _ in range(2))
-    a, b = [forward[i] for i in range(4)], [backward[i] for i in reversed(range(4))][::-1]
-    for x, y in zip(a, b, strict=True):
-        assert all(torch.equal(x[name], y[name]) for name in x)
-    assert a[0]["primal"].shape == (3, 40, 40) and a[0]["target"].shape == (3, 10, 10)
-    assert not torch.equal(a[0]["primal"], a[1]["primal"])
-
-
 class CausticCrop(SyntheticCrop):
     """With light that gradients hold nothing of, in a layer of its own."""
 
