@@ -156,7 +156,7 @@ def test_who_survives(renderer):
         assert abs(product.sum()) < 4.5 * np.sqrt((product**2).sum())
 
 
-@pytest.mark.parametrize("name", ["lens", "glossy"])
+@pytest.mark.parametrize("name", ["lens", pytest.param("glossy", marks=pytest.mark.slow)])
 def test_what_the_camera_has_seen_is_found_again(renderer, name):
     """The second kernel splats what the first one has splatted, and never a vertex that was not seen."""
     from ngpt_studies.gbdpt.light_again import Marker, light_again, marked

@@ -102,7 +102,7 @@ def test_paths_from_both_ends_are_recorded_once(renderer, recordings, scene):
     assert_paths_are_recorded_once(renderer, recordings, "gbdpt", scene)
 
 
-@pytest.mark.parametrize("name", ["gpm", "gbdpt", "restir"])
+@pytest.mark.parametrize("name", [slow("gpm"), "gbdpt", "restir"])
 def test_a_scene_goes_with_its_last_render(renderer, name):
     assert_a_scene_goes_with_its_last_render(renderer, name)
 

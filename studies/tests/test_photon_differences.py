@@ -86,13 +86,12 @@ def test_the_primal_is_that_of_the_sampler_without_gradients(renderer, pair, nam
         [
             # Measured: 0.945, 12.7 and 91; for gvcm, of photons that are near to both of two pixels, 1.9
             ("gpm", "diffuse", 64, {"radius": 1.0}, 0.1, 5, 30),
-            ("gbre", "fog", 32, {"radius": 1.0}, 0.1, 5, 30),
             ("gvcm", "seen_through_glass", 32, {"radius": 3.0}, None, 1.5, 1.5),
         ],
         [
             # Photons from glass are near to both, as long as the radius is wide. No other photon has a copy.
             ("gpm", "caustics", 32, {"radius": 3.0}, None, 1.5, 2),
-            ("gvpm", "fog", 48, {"radius": 1.0}, 0.1, 5, 30),
+            *((name, "fog", 32, {"radius": 1.0}, 0.1, 5, 30) for name in ("gvpm", "gbre")),
             ("gbeams", "fog", 32, {"radius": 0.5}, 0.15, 3, 5),
             # Where a grid is empty there are none: more fail than in fog.
             ("gvpm", "wisps", 24, {"radius": 0.7, "photons": 8}, 0.2, 6, 15),
