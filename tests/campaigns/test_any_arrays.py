@@ -1,6 +1,5 @@
 """Arrays of any kind through every method: a finite image of all that was given, or an error with a name."""
 
-import os
 import time
 import warnings
 from collections import Counter
@@ -10,7 +9,7 @@ import pytest
 from full_stack import full_layers
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from reliability import record
+from reliability import at_length, record
 
 import ngpt
 from ngpt.errors import NgptError
@@ -123,11 +122,22 @@ BLIND = ("oidn",)
 SEEING = [name for name in FOR_USE[1:] if not METHODS[name].missing() and (METHODS[name].variant or name) not in BLIND]
 
 
-@pytest.mark.parametrize("method", FOR_USE)
-@QUICK
-@given(layers=stacks(), options=st.sampled_from(OPTIONS))
-def test_every_method_takes_any_arrays(method, layers, options):
-    check(layers, method, options_of(method, options))
+@pytest.mark.parametrize(
+    ("methods", "count"), [*(pytest.param([name], 10, id=name) for name in FOR_USE), at_length(FOR_USE, 500)]
+)
+def test_every_method_takes_any_arrays(methods, count):
+    TRIED.clear()
+    begun = time.perf_counter()
+    for method in methods:
+        # Each run of the long form tries other arrays.
+        @settings(QUICK, max_examples=count, derandomize=count < 500)
+        @given(layers=stacks(), options=st.sampled_from(OPTIONS))
+        def try_them(method, layers, options):
+            check(layers, method, options_of(method, options))
+
+        try_them(method)
+    seconds = round(time.perf_counter() - begun, 1)
+    record("Arrays of any kind through every method", TRIED.total(), dict(TRIED), seconds=seconds)
 
 
 @QUICK
@@ -155,24 +165,6 @@ def test_denoise_takes_any_arrays(layers, method):
     if result is not None:
         assert result.shape == image.shape and np.isfinite(result[..., :3]).all()
         assert result.dtype == image.dtype and np.array_equal(result[..., 3:], image[..., 3:], equal_nan=True)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_every_method_takes_many_arrays():
-    """As many as NGPT_EXAMPLES says, 500 if it does not, for each method; each run tries others."""
-    TRIED.clear()
-    begun = time.perf_counter()
-    for method in FOR_USE:
-
-        @settings(QUICK, max_examples=int(os.environ.get("NGPT_EXAMPLES", "500")), derandomize=False)
-        @given(layers=stacks(), options=st.sampled_from(OPTIONS))
-        def many(method, layers, options):
-            check(layers, method, options_of(method, options))
-
-        many(method)
-    seconds = round(time.perf_counter() - begun, 1)
-    record("Arrays of any kind through every method", TRIED.total(), dict(TRIED), seconds=seconds)
 
 
 @pytest.mark.parametrize("method", SEEING)

@@ -74,18 +74,16 @@ def flat(x, y):
     return Place(mi.Point3f(x, y, 0.02), mi.UInt32(0), mi.Int32(-3))
 
 
-def known(records, place):
-    """What a cache of these records knows at a place: RGB, half the difference of its halves, and whether it is known.
+def known(place, values, unit=0.0, at=None):
+    """What a cache of these records knows at their places: RGB, half the difference of its halves, whether it is known.
 
-    Every other record goes into the second half.
+    Every other record goes into the second half. The first records choose the ``unit`` of sums if it is 0.
     """
     filled = cache.Cache(FINENESS)
-    # The unit of sums is by the first records, if it is not given.
-    for where, value, unit in records:
-        filled.unit = unit or filled.unit
-        filled.add(where, dr.arange(mi.UInt32, dr.width(value)) & 1, value)
+    filled.unit = unit
+    filled.add(place, dr.arange(mi.UInt32, dr.width(values)) & 1, values)
     filled.settle(FINENESS)
-    (light,), (difference,), found = filled.known.look(place, LEAST, mi.Bool(True))
+    (light,), (difference,), found = filled.known.look(at or place, LEAST, mi.Bool(True))
     return np.array(light, np.float64), np.array(difference, np.float64), np.array(found)
 
 
@@ -102,8 +100,8 @@ def test_what_is_known_depends_on_no_order(renderer):
         return place, [mi.Float(v[which]) for v in value], 2.0**-26
 
     everywhere = part(np.arange(N // 2))
-    light, difference, found = known([everywhere], everywhere[0])
-    others = known([part(order)], everywhere[0])
+    light, difference, found = known(*everywhere)
+    others = known(*part(order), at=everywhere[0])
     assert all(np.array_equal(a, b) for a, b in zip((light, difference, found), others, strict=True))
     assert 0.2 < found.mean() <= 1
     # The means of exponential numbers are near 1.
@@ -116,7 +114,7 @@ def test_what_is_known_has_all_the_light(renderer, scale):
     u, v, light = np.random.default_rng(1).random((3, N)).astype(np.float32)
     light[5] = 1e3
     place, light = flat(u, v), scale * mi.Float(light)
-    (red, green, blue), _, found = known([(place, [light, 0.5 * light, -0.25 * light], None)], place)
+    (red, green, blue), _, found = known(place, [light, 0.5 * light, -0.25 * light])
     assert np.allclose(green, 0.5 * red, rtol=1e-4) and np.allclose(blue, -0.25 * red, rtol=1e-4)
     # All cells have enough records in both halves, which count alike whatever their numbers.
     assert found.all() and red.sum() == pytest.approx(np.array(light, np.float64).sum(), rel=0.1)
@@ -127,7 +125,7 @@ def test_half_the_difference_is_a_sample_of_the_error(renderer):
     rng = np.random.default_rng(2)
     u, v = rng.random((2, 4 * N)).astype(np.float32)
     place, value = flat(u, v), mi.Float(rng.exponential(1, 4 * N).astype(np.float32))
-    (red, *_), (difference, *_), found = known([(place, [value, value, value], None)], place)
+    (red, *_), (difference, *_), found = known(place, [value, value, value])
     cells, first = np.unique(red[found], return_index=True)
     errors, samples = np.square(cells - 1), np.square(difference[found][first])
     assert len(cells) > 50 and samples.mean() == pytest.approx(errors.mean(), rel=0.5)
