@@ -8,8 +8,8 @@ image = ngpt.denoise(noisy, albedo=albedo, normal=normal)       # arrays, tensor
 denoiser = ngpt.Denoiser(size, albedo=True, normals=True)       # called as mi.OptixDenoiser is
 temporal = ngpt.Temporal()                                      # frames of a shot: image = temporal.next(stack, image)
 
-help(ngpt.denoise) lists the methods, what they need, and their options. The logger "ngpt" says what is read, chosen and
-run.
+help(ngpt.denoise) lists the methods with the layers that they need and their options. The logger "ngpt" reports the
+files, layers and methods in use.
 """
 
 import logging
@@ -36,11 +36,11 @@ if TYPE_CHECKING:
     from ngpt.stack import GradientStack as GradientStack
     from ngpt.system.limits import limit_threads as limit_threads
 
-# Official builds of ONNX Runtime send telemetry by themselves (SECURITY.md). ONNX Runtime reads this variable once,
-# when it is loaded. Other code, such as PyTorch's exporters, may load it first.
+# Official builds of ONNX Runtime send telemetry (SECURITY.md) unless this variable is set when they are loaded, which
+# other code, such as PyTorch's exporters, may do first.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
-# Quiet, unless a program asks: logging.getLogger("ngpt").setLevel("INFO"), with a handler of its own.
+# Nothing is logged unless a program sets a handler and a level: logging.getLogger("ngpt").setLevel("INFO").
 logging.getLogger("ngpt").addHandler(logging.NullHandler())
 
 # The module of each public name. It is imported on first use, so that importing this package does not load NumPy and

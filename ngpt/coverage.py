@@ -1,11 +1,11 @@
-"""Pixels that are empty: alpha is 0 there and the input has no light there, so a result has none either.
+"""Keeps results dark in empty pixels, where alpha is 0 and the input has no light.
 
-Light is premultiplied by alpha, so light at alpha 0 is legal: fire and glare add to what is behind them. Such light
-stays, and so do dark pixels among it.
+Light is premultiplied by alpha, so light at alpha 0 is legal: fire and glare add to the background. Such light, and
+dark pixels among it, are not changed.
 
-Light that a method spreads into empty pixels is missing in the covered ones. Hair, for example, may cover a tenth of
-each pixel, so that few samples hit it and a method blurs it. The light in empty pixels is therefore given back to the
-covered pixels around, in proportion to their alpha, up to the light that the input has there.
+Light that a method spreads into empty pixels is missing in covered pixels. Hair, for example, may cover a tenth of each
+pixel, so that few samples hit it and a method blurs it. Therefore the light in empty pixels is given back to the
+covered pixels around them, in proportion to their alpha, up to the light that the input has there.
 """
 
 import numpy as np
@@ -13,14 +13,14 @@ import numpy as np
 from ngpt.stack import GradientStack
 from ngpt.system.late import ndimage
 
-# Side of the square, around light at alpha 0, where black pixels may be chance.
+# Side, in pixels, of the square around light at alpha 0 in which black pixels may be black by chance
 _CHANCE = 5
-# Standard deviation, in pixels, of the window over which light is given back.
+# Standard deviation, in pixels, of the window in which light is given back
 _WINDOW = 2.0
 
 
 def empty_pixels(stack: GradientStack) -> np.ndarray:
-    """(H, W) booleans. If most of the light is at alpha 0, alpha is not coverage, and no pixel counts as empty."""
+    """The empty pixels, (H, W) booleans. None are empty if most light is at alpha 0: then alpha is not coverage."""
     if "alpha" not in stack:
         return np.zeros((stack.height, stack.width), bool)
     uncovered = stack["alpha"][..., 0] == 0
@@ -33,7 +33,7 @@ def empty_pixels(stack: GradientStack) -> np.ndarray:
 
 
 def kept_within(image: np.ndarray, stack: GradientStack) -> np.ndarray:
-    """A reconstruction (H, W, 3) of the stack's primal, with no light in its empty pixels; float32."""
+    """The reconstruction (H, W, 3) of a stack, with the light in its empty pixels given back; float32."""
     empty = empty_pixels(stack)
     if not image[empty].any():
         return image
@@ -46,10 +46,10 @@ def kept_within(image: np.ndarray, stack: GradientStack) -> np.ndarray:
 
 
 def mirrored(image: np.ndarray, empty: np.ndarray) -> np.ndarray:
-    """The image (H, W, C) with its ``empty`` pixels filled from the covered ones that they would see in a mirror.
+    """The image (H, W, C) with its ``empty`` pixels filled by reflection at the nearest covered pixel.
 
-    The mirror is at the nearest covered pixel. Where it shows no covered pixel of the same island, the nearest pixel
-    itself is taken. So each island is continued by light and noise like its own.
+    If the reflected pixel is not in the same island of covered pixels, the nearest pixel itself is taken. So each
+    island is continued by light and noise like its own.
     """
     if not empty.any() or empty.all():
         return image
@@ -62,10 +62,10 @@ def mirrored(image: np.ndarray, empty: np.ndarray) -> np.ndarray:
 
 
 def _around(values: np.ndarray) -> np.ndarray:
-    """(H, W, C), the sum over a Gaussian window around each pixel."""
+    """The mean of (H, W, C) in a Gaussian window around each pixel; pixels outside of the image are 0."""
     return ndimage.gaussian_filter(values, (_WINDOW, _WINDOW, 0), mode="constant", truncate=3)
 
 
 def _over(values: np.ndarray, divisor: np.ndarray) -> np.ndarray:
-    """The quotient, 0 where the divisor is 0."""
+    """The quotient; 0 where the divisor is 0."""
     return np.where(divisor != 0, values / np.where(divisor != 0, divisor, 1), 0)

@@ -1,4 +1,4 @@
-"""The one exception that users of ngpt meet, its subclass for wrong calls, and interrupts that other libraries hide."""
+"""The exception that ngpt raises for users, its subclass for wrong calls, and interrupts that other libraries hide."""
 
 from collections.abc import Iterable
 
@@ -6,11 +6,11 @@ LONGEST = 1000
 
 
 class NgptError(ValueError):
-    """A problem the user can act on.
+    """A problem that the user can solve.
 
-    The message is one line that names the file, the layer and the number that is wrong, and says what to do about it.
-    Text from a broken file, with line breaks or a megabyte long, is shortened to one line. The library only raises it;
-    the command line prints it and turns it into an exit status.
+    The message is one line that names the file, the layer and the wrong number, and says what to do. Line breaks are
+    removed and long texts shortened, since text from a broken file may have a megabyte. The command line prints the
+    message and ends with status 1.
     """
 
     def __init__(self, message: str):
@@ -20,19 +20,15 @@ class NgptError(ValueError):
 
 
 class WrongUse(NgptError):
-    """A request that makes no sense, whatever the files hold: an unknown option, a wrong value, or two options that
-    exclude each other.
+    """A request that makes no sense for any file: an unknown option, a wrong value, or options that exclude each other.
 
-    The command line ends with status 2 for it, and with 1 for any other ``NgptError``.
+    The command line ends with status 2.
     """
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """The question "did you mean '...'? " if an unknown ``word`` is near one of the ``known`` names, else "".
-
-    Messages put it before the list of the known names.
-    """
-    from difflib import get_close_matches  # only for those who mistype
+    """The question "did you mean '...'? " if an unknown ``word`` is similar to one of the ``known`` names, else ""."""
+    from difflib import get_close_matches  # only needed for typing errors
 
     near = get_close_matches(word.lower(), names := {name.lower(): name for name in known}, 1)
     return f"did you mean '{names[near[0]]}'? " if near else ""
@@ -41,20 +37,20 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 class Interrupted(KeyboardInterrupt):
     """The exception that Ctrl-C and SIGTERM raise in a command.
 
-    Once a plain KeyboardInterrupt has passed through code compiled from a string, such as that of dataclasses and named
-    tuples, Python 3.11 ends itself by SIGINT, whatever exit status it is given.
+    It is not a plain KeyboardInterrupt: if one has passed through code compiled from a string, such as that of
+    dataclasses and named tuples, Python 3.11 ends by SIGINT with another exit status.
     """
 
 
 def stop_if_interrupted(error: BaseException) -> None:
     """Raises KeyboardInterrupt if ``error`` was caused by one, as after Ctrl-C in a library that wraps exceptions.
 
-    Dr.Jit's loops and recordings turn a KeyboardInterrupt into a RuntimeError that holds its cause. Mitsuba's plugins
-    turn it into a RuntimeError with only a text.
+    Dr.Jit's loops and recordings turn a KeyboardInterrupt into a RuntimeError with a cause. Mitsuba's plugins turn it
+    into a RuntimeError whose text ends in its name.
     """
     cause: BaseException | None = error
     while cause is not None:
-        told = str(cause).rstrip().endswith(("\nKeyboardInterrupt:", "\nInterrupted:"))
-        if told or isinstance(cause, KeyboardInterrupt):
+        by_text = str(cause).rstrip().endswith(("\nKeyboardInterrupt:", "\nInterrupted:"))
+        if by_text or isinstance(cause, KeyboardInterrupt):
             raise KeyboardInterrupt from error
         cause = cause.__cause__ or cause.__context__

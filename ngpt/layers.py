@@ -1,4 +1,4 @@
-"""The layers of a gradient stack: names, channels, units, signs. The contract between all rooms and all files."""
+"""The contract between all parts of ngpt: the layers of a gradient stack with their channels, units and signs."""
 
 from dataclasses import dataclass
 
@@ -11,8 +11,9 @@ XY = ("X", "Y")
 class Layer:
     """One layer of the contract.
 
-    ``channels`` are the suffixes in memory and file order. ``float_on_disk`` layers are written as 32-bit float: the
-    11-bit mantissa of half spoils differences, and its ceiling of 65504 spoils variances and distances.
+    ``channels``       the suffixes of its channels, in the order of memory and files
+    ``float_on_disk``  whether files need 32-bit floats, since half has too few bits (11) for differences, and too low a
+                       limit (65504) for variances and distances
     """
 
     name: str
@@ -25,7 +26,7 @@ LAYERS: dict[str, Layer] = {
     layer.name: layer
     for layer in (
         Layer("primal", RGB, False, "Monte Carlo estimate of the pixel, directly seen emission included"),
-        Layer("direct", RGB, False, "emission the camera sees directly: part of primal, not of dx and dy"),
+        Layer("direct", RGB, False, "emission that the camera sees directly: part of primal, not of dx and dy"),
         Layer(
             "caustic", RGB, True, "light over rough surfaces, then mirrors or glass: part of primal, not of dx and dy"
         ),
@@ -35,7 +36,7 @@ LAYERS: dict[str, Layer] = {
         Layer("normal", XYZ, False, "unit shading normal there, camera space: +x right, +y up, +z toward the viewer"),
         Layer("depth", ("Z",), True, "path length from the camera to that vertex, world units, 0 where it escapes"),
         Layer("diffuse", RGB, False, "light that diffuse lobes scatter toward the camera: part of primal"),
-        Layer("specular", RGB, False, "the rest: primal - direct - diffuse"),
+        Layer("specular", RGB, False, "all other light: primal - direct - diffuse"),
         Layer("primal_var", RGB, True, "sample variance of the pixel mean of primal - caustic (divided by spp)"),
         Layer("caustic_var", RGB, True, "sample variance of the pixel mean of caustic"),
         Layer("diffuse_var", RGB, True, "sample variance of the pixel mean of diffuse"),
@@ -43,8 +44,8 @@ LAYERS: dict[str, Layer] = {
         Layer("dx_var", RGB, True, "sample variance of the pixel mean of dx"),
         Layer("dy_var", RGB, True, "sample variance of the pixel mean of dy"),
         Layer("shared", RGB, False, "a sample of the noise that pixels share, part of primal_var: see ngpt.shared"),
-        Layer("samples", ("N",), True, "base paths of the pixel, where pixels differ in them"),
-        Layer("motion", XY, True, "pixels from here to where this point was one frame before: x right, y down, or NaN"),
+        Layer("samples", ("N",), True, "number of base paths of the pixel, if pixels differ in it"),
+        Layer("motion", XY, True, "pixels from here to this point's place one frame before: x right, y down, or NaN"),
         Layer("dt", RGB, True, "difference in time: estimates I[p] - I_before[p + motion], without direct; or NaN"),
         Layer("dt_var", RGB, True, "sample variance of the pixel mean of dt"),
         Layer("alpha", ("A",), False, "coverage, untouched by reconstruction"),
@@ -52,13 +53,13 @@ LAYERS: dict[str, Layer] = {
     )
 }
 
-# The differences of the contract: layer -> offset (x, y, frames) from a pixel to the one it is compared with; y down.
+# Layers of differences -> offset (x, y, frames) from a pixel to the pixel that it is subtracted from; y points down.
 DIFFERENCES: dict[str, tuple[int, int, int]] = {"dx": (1, 0, 0), "dy": (0, 1, 0)}
 
 # Header attribute: the variance of the pixel mean of ``albedo`` or ``normal``, whichever is larger, averaged over
 # pixels and channels
 FEATURE_NOISE = "ngpt:featureNoise"
 
-# Header attribute: 1 if photons, gathered within a radius, found the light in ``caustic``. Neighbouring pixels gather
-# the same photons, so they share its noise, which OIDN takes for detail.
+# Header attribute: 1 if the light in ``caustic`` comes from photons that were gathered within a radius. Neighbouring
+# pixels gather the same photons and share their noise, which OIDN takes for detail.
 GATHERED = "ngpt:gathered"

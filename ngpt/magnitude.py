@@ -1,13 +1,12 @@
-"""Scales light of any exposure so that single precision holds its squares, and scales results back.
+"""Scales very bright or dark light so that single precision can hold its squares, and scales results back.
 
-Methods square light and weigh by variances in single precision, which ends at 2^±127. So a stack whose typical light is
-beyond 2^±``ORDINARY`` is multiplied by a power of two before a method sees it, and the result is multiplied back. Both
-are exact. Any other stack stays as it is, bit for bit.
+Methods square light and divide by variances in single precision, which ends at 2^±127. So a stack whose typical light
+is beyond 2^±``ORDINARY`` is multiplied by a power of two before a method reads it, and the result is divided by it.
+Both are exact. All other stacks are not changed.
 
-Variances may have left the range of single precision before: light of 1e-30 has variances of 1e-60. ``GradientStack``
-keeps double precision if it is given double precision. In files, and in arrays of single precision, such variances are
-0 or infinite. Infinite variances count as unknown, as everywhere. Variances of 0 count as unknown where the light is so
-dim that its square could underflow to 0.
+Light of 1e-30 has variances of 1e-60, which single precision cannot hold. ``GradientStack`` keeps variances in double
+precision if they are passed so. In files and in arrays of single precision, they are 0 or infinite. Infinite variances
+count as unknown, and so do variances of 0 of light that is so dark that its square may underflow.
 """
 
 import math
@@ -18,16 +17,16 @@ import numpy as np
 from ngpt.layers import LAYERS, RGB
 from ngpt.stack import GradientStack
 
-# The powers of two of typical light that methods are made for: a millionth to a million.
+# Methods are made for typical light from 2^-ORDINARY to 2^ORDINARY: a millionth to a million.
 ORDINARY = 20
-# The largest light has at most this number of binary digits before the point: its square is a float.
+# The largest power of two of scaled light, whose square float32 can hold
 _LARGEST = 62
-# For typical light below 2^-_DIM, variances of 0 say nothing: a millionth of its square is below 2^-148.
+# Below 2^-_DIM, variances of light may be 0 by underflow: a millionth of its square is below 2^-148.
 _DIM = 64
-# The number of values sampled for the typical light. Their distance is no multiple of 3, so all colours occur.
+# The number of values sampled for the typical light. Their distance is not a multiple of 3, so that all colours occur.
 _LOOKED_AT = 1 << 16
 
-# Sums of squares of light beyond this leave single precision.
+# Light above which sums of squares may leave single precision
 WIDE = 2.0**60
 
 LIGHT = tuple(name for name, layer in LAYERS.items() if layer.channels == RGB and name != "albedo")
@@ -35,10 +34,10 @@ VARIANCES = tuple(name for name in LIGHT if name.endswith("_var"))
 
 
 def magnitude(stack: GradientStack) -> int:
-    """The power of two of the typical light of a stack; 0 where that is ordinary, and where there is no light.
+    """The power of two by which the light of a stack is to be divided; 0 for ordinary light, and if there is no light.
 
-    The typical light is the median of the primal's finite values other than 0. The result is raised if the squares of
-    the largest values would otherwise not be finite.
+    It is the power of two of the typical light: the median of the primal's finite values other than 0. It is larger if
+    the squares of the largest values would otherwise not be finite.
     """
     primal = stack["primal"]
     flat = primal.reshape(-1)
@@ -56,8 +55,11 @@ def magnitude(stack: GradientStack) -> int:
 
 
 def bound(image: np.ndarray) -> float:
-    """The limit above which light counts as an outlier. It is infinity for ordinary images. If some light is above
-    ``WIDE``, as in single fireflies, it is 2^``ORDINARY`` times the typical light, but at most ``WIDE``."""
+    """The limit above which light counts as an outlier.
+
+    It is infinite unless some light is above ``WIDE``, as single fireflies may be. Then it is 2^``ORDINARY`` times the
+    typical light, but at most ``WIDE``.
+    """
     if np.abs(image).max(initial=0) <= WIDE:
         return math.inf
     return min(max(_median(image.reshape(-1)), 2.0**-_LARGEST) * 2.0**ORDINARY, WIDE)
@@ -66,12 +68,12 @@ def bound(image: np.ndarray) -> float:
 def _median(values: np.ndarray) -> float:
     """The median of the absolute values that are finite and not 0; 0 if there are none."""
     sizes = np.abs(values[np.isfinite(values) & (values != 0)])
-    # In double precision: the mean of two in the middle may be beyond the largest of single precision.
+    # The mean of the two middle values may exceed single precision.
     return float(np.median(sizes.astype(np.float64))) if sizes.size else 0.0
 
 
 def scaled(stack: GradientStack, power: int) -> GradientStack:
-    """The stack with 2^-power times its light, all layers in single precision; itself where nothing changes."""
+    """The stack with 2^-power times its light, all layers in single precision."""
     changed = {}
     for name in stack.names:
         layer = stack[name]
@@ -89,6 +91,6 @@ def scaled(stack: GradientStack, power: int) -> GradientStack:
 
 
 def enlarged(light: np.ndarray, power: int) -> np.ndarray:
-    """2^power times the light, of its type; infinite where that cannot hold it."""
+    """2^power times the light, of the same type; infinite where this type cannot hold it."""
     with np.errstate(over="ignore", under="ignore"):
         return np.ldexp(light, power) if power else light

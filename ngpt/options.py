@@ -1,4 +1,4 @@
-"""Options of samplers and methods: typed, with default and meaning; the same in commands, files and Python."""
+"""Options of samplers and methods, which are the same in commands, files and Python."""
 
 import math
 import os
@@ -8,7 +8,7 @@ from typing import Any
 
 from ngpt.errors import WrongUse, did_you_mean
 
-# The audience of a sampler or method: all users; users with a reason; those who study it
+# The audience of a sampler or method: all users, users with a special need, researchers
 STANDINGS = ("use", "niche", "study")
 
 Value = bool | int | float | str
@@ -17,11 +17,11 @@ _ANY = (-math.inf, math.inf)
 
 @dataclass(frozen=True)
 class Option:
-    """An option, of the type of its ``default``.
+    """An option. The ``default`` has its type.
 
     ``meaning``  one line for the user
-    ``choices``  the allowed values; () for all within the range
-    ``range``    least and greatest value of a number; if there are ``choices`` too, numbers and choices are allowed
+    ``choices``  the allowed values; () for any
+    ``range``    the least and the greatest number that is allowed; with ``choices``, these are allowed too
     """
 
     default: Value
@@ -46,7 +46,7 @@ class Option:
         return f"{kind}, or {words}" if words else kind
 
     def check(self, value: Any) -> Value:
-        """The ``value``, which may be a text, as the option's type. Raises WrongUse for values that are not allowed."""
+        """The ``value``, which may be a text, in the option's type. Raises WrongUse if it is not allowed."""
         if self.choices and (given := self._typed(value, type(self.choices[0]))) in self.choices:
             assert given is not None
             return given
@@ -60,15 +60,16 @@ class Option:
 
     @property
     def _kind(self) -> type:
-        """The type of values that are none of the choices."""
+        """The type of values that are not among the choices."""
         return float if isinstance(self.default, str) and self.range != _ANY else type(self.default)
 
     def _typed(self, value: Any, kind: type) -> Value | None:
+        """The ``value`` in the type ``kind``; None if it cannot be converted without loss."""
         if kind is str:
             return os.fspath(value) if isinstance(value, str | os.PathLike) else None
         if isinstance(value, str) and kind is bool:
             return {"true": True, "false": False}.get(value.lower())
-        # To Python, true is a number.
+        # In Python, bool is a kind of int.
         if isinstance(value, bool) or kind is bool:
             return bool(value) if type(value) is kind else None
         try:
@@ -86,10 +87,10 @@ def written(value: Any) -> str:
 
 
 def settings(owner: str, options: Mapping[str, Option], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Values of all ``options``: those ``given``, which may be texts, and the others' defaults.
+    """The values of all ``options``: the ``given`` ones, which may be texts, and defaults for all others.
 
-    Raises WrongUse, which names the ``owner`` ("method 'l2'"), for options that do not exist, and for values that are
-    not allowed.
+    Raises WrongUse for unknown options and for values that are not allowed; the message names the ``owner``, such as
+    "method 'l2'".
     """
     found: dict[str, Any] = {name: option.default for name, option in options.items()}
     for name, value in given.items():
@@ -109,5 +110,5 @@ def unusual(options: Mapping[str, Option], values: Mapping[str, Any]) -> dict[st
 
 
 def as_text(values: Mapping[str, Any]) -> str:
-    """Options in the form of ``-O``, separated by commas."""
+    """The values as text: NAME=VALUE, separated by commas."""
     return ", ".join(f"{name}={written(value)}" for name, value in values.items())

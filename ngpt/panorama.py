@@ -1,34 +1,36 @@
-"""Images of 360 degrees: their left and right borders are adjacent, so methods get images that continue on both sides.
+"""Panoramas of 360 degrees, whose left and right borders are neighbours: they are continued on both sides for methods.
 
-The header marks such an image by OpenEXR's ``envmap`` for latitude and longitude, or by our ``ngpt:wrap``.
+The header marks them by OpenEXR's ``envmap`` for latitude and longitude, or by ``ngpt:wrap``.
 """
+
+from dataclasses import replace
 
 import numpy as np
 
 from ngpt.stack import GradientStack
 from ngpt.subpixels import subpixels
 
-WRAP = "ngpt:wrap"  # a header attribute, 1: the image wraps
-# Columns that are added on each side. OIDN reads pixels up to this distance, and classical methods hardly farther ones.
+WRAP = "ngpt:wrap"  # header attribute: 1 if the image is a panorama
+# Columns that are added on each side. OIDN reads pixels up to this distance, and classical methods hardly beyond it.
 MARGIN = 96
 
 
 def wraps(stack: GradientStack) -> bool:
-    """Whether the first column continues the last one, as in a panorama that is whole from left to right."""
-    said = stack.attributes.get("envmap", "")
+    """Whether the stack is a panorama, complete from left to right, so that its first column follows its last."""
+    kind = stack.attributes.get("envmap", "")
     whole = (stack.place.data.left, stack.width) == (stack.place.display.left, stack.place.display.width)
-    return whole and (stack.attributes.get(WRAP) == 1 or getattr(said, "name", said) == "ENVMAP_LATLONG")
+    return whole and (stack.attributes.get(WRAP) == 1 or getattr(kind, "name", kind) == "ENVMAP_LATLONG")
 
 
 def wrapping(stack: GradientStack) -> GradientStack:
-    """The stack with the mark of an image that wraps, whatever its header says."""
-    return GradientStack(stack.layers, stack.attributes | {WRAP: 1}, stack.source, stack.path, stack.place, stack.fine)
+    """The stack, marked as a panorama."""
+    return replace(stack, attributes=stack.attributes | {WRAP: 1})
 
 
 def continued(stack: GradientStack) -> GradientStack:
-    """The stack (H, W) as one that does not wrap, (H, W + 2 MARGIN), with the image's other side beside each border.
+    """A panorama (H, W) as a plain stack (H, W + 2 MARGIN), with the opposite columns added beside each border.
 
-    Differences between the last column and the first are not known, and count as lost.
+    Differences between the last column and the first are not known, and become NaN.
     """
     columns = np.arange(-MARGIN, stack.width + MARGIN) % stack.width
     layers = {name: stack[name][:, columns] for name in stack.names}

@@ -1,7 +1,7 @@
 """The interface of a renderer for the evaluation, ``ngpt info`` and ``ngpt train``.
 
-``ngpt.system.parts.find_renderer`` finds the one that is installed, ``data_gen.service``: an entry point of the group
-"ngpt.renderers" names it. Nothing in ngpt imports it.
+``ngpt.system.parts.find_renderer`` returns the installed renderer, ``data_gen.service``, which an entry point of the
+group "ngpt.renderers" names. Nothing in ngpt imports it.
 """
 
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from ngpt.stack import GradientStack
 
-# The options of a render: its sampler's name, the sampler's own options, whether features are rendered, and subpixels
+# The options of a render: the name of its sampler, the options of the sampler, whether features are rendered, subpixels
 Options = Mapping[str, Any]
 
 
@@ -24,33 +24,33 @@ class Renderer(Protocol):
     def render(
         self, scene: Any, options: Options, spp: int | None, seed: int, *, seconds: float | None
     ) -> GradientStack:
-        """A stack of ``spp`` samples per pixel, or of those that fit into ``seconds``."""
+        """A stack of ``spp`` samples per pixel, or of as many as ``seconds`` allow."""
 
     def warm_up(self, scene: Any, options: Options) -> GradientStack:
-        """Compiles the kernels of a render; returns its stack of one sample."""
+        """Compiles the kernels of a render, and returns a stack of one sample per pixel."""
 
     def timed(self, scene: Any, options: Options, spp: int, seed: int, clock: str) -> tuple[GradientStack, float]:
-        """A stack and its seconds, by the ``clock`` "wall" or "processor"."""
+        """A stack, and the seconds of its render by the ``clock`` "wall" or "processor"."""
 
     def measure(
         self, scene: Any, renders: Mapping[str, Options], spp: int, repeats: int, *, clock: str
     ) -> tuple[dict[str, list[float]], GradientStack]:
-        """Seconds per sample of each of the ``renders`` by name, and the last stack of the first of them."""
+        """The seconds per sample of each of the named ``renders``, and the last stack of the first one."""
 
     def batch(self, sampler: str) -> int:
-        """The number of samples per pixel that depend on each other; 0 if all are independent."""
+        """The number of samples per pixel in a group that depend on each other; 0 if all are independent."""
 
     def gradients(self, sampler: str) -> bool:
         """Whether the sampler renders gradients; True for an unknown one."""
 
     def unusual(self, sampler: str, options: Options) -> str:
-        """The sampler's options, and ``subpixels``, that are not defaults: "radius=1, photons=2, subpixels=2".
+        """The options of the sampler, and ``subpixels``, that are not defaults: "radius=1, photons=2, subpixels=2".
 
-        Raises NgptError for wrong ones.
+        Raises NgptError for wrong options.
         """
 
     def code(self, sampler: str) -> str:
-        """A hash of the code that a render by the sampler runs; "auto" is a sampler too."""
+        """A hash of the code that a render by the sampler, which may be "auto", runs."""
 
     def scene_code(self, name: str) -> str:
         """A hash of a built-in scene."""
@@ -59,18 +59,20 @@ class Renderer(Protocol):
         """Samplers and built-in scenes, for ``ngpt info``."""
 
     def describe_sampler(self, name: str) -> dict[str, Any]:
-        """The registry's description of a sampler; empty if no sampler has that name."""
+        """The description of a sampler; an empty dictionary if no sampler has that name."""
 
     def inspect(self, name: str, parameters: dict[str, str]) -> dict[str, Any]:
         """The contents of a scene, and how it would be rendered."""
 
 
 class Crops(Protocol):
-    """The function that renders crops for ``ngpt train``. ``ngpt.system.parts.find_crops`` finds it by an entry point
-    of the group "ngpt.crops"; ours is ``data_gen.dataset.stream.stream``."""
+    """The function that renders crops for ``ngpt train``, such as ``data_gen.dataset.stream.stream``.
+
+    ``ngpt.system.parts.find_crops`` finds it by an entry point of the group "ngpt.crops".
+    """
 
     def __call__(self, config: Path, kept: str = "") -> AbstractContextManager[Any]:
-        """Crops of a dataset's configuration, rendered in another process while they are trained on.
+        """The crops of a data set's configuration, which another process renders during the training.
 
-        ``kept``  folder for its references, which are made once; "" always makes new ones
+        ``kept``  folder in which references are kept; "": all references are made anew
         """

@@ -1,4 +1,4 @@
-"""Non-finite pixels are repaired from their neighbours, and their gradients are no longer trusted."""
+"""Repairs non-finite pixels from their neighbours, and marks their gradients as not trusted."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,35 +11,32 @@ from ngpt.stack import GradientStack
 from ngpt.subpixels import spread, subpixels
 from ngpt.system.late import ndimage
 
-# The insides of holes are filled from blocks whose sides are powers of this number. Tiles of networks begin at its
-# multiples.
+# Holes are filled from blocks whose sides are powers of this number. Tiles of networks begin at multiples of it.
 BLOCK = 8
 
 
 @dataclass(frozen=True)
 class Repaired:
-    """The data that a reconstruction works on.
+    """The finite data that a reconstruction reads. Variances are NaN where they are not known.
 
-    ``image``    (H, W, 3) primal without direct emission, finite; for methods that read gradients, also without
-                 ``caustic``
-    ``direct``   (H, W, 3) direct emission, finite, to be added back
-    ``dx, dy``   (H, W, 3) gradients, finite (0 where they are not trusted), None where the stack has none
-    ``trusted``  for dx and dy, (H, W) booleans, None if all differences are trusted
-    ``variances``  of image, dx and dy, (H, W, 3), NaN where not known; None if the stack lacks one of these layers
-    ``noise``    the variance of image only, (H, W, 3), NaN where not known; None where the stack lacks it
+    ``image``    (H, W, 3) primal without direct emission; for methods that read gradients, also without ``caustic``
+    ``direct``   (H, W, 3) direct emission, which is added to the result
+    ``dx, dy``   (H, W, 3) gradients, 0 where they are not trusted; None if the stack has none
+    ``trusted``  where dx and dy are trusted, (H, W) booleans each; None if all differences are trusted
+    ``variances``  of image, dx and dy, (H, W, 3) each; None if the stack lacks one of them
     ``pixels``   number of pixels whose primal was replaced
     ``gradients``  number of differences left out
-    ``features``  albedo, normal and depth, those the stack holds, with 0 where they are not finite
-    ``caustic``  (H, W, 3) light that gradients exclude, finite: it is taken out of image, denoised separately and added
-                 back; None if there is none
-    ``caustic_var``  its variance, (H, W, 3), NaN where not known; None where the stack lacks it
-    ``feature_noise``  the variance of albedo or normal, whichever is larger, mean over the image; None: not known
-    ``empty``    (H, W) booleans, the pixels that alpha says hold nothing (``ngpt.coverage``); None where there are none
-    ``fine``     primal, albedo and normal by subpixels (``ngpt.subpixels``), finite; empty where there are none
-    ``parts``    diffuse and specular light, finite, and their variances as ``diffuse_var`` and ``specular_var``, NaN
-                 where not known; only the ones that the stack holds
-    ``by_oidn``  OIDN's images of these data (``ngpt.network.inputs.Oidn``), for methods that read them; None: not made
-                 yet
+    ``features``  albedo, normal and depth, if the stack has them; 0 where they are not finite
+    ``noise``    the variance of image, (H, W, 3); None if the stack lacks it
+    ``caustic``  (H, W, 3) light that gradients exclude, which is denoised separately and added to the result; None if
+                 there is none
+    ``caustic_var``  the variance of caustic, (H, W, 3); None if the stack lacks it
+    ``feature_noise``  the variance of albedo or normal, whichever is larger, averaged over the image; None: not known
+    ``empty``    the empty pixels (``ngpt.coverage``), (H, W) booleans; None if the stack has no alpha
+    ``fine``     primal, albedo and normal by subpixels (``ngpt.subpixels``), if the stack has them
+    ``parts``    diffuse and specular light, and the variances ``diffuse_var`` and ``specular_var``, if the stack has
+    them
+    ``by_oidn``  OIDN's images of these data (``ngpt.network.inputs.Oidn``); None until a method needs them
     """
 
     image: np.ndarray
@@ -61,20 +58,20 @@ class Repaired:
     by_oidn: Any = None
 
     def known_variances(self) -> dict[str, np.ndarray]:
-        """The variances of image, dx and dy that the stack holds, by the names of its layers; see ``variances``."""
+        """The known variances of image, dx and dy, by the names of their layers: all three, primal_var, or none."""
         if self.variances is not None:
             return dict(zip(("primal_var", "dx_var", "dy_var"), self.variances, strict=True))
         return {} if self.noise is None else {"primal_var": self.noise}
 
 
 def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
-    """Separates direct emission, replaces non-finite pixels and finds the gradients that cannot be trusted.
+    """Separates direct emission, replaces non-finite pixels, and finds the gradients that cannot be trusted.
 
-    ``gradients``  whether the method reads gradients, or leaves the light of photons to another method. Such a method
-                   works on light without ``caustic``. All others get the whole primal and its whole variance.
+    ``gradients``  whether ``caustic`` is separated too, for methods that read gradients or leave the light of photons
+                   to another method. Otherwise image is the whole primal, with its whole variance
 
-    A difference is not trusted if it is not finite itself or one of its two pixels was not. Raises NgptError when the
-    primal has no finite pixel at all.
+    A difference is not trusted if it or one of its two pixels is not finite. Raises NgptError if no pixel of the primal
+    is finite.
     """
     primal = stack["primal"]
     direct = stack["direct"] if "direct" in stack else np.zeros_like(primal)
@@ -84,9 +81,9 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
         good &= finite_pixels(caustic)
     if not good.any():
         raise NgptError(f"{stack.path}: layer 'primal' has no finite pixel among {good.size}; render it again")
-    # Only layers that change are copied, since layers may be large.
+    # Layers may be large, so they are copied only if they change.
     image = primal
-    # Inf - Inf may occur here; such values are replaced below.
+    # Inf - Inf may occur here. The result is replaced below.
     with np.errstate(invalid="ignore"):
         if direct.any():
             image = image - direct
@@ -96,11 +93,12 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
         image, direct = _from_neighbours(image, good), np.where(good[..., None], direct, 0)
         caustic = None if caustic is None else _from_neighbours(caustic, good)
     features = {name: _finite(stack[name]) for name in ("albedo", "normal", "depth") if name in stack}
-    # Where the camera sees an emitter, the primal's variance includes the direct emission.
+    # Where the camera sees an emitter, the primal's variance includes that of the direct emission.
     known = good & ~direct.any(axis=-1) if direct.any() else good
     noise = _where(known, variance_of_primal(stack, gradients)) if "primal_var" in stack else None
-    said = stack.number(FEATURE_NOISE)
-    apart: dict[str, Any] = {"parts": _parts(stack, good), "feature_noise": said if said is None or said >= 0 else None}
+    feature_noise = stack.number(FEATURE_NOISE)
+    apart: dict[str, Any] = {"parts": _parts(stack, good)}
+    apart["feature_noise"] = None if feature_noise is None or feature_noise < 0 else feature_noise
     if stack.fine:
         light = image + direct if caustic is None or not gradients else image + direct + caustic
         apart["fine"] = _finite_subpixels(stack, light, features)
@@ -116,7 +114,7 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
         both[here] &= good[there]
         both &= finite_pixels(stack[name])
         border = np.s_[:, -1] if axis == 1 else np.s_[-1]
-        both[border] = True  # no difference there, so nothing to mistrust
+        both[border] = True  # there is no difference
         layer = stack[name]
         if not both.all() or layer[border].any():
             layer = np.where(both[..., None], layer, 0)
@@ -133,7 +131,7 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
 
 
 def _parts(stack: GradientStack, good: np.ndarray) -> dict[str, np.ndarray]:
-    """``Repaired.parts``: pixels that are not ``good``, or lack a part, are filled from their neighbours."""
+    """``Repaired.parts``. Pixels that are not ``good``, or where a part is not finite, are filled from neighbours."""
     held = [name for name in ("diffuse", "specular") if name in stack]
     for name in held:
         good = good & finite_pixels(stack[name])
@@ -142,31 +140,31 @@ def _parts(stack: GradientStack, good: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def variance_of_primal(stack: GradientStack, gradients: bool = False) -> np.ndarray:
-    """The variance of the primal, (H, W, 3); with ``gradients``, only of the light that they are the differences of.
+    """The variance of the primal, (H, W, 3), or with ``gradients`` only of its light outside ``caustic``.
 
-    The variance of the whole primal is NaN where ``caustic`` holds light of unknown variance.
+    The variance of the whole primal is NaN where the variance of ``caustic`` is not known.
     """
     variance = stack["primal_var"]
     if gradients or "caustic" not in stack:
         return variance
-    alone = np.where(stack["caustic"].any(axis=-1, keepdims=True), np.float32(np.nan), variance)
+    without = np.where(stack["caustic"].any(axis=-1, keepdims=True), np.float32(np.nan), variance)
     if "caustic_var" not in stack:
-        return alone
+        return without
     further = stack["caustic_var"]
-    return np.where(np.isfinite(further) & (further >= 0) & (variance >= 0), variance + further, alone)
+    return np.where(np.isfinite(further) & (further >= 0) & (variance >= 0), variance + further, without)
 
 
 def finite_pixels(layer: np.ndarray) -> np.ndarray:
-    """Where all channels of (H, W, C) are finite. The whole array is tested first, since tests along a short last axis
-    are slow."""
+    """Where all channels of (H, W, C) are finite, (H, W) booleans."""
     good = np.isfinite(layer)
+    # Reductions along a short last axis are slow, and most layers are finite.
     return np.ones(layer.shape[:2], bool) if good.all() else good.all(axis=-1)
 
 
 def _finite_subpixels(
     stack: GradientStack, light: np.ndarray, features: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """The subpixels of a stack; those that are not finite have the value of their pixel in the repaired layers."""
+    """The subpixels of a stack. Non-finite ones are replaced by their repaired pixels: ``light``, or ``features``."""
     k = subpixels(stack.fine, stack.width)
     fine = {}
     for name, layer in stack.fine.items():
@@ -182,15 +180,15 @@ def _finite(layer: np.ndarray) -> np.ndarray:
 
 
 def _where(flags: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """The variance where ``flags`` hold, NaN elsewhere."""
+    """The variance where ``flags`` are True, NaN elsewhere."""
     return variance if flags.all() else np.where(flags[..., None], variance, np.float32(np.nan))
 
 
 def _from_neighbours(light: np.ndarray, good: np.ndarray) -> np.ndarray:
-    """The light (H, W, 3), with pixels that are not good replaced.
+    """The light (H, W, 3) with all pixels replaced that are not ``good``.
 
-    A pixel gets the mean of the good pixels among its eight neighbours. Inside a larger hole, where there are none, it
-    gets the mean of the good pixels in the smallest block that has any: of 8x8 pixels, 64x64 and so on.
+    A pixel becomes the mean of the good pixels among its eight neighbours. If there are none, it becomes the mean of
+    the good pixels in the smallest block that has any: of 8x8 pixels, 64x64, and so on.
     """
     image = np.where(good[..., None], light, np.float32(0))
     weight = ndimage.uniform_filter(good.astype(np.float64), 3, mode="constant")
@@ -205,7 +203,7 @@ def _from_neighbours(light: np.ndarray, good: np.ndarray) -> np.ndarray:
 
 
 def _from_blocks(total: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Sums (H, W, 3) over counts (H, W, 1); where the count is 0, the ratio of the smallest block that has any."""
+    """Sums (H, W, 3) divided by counts (H, W, 1); where a count is 0, the ratio in the smallest block with a count."""
     mean = total / np.maximum(count, 1)
     if count.all() or count.size == 1:
         return mean

@@ -1,4 +1,4 @@
-"""The file of a result: OpenEXR with the whole stack, PFM, or a picture."""
+"""Writes results: as OpenEXR with the whole stack, as PFM, or as pictures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,23 +18,27 @@ from ngpt.io.reduced import smaller
 from ngpt.stack import GradientStack
 from ngpt.windows import Place, Window
 
-# Kinds of files that hold results
+# The endings of files that can hold results
 IMAGES = (".exr", ".pfm", *PICTURES)
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a picture shows light: its view transform (``ngpt.image.transforms``), and its exposure in stops, or
-    "auto"."""
+    """How pictures show light.
+
+    ``transform``  the view transform, a name in ``ngpt.image.transforms``
+    ``exposure``   in stops, or "auto"
+    """
 
     transform: str = "standard"
     exposure: float | str = 0.0
 
     def of(self, image: np.ndarray) -> np.ndarray:
-        """The pixels of a picture of an image (H, W, 3) in linear Rec. 709."""
+        """The picture (H, W, 3) uint8 sRGB of an image (H, W, 3) in linear Rec. 709."""
         return shown(image, self.transform, self.stops(image))
 
     def stops(self, image: np.ndarray) -> float:
+        """The exposure of an image in stops."""
         return auto_exposure(image) if isinstance(self.exposure, str) else self.exposure
 
 
@@ -48,9 +52,9 @@ def write_result(
     into: str | None = None,
     reduce: int = 1,
 ) -> None:
-    """Writes images (H, W, 3), one for each of the ``views``, with their stacks. Only OpenEXR files hold several views.
+    """Writes the results (H, W, 3) of ``views`` with their stacks, as OpenEXR; or the first result in another format.
 
-    ``attributes`` say how they were made; ``into`` and ``reduce`` are as in ``ngpt.write``.
+    ``attributes``, ``into`` and ``reduce`` are as for ``ngpt.write``; ``look`` is for pictures.
     """
     if target.suffix.lower() == ".exr":
         images, stacks = (list(each) for each in zip(*views, strict=True))
@@ -65,7 +69,7 @@ def write_result(
 
 
 def check_image(target: Path, transform: str) -> None:
-    """Raises an error for a file that cannot hold a result, or that this machine cannot make."""
+    """Raises an error if a file cannot hold a result, or if a package for its kind or the transform is missing."""
     kind = target.suffix.lower()
     if kind not in IMAGES:
         raise WrongUse(f"{target}: results are OpenEXR, PFM or pictures; let the name end in {' '.join(IMAGES)}")
@@ -75,12 +79,13 @@ def check_image(target: Path, transform: str) -> None:
 
 
 def in_picture(image: np.ndarray, place: Place) -> np.ndarray:
-    """The part of an image (H, W, 3) in the display window, without overscan. An image outside of it is shown whole.
+    """The part of an image (H, W, 3) in the display window, with square pixels.
 
-    Pixels become as wide as they are high.
+    An image outside of the display window is returned whole.
     """
     return squared(image[seen(place).within(place.data)], place.aspect)
 
 
 def seen(place: Place) -> Window:
+    """The part of the data window in the display window; the whole data window if there is none."""
     return place.data.common(place.display) or place.data

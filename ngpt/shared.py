@@ -1,16 +1,17 @@
 """Noise that pixels share: the layer ``shared`` of renders whose paths end in a cache.
 
-The layer is a sample of that noise, with the same distribution. For any weights w of pixels, the expected square of Σ w
-shared is the variance that the cache gives to Σ w primal: of a pixel, of a block, or of the whole image. Stacks are
-merged by means, and so are their layers ``shared``. ``primal_var`` includes the variance of this noise in each pixel.
+The layer is a sample with the distribution of that noise. For any weights w of pixels, the expected square of Σ w
+shared is the variance that the cache adds to Σ w primal: in a pixel, in a block, or in the whole image. ``primal_var``
+includes the variance of this noise in each pixel. Merged stacks have the mean of the layers ``shared``, like means of
+all layers.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-# Header attributes: whether paths shared their tails, or why not; the share of the cache's light that was cut from
-# records that were too bright
+# Header attributes: a sentence on whether paths shared their tails, or why not; and the share of the cache's light that
+# was cut from records that were too bright
 TAILS, CUT = "ngpt:tails", "ngpt:tailsCut"
 # Side, in pixels, of the square over which squares of ``shared`` are averaged for a pixel's variance
 _AROUND = 5
@@ -19,22 +20,20 @@ _BLOCK = 32
 
 
 def shared_variance(shared: np.ndarray) -> np.ndarray:
-    """The variance of the noise that each pixel shares with others, (H, W, C), from the layer ``shared``, (H, W, C).
+    """The variance of the shared noise in each pixel, (H, W, C), from the layer ``shared``, (H, W, C).
 
-    Values that are not finite count as zero.
+    Values that are not finite count as zero, because the running sums of ``box_means`` would spread them.
     """
-    # The running sums of ``box_means`` would carry such values to all later pixels.
     squares = np.square(np.where(np.isfinite(shared), shared, 0).astype(np.float64))
     means = [box_means(squares[..., channel], _AROUND) for channel in range(squares.shape[-1])]
     return np.maximum(np.stack(means, axis=-1), 0)
 
 
 def noise_of_light(primal: np.ndarray, primal_var: np.ndarray, shared: np.ndarray) -> dict[str, dict[str, float]]:
-    """The standard error of the mean light of the whole image, and of blocks of ``_BLOCK`` pixels where there are any.
+    """The standard errors of the mean light of the whole image, and of blocks of ``_BLOCK`` pixels if any are whole.
 
-    The layers are (H, W, C). "own" is the noise of single pixels, "shared" the noise that they have in common; both are
-    root mean squares over channels and blocks, relative to the mean light of the image. Values that are not finite
-    count as zero.
+    The layers are (H, W, C). "own" is the noise of single pixels, and "shared" is shared noise. Both are root mean
+    squares over channels and blocks, relative to the mean light of the image. Values that are not finite count as zero.
     """
     layers = (np.where(np.isfinite(layer), layer, 0) for layer in (primal, primal_var, shared))
     light, variance, sample = (layer.astype(np.float64) for layer in layers)
@@ -53,12 +52,12 @@ def noise_of_light(primal: np.ndarray, primal_var: np.ndarray, shared: np.ndarra
 
 
 def box_means(image: np.ndarray, size: int) -> np.ndarray:
-    """Means over ``size`` x ``size`` pixels around each pixel of (H, W), mirrored at the edges.
+    """The mean of ``size`` x ``size`` pixels around each pixel of (H, W), which is mirrored at its edges.
 
-    The result has the same bits as SciPy's ``uniform_filter``. Importing SciPy would take longer than computing all
-    variances of a small render.
+    The result has the bits of SciPy's ``uniform_filter``, whose import would take longer than all variances of a small
+    render.
     """
-    if not image.size:  # the differences within a single row or column of pixels
+    if not image.size:  # differences within a single row or column of pixels
         return image
     before = size // 2
     for axis in (0, 1):

@@ -1,4 +1,4 @@
-"""The gradient stack: the data type that renderers of gradients pass to reconstructions."""
+"""The gradient stack: the layers of a rendering, which reconstructions read."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,21 +16,21 @@ from ngpt.windows import Place
 
 @dataclass(eq=False, repr=False)
 class GradientStack(Mapping[str, np.ndarray]):
-    """The layers of one rendering, scene-linear, row 0 on top: a mapping from their names to arrays.
+    """The layers of one rendering, scene-linear, with row 0 at the top: a mapping from names to arrays.
 
-    ``layers`` maps names of the contract (``ngpt.layers.LAYERS``) to C-contiguous float32 arrays (H, W, C), where C is
-    the number of the layer's channels. The arrays passed may have any real type and memory layout, and shape (H, W) if
-    C is 1. They are converted, copied only if necessary, and never modified. Every float value is legal, including NaN
-    and Inf. Variances passed in double precision stay so if float32 cannot hold them: light of 1e30 or 1e-30 has such
-    variances. Files hold them with 32 bits. The last column of dx and the last row of dy are unused; they are kept as
-    they are.
+    ``layers``      names of the contract (``ngpt.layers.LAYERS``) -> C-contiguous float32 arrays (H, W, C), where C is
+                    the number of channels of the layer. Arrays of any real type and memory layout may be passed, and
+                    (H, W) if C is 1. They are converted, copied only if necessary, and never modified
+    ``attributes``  header attributes that OpenEXR itself does not need, such as ``ngpt:spp``
+    ``source``      the file that the stack was read from (``ngpt.io.layout.StackSource``), with its other channels
+    ``path``        the name of the stack in messages
+    ``place``       the place of the pixels in the whole picture; without it, they are the whole picture
+    ``fine``        layers of subpixels, if there are any (``ngpt.subpixels``)
 
-    ``attributes`` are the header attributes that OpenEXR itself does not need, such as ``ngpt:spp``. ``source`` is the
-    file that the stack was read from (``ngpt.io.layout.StackSource``), with the channels that pass through. ``path`` is
-    for messages. ``place`` is where the pixels lie in the whole picture; by default, and if it has another size, they
-    are the whole picture. ``fine`` are the layers of subpixels, if there are any (``ngpt.subpixels``).
+    All float values are legal, including NaN and Inf. Variances in double precision stay so if float32 cannot hold
+    them, as those of light of 1e30 or 1e-30. The last column of dx and the last row of dy are unused and not changed.
 
-    Raises NgptError for unknown layers, types that are not real numbers, wrong shapes, layers that differ in size,
+    Raises NgptError for unknown layers, types that are not real numbers, wrong shapes, layers of different sizes,
     images without pixels, and finite numbers that float32 cannot hold.
     """
 
@@ -57,18 +57,17 @@ class GradientStack(Mapping[str, np.ndarray]):
     def from_arrays(
         cls, *, attributes: Mapping[str, Any] | None = None, path: str = "stack", **layers: ArrayLike
     ) -> "GradientStack":
-        """Makes a stack of arrays: ``GradientStack.from_arrays(primal=image, dx=dx, dy=dy)``."""
+        """Makes a stack from arrays: ``GradientStack.from_arrays(primal=image, dx=dx, dy=dy)``."""
         return cls({name: np.asarray(array) for name, array in layers.items()}, dict(attributes or {}), path=path)
 
     @classmethod
     def from_aovs(
         cls, tensor: ArrayLike, names: Sequence[str], attributes: Mapping[str, Any] | None = None
     ) -> "GradientStack":
-        """A stack from the (height, width, channels) tensor that ``mi.render(scene)`` returns with one of our
-        integrators.
+        """Makes a stack from the tensor (H, W, channels) that ``mi.render(scene)`` returns for an integrator of ngpt.
 
-        ``names`` are the integrator's ``aov_names()``, one for each channel: "primal.R". Raises NgptError if there are
-        more or fewer names than channels, for a name of no layer, and for a layer with missing channels.
+        ``names`` are the integrator's ``aov_names()``, one for each channel: "primal.R". Raises NgptError if their
+        number differs from the number of channels, for unknown layers, and for layers with missing channels.
         """
         array = np.asarray(tensor)
         if array.ndim != 3 or array.shape[2] != len(names):
@@ -86,7 +85,7 @@ class GradientStack(Mapping[str, np.ndarray]):
             layers[name] = array[..., [place[channel] for channel in channels]]
         return cls(layers, dict(attributes or {}))
 
-    # Stacks compare as objects do, and not as mappings: arrays have no one truth value.
+    # Stacks are compared by identity, not as mappings, because comparisons of arrays have no single truth value.
     __eq__ = object.__eq__
     __hash__ = object.__hash__
 
@@ -100,7 +99,7 @@ class GradientStack(Mapping[str, np.ndarray]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The layers held, in the order of the contract."""
+        """The names of the layers, in the order of the contract."""
         return tuple(name for name in LAYERS if name in self.layers)
 
     def __contains__(self, name: object) -> bool:
@@ -113,7 +112,7 @@ class GradientStack(Mapping[str, np.ndarray]):
         return len(self.layers)
 
     def get(self, name: str, default: Any = None) -> Any:
-        """Layer ``name``, or ``default`` if the stack does not hold it."""
+        """The layer ``name``, or ``default`` if the stack does not have it."""
         return self.layers.get(name, default)
 
     def __repr__(self) -> str:
@@ -129,8 +128,7 @@ class GradientStack(Mapping[str, np.ndarray]):
         return f"GradientStack {self.path}, {self.width}x{self.height}{samples}"
 
     def number(self, attribute: str) -> float | None:
-        """An attribute as a finite number; None if it is missing or anything else, as files of other programs may
-        hold."""
+        """An attribute as a finite number; None if it is missing or has another type."""
         value = self.attributes.get(attribute)
         if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
             return None
@@ -138,13 +136,13 @@ class GradientStack(Mapping[str, np.ndarray]):
         return number if abs(number) < np.inf else None
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Returns layer ``name``; raises NgptError if the stack does not hold it."""
+        """The layer ``name``. Raises NgptError if the stack does not have it."""
         if name not in self.layers:
             self.require(name)
         return self.layers[name]
 
     def require(self, *names: str, why: str = "") -> None:
-        """Raises NgptError unless all of ``names`` are held; ``why`` says who needs them ("method 'l1'")."""
+        """Raises NgptError unless the stack has all these layers. ``why`` is who needs them: "method 'l1'"."""
         missing = [name for name in names if name not in self.layers]
         for name in missing:
             _check_name(name, self.path)
@@ -161,16 +159,16 @@ class GradientStack(Mapping[str, np.ndarray]):
             raise NgptError(f"{self.path}: {needs} {what}; the stack holds {', '.join(self.names)}; {remedy}")
 
     def replace(self, **layers: ArrayLike) -> "GradientStack":
-        """Returns a stack with these layers replaced or added, and the same attributes, source and place.
+        """A stack with these layers replaced or added, and the same attributes, source and place.
 
-        If a layer that has subpixels is replaced, the result has no subpixels: they belong to the old layer.
+        If a layer with subpixels is replaced, the result has no subpixels, since they belong to the old layer.
         """
         new = {name: np.asarray(array) for name, array in layers.items()}
         fine = {} if self.fine.keys() & new.keys() else self.fine
         return GradientStack({**self.layers, **new}, self.attributes, self.source, self.path, self.place, fine)
 
 
-# If the largest variance is below this, float32 would lose digits of variances 2^-40 times as large.
+# If the largest variance is below this, float32 would lose digits of variances that are 2^40 times smaller.
 _DIM = 2.0**-86
 
 
@@ -181,7 +179,7 @@ def _check_name(name: str, path: str) -> None:
 
 
 def _as_layer(name: str, array: ArrayLike, path: str) -> np.ndarray:
-    """Returns ``array`` as (H, W, C) float32, C-contiguous."""
+    """The array as (H, W, C) float32, C-contiguous; variances as float64 if float32 cannot hold them."""
     _check_name(name, path)
     given = np.asarray(array)
     channels = len(LAYERS[name].channels)
@@ -210,10 +208,11 @@ def _as_layer(name: str, array: ArrayLike, path: str) -> np.ndarray:
 
 
 def _check_size(path: str, name: str, shape: tuple[int, ...], first: str, expected: tuple[int, ...]) -> None:
+    """Raises NgptError if the size of layer ``name`` differs from that of the layer ``first``."""
     (height, width), (rows, columns) = shape[:2], expected[:2]
     if (height, width) == (rows, columns):
         return
-    remedy = "all layers of a stack are of one size: render or crop them alike"
+    remedy = "render or crop all layers of a stack to one size"
     if name == "dx" and (height, width) == (rows, columns - 1):
         remedy = "gradients are stored at image size with an unused last column: pad it with zeros"
     elif name == "dy" and (height, width) == (rows - 1, columns):

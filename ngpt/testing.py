@@ -1,8 +1,8 @@
-"""Statistical tests of renderings, for our own tests and for anyone who writes a sampler.
+"""Statistical tests of renderings, for the tests of ngpt and for authors of samplers.
 
-A sampler is right if its mean is right. A single image and a fixed tolerance cannot show that. But independent renders
-of the sampler and of a reference give their own standard errors, and the number of comparisons sets the significance
-level of each.
+A sampler is right if its mean is right. A single image and a fixed tolerance cannot show this. Independent renders of
+the sampler and of a reference can: their spread gives standard errors, and the number of comparisons sets the
+significance level of each.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from scipy.stats import t as student_t
 
 @dataclass(frozen=True)
 class ZTest:
-    """Outcome of comparing the means of two sets of renders, block by block.
+    """The result of comparing the means of two sets of renders, block by block.
 
     ``z``        (rows, columns, C) differences of block means in standard errors
     ``p``        two-sided p-values of the same shape
@@ -42,15 +42,16 @@ def z_test(
 ) -> ZTest:
     """Tests whether two sets of independent renders have the same mean.
 
-    ``renders``, ``references``  (batches, H, W, C), at least 8 batches each; batches must differ in their seed
-    ``block``                    edge of the pixel blocks whose means are compared: averaging makes them nearly normal,
-                                 which single pixels of path-traced images are not
-    ``level``                    probability that two equal means fail the test as a whole
-    ``scale``                    largest value of the images that a layer is computed from, if the layer's own is
-                                 smaller
+    ``renders``, ``references``  (batches, H, W, C), at least 8 batches each, rendered with different seeds
+    ``block``                    edge, in pixels, of the blocks whose means are compared. Means of blocks are nearly
+                                 normal, which single pixels of path-traced images are not
+    ``level``                    probability that the test fails for equal means
+    ``scale``                    largest value of the images that a layer is computed from, if the layer has smaller
+                                 values
 
-    Welch's t-test per block and channel, with Šidák's correction 1 - (1 - level)^(1/n). Standard errors are bounded
-    from below by float32 rounding of the scale, so blocks without any variance must agree up to that rounding.
+    It is Welch's t-test for each block and channel, with Šidák's correction 1 - (1 - level)^(1/n). Standard errors are
+    at least the rounding of float32 at this scale, so blocks without variance must agree up to rounding. Raises
+    ValueError for fewer than 8 batches.
     """
     means, errors = [], []
     for batches in (renders, references):
@@ -71,7 +72,7 @@ def z_test(
 
 
 def _block_means(batches: np.ndarray, block: int) -> np.ndarray:
-    """(batches, H // block, W // block, C) means; pixels beyond the last whole block are left out."""
+    """The means of blocks, (batches, H // block, W // block, C); pixels beyond the last whole block are left out."""
     n, height, width, channels = batches.shape
     rows, columns = height // block, width // block
     cut = batches[:, : rows * block, : columns * block]

@@ -1,3 +1,3 @@
-"""The version, where every module can read it without importing the package."""
+"""The version, in a module that imports nothing."""
 
 __version__ = "0.1.0"

@@ -1,7 +1,7 @@
-"""The place of an image: the rectangle of its pixels, within the rectangle of the whole picture.
+"""The place of an image: the rectangle of its pixels, and the rectangle of the whole picture.
 
-OpenEXR calls them data window and display window. Pixels of two images correspond if they have the same place in the
-picture, not the same index in the arrays.
+OpenEXR calls them data window and display window. Pixels of two images correspond if they have the same coordinates in
+the picture, not the same index in the arrays.
 """
 
 from collections.abc import Sequence
@@ -12,12 +12,12 @@ import numpy as np
 
 from ngpt.errors import NgptError
 
-MOST = 2**28  # pixels of a picture that is filled up: 16384 x 16384
+MOST = 2**28  # the most pixels of a canvas: 16384 x 16384
 
 
 @dataclass(frozen=True)
 class Window:
-    """A rectangle of pixels, x to the right and y down: the first is (left, top), which may be negative."""
+    """A rectangle of pixels. Its first pixel is (left, top), which may be negative; x points right and y down."""
 
     left: int
     top: int
@@ -26,7 +26,7 @@ class Window:
 
     @classmethod
     def of_box(cls, box: Any) -> "Window":
-        """The window from its first to its last pixel, as OpenEXR has it: ((left, top), (right, bottom))."""
+        """The window of OpenEXR's ((left, top), (right, bottom)), its first and its last pixel."""
         (left, top), (right, bottom) = ((int(n) for n in corner) for corner in box)
         return cls(left, top, right - left + 1, bottom - top + 1)
 
@@ -49,31 +49,32 @@ class Window:
         return f"{self.width}x{self.height} at ({self.left}, {self.top})"
 
     def common(self, other: "Window") -> "Window | None":
-        """The pixels of both; None where they have none in common."""
+        """The pixels that both have; None if there are none."""
         left, top = max(self.left, other.left), max(self.top, other.top)
         width = min(self.left + self.width, other.left + other.width) - left
         height = min(self.top + self.height, other.top + other.height) - top
         return Window(left, top, width, height) if width > 0 and height > 0 else None
 
     def around(self, other: "Window") -> "Window":
-        """The smallest rectangle that holds both."""
+        """The smallest window that holds both."""
         left, top = min(self.left, other.left), min(self.top, other.top)
         right = max(self.left + self.width, other.left + other.width)
         bottom = max(self.top + self.height, other.top + other.height)
         return Window(left, top, right - left, bottom - top)
 
     def within(self, other: "Window") -> tuple[slice, slice]:
-        """Rows and columns of these pixels in an image of the window ``other``, which holds them all."""
+        """The rows and columns of these pixels in an image of the window ``other``, which must hold all of them."""
         x, y = self.left - other.left, self.top - other.top
         return slice(y, y + self.height), slice(x, x + self.width)
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where an image lies: ``data`` is the rectangle of its pixels, ``display`` is the rectangle of the whole picture.
+    """The place of an image.
 
-    ``data`` may be a part of the picture, reach beyond it (overscan), or both. ``aspect`` is the width of a pixel over
-    its height, as pictures show it; it does not change where pixels lie.
+    ``data``     the window of its pixels: a part of the picture, or more than the picture (overscan), or both
+    ``display``  the window of the whole picture
+    ``aspect``   the width of a pixel divided by its height, for display
     """
 
     data: Window
@@ -87,7 +88,7 @@ class Place:
 
     @property
     def known(self) -> bool:
-        """Whether more than the size is known."""
+        """Whether more is known than the size of the image."""
         return self != Place.whole(*self.data.size)
 
     def __str__(self) -> str:
@@ -96,12 +97,11 @@ class Place:
         return f"{self.data} of {self.display if any(self.display.corner) else Place.whole(*self.display.size)}"
 
     def seen_from(self, other: "Place") -> "Window | None":
-        """The window of the pixels in the coordinates of ``other``; None if the two pictures have different
-        resolutions.
+        """The window of the pixels in the coordinates of ``other``; None if the pictures have different resolutions.
 
-        If only the size of an image is known, it takes the place of the other image of that size: many programs lose
-        the place of a crop. Other display windows share one coordinate system, unless they have the same corner and
-        different sizes: then the resolutions differ.
+        If only the size of one image is known, and the other has the same size, they are taken to be at the same place,
+        because many programs lose the place of a crop. Otherwise all windows have the same coordinates, unless two
+        display windows have the same corner and different sizes: then the resolutions differ.
         """
         if self.display != other.display:
             if self.data.size == other.data.size and not (self.known and other.known):
@@ -111,21 +111,21 @@ class Place:
         return self.data
 
     def shift_in(self, other: "Place") -> tuple[int, int] | None:
-        """The column and row of this image's first pixel in an image at ``other``; None as in ``seen_from``."""
+        """The column and row of the first pixel in an image at ``other``; None as for ``seen_from``."""
         window = self.seen_from(other)
         return None if window is None else (window.left - other.data.left, window.top - other.data.top)
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """Overlaid images: the ``windows`` of all, in the coordinates of the first, and the ``common`` pixels."""
+    """The ``windows`` of several images in the coordinates of the first one, and their ``common`` pixels."""
 
     windows: list[Window]
     common: Window
 
     @property
     def line(self) -> str:
-        """A message about the compared pixels; "" if these are all pixels of all images."""
+        """A message about the common pixels; "" if these are all pixels of all images."""
         if all(window == self.common for window in self.windows):
             return ""
         return f"compared are the pixels that all images have: {self.common}"
@@ -136,7 +136,10 @@ class Overlap:
 
 
 def overlap(names: Sequence[str], places: Sequence[Place]) -> Overlap:
-    """Raises NgptError for images that have no pixel in common, and for pictures of different sizes."""
+    """The overlap of images, whose ``names`` are for messages.
+
+    Raises NgptError for images that have no pixel in common, and for pictures of different resolutions.
+    """
     windows, common = [], places[0].data
     for name, place in zip(names, places, strict=True):
         window = place.seen_from(places[0])
@@ -151,9 +154,9 @@ def overlap(names: Sequence[str], places: Sequence[Place]) -> Overlap:
 
 
 def put(image: np.ndarray, window: Window, canvas: Window, outside: float = 0.0) -> np.ndarray:
-    """An image (H, W, C) of the pixels of ``window``, cut to ``canvas`` and filled up to it with ``outside``.
+    """An image (H, W, C) of ``window`` on the pixels of ``canvas``; ``outside`` is the value of missing pixels.
 
-    Raises NgptError for an absurdly large canvas, which a few bytes of a header can ask for.
+    Raises NgptError for a canvas of more than ``MOST`` pixels, which a damaged header may ask for.
     """
     if window == canvas:
         return image

@@ -1,7 +1,6 @@
-"""Images of NumPy, PyTorch, Dr.Jit and others, and Mitsuba's bitmaps: as NumPy arrays, and results as the kind of the
-input.
+"""Converts arrays of NumPy, PyTorch, Dr.Jit and others, and Mitsuba's bitmaps, to NumPy, and results back.
 
-No library is imported here: arrays are known by what they can do.
+No library is imported here: arrays are recognised by their methods.
 """
 
 import sys
@@ -12,12 +11,12 @@ import numpy as np
 
 from ngpt.errors import NgptError
 
-# Channels of colour, albedo and normal: a tensor with this number may be the output of an integrator with AOVs.
+# The channels of colour, albedo and normal: a tensor with at least this number may be the output of an integrator.
 _OF_A_STACK = 9
 
 
 class Tensor(Protocol):
-    """An array (height, width, channels) of any library: NumPy, PyTorch, Dr.Jit, JAX."""
+    """An array (H, W, C) of any library: NumPy, PyTorch, Dr.Jit, JAX."""
 
     @property
     def shape(self) -> tuple[int, ...]: ...
@@ -35,7 +34,7 @@ class Transform(Protocol):
 
 
 Image = Tensor | Bitmap
-Kind = TypeVar("Kind", bound=Image)  # the kind that went in is the kind that comes out
+Kind = TypeVar("Kind", bound=Image)  # the kind of an input and its result
 
 
 def is_bitmap(value: Any) -> bool:
@@ -43,10 +42,10 @@ def is_bitmap(value: Any) -> bool:
 
 
 def to_numpy(value: Any, name: str = "the array") -> np.ndarray:
-    """Arrays of any library, from any device, as NumPy's; shared where that is possible.
+    """An array of any library, on any device, as a NumPy array that shares its memory if possible.
 
-    Raises NgptError, which begins with ``name``, for what NumPy cannot read, for bitmaps that are not linear, and for
-    tensors with gradients, which would be lost here in silence.
+    Raises NgptError, whose message begins with ``name``, for objects that NumPy cannot read, for bitmaps that are not
+    linear, and for tensors that carry gradients, which would be lost.
     """
     if isinstance(value, np.ndarray):
         return value
@@ -67,13 +66,13 @@ def to_numpy(value: Any, name: str = "the array") -> np.ndarray:
         if array.dtype == object and hasattr(value, "__dlpack__"):
             array = np.from_dlpack(value)
     except (TypeError, ValueError, BufferError, RuntimeError) as error:
-        told = " ".join(str(error).split())
-        raise NgptError(f"{name} is a {type(value).__name__} that NumPy cannot read: {told}; pass an array") from error
+        why = " ".join(str(error).split())
+        raise NgptError(f"{name} is a {type(value).__name__} that NumPy cannot read: {why}; pass an array") from error
     return array.astype(np.float32) if array.dtype.name == "bfloat16" else array
 
 
 def _detached(value: Any, name: str) -> str:
-    """The code that detaches ``value``, called ``name``, from its gradients; "" if it has none."""
+    """The code that detaches ``value``, called ``name``, from its gradients; "" if it carries none."""
     torch = sys.modules.get("torch")
     if torch is not None and isinstance(value, torch.Tensor):
         return f"{name}.detach()" if value.requires_grad and torch.is_grad_enabled() else ""
@@ -82,9 +81,9 @@ def _detached(value: Any, name: str) -> str:
 
 
 def like(image: np.ndarray, example: Any) -> Any:
-    """The image (H, W, C) in the library, on the device and with the number type of ``example``.
+    """The image (H, W, C) as an object of the same library, device and number type as ``example``.
 
-    A bitmap of many channels gives one of as many as the image has: RGB or RGBA. Other objects give NumPy arrays.
+    For a bitmap, it is an RGB or RGBA bitmap. For objects of unknown kinds, it is a NumPy array.
     """
     if isinstance(example, np.ndarray):
         return _of_type(image, example.dtype) if example.dtype.kind == "f" else image
@@ -104,7 +103,7 @@ def like(image: np.ndarray, example: Any) -> Any:
 
 
 def _of_type(image: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """Half floats end at 65504: what a method adds beyond that stays finite."""
+    """The image in another type of floats. Values beyond the range of half floats are clipped to stay finite."""
     limits = np.finfo(dtype)
     return (np.clip(image, limits.min, limits.max) if dtype.itemsize == 2 else image).astype(dtype)
 
@@ -112,11 +111,11 @@ def _of_type(image: np.ndarray, dtype: np.dtype) -> np.ndarray:
 def layer(
     where: str, name: str, value: Any, channels: Collection[int], size: tuple[int, int] | None = None
 ) -> np.ndarray:
-    """``value`` as a NumPy array (height, width, C), C one of ``channels``, of any floating point type.
+    """The ``value`` as a NumPy array (H, W, C) of floats, where C is one of ``channels``.
 
-    ``size``  (height, width) that it must have; None for any
+    ``size``  the required (height, width); None for any
 
-    Raises NgptError for other shapes, images without pixels and integers; the message begins with ``where``.
+    Raises NgptError, whose message begins with ``where``, for other shapes, images without pixels, and integers.
     """
     array = to_numpy(value, f"{where}: {name}")
     array = array[..., None] if array.ndim == 2 and 1 in channels else array
@@ -134,7 +133,7 @@ def layer(
 
 
 def _remedy(name: str, value: Any, shape: tuple[int, ...], channels: Collection[int]) -> str:
-    """What to pass instead, where that is clear: "" or the end of a sentence."""
+    """The end of a message about a wrong shape, with the array to pass instead; "" if that is not clear."""
     if len(shape) == 3 and shape[0] in channels and shape[2] not in channels:
         turn = "permute" if hasattr(value, "permute") else "transpose"
         return f"; channels come first there: pass {name}.{turn}(1, 2, 0)"

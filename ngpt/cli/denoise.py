@@ -48,9 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o",
         "--output",
         metavar="OUT",
-        help=f"for one stack a file: .exr, .pfm or a picture (.png .jpg .webp); for several a folder, or names such as "
-        f"clean.%%04d.exr; -: standard output. Missing folders are created (default: STACK{RESULT_SUFFIX}.exr beside "
-        "each stack)",
+        help="for one stack a file (.exr .pfm .png .jpg .webp), for several a folder, or names as clean.%%04d.exr; -: "
+        f"standard output. Missing folders are made (default: STACK{RESULT_SUFFIX}.exr beside each stack)",
     )
     first = "; ".join(f"{name}: {method.summary}" for name, method in by_standing("use").items())
     parser.add_argument(
@@ -64,9 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--alpha", help="weight of the noisy image in l2 and l1: a number, or auto")
     parser.add_argument("--weights", metavar="FILE", help="your own network: .onnx, .safetensors or .tza")
-    parser.add_argument(
-        "--device", help="device for networks: cpu (default), cuda, tensorrt, openvino, directml or coreml"
-    )
+    parser.add_argument("--device", help="for networks: cpu (default), cuda, tensorrt, openvino, directml or coreml")
     what = f"memory limit for networks; larger images are computed in tiles (default: {MEMORY})"
     parser.add_argument("--memory", type=int, metavar="MIB", help=what)
     parser.add_argument("--threads", type=int, metavar="N", help="number of threads (default: all cores)")
@@ -77,13 +74,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--halves",
         nargs=2,
         metavar=("A", "B"),
-        help="as --error, and compare the results of two stacks of half the samples each, such as the two that STACK "
-        "was merged from, which also detects blotches; takes four times the time",
+        help="like --error, but also compare the results of two stacks with half of the samples each, such as those "
+        "that STACK was merged from, to detect blotches too; takes four times the time",
     )
     names = ", ".join(f"{pattern} ({renderer})" for renderer, pattern in lightgroups.PATTERNS.items())
-    parser.add_argument(
-        "--groups", action="store_true", help=f"also denoise light groups, so that they add up to the result: {names}"
-    )
+    what = f"also denoise light groups, so that they add up to the result: {names}"
+    parser.add_argument("--groups", action="store_true", help=what)
     what = "also a light group of this name; * stands for any letters; may be repeated"
     parser.add_argument("--group", action="append", default=[], metavar="NAME", help=what)
     parser.add_argument(
@@ -97,8 +93,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=arguments.positive,
         default=1,
         metavar="K",
-        help="for images rendered K times as large as wanted: denoise them so, and make one pixel of each K x K. 2, "
-        "with a quarter of the samples, keeps edges best",
+        help="make one pixel of each K x K after denoising, for images rendered K times as large as needed. 2, with a "
+        "quarter of the samples, keeps edges best",
     )
     parser.add_argument(
         "--into",
@@ -106,18 +102,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="layer that the result replaces beside the root R G B, such as Combined; root: none (default: the layer "
         "that the noisy image was read from, unless it is called noisy)",
     )
-    parser.add_argument(
-        "--wrap",
-        action="store_true",
-        help="the images are panoramas: their left and right borders are neighbours. Files with the attribute envmap "
-        "need no --wrap",
-    )
-    parser.add_argument(
-        "--ref",
-        metavar="REF",
-        help="reference image: print the error in the pixels that both have, as relMSE and as trimmed relMSE, which "
-        "leaves out the worst 0.1 %% of the pixels",
-    )
+    what = "the images are panoramas, whose left and right borders are neighbours; not needed for files with envmap"
+    parser.add_argument("--wrap", action="store_true", help=what)
+    what = "reference image: print relMSE in the pixels that both have, and relMSE without the worst 0.1 %% of these"
+    parser.add_argument("--ref", metavar="REF", help=what)
     arguments.add_files(parser)
     arguments.add_layers(parser)
     arguments.add_view(parser, "default: all views")
@@ -125,9 +113,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_untrusted(parser)
     existing = parser.add_mutually_exclusive_group()
     arguments.add_force(existing)
-    existing.add_argument(
-        "--skip-existing", action="store_true", help="leave existing results alone, to continue a folder"
-    )
+    existing.add_argument("--skip-existing", action="store_true", help="skip stacks with results, to continue a folder")
     arguments.add_json(parser)
 
 

@@ -1,4 +1,4 @@
-"""``ngpt report``: one page that compares the images of any renderers and denoisers."""
+"""``ngpt report``: writes a page that compares images of any renderers and denoisers."""
 
 import argparse
 import os
@@ -29,7 +29,7 @@ from ngpt.windows import Place, overlap, put
 
 Slices = tuple[slice, slice]
 
-# Denoising changes the mean by much less than this.
+# A difference of exposure, in stops, that is reported. Denoising changes the mean by much less.
 _STOPS = 0.5
 FLICKER = (
     "mean of (d - d_r)^2 / (m + 0.001), d the change along motion from the frame before, d_r that of the reference r, "
@@ -76,6 +76,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def images_or_shots(args: argparse.Namespace, target: Path, console: Console) -> int:
+    """Writes the page of images, or of shots if any of them is one, and returns the exit status."""
     names = labels(args.images)
     if any(is_shot(path) for path in args.images):
         return run_shots(args, names, target, console)
@@ -109,13 +110,13 @@ def images_or_shots(args: argparse.Namespace, target: Path, console: Console) ->
         formulas = {name: METRICS[name].formula for name in metrics}
         rows = [[entry.name, *(f"{value:.4g}" for value in entry.metrics.values())] for entry in entries]
         print_table([["", *entries[0].metrics], *rows])
-    rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
-    scene = Scene(f"{width}x{height}", caption, reference, entries, layers, rising)
+    scene = Scene(f"{width}x{height}", caption, reference, entries, layers, _rising())
     title = ", ".join(names) if len(names) < 5 else f"{len(names)} images"
     return finish(args, target, title, [scene], Overview(formulas=formulas), console)
 
 
 def run_trainings(args: argparse.Namespace, target: Path, console: Console) -> int:
+    """Writes the page of training runs, and returns the exit status."""
     if args.ref:
         raise WrongUse("--ref is for images; leave it out for training runs")
     names = [Path(name).as_posix() for name in labels(args.images)]
@@ -126,13 +127,15 @@ def run_trainings(args: argparse.Namespace, target: Path, console: Console) -> i
 
 
 def run_shots(args: argparse.Namespace, names: list[str], target: Path, console: Console) -> int:
-    """Folders of frames of equal names: a page that plays them, and measurements over all frames."""
+    """Writes the page that plays shots, with measurements over all frames, and returns the exit status."""
     folders = [*args.images, *([args.ref] if args.ref else [])]
-    shots = [shot_files_of(folder) for folder in folders]
+    for folder in folders:
+        if not is_shot(folder):
+            raise NgptError(f"{folder}: is not a folder, but others are; give only folders of frames, or only images")
+    shots = [shot_files(folder) for folder in folders]
     frames = frames_of(folders, shots)
-    for folder, files in zip(folders, shots, strict=True):
-        for remark in remarks(folder, files):
-            console.say(remark)
+    for remark in (line for folder, files in zip(folders, shots, strict=True) for line in remarks(folder, files)):
+        console.say(remark)
     start = str(frames[0][0])
     first = read_picture(start).place.display
     metrics, lacks = available(first.height, first.width) if args.ref else ([], {})
@@ -140,7 +143,7 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
     scenes: list[Scene] = []
     motions: list[np.ndarray | None] = []
     partly = 0
-    # The frames of each folder as they are measured: NaN where the frame does not cover the display window.
+    # The frames of each folder for measurements: NaN where a frame does not cover the display window
     known: list[list[np.ndarray]] = [[] for _ in folders]
     with console.progress("report", "frames") as progress:
         for done, frame in enumerate(frames):
@@ -162,12 +165,11 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
             if reference is not None:
                 for entry, path in zip(entries, paths, strict=False):
                     add_errors(entry, metrics, reference, path, paths[-1], both.within(display))
-            rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
             caption = f"{frame[0].name}, {first.width}x{first.height}"
-            scenes.append(Scene(frame[0].stem, caption, reference, entries, rising=rising, meanings=MEANINGS))
+            scenes.append(Scene(frame[0].stem, caption, reference, entries, rising=_rising(), meanings=MEANINGS))
         progress(len(frames), len(frames))
     if partly:
-        console.say(f"{partly} of {len(frames)} frames: compared are the pixels that all images have")
+        console.say(f"{partly} of {len(frames)} frames: only the pixels that all images have are compared")
     tables = {}
     for place in range(len(names)):
         add_maps(scenes, place, "change", change_maps(known[place], motions))
@@ -180,8 +182,7 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
             means = [float(np.mean([scene.entries[place].metrics[metric] for scene in scenes])) for metric in metrics]
             rows.append([name, *(f"{value:.4g}" for value in (*means, flicker(images, references, motions)))])
         if all(motion is None for motion in motions[1:]):
-            what = "no frame after the first has motion vectors (layer 'motion'), which tell flicker from movement"
-            console.say(f"flicker is nan: {what}")
+            console.say("flicker is nan: it needs motion vectors (layer 'motion'), which no frame after the first has")
         tables = {f"Means over {len(frames)} frames": rows}
         print_table(rows)
     formulas = {name: METRICS[name].formula for name in metrics} | ({"flicker": FLICKER} if tables else {})
@@ -193,11 +194,10 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
 def finish(
     args: argparse.Namespace, target: Path, title: str, scenes: list[Scene], about: Overview, console: Console
 ) -> int:
-    """Writes the page of images, or the page that plays a shot, and prints how to open it."""
+    """Writes the page of images, or the page that plays a shot, and returns the exit status."""
     facts, shot = {"ngpt": __version__}, any(is_shot(path) for path in args.images)
-    write_report(
-        target, title, scenes, command=args.command, footer=facts, overview=about, overwrite=args.force, shot=shot
-    )
+    more: Any = {"overview": about, "overwrite": args.force, "shot": shot}
+    write_report(target, title, scenes, command=args.command, footer=facts, **more)
     if large := oversize(target):
         console.say(large)
     console.say(f"{target}: open it in a browser")
@@ -205,7 +205,7 @@ def finish(
 
 
 def add_maps(scenes: list[Scene], place: int, name: str, changes: list[np.ndarray]) -> None:
-    """Adds maps of squared relative changes, one for each frame but the first, to the pictures at ``place``."""
+    """Adds maps of squared relative changes, one for each frame but the first, to the entries at index ``place``."""
     for scene, change in zip(scenes, [np.zeros((1, 1, 3)), *changes], strict=True):
         image = scene.entries[place].image
         values = np.clip(np.sqrt(np.nan_to_num(change.mean(axis=-1))), 0, 1)
@@ -222,17 +222,10 @@ def motion_of(paths: list[str], place: Place) -> np.ndarray | None:
     return None
 
 
-def shot_files_of(folder: str) -> list[Path]:
-    """The frames of a shot; raises NgptError for a single file."""
-    if not is_shot(folder):
-        raise NgptError(f"{folder}: is not a folder, but others are; give only folders of frames, or only images")
-    return shot_files(folder)
-
-
 def frames_of(folders: list[str], shots: list[list[Path]]) -> list[tuple[Path, ...]]:
-    """The file of each frame in every shot, in the order of the first; raises NgptError where one lacks a frame.
+    """The files of each frame, one of every shot, in the order of the first. Raises NgptError if a shot lacks a frame.
 
-    Frames are matched by the names of their files, or by their numbers if all shots are names of frames.
+    Frames are matched by the names of their files, or by their numbers if all shots are names with a field for these.
     """
     found: list[dict[Any, Path]] = [{frame_name(path): path for path in files} for files in shots]
     if all(map(varies, folders)):
@@ -248,7 +241,7 @@ def frames_of(folders: list[str], shots: list[list[Path]]) -> list[tuple[Path, .
 
 
 def labels(paths: list[str]) -> list[str]:
-    """A name for each file: its own without the ending, after the folders needed to make all names differ."""
+    """A name for each file: its own without the ending, after as many folders as make all names differ."""
     places = [Path(os.path.abspath(path)) for path in paths]
     for place, path in zip(places, paths, strict=True):
         if places.count(place) > 1:
@@ -264,7 +257,7 @@ def labels(paths: list[str]) -> list[str]:
 def add_errors(
     entry: Entry, metrics: list[str], reference: np.ndarray, path: str, other: str, part: Slices = np.s_[:, :]
 ) -> None:
-    """Measures ``part`` of a picture from file ``path`` against the reference from file ``other``."""
+    """Measures ``part`` of the picture of file ``path`` against the reference of file ``other``."""
     try:
         entry.metrics, maps = judge(metrics, entry.image[part], reference[part])
     except NgptError as error:
@@ -274,8 +267,13 @@ def add_errors(
         entry.maps[name][part] = values
 
 
+def _rising() -> list[str]:
+    """The metrics for which higher is better."""
+    return [name for name, metric in METRICS.items() if metric.better == "higher"]
+
+
 def print_table(rows: list[list[str]]) -> None:
-    """Prints the numbers of the page, for users who do not open it."""
+    """Prints the numbers of the page."""
     width = max(len(row[0]) for row in rows)
     for row in rows:
         tell(f"{row[0]:{width}}" + "".join(f"{cell:>16}" for cell in row[1:]))

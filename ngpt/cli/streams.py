@@ -1,4 +1,4 @@
-"""``-`` as the name of a file: standard input, or standard output."""
+"""The name ``-`` for standard input and standard output."""
 
 import shutil
 import sys
@@ -15,9 +15,9 @@ STREAM = "-"
 
 @contextmanager
 def standard_input(names: Sequence[str]) -> Iterator[list[str]]:
-    """The names, where a file with the contents of standard input replaces ``-``; messages call it "standard input".
+    """Yields the names, with ``-`` replaced by the name of a file with the contents of standard input.
 
-    Raises WrongUse if ``-`` occurs twice.
+    Messages call this file "standard input". Raises WrongUse if ``-`` occurs twice.
     """
     if STREAM not in names:
         yield list(names)
@@ -34,11 +34,10 @@ def standard_input(names: Sequence[str]) -> Iterator[list[str]]:
 
 @contextmanager
 def as_files(stacks: list[str], output: str | None) -> Iterator[tuple[list[str], str | None]]:
-    """The names of inputs and output, where files replace ``-``. Standard input has been read when the block begins.
-    The file that the block has written goes to standard output when it ends. OpenEXR needs random access, so both need
-    a file.
+    """Yields the names of inputs and output, with ``-`` replaced by the names of files, since OpenEXR needs files.
 
-    Raises NgptError for ``-`` beside other inputs, without an output, and for images that would go to a terminal.
+    Standard input is read before the block. The output file goes to standard output after it. Raises NgptError for
+    ``-`` beside other inputs or without an output, and for an image that would go to a terminal.
     """
     if STREAM in stacks and len(stacks) > 1:
         raise NgptError(f"'{STREAM}' is one stack, and {len(stacks)} are given; denoise them one by one")

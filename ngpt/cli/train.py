@@ -82,12 +82,12 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def _on_disk(settings: Any) -> list[str]:
-    """The folders of training sets, except sets that are rendered during the training."""
+    """The folders of training sets that exist on disk; others are rendered during the training."""
     return [folder for folder in settings.data.folders if not folder.endswith(".toml")]
 
 
 def _task(settings: Any, out: Path, stack: ExitStack, processes: Any, say: Callable[[str], None]) -> Any:
-    """The task of the settings, on the data in their folders; ``stack`` closes sets that are being rendered."""
+    """The task of the settings with its data; ``stack`` ends the rendering of training sets."""
     from ngpt.system.parts import find_crops
     from ngpt.training.clips import clips
     from ngpt.training.crops import Mixture, open_crops
@@ -101,13 +101,13 @@ def _task(settings: Any, out: Path, stack: ExitStack, processes: Any, say: Calla
     if settings.temporal:
         if processes.rank == 0:
             methods = ", ".join(settings.temporal.methods)
-            say(f"results frame by frame, by {methods}: those that are not in {out / 'results'} are made now")
+            say(f"results frame by frame, by {methods}: those not yet in {out / 'results'} are made now")
         found = list(clips(on_disk, settings.temporal.methods, out / "results"))
     else:
         found = [crop for folder in on_disk for crop in open_crops(folder)]
-    training, held_out, told = split(found, settings.data.validation, settings.data.validation_share)
-    if told and processes.rank == 0:
-        say(told)
+    training, held_out, message = split(found, settings.data.validation, settings.data.validation_share)
+    if message and processes.rank == 0:
+        say(message)
     if settings.temporal:
         return Blending(settings, training, held_out)
     made = [configs.find_config(f, configs.DATASET) for f in settings.data.folders if f.endswith(".toml")]

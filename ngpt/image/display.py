@@ -1,7 +1,7 @@
-"""From scene-linear numbers to 8-bit colours for looking at.
+"""Converts scene-linear floats to 8-bit sRGB colours (H, W, 3) to look at.
 
-Never measure on these colours: they are clamped and rounded. Every function takes scene-linear floats and returns (H,
-W, 3) uint8 in sRGB. A NaN is always magenta, so that it cannot be mistaken for a colour.
+These colours must not be measured, because they are clamped and rounded. NaN is always magenta, so that it cannot be
+mistaken for a colour.
 """
 
 import math
@@ -12,22 +12,21 @@ import numpy as np
 from ngpt.errors import NgptError
 
 MAGENTA = (255, 0, 255)
-MIDDLE_GREY = 0.18  # the display value that a light meter gives the average scene
+MIDDLE_GREY = 0.18  # the reflectance to which a light meter exposes the average scene
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
 
-ERROR_EPSILON = 1e-2  # keeps the relative error of black pixels finite, at automatic exposure
-ERROR_RANGE = (1e-4, 1.0)  # relative squared error at the two ends of the heat table: 1 % and 100 %
+ERROR_EPSILON = 1e-2  # keeps the relative error of black pixels finite; for images at automatic exposure
+ERROR_RANGE = (1e-4, 1.0)  # relative squared errors at the ends of the heat table: 1 % and 100 %, squared
 
-MOST_ASPECT = 16.0  # of pixels: larger values in a header make no sense
+MOST_ASPECT = 16.0  # the largest aspect of pixels that makes sense
 
-# "inferno" of Smith and van der Walt at nine even steps: its lightness grows evenly, so colour-blind readers can use
-# it.
+# "inferno" of Smith and van der Walt at nine even steps. Its lightness grows evenly, which serves colour-blind readers.
 _INFERNO = ("000004", "210c4a", "57106e", "8a226a", "bc3754", "e45a31", "f98e09", "f9cb35", "fcffa4")
 _DIVERGING = ("9ecbff", "2f7fd6", "777777", "d9772b", "ffd09a")  # negative blue, zero grey, positive orange
 
 
 def to_srgb8(image: np.ndarray, exposure_stops: float = 0.0) -> np.ndarray:
-    """(H, W, 3) scene-linear -> uint8 sRGB (IEC 61966-2-1), after multiplication by 2**exposure_stops.
+    """Scene-linear (H, W, 3) as uint8 sRGB (IEC 61966-2-1), after multiplication by 2**exposure_stops.
 
     Negative values show as 0, a pixel with +Inf as white, a pixel with NaN as magenta.
     """
@@ -35,15 +34,15 @@ def to_srgb8(image: np.ndarray, exposure_stops: float = 0.0) -> np.ndarray:
 
 
 def encoded_srgb(light: np.ndarray) -> np.ndarray:
-    """Linear values >= 0 -> sRGB values in [0, 1]."""
+    """Linear values of 0 or more as sRGB values from 0 to 1."""
     linear = np.minimum(light, 1.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def to_display8(image: np.ndarray, transform: Callable[[np.ndarray], np.ndarray], stops: float) -> np.ndarray:
-    """As :func:`to_srgb8`, with another transform: (H, W, 3) of light >= 0 -> display values."""
+    """Like :func:`to_srgb8`, with another ``transform`` from light (H, W, 3) of 0 or more to display values."""
     image = _rgb(image)
-    # Clamped before and after the gain: before, so that Inf and the largest floats cannot overflow into a NaN.
+    # Clamped before and after the gain, so that Inf and the largest floats cannot overflow into NaN.
     light = np.clip(np.nan_to_num(image, nan=0.0, posinf=1e30, neginf=0.0), 0.0, 1e30)
     values = np.clip(transform(np.minimum(light * 2.0**stops, 1e30)), 0.0, 1.0)
     out = np.floor(255.0 * values + 0.5).astype(np.uint8)
@@ -53,9 +52,9 @@ def to_display8(image: np.ndarray, transform: Callable[[np.ndarray], np.ndarray]
 
 
 def squared(image: np.ndarray, aspect: float) -> np.ndarray:
-    """An image (H, W, C) with square pixels, made from pixels whose width is ``aspect`` times their height.
+    """An image (H, W, C) with square pixels, from pixels whose width is ``aspect`` times their height.
 
-    Pixels are repeated, so a picture only becomes larger.
+    Pixels are repeated, so that the image only becomes larger.
     """
     if not (1 / MOST_ASPECT <= aspect <= MOST_ASPECT) or aspect == 1:
         return image
@@ -67,10 +66,10 @@ def squared(image: np.ndarray, aspect: float) -> np.ndarray:
 def auto_exposure(reference: np.ndarray) -> float:
     """The exposure, in stops, that brings the log-average luminance of (H, W, 3) to middle grey, 0.18.
 
-    Only finite pixels count. Pixels 13 stops or more below the bright end count as background, and are left out.
-    Fireflies are clamped to the 99th percentile of the lit pixels. An all-black image gives 0.
+    Only finite pixels count. Pixels 13 stops or more below the 99th percentile of the lit pixels count as background
+    and are left out. Fireflies are clamped to that percentile. The exposure of a black image is 0.
     """
-    with np.errstate(invalid="ignore"):  # Inf - Inf, left out below
+    with np.errstate(invalid="ignore"):  # Inf - Inf is NaN, which is left out below
         luminance = (_rgb(reference) @ LUMINANCE).ravel()
     lit = luminance[np.isfinite(luminance) & (luminance > 0.0)]
     if lit.size == 0:
@@ -82,23 +81,23 @@ def auto_exposure(reference: np.ndarray) -> float:
 
 
 def signed_map(gradient: np.ndarray) -> np.ndarray:
-    """A gradient layer, (H, W, 3) of either sign: zero is grey, negative is blue, positive is orange.
+    """The colours of a gradient layer (H, W, 3): zero is grey, negative blue, positive orange.
 
-    It shows the mean over RGB, linear up to the 99th percentile of its magnitude.
+    They show the mean over RGB, linearly up to the 99th percentile of its magnitude.
     """
     value = _rgb(gradient).mean(axis=2)
     magnitude = np.abs(value[np.isfinite(value)])
     scale = np.percentile(magnitude, 99.0) if magnitude.size else 0.0
-    if scale == 0.0:  # for a layer that is zero nearly everywhere
+    if scale == 0.0:  # the layer is zero nearly everywhere
         scale = magnitude.max(initial=0.0) or 1.0
     return coloured(0.5 + 0.5 * value / scale, sign_table())
 
 
 def layer_view(name: str, layer: np.ndarray) -> np.ndarray:
-    """A layer of a stack, (H, W), (H, W, 1) or (H, W, 3), as (H, W, 3) uint8: each kind in its own way.
+    """The colours (H, W, 3) uint8 of a layer of a stack, (H, W), (H, W, 1) or (H, W, 3), by its name.
 
     Gradients are shown as in :func:`signed_map`, normals as colours, depth up to its 99th percentile, light and
-    variances at automatic exposure, and other layers unchanged.
+    variances at automatic exposure, and other layers as they are.
     """
     layer = np.atleast_3d(np.asarray(layer, dtype=np.float64))
     layer = np.broadcast_to(layer, (*layer.shape[:2], 3))
@@ -125,17 +124,17 @@ def thumbnail(picture: np.ndarray, width: int) -> np.ndarray:
 
 
 def heat_table() -> np.ndarray:
-    """(256, 3) uint8 sRGB from black over red to pale yellow."""
+    """Colours from black through red to pale yellow, (256, 3) uint8 sRGB."""
     return colour_table(_INFERNO, 256)
 
 
 def sign_table() -> np.ndarray:
-    """(255, 3) uint8 sRGB from blue over grey to orange; the odd size gives zero an entry of its own."""
+    """Colours from blue through grey to orange, (255, 3) uint8 sRGB. Their number is odd, so that one is for zero."""
     return colour_table(_DIVERGING, 255)
 
 
 def colour_table(anchors: tuple[str, ...], size: int) -> np.ndarray:
-    """(size, 3) uint8: the anchors at even steps, straight lines between them."""
+    """Colours (size, 3) uint8: the anchors at even steps, with linear interpolation between them."""
     colours = np.array([list(bytes.fromhex(anchor)) for anchor in anchors], dtype=np.float64)
     place = np.linspace(0.0, len(anchors) - 1, size)
     table = [np.interp(place, np.arange(len(anchors)), channel) for channel in colours.T]
@@ -143,7 +142,7 @@ def colour_table(anchors: tuple[str, ...], size: int) -> np.ndarray:
 
 
 def coloured(place: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """(H, W) positions in [0, 1], clamped, looked up in a (N, 3) table; NaN is magenta."""
+    """The colours of positions (H, W) in a table (N, 3), from 0 to 1, to which they are clamped; NaN is magenta."""
     index = np.rint((len(table) - 1) * np.clip(np.nan_to_num(place, nan=0.0), 0.0, 1.0))
     out = table[index.astype(np.uint8)]
     out[np.isnan(place)] = MAGENTA

@@ -1,4 +1,4 @@
-"""A gradient stack in a notebook: a small picture and a table, as HTML without style or script."""
+"""Shows a gradient stack in a notebook: a small picture and a table, as HTML without style or script."""
 
 import base64
 from collections.abc import Mapping
@@ -13,12 +13,12 @@ WIDTH = 160  # pixels of the picture
 
 
 def stack_html(title: str, layers: Mapping[str, np.ndarray]) -> str:
-    """``title``, a picture of the first of the ``layers`` (H, W, C), and the least, mean and largest value of each.
+    """HTML with the title, a picture of the first layer (H, W, C), and the least, mean and largest value of each.
 
-    Only finite values count; the last column is the number of pixels with a non-finite value.
+    Only finite values count. The last column of the table is the number of pixels with a non-finite value.
     """
     name, image = next(iter(layers.items()))
-    # A sample of the pixels of a large image is enough: the picture should appear at once.
+    # Some of the pixels of a large image are enough, and faster.
     step = max(1, image.shape[1] // (4 * WIDTH))
     picture = encode_png(display.thumbnail(display.layer_view(name, image[::step, ::step]), WIDTH))
     source = "data:image/png;base64," + base64.b64encode(picture).decode()

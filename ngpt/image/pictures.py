@@ -1,7 +1,7 @@
-"""Pictures and films of 8-bit sRGB: PNG by ``ngpt.image.png``, JPEG and WebP by Pillow, MP4 by FFmpeg.
+"""Writes pictures and films of 8-bit sRGB: PNG by ``ngpt.image.png``, JPEG and WebP by Pillow, MP4 by FFmpeg.
 
-A shot is a lossless animated WebP, or an MP4 (H.264 where FFmpeg has it). FFmpeg is the program of that name, or the
-one in the package imageio-ffmpeg.
+A film is a lossless animated WebP, or an MP4 (H.264 if FFmpeg has it). FFmpeg is the installed program, or the one in
+the package imageio-ffmpeg.
 """
 
 import os
@@ -28,7 +28,7 @@ _QUALITY = 95  # of JPEG; colour is stored at full resolution
 
 
 def check_kind(path: Path, kinds: tuple[str, ...]) -> None:
-    """Raises NgptError for a file of another kind, or of a kind that cannot be written on this machine."""
+    """Raises NgptError if a file is not of one of these kinds, or if a package for its kind is not installed."""
     kind = path.suffix.lower()
     if kind not in kinds:
         raise NgptError(f"{path}: ngpt cannot write this kind of file; let the name end in one of {' '.join(kinds)}")
@@ -39,7 +39,7 @@ def check_kind(path: Path, kinds: tuple[str, ...]) -> None:
 
 
 def check_size(path: Path, width: int, height: int) -> None:
-    """Raises NgptError for more pixels than the format has room for."""
+    """Raises NgptError if an image is too large for its format."""
     most = _LONGEST.get(path.suffix.lower(), max(width, height))
     if max(width, height) > most:
         raise NgptError(
@@ -49,7 +49,7 @@ def check_size(path: Path, width: int, height: int) -> None:
 
 
 def write_picture(path: Path, pixels: np.ndarray, overwrite: bool = False) -> None:
-    """Writes (H, W, 3) uint8 of sRGB as PNG, JPEG or WebP (without loss), by the name's end."""
+    """Writes sRGB pixels (H, W, 3) uint8 as PNG, JPEG or lossless WebP, by the ending of the name."""
     check_kind(path, PICTURES)
     check_size(path, pixels.shape[1], pixels.shape[0])
     with atomic_output(path, overwrite) as temporary:
@@ -64,7 +64,7 @@ def write_picture(path: Path, pixels: np.ndarray, overwrite: bool = False) -> No
 
 
 def write_shot(path: Path, frames: Iterable[np.ndarray], fps: float, overwrite: bool = False) -> None:
-    """Writes frames (H, W, 3) uint8 of sRGB, all of one size, as an animated WebP or an MP4, by the name's end."""
+    """Writes sRGB frames (H, W, 3) uint8 of one size as animated WebP or MP4, by the ending of the name."""
     check_kind(path, SHOTS)
     one_size = _of_one_size(path, frames)
     first = next(one_size)
@@ -104,7 +104,7 @@ def _ffmpeg(path: Path) -> str:
 def _write_mp4(path: Path, temporary: Path, frames: Iterable[np.ndarray], size: tuple[int, int], fps: float) -> None:
     command = [_ffmpeg(path), "-loglevel", "error", "-nostdin", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
     command += ["-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}", "-i", "-", "-an"]
-    # Players need even sides, and tags that name the colour space.
+    # Players need even sides, and tags for the colour space.
     command += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2,scale=out_color_matrix=bt709:out_range=tv", "-pix_fmt", "yuv420p"]
     command += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "iec61966-2-1", "-f", "mp4"]
     # With "file:", a name that begins with a dash, or looks like a protocol, still names a file.
@@ -116,7 +116,7 @@ def _write_mp4(path: Path, temporary: Path, frames: Iterable[np.ndarray], size: 
                 process.stdin.write(np.ascontiguousarray(frame).tobytes())
             process.stdin.close()
         except BrokenPipeError:
-            pass  # FFmpeg's own message is read below.
+            pass  # the message of FFmpeg is read below
         except BaseException:
             process.kill()
             raise

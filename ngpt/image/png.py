@@ -1,4 +1,4 @@
-"""A PNG encoder for 8-bit RGB and palettes: reports need no other format, and so no image library."""
+"""Encodes PNGs of 8-bit RGB or with a palette, so that reports need no image library."""
 
 import struct
 import zlib
@@ -9,9 +9,9 @@ from ngpt.errors import NgptError
 
 
 def encode_png(image: np.ndarray, level: int = 9) -> bytes:
-    """Encodes (H, W, 3) uint8, row 0 on top, as an sRGB PNG. The same pixels give the same bytes.
+    """An sRGB PNG of pixels (H, W, 3) uint8, with row 0 at the top. The same pixels give the same bytes.
 
-    ``level`` is zlib's compression level: 9 makes the smallest file, and 1 takes a tenth of the time.
+    ``level`` is the compression level of zlib: 9 makes the smallest file, and 1 takes a tenth of the time.
     """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
         raise NgptError(f"PNG: needs a non-empty (H, W, 3) uint8 image, got {image.shape} {image.dtype}")
@@ -19,7 +19,7 @@ def encode_png(image: np.ndarray, level: int = 9) -> bytes:
 
 
 def encode_palette_png(places: np.ndarray, table: np.ndarray, level: int = 6) -> bytes:
-    """Encodes (H, W) uint8 indices into a ``table`` of at most 256 colours, (N, 3) uint8: a third of RGB's size."""
+    """A PNG of indices (H, W) uint8 into a ``table`` of at most 256 colours (N, 3) uint8: a third of RGB's size."""
     if places.dtype != np.uint8 or places.ndim != 2 or places.size == 0 or places.max() >= len(table):
         raise NgptError(f"PNG: needs non-empty (H, W) uint8 places in a table, got {places.shape} {places.dtype}")
     # Rows without a filter, as the standard advises for palettes.
@@ -39,7 +39,7 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def _filtered(image: np.ndarray) -> bytes:
-    """Each row with the filter (none, left or up) whose residuals are smallest: the heuristic of the PNG standard."""
+    """The rows, each with the filter (none, left or up) of the smallest residuals: the PNG standard's heuristic."""
     rows = image.reshape(len(image), -1)
     left, up = rows.copy(), rows.copy()
     left[:, 3:] -= rows[:, :-3]  # uint8 wraps modulo 256, as the standard asks

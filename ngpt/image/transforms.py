@@ -1,8 +1,8 @@
-"""View transforms: from scene-linear light of Rec. 709 to 8-bit sRGB, for pictures that people look at.
+"""View transforms from scene-linear Rec. 709 to 8-bit sRGB, for pictures to look at.
 
-standard  the sRGB curve (IEC 61966-2-1); values above 1 are white
+standard  the sRGB curve (IEC 61966-2-1); values above 1 are clipped
 filmic    AgX: highlights roll off and lose their colour, as on film
-aces      ACES 1.3, "ACES 1.0 - SDR Video", by OpenColorIO's built-in configuration; needs its package
+aces      ACES 1.3, "ACES 1.0 - SDR Video", by the built-in configuration of OpenColorIO, which must be installed
 """
 
 from collections.abc import Callable
@@ -16,8 +16,8 @@ from ngpt.errors import NgptError
 from ngpt.image.display import encoded_srgb, to_display8
 from ngpt.system.install import package_command
 
-# AgX (Troy Sobotka) in the form of B. Wrensch, "Minimal AgX implementation" (iolite-engine.com, 2023): primaries drawn
-# toward grey, stops from 2^-12.47393 to 2^4.026069, a polynomial for the curve, primaries drawn back.
+# AgX (Troy Sobotka) in the form of B. Wrensch, "Minimal AgX implementation" (iolite-engine.com, 2023): primaries are
+# moved toward grey, light from 2^-12.47393 to 2^4.026069 is mapped by a polynomial, and primaries are moved back.
 _INSET = np.array(
     [
         [0.842479062253094, 0.0784335999999992, 0.0792237451477643],
@@ -31,21 +31,21 @@ _CONFIGURATION = "ocio://cg-config-v2.1.0_aces-v1.3_ocio-v2.3"
 
 
 def filmic(light: np.ndarray) -> np.ndarray:
-    """(H, W, 3) >= 0 -> display values of sRGB, by AgX."""
+    """Light (H, W, 3) of 0 or more as display values of sRGB, by AgX."""
     stops = np.log2(np.maximum(light @ _INSET.T, 2.0**_DARKEST))
     place = np.clip((stops - _DARKEST) / (_BRIGHTEST - _DARKEST), 0.0, 1.0)
     return np.polyval(_CURVE, place) @ np.linalg.inv(_INSET).T
 
 
 def aces(light: np.ndarray) -> np.ndarray:
-    """(H, W, 3) >= 0 -> display values of sRGB, by OpenColorIO."""
+    """Light (H, W, 3) of 0 or more as display values of sRGB, by OpenColorIO."""
     image = np.ascontiguousarray(light, np.float32)
     _aces().applyRGB(image)
     return image
 
 
 def check_transform(name: str) -> None:
-    """Raises NgptError for a transform that needs a missing package."""
+    """Raises NgptError if the package of a transform is missing."""
     if name == "aces":
         _aces()
 
@@ -69,9 +69,9 @@ TRANSFORMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"standard": encoded
 
 
 def shown(image: np.ndarray, transform: str = "standard", stops: float = 0.0) -> np.ndarray:
-    """(H, W, 3) scene-linear of Rec. 709 -> uint8 sRGB, after multiplication by 2**stops.
+    """Scene-linear Rec. 709 (H, W, 3) as uint8 sRGB, after multiplication by 2**stops.
 
-    Negative values show as 0, a pixel with +Inf as white, a pixel with NaN as magenta. Raises NgptError if the
-    transform needs a package that is not installed.
+    Negative values show as 0, a pixel with +Inf as white, a pixel with NaN as magenta. Raises NgptError if the package
+    of the transform is missing.
     """
     return to_display8(image, TRANSFORMS[transform], stops)

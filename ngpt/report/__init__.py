@@ -1,1 +1,1 @@
-"""Pages to look at: the self-contained HTML report, and pages that a render keeps up to date."""
+"""Writes pages: the HTML report in one file, and the page of a running render."""

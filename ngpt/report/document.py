@@ -1,4 +1,4 @@
-"""A page of text, tables and plots in the viewer's style: one file, without scripts, that loads nothing else."""
+"""Pages of text, tables and plots in the style of the report: one file, without scripts, that loads nothing else."""
 
 import base64
 import hashlib
@@ -8,12 +8,16 @@ from ngpt.system.text import markup
 
 
 def document(title: str, body: str, *, command: str = "", style: str = "", refresh: int = 0) -> str:
-    """The HTML of a page; ``body`` is markup, ``style`` more rules. With ``refresh`` it is reloaded after every period
-    of this many seconds, as long as it is open."""
+    """The HTML of a page.
+
+    ``body``     markup
+    ``style``    rules of CSS in addition to those of the report
+    ``refresh``  seconds after which an open page is loaded again; 0: never
+    """
     sheet = (package_files("ngpt.report") / "report.html").read_text(encoding="utf-8")
     sheet = sheet.split("<style>")[1].split("</style>")[0] + style
-    allowed = "sha256-" + base64.b64encode(hashlib.sha256(sheet.encode()).digest()).decode()
-    policy = f"default-src 'none'; img-src data:; style-src '{allowed}'; base-uri 'none'; form-action 'none'"
+    allowed = source_hash(sheet)
+    policy = f"default-src 'none'; img-src data:; style-src {allowed}; base-uri 'none'; form-action 'none'"
     again = f'<meta http-equiv="refresh" content="{refresh}">\n' if refresh else ""
     return (
         f'<!DOCTYPE html>\n<html lang="en" data-ready="true">\n<head>\n<meta charset="utf-8">\n'
@@ -24,3 +28,8 @@ def document(title: str, body: str, *, command: str = "", style: str = "", refre
         f"<main>\n{body}\n</main>\n"
         f"<footer><code>{markup(command)}</code></footer>\n</body>\n</html>\n"
     )
+
+
+def source_hash(body: str) -> str:
+    """The hash of a style or a script for a page's Content-Security-Policy, which allows no other."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()}'"

@@ -1,4 +1,4 @@
-"""The report of an evaluation: from the results folder of ``eval.py`` to one HTML file."""
+"""Writes the report of an evaluation: one HTML file from the folder of results."""
 
 import json
 import math
@@ -13,17 +13,16 @@ from ngpt.report.content import Entry, Overview, Scene
 from ngpt.report.page import write_report
 
 FORMAT = 2
-# Pixels of all pictures that a page holds in acceptable quality: 8 methods and the reference, 6 scenes
+# The most pixels that a page can hold in acceptable quality: 6 scenes with 8 methods and the reference
 ROOM = 54 * 1280 * 720
 
 
 def write_evaluation_report(folder: str | os.PathLike, output: str | os.PathLike, *, overwrite: bool = False) -> Path:
     """Writes the report of ``folder``/results.json to ``output`` and returns its path.
 
-    Tables hold every cell. Pictures of the first seed are shown for the lowest sample counts, as long as they fit into
-    ROOM; the page says for which ones. A method without a picture is listed with the reason.
-
-    Raises NgptError if the folder has no readable results, or no result has a picture.
+    Tables hold all results. Pictures are shown of the first seed, for the lowest sample counts that fit into ROOM; the
+    page says for which ones. A method without a picture is listed with the reason. Raises NgptError if the folder has
+    no readable results, or no result has a picture.
     """
     folder = Path(folder)
     results = read_results(folder)
@@ -61,8 +60,7 @@ def read_results(folder: Path) -> dict[str, Any]:
 
 
 def _fitting(results: dict, cells: list[dict], counts: list[int]) -> list[int]:
-    """The sample counts whose pictures fit into ROOM, at least one. High counts are left out first: their pictures look
-    alike."""
+    """The lowest sample counts whose pictures fit into ROOM, at least one. At high counts, all pictures look alike."""
     taken, shown = 0, list[int]()
     for spp in counts:
         drawn = {(cell["scene"], cell["method"]) for cell in cells if cell["spp"] == spp}
@@ -75,6 +73,7 @@ def _fitting(results: dict, cells: list[dict], counts: list[int]) -> list[int]:
 
 
 def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) -> Scene:
+    """The tab of a scene at a sample count, from its cells: one for each method and seed."""
     scene = results["scenes"][name]
     entries, absent = [], []
     for method in results["methods"]:
@@ -91,7 +90,7 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
             values = [math.nan if value is None else value for value in found]
             metrics[metric] = values[0] if len(values) == 1 else values
         entries.append(Entry(method, read_image(folder / pictured["image"]), seconds, metrics))
-    # The captions show the first metric, and the best method is chosen by it.
+    # The first metric is shown below the pictures and decides which method is best.
     for entry in entries:
         entry.metrics = dict(sorted(entry.metrics.items(), key=lambda item: item[0] != results["primary"]))
     reference = scene["reference"] or {"image": None}
@@ -99,7 +98,7 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
     clock = f"sampler {results['settings']['clock']}" if several_samplers(results) else "gradients"
     size = f"{scene['size'][0]}x{scene['size'][1]}"
     facts = [f"{size}, equal rendering time to {spp} spp of {clock}; times are render and method"]
-    # For references from elsewhere the number of samples may be unknown.
+    # The number of samples of a reference from elsewhere may be unknown.
     samples = f"reference {reference['spp']:g} spp" if reference.get("spp") else "reference"
     facts += [samples] if image is not None else ["no reference"]
     floors = [f"{metric} {value:.3g}" for metric, value in reference.get("floors", {}).items() if value is not None]
@@ -110,15 +109,16 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
 
 
 def _row(results: dict, scene: str | None, spp: int, method: str) -> dict:
-    """The row of the summary; an empty row if there is none."""
-    for row in results["summary"]:
-        if (row["scene"], row["spp"], row["method"]) == (scene, spp, method):
-            return row
-    return {"metrics": {}, "seconds": {"total": None}, "pareto": False}
+    """The row of the summary for a scene, a sample count and a method; an empty row if there is none."""
+    found = (row for row in results["summary"] if (row["scene"], row["spp"], row["method"]) == (scene, spp, method))
+    return next(found, {"metrics": {}, "seconds": {"total": None}, "pareto": False})
 
 
 def _tables(results: dict) -> dict[str, list[list[str]]]:
-    """The primary metric of all methods and sample counts: one table for the mean, one for each scene."""
+    """Tables of the primary metric by methods and sample counts, for the mean and for each scene; and two others.
+
+    The others are the costs of samplers, if there are several, and the absent results with their reasons.
+    """
     counts = sorted({row["spp"] for row in results["summary"]})
     tables = {}
     for scene in [None, *results["scenes"]]:
@@ -142,12 +142,12 @@ def _tables(results: dict) -> dict[str, list[list[str]]]:
 
 
 def several_samplers(results: dict) -> bool:
-    """Whether any method's stacks come from another sampler than the usual one for their kind."""
+    """Whether any method has stacks of another sampler than the usual one for its kind of stack."""
     return any(entry["render"] != entry["stack"] for entry in results["methods"].values())
 
 
 def _costs(results: dict) -> dict[str, list[list[str]]]:
-    """The cost of one sample per pixel, by scene and sampler: milliseconds for the whole image."""
+    """The table of the cost of one sample per pixel, in milliseconds for the whole image, by scene and sampler."""
     costs = {name: entry["cost"] for name, entry in results["scenes"].items() if entry.get("cost")}
     renders = list(dict.fromkeys(name for cost in costs.values() for name in cost))
     rows = [["scene", *renders, "auto"]]
@@ -158,7 +158,7 @@ def _costs(results: dict) -> dict[str, list[list[str]]]:
 
 
 def _cell(row: dict, metric: str, doubt: float | None) -> str:
-    """The numbers of a row; ~ where the error is below ``doubt``, which the reference cannot resolve."""
+    """The text of a row's numbers, with ~ if the error is below ``doubt``, the noise of the reference."""
     value = row["metrics"].get(metric)
     if not value or value["median"] is None:
         return "-"
@@ -171,6 +171,7 @@ def _cell(row: dict, metric: str, doubt: float | None) -> str:
 
 
 def _formulas(results: dict) -> dict[str, str]:
+    """The formulas of the metrics, and of r in them if references have two halves."""
     texts = {name: f"{metric['formula']} ({metric['better']} is better)" for name, metric in results["metrics"].items()}
     if any((scene.get("reference") or {}).get("halves") for scene in results["scenes"].values()):
         texts["r"] = (

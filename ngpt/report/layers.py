@@ -1,4 +1,4 @@
-"""The contents of one file for the page: radiance as pictures with an exposure, other layers in their own colours."""
+"""Prepares the contents of one file for the report: light as pictures, other layers in colours of their own."""
 
 import numpy as np
 
@@ -7,15 +7,15 @@ from ngpt.io.primaries import converted, to_rec709
 from ngpt.report.content import Entry
 from ngpt.stack import GradientStack
 
-# Layers of the contract that hold radiance; gradients, variances and features do not.
+# Layers of the contract that hold light
 _LIGHT = ("primal", "direct", "caustic", "diffuse", "specular")
 
 
 def of_stack(stack: GradientStack, shown: np.ndarray, name: str) -> tuple[list[Entry], dict[str, np.ndarray]]:
-    """Pictures and layers of a file, as a ``Scene`` takes them: (H, W, 3) scene-linear, and (H, W, 1) or (H, W, 3).
+    """The entries and the layers of a ``Scene`` for one file: (H, W, 3) scene-linear; and (H, W, 1) or (H, W, 3).
 
-    ``shown`` (H, W, 3) is the picture that a viewer shows. It comes first, under the name of the file. In a result, the
-    input follows as "primal". Channels outside of the contract that form no colour are separate layers.
+    ``shown`` (H, W, 3) is the picture that a viewer shows. It is the first entry, called ``name``. In a result, the
+    input follows as "primal". Channels that belong to no colour and no layer of the contract are layers of their own.
     """
     light = {layer: stack[layer] for layer in _LIGHT if layer in stack}
     light |= {layer: image for layer, image in layers_of_light(stack).items() if layer not in light}
@@ -23,13 +23,13 @@ def of_stack(stack: GradientStack, shown: np.ndarray, name: str) -> tuple[list[E
     light = {layer: converted(image, matrix) for layer, image in light.items()}
     entries = [Entry(name, shown)]
     for layer, image in light.items():
-        # The file holds the root layer a second time, under its renderer's name.
+        # A file may hold the root a second time, under its renderer's name.
         if not np.array_equal(image, shown, equal_nan=True):
             entries.append(Entry(layer if layer != name else f"{layer} (layer)", image))
     taken = {entry.name for entry in entries}
     layers = {layer: _three(stack[layer]) for layer in stack.names if layer not in light}
     for channel, values in channels_alone(stack).items():
-        if channel not in "RGB":  # the root layer, which is shown already
+        if channel not in "RGB":  # the root, which is shown already
             layers[channel] = np.asarray(values, np.float32)[..., None]
     return entries, {layer: values for layer, values in layers.items() if layer not in taken}
 

@@ -1,11 +1,11 @@
-"""The page of a running render: a small web server on the loopback address, which only this machine can reach.
+"""The page of a running render, from a small web server that only this machine can reach (the loopback address).
 
-    GET  /         the page of the newest images: the report, with a script that asks for newer ones
-    GET  /status   {"number": of the newest images, "text": the progress of the render, "ended": whether it is over}
-    POST /enough   ends the render, as Ctrl-C does; accepted only from the page itself
+    GET  /         the page with the newest images: a report with a script that requests newer ones
+    GET  /status   {"number": of the newest images, "text": progress of the render, "ended": whether it is over}
+    POST /enough   ends the render like Ctrl-C; accepted only from the page itself
 
-The server answers nothing else, and stores nothing that a browser sends. Other sites learn nothing through a browser:
-the server refuses requests under another host name, and ``enough`` from another origin.
+The server answers no other requests, and stores nothing that a browser sends. Other sites learn nothing through a
+browser, because requests under another host name, and ``enough`` from another origin, are refused.
 """
 
 import json
@@ -24,11 +24,11 @@ from ngpt.system.text import markup, printable
 from ngpt.version import __version__
 
 ADDRESS, PORT = "127.0.0.1", 8642
-# Seconds without a request after which a viewer counts as gone; and seconds that viewers are waited for at the end.
+# Seconds without a request after which a viewer counts as gone; seconds of waiting for viewers at the end
 _GONE, _FAREWELL = 5.0, 2.5
-# The most connections at a time, each with its own thread: enough for some browsers, which open up to six each.
+# The largest number of connections, each with its own thread. A browser opens up to six.
 MOST = 32
-# The most seconds for a request and its answer: a large page may go through a slow tunnel.
+# The largest number of seconds for a request and its answer: a large page may pass through a slow tunnel.
 _LONGEST = 60.0
 _FIRST = """<!DOCTYPE html><html lang="en"><meta charset="utf-8"><meta http-equiv="refresh" content="1">
 <meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" content="dark">
@@ -45,7 +45,7 @@ _HEADERS = {
 
 
 class LivePage:
-    """Serves until ``close`` is called; ``enough`` is True once the page's button was pressed.
+    """Serves the page until ``close`` is called. ``enough`` is True once a viewer has pressed the button.
 
     Listens on ``port``, or on any free port if that one is in use. Raises NgptError if no port is free.
     """
@@ -73,7 +73,7 @@ class LivePage:
         return time.monotonic() - self._asked < _GONE
 
     def show(self, preview: Preview, caption: str) -> None:
-        """Replaces the images of the page. All of them are shown at the exposure of the first preview."""
+        """Replaces the images of the page. All are shown at the exposure of the first preview."""
         scene = preview.scene("newest", caption)
         if self.exposure is None:
             self.exposure = auto_exposure(scene)
@@ -83,7 +83,7 @@ class LivePage:
         self.text, self.number = text, number
 
     def tell(self, line: str) -> None:
-        """Sets the line that says how far the render is."""
+        """Sets the line about the progress of the render."""
         self.line = line
 
     def close(self, line: str) -> None:
@@ -91,7 +91,7 @@ class LivePage:
         self.line, self.ended = line, True
         if self.watched:
             self._told_end.wait(_FAREWELL)
-            time.sleep(0.2)  # Pages that saw the end ask for the last images.
+            time.sleep(0.2)  # for pages that now request the last images
         self.server.shutdown()
         self.server.server_close()
 
@@ -99,7 +99,7 @@ class LivePage:
         return _FIRST.format(title=markup(self.title), line=markup(self.line), command=markup(self.command))
 
     def answer(self, path: str) -> tuple[str, str] | None:
-        """(content type, text) of the page at ``path``; None if there is none."""
+        """The content type and the text of the page at ``path``; None if there is none."""
         if path == "/":
             self._asked = time.monotonic()
             return "text/html", self.text or self._first()
@@ -121,15 +121,15 @@ def _listening(port: int, page: LivePage) -> ThreadingHTTPServer:
 
 
 class _Server(ThreadingHTTPServer):
-    """Answers each connection in a thread, ``MOST`` at a time, each for ``_LONGEST`` seconds at most.
+    """Answers each connection in a thread: at most ``MOST`` at once, and each for at most ``_LONGEST`` seconds.
 
-    If all are taken, a new connection replaces the oldest one: ordinary requests last some milliseconds. So neither
-    many nor slow connections can block the page, or use up the memory and the file descriptors of the render.
+    If there are ``MOST``, a new connection replaces the oldest one, since ordinary requests last some milliseconds. So
+    neither many nor slow connections can block the page, or use up the render's memory and file descriptors.
     """
 
     daemon_threads = True
     allow_reuse_address = os.name != "nt"  # On Windows two servers could listen on one port.
-    request_queue_size = 128  # a client that finds the queue full tries again only after seconds
+    request_queue_size = 128  # large, because a client that finds the queue full waits for seconds
 
     def __init__(self, *args):
         self._open: dict[socket.socket, float] = {}  # connection -> time when it began, oldest first
@@ -156,7 +156,7 @@ class _Server(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def service_actions(self) -> None:
-        """The server calls this regularly: closes connections that have lasted too long."""
+        """Closes connections that have lasted too long. The server calls this regularly."""
         with self._changed:
             for connection, begun in self._open.items():
                 if time.monotonic() - begun > _LONGEST:
@@ -167,7 +167,7 @@ class _Server(ThreadingHTTPServer):
 
 
 def _hang_up(connection: socket.socket) -> None:
-    """Shuts the connection down, which ends the wait of its thread."""
+    """Shuts a connection down, so that its thread ends."""
     with suppress(OSError):
         connection.shutdown(socket.SHUT_RDWR)
 
@@ -194,7 +194,7 @@ class _Handler(BaseHTTPRequestHandler):
         return self._send(HTTPStatus.NO_CONTENT)
 
     def _meant(self) -> bool:
-        """Whether the request names our host, and not a foreign name that resolves to this address."""
+        """Whether the request is for our host name, and not for a foreign name that resolves to this address."""
         return self.headers.get("Host") in {f"{host}:{self.server.server_port}" for host in (ADDRESS, "localhost")}
 
     def _send(self, status: HTTPStatus, kind: str = "text/plain", text: str = "") -> None:

@@ -1,13 +1,11 @@
-"""One HTML file that shows every method on every scene.
+"""Writes the report: one HTML file that shows all methods on all scenes.
 
-The page needs no network and no other file. It stores pictures as scene-linear numbers (:mod:`ngpt.report.pixelcodec`),
-so the reader can change the exposure and see errors of the radiance itself. The page states the error that the storage
-adds. ``report.html`` holds the frame, the style and the script; this file fills it. Without JavaScript the tables and
-the thumbnails remain.
+The page needs no network and no other file. Its pictures are scene-linear numbers (:mod:`ngpt.report.pixelcodec`), so
+that readers can change the exposure and see errors of radiance. The page states the error that this storage adds.
+``report.html`` is the template with style and script. Without JavaScript, tables and thumbnails are still shown.
 """
 
 import base64
-import hashlib
 import json
 import os
 import re
@@ -21,12 +19,13 @@ from ngpt.errors import NgptError
 from ngpt.image import display
 from ngpt.report import pixelcodec
 from ngpt.report.content import REFERENCE, Overview, Scene
+from ngpt.report.document import source_hash
 from ngpt.report.markup import overview_html, section
 from ngpt.system.text import markup, printable
 from ngpt.system.writing import write_text
 
 _SOURCES = ("report.html", "live.js")
-PAGE_LIMIT = 40e6  # bytes that mail and browsers still accept
+PAGE_LIMIT = 40e6  # the largest size in bytes that mail and browsers accept
 
 
 def write_report(
@@ -40,12 +39,15 @@ def write_report(
     overwrite: bool = False,
     shot: bool = False,
 ) -> Path:
-    """Writes the page to ``path`` and returns it. The same arguments give the same bytes.
+    """Writes the page to ``path`` and returns the path. The same arguments give the same bytes.
 
-    ``command`` is the command line that made the pictures, ``footer`` further facts (versions, device, seed, date).
+    ``command``  the command line that made the pictures
+    ``footer``   further facts: versions, device, seed, date
+    ``shot``     whether the scenes are the frames of a shot, which the page then plays at one exposure
+
     Pictures are stored with a relative error of at most 0.14 %. If the page would exceed PAGE_LIMIT bytes, they are
-    stored more coarsely, starting with the noisiest; the page states the worst error of each. The scenes of a ``shot``
-    are its frames: the page plays them at one exposure. Raises NgptError for scenes that do not fit together.
+    stored more coarsely, the noisiest first. The page states the largest error of each picture. Raises NgptError for
+    scenes without pictures, and for images of different sizes or equal names in a scene.
     """
     path = Path(path)
     if not scenes:
@@ -61,7 +63,7 @@ def write_report(
 
 
 def auto_exposure(scene: Scene) -> float:
-    """The exposure of a scene's pictures in stops, from its reference, or from the first picture if it has none."""
+    """The exposure for the pictures of a scene, in stops, from its reference, or else from its first picture."""
     return display.auto_exposure(scene.entries[0].image if scene.reference is None else scene.reference)
 
 
@@ -76,14 +78,15 @@ def page_text(
     shot: bool = False,
     live: int = 0,
 ) -> str:
-    """The HTML of the page; ``exposures`` holds one number for each scene, in stops. See ``write_report`` for the rest.
+    """The HTML of the page; for other arguments see ``write_report``.
 
-    ``live`` is the number of a page of ``ngpt.report.live``, from 1 on. Such a page has another script, which asks for
-    the next page. 0 for a report.
+    ``exposures``  the exposure of each scene, in stops
+    ``live``       the number of a page of ``ngpt.report.live``, from 1 on, whose script requests newer pages; 0 for a
+                   report
     """
     sections = [section(number, scene, exposures[number]) for number, scene in enumerate(scenes)]
     after = overview_html(overview or Overview())
-    taken = len(after) + sum(map(len, sections)) + 60_000  # the template, and a margin for the estimates below
+    taken = len(after) + sum(map(len, sections)) + 60_000  # with the template, and a margin for the estimates below
     pixels, steps = _pixels(scenes, exposures, 0.99 * 0.75 * (PAGE_LIMIT - taken))  # base64 adds a third
     facts = [_facts(*each) for each in zip(scenes, exposures, steps, strict=True)]
     table = base64.b64encode(display.heat_table().tobytes()).decode()
@@ -112,7 +115,7 @@ def page_text(
 
 
 def _printable(value: Any) -> Any:
-    """The value with all texts made printable, as in the markup: the script looks names up there."""
+    """The value with all texts made printable, as in the markup, in which the script looks names up."""
     if isinstance(value, dict):
         return {printable(key): _printable(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -121,7 +124,7 @@ def _printable(value: Any) -> Any:
 
 
 def oversize(path: str | os.PathLike) -> str:
-    """The message about a page that is larger than PAGE_LIMIT; "" for others."""
+    """The message about a page that is larger than PAGE_LIMIT; "" for smaller pages."""
     size = os.path.getsize(path)
     if size <= PAGE_LIMIT:
         return ""
@@ -132,22 +135,18 @@ def oversize(path: str | os.PathLike) -> str:
 
 
 def _filled(live: bool, **parts: str) -> str:
-    """The template with its marks replaced, in one pass so that no part is searched for the marks of another."""
+    """The template with its marks replaced by ``parts``, in one pass, so that marks inside parts stay as they are."""
     text, more = ((package_files("ngpt.report") / name).read_text(encoding="utf-8") for name in _SOURCES)
-    # The policy lists hashes of our styles and scripts, so markup that is smuggled in by a name cannot run.
+    # The policy allows only our styles and scripts, by their hashes, so that a script in a name cannot run.
     for tag in ("style", "script"):
-        parts[tag.upper() + "_HASH"] = _source_hash(text.split(f"<{tag}>")[1].split(f"</{tag}>")[0])
-    parts["MORE_POLICY"] = f" {_source_hash(more)}; connect-src 'self'" if live else ""
+        parts[tag.upper() + "_HASH"] = source_hash(text.split(f"<{tag}>")[1].split(f"</{tag}>")[0])
+    parts["MORE_POLICY"] = f" {source_hash(more)}; connect-src 'self'" if live else ""
     parts["MORE_SCRIPT"] = f"<script>{more}</script>" if live else ""
     return re.sub(r"\{\{([A-Z_]+)\}\}", lambda mark: parts[mark.group(1)], text)
 
 
-def _source_hash(body: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()}'"
-
-
 def _check(path: Path, scene: Scene) -> None:
-    """Raises NgptError for a scene that the page cannot show: no picture, pictures of unequal size, or equal names."""
+    """Raises NgptError for a scene without pictures, with pictures of different sizes, or with equal names."""
     if not scene.entries:
         raise NgptError(f"{path}: scene '{scene.name}' has no entry; give it at least one method")
     pictures = scene.pictures
@@ -170,7 +169,7 @@ def _check(path: Path, scene: Scene) -> None:
 
 
 def _facts(scene: Scene, stops: float, steps: list[int]) -> dict:
-    """What the script needs about a scene, besides the pixels."""
+    """The facts about a scene that the script needs in addition to the pixels."""
     best = scene.best(next(iter(scene.entries[0].metrics), ""))
     names = [entry.name for entry in scene.entries]
     first = scene.baseline.name
@@ -192,8 +191,7 @@ def _facts(scene: Scene, stops: float, steps: list[int]) -> dict:
 
 
 def _pixels(scenes: list[Scene], exposures: list[float], room: float) -> tuple[list[str], list[list[int]]]:
-    """The script elements of all pictures, in about ``room`` bytes, and for each scene the steps per stop of its
-    pictures."""
+    """The script elements of all pictures, in about ``room`` bytes; and the steps per stop of each scene's pictures."""
     exposed = [
         [image.astype(np.float64) * 2.0 ** round(stops) for _, image in scene.pictures]
         for scene, stops in zip(scenes, exposures, strict=True)

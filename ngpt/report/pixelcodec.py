@@ -1,25 +1,25 @@
-"""Pictures of a report: scene-linear numbers in few bytes, each within a stated relative error.
+"""Stores the pictures of a report: scene-linear numbers in few bytes, each within a known relative error.
 
-A value v, exposed so that middle grey is near 0.18, becomes the whole number nearest
-sgn(v) · steps · log2(1 + |v| / TOE). At most half a step is lost: |stored - v| / (|v| + TOE) is up to
-2^(0.5 / steps) - 1, which is 0.0014 at 256 steps per stop, 0.029 at 12, and 0.09 at 4. The other steps are lossless:
-the three numbers of a pixel are decorrelated by lifting (YCoCg-R, Malvar and Sullivan 2003), each row is predicted from
-its neighbours (the median of LOCO-I, or the mean of four where noise prevails), and the residuals are deflated. All
-arithmetic is modulo 2^16. ``report.html`` holds the decoder.
+A value v, exposed so that middle grey is near 0.18, is rounded to the whole number nearest
+sgn(v) · steps · log2(1 + |v| / TOE). The error |stored - v| / (|v| + TOE) is at most 2^(0.5 / steps) - 1, which is
+0.0014 at 256 steps per stop, 0.029 at 12, and 0.09 at 4. All that follows is lossless: the three numbers of a pixel are
+decorrelated by lifting (YCoCg-R, Malvar and Sullivan 2003), each number is predicted from its neighbours (by the median
+of LOCO-I, or by the mean of four in noisy rows), and the residuals are deflated. All arithmetic is modulo 2^16.
+``report.html`` has the decoder.
 """
 
 import zlib
 
 import numpy as np
 
-TOE = 2.0**-6  # exposed radiance; codes are about linear below it and logarithmic above
+TOE = 2.0**-6  # exposed radiance, below which codes are about linear, and above which they are logarithmic
 LADDER = (256, 128, 64, 48, 32, 24, 16, 12, 8, 6, 4)  # steps per stop, finest first
 MAX_CODE = 32000  # 125 stops above TOE at 256 steps per stop; larger values are clamped to it
 INFINITE, UNDEFINED = 32001, 32002
 
 
 def codes(image: np.ndarray, steps: int) -> np.ndarray:
-    """(..., 3) exposed floats -> int16; ±INFINITE and UNDEFINED stand for values that are not finite."""
+    """Exposed floats (..., 3) as int16; ±INFINITE and UNDEFINED stand for values that are not finite."""
     image = np.asarray(image, dtype=np.float64)
     with np.errstate(invalid="ignore"):
         code = np.sign(image) * np.minimum(np.rint(steps * np.log2(1.0 + np.abs(image) / TOE)), MAX_CODE)
@@ -30,19 +30,19 @@ def codes(image: np.ndarray, steps: int) -> np.ndarray:
 def values(code: np.ndarray, steps: int) -> np.ndarray:
     """The inverse of :func:`codes`, float64."""
     size = np.abs(code.astype(np.float64))
-    with np.errstate(over="ignore"):  # codes that stand for no finite number are replaced below
+    with np.errstate(over="ignore"):  # INFINITE and UNDEFINED are replaced below
         out = np.sign(code) * TOE * (2.0 ** (np.minimum(size, MAX_CODE) / steps) - 1.0)
     out = np.where(size == INFINITE, np.copysign(np.inf, out), out)
     return np.where(code == UNDEFINED, np.nan, out)
 
 
 def encode(image: np.ndarray, steps: int) -> bytes:
-    """(H, W, 3) exposed floats -> deflated bytes, in this order:
+    """Exposed floats (H, W, 3) as deflated bytes, in this order:
 
     3 H bytes  the predictor of each row of Y, then of Cg and Co: 0 median, 1 mean
-    nibbles    all residuals in zigzag code (0, -1, 1, -2, ...), two in a byte, the first one high; 15 marks a
-               residual of 15 or more
-    bytes      the low bytes of those larger residuals, then their high bytes
+    nibbles    all residuals in zigzag code (0, -1, 1, -2, ...), two in a byte, the first one in its high half; 15
+               stands for 15 or more
+    bytes      the low bytes of the residuals of 15 or more, then their high bytes
     """
     red, green, blue = np.moveaxis(codes(image, steps), 2, 0)
     orange = red - blue  # int16 wraps
@@ -65,8 +65,10 @@ def encode(image: np.ndarray, steps: int) -> bytes:
 
 
 def _guesses(plane: np.ndarray) -> list[np.ndarray]:
-    """The two predictions of each number, int16. Above the first row all values are 0; beyond the sides the values of
-    the row above continue."""
+    """Two predictions of each number, int16, by the median and the mean of neighbours.
+
+    Neighbours above the first row are 0; those beyond the sides are equal to the nearest number of the row above.
+    """
     padded = np.pad(plane.astype(np.int32), ((1, 0), (1, 1)), mode="edge")
     padded[0] = 0
     above, corner, other = padded[:-1, 1:-1], padded[:-1, :-2], padded[:-1, 2:]
@@ -79,10 +81,10 @@ def _guesses(plane: np.ndarray) -> list[np.ndarray]:
 
 
 def fitting_steps(images: list[np.ndarray], room: float) -> list[int]:
-    """Steps per stop for each of the exposed ``images`` such that all of them, encoded, take about ``room`` bytes.
+    """Steps per stop for each of the exposed ``images``, so that all of them, encoded, take about ``room`` bytes.
 
-    The image that takes most room is made coarser first: it is the noisiest, and noise hides the loss best. Sizes are
-    estimated from an eighth of the rows. If all images have the coarsest steps, the result may exceed ``room``.
+    The largest encoded image is made coarser first, because it is the noisiest, and noise hides the loss best. Sizes
+    are estimated from an eighth of the rows. With the coarsest steps for all images, the result may exceed ``room``.
     """
     places = [0] * len(images)
     sizes = [_estimate(image, LADDER[0]) for image in images]
@@ -97,5 +99,6 @@ def fitting_steps(images: list[np.ndarray], room: float) -> list[int]:
 
 
 def _estimate(image: np.ndarray, steps: int) -> float:
+    """The size of an encoded image in bytes, from an eighth of its rows if it is large."""
     rows = np.arange(len(image)) % 64 < 8 if len(image) >= 256 else np.ones(len(image), bool)
     return len(encode(image[rows], steps)) * len(image) / rows.sum()

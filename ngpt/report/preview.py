@@ -1,4 +1,4 @@
-"""Preview of a running render: the noisy image, a quick reconstruction, and their standard errors."""
+"""Previews of a running render: the noisy image, a quick reconstruction, and their standard errors."""
 
 from dataclasses import dataclass, field
 
@@ -11,8 +11,8 @@ from ngpt.report.content import Entry, Scene
 from ngpt.stack import GradientStack
 
 _NOISY = "noisy"
-# Quick methods with an error near the best; the first that is available is used. The first two take 50 and 75 ms for
-# 240x160 pixels on two cores.
+# Quick methods with small errors, of which the first usable one runs. The first two take 50 and 75 ms on two cores, for
+# 240x160 pixels.
 _QUICK = ("oidn-fast", "wcv", "l2")
 _LOW, _HIGH = np.log10(ERROR_RANGE)
 _MEANING = "standard error relative to the light"
@@ -21,11 +21,16 @@ _MARKS = ["≤ 1 %", "3.2 %", "10 %", "32 %", "≥ 100 %"]
 
 @dataclass
 class Preview:
-    """Images (H, W, 3), scene-linear, by name, the noisy one first; maps (H, W) in [0, 1] by the names of images."""
+    """The images and maps of a preview.
+
+    ``images``  name -> (H, W, 3) scene-linear, the noisy image first
+    ``maps``    name of an image -> name of a map -> (H, W) from 0 to 1
+    ``most``    the largest number of samples of a pixel; 0 if all pixels have the same number
+    """
 
     images: dict[str, np.ndarray]
     maps: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
-    most: float = 0.0  # the largest number of samples of a pixel if the numbers differ; else 0
+    most: float = 0.0
 
     def scene(self, name: str, caption: str) -> Scene:
         """The preview as a tab of the report."""
@@ -36,9 +41,9 @@ class Preview:
 
 
 def preview(stack: GradientStack) -> Preview:
-    """A preview from the samples that a stack holds so far, with maps of the standard errors if it has variances."""
-    able = [name for name in _QUICK if all(layer in stack for layer in METHODS[name].needs)]
-    method = next((name for name in able if not METHODS[name].missing()), "")
+    """The preview of a stack, with maps of the standard errors if it has variances."""
+    usable = (n for n in _QUICK if all(layer in stack for layer in METHODS[n].needs) and not METHODS[n].missing())
+    method = next(usable, "")
     light = stack["primal"]
     unit = np.square(light).mean(axis=-1) + ERROR_EPSILON * 4.0 ** -auto_exposure(light)
     found, maps = Preview({_NOISY: light}), {}
@@ -61,6 +66,6 @@ def preview(stack: GradientStack) -> Preview:
 
 
 def _place(variance: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """The place (H, W) on the scale of errors, in [0, 1], of variances (H, W, 3) over squared radiance (H, W)."""
+    """Variances (H, W, 3) over squared radiance (H, W), as values from 0 to 1 (H, W) on the scale of errors."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.clip((np.log10(np.nan_to_num(variance).mean(axis=-1) / unit) - _LOW) / (_HIGH - _LOW), 0, 1)

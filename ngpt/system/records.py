@@ -1,4 +1,4 @@
-"""Reads records in JSON and TOML, and checks that they have the expected shape."""
+"""Reads JSON and TOML, and checks the types of their values."""
 
 import json
 import tomllib
@@ -13,23 +13,23 @@ from ngpt.system.reading import read_text
 
 T = TypeVar("T")
 
-# A type; several allowed types; [shape]: a list of such values; {name: shape}: a table with at least these entries;
-# {str: shape}: a table with any names. Whole numbers have 64 bits.
+# The shape of a value: a type; or several types, one of which it must have; [shape] for a list of such values; {name:
+# shape} for a table with at least these entries; {str: shape} for a table with any names. Whole numbers have 64 bits.
 Shape = type | tuple[type, ...] | list["Shape"] | dict["str | type[str]", "Shape"]
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """The contents of a TOML file. Raises NgptError if it cannot be read or is no TOML."""
+    """The contents of a TOML file. Raises NgptError if it cannot be read or is not TOML."""
     return _call(tomllib.loads, read_text(path), str(path))
 
 
 def read_json(path: str | Path) -> Any:
-    """The contents of a JSON file. Raises NgptError if it cannot be read or is no JSON."""
+    """The contents of a JSON file. Raises NgptError if it cannot be read or is not JSON."""
     return _call(json.loads, read_text(path), str(path))
 
 
 def parse_json(text: str, where: str) -> Any:
-    """Raises NgptError for text that is not JSON; ``where`` begins the message."""
+    """The value of a text in JSON. Raises NgptError, whose message begins with ``where``, if it is not JSON."""
     return _call(json.loads, text, where)
 
 
@@ -43,7 +43,7 @@ def _call(parser: Callable[[str], Any], text: str, where: str) -> Any:
 
 
 def check(value: Any, shape: Shape, where: str) -> None:
-    """Raises NgptError, with ``where`` and the place in the record, unless ``value`` is of that shape."""
+    """Raises NgptError unless ``value`` has this shape. The message begins with ``where`` and its place there."""
     if isinstance(shape, list):
         _demand(isinstance(value, list | tuple), value, "a list", where)
         for i, item in enumerate(value):
@@ -68,7 +68,7 @@ def _demand(condition: bool, value: Any, wanted: str, where: str) -> None:
 
 
 def _shown(value: Any) -> str:
-    """The first 60 letters of the value's ``repr``."""
+    """The beginning of the value's ``repr``, for messages."""
     try:
         return repr(value)[:60]
     except ValueError:  # Python raises it for whole numbers of more than 4300 digits
@@ -76,13 +76,11 @@ def _shown(value: Any) -> str:
 
 
 def from_table(kind: type[T], values: Any, where: str) -> T:
-    """The dataclass ``kind`` from a table of settings, whose values must have the annotated types.
+    """Makes the dataclass ``kind`` from a table of settings, whose values must have the annotated types.
 
-    Lists become tuples, tables become dataclasses, where the annotations say so: ``tuple[int, ...]``,
-    ``tuple[Files, ...]``. A whole number is accepted where a number is expected. ``kind`` itself must raise NgptError
-    for values that it refuses.
-
-    Raises NgptError, which begins with ``where``, for settings that are unknown, missing, or of another type.
+    Lists become tuples, and tables become dataclasses, as annotated: ``tuple[int, ...]``, ``tuple[Files, ...]``. A
+    whole number also counts as a number. Raises NgptError, whose message begins with ``where``, for settings that are
+    unknown, missing, of another type, or refused by ``kind`` with an NgptError.
     """
     if not isinstance(values, dict):
         raise NgptError(f"{where} = {_shown(values)}: must be a table")
@@ -106,11 +104,11 @@ def from_table(kind: type[T], values: Any, where: str) -> T:
 
 
 class _OtherType(Exception):
-    """A value is not what its annotation says."""
+    """A value does not have its annotated type."""
 
 
 def _converted(value: Any, hint: Any, where: str) -> Any:
-    """``value`` converted to the annotated type; raises ``_OtherType`` if it has another one."""
+    """The ``value`` as the annotated type. Raises ``_OtherType`` if it has another type."""
     kinds = get_args(hint)
     if get_origin(hint) is UnionType:  # a table that may be left out
         return _converted(value, kinds[0], where)
@@ -139,7 +137,7 @@ _NAMES = {int: "whole number", float: "number", str: "string", dict: "table", li
 
 
 def described(hint: Any, many: bool = False) -> str:
-    """An annotated type in the words of TOML: "a list of strings"."""
+    """An annotated type in words, "a list of strings"; with ``many`` in the plural, "lists of strings"."""
     kind, kinds = get_origin(hint) or hint, get_args(hint)
     if kind is bool:
         return "true or false"
@@ -151,7 +149,7 @@ def described(hint: Any, many: bool = False) -> str:
 
 
 def _example(default: Any) -> str:
-    """The default as an example for messages; "" if it is empty."""
+    """The default as an example for messages; "" if there is none or it is empty."""
     if default is MISSING or not default:
         return ""
     return f", like {list(default) if isinstance(default, tuple) else repr(default)}"

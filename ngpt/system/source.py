@@ -1,4 +1,4 @@
-"""Hashes and imports of Python files, for the keys of caches: comments and docstrings do not count."""
+"""Hashes Python files, without comments and docstrings, and lists their imports, for the keys of caches."""
 
 import ast
 import hashlib
@@ -8,9 +8,9 @@ _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def source_hash(folder: Path, left_out: tuple[str, ...] = ()) -> str:
-    """SHA-256 over names and code of the Python files in ``folder``, without comments and docstrings.
+    """SHA-256 of the names and the code of the Python files in ``folder``, without comments and docstrings.
 
-    ``left_out`` are paths of files and folders in ``folder`` that do not count.
+    ``left_out`` lists paths of files and folders in ``folder`` that do not count.
     """
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*.py")):
@@ -21,7 +21,7 @@ def source_hash(folder: Path, left_out: tuple[str, ...] = ()) -> str:
 
 
 def code_text(path: Path) -> str:
-    """A file's syntax tree as text, without docstrings."""
+    """The syntax tree of a file as text, without docstrings."""
     tree = ast.parse(path.read_bytes())
     for node in ast.walk(tree):
         if isinstance(node, _DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
@@ -30,9 +30,9 @@ def code_text(path: Path) -> str:
 
 
 def imports(path: Path) -> set[str]:
-    """Full names of the modules that a file imports, at any place, and of the names that it imports from them.
+    """The full names of the modules that a file imports anywhere, and of the names that it imports from them.
 
-    Imports under ``TYPE_CHECKING`` and relative imports are not listed.
+    Relative imports, and imports under ``TYPE_CHECKING``, are not listed.
     """
     found: set[str] = set()
     queue: list[ast.AST] = [ast.parse(path.read_bytes())]

@@ -1,6 +1,6 @@
-"""Configurations to start from: comments list every parameter with its meaning and its default.
+"""Makes configurations to start from, in which comments list all parameters with their meanings and defaults.
 
-The meaning of a parameter is in the docstring of its dataclass, as ``name``  meaning.
+The meaning of a parameter is an entry, ``name``  meaning, in the docstring of its dataclass.
 """
 
 import re
@@ -16,7 +16,7 @@ _HEAD = r"^\[+([\w-]+)[\w.-]*\]+ *(?:#.*)?$"
 
 
 def entries(kind: type) -> list[tuple[tuple[str, ...], str]]:
-    """The entries of a dataclass's docstring, ``one``, ``two``  meaning: (names, meaning) of each."""
+    """The entries of a dataclass's docstring, ``one``, ``two``  meaning, as pairs of names and meaning."""
     found: list[tuple[tuple[str, ...], str]] = []
     inside = False
     for line in cleandoc(kind.__doc__ or "").splitlines():
@@ -32,13 +32,14 @@ def entries(kind: type) -> list[tuple[tuple[str, ...], str]]:
 def template(
     text: str, tables: Mapping[str, type | None], others: Mapping[str, Mapping[str, tuple[str, Any]]] = {}
 ) -> str:
-    """The configuration ``text``, with a comment for every parameter that it does not set: its meaning and its default.
+    """The configuration ``text``, with the meaning and the default of each parameter that it does not set as comments.
 
-    ``tables``  dataclasses of the tables, by name; "" is the top level, None means a table without comments
-    ``others``  further parameters of a table by name: meaning and default
+    ``tables``  the dataclass of each table, by its name; "" is the top level, and None stands for a table without
+                comments
+    ``others``  further parameters by table and name: their meanings and defaults
     """
     given = tomllib.loads(text)
-    # Comments right above a header belong to it.
+    # The comments directly above a header belong to it.
     heads = [match.start() for match in re.finditer(rf"(?:^#.*\n)*{_HEAD}", text, re.M)]
     sections = [text[start:end] for start, end in zip([0, *heads], [*heads, len(text)], strict=True)]
     present = [match[1] if (match := re.search(_HEAD, section, re.M)) else "" for section in sections]
@@ -57,16 +58,16 @@ def template(
 
 
 def _commented(kind: type, given: set[str], others: Mapping[str, tuple[str, Any]]) -> str:
-    """Lines for the parameters of a dataclass, and ``others``, that are not ``given``."""
-    told = entries(kind)
-    explained = {name for names, _ in told for name in names}
+    """Comments for the parameters of a dataclass, and for ``others``, that are not ``given``."""
+    meanings = entries(kind)
+    explained = {name for names, _ in meanings for name in names}
     known = [field for field in fields(kind) if not field.metadata.get("internal")]
-    told += [((field.name,), "") for field in known if field.name not in explained]
-    told += [((name,), meaning) for name, (meaning, _) in others.items()]
+    meanings += [((field.name,), "") for field in known if field.name not in explained]
+    meanings += [((name,), meaning) for name, (meaning, _) in others.items()]
     defaults = {field.name: _default(field) for field in known}
     defaults |= {name: default for name, (_, default) in others.items()}
     lines = []
-    for names, meaning in told:
+    for names, meaning in meanings:
         if left := [name for name in names if name not in given]:
             words = meaning.replace("``", "").partition("\n")[0]
             lines += textwrap.wrap(words, 116, initial_indent="# ", subsequent_indent="#   ")

@@ -1,4 +1,4 @@
-"""Makes text of unknown origin safe to show: names in files may control a terminal, or hide and reverse text."""
+"""Makes text safe to show: names from files may control a terminal, or hide and reverse text."""
 
 import re
 from collections.abc import Iterator
@@ -7,20 +7,19 @@ from html import escape
 
 from ngpt.errors import NgptError
 
-# Invisible letters that Python counts as printable: fillers, joiners and selectors of variants.
+# Invisible letters that Python counts as printable: fillers, joiners and variation selectors
 # [Unicode 15, property Default_Ignorable_Code_Point]
 _INVISIBLE = re.compile(
     "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u3164\ufe00-\ufe0f\uffa0\ufff0-\ufff8\U000e0000-\U000e0fff]"
 )
 
-
-# Names in messages, by path, of temporary files that stand for something else, such as standard input.
+# Path of a temporary file -> its name in messages, such as "standard input"
 _names: dict[str, str] = {}
 
 
 @contextmanager
 def called(path: str, name: str) -> Iterator[None]:
-    """In the block, messages and results name the file ``path`` as ``name``; so do errors that leave the block."""
+    """In the block, and in errors that leave it, messages and results call the file ``path`` ``name``."""
     _names[path] = name
     try:
         yield
@@ -31,17 +30,17 @@ def called(path: str, name: str) -> Iterator[None]:
 
 
 def by_names(text: str) -> str:
-    """The text with paths replaced by the names that ``called`` gives them."""
+    """The text, with paths replaced by the names that ``called`` gives them."""
     for path, name in _names.items():
         text = text.replace(path, name)
     return text
 
 
 def printable(text: str) -> str:
-    """One line of text in which every letter is visible and in its place.
+    """The text as one line in which all letters are visible and in order.
 
     Control characters, line breaks, marks of direction (U+202E reverses the text after it) and invisible letters become
-    Python's escapes, such as ``\\x1b`` and ``\\u202e``. Files have the names that ``called`` gives them.
+    Python's escapes, such as ``\\x1b`` and ``\\u202e``. Paths are replaced as in ``by_names``.
     """
     text = by_names(text)
     if text.isprintable() and not _INVISIBLE.search(text):
@@ -53,5 +52,5 @@ def printable(text: str) -> str:
 
 
 def markup(text: str) -> str:
-    """``printable`` text, escaped for HTML: as text or as the value of an attribute."""
+    """The ``printable`` text, escaped for HTML, as text or as the value of an attribute."""
     return escape(printable(text))

@@ -1,4 +1,4 @@
-"""A pool of threads for NumPy, which releases Python's lock, so that parts of an array are computed in parallel."""
+"""A pool of threads that computes parts of arrays in parallel, because NumPy releases Python's lock."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +11,7 @@ from ngpt.system.limits import processors
 def map_parts(function: Callable[[Any], Any], parts: Iterable) -> list:
     """``function(part)`` for each of ``parts``, in their order, computed by ``processors()`` threads.
 
-    ``function`` must not call ``map_parts`` itself: threads that wait for threads of the same pool may wait forever.
+    ``function`` must not call ``map_parts``: threads that wait for threads of the same pool may wait forever.
     """
     return list(_threads(processors()).map(function, parts))
 

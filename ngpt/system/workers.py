@@ -1,4 +1,4 @@
-"""Worker processes that do not outlive their parent process."""
+"""Ends worker processes with their parent process."""
 
 import os
 import signal
@@ -9,8 +9,8 @@ from multiprocessing import parent_process
 def end_with_parent(interruptible: bool = True) -> None:
     """Ends the calling worker of multiprocessing when its parent ends, even if the parent is killed.
 
-    Linux' PR_SET_PDEATHSIG would end the worker already with the thread that started it. Ctrl-C, which all processes of
-    a terminal receive, ends an ``interruptible`` worker silently; other workers ignore it.
+    Linux's PR_SET_PDEATHSIG is not used, because it ends the worker with the thread that started it. Ctrl-C, which all
+    processes of a terminal receive, ends an ``interruptible`` worker silently. Other workers ignore it.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL if interruptible else signal.SIG_IGN)
     threading.Thread(target=_wait, daemon=True).start()

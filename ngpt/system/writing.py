@@ -1,4 +1,4 @@
-"""Writes files of bytes, text and JSON, completely or not at all; and formats tables as text."""
+"""Writes files of bytes, text and JSON, complete or not at all; and formats tables as text."""
 
 import csv
 import io
@@ -11,13 +11,13 @@ from ngpt.system.files import atomic_output
 
 
 def write_bytes(path: str | Path, data: bytes, overwrite: bool = True) -> None:
-    """Writes ``path``. Raises NgptError if that is impossible, or if it exists and ``overwrite`` is False."""
+    """Writes ``path``. Raises NgptError if it cannot be written, or if it exists and ``overwrite`` is False."""
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(data)
 
 
 def write_text(path: Path, text: str, overwrite: bool = True) -> None:
-    """As ``write_bytes``, in UTF-8; line ends are those of ``text``, on all systems."""
+    """Writes ``text`` in UTF-8, with its own line ends on all systems, as ``write_bytes`` does."""
     write_bytes(path, text.encode(), overwrite)
 
 
@@ -27,13 +27,13 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def csv_text(rows: Iterable[Iterable[object]]) -> str:
-    """Comma-separated values, one line for each row; None is an empty cell."""
+    """The rows as lines of comma-separated values; None is an empty cell."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
 
 
 def markdown_table(heads: list[str], rows: Iterable[Iterable[str]], left: int = 1) -> list[str]:
-    """Lines of Markdown; the first ``left`` columns are aligned to the left, the others to the right."""
+    """A table as lines of Markdown. The first ``left`` columns are aligned to the left, the others to the right."""
     rule = "|---" * left + "|--:" * (len(heads) - left) + "|"
     return [f"| {' | '.join(heads)} |", rule, *(f"| {' | '.join(row)} |" for row in rows)]

@@ -92,7 +92,7 @@ def test_a_report_of_a_shot_shows_display_windows(write, tmp_path, command):
         write(f"shot/f.{i}.exr", 3 * i, i, 30 + i, 30)
         write(f"refs/f.{i}.exr")
     output, errors = command("report shot --ref refs -o page.html")
-    assert "3 of 3 frames: compared are the pixels that all images have" in errors
+    assert "3 of 3 frames: only the pixels that all images have are compared" in errors
     assert re.search(r"shot +0 +0 ", output) and output.split()[-1] == "0"
     assert f"{WIDTH}x{HEIGHT}" in (tmp_path / "page.html").read_text()
 
