@@ -99,6 +99,6 @@ def belong(fine: Mapping[str, np.ndarray], layers: Mapping[str, np.ndarray], pat
     for name, layer in fine.items():
         k = layer.shape[1] // layers[name].shape[1] if name in layers else 0
         if not k or not np.array_equal(means(layer, k), layers[name], equal_nan=True):
-            _LOG.warning("%s: the subpixels are left out, since their means differ from the pixels of '%s'", path, name)
+            _LOG.warning("%s: the means of the subpixels differ from '%s', so they are left out", path, name)
             return False
     return True

@@ -62,6 +62,10 @@ class Window:
         bottom = max(self.top + self.height, other.top + other.height)
         return Window(left, top, right - left, bottom - top)
 
+    def times(self, k: int) -> "Window":
+        """The window after each pixel has become K x K pixels."""
+        return Window(k * self.left, k * self.top, k * self.width, k * self.height)
+
     def within(self, other: "Window") -> tuple[slice, slice]:
         """The rows and columns of these pixels in an image of the window ``other``, which must hold all of them."""
         x, y = self.left - other.left, self.top - other.top

@@ -145,11 +145,7 @@ def other(name: str, parameters: dict[str, str]) -> dict:
 
 def stack(stack: GradientStack) -> dict:
     """The description of a stack that was read from a file: its layers, usable methods and header."""
-    assert stack.source is not None
     parts, resolution = stack.source.image.parts, stack.source.resolution
-    main = parts[resolution["primal"].part]
-    windows = (main.header[name] for name in ("dataWindow", "displayWindow"))
-    data, display = ([[int(n) for n in corner] for corner in window] for window in windows)
     further = pass_through(stack)
     METHODS.load()
     rates = {name: channel for name, channel in further.items() if name.startswith(DIAGNOSTICS)}
@@ -170,8 +166,8 @@ def stack(stack: GradientStack) -> dict:
     report = {
         "file": stack.path,
         "size": [stack.width, stack.height],
-        "data window": data,
-        "display window": display,
+        "data window": [corner.tolist() for corner in stack.place.data.box],
+        "display window": [corner.tolist() for corner in stack.place.display.box],
         "parts": len(parts),
         "layers": layers,
         "diagnostics": {
@@ -182,7 +178,7 @@ def stack(stack: GradientStack) -> dict:
             }
             for name, rate in rates.items()
         },
-        "noise of the mean light, relative to it": _noise(stack),
+        "noise of the mean light, relative to it": {},
         "shared tails": _tails(stack),
         "other channels": [name for name in further if name not in rates],
         "missing": _missing(stack),
@@ -197,17 +193,11 @@ def stack(stack: GradientStack) -> dict:
         "auto": choose(stack),
         "attributes": {name: _plain(value) for name, value in sorted(stack.attributes.items())},
     }
-    for name in ("diagnostics", "noise of the mean light, relative to it", "shared tails", "proposed"):
-        if not report[name]:
-            del report[name]
-    return report
-
-
-def _noise(stack: GradientStack) -> dict:
-    """``noise_of_light`` of the stack; an empty dictionary if its pixels share no noise."""
-    if "shared" not in stack or "primal_var" not in stack:
-        return {}
-    return noise_of_light(stack["primal"], stack["primal_var"], stack["shared"])
+    if "shared" in stack and "primal_var" in stack:
+        noise = noise_of_light(stack["primal"], stack["primal_var"], stack["shared"])
+        report["noise of the mean light, relative to it"] = noise
+    absent = ("diagnostics", "noise of the mean light, relative to it", "shared tails", "proposed")
+    return {name: value for name, value in report.items() if value or name not in absent}
 
 
 def _tails(stack: GradientStack) -> str:

@@ -17,7 +17,6 @@ from ngpt.io.openexr import ExrImage, ExrPart
 from ngpt.layers import LAYERS, RGB
 from ngpt.stack import GradientStack
 from ngpt.subpixels import FINE, HALF, SUBPIXELS, belong
-from ngpt.windows import Window
 
 _LOG = logging.getLogger(__name__)
 
@@ -45,9 +44,9 @@ def subpixels_of(part: ExrPart, stack: GradientStack) -> dict[str, np.ndarray]:
     """The subpixels in a part, by layer; none, with a warning, if they do not match the pixels of the stack."""
     data, window = stack.place.data, data_window(part)
     k = part.header[SUBPIXELS]
-    if not isinstance(k, int) or k < 2 or window != _window(data, k):
+    if not isinstance(k, int) or k < 2 or window != data.times(k):
         found = (stack.path, PART, window, SUBPIXELS, k, data)
-        _LOG.warning("%s: part '%s' has %s and '%s' %s, which do not fit the pixels at %s; it is left out", *found)
+        _LOG.warning("%s: part '%s' has %s and '%s' %s, which do not fit the pixels at %s; they are left out", *found)
         return {}
     names = {name: _channels(name) for name in FINE}
     held = {name: gather(part, its) for name, its in names.items() if all(c in part.channels for c in its)}
@@ -63,7 +62,7 @@ def with_subpixels(image: ExrImage, main: int, stack: GradientStack) -> ExrImage
     k = stack.fine["primal"].shape[1] // stack.width
     header[SUBPIXELS] = k
     own = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, SUBPIXELS: k}
-    own["dataWindow"] = _window(stack.place.data, k).box
+    own["dataWindow"] = stack.place.data.times(k).box
     part = ExrPart(PART, own | {name: header[name] for name in _COMMON if name in header}, {})
     for name, layer in stack.fine.items():
         scatter(part, _channels(name), layer, half=name in HALF)
@@ -72,7 +71,3 @@ def with_subpixels(image: ExrImage, main: int, stack: GradientStack) -> ExrImage
 
 def _channels(name: str) -> tuple[str, ...]:
     return RGB if name == "primal" else tuple(f"{name}.{channel}" for channel in LAYERS[name].channels)
-
-
-def _window(data: Window, k: int) -> Window:
-    return Window(k * data.left, k * data.top, k * data.width, k * data.height)

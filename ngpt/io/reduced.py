@@ -18,7 +18,7 @@ vectors of unknown unit, and Cryptomatte in half floats, which has lost its ids.
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -63,7 +63,7 @@ def cut_pixels(place: Place, k: int) -> str:
     lines: list[str] = []
     for name, window in (("data", place.data), ("display", place.display)):
         small = reduced_window(window, k)
-        whole = Window(k * small.left, k * small.top, k * small.width, k * small.height)
+        whole = small.times(k)
         if whole != window and f"window {window}" not in " ".join(lines):
             lines.append(f"{name} window {window} is no multiple of {k}: {whole} of it is taken")
     return "; ".join(lines)
@@ -111,41 +111,32 @@ def reduced(image: ExrImage, k: int, stacks: Sequence[GradientStack]) -> ExrImag
     return ExrImage([_reduced_part(part, k, known, listed, stacks[0].path) for part in image.parts])
 
 
-@dataclass(frozen=True)
-class _Part:
-    """The channels of a part as blocks (h, w, K²), and the names of their layers in the contract, "" if none."""
-
-    blocks: dict[str, np.ndarray]
-    layers: dict[str, str]
-    k: int
-
-    def nearest(self) -> np.ndarray:
-        """The index (h, w) of the nearest pixel in each block; 0 where there is no depth."""
-        depth = next((self.blocks[name] for name in self.blocks if _kind(name, self.layers[name]) == "depth"), None)
-        if depth is None:
-            return np.zeros(next(iter(self.blocks.values())).shape[:2], int)
-        return np.argmin(np.where(np.isfinite(depth) & (depth > 0), depth, np.inf), axis=-1)
-
-
 def _reduced_part(part: ExrPart, k: int, known: dict[int, str], listed: list[str], path: str) -> ExrPart:
+    """The part in large pixels.
+
+    ``known`` has the layer of the contract for the ids of channels, and ``listed`` the names of Cryptomattes.
+    """
     window = data_window(part)
     crypto = _cryptomattes(part, listed)
-    layers = {name: known.get(id(channel), "") for name, channel in part.channels.items()}
-    whole = _Part({name: _blocks(channel, window, k) for name, channel in part.channels.items()}, layers, k)
+    kinds = {name: _kind(name, known.get(id(channel), "")) for name, channel in part.channels.items()}
+    each = {name: _blocks(channel, window, k) for name, channel in part.channels.items()}
+    depths = (each[name] for name, kind in kinds.items() if kind == "depth")
     channels: dict[str, np.ndarray] = {}
     nearest: np.ndarray | None = None
     ranked = {name for names in crypto.values() for name in names}
-    for name, blocks in whole.blocks.items():
+    for name, blocks in each.items():
         if name in ranked:
             continue
-        kind = _kind(name, layers[name]) if blocks.dtype.kind != "u" else "id"
+        kind = kinds[name] if blocks.dtype.kind != "u" else "id"
         if kind == "unknown motion":
             raise NgptError(
                 f"{path}: channel '{name}' looks like motion vectors, and their unit is not known; name them: "
                 '--layer motion="X,Y" in pixels of the large image, or leave the layer out'
             )
         if kind == "place":
-            nearest = whole.nearest() if nearest is None else nearest
+            if nearest is None:
+                depth = next(depths, np.zeros(blocks.shape))
+                nearest = np.argmin(np.where(np.isfinite(depth) & (depth > 0), depth, np.inf), axis=-1)
             values = np.take_along_axis(blocks, nearest[..., None], axis=-1)[..., 0]
         else:
             values = _RULES[kind](blocks)
@@ -156,7 +147,7 @@ def _reduced_part(part: ExrPart, k: int, known: dict[int, str], listed: list[str
             raise NgptError(f"{path}: Cryptomatte '{layer}' has {len(names)} channels, and ids and coverages are pairs")
         if any(part.channels[name].dtype != np.float32 for name in names):
             raise NgptError(f"{path}: Cryptomatte '{layer}' is not of 32-bit floats, so its ids are lost; render it so")
-        channels |= _ranks(names, whole.blocks)
+        channels |= _ranks(names, each)
     own = {name: channels[name] for name in part.channels}
     display = reduced_window(Window.of_box(part.header["displayWindow"]), k)
     header = part.header | {"dataWindow": reduced_window(window, k).box, "displayWindow": display.box}

@@ -27,13 +27,10 @@ def of_stack(stack: GradientStack, shown: np.ndarray, name: str) -> tuple[list[E
         if not np.array_equal(image, shown, equal_nan=True):
             entries.append(Entry(layer if layer != name else f"{layer} (layer)", image))
     taken = {entry.name for entry in entries}
-    layers = {layer: _three(stack[layer]) for layer in stack.names if layer not in light}
+    layers = {layer: stack[layer] for layer in stack.names if layer not in light}
+    # The page shows one or three channels, so layers of two get a third one of zeros.
+    layers = {layer: np.pad(v, ((0, 0), (0, 0), (0, int(v.shape[2] == 2)))) for layer, v in layers.items()}
     for channel, values in channels_alone(stack).items():
         if channel not in "RGB":  # the root, which is shown already
             layers[channel] = np.asarray(values, np.float32)[..., None]
     return entries, {layer: values for layer, values in layers.items() if layer not in taken}
-
-
-def _three(layer: np.ndarray) -> np.ndarray:
-    """The layer as (H, W, 1) or (H, W, 3): two channels get a third one of zeros."""
-    return np.pad(layer, ((0, 0), (0, 0), (0, 1))) if layer.shape[2] == 2 else layer

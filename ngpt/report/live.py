@@ -77,9 +77,8 @@ class LivePage:
         scene = preview.scene("newest", caption)
         if self.exposure is None:
             self.exposure = auto_exposure(scene)
-        number = self.number + 1
-        facts = {"ngpt": __version__}
-        text = page_text(self.title, [scene], [self.exposure], command=self.command, footer=facts, live=number)
+        number, footer = self.number + 1, {"ngpt": __version__}
+        text = page_text(self.title, [scene], [self.exposure], command=self.command, footer=footer, live=number)
         self.text, self.number = text, number
 
     def tell(self, line: str) -> None:
@@ -95,14 +94,12 @@ class LivePage:
         self.server.shutdown()
         self.server.server_close()
 
-    def _first(self) -> str:
-        return _FIRST.format(title=markup(self.title), line=markup(self.line), command=markup(self.command))
-
     def answer(self, path: str) -> tuple[str, str] | None:
         """The content type and the text of the page at ``path``; None if there is none."""
         if path == "/":
             self._asked = time.monotonic()
-            return "text/html", self.text or self._first()
+            first = {"title": self.title, "line": self.line, "command": self.command}
+            return "text/html", self.text or _FIRST.format(**{name: markup(text) for name, text in first.items()})
         if path == "/status":
             self._asked = time.monotonic()
             news = {"number": self.number, "text": printable(self.line), "ended": self.ended}

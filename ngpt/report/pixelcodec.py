@@ -27,15 +27,6 @@ def codes(image: np.ndarray, steps: int) -> np.ndarray:
     return np.where(np.isnan(image), UNDEFINED, code).astype(np.int16)
 
 
-def values(code: np.ndarray, steps: int) -> np.ndarray:
-    """The inverse of :func:`codes`, float64."""
-    size = np.abs(code.astype(np.float64))
-    with np.errstate(over="ignore"):  # INFINITE and UNDEFINED are replaced below
-        out = np.sign(code) * TOE * (2.0 ** (np.minimum(size, MAX_CODE) / steps) - 1.0)
-    out = np.where(size == INFINITE, np.copysign(np.inf, out), out)
-    return np.where(code == UNDEFINED, np.nan, out)
-
-
 def encode(image: np.ndarray, steps: int) -> bytes:
     """Exposed floats (H, W, 3) as deflated bytes, in this order:
 

@@ -10,13 +10,15 @@ from typing import BinaryIO
 from ngpt.errors import NgptError
 
 MOST_TEXT = 2**28  # bytes of a configuration or a record
+_AT_ONCE = getattr(os, "O_NONBLOCK", 0)  # Windows does not have it
 
 
 @contextmanager
 def regular_file(path: Path) -> Iterator[BinaryIO]:
     """Opens a file for reading. Raises NgptError if it is missing or unreadable, and for pipes, devices and folders."""
     try:
-        file = open(path, "rb", opener=_open_at_once)  # noqa: SIM115
+        # Without O_NONBLOCK, a pipe without a writer would make ``open`` wait.
+        file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | _AT_ONCE))  # noqa: SIM115
     except FileNotFoundError:
         raise NgptError(f"{path}: not found; check the name") from None
     except (OSError, ValueError) as error:  # ValueError: a name with a zero in it
@@ -30,11 +32,6 @@ def regular_file(path: Path) -> Iterator[BinaryIO]:
             yield file
         except OSError as error:
             raise NgptError(f"{path}: cannot be read: {error.strerror or error}") from error
-
-
-def _open_at_once(name: str, flags: int) -> int:
-    """Opens a file without waiting, as a pipe without a writer would make it wait."""
-    return os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def read_bytes(path: str | Path, most: int) -> bytes:

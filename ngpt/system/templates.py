@@ -64,7 +64,7 @@ def _commented(kind: type, given: set[str], others: Mapping[str, tuple[str, Any]
     known = [field for field in fields(kind) if not field.metadata.get("internal")]
     meanings += [((field.name,), "") for field in known if field.name not in explained]
     meanings += [((name,), meaning) for name, (meaning, _) in others.items()]
-    defaults = {field.name: _default(field) for field in known}
+    defaults = {f.name: f.default if f.default_factory is MISSING else f.default_factory() for f in known}
     defaults |= {name: default for name, (_, default) in others.items()}
     lines = []
     for names, meaning in meanings:
@@ -73,10 +73,6 @@ def _commented(kind: type, given: set[str], others: Mapping[str, tuple[str, Any]
             lines += textwrap.wrap(words, 116, initial_indent="# ", subsequent_indent="#   ")
             lines += [f"# {name} = {toml(defaults[name])}" for name in left]
     return "\n".join(lines)
-
-
-def _default(field: Any) -> Any:
-    return field.default if field.default_factory is MISSING else field.default_factory()
 
 
 def toml(value: Any) -> str:
