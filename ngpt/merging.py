@@ -329,10 +329,7 @@ def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
     for stack in stacks:
         strange = next((name for name in pass_through(stack) if not name.startswith(DIAGNOSTICS)), None)
         if strange is not None:
-            raise NgptError(
-                f"{stack.path}: channel '{strange}' is no layer that could be averaged; merge stacks as `ngpt render` "
-                "writes them, before they are reconstructed"
-            )
+            raise NgptError(f"{stack.path}: channel '{strange}' has no mean; merge stacks as `ngpt render` writes them")
 
 
 def _means(stack: GradientStack) -> set[str]:

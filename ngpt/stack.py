@@ -71,10 +71,8 @@ class GradientStack(Mapping[str, np.ndarray]):
         """
         array = np.asarray(tensor)
         if array.ndim != 3 or array.shape[2] != len(names):
-            raise NgptError(
-                f"the tensor has shape {array.shape} and there are {len(names)} names; give the tensor of mi.render() "
-                "and the integrator's aov_names() after it"
-            )
+            found = f"the tensor has shape {array.shape} and there are {len(names)} names"
+            raise NgptError(f"{found}; give the tensor of mi.render() and the integrator's aov_names() after it")
         place = {name: i for i, name in enumerate(names)}
         layers = {}
         for name in dict.fromkeys(name.partition(".")[0] for name in names):

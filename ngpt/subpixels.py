@@ -88,10 +88,8 @@ def check(fine: Mapping[str, np.ndarray], width: int, height: int, path: str) ->
     k = subpixels(fine, width)
     for name, layer in fine.items():
         if k < 1 or layer.shape != (k * height, k * width, 3) or layer.dtype != np.float32:
-            raise NgptError(
-                f"{path}: the subpixels of '{name}' are {layer.dtype} {layer.shape}, the image {width}x{height}; "
-                f"give float32 (K * {height}, K * {width}, 3)"
-            )
+            found = f"the subpixels of '{name}' are {layer.dtype} {layer.shape}, the image {width}x{height}"
+            raise NgptError(f"{path}: {found}; give float32 (K * {height}, K * {width}, 3)")
 
 
 def belong(fine: Mapping[str, np.ndarray], layers: Mapping[str, np.ndarray], path: str) -> bool:

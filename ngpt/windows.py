@@ -165,10 +165,8 @@ def put(image: np.ndarray, window: Window, canvas: Window, outside: float = 0.0)
     if window == canvas:
         return image
     if canvas.width * canvas.height > MOST:
-        raise NgptError(
-            f"the display window is {canvas.width}x{canvas.height} pixels, and the file has {window}; "
-            f"at most {MOST >> 20} million pixels are shown: set a smaller display window"
-        )
+        size = f"{canvas.width}x{canvas.height}"
+        raise NgptError(f"the display window is {size}; at most {MOST >> 20} million pixels are shown: make it smaller")
     filled = np.full((canvas.height, canvas.width, *image.shape[2:]), outside, image.dtype)
     if common := window.common(canvas):
         filled[common.within(canvas)] = image[common.within(window)]

@@ -218,10 +218,8 @@ class Denoiser:
         missing, and as ``ngpt.denoise`` does.
         """
         if unknown := [name for name in layers if name not in _FURTHER]:
-            raise NgptError(
-                f"Denoiser: no layer is called '{unknown[0]}'; "
-                f"{did_you_mean(unknown[0], _FURTHER)}there are: {', '.join(_FURTHER)}"
-            )
+            meant = did_you_mean(unknown[0], _FURTHER)
+            raise NgptError(f"Denoiser: no layer is called '{unknown[0]}'; {meant}there are: {', '.join(_FURTHER)}")
         given: dict[str, Any] = {"albedo": _first(albedo, albedo_ch), "normals": _first(normals, normals_ch)}
         given["flow"] = _first(flow, flow_ch)
         given["previous_denoised"] = _first(previous_denoised, previous_denoised_ch)

@@ -50,10 +50,7 @@ def to_numpy(value: Any, name: str = "the array") -> np.ndarray:
     if isinstance(value, np.ndarray):
         return value
     if detached := _detached(value, name.rpartition(" ")[2]):
-        raise NgptError(
-            f"{name} carries gradients, and no method passes them on; pass {detached} (docs/use/python.md shows how an "
-            "optimization keeps them)"
-        )
+        raise NgptError(f"{name} carries gradients, which no method passes on; pass {detached} (docs/use/python.md)")
     if is_bitmap(value) and value.srgb_gamma():
         raise NgptError(f"{name} is a bitmap with the curve of displays; pass bitmap.convert(srgb_gamma=False)")
     try:

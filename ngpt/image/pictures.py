@@ -42,10 +42,8 @@ def check_size(path: Path, width: int, height: int) -> None:
     """Raises NgptError if an image is too large for its format."""
     most = _LONGEST.get(path.suffix.lower(), max(width, height))
     if max(width, height) > most:
-        raise NgptError(
-            f"{path}: {width}x{height} pixels are too many for {path.suffix}, which has {most} a side at most; let the "
-            "name end in .png or .exr"
-        )
+        kind = path.suffix
+        raise NgptError(f"{path}: {width}x{height} pixels are too many for {kind}, which has {most} a side; write .exr")
 
 
 def write_picture(path: Path, pixels: np.ndarray, overwrite: bool = False) -> None:

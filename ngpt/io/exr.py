@@ -281,10 +281,8 @@ def write(
     for one, stack in pairs:
         pixels = GradientStack.from_arrays(path=str(path), primal=one)["primal"]
         if pixels.shape != stack["primal"].shape:
-            raise NgptError(
-                f"{path}: the result is {pixels.shape[1]}x{pixels.shape[0]} but the stack {stack.path} is "
-                f"{stack.width}x{stack.height}; results are written at the size of their stack"
-            )
+            sizes = f"{pixels.shape[1]}x{pixels.shape[0]} but the stack {stack.path} is {stack.width}x{stack.height}"
+            raise NgptError(f"{path}: the result is {sizes}; results are written at the size of their stack")
         made = _result(stack, pixels, made, attributes or {}, into, str(path))
     assert made is not None
     if reduce != 1:

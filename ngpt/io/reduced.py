@@ -84,10 +84,8 @@ def check_reducible(stack: GradientStack, k: int) -> None:
     if k < 2:
         raise WrongUse(f"images are reduced by 2 or more, not by {k}")
     if gradients := [name for name in ("dx", "dy", "dt") if name in stack]:
-        raise NgptError(
-            f"{stack.path}: has {', '.join(gradients)}, differences between its pixels and not between larger ones; "
-            "leave --reduce out, and render with --subpixels instead"
-        )
+        held = f"has {', '.join(gradients)}, differences between its pixels and not between larger ones"
+        raise NgptError(f"{stack.path}: {held}; leave --reduce out, and render with --subpixels instead")
     try:
         reduced_place(stack.place, k)
     except NgptError as error:

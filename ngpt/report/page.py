@@ -128,10 +128,8 @@ def oversize(path: str | os.PathLike) -> str:
     size = os.path.getsize(path)
     if size <= PAGE_LIMIT:
         return ""
-    return (
-        f"{path}: {size / 1e6:.3g} MB, more than the {PAGE_LIMIT / 1e6:.3g} MB that mail and browsers take without "
-        "complaint, though its pictures are stored as coarsely as possible; show fewer pictures, or smaller ones"
-    )
+    sizes = f"{size / 1e6:.3g} MB, more than the {PAGE_LIMIT / 1e6:.3g} MB that mail and browsers accept"
+    return f"{path}: {sizes}; show fewer pictures, or smaller ones"
 
 
 def _filled(live: bool, **parts: str) -> str:

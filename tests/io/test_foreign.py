@@ -204,14 +204,14 @@ def test_the_habits_of_oidn_denoise(tmp_path, command):
 @pytest.mark.parametrize(
     ("name", "data", "expected"),
     [
-        ("a.pfm", b"PF\n4 5\n-1.0\n" + bytes(100), "25 of its 60 numbers are there"),
+        ("a.pfm", b"PF\n4 5\n-1.0\n" + bytes(100), "only 25 of its 60 numbers"),
         ("a.pfm", b"PF\n4 5\nx\n" + bytes(240), "its header is not: PF, width and height, scale"),
         ("a.pfm", b"PF\n0 5\n-1\n", "it is 0x5 pixels"),
         ("a.pfm", b"Pf\n60000 60000\n-1\n" + bytes(99), "is 60000x60000 pixels, and 256 million are read at most"),
         ("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 1 +X 1\n" + bytes(4), "32-bit_rle_xyze and no RGB"),
         ("a.hdr", b"#?RADIANCE\n\n+X 1 -Y 1\n" + bytes(4), "has columns for rows"),
         ("a.hdr", b"#?RADIANCE\nEXPOSURE=0\n\n-Y 1 +X 1\n" + bytes(4), "EXPOSURE is"),
-        ("a.hdr", b"#?RADIANCE\n\n-Y 2 +X 2\n" + bytes(4), "1 of its 4 pixels are there"),
+        ("a.hdr", b"#?RADIANCE\n\n-Y 2 +X 2\n" + bytes(4), "only 1 of its 4 pixels"),
         ("a.hdr", b"#?RADIANCE\n\n-Y 2 +X 9\n\2\2\0\x09\x8a", "row 0 breaks off or is too long"),
         ("a.png", png(np.zeros((4, 4, 3), int), 2)[:-20], "it ends before all"),
         ("a.png", b"\x89PNG\r\n\x1a\n", "it has no header"),

@@ -1,1 +1,1 @@
-"""Images in formats other than OpenEXR: PFM, Radiance HDR, PNG, TIFF, JPEG. ``files`` reads them all."""
+"""Reads images in formats other than OpenEXR: PFM, Radiance HDR, PNG, TIFF and JPEG."""

@@ -1,7 +1,7 @@
-"""Reads a file of any known format as if it were OpenEXR: ``read_file`` and ``file_headers``.
+"""Reads files of all known formats as if they were OpenEXR.
 
-Values encoded for displays (PNG, JPEG, TIFF of whole numbers) become scene-linear by the sRGB formula, colours are
-multiplied by alpha, grey becomes R = G = B. The header attribute ``ngpt:from`` names the original format.
+Values that are encoded for displays (PNG, JPEG, TIFF of whole numbers) become scene-linear by the sRGB formula. Colours
+are multiplied by alpha, and grey becomes R = G = B. The header attribute ``ngpt:from`` names the original format.
 """
 
 import logging
@@ -21,12 +21,13 @@ from ngpt.io.foreign.form import Damage, Form, Unread
 from ngpt.io.header import PartHeader, check_size, read_headers
 from ngpt.io.openexr import ExrImage, ExrPart, read_exr, read_header
 from ngpt.system.reading import regular_file
+from ngpt.windows import Window
 
 _LOG = logging.getLogger(__name__)
 
-# The header attribute for the original format, and the end of its value if the image was encoded for displays.
+# The header attribute for the original format, and the end of its value if the image was encoded for displays
 FROM, ENCODED = "ngpt:from", " of sRGB"
-# The first bytes of a file, and its reader.
+# The first bytes of a file -> its reader
 READERS: dict[bytes, Callable[[BinaryIO], Form]] = {
     b"PF": pfm.describe,
     b"Pf": pfm.describe,
@@ -35,12 +36,12 @@ READERS: dict[bytes, Callable[[BinaryIO], Form]] = {
     **dict.fromkeys(tiff.MAGICS, tiff.describe),
     jpeg.MAGIC: jpeg.describe,
 }
-# Exceptions that libraries and struct raise for damaged files.
+# Exceptions that libraries and struct raise for damaged files
 _BROKEN = (Damage, struct.error, zlib.error, ValueError, TypeError, LookupError, ArithmeticError, AttributeError)
 
 
 def read_file(path: str | os.PathLike) -> ExrImage:
-    """The whole contents of a file. Raises NgptError as ``ngpt.io.openexr.read_exr`` does, for each of the formats."""
+    """Reads a file of any known format. Raises NgptError as ``ngpt.io.openexr.read_exr`` does."""
     path = Path(path)
     with regular_file(path) as file:
         reader = _reader(file)
@@ -52,13 +53,16 @@ def read_file(path: str | os.PathLike) -> ExrImage:
 
 
 def file_headers(file: BinaryIO, path: str) -> list[PartHeader]:
-    """What ``ngpt.io.header.read_headers`` returns for OpenEXR, for an open file of any of these formats."""
+    """The headers of an open file of any known format. Raises NgptError as ``ngpt.io.header.read_headers`` does."""
     reader = _reader(file)
     return [_header(_form(path, file, reader))] if reader else read_headers(file, path)
 
 
 def first_attributes(path: Path) -> dict[str, Any]:
-    """The attributes of a file's first part; none in formats other than OpenEXR. Raises NgptError."""
+    """The attributes of the first part of a file, none for formats other than OpenEXR.
+
+    Raises NgptError as ``ngpt.io.openexr.read_header`` does.
+    """
     with regular_file(path) as file:
         if _reader(file):
             return {}
@@ -66,7 +70,7 @@ def first_attributes(path: Path) -> dict[str, Any]:
 
 
 def tell_conversion(path: Path) -> None:
-    """Logs, as ``read_file`` does, how light was converted, for a file that another process has read."""
+    """Logs the conversion of light as ``read_file`` does, for a file that another process has read."""
     with regular_file(path) as file:
         reader = _reader(file)
         if reader is not None:
@@ -86,6 +90,7 @@ def _reader(file: BinaryIO) -> Callable[[BinaryIO], Form] | None:
 
 
 def _form(path: str | Path, file: BinaryIO, reader: Callable[[BinaryIO], Form]) -> Form:
+    """The description of an image that is not too large. Raises NgptError if it is, or if the file is damaged."""
     form = _guarded(path, lambda: reader(file))
     width, height = form.size
     if width < 1 or height < 1:
@@ -104,6 +109,7 @@ def _names(form: Form) -> str:
 
 
 def _as_part(path: Path, form: Form) -> ExrPart:
+    """The decoded image as a part of OpenEXR."""
     stored = _guarded(path, form.decode)
     planes = [stored[..., i] for i in range(form.channels)]
     alpha = planes.pop() if form.channels in (2, 4) else None
@@ -118,8 +124,7 @@ def _as_part(path: Path, form: Form) -> ExrPart:
     colours = [np.ascontiguousarray(plane, np.float32) for plane in planes]
     channels = dict(zip("RGB", colours * (3 // len(colours)), strict=True))
     channels |= {} if alpha is None else {"A": np.ascontiguousarray(alpha, np.float32)}
-    width, height = form.size
-    window = (np.zeros(2, np.int32), np.array([width - 1, height - 1], np.int32))
+    window = Window(0, 0, *form.size).box
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
@@ -132,12 +137,12 @@ def _as_part(path: Path, form: Form) -> ExrPart:
 
 
 def linear_srgb(values: np.ndarray) -> np.ndarray:
-    """Display values in [0, 1] -> linear light (IEC 61966-2-1)."""
+    """The linear light of display values from 0 to 1 (IEC 61966-2-1)."""
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
 def _guarded(path: str | Path, work: Callable):
-    """The result of ``work``. Its errors become NgptErrors, which name the file."""
+    """The result of ``work()``. Errors about the file become NgptErrors that name it."""
     try:
         return work()
     except Unread as error:

@@ -1,4 +1,4 @@
-"""JPEG, by Pillow, rotated by its orientation tag."""
+"""Reads JPEG by Pillow, and rotates it by its orientation tag."""
 
 from importlib.util import find_spec
 from typing import BinaryIO
@@ -9,18 +9,18 @@ from ngpt.io.foreign.form import Form, Unread
 from ngpt.system.install import package_command
 
 MAGIC = b"\xff\xd8\xff"
-_SIDEWAYS = (5, 6, 7, 8)  # values of the tag of orientation that swap width and height
+_SIDEWAYS = (5, 6, 7, 8)  # values of the orientation tag that swap width and height
 _ORIENTATION = 0x112
 
 
 def describe(file: BinaryIO) -> Form:
-    """The image of an open file, which is at its start."""
+    """Describes the image of an open file. Raises Damage or Unread."""
     if find_spec("PIL") is None:
         raise Unread(f"JPEG needs Pillow: {package_command('pillow')}")
     from PIL import ImageOps
     from PIL.JpegImagePlugin import JpegImageFile
 
-    # We limit the size ourselves, before decoding.
+    # Not Image.open, which limits the size: ``files`` checks it before decoding.
     image = JpegImageFile(file)
     if image.mode not in ("L", "RGB"):
         raise Unread(f"holds {image.mode} and neither grey nor R G B; save it as R G B")

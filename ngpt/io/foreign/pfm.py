@@ -1,7 +1,7 @@
-"""Portable float maps, the format of Open Image Denoise's own programs: read and written.
+"""Reads and writes portable float maps (PFM), the format of Open Image Denoise's programs.
 
-A header of text (``PF`` or ``Pf`` for grey, width and height, scale), then float32, the bottom row first. A negative
-scale means little-endian; its magnitude multiplies the numbers, as in oidnDenoise.
+A file has a header of text (``PF``, or ``Pf`` for grey; width and height; scale), and then float32 numbers, the bottom
+row first. A negative scale means little-endian. Its magnitude multiplies the numbers, as in oidnDenoise.
 https://www.pauldebevec.com/Research/HDR/PFM/
 """
 
@@ -20,7 +20,7 @@ _HEADER = re.compile(rb"P([Ff])\s+(\d{1,9})\s+(\d{1,9})\s+(\S{1,40})\s")
 
 
 def describe(file: BinaryIO) -> Form:
-    """The image of an open file, which is at its start."""
+    """Describes the image of an open file. Raises Damage."""
     header = _HEADER.match(file.read(256))
     try:
         scale = float(header[4]) if header else 0.0
@@ -36,7 +36,7 @@ def describe(file: BinaryIO) -> Form:
         count = width * height * channels
         values = np.fromfile(file, "<f4" if scale < 0 else ">f4", count)
         if values.size < count:
-            raise Damage(f"{values.size} of its {count} numbers are there")
+            raise Damage(f"it has only {values.size} of its {count} numbers")
         values = values.reshape(height, width, channels)[::-1].astype(np.float32)
         with np.errstate(over="ignore"):
             return values if abs(scale) == 1.0 else values * np.float32(abs(scale))
@@ -45,7 +45,7 @@ def describe(file: BinaryIO) -> Form:
 
 
 def write_pfm(path: str | os.PathLike, image: np.ndarray, overwrite: bool = False) -> Path:
-    """Writes (H, W, 3), row 0 on top, as little-endian float32, complete or not at all."""
+    """Writes an image (H, W, 3), with row 0 at the top, as little-endian float32, complete or not at all."""
     height, width = image.shape[:2]
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         file.write(b"PF\n%d %d\n-1.0\n" % (width, height))

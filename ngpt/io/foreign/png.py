@@ -1,4 +1,4 @@
-"""PNG: all types of colour and depth, in rows or interlaced. Gamma and profiles are ignored: values are taken as sRGB.
+"""Reads PNG of all colour types and depths, interlaced or not. Gamma and profiles are ignored: values count as sRGB.
 
 https://www.w3.org/TR/png-3/; ``ngpt.image.png`` is the encoder.
 """
@@ -15,13 +15,13 @@ from ngpt.io.foreign.form import Damage, Form, Unread
 MAGIC = b"\x89PNG\r\n\x1a\n"
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
-_LONGEST = 2**16  # pixels of a side: filters take a step for each diagonal of an image
-# x and y of the first pixel of each pass, and the steps to the next ones.
+_LONGEST = 2**16  # pixels of a side, because filters are undone in a loop over diagonals
+# x and y of the first pixel of each pass, and the steps to the next pixels
 _ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
 
 
 def describe(file: BinaryIO) -> Form:
-    """The image of an open file, which is at its start."""
+    """Describes the image of an open file. Raises Damage or Unread."""
     file.seek(len(MAGIC))
     if file.read(8) != b"\0\0\0\rIHDR":
         raise Damage("it has no header")
@@ -42,23 +42,23 @@ def describe(file: BinaryIO) -> Form:
             return _looked_up(samples[..., 0], palette, clear)
         most = 2**depth - 1
         if clear:
-            # One colour is transparent.
-            wanted = np.frombuffer(clear[: 2 * samples.shape[2]], ">u2")
-            if wanted.size < samples.shape[2]:
+            # Pixels of this colour are transparent.
+            colour_key = np.frombuffer(clear[: 2 * samples.shape[2]], ">u2")
+            if colour_key.size < samples.shape[2]:
                 raise Damage("its clear colour breaks off")
-            there = (samples != wanted).any(axis=-1, keepdims=True)
-            samples = np.concatenate([samples, (there * most).astype(samples.dtype)], axis=-1)
+            opaque = (samples != colour_key).any(axis=-1, keepdims=True)
+            samples = np.concatenate([samples, (opaque * most).astype(samples.dtype)], axis=-1)
         return samples if depth >= 8 else (samples * (255 // most)).astype(np.uint8)
 
-    # One byte inflates to at most 1032, and an index into a palette becomes four floats.
+    # One byte inflates to at most 1032 bytes, and an index into a palette becomes four floats.
     ratio = 1032 * 8 * 16 // depth
     return Form(f"PNG, {depth} bits", (width, height), planes, ratio, True, decode, straight=True)
 
 
 def _before_pixels(file: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
-    """The chunks before the first one with pixels, with the data of the palette and the transparent colour.
+    """Yields the kind and the data of the chunks with the palette and the transparent colour.
 
-    The file is then at the first chunk with pixels.
+    Then the file is at the first chunk with pixels.
     """
     while True:
         length, kind = _next(file)
@@ -82,7 +82,7 @@ def _next(file: BinaryIO) -> tuple[int, bytes]:
 
 
 def _data(file: BinaryIO, length: int, kind: bytes) -> bytes:
-    """The data of the chunk; its checksum is verified."""
+    """The data of a chunk, whose checksum is verified."""
     data, checksum = file.read(length), file.read(4)
     if len(checksum) < 4:
         raise Damage("it ends before all of its pixels are there")
@@ -92,10 +92,10 @@ def _data(file: BinaryIO, length: int, kind: bytes) -> bytes:
 
 
 def _samples(file: BinaryIO, size: tuple[int, int], depth: int, channels: int, interlaced: bool) -> np.ndarray:
-    """(H, W, channels) uint8 or uint16, as they are stored."""
+    """The numbers of all pixels as they are stored, (H, W, channels) uint8 or uint16."""
     width, height = size
     passes = _ADAM7 if interlaced else ((0, 0, 1, 1),)
-    # Columns and rows of each pass; then its rows and the bytes of a row.
+    # ``areas`` has the columns and rows of each pass, ``shapes`` its rows and the bytes of a row.
     areas = [(-(-(width - x) // step), -(-(height - y) // rise)) for x, y, step, rise in passes]
     shapes = [(rows, -(-columns * channels * depth // 8)) if columns > 0 else (0, 0) for columns, rows in areas]
     data = _inflated(file, sum(rows * (1 + length) for rows, length in shapes if length))
@@ -119,7 +119,7 @@ def _samples(file: BinaryIO, size: tuple[int, int], depth: int, channels: int, i
 
 
 def _inflated(file: BinaryIO, size: int) -> bytes:
-    """The first ``size`` bytes in the chunks of pixels, inflated; further bytes are ignored."""
+    """The first ``size`` inflated bytes of the chunks with pixels; all others are ignored."""
     inflate, data = zlib.decompressobj(), bytearray()
     while len(data) < size:
         length, kind = _next(file)
@@ -130,16 +130,16 @@ def _inflated(file: BinaryIO, size: int) -> bytes:
 
 
 def _unfiltered(lines: np.ndarray, step: int) -> np.ndarray:
-    """Undoes the filters of rows: (rows, 1 + bytes) -> (rows, bytes). The first byte of a row is its filter.
+    """Undoes the filters of rows, (rows, 1 + bytes), whose first byte is the filter; returns (rows, bytes).
 
-    ``step`` is the number of bytes of a pixel. A pixel needs those to its left, above, and above left. So all pixels on
-    a diagonal are computed at once.
+    ``step`` is the number of bytes of a pixel. A pixel depends on the pixels to its left, above, and above left, so all
+    pixels on a diagonal are computed at once.
     """
     filters, coded = lines[:, 0], lines[:, 1:]
     if filters.max(initial=0) > 4:
         raise Damage(f"row {int(filters.argmax())} has filter {filters.max()}; filters are 0 to 4")
     rows, columns = len(lines), coded.shape[1] // step
-    # One row above and one column to the left are zeros.
+    # The row above and the column to the left are zeros.
     out = np.zeros((rows + 1, columns + 1, step), np.int16)
     out[1:, 1:] = coded.reshape(rows, columns, step)
     if filters.any():
@@ -163,7 +163,7 @@ def _unfiltered(lines: np.ndarray, step: int) -> np.ndarray:
 
 
 def _looked_up(places: np.ndarray, palette: bytes, clear: bytes) -> np.ndarray:
-    """(H, W, 3 or 4) uint8 from indices into a palette; ``clear`` is the alpha of its first colours."""
+    """The colours (H, W, 3 or 4) uint8 of indices into a palette; ``clear`` is the alpha of its first colours."""
     table = np.frombuffer(palette[: len(palette) // 3 * 3], np.uint8).reshape(-1, 3)
     if places.max() >= len(table):
         raise Damage(f"its palette has {len(table)} colours, and a pixel is number {places.max()}")

@@ -1,7 +1,7 @@
-"""Radiance HDR: RGBE pixels, plain or by either of the format's run lengths.
+"""Reads Radiance HDR: RGBE pixels, plain or with the old or the new run lengths.
 
-A pixel is R G B in 8 bits and an exponent that they share: value = byte * 2^(e - 136), as in most readers (Radiance
-itself adds half a step). EXPOSURE and COLORCORR have been multiplied onto the pixels and are divided out.
+A pixel has R G B in 8 bits each and an exponent e for all three: value = byte * 2^(e - 136), as in most readers.
+(Radiance itself adds half a step.) Pixels are divided by EXPOSURE and COLORCORR, with which they were multiplied.
 https://radsite.lbl.gov/radiance/refer/filefmts.pdf
 """
 
@@ -14,11 +14,11 @@ import numpy as np
 from ngpt.io.foreign.form import Damage, Form, Unread
 
 _MOST = 2**16  # bytes of the header
-_SHORTEST, _LONGEST = 8, 0x7FFF  # image rows of such widths may use the newer run lengths
+_SHORTEST, _LONGEST = 8, 0x7FFF  # the widths of images that may have the new run lengths
 
 
 def describe(file: BinaryIO) -> Form:
-    """The image of an open file, which is at its start."""
+    """Describes the image of an open file. Raises Damage or Unread."""
     start = file.read(_MOST)
     text, gap, rest = start.partition(b"\n\n")
     line = re.match(rb"([-+])Y +(\d{1,9}) +([-+])X +(\d{1,9})\n", rest)
@@ -41,12 +41,12 @@ def describe(file: BinaryIO) -> Form:
             light = light if (gain == 1.0).all() else (light / gain).astype(np.float32)
         return light[:: 1 if line[1] == b"-" else -1, :: 1 if line[3] == b"+" else -1]
 
-    # A pair of bytes of the newer run lengths stands for 127 values; one old repetition may stand for a whole image.
+    # A pair of bytes of the new run lengths can hold 127 values, and one old repetition a whole image.
     return Form("Radiance HDR", (width, height), 3, 2**24, False, decode)
 
 
 def _multiplied(header: bytes) -> np.ndarray:
-    """(3,): the factor of the pixels, the product of all header lines that give one."""
+    """The factors (3,) of the pixels: the product of all EXPOSURE and COLORCORR in the header."""
     gain = np.ones(3)
     for name, value in re.findall(rb"^(EXPOSURE|COLORCORR) *= *(.*)$", header, re.MULTILINE):
         try:
@@ -62,7 +62,7 @@ def _multiplied(header: bytes) -> np.ndarray:
 
 
 def _pixels(data: bytes, width: int, height: int) -> np.ndarray:
-    """(H, W, 4) uint8."""
+    """The RGBE pixels (H, W, 4) uint8."""
     if _SHORTEST <= width <= _LONGEST and data[:4] == bytes((2, 2, width >> 8, width & 255)):
         return _new_runs(data, width, height)
     pixels = np.frombuffer(data[: len(data) // 4 * 4], np.uint8).reshape(-1, 4)
@@ -70,13 +70,15 @@ def _pixels(data: bytes, width: int, height: int) -> np.ndarray:
     if repeats.any():
         pixels = _old_runs(pixels, repeats, width * height)
     if len(pixels) < width * height:
-        raise Damage(f"{len(pixels)} of its {width * height} pixels are there")
+        raise Damage(f"it has only {len(pixels)} of its {width * height} pixels")
     return pixels[: width * height].reshape(height, width, 4)
 
 
 def _old_runs(pixels: np.ndarray, repeats: np.ndarray, count: int) -> np.ndarray:
-    """A pixel 1 1 1 n repeats the pixel before it n times; in a row of such pixels, each n counts 256 times as much as
-    the one before."""
+    """The pixels (n, 4) without repetitions. A pixel 1 1 1 n repeats the pixel before it n times.
+
+    If several such pixels follow each other, each n counts 256 times as much as the one before.
+    """
     places = np.arange(len(pixels))
     last = np.maximum.accumulate(np.where(repeats, -1, places))
     if repeats[0]:
@@ -85,14 +87,17 @@ def _old_runs(pixels: np.ndarray, repeats: np.ndarray, count: int) -> np.ndarray
     times = np.where(repeats, pixels[:, 3].astype(np.int64) << (8 * np.maximum(digit, 0)), 1)
     end = np.cumsum(times)
     if not len(end) or end[-1] < count:
-        raise Damage(f"{end[-1] if len(end) else 0} of its {count} pixels are there")
+        raise Damage(f"it has only {end[-1] if len(end) else 0} of its {count} pixels")
     # Values beyond the image are not used.
     times = np.clip(count - (end - times), 0, times)
     return np.repeat(pixels[last], times, axis=0)
 
 
 def _new_runs(data: bytes, width: int, height: int) -> np.ndarray:
-    """Each row stores all R, then all G, B and exponents. 128 + n and a byte repeat that byte n times."""
+    """The pixels (H, W, 4) of rows that store all R, then all G, B and exponents.
+
+    The byte 128 + n means that the next byte occurs n times, and a byte n of up to 128 that n bytes follow.
+    """
     pixels, place, begin = np.empty((height, 4, width), np.uint8), 0, bytes((2, 2, width >> 8, width & 255))
     for y in range(height):
         if data[place : place + 4] != begin:

@@ -1,4 +1,4 @@
-"""TIFF, by tifffile: the first image of a file, of 8 or 16 bits (sRGB) or of floats (scene-linear)."""
+"""Reads the first image of a TIFF by tifffile: 8 or 16 bits count as sRGB, and floats as scene-linear."""
 
 import zlib
 from importlib.util import find_spec
@@ -11,16 +11,16 @@ from ngpt.system.install import package_command
 
 MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _LZW, _DEFLATE = 5, (8, 32946)
-# None, LZW, Deflate under its two numbers, PackBits.
+# None, LZW, Deflate under its two numbers, PackBits
 _COMPRESSIONS = (1, _LZW, *_DEFLATE, 32773)
 _FLOATING = 3  # predictor
 _GREY, _COLOUR = 1, 2
-_STRAIGHT = 2  # alpha by which colours are not multiplied
-_BURST = 2**24  # the most bytes of a strip that is unpacked without a check of its size
+_STRAIGHT = 2  # the kind of alpha by which colours are not multiplied
+_BURST = 2**24  # strips that unpack to at most this number of bytes are always accepted
 
 
 def describe(file: BinaryIO) -> Form:
-    """The image of an open file, which is at its start."""
+    """Describes the image of an open file. Raises Damage or Unread."""
     if find_spec("tifffile") is None:
         raise Unread(f"TIFF needs tifffile: {package_command('tifffile')}")
     import tifffile
@@ -63,7 +63,7 @@ def describe(file: BinaryIO) -> Form:
 
 
 def _check_strips(page: Any, file: BinaryIO, kind: np.dtype) -> None:
-    """Raises Damage for a strip or tile that unpacks to more than its pixels: zlib would fill the memory."""
+    """Raises Damage for a strip or tile that unpacks to more than its pixels, and would fill the memory."""
     across, down = (page.tilewidth, page.tilelength) if page.is_tiled else (page.imagewidth, page.rowsperstrip)
     most = max(across * min(down, page.imagelength + down) * page.samplesperpixel * kind.itemsize, _BURST)
     for place, length in zip(page.dataoffsets, page.databytecounts, strict=False):
