@@ -329,7 +329,9 @@ def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
     for stack in stacks:
         strange = next((name for name in pass_through(stack) if not name.startswith(DIAGNOSTICS)), None)
         if strange is not None:
-            raise NgptError(f"{stack.path}: channel '{strange}' has no mean; merge stacks as `ngpt render` writes them")
+            raise NgptError(
+                f"{stack.path}: channel '{strange}' has no mean; merge renders before they are reconstructed"
+            )
 
 
 def _means(stack: GradientStack) -> set[str]:

@@ -151,7 +151,7 @@ def error_cases(rng):
         "one": ([one], "at least two stacks, and got 1"),
         "more layers": ([bare, two], "2.exr has 'd[xy]' and 1.exr has not"),
         "no variance": ([one, unknown], "2.exr has no 'primal_var' though it has 4 samples"),
-        "a strange channel": (strange, "channel 'id' is no layer"),
+        "a strange channel": (strange, "channel 'id' has no mean"),
         "counts of nan": ([one, samples_of(two, np.nan)], no_number),
         "negative counts": ([one, samples_of(two, -1)], no_number),
         "endless counts": ([one, samples_of(two, 1e30)], no_number),

@@ -70,8 +70,8 @@ def test_numbers_are_numbers():
         ({"primal": 1.0}, "layer 'primal' has shape ()"),
         ({"dx": image(3, 3), "primal": image()}, "stored at image size with an unused last column: pad it with zeros"),
         ({"dy": image(2, 4), "primal": image()}, "stored at image size with an unused last row: pad it with zeros"),
-        ({"dx": image(2, 4), "primal": image()}, "layer 'dx' is 4x2 but 'primal' is 4x3; all layers of a stack"),
-        ({"albedo": image(1, 2), "primal": image()}, "layer 'albedo' is 2x1 but 'primal' is 4x3; all layers of a"),
+        ({"dx": image(2, 4), "primal": image()}, "layer 'dx' is 4x2 but 'primal' is 4x3; render or crop all"),
+        ({"albedo": image(1, 2), "primal": image()}, "layer 'albedo' is 2x1 but 'primal' is 4x3; render or crop all"),
     ],
 )
 def test_arrays_that_are_no_layers(layers, expected):
