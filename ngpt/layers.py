@@ -53,6 +53,12 @@ LAYERS: dict[str, Layer] = {
     )
 }
 
+
+def stored_channels(name: str) -> tuple[str, ...]:
+    """The names of a layer's channels in files of ngpt: "dx.R", but "R" for primal and "A" for alpha."""
+    return tuple(suffix if name in ("primal", "alpha") else f"{name}.{suffix}" for suffix in LAYERS[name].channels)
+
+
 # Layers of differences -> offset (x, y, frames) from a pixel to the pixel that it is subtracted from; y points down.
 DIFFERENCES: dict[str, tuple[int, int, int]] = {"dx": (1, 0, 0), "dy": (0, 1, 0)}
 

@@ -12,6 +12,7 @@ import numpy as np
 from ngpt.cli.arguments import add_json, add_layers, add_untrusted, add_view, assignment, print_json
 from ngpt.cli.streams import standard_input
 from ngpt.errors import NgptError, WrongUse
+from ngpt.image.notebook import value_range
 from ngpt.io.aliases import format_aliases
 from ngpt.io.exr import pass_through, read, views_in
 from ngpt.io.resolution import layers_held, propose
@@ -152,17 +153,11 @@ def stack(stack: GradientStack) -> dict:
     layers = {}
     for name in stack.names:
         found = resolution[name]
-        values = stack[name]
-        finite = values[np.isfinite(values)]
         layers[name] = {
             "channels": " ".join(found.channels),
             "part": parts[found.part].name or found.part,
             "type": str(parts[found.part].channels[found.channels[0]].dtype),
-            "min": float(finite.min()) if finite.size else None,
-            "mean": float(finite.mean(dtype=np.float64)) if finite.size else None,
-            "max": float(finite.max()) if finite.size else None,
-            "nonfinite": int(np.sum(~np.isfinite(values).all(axis=-1))),
-        }
+        } | value_range(stack[name])
     report = {
         "file": stack.path,
         "size": [stack.width, stack.height],

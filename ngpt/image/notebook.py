@@ -31,9 +31,14 @@ def stack_html(title: str, layers: Mapping[str, np.ndarray]) -> str:
     )
 
 
-def _row(name: str, layer: np.ndarray) -> str:
+def value_range(layer: np.ndarray) -> dict[str, float]:
+    """The least, mean and largest finite value of a layer (H, W, C), NaN without any; and its non-finite pixels."""
     finite = np.isfinite(layer)
-    values = layer[finite]
-    numbers = [values.min(), values.mean(dtype=np.float64), values.max()] if values.size else [np.nan] * 3
-    cells = [*(f"{number:.4g}" for number in numbers), str(np.count_nonzero(~finite.all(axis=-1)))]
+    values = layer[finite] if finite.any() else np.array([np.nan])
+    found = {"min": float(values.min()), "mean": float(values.mean(dtype=np.float64)), "max": float(values.max())}
+    return found | {"nonfinite": int(np.count_nonzero(~finite.all(axis=-1)))}
+
+
+def _row(name: str, layer: np.ndarray) -> str:
+    cells = [f"{number:.4g}" if isinstance(number, float) else str(number) for number in value_range(layer).values()]
     return f"<tr><th>{markup(name)}</th>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"

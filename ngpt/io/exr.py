@@ -28,7 +28,7 @@ from ngpt.io.resolution import Found, Resolution, channels_like, resolve, resolv
 from ngpt.io.resolution import layers_of_light as find_light
 from ngpt.io.results import MADE_BY, STRUCTURE, image_of, leave_out_old_error, new_header, replaced_layer, with_result
 from ngpt.io.views import Part, View, choose_views, views_of
-from ngpt.layers import LAYERS, RGB, XYZ
+from ngpt.layers import LAYERS, RGB, XYZ, stored_channels
 from ngpt.stack import GradientStack
 from ngpt.system.reading import regular_file
 from ngpt.system.threads import map_parts
@@ -330,8 +330,7 @@ def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> G
     stack.require("primal", why="carrying further channels")
     part, found = ExrPart("", new_header(stack), {}), {}
     for name in stack.names:
-        prefix = "" if name in ("primal", "alpha") else f"{name}."
-        found[name] = Found(0, tuple(prefix + suffix for suffix in LAYERS[name].channels), name)
+        found[name] = Found(0, stored_channels(name), name)
         scatter(part, found[name].channels, stack[name], half=False)
     part.channels.update({name: np.ascontiguousarray(image, np.float32) for name, image in channels.items()})
     image = ExrImage([part])

@@ -14,7 +14,7 @@ import OpenEXR
 
 from ngpt.io.layout import data_window, gather, scatter
 from ngpt.io.openexr import ExrImage, ExrPart
-from ngpt.layers import LAYERS, RGB
+from ngpt.layers import stored_channels
 from ngpt.stack import GradientStack
 from ngpt.subpixels import FINE, HALF, SUBPIXELS, belong
 
@@ -48,7 +48,7 @@ def subpixels_of(part: ExrPart, stack: GradientStack) -> dict[str, np.ndarray]:
         found = (stack.path, PART, window, SUBPIXELS, k, data)
         _LOG.warning("%s: part '%s' has %s and '%s' %s, which do not fit the pixels at %s; they are left out", *found)
         return {}
-    names = {name: _channels(name) for name in FINE}
+    names = {name: stored_channels(name) for name in FINE}
     held = {name: gather(part, its) for name, its in names.items() if all(c in part.channels for c in its)}
     return held if "primal" in held and belong(held, stack.layers, stack.path) else {}
 
@@ -65,9 +65,5 @@ def with_subpixels(image: ExrImage, main: int, stack: GradientStack) -> ExrImage
     own["dataWindow"] = stack.place.data.times(k).box
     part = ExrPart(PART, own | {name: header[name] for name in _COMMON if name in header}, {})
     for name, layer in stack.fine.items():
-        scatter(part, _channels(name), layer, half=name in HALF)
+        scatter(part, stored_channels(name), layer, half=name in HALF)
     return ExrImage([*(each if each.name else replace(each, name=_PIXELS) for each in image.parts), part])
-
-
-def _channels(name: str) -> tuple[str, ...]:
-    return RGB if name == "primal" else tuple(f"{name}.{channel}" for channel in LAYERS[name].channels)

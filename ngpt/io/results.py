@@ -11,7 +11,7 @@ from ngpt.io.layout import as_stored, data_window, holds, is_half, scatter, take
 from ngpt.io.openexr import ExrImage, ExrPart
 from ngpt.io.resolution import Found, Resolution, channels_like, layers_of_light
 from ngpt.io.views import View
-from ngpt.layers import LAYERS
+from ngpt.layers import LAYERS, stored_channels
 from ngpt.stack import GradientStack
 from ngpt.system.threads import map_parts
 from ngpt.windows import put
@@ -71,8 +71,7 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
             part, names = image.parts[resolution[name].part], resolution[name].channels
             half = is_half(part, names) and not LAYERS[name].float_on_disk
         else:
-            prefix = "" if name in ("primal", "alpha") else f"{name}."
-            part, names = image.parts[main], tuple(prefix + suffix for suffix in LAYERS[name].channels)
+            part, names = image.parts[main], stored_channels(name)
             if stack.source is not None:
                 names = tuple(stack.source.view.channel(main, channel) for channel in names)
             resolution[name] = Found(main, names, name)
