@@ -39,8 +39,8 @@ def kept_within(image: np.ndarray, stack: GradientStack) -> np.ndarray:
         return image
     spread = np.where(empty[..., None], image, 0).astype(np.float64)
     left = image - spread
-    owed, there = _around(np.nan_to_num(stack["primal"], posinf=0.0, neginf=0.0) - left), _around(spread)
-    spread *= np.clip(_over(owed, there), 0, 1)
+    owed, spread_there = _around(np.nan_to_num(stack["primal"], posinf=0.0, neginf=0.0) - left), _around(spread)
+    spread *= np.clip(_over(owed, spread_there), 0, 1)
     alpha = np.clip(np.nan_to_num(stack["alpha"].astype(np.float64)), 0, 1)
     return (left + alpha * _around(_over(spread, _around(alpha)))).astype(np.float32)
 

@@ -118,6 +118,6 @@ def _write_mp4(path: Path, temporary: Path, frames: Iterable[np.ndarray], size: 
         except BaseException:
             process.kill()
             raise
-        said = process.stderr.read().decode(errors="replace").strip().splitlines()
+        messages = process.stderr.read().decode(errors="replace").strip().splitlines()
     if process.returncode:
-        raise NgptError(f"{path}: FFmpeg failed: {said[-1] if said else f'status {process.returncode}'}")
+        raise NgptError(f"{path}: FFmpeg failed: {messages[-1] if messages else f'status {process.returncode}'}")

@@ -137,10 +137,10 @@ def _stack(
     arrays = dict(zip(resolution, layers_found, strict=True))
     attributes = {name: value for name, value in main.header.items() if name not in STRUCTURE}
     stack = GradientStack(arrays, attributes, StackSource(image, resolution, view), path, place_of(main))
-    alone = {name: _read_alone(file, name, stack, main, isolated) for name, file in (files or {}).items()}
+    separate = {name: _separate_layer(file, name, stack, main, isolated) for name, file in (files or {}).items()}
     places = ", ".join(f"{name} ({' '.join(found.channels)})" for name, found in resolution.items())
     _LOG.info("%s: %dx%d, %s", path, stack.width, stack.height, places)
-    return stack.replace(**alone) if alone else stack
+    return stack.replace(**separate) if separate else stack
 
 
 def layers_in(path: str | os.PathLike, layers: Mapping[str, str] | None = None) -> frozenset[str]:
@@ -166,7 +166,9 @@ def _views_in(path: str | os.PathLike) -> tuple[list[View], list[dict[str, str]]
     return views_of(parts), [{name: part.text(name) for name in part.attributes} for part in headers]
 
 
-def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: ExrPart, isolated: bool) -> np.ndarray:
+def _separate_layer(
+    file: str | os.PathLike, name: str, stack: GradientStack, main: ExrPart, isolated: bool
+) -> np.ndarray:
     """Layer ``name`` (H, W, C) from a separate file.
 
     Raises NgptError unless it has the size of the ``stack`` and the place of ``main``, the part with the primal.

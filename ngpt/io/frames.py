@@ -114,14 +114,14 @@ def remarks(name: str, files: Sequence[Path], results: bool = True) -> list[str]
 
     ``name`` is the folder or pattern, ``files`` are its frames. ``results`` is whether omitted results are counted.
     """
-    said = []
+    lines = []
     if left := len(set(_files(name)) - set(files)) if results else 0:
         pattern = (Path(name) if Path(name).is_dir() else Path(name).parent) / f"*{RESULT_SUFFIX}.exr"
-        said.append(f"{name}: {left} results beside their inputs are left out; '{pattern}' names them")
+        lines.append(f"{name}: {left} results beside their inputs are left out; '{pattern}' names them")
     found = series(files)
     if len(found) > 1 and len(files) > len(found):
         each = ", ".join(f"{one.name} ({len(one.files)})" for one in found)
-        said.append(f"{name}: {len(found)} series of frames, one after the other: {each}")
+        lines.append(f"{name}: {len(found)} series of frames, one after the other: {each}")
     for one in found:
         steps = list(pairwise(sorted(set(one.numbers))))
         step = min((after - before for before, after in steps), default=1)
@@ -129,8 +129,8 @@ def remarks(name: str, files: Sequence[Path], results: bool = True) -> list[str]
         if gaps:
             some = ", ".join(str(first) if first >= last else f"{first} to {last}" for first, last in gaps[:5])
             some += f" and {len(gaps) - 5} more gaps" if len(gaps) > 5 else ""
-            said.append(f"{name}: {one.name} goes from {steps[0][0]} to {steps[-1][1]} without {some}")
-    return said
+            lines.append(f"{name}: {one.name} goes from {steps[0][0]} to {steps[-1][1]} without {some}")
+    return lines
 
 
 def _files(name: str) -> list[Path]:

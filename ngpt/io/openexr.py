@@ -143,7 +143,7 @@ def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False)
 
 
 def _reason(error: Exception, name: str, path: Path) -> str:
-    """The first line of an error of OpenEXR, which knows the file ``path`` by ``name``."""
+    """The first line of an error of OpenEXR, in which ``name``, as given to OpenEXR, is replaced by the file\'s own."""
     return (str(error).splitlines() or [type(error).__name__])[0].replace(name, path.name)
 
 

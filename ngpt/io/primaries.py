@@ -72,14 +72,14 @@ def _primaries(attributes: Mapping[str, Any]) -> Any:
     if attributes.get("acesImageContainerFlag") == 1:
         return ACES_AP0
     for name in ("colorInteropID", "chromaticities", "oiio:ColorSpace"):
-        said = attributes.get(name)
-        if name == "chromaticities" and said is not None:
-            return said
-        plain = re.sub("[^a-z0-9]", "", str(said or "").lower())
+        value = attributes.get(name)
+        if name == "chromaticities" and value is not None:
+            return value
+        plain = re.sub("[^a-z0-9]", "", str(value or "").lower())
         if plain in _SPACES:
             return _SPACES[plain]
         if plain not in _NO_SPACE:
-            _LOG.warning("%s '%s' is ignored: ngpt knows no linear space of that name", name, said)
+            _LOG.warning("%s '%s' is ignored: ngpt knows no linear space of that name", name, value)
     return None
 
 

@@ -111,7 +111,7 @@ def resolve(
             home = _home(groups, found["primal"], origin)
     primal = found["primal"]
     for name, other in found.items():
-        # The root of a multi-part file may be a part called `albedo`, say, and then it is no primal.
+        # The root of a file of several parts may be a part called `albedo`, which is not a primal.
         if name != "primal" and "primal" not in overrides and other[:2] == primal[:2]:
             raise _no_primal(groups, path)
     for name, beside in OWN.items():
@@ -266,7 +266,7 @@ def _chosen(layer: Layer, text: str, groups: list[_Group], home: _Home, path: st
 
 
 def _places(channel: str, groups: list[_Group]) -> set[tuple[int, str]]:
-    """The parts and names of the channels with this whole name; if there are none, of those whose name ends in it."""
+    """The parts and names of the channels with this name, or if there are none, with a name that ends in it."""
     names = {(g.part, own): f"{g.name}.{suffix}".strip(".") for g in groups for suffix, own in g.channels.items()}
     whole = {place for place, name in names.items() if channel in (name, place[1])}
     return whole or {place for place, name in names.items() if name.endswith(f".{channel}")}
@@ -308,7 +308,7 @@ def channels_like(found: Found) -> tuple[str, ...]:
 
 
 def _lone(groups: list[_Group]) -> Found | None:
-    """The only layer of colour that could be the primal, whatever its name."""
+    """The only layer of colour that could be the primal, under any name; None if there is none or more than one."""
     features = _features(groups)
     words = (*NO_LIGHT, *(look for looks in LOOKS.values() for look in looks))
     tails = [(group, plain(group.name.rpartition(".")[2])) for group in groups if group.name]

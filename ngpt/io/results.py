@@ -1,4 +1,4 @@
-"""Stacks and results as files: the file that a stack was read from, with its layers brought up to date and a result."""
+"""Makes the contents of files from stacks and results: the file of a stack, with changed layers and a result."""
 
 from dataclasses import replace
 from typing import Any
@@ -16,23 +16,24 @@ from ngpt.stack import GradientStack
 from ngpt.system.threads import map_parts
 from ngpt.windows import put
 
-# Attributes that describe how a part is stored, rather than what it shows; all others are attributes of the stack.
+# Attributes about the storage of a part; all others are attributes of the stack.
 STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"} | {
     "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type"
 }  # fmt: skip
-# Attributes that say what made a result; the stack's own attributes stay.
+# Attributes about the making of a result; a new result does not take them from its stack.
 MADE_BY = (
     *("ngpt:method", "ngpt:weights", "ngpt:options", "ngpt:estimated", "ngpt:reconstructSeconds"),
     *("ngpt:temporal", "ngpt:history", "ngpt:historyWeights", "ngpt:pass", "ngpt:reduced"),
 )
-# A primal with this in its name is known to be noisy: nobody mistakes it for the final image.
+# A layer with this word in its name is not replaced by a result, because nobody takes it for the final image.
 _NOISY = "noisy"
 
 
 def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> tuple[ExrImage, Resolution, int]:
-    """Returns the stack as a file, where the layers are in it, and the index of the part that has the attributes.
+    """The stack as a file, the places of its layers there, and the index of the part with its attributes.
 
-    ``base``: the file with the results that other views have already.
+    ``base`` is the file with the results of other views, if there are any. Raises NgptError if the stack does not have
+    the size of the file that it was read from.
     """
     if stack.source is None:
         stack.require("primal", why=f"writing {path}")
@@ -40,7 +41,7 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
     else:
         own = stack.source.image.parts
         image = ExrImage([replace(part, channels=dict(part.channels)) for part in (base.parts if base else own)])
-        # ``base`` lacks other changes to this view, such as changes to its light groups.
+        # ``base`` lacks changes to this view, such as those of its light groups.
         for part, source, (_, channels) in zip(image.parts, own, stack.source.view.parts, strict=False):
             part.channels.update({name: source.channels[name] for name in channels.values() if base})
         resolution = dict(stack.source.resolution)
@@ -55,18 +56,18 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
     image.parts[main] = replace(image.parts[main], header={**header, **stack.attributes})
     known = [name for name in stack.names if name in resolution]
 
-    def is_there(name: str) -> bool:
+    def is_unchanged(name: str) -> bool:
         found = resolution[name]
         if as_stored(image, found, main):
             return holds(image.parts[found.part], found.channels, stack[name])
         return np.array_equal(taken(image, found, main), stack[name], equal_nan=True)
 
-    unchanged = dict(zip(known, map_parts(is_there, known), strict=True))
+    unchanged = dict(zip(known, map_parts(is_unchanged, known), strict=True))
     for name in stack.names:
         values, half = stack[name], False
         if unchanged.get(name):
             continue
-        # Channels in another renderer's units, or on other pixels, stay as they are, and ours are added beside them.
+        # Channels in another renderer's units, or on other pixels, are not changed, and ours are added beside them.
         if name in resolution and as_stored(image, resolution[name], main):
             part, names = image.parts[resolution[name].part], resolution[name].channels
             half = is_half(part, names) and not LAYERS[name].float_on_disk
@@ -87,7 +88,7 @@ def new_header(stack: GradientStack) -> dict[str, Any]:
 
 
 def leave_out_old_error(stack: GradientStack, image: ExrImage) -> None:
-    """Removes the layer ``error`` that came with the file of a stack: it belongs to an earlier result."""
+    """Removes the layer ``error`` from the file of a stack if the stack still has it: an earlier result made it."""
     place = stack.source.resolution.get("error") if stack.source else None
     if place and "error" in stack and holds(stack.source.image.parts[place.part], place.channels, stack["error"]):
         for channel in place.channels:
@@ -95,13 +96,13 @@ def leave_out_old_error(stack: GradientStack, image: ExrImage) -> None:
 
 
 def replaced_layer(resolution: Resolution, view: View, origin: str, into: str | None, path: str) -> Found | None:
-    """The layer that holds a result besides the root: users who load that layer want the result too.
+    """The layer that a result replaces in addition to the root, for users who load that layer; None for no layer.
 
-    ``into`` names it, whole or by its tail after a dot; "root" is none. By default it is the layer that the input came
-    from, unless its name says that it is noisy; ``origin`` is the name of that layer if an earlier result moved the
-    input.
+    ``into``    its name, whole or the end after a dot; "root" for no layer; None for the layer of the input, unless
+                "noisy" is in its name
+    ``origin``  the name of the layer of the input, if an earlier result has moved the input
 
-    Raises NgptError unless ``into`` fits one layer of colour.
+    Raises NgptError unless ``into`` fits exactly one layer of colour.
     """
     primal, others = resolution["primal"], layers_of_light(view.parts, resolution)
     names = channels_like(primal)
@@ -124,10 +125,10 @@ def replaced_layer(resolution: Resolution, view: View, origin: str, into: str | 
 def with_result(
     image: ExrImage, resolution: Resolution, view: View, pixels: np.ndarray, shown: Found | None
 ) -> tuple[ExrImage, int]:
-    """Returns the file with ``pixels`` (H, W, 3) float32 as the root of a view's first part, the input as primal.R/G/B.
+    """The file with ``pixels`` (H, W, 3) float32 as the root of a view's first part and the input as primal.R/G/B.
 
-    ``pixels`` also replace the layer ``shown``, whose name goes into the header as ``ngpt:pass``. The second value is
-    the index of the part with the result.
+    ``pixels`` also replace the layer ``shown``, which the attribute ``ngpt:pass`` then names. The second value is the
+    index of the part with the result.
     """
     primal, alpha = resolution["primal"], resolution.get("alpha")
     source, parts, place = image.parts[primal.part], list(image.parts), view.first
@@ -148,7 +149,7 @@ def with_result(
         if view.name:
             header = {key: value for key, value in header.items() if key != "multiView"} | {"view": view.name}
         root, kept = suffixes, tuple(f"primal.{suffix}" for suffix in suffixes)
-        # A part at the end leaves the numbers of the other views' parts unchanged.
+        # At the end, a new part does not change the indices of the parts of other views.
         place = 0 if place == 0 else len(parts)
         parts.insert(place, ExrPart(name, header, {}))
     channels = parts[place].channels

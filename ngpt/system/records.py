@@ -13,8 +13,8 @@ from ngpt.system.reading import read_text
 
 T = TypeVar("T")
 
-# The shape of a value: a type; or several types, one of which it must have; [shape] for a list of such values; {name:
-# shape} for a table with at least these entries; {str: shape} for a table with any names. Whole numbers have 64 bits.
+# The shape of a value: a type; a tuple of allowed types; [shape], a list of such values; {name: shape}, a table with at
+# least these entries; {str: shape}, a table with any names. Whole numbers have 64 bits.
 Shape = type | tuple[type, ...] | list["Shape"] | dict["str | type[str]", "Shape"]
 
 

@@ -43,8 +43,6 @@ def printable(text: str) -> str:
     Python's escapes, such as ``\\x1b`` and ``\\u202e``. Paths are replaced as in ``by_names``.
     """
     text = by_names(text)
-    if text.isprintable() and not _INVISIBLE.search(text):
-        return text
     return "".join(
         letter if letter.isprintable() and not _INVISIBLE.match(letter) else letter.encode("unicode_escape").decode()
         for letter in text
