@@ -178,7 +178,7 @@ def relative(text: str) -> float:
 
 
 def number(text: str, fits: Callable[[float], bool], refusal: str) -> float:
-    """The number in a text. If there is none, or ``fits`` is False for it, the error is the text and ``refusal``."""
+    """The number in a text. If there is none, or it does not fit, the error quotes the text and ends in ``refusal``."""
     try:
         found = float(text)
     except ValueError:

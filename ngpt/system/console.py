@@ -120,7 +120,7 @@ def _open_standard_streams() -> None:
 
 @contextmanager
 def _own_stderr() -> Iterator[None]:
-    """Gives messages a descriptor of their own, because descriptor 2 is closed while any thread reads OpenEXR."""
+    """Gives messages a descriptor of their own, because descriptor 2 leads nowhere while any thread reads OpenEXR."""
     stream = sys.stderr
     if type(stream) is not io.TextIOWrapper or stream.fileno() != 2:  # the stream of a test or a notebook
         yield

@@ -204,7 +204,7 @@ def _sync_folder(folder: Path) -> None:
 
 @contextmanager
 def exclusive(folder: str | os.PathLike, wait: bool = False) -> Iterator[None]:
-    """Keeps other processes that call this function for ``folder`` waiting during the block.
+    """Keeps other processes that call this function out of ``folder`` during the block.
 
     If another process is in its block, raises NgptError, or waits if ``wait`` is True. The lock ends with the process,
     even if processes that it forked go on.

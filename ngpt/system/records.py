@@ -43,7 +43,7 @@ def _call(parser: Callable[[str], Any], text: str, where: str) -> Any:
 
 
 def check(value: Any, shape: Shape, where: str) -> None:
-    """Raises NgptError unless ``value`` has this shape. The message begins with ``where`` and its place there."""
+    """Raises NgptError unless ``value`` has this shape. The message begins with ``where`` and the entry."""
     if isinstance(shape, list):
         _demand(isinstance(value, list | tuple), value, "a list", where)
         for i, item in enumerate(value):
