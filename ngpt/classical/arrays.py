@@ -1,4 +1,4 @@
-"""Operations that the solvers share: cosine transforms, bands of rows, layouts.
+"""Operations for several solvers: cosine transforms, bands of rows, layouts.
 
 Arrays are (..., H, W), float32 or float64, unless a function says otherwise.
 """
@@ -12,8 +12,8 @@ from ngpt.system.late import fft
 from ngpt.system.limits import processors
 from ngpt.system.threads import map_parts
 
-# The number of values in one band of rows, over all results. The dozen or so temporaries of a stencil then stay in the
-# cache of a core, where plain NumPy expressions are several times faster than over whole images.
+# The number of values of all results in one band of rows. About a dozen temporary arrays of this size fit into the
+# cache of a core. There, NumPy expressions are several times faster than over whole images.
 BAND = 3 << 17
 
 
@@ -30,7 +30,7 @@ def image(planes: np.ndarray) -> np.ndarray:
 def over_colours(image: np.ndarray) -> np.ndarray:
     """(H, W, C) summed over C in double precision.
 
-    It adds channel by channel, which is ten times as fast as NumPy's sum over an axis of three.
+    Adding channel by channel is ten times as fast as NumPy's sum over an axis of three.
     """
     total = image[..., 0].astype(np.float64)
     for channel in range(1, image.shape[-1]):
@@ -51,7 +51,7 @@ def empty(array: np.ndarray, *lead: int, channels_last: bool = False, dtype: Any
 def map_rows(function: Callable[[int, int], Any], *like: np.ndarray) -> list:
     """The results of ``function(first, last)`` for bands of rows first .. last - 1, top to bottom.
 
-    They are computed on all cores. Bands are as large as arrays of the shapes ``like`` need, see ``BAND``.
+    They are computed on all cores. The height of the bands follows from ``BAND`` and the sizes of the arrays ``like``.
     """
     height = like[0].shape[-2]
     rows = max(1, BAND * height // max(1, sum(array.size for array in like)))
@@ -59,7 +59,7 @@ def map_rows(function: Callable[[int, int], Any], *like: np.ndarray) -> list:
 
 
 def map_silent(function: Callable[[Any], Any], parts: Iterable) -> list:
-    """``map_parts`` without NumPy's warnings: reconstruct() checks the results. NumPy silences them per thread."""
+    """``map_parts`` without NumPy's warnings, which are silenced in each thread. reconstruct() checks the results."""
 
     def silent(part: Any) -> Any:
         with np.errstate(all="ignore"):
@@ -71,8 +71,8 @@ def map_silent(function: Callable[[Any], Any], parts: Iterable) -> list:
 def by_rows(function: Callable[[int, int], tuple], *out: np.ndarray) -> tuple:
     """The arrays ``out``, filled with the rows first .. last - 1 that ``function(first, last)`` returns.
 
-    Bands of rows are computed on all cores. The function may read only its own rows of ``out``. Further values that it
-    returns are the last item of the result: a list with one entry for each band, from top to bottom.
+    Bands of rows are computed on all cores. The function may read only its own rows of ``out``. If it returns further
+    values, they are in the last item of the result: a list with one entry for each band, from top to bottom.
     """
 
     def band(first: int, last: int) -> tuple:

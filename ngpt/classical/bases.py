@@ -1,6 +1,6 @@
-"""The classical reconstructions of a repaired stack: their layers and options, and those that networks start from.
+"""The classical reconstructions of a repaired stack, by name, with their layers and options.
 
-The solvers in this package take arrays only. This module gives them the arrays of a stack, and calls them by name.
+The solvers in this package take only arrays. This module calls them with the arrays of a stack.
 """
 
 from collections.abc import Callable
@@ -18,11 +18,11 @@ from ngpt.repair import Repaired
 
 @dataclass(frozen=True)
 class Classical:
-    """How to call one classical reconstruction.
+    """A classical reconstruction.
 
-    ``needs``    layers of the stack it cannot do without
-    ``solve``    Repaired, options -> (H, W, 3) float32 without direct emission
-    ``options``  the options it takes
+    ``needs``    the layers that the stack must hold
+    ``solve``    (Repaired, options) -> (H, W, 3) float32 without direct emission
+    ``options``  its options, by name
     """
 
     needs: tuple[str, ...]
@@ -55,7 +55,7 @@ def _keeping_energy(solver: Callable[..., np.ndarray], data: Repaired) -> np.nda
 
 
 def _alpha(data: Repaired, alpha: float | str, norm: int) -> float:
-    """``alpha`` as a number: "auto" is derived from the variances; without variances it is the fixed default."""
+    """``alpha`` as a number: "auto" follows from the variances; without variances it is the fixed default."""
     if not isinstance(alpha, str):
         return alpha
     if data.variances is None:
@@ -82,8 +82,8 @@ CLASSICAL = {
     "wl2": Classical(_ALL, partial(_keeping_energy, weighted.wl2), {}),
 }
 
-# The methods that a network can start from: they cost less than the network. wcv has only its sweeps here, since they
-# need no pixels outside a tile.
+# The methods that a network can start from, which take less time than the network. Here, wcv does not restore its
+# energy, for which a tile would need pixels outside of it.
 BASES = {
     "l2": CLASSICAL["l2"],
     "cv": CLASSICAL["cv"],

@@ -5,15 +5,15 @@
     cv     w_pq equal                                        [survey eq. 14]
     wcv    w_pq ~ 1 / (f_n var I_p + var ΔI_qp)              [survey eq. 20 - 22]
 
-repeated 50 times, beginning with the primal. The weights have var I_p: with var I_q, the variance of the neighbour,
-they would lose energy. f_n is the factor by which n iterations have lowered the variance of a pixel. The reference
-implementation of Rousselle et al. sets f_n = 1 / Π_k≤n (1.01 + 4 · 2⁻ᵏ), and so do we. It also adds 1e-4 to all
-variances, which depends on the exposure; ``ngpt.classical.variances`` says what we add.
+This is repeated 50 times, beginning with the primal. The weights use var I_p. With var I_q, the variance of the
+neighbour, they would lose energy. f_n is the factor by which n iterations have lowered the variance of a pixel:
+f_n = 1 / Π_k≤n (1.01 + 4 · 2⁻ᵏ), as in the reference implementation of Rousselle et al. That implementation adds 1e-4
+to all variances, which depends on the exposure; see ``ngpt.classical.variances`` for our addend.
 
-After the first few iterations f_n hardly changes. From there on, ``wcv`` takes 12 steps of different lengths in place
-of 44 iterations [scheduled relaxation: Yang and Mittal 2014, "Acceleration of the Jacobi iterative method by factors
-exceeding 100 using scheduled relaxation"]. An iteration multiplies a wave by 1 - λ, where λ depends on the length of
-the wave and on the variances. A step of length s multiplies it by 1 - s λ. The product of all factors is within 0.03 of
+After a few iterations f_n hardly changes. From there on, ``wcv`` takes 12 steps of different lengths in place of 44
+iterations [scheduled relaxation: Yang and Mittal 2014, "Acceleration of the Jacobi iterative method by factors
+exceeding 100 using scheduled relaxation"]. An iteration multiplies a wave by 1 - λ, where λ depends on its wavelength
+and on the variances. A step of length s multiplies it by 1 - s λ. The product of all these factors is within 0.03 of
 the product over 50 iterations.
 
 Memory in bytes per pixel of three float32 channels: 94 with the output, beyond the 36 (wcv 72) of the input.
@@ -30,9 +30,9 @@ from ngpt.classical.variances import smooth_variances, without_missing
 
 # Iterations of cv.
 SWEEPS = 50
-# For wcv: the number of iterations by the formula; then f and the lengths of the steps, found by least squares on the
-# products. Short steps remove the short waves that long steps enlarge. In this order, no wave is ever larger than at
-# the start.
+# For wcv: the number of iterations with f_n; then f and the lengths of the steps, which were found by least squares on
+# the products. Short steps remove the short waves that long steps enlarge. In this order, no wave ever becomes larger
+# than at the start.
 _FIRST, _LATE = 6, 1 / 85
 _STEPS = (0.57, 12.3, 0.592, 12.3, 0.634, 4.29, 0.702, 2.47, 0.807, 1.66, 0.969, 1.225)
 
@@ -46,11 +46,11 @@ def cv(
 ) -> np.ndarray:
     """Uniform control variates, (H, W, C) in the units of ``primal``; arguments as for ``ngpt.classical.poisson.l2``.
 
-    Linear in (primal, dx, dy). ``sweeps`` is the number of Jacobi iterations. The more there are, the more do distant
-    pixels count; in the limit, the image is a constant plus the integrated gradients.
+    Linear in (primal, dx, dy). ``sweeps`` is the number of Jacobi iterations. With more iterations, distant pixels have
+    more influence; in the limit, the image is a constant plus the integrated gradients.
     """
     equations = Equations(primal, dx, dy, trusted)
-    # Differences of variance 0 have equal weights.
+    # With variances of 0, all differences have the same weight.
     one = np.ones_like(equations.primal[:1])
     exact = without_missing(np.zeros((2, *one.shape[1:]), one.dtype), trusted)
     return _sweep(equations, one, exact, [(1.0, 1.0)] * sweeps)
@@ -78,7 +78,7 @@ def wcv(
 
 
 def schedule() -> list[tuple[float, float]]:
-    """(f, s) for each iteration of wcv: the factor of the primal's variance, and the factor of the change."""
+    """(f, s) for each iteration of wcv: the factors of the primal's variance and of the change."""
     f, first = 1.0, []
     for n in range(_FIRST):
         f /= 1.01 + 4 * 0.5**n
@@ -89,10 +89,10 @@ def schedule() -> list[tuple[float, float]]:
 def _sweep(
     equations: Equations, primal_var: np.ndarray, difference_var: np.ndarray, schedule: list[tuple[float, float]]
 ) -> np.ndarray:
-    """Jacobi sweeps on the correction u = I - P, by ``schedule``.
+    """The image after Jacobi sweeps on the correction u = I - P, one for each entry (f, s) of ``schedule``:
 
-    u += s Σ a e / (1 + Σ a) over the neighbours of a pixel: e is the neighbour's estimate of the pixel, minus the
-    pixel's value, and a = f var I / (f var I + var Δ) <= 1 its weight, relative to the pixel's own weight.
+    u += s Σ a e / (1 + Σ a). The sums are over the neighbours of a pixel. e is a neighbour's estimate of the pixel,
+    minus the pixel's value, and a = f var I / (f var I + var Δ) <= 1 is its weight, relative to the pixel's own weight.
     """
     r, scale = equations.scaled_residual()
     return equations.image(jacobi(r, primal_var, difference_var, schedule), scale)

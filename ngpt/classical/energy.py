@@ -1,9 +1,9 @@
-"""Restores the light that data-dependent weights lose, near the place where it was lost.
+"""Restores the light that weighted reconstructions lose, near the place where it was lost.
 
-Weights are estimated from the samples that they weigh. A pixel with a bright sample is trusted less than its neighbours
-without one, so weighted means are too dark. So the image is multiplied by a ratio: the light of the primal, which is
-unbiased, over the light of the image, both summed over a wide neighbourhood. Dark regions beside bright ones get little
-of the restored light.
+Weights are estimated from the same samples that they weight. A pixel with a bright sample is trusted less than its
+neighbours without one, so weighted means are too dark. The image is therefore multiplied by a ratio: the light of the
+primal, which is unbiased, over the light of the image, both summed over a wide neighbourhood. Dark regions beside
+bright ones get little of the restored light.
 """
 
 import numpy as np
@@ -12,23 +12,22 @@ from ngpt.classical.arrays import by_rows, empty, over_colours
 from ngpt.classical.arrays import image as as_image
 from ngpt.classical.leastsquares import solve
 
-# The size of the neighbourhood in pixels: the length scale of the screened Poisson equation. 16 and 64 are as good.
+# The size of the neighbourhood in pixels: the length scale of a screened Poisson equation. 16 and 64 are as good.
 REACH = 32
 
-# A neighbourhood becomes at most this many times brighter or darker. Beside a pixel of 1e12, rounding makes the sums,
-# and so the ratio, meaningless.
+# The largest ratio and its inverse. Beside a pixel of 1e12, rounding errors make sums and ratios meaningless.
 MOST = 4.0
 
 
 def keep_energy(image: np.ndarray, primal: np.ndarray) -> np.ndarray:
     """The reconstruction ``image`` with the local brightness of ``primal``; all are (H, W, C).
 
-    All colours have the same factor, which is smooth, and 1 where the brightness of the two agrees. For this function
-    f, f(k image, k primal) = k f(image, primal).
+    The ratio is smooth, the same for all colours, and 1 where the brightness of both is equal. If both are multiplied
+    by k, so is the result.
     """
     double = empty(image[..., 0], 2, dtype=np.float64)
     brightness, _ = by_rows(lambda i, j: (np.stack([over_colours(x[i:j]) for x in (primal, image)]),), double)
-    # Averages over REACH pixels, up to a factor that cancels in the ratio. The total light is kept.
+    # Averages over REACH pixels, up to a factor that cancels in the ratio.
     local = solve(brightness, 1 / REACH**2)
 
     def rows(first: int, last: int) -> tuple:

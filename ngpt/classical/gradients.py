@@ -1,4 +1,4 @@
-"""Forward differences: the one place that fixes the sign and position of a gradient.
+"""Forward differences. The sign and position of gradients are defined here.
 
 dx[y, x] = I[y, x + 1] - I[y, x]    last column 0
 dy[y, x] = I[y + 1, x] - I[y, x]    last row 0
@@ -43,7 +43,7 @@ def adjoint(dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
 
 
 def adjoint_by_rows(function: Callable[[int, int], tuple], *out: np.ndarray) -> tuple:
-    """Like ``by_rows``, but the function's first three values v, dx, dy are combined into v + adjoint(dx, dy).
+    """``by_rows`` for a function that returns v, dx, dy and further values; the first result is v + adjoint(dx, dy).
 
     v may be None, which stands for 0.
     """
@@ -57,7 +57,7 @@ def adjoint_by_rows(function: Callable[[int, int], tuple], *out: np.ndarray) -> 
         return (total, *values[:others], last, dy[..., -1, :], *values[others:])
 
     total, *arrays, bands = by_rows(band, *out)
-    # The differences dy of a band's last row also contribute to the first row of the next band.
+    # The last row of dy of a band also contributes to the first row of the next band.
     for last, lowest, *_ in bands[:-1]:
         total[..., last, :] += lowest
     return (total, *arrays, [values for _, _, *values in bands])

@@ -1,14 +1,15 @@
 """The sweeps of ``ngpt.classical.controlvariates`` on NumPy arrays, arranged for the caches of a processor.
 
-It uses only NumPy, and is faster than plain NumPy expressions over bands of an image (docs/lab/log), because:
+It is faster than plain NumPy expressions over bands of an image (docs/lab/log), because:
 
-- The image is cut into strips of rows, which threads work on. A strip has ``DEPTH`` more rows on both sides, copies of
-  its neighbours' rows. So it needs no exchange for ``DEPTH`` sweeps: errors at its ends move in by one row a sweep.
-- Within a strip, sweeps follow each other one row apart, on a block of rows at a time. Their data stays in the cache.
-- There are few calls of NumPy, and each does much: both directions and all colours. Each call takes Python's lock at
-  its end, and a thread that has to wait for the lock sleeps. With short calls, two threads are slower than one.
-- Rows are padded to whole vectors and laid end to end, so that operations see one long aligned array. The difference
-  between the last pixel of a row and the first of the next has weight 0.
+- The image is cut into strips of rows, and each thread works on a strip. A strip has ``DEPTH`` more rows at both ends,
+  which are copies of its neighbours' rows. So strips need no exchange for ``DEPTH`` sweeps: errors at the ends of a
+  strip move inwards by one row in each sweep.
+- Within a strip, each sweep follows the previous one at a distance of one row, on blocks of rows in the cache.
+- There are few calls of NumPy, each for both directions and all colours. At its end, a call takes Python's lock, and a
+  thread that waits for the lock sleeps. With many short calls, two threads are slower than one.
+- Rows are padded to whole vectors and laid end to end, so that operations read one long aligned array. The difference
+  between the last pixel of a row and the first pixel of the next row has weight 0.
 """
 
 import math
@@ -21,9 +22,9 @@ from ngpt.classical.arrays import map_silent
 
 # Sweeps between two exchanges of rows.
 DEPTH = 6
-# Rows of a strip without the neighbours' rows. Fewer rows mean more copies; more rows leave threads without work.
+# Rows of a strip without the copied rows. Fewer rows mean more copies; with more rows, some threads have no work.
 _STRIP = 180
-# Pixels that are processed at a time: fewer make more calls, more do not fit into the cache.
+# Pixels that are processed at a time. Fewer need more calls; more do not fit into the cache.
 _PIXELS = 30720
 # Bytes of the widest vectors. Operations on addresses that are not multiples of this take twice as long.
 _VECTOR = 64
@@ -32,11 +33,13 @@ _VECTOR = 64
 def jacobi(
     r: np.ndarray, primal_var: np.ndarray, difference_var: np.ndarray, schedule: list[tuple[float, float]]
 ) -> np.ndarray:
-    """The correction u (C, H, W): from 0, one sweep for each entry (f, s) of ``schedule``, see ``controlvariates``.
+    """The correction u (C, H, W) after one sweep for each entry (f, s) of ``schedule``, see ``controlvariates``.
 
-    ``r`` (2, C, H, W) are the residuals of the differences, ``primal_var`` is (1, H, W) > 0, and ``difference_var``
-    (2, 1, H, W), infinite where there is no difference. All are float32 or float64. ``r`` is overwritten: u is in its
-    memory.
+    ``r``               (2, C, H, W), the residuals of the differences; overwritten, since u is in its memory
+    ``primal_var``      (1, H, W) > 0
+    ``difference_var``  (2, 1, H, W), infinite where there is no difference
+
+    All are float32 or float64.
     """
     height = r.shape[2]
     count = max(1, round(height / _STRIP))
@@ -57,8 +60,8 @@ def jacobi(
 class _Strip:
     """Rows first .. last - 1 of the image, and ``DEPTH`` more on both sides.
 
-    All arrays are (..., rows * pitch). ``ratio`` is the variance of the difference divided by the variance of the
-    pixel, for the neighbours right, below, left and above. It is infinite where there is no neighbour.
+    All arrays are (..., rows * pitch). ``ratio`` is the variance of the difference over the variance of the pixel, for
+    the neighbours right, below, left and above; infinite without a neighbour.
     """
 
     def __init__(self, r: np.ndarray, v: np.ndarray, differences: np.ndarray, first: int, last: int):
@@ -71,7 +74,7 @@ class _Strip:
         image = slice(max(first - DEPTH, 0), min(last + DEPTH, height))
         strip = slice(image.start - first + DEPTH, image.stop - first + DEPTH)
         size = self.rows * self.pitch
-        # With one more row above and one below; no differences lead to them.
+        # With one more row above and one below, which no difference connects.
         self.u = _aligned((channels, size + 2 * self.pitch), dtype, 0)
         self.r = _aligned((2, channels, size), dtype, 0)
         # For each pixel, its neighbours to the right and below.
@@ -87,7 +90,7 @@ class _Strip:
 
     @property
     def inner(self) -> np.ndarray:
-        """The correction in the rows that are this strip's own, (C, last - first, W)."""
+        """The correction in the strip's own rows, (C, last - first, W)."""
         return self._grid(self.u)[:, DEPTH + 1 : -DEPTH - 1, : self.width]
 
     def exchange(self, lower: "_Strip") -> None:
@@ -111,8 +114,8 @@ class _Strip:
     ) -> None:
         """One sweep over rows top .. end - 1.
 
-        ``above`` (C, pitch) is d for dy of the row above ``top``, from before this sweep changed that row. It is
-        replaced by d of row end - 1, for the next call.
+        ``above`` (C, pitch) is d of dy for the row above ``top``, as it was before this sweep changed that row. It is
+        replaced by d of row end - 1, for the next call. See ``_Scratch`` for d.
         """
         pitch, first, last = self.pitch, top * self.pitch, end * self.pitch
         size = last - first
@@ -139,13 +142,13 @@ class _Strip:
 
 
 class _Scratch:
-    """The memory that a thread needs besides the strip, for this number of rows.
+    """The memory for sweeps over this number of rows.
 
-    ``arrays``  (..., pixels): the weights of the neighbours; the sum of these and the pixel's own; d, the estimates by
-                the right and lower neighbours minus the pixel, without weights; the same of the pixels to the left and
-                above; and as much scratch space
-    ``rows``    (C, pixels): d of the lower neighbours, with one more row on top
-    ``above``   (sweeps, C, pitch): for each sweep under way, d of the row above its next rows
+    ``arrays``  (..., pixels): the weights of the four neighbours; the sum of these weights and the pixel's own; d,
+                which is the estimate by the right and by the lower neighbour minus the pixel; d of the pixels to the
+                left and above; and scratch space of the same size
+    ``rows``    (C, pixels): d of the lower neighbours, with one more row at the top
+    ``above``   (sweeps, C, pitch): for each sweep, d of the row above its next rows
     """
 
     def __init__(self, strip: _Strip, rows: int):
@@ -170,7 +173,7 @@ def _pair(a: np.ndarray, b: np.ndarray, size: int) -> np.ndarray:
 
 
 def _aligned(shape: tuple[int, ...], dtype: np.dtype, value: float | None = None) -> np.ndarray:
-    """An array that begins at a whole vector, filled with ``value`` or not at all."""
+    """An array whose address is a multiple of ``_VECTOR``, filled with ``value`` unless that is None."""
     size = math.prod(shape) * dtype.itemsize
     memory = np.empty(size + _VECTOR, np.uint8)
     start = -memory.ctypes.data % _VECTOR

@@ -1,7 +1,7 @@
-"""Least squares over an image and its differences, shared by the linear reconstructions and the inner solves.
+"""Least squares over an image and its differences, for the linear reconstructions and as a part of others.
 
-The equations are I ≈ P and ∇I ≈ G. All solvers look for the correction u = I - P, for which they read u ≈ 0 and
-∇u ≈ r with r = G - ∇P: exact gradients have r = 0 and give u = 0, whatever the weights.
+The equations are I ≈ P and ∇I ≈ G. All solvers compute the correction u = I - P. For it, the equations are u ≈ 0 and
+∇u ≈ r, with r = G - ∇P. So exact gradients have r = 0 and give u = 0, whatever the weights.
 """
 
 import math
@@ -12,19 +12,19 @@ from ngpt.classical.arrays import by_rows, dct2, empty, idct2, image, map_rows, 
 from ngpt.classical.gradients import adjoint_by_rows, differences
 from ngpt.errors import NgptError
 
-# If the ratio of the largest value to a typical one exceeds this, inputs are solved in double precision. In float32,
-# the transforms would spread the rounding errors of the largest value over all others.
+# If the ratio of the largest value to a typical one exceeds this, the equations are solved in double precision. In
+# float32, the transforms would spread rounding errors of the largest value over all others.
 FLOAT32_RANGE = 2.0**16
 
-# A value counts as at most this multiple of the mean, see ``robust_mean``.
+# In ``robust_mean``, a value counts at most as this multiple of the mean.
 CLIP = 100
 
 
 class Equations:
-    """The right-hand sides P and G as planes (C, H, W), in double precision if their range needs it.
+    """The right-hand sides P and G as planes (C, H, W), in double precision if their range requires it.
 
     ``primal``, ``dx``, ``dy``  (H, W, C) float32 or float64, finite
-    ``trusted``  for dx and dy, (H, W) booleans: a difference marked False has no equation; None trusts all
+    ``trusted``  (H, W) booleans for dx and dy: a difference that is False has no equation; None trusts all
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Equations:
         return b if self._holds(peaks) else self.divergence()
 
     def scaled_residual(self) -> tuple[np.ndarray, float]:
-        """(r / scale, scale), r as (2, C, H, W); scale is a power of two (exact) of about the mean of |r|, or 0."""
+        """(r / scale, scale) with r as (2, C, H, W). The scale is a power of two near the mean of |r|; 0 if r is 0."""
 
         def rows(first, last):
             r = np.stack(self.residual(first, last))
@@ -77,7 +77,7 @@ class Equations:
         return r, scale
 
     def _holds(self, peaks: list) -> bool:
-        """Whether the precision suffices; ``peaks`` are the largest |r| of each band. If not, switches to double."""
+        """Whether the precision suffices. If not, switches to double. ``peaks`` has the largest |r| of each band."""
         peak = float(np.max(peaks))
         if not math.isfinite(peak):
             raise NgptError("primal, dx or dy holds values that are not finite; ngpt.reconstruct() repairs them first")
@@ -87,7 +87,7 @@ class Equations:
         return False
 
     def image(self, u: np.ndarray, scale: float = 1.0, out: np.ndarray | None = None) -> np.ndarray:
-        """P + scale · u as (H, W, C) in the precision of the input; ``out`` (C, H, W) is memory that may be reused."""
+        """P + scale · u as (H, W, C), in the precision of the input. ``out`` (C, H, W) is memory for the result."""
         out = empty(u, len(u), channels_last=True) if out is None else out
 
         def rows(first, last):
@@ -107,12 +107,12 @@ def solve(b: np.ndarray, screen: float, mean: np.ndarray | float | None = None) 
     """The planes u (C, H, W) with (screen + ∇ᵀ∇) u = b; b is overwritten.
 
     The cosine transform of type II diagonalises ∇ᵀ∇ under Neumann boundaries [Bhat et al. 2008]. ``mean`` (C) is the
-    mean of u, if the caller knows it. Otherwise it is computed by a division by ``screen``, which enlarges its rounding
-    error if ``screen`` is small.
+    mean of u if it is known. Otherwise it is computed by a division by ``screen``, which enlarges rounding errors if
+    ``screen`` is small.
     """
     height, width = b.shape[-2:]
     λy, λx = ((4 * np.sin(np.pi / 2 * np.arange(n) / n) ** 2).astype(b.dtype) for n in (height, width))
-    # With all channels of b, and in the same layout: NumPy is slow if axes have different orders in memory.
+    # In the layout of b, because NumPy is slow if the axes of two arrays have different orders in memory.
     screened = np.zeros_like(b[:, :1]) + screen
     screened += λx
     coefficients = dct2(b)
@@ -130,7 +130,7 @@ def solve_weighted(
     ``r`` is (2, C, H, W), 0 in the unused column and row; ``weights`` (2, 1, H, W) >= 0; ``screen`` > 0, either
     (1, H, W) or one number for all pixels.
 
-    Conjugate gradients stop when the norm of the residual, by the preconditioner, is ``tolerance`` times the first one.
+    Conjugate gradients stop when the norm of the residual, by the preconditioner, is ``tolerance`` times the first.
     """
     flux = weights * r
     b, _ = adjoint_by_rows(lambda i, j: (None, *flux[..., i:j, :]), empty(r, len(r[0])))
@@ -141,8 +141,8 @@ class Weighted:
     """The matrix screen + ∇ᵀ weights ∇ and its preconditioner D^-1/2 (σ + ∇ᵀ∇)⁻¹ D^-1/2, by cosine transforms.
 
     If ``screen`` is an array, D is the mean weight around a pixel plus ``screen`` [Concus and Golub 1973, "Use of Fast
-    Direct Methods for the Efficient Numerical Solution of Nonseparable Elliptic Equations"]. If it is a number, D is 1;
-    the mean of the solution is then 0, like the mean of the right-hand side.
+    Direct Methods for the Efficient Numerical Solution of Nonseparable Elliptic Equations"]. If ``screen`` is a number,
+    D is 1, and the mean of the solution is 0, as is that of the right-hand side.
     """
 
     def __init__(self, screen: np.ndarray | float, weights: np.ndarray):
@@ -223,14 +223,14 @@ def sum_of(values: np.ndarray) -> float:
 
 
 def total_of(bands: list) -> float:
-    """The sum over ``bands``, the lists of one value each that ``by_rows`` returns last."""
+    """The sum over ``bands``: lists of one value each, which ``by_rows`` returns last."""
     return float(sum(value for (value,) in bands))
 
 
 def robust_mean(*layers: np.ndarray) -> float:
-    """A mean of values >= 0 in arrays of any shape, where no value counts as more than ``CLIP`` times the mean.
+    """A mean of values >= 0 in arrays of any shape, in which a value counts at most as ``CLIP`` times the mean.
 
-    It is close to the ordinary mean for ordinary data; a few pixels of 1e12 do not move it.
+    It is close to the mean for ordinary data, and a few pixels of 1e12 hardly change it.
     """
     rows = [layer.reshape(-1, layer.shape[-1]) for layer in layers if math.prod(layer.shape)]
     count = sum(math.prod(values.shape) for values in rows)

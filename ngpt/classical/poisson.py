@@ -28,14 +28,14 @@ from ngpt.errors import NgptError
 DEFAULT_ALPHA = 0.2
 
 # ADMM: the over-relaxation, and the threshold 1 + FIRST_STRIDE · DECAYⁿ in units of the mean residual. The long strides
-# at first move the outliers; with only short strides, that takes hundreds of iterations. Of twenty such schedules, this
-# one comes within 0.5 % of the minimum in the fewest iterations on the worst of eight stacks: 46, and 28 to 41 on the
-# others.
+# at the beginning move outliers, which would take hundreds of iterations with short strides. Of twenty such schedules,
+# this one comes within 0.5 % of the minimum in the fewest iterations on the worst of eight stacks: 46. On the others it
+# takes 28 to 41.
 RELAXATION = 1.6
 FIRST_STRIDE = 300.0
 DECAY = 0.75
 
-# The number of iterations over which progress is measured, once the strides are short.
+# The number of iterations over which progress is measured after the strides have become short.
 WINDOW = 5
 
 
@@ -48,12 +48,13 @@ def l2(
 ) -> np.ndarray:
     """The exact minimiser of the squared energy, (H, W, C) in the units of ``primal``.
 
-    ``primal``, ``dx``, ``dy``  (H, W, C) float32 or float64, finite; last column of dx and row of dy are ignored
+    ``primal``, ``dx``, ``dy``  (H, W, C) float32 or float64, finite; the last column of dx and row of dy are ignored
     ``alpha``    weight of the primal's residual, > 0: a small one trusts the gradients, a large one the primal
-    ``trusted``  for dx and dy, (H, W) booleans: a difference marked False gets no weight
+    ``trusted``  (H, W) booleans for dx and dy: a difference that is False has no weight; None trusts all
 
     Linear in (primal, dx, dy), so reconstructions of light groups add up to the reconstruction of their sum. With
-    ``trusted``, the solver is conjugate gradients (``leastsquares.solve_weighted``), to 1e-8 of the residual.
+    ``trusted``, the equations are solved by conjugate gradients (``leastsquares.solve_weighted``), to 1e-8 of the
+    residual.
     """
     check_alpha(alpha)
     equations = Equations(primal, dx, dy, trusted)
@@ -77,9 +78,9 @@ def l1(
 ) -> np.ndarray:
     """The minimiser of the sum of norms, (H, W, C); arguments are as for ``l2``.
 
-    Stops when five iterations lower the sum of norms by less than the share ``tolerance``, which leaves it within 0.5 %
-    of the minimum. The result is robust to outliers, but not linear, and too dark where few bright samples carry the
-    light: the norm seeks the median where l2 seeks the mean.
+    The iteration stops when five steps lower the sum of norms by less than the share ``tolerance``. It is then within
+    0.5 % of the minimum. The result is robust to outliers, but not linear, and too dark where a few bright samples
+    carry the light, because the norm leads to medians, and the square to means.
     """
     check_alpha(alpha)
     equations = Equations(primal, dx, dy, trusted)
@@ -93,15 +94,15 @@ def least_norms(
 ) -> tuple[np.ndarray, list[float]]:
     """The correction u (C, H, W) that minimises Σ ‖K u - (0, r)‖, K = (α, ∂x, ∂y), and the energy after each iteration.
 
-    The energies begin once the strides are short. In them, a norm counts as at most a thousand times the mean norm at
-    the start. ``r`` (2, C, H, W) has a magnitude near 1, as ``Equations.scaled_residual`` returns it.
+    There is no energy before the strides are short. In an energy, a norm counts at most as a thousand times the mean
+    norm at the start. ``r`` (2, C, H, W) has a magnitude near 1, as by ``Equations.scaled_residual``.
 
     ADMM [Boyd et al. 2011, "Distributed Optimization and Statistical Learning via ADMM", section 3.4] on the residuals
-    e = K u - r. Its inner problem KᵀK u = Kᵀ(...) is again one that the cosine transforms solve. In the form of Douglas
-    and Rachford, the only state is s = e + scaled dual variable, and shrink(s) = factor · s is the residual to aim at.
+    e = K u - r. The cosine transforms also solve its inner problem KᵀK u = Kᵀ(...). In the form of Douglas and
+    Rachford, the only state is s = e + scaled dual variable, and shrink(s) = factor · s is the residual to aim at.
     """
     channels = len(r[0])
-    # 1 for every equation that counts. The unused column and row need no 0, since their residual is 0.
+    # 1 for every equation that counts. The unused column and row may be 1, because their residual is 0.
     counts = np.ones_like(r[:1, :1]) if trusted is None else _counts(r, trusted)
 
     def residual(u, first, last):
@@ -110,7 +111,7 @@ def least_norms(
         return e
 
     def norm(e):
-        # The tiny number keeps thresholds over norms finite.
+        # The tiny number keeps ratios of thresholds to norms finite.
         return np.sqrt((e * e).sum(1, keepdims=True) + 1e-30)
 
     def start(first, last):
@@ -135,8 +136,8 @@ def least_norms(
     b, _ = adjoint_by_rows(lambda i, j: (None, *r[..., i:j, :]), empty(r, channels))
     u, free = solve(b, alpha**2, mean=0.0), [empty(b, channels), empty(b, channels)]
     s, norms, _ = by_rows(start, empty(r, 3, channels), empty(r, 3, 1))
-    # The unit of the iteration is the mean residual, so it follows the exposure of the image. Outliers must not set
-    # this unit. Their energy may exceed the energy of all other pixels, so it must not decide when to stop.
+    # The unit of the iteration is the mean residual, so that it follows the exposure of the image. Outliers must not
+    # determine this unit. Their energy may exceed that of all other pixels, so it must not decide when to stop.
     mean = robust_mean(norms)
     limit, stride = 1000 * mean, max(FIRST_STRIDE * mean, float(norms.max()) / 10)
     threshold = mean + stride

@@ -1,19 +1,18 @@
-"""Variances of a stack, prepared as weights, and the α that follows from them.
+"""Prepares the variances of a stack as weights, and computes the α that follows from them.
 
-The input is sample variances of pixel means, from as few as two samples. They are too noisy to be used pixel by pixel,
-zero where all samples missed the light, and, like the values, larger where a sample hit it. Weights computed directly
-from them would trust the pixels that saw nothing.
+The input is sample variances of pixel means, from as few as two samples. They are too noisy to be used pixel by pixel.
+They are zero where all samples missed the light, and large where a sample hit it. Weights computed directly from them
+would trust the pixels that found no light.
 
 For the primal, such weights darken the image. So its variances are averaged over a neighbourhood.
 
-For differences, such weights only smooth. But most of the variance belongs to a few differences, whose light no shift
-mapping follows. An average over neighbours would pass their variance on to clean differences, and make the noisy ones
-look better than they are. So a difference keeps its own variance if that is large. Otherwise it gets a typical variance
-of its neighbourhood: the fourth power of the mean of fourth roots, which outliers do not dominate.
+For differences, such weights only smooth. But a few differences have most of the variance, because no shift mapping can
+follow their light. An average over neighbours would give their variance to clean differences, and too little variance
+to the noisy ones. So a difference keeps its own variance if this is large. Otherwise it gets a typical variance of its
+neighbourhood: the fourth power of the mean of fourth roots, which outliers do not dominate.
 
-All variances are summed over colours (a colour is weighted as one vector), and bounded from below in proportion to
-their mean. The weights follow the exposure of the image: k times the image, with k² times the variances, has k⁻² times
-the weights.
+All variances are summed over colours, because a colour is weighted as one vector. They have a lower bound in proportion
+to their mean. If the image is multiplied by k and its variances by k², the weights are divided by k².
 """
 
 import math
@@ -27,31 +26,31 @@ from ngpt.classical.leastsquares import robust_mean, sum_of
 # This share of the mean over primal and differences is added to every variance.
 FLOOR = 3e-3
 
-# A difference has at least this many times the typical variance around it: the mean of fourth roots is below the mean.
-# Among 2, 3 and 4, wcv has the least error with 2, by 1 %, and wl2 with 3.
+# A difference has at least this many times the typical variance around it, because the typical variance is below the
+# mean. Of 2, 3 and 4, wcv has the least error with 2, by 1 %, and wl2 with 3.
 TYPICAL = 3
 
-# The variances of differences are multiplied by this, relative to the primal's. Neighbouring pixels share paths, so
-# errors of differences partly cancel in the sums that a reconstruction takes. Means of differences over blocks of 8x8
-# have .56 to .92 of the variance that independent differences would have (96x64, eight scenes). Means of the primal
-# have .8 to 1. Among 1, .7, .5 and .35, wcv and wl2 have the least error with .7 at 4 samples and with .35 to .5 from
-# 16 on (docs/lab/log).
+# A factor on the variances of differences, relative to those of the primal. Neighbouring pixels share paths, so errors
+# of differences partly cancel in the sums of a reconstruction. Means of differences over blocks of 8x8 pixels have .56
+# to .92 of the variance that independent differences would have (96x64, eight scenes), and means of the primal .8 to 1.
+# Of 1, .7, .5 and .35, wcv and wl2 have the least error with .7 at 4 samples and with .35 to .5 from 16 samples on
+# (docs/lab/log).
 SHARED = 0.6
 
-# The least count of valid values that sums are divided by, against division by zero.
+# The least number that sums are divided by in place of a count of 0.
 FEW = 1e-9
 
-# This share of the variances, the largest ones, does not count for α.
+# For α, this share of the variances is left out: the largest ones.
 OUTLIERS = 1e-4
 
 
 def auto_alpha(primal_var: np.ndarray, dx_var: np.ndarray, dy_var: np.ndarray, norm: int = 2) -> float:
     """The α that weights the primal against the gradients by their noise; variances are (H, W, C).
 
-    ``norm`` 2: the square root of mean gradient variance over mean primal variance, which weights the two terms of l2
-    by inverse variance. ``norm`` 1: mean standard deviation of gradients over mean standard deviation of the primal.
-    Values that are negative or not finite are left out, and so are the largest: one in ten thousand, but at least one.
-    The result is in [1e-3, 1e3]; it is 1 if there is no noise at all.
+    ``norm`` 2: the root of the mean variance of gradients over the mean variance of the primal, which weights the two
+    terms of l2 by inverse variance. ``norm`` 1: the mean standard deviation of gradients over that of the primal.
+    Values that are negative or not finite are left out, and so are the largest ones: one in ten thousand, but at least
+    one. The result is in [1e-3, 1e3]; it is 1 if there is no noise at all.
     """
 
     def mean(*layers: np.ndarray) -> float:
@@ -73,11 +72,11 @@ def smooth_variances(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Variances of the primal (1, H, W) and of the differences (2, 1, H, W), summed over colours, relative, positive.
 
-    Variances of the primal are averaged twice over 3 x 3 pixels. Values that are negative or not finite are left out of
-    the averages. A difference has at least ``TYPICAL`` times the typical variance of its neighbourhood: the fourth
-    power of such an average of fourth roots. All are divided by a robust mean of the three layers, and ``FLOOR`` is
-    added; without any noise, they are 1 everywhere. Then variances of the primal are divided by ``SHARED``. Differences
-    that are not ``trusted``, and differences that do not exist, have infinite variance.
+    Variances of the primal are averaged twice over 3 x 3 pixels, without values that are negative or not finite. A
+    difference has at least ``TYPICAL`` times the typical variance of its neighbourhood, which is the fourth power of
+    such an average of fourth roots. All are divided by a robust mean of the three layers, and ``FLOOR`` is added;
+    without any noise, they are 1 everywhere. Then variances of the primal are divided by ``SHARED``. Differences that
+    are not ``trusted`` or do not exist have infinite variance.
     """
     layers = [smoothed(primal_var), *(smoothed(layer, True) for layer in (dx_var[:, :-1], dy_var[:-1]))]
     mean = robust_mean(*layers)
@@ -88,7 +87,7 @@ def smooth_variances(
 
 
 def relative(layer: np.ndarray, mean: float, dtype: Any) -> np.ndarray:
-    """Variances (H, W) over their mean, with ``FLOOR`` added; 1 everywhere without any noise."""
+    """Variances (H, W) divided by ``mean``, plus ``FLOOR``; 1 everywhere if the mean is 0."""
 
     def rows(first: int, last: int) -> tuple:
         part = layer[first:last]
@@ -98,7 +97,7 @@ def relative(layer: np.ndarray, mean: float, dtype: Any) -> np.ndarray:
 
 
 def without_missing(variances: np.ndarray, trusted: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray:
-    """Variances (2, H, W) of differences as (2, 1, H, W), infinite where one is missing or not ``trusted``."""
+    """Variances (2, H, W) of differences as (2, 1, H, W), infinite for missing and for not ``trusted`` ones."""
     variances[0, :, -1] = math.inf
     variances[1, -1] = math.inf
     if trusted is not None:
@@ -113,10 +112,7 @@ def _positive_values(variance: np.ndarray) -> np.ndarray:
 
 
 def _over_colours(variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, C) -> the sum over C, and where it is usable: finite, of values >= 0.
-
-    The sum is in double precision, since squares of large radiances are large.
-    """
+    """(H, W, C) -> the sum over C in double precision, and where it is usable: finite, of values >= 0."""
     channels = [variance[..., i] for i in range(variance.shape[-1])]
     total, good = channels[0].astype(np.float64, copy=False), channels[0] >= 0
     for channel in channels[1:]:
@@ -126,10 +122,10 @@ def _over_colours(variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def smoothed(variance: np.ndarray, outliers: bool = False) -> np.ndarray:
-    """(H, W, C) -> (H, W): the usable sums over colours, averaged over 3 x 3 pixels twice.
+    """(H, W, C) -> (H, W): the usable sums over colours, averaged twice over 3 x 3 pixels.
 
-    Where none of these is usable, the result is the mean over the image. With ``outliers``, fourth roots are averaged,
-    the fourth power is multiplied by ``TYPICAL``, and a sum that is larger than this is kept.
+    Where no sum is usable, the result is the mean over the image. With ``outliers``, the average is over fourth roots,
+    its fourth power is multiplied by ``TYPICAL``, and larger sums are kept.
     """
     height = len(variance)
 
@@ -140,11 +136,11 @@ def smoothed(variance: np.ndarray, outliers: bool = False) -> np.ndarray:
         raw, sums = total, (sum_of(total[own]), int(good[own].sum()))
         if outliers:
             total = np.sqrt(np.sqrt(total))
-            # The roots fit into single precision.
+            # Single precision can hold the roots.
             total = (total if good.all() else np.where(good, total, 0)).astype(variance.dtype, copy=False)
         total = _box(_box(total))
         if good.all():
-            # The count of values is the count of rows times the count of columns.
+            # Without missing values, a count is the count of rows times the count of columns.
             ones = np.ones_like(total)
             count = _box(_box(ones[:, :1])) * _box(_box(ones[:1]))
         else:
@@ -152,7 +148,7 @@ def smoothed(variance: np.ndarray, outliers: bool = False) -> np.ndarray:
         smooth = total / count.clip(FEW, None)
         if outliers:
             smooth = np.maximum(TYPICAL * (smooth * smooth) ** 2, raw)
-        # Negative marks missing values, since no variance is negative.
+        # -1 marks missing values.
         return np.where(count > 0, smooth, -1)[own], *sums
 
     smooth, bands = by_rows(rows, empty(variance[..., 0], dtype=np.float64))

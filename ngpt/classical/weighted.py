@@ -2,8 +2,8 @@
 
     wl2   min  Σ |I - P|² / var P  +  Σ |∇I - G|² / var G
 
-This is the maximum-likelihood image for independent normal noise of these variances. All colours of a pixel have the
-same weight (``ngpt.classical.variances``). There is no α: the variances take its place.
+This is the most likely image if the noise is normal and independent, with these variances. All colours of a pixel have
+the same weight (``ngpt.classical.variances``). The variances take the place of α.
 
 Solved by conjugate gradients with the cosine transforms as preconditioner (``ngpt.classical.leastsquares``). Memory in
 bytes per pixel of three float32 channels: 165 with the output, beyond the 72 of the input.

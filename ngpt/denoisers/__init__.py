@@ -1,1 +1,1 @@
-"""Denoisers that use no gradients, as methods: OIDN, NFOR, non-local means."""
+"""Denoisers that use no gradients: OIDN, NFOR, and the diffusion of light that gradients exclude."""

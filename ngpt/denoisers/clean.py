@@ -1,21 +1,21 @@
-"""Decides whether albedo and normal have so little noise that OIDN should read them without prefiltering."""
+"""Decides whether OIDN should read albedo and normal without prefiltering, because they have little noise."""
 
 import numpy as np
 
 from ngpt.repair import Repaired
 
-# Features are clean if their variance is at most this share of the primal's relative variance. Their variance by itself
-# does not decide. At 7e-4, prefiltering lowers the error by a fifth in simple scenes, whose images have little noise.
-# At 2e-3, it lowers nothing in rooms (docs/lab/log).
+# Features are clean if their variance is at most this share of the primal's relative variance. A fixed limit on their
+# variance would not do: at 7e-4, prefiltering lowers the error by a fifth in simple scenes, whose images have little
+# noise; at 2e-3, it does not lower the error in rooms (docs/lab/log).
 CLEAN = 0.003
-# Light below √DARK times the mean is dark: its relative variance counts less.
+# The relative variance of light below √DARK times the mean counts less.
 DARK = 1e-3
 
 
 def features_are_clean(data: Repaired) -> bool:
-    """Whether the noise of albedo and normal is known and small compared with the image's, see ``CLEAN``.
+    """Whether the noise of albedo and normal is known and small compared to the noise of the image, see ``CLEAN``.
 
-    If the noise of the image is not known, the features must have none.
+    If the noise of the image is unknown, the features must be free of noise.
     """
     if data.feature_noise is None or data.noise is None:
         return data.feature_noise == 0

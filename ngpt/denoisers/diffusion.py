@@ -1,13 +1,13 @@
 """The diffusion of ``ngpt.denoisers.caustic`` on NumPy arrays, arranged for the caches of a processor.
 
-It takes as little processor time as pure NumPy allows (docs/lab/log), by these means:
+It takes as little processor time as NumPy allows (docs/lab/log):
 
-- Rows are laid end to end with a gap after each, and with empty rows above and below. So a neighbour at any distance is
-  at the same offset from all pixels. Borders need no special case: nothing is exchanged with a gap, which is too far
-  away.
-- Pixels are processed some thousands at a time, which stay in the cache.
-- What two pixels exchange is computed once and stored for both. Then each pixel is a weighted sum over 3x3.
-- No exponential is so small that a processor takes its slow path, and shares below the smallest one are exactly 0.
+- Rows are laid end to end with a gap after each, and with empty rows above and below. So a neighbour at any distance
+  has the same offset from all pixels. Borders need no special case: the surfaces of a gap are so far away that nothing
+  is exchanged with them.
+- Some thousand pixels are processed at a time, which stay in the cache.
+- The exchange between two pixels is computed once and stored for both. Then each pixel is a weighted sum over 3x3.
+- No exponential is so small that a processor computes it slowly, and smaller shares are exactly 0.
 """
 
 import numpy as np
@@ -16,11 +16,11 @@ from ngpt.classical.arrays import map_silent
 
 # The distances in pixels, one pass each. The last two smooth the grids that the larger distances leave.
 DISTANCES = (1, 2, 4, 8, 16, 32, 1, 2)
-# Two pixels exchange only 1/e as much light if they differ, beyond their noise, by this number of standard deviations.
+# If the light of two pixels differs by this number of standard deviations beyond its noise, they exchange 1/e as much.
 SIGNIFICANT = 3.0
 # The neighbours of one half plane at distance 1, and their weights in the binomial filter of 3x3 pixels.
 NEIGHBOURS = ((0, 1, 1 / 8), (1, 0, 1 / 8), (1, 1, 1 / 16), (1, -1, 1 / 16))
-# Pixels that are processed at a time: fewer make more calls, more do not fit into the cache.
+# Pixels that are processed at a time. Fewer need more calls; more do not fit into the cache.
 _PIXELS = 16384
 # The value of surfaces in gaps.
 _FAR = float(np.finfo(np.float32).max)
@@ -32,21 +32,21 @@ _LEAST = np.exp(np.full(1, -SMALLEST))
 def diffused(light: np.ndarray, variance: np.ndarray, surfaces: np.ndarray) -> np.ndarray:
     """``light`` (C, H, W), spread by the diffusion, with the same sum.
 
-    ``variance`` (H, W) is the variance of ``light``; ``surfaces`` (N, H, W) are features of any unit. All arrays are
-    float32 and finite. Two pixels whose ``surfaces`` are 1 apart exchange 1/e of what they would otherwise.
+    ``variance`` (H, W) is the variance of ``light``, and ``surfaces`` (N, H, W) are features. All arrays are float32
+    and finite. Two pixels whose ``surfaces`` differ by 1 exchange 1/e as much as with equal ones.
     """
     floor = np.float32(1e-12 * np.mean(light**2) + 1e-37)
     layout = _Layout(*variance.shape)
     now = layout.laid(light, 0), layout.laid(variance[None], 0)
     after = np.zeros_like(now[0]), np.zeros_like(now[1])
-    # If no surface is known, a constant one separates pixels from gaps.
+    # Without surfaces, a constant one still separates pixels from gaps.
     surface = layout.laid(surfaces if len(surfaces) else np.zeros((1, *variance.shape), np.float32), _FAR)
     shares = np.zeros((3, 3, layout.size + layout.margin), np.float32)
     for distance in DISTANCES:
         around = [layout.around(layer, distance) for layer in (*now, surface)]
         inner = [layer[:, layout.margin :] for layer in after]
         for down, right, _ in NEIGHBOURS:
-            # A smaller distance has written here, where this one writes nothing.
+            # Clears values of a smaller distance, where this distance writes nothing.
             shares[1 - down, 1 - right, : layout.offset(down, right, distance)] = 0
 
         def share(first: int, distance: int = distance, around: list = around) -> None:
@@ -68,7 +68,7 @@ def diffused(light: np.ndarray, variance: np.ndarray, surfaces: np.ndarray) -> n
 
 
 class _Layout:
-    """Images (C, H, W) as (C, margin + H * pitch + margin): a gap of the largest distance after each row."""
+    """Images (C, H, W) as (C, margin + H * pitch + margin). After each row is a gap as wide as the largest distance."""
 
     def __init__(self, height: int, width: int):
         self.height, self.width, self.pitch = height, width, width + max(DISTANCES)
@@ -128,8 +128,8 @@ def _exchange(
 ) -> None:
     """Writes the sums of light and variance over 3x3 pixels, weighted by ``shares``, into the last two arguments.
 
-    Sums are (C, pixels), the other arrays (3, 3, ..., pixels). ``shares`` are overwritten by their squares, which weigh
-    the variance.
+    Sums are (C, pixels), the other arrays (3, 3, ..., pixels). ``shares`` are overwritten by their squares, which are
+    the weights of the variance.
     """
     shares[1, 1] = 0
     np.subtract(1, np.add.reduce(shares, axis=(0, 1)), out=shares[1, 1])
@@ -139,8 +139,8 @@ def _exchange(
 
 
 def _sum(weights: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
-    # Column by column: at distance 1 the axis of columns has the same stride as the axis of pixels, and einsum would
-    # choose these three values for its inner loop.
+    # Column by column: at distance 1 the axis of columns has the same stride as the axis of pixels, so einsum would use
+    # its three values for the inner loop.
     left, middle, right = (np.einsum("ip,icp->cp", weights[:, i], values[:, i]) for i in range(3))
     np.add(left, middle, out=out)
     out += right

@@ -8,9 +8,9 @@ For each pixel p, the light of its neighbourhood is fitted by a linear function 
 renderings", section 4]. The weights w are those of non-local means on the colours. Each fit gives values for all pixels
 of its neighbourhood; these are averaged with the same weights ("collaborative filtering" in the paper).
 
-The paper computes the weights, and chooses a bandwidth, by two half buffers. A stack holds one image. So the patch
-distance subtracts the part that the image's variance explains [Rousselle et al. 2012, "Adaptive rendering with
-non-local means filtering", equation 4], and each pixel mixes two bandwidths by Stein's unbiased estimate of their
+The paper computes the weights and chooses a bandwidth by two half buffers, but a stack holds only one image. So the
+part of the patch distance that the image's variance explains is subtracted [Rousselle et al. 2012, "Adaptive rendering
+with non-local means filtering", equation 4], and each pixel mixes two bandwidths by Stein's unbiased estimate of their
 errors.
 """
 
@@ -26,13 +26,13 @@ from ngpt.system.late import ndimage
 RADIUS = 9  # of the neighbourhood, 19x19 pixels
 PATCH = 3  # radius of the patches that are compared
 BANDWIDTHS = (0.5, 1.0)
-# The ridge of the regression: a feature hardly counts if its variance in the neighbourhood, relative to its squared
-# range in the image, is below this.
+# The ridge of the regression. A feature has little influence if its variance in the neighbourhood, relative to its
+# squared range in the image, is below this.
 RIDGE = 1e-3
-# A pixel counts half if its variance is this many times the median of its neighbourhood.
+# A pixel has half the weight if its variance is this many times the median of its neighbourhood.
 OUTLIER = 1000.0
-# In units of the 99th percentile of the light: light is cut at FAR, and at FLOOR in the estimate of negligible noise
-# (``_floor``). One pixel of 1e30 would leave the range of single precision, and blur all others.
+# Light is clamped to FAR, in units of its 99th percentile, and in the estimate of negligible noise (``_floor``) to
+# FLOOR. Otherwise one pixel of 1e30 would exceed the range of single precision, and blur all others.
 FAR, FLOOR = 1e6, 1e3
 _TILE = 48  # side of a tile in pixels: its sums stay in the processor's cache
 
@@ -40,16 +40,19 @@ _TILE = 48  # side of a tile in pixels: its sums stay in the processor's cache
 def nfor(image: np.ndarray, variance: np.ndarray, features: list[np.ndarray]) -> np.ndarray:
     """The denoised image, (H, W, 3) float32.
 
-    ``image`` is (H, W, 3), finite. ``variance`` is the variance of its pixels as means, NaN where it is not known.
-    ``features`` is a list of (H, W, C). Memory is about 100 floats a pixel.
+    ``image``     (H, W, 3), finite
+    ``variance``  (H, W, 3), the variance of its pixels, NaN where it is unknown
+    ``features``  a list of (H, W, C)
+
+    It needs memory for about 100 floats per pixel.
     """
-    # Variances are not averaged over neighbours. That is safer in other methods, but blurs here (docs/lab/log).
+    # Variances are not averaged over neighbours: that is safer in other methods, but here it blurs (docs/lab/log).
     variance = np.where(np.isfinite(variance), np.maximum(variance, 0), 0).astype(np.float32)
     power = _power(image)
     image = np.clip(np.ldexp(image, -power), -FAR, FAR)
     variance = np.minimum(np.ldexp(variance, -2 * power), np.float32(FAR**2))
     design = _design(features, image.shape[:2])
-    # Squares of extreme fireflies would be infinite. Patches are compared as well with such light cut at ``most``.
+    # Squares of extreme fireflies would be infinite, so patches are compared with light clamped to ``most``.
     most = bound(image)
     seen = image if most == np.inf else np.clip(image, -most, most)
     variance = np.minimum(variance, np.float32(most) ** 2)
@@ -78,9 +81,9 @@ def _power(image: np.ndarray) -> int:
 
 
 def estimated_variance(image: np.ndarray) -> np.ndarray:
-    """An estimate (H, W, 3) for an image whose variance is not known: its squared distances from a 3 x 3 median.
+    """An estimate (H, W, 3) of the variance of an image: its squared distance from its 3 x 3 median.
 
-    The squares are averaged twice over 3 x 3 pixels. Detail finer than the median counts as noise
+    The squares are averaged twice over 3 x 3 pixels. Detail that the median removes counts as noise
     (docs/lab/log/2026-W48.md).
     """
     squares = (image.astype(np.float64) - ndimage.median_filter(image, (3, 3, 1), mode="nearest")) ** 2
@@ -90,10 +93,10 @@ def estimated_variance(image: np.ndarray) -> np.ndarray:
 
 
 def _trust(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """(H, W, 1) in (0, 1]: near 1 except for pixels whose variance is far above their neighbourhood's.
+    """The weight of each pixel, (H, W, 1) in (0, 1]: small if its variance is far above that of its neighbourhood.
 
-    A spot of light in the dark differs from the dark by little more than its own noise, and the patches around it look
-    like it. Without this weight, the spot would be smeared over them.
+    A spot of light in the dark differs from the dark by little more than its own noise, so the patches around it look
+    similar. Without this weight, the spot would be spread over them.
     """
     total = variance.mean(axis=-1)
     usual = OUTLIER * ndimage.median_filter(total, 2 * RADIUS + 1) + _floor(image)
@@ -123,9 +126,9 @@ def _design(features: list[np.ndarray], size: tuple[int, int]) -> np.ndarray:
 def _filtered(
     image: np.ndarray, seen: np.ndarray, variance: np.ndarray, trust: np.ndarray, design: np.ndarray, bandwidth: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The result F (H, W, 3) at one bandwidth, and the weight (H, W) of each pixel in its own fit, about dF/dI.
+    """The result F (H, W, 3) with one bandwidth, and the weight (H, W) of each pixel in its own fit, about dF/dI.
 
-    ``image`` is averaged; ``seen`` is the image in which patches are compared.
+    ``image`` is averaged. Patches are compared in ``seen``.
     """
     n = design.shape[-1]
     rows, columns = np.triu_indices(n)
@@ -135,14 +138,14 @@ def _filtered(
     sums = _gathered(moments * trust, seen, variance, bandwidth)
     gram = np.empty((*image.shape[:2], n, n))
     gram[..., rows, columns] = gram[..., columns, rows] = sums[..., : len(rows)]
-    # The ridge is only on the slopes, in proportion to the sum of the weights, so that flat features do not make the
-    # fit unstable.
+    # The ridge is only on the slopes, in proportion to the sum of the weights. It keeps the fit stable if features are
+    # constant.
     weight = gram[..., 0, 0].copy()
     index = np.arange(1, n)
     gram[..., index, index] += RIDGE * weight[..., None]
     right = sums[..., len(rows) :].reshape(*image.shape[:2], n, 3)
     fits = np.linalg.solve(gram, right.astype(np.float64)).astype(np.float32)
-    # A pixel's own weight in its own fit: the hat matrix's diagonal.
+    # The weight of a pixel in its own fit is the diagonal of the hat matrix.
     leverage = np.einsum("...i,...i", design, np.linalg.solve(gram, design[..., None].astype(np.float64))[..., 0])
     spread = np.concatenate([fits.reshape(*image.shape[:2], -1), np.ones((*image.shape[:2], 1), np.float32)], axis=-1)
     del sums, gram, right
@@ -167,7 +170,7 @@ def _gathered(values: np.ndarray, image: np.ndarray, variance: np.ndarray, bandw
 
 
 def _weights(image: np.ndarray, variance: np.ndarray, bandwidth: float) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Each offset (dy, dx) with the weights (H, W) of the pixels there; 0 where that is outside the image."""
+    """Yields (dy, dx, weights): for each offset, the weights (H, W) of the pixels at it; 0 outside the image."""
     height, width = image.shape[:2]
     floor = _floor(image)
     reach = [range(-min(RADIUS, n - 1), min(RADIUS, n - 1) + 1) for n in (height, width)]

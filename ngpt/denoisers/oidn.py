@@ -1,4 +1,4 @@
-"""Intel Open Image Denoise as a method: it reads the primal and features, no gradients."""
+"""Intel Open Image Denoise as a method. It reads the primal and features, but no gradients."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -17,7 +17,7 @@ from ngpt.system.install import package_command
 
 AUXILIARY = ("prefiltered", "clean", "noisy", "none")
 QUALITIES = {"high": "High", "balanced": "Balanced", "fast": "Fast"}
-# The values of ``filter``: OIDN's own filter and its settings.
+# The values of the option ``filter``, and the settings of OIDN that they stand for.
 FILTERS: dict[str, dict[str, Any]] = {
     "image": {"hdr": True},
     "lightmap": {"kind": "RTLightmap"},
@@ -44,23 +44,23 @@ def missing() -> str:
 def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") -> np.ndarray:
     """The image that OIDN makes of the primal, albedo and normal: (H, W, 3) float32 without direct emission.
 
-    OIDN takes no normals without albedo, so they are left out if there is no albedo. If the stack has subpixels
-    (``ngpt.subpixels``), they are denoised, and their means are the image; "auto" makes ``of_both``.
+    OIDN takes no normals without albedo, so without albedo they are left out. If the stack has subpixels
+    (``ngpt.subpixels``), OIDN denoises them, and the image is their means; with "auto", the image is ``of_both``.
 
-    ``auxiliary``  how OIDN uses the features: "prefiltered" denoises them with its own models first and then
-                   marks them as clean, which its documentation recommends for the best quality;
-                   "clean" marks them as clean without denoising them; "noisy" does neither; "none" leaves them out;
-                   "auto" is "prefiltered" without subpixels
-    ``quality``    "high", "balanced" or "fast": the quality for the image, and for features that are denoised first
-    ``filter``     one of ``FILTERS``: "lightmap" and "directional" are OIDN's for lightmaps, which take no features
+    ``auxiliary``  how OIDN uses the features: "prefiltered" first denoises them with OIDN's own models and then marks
+                   them as clean, as its documentation recommends for the best quality; "clean" marks them as clean
+                   without denoising them; "noisy" does neither; "none" leaves them out; "auto" is "prefiltered" without
+                   subpixels
+    ``quality``    "high", "balanced" or "fast": the quality for the image, and for prefiltering
+    ``filter``     one of ``FILTERS``: "lightmap" and "directional" are for lightmaps, and read no features
 
-    Without features, OIDN reads mirror images of the covered pixels in place of empty ones. Otherwise it would darken
+    Without features, mirror images of the covered pixels take the place of empty pixels. Otherwise OIDN would darken
     the borders of the islands of a lightmap, and light would leak from one island to another. Empty pixels of the
     result are those of the primal.
     """
     require_oidn()
     features = {}
-    # With light sources that are seen directly: OIDN was trained on such images.
+    # With directly visible light sources, because OIDN was trained on such images.
     image, layers = data.image + data.direct, data.features
     k = subpixels(data.fine, image.shape[1]) if filter == "image" else 1
     if filter != "image":
@@ -89,14 +89,14 @@ def oidn(data: Repaired, auxiliary: str, quality: str, filter: str = "image") ->
 
 
 def of_both(data: Repaired, quality: str) -> np.ndarray:
-    """The mean of OIDN's image of the pixels and its images at K, K / 2 ... times the size; (H, W, 3) float32.
+    """The mean of OIDN's images of pixels and of K x K, K / 2 x K / 2, ... subpixels; (H, W, 3) float32.
 
-    Without subpixels, it is the image of the pixels. The features of pixels are marked as clean, those of subpixels as
-    noisy. Marked as clean, they would leave noise behind a lens, and prefiltering them would take four times as long
+    Without subpixels, it is the image of the pixels. Features of pixels are marked as clean, and features of subpixels
+    as noisy: marked as clean, they would leave noise behind a lens, and prefiltering would take four times as long
     (docs/lab/log).
 
-    Small pixels keep edges, and large ones keep smooth areas. The errors of these images differ so much that their mean
-    has less error than each of them in nearly every scene.
+    Images of small pixels keep edges, and those of large pixels have smooth areas. Their errors differ so much that the
+    mean has less error than each of the images in nearly every scene.
     """
     images = [oidn(replace(data, fine={}), "clean", quality)]
     k, fine = subpixels(data.fine, data.image.shape[1]), data.fine
@@ -110,16 +110,15 @@ def of_both(data: Repaired, quality: str) -> np.ndarray:
 
 
 def with_clean_features(data: Repaired) -> Repaired:
-    """The data with albedo and normal of pixels prefiltered, for images that something else corrects.
+    """The data with prefiltered albedo and normal of pixels, for ``of_both`` and for networks.
 
-    The quality is "balanced": "high" takes more than twice as long, and neither means of two sizes nor networks gain by
-    it (docs/lab/log).
+    The quality is "balanced". "high" takes more than twice as long, and improves neither of them (docs/lab/log).
     """
     return replace(data, features=data.features | prefiltered(data.features, "balanced"))
 
 
 def prefiltered(features: Mapping[str, np.ndarray], quality: str) -> dict[str, np.ndarray]:
-    """Albedo and normal (H, W, 3) denoised by OIDN's own models for them, whether they are noisy or not."""
+    """Albedo and normal (H, W, 3), denoised by OIDN's models for them."""
     require_oidn()
     return {name: _prefiltered(name, layer, quality) for name, layer in _in_range(features).items()}
 
@@ -136,6 +135,6 @@ def _prefiltered(name: str, layer: np.ndarray, quality: str) -> np.ndarray:
 
 
 def require_oidn() -> None:
-    """Raises NgptError where OIDN is not installed."""
+    """Raises NgptError if OIDN is not installed."""
     if missing():
         raise NgptError(f"method 'oidn': {missing()}")

@@ -1,6 +1,6 @@
-"""OIDN's devices and filters, which all threads of a process share: one thread uses them at a time.
+"""Runs OIDN's filters. All threads of a process share its devices and filters, and only one thread uses them at a time.
 
-Two threads that set the images of one filter would get each other's pixels. Waiting costs them no time, since OIDN
+If two threads set the images of one filter, they would get each other's pixels. Waiting costs no time, because OIDN
 uses all cores, or as many as ``ngpt.limit_threads`` allows. Making a filter takes longer than running it on a small
 image, so filters are kept.
 """
@@ -16,11 +16,11 @@ from ngpt.io.primaries import BEYOND, TO_WIDE, converted, negative_share
 from ngpt.system.forks import hold_while_forking
 from ngpt.system.limits import limited, processors
 
-# Our name of a device -> its name in OIDN's Python package
+# Our name of a device -> its name in OIDN's Python package.
 DEVICES = {"auto": "Default", "cpu": "CPU", "cuda": "CUDA", "hip": "HIP", "metal": "Metal", "sycl": "SYCL"}
-# Negative light below this share of all light is rounding, and not worth a second run.
+# Negative light below this share of all light counts as rounding, and is not denoised separately.
 _ROUNDING = 1e-6
-# The number of filters that are kept. An image and its features, with two qualities, take five.
+# The number of filters that are kept. An image and its features with two qualities need five.
 _MOST = 8
 
 _lock = Lock()
@@ -38,8 +38,8 @@ def filtered(
 ) -> np.ndarray:
     """The result of OIDN's filter "RT", or of another ``kind``, (H, W, 3) float32.
 
-    OIDN reads negative light as 0. So an image with many colours beyond its primaries is denoised in wider primaries,
-    which leaves less error. Other negative light is denoised by itself and then subtracted.
+    OIDN reads negative light as 0. So an image with many colours outside of its primaries is denoised in wider
+    primaries, which leaves less error. All other negative light is denoised separately and then subtracted.
 
     ``images``    "color", "albedo" and "normal", or some of them: (H, W, 3) float32, C-contiguous, of one size
     ``device``    one of ``DEVICES``
@@ -83,10 +83,10 @@ def _filtered(
     key = (where, weights, kind, tuple(images), result.shape, tuple(settings.items()))
     try:
         with _lock:
-            # A filter is taken out until it has worked, so that one that failed is not used again.
+            # A filter is put back only after it has worked, so that a failed one is not used again.
             made = _filters.pop(key, None) or _made(where, weights, kind, settings)
             _run(_devices[where], made, images, result)
-            # Filters with weights of the user are not kept: there are many, and each is as large as an image.
+            # Filters with a user's weights are not kept: there may be many, and each is as large as an image.
             if weights is None:
                 _filters[key] = made
             while len(_filters) > _MOST:
@@ -97,7 +97,7 @@ def _filtered(
 
 
 def _made(where: tuple[str, int], weights: bytes | None, kind: str, settings: Mapping[str, Any]) -> Any:
-    """A new filter on the device ``where``: (name, threads). With 0 threads, a CPU device has OIDN's own number."""
+    """A new filter on the device ``where`` = (name, threads). 0 threads stands for OIDN's own number on a CPU."""
     import mitsuba_oidn
 
     if where not in _devices:
@@ -115,9 +115,9 @@ def _made(where: tuple[str, int], weights: bytes | None, kind: str, settings: Ma
 
 
 def _run(device: Any, made: Any, images: Mapping[str, np.ndarray], result: np.ndarray) -> None:
-    """Runs the filter ``made`` on ``images`` and writes ``result``; the filter keeps none of the arrays.
+    """Runs the filter ``made`` on ``images``, and writes ``result``. The filter keeps no reference to the arrays.
 
-    The device reads arrays in place if it can, and otherwise through buffers.
+    If the device cannot read arrays in place, buffers are used.
     """
     height, width = result.shape[:2]
     buffers = {}

@@ -1,1 +1,1 @@
-"""Every sampler and method on the same scenes with the same clock; tables, plots and a report."""
+"""Compares samplers and methods on the same scenes after the same time."""

@@ -1,4 +1,4 @@
-"""One cell of the table: a method on a stack against the reference; computed once, then taken from the cache."""
+"""Computes the cells of the tables: the result of a method for a stack, compared to the reference. Cells are cached."""
 
 import hashlib
 import json
@@ -23,22 +23,22 @@ from ngpt.system.files import make_folder
 from ngpt.system.machine import versions
 from ngpt.system.writing import write_json
 
-# Packages whose versions change results. Some rows are absent where a package is.
+# Packages whose versions change results. Without some of them, rows are absent.
 PACKAGES = ("numpy", "scipy", "mitsuba", "torch", "mitsuba-oidn", "scikit-image", "flip-evaluator")
 
-# The version of the format of cached cells. 2: times by both clocks
+# The version of the format of cached cells. Since version 2, they have times by both clocks.
 _FORMAT = 2
 
 
 class Scorer:
-    """Runs methods after a warm-up, and measures their results and times."""
+    """Runs methods after a warm-up, and measures their errors and times."""
 
     def __init__(self, config: Config, cache: Path):
         self.config, self.cache = config, cache
         make_folder(self.cache)
         self._warm: set[tuple] = set()
         self._code = [_FORMAT, library_hash(), versions(*PACKAGES)]
-        # The options of metrics that take any
+        # The options of metrics, by name.
         self.options = {"E-LPIPS": config.elpips}
         found = {name: METRICS[name].missing for name in config.metrics}
         lacks = {name: missing(**self.options.get(name, {})) for name, missing in found.items() if missing}
@@ -49,11 +49,11 @@ class Scorer:
     def cell(
         self, column: Column, stack: Callable[[], GradientStack], reference: Reference, key: list, image: Path | None
     ) -> dict[str, Any]:
-        """The entries of a cell: ``metrics``, the seconds of ``reconstruct`` by clock, and ``absent``, None.
+        """The entries of a cell: ``metrics``, ``reconstruct`` with the seconds by clock, and ``absent``, which is None.
 
-        If the method fails, ``absent`` is the reason and the only entry. The result is written to the file ``image``,
-        if that is not None. ``key`` identifies the stack in the cache; ``stack`` is called only if the cell is not
-        cached.
+        If the method fails, the only entry is ``absent``, the reason. ``key`` identifies the stack in the cache.
+        ``stack`` is called only if the cell is not in the cache. The result is written to the file ``image`` unless
+        that is None.
         """
         parts = [key, column.method, column.options, file_hash(column.options.get("weights", ""))]
         parts += filter(None, [code_of(METHODS[column.method].run)])
@@ -72,7 +72,7 @@ class Scorer:
             seconds = {"wall": result.seconds, "processor": time.process_time() - begins}
             values = self._scores(self.metrics, result.image, *reference.images)
         except NgptError as error:
-            # Not cached: a missing package or file may be there the next time.
+            # Not cached, because a missing package or file may be there the next time.
             return {"absent": str(error)}
         if image is not None:
             image.parent.mkdir(parents=True, exist_ok=True)
@@ -84,7 +84,7 @@ class Scorer:
     def floors(self, reference: Reference) -> dict[str, float | None]:
         """The metrics between the two halves of a reference, which show its noise; {} for a reference of one image.
 
-        Squared metrics are left out: with two halves, they are free of this noise.
+        Squared metrics are left out, because with two halves they do not include this noise.
         """
         if len(reference.images) == 1:
             return {}
@@ -95,7 +95,7 @@ class Scorer:
         return json.loads(path.read_text())
 
     def _scores(self, names: list[str], image: np.ndarray, *halves: np.ndarray) -> dict[str, float | None]:
-        """The metrics ``names`` of an image; None where one is not finite, like the PSNR of equal images."""
+        """The metrics ``names`` of an image; None for values that are not finite, like the PSNR of equal images."""
         values = scores(names, image, *halves, options=self.options)
         return {name: value if math.isfinite(value) else None for name, value in values.items()}
 

@@ -14,9 +14,9 @@ from ngpt.options import settings
 from ngpt.system.parts import find_renderer
 from ngpt.system.records import check, from_table, read_toml
 
-# The values of ``images``: the seeds whose pictures are kept.
+# The values of ``images``: the seeds whose images are kept.
 IMAGES = ("first", "all", "none")
-# The values of ``time``: the clock of equal time. Other work on the machine hardly changes processor time.
+# The values of ``time``: the clock that measures equal time. Other work on the machine hardly changes processor time.
 CLOCKS = ("wall", "processor")
 
 
@@ -24,12 +24,12 @@ CLOCKS = ("wall", "processor")
 class Column:
     """A column of the tables: a method with its options, on the stacks of one sampler.
 
-    ``name``     the name in tables: the family, and the sampler in brackets where several are compared
+    ``name``     the name in tables: the family, and the sampler in brackets if several are compared
     ``family``   the name in the configuration: a method or a variant
-    ``method``   the name in ``ngpt.methods.METHODS``; an unknown name makes rows that say so
-    ``sampler``  the name of the sampler in the configuration; ``render`` has the renderer's own name
+    ``method``   the name in ``ngpt.methods.METHODS``; for an unknown name, the rows say so
+    ``sampler``  the name of the sampler in the configuration; ``render`` has the renderer's name for it
     ``render``   the stacks that the method reads
-    ``options``  the method's options that differ from its defaults
+    ``options``  the options of the method that differ from their defaults
     """
 
     name: str
@@ -49,27 +49,27 @@ class Config:
     ``title``     the title of the report
     ``scenes``    built-in scenes, scene files, patterns, or folders of stacks: KIND-SPP-SEED.exr and reference.exr
     ``size``      width and height in pixels
-    ``spp``       samples per pixel of the stacks by ``clock``; other stacks get the number that takes the same time
-    ``rival_spp``  the same for the columns of ``against``; empty: as ``spp``. Larger numbers let the curves of rivals
+    ``spp``       samples per pixel of stacks by ``clock``; other stacks get as many samples as take the same time
+    ``rival_spp``  the same for the columns of ``against``; empty: as ``spp``. With larger numbers, the curves of rivals
               reach the whole time of methods that take longer to reconstruct
     ``seeds``     the number of renders of each stack, each with its own seed
     ``methods``   methods of `ngpt info`, or variants: tables [variants.NAME] with method, options, stack and sampler
     ``samplers``, ``rivals``  samplers of stacks with gradients, and without; tables [samplers.NAME] give them options,
-              and ``subpixels`` as for ``ngpt render``; without, there are none
+              and ``subpixels`` as for ``ngpt render`` (none by default)
     ``clock``     the sampler whose samples ``spp`` counts
     ``time``      "wall", or "processor": all cores together, which other work on the machine hardly changes
     ``metrics``   the metrics to measure; E-LPIPS needs a table [elpips] with backbone and weights
     ``primary``   the metric of tables and plots
     ``reference_spp``, ``reference_seconds``  samples per pixel of a reference; if that is 0, seconds of rendering
-    ``reference_sampler``  the sampler of references: one that finds all the light of the scenes
-    ``timing_spp``, ``timing_repeats``  samples per pixel, and number, of the renders that measure the cost of a sample
-    ``images``    pictures to keep: of the "first" seed, of "all", or "none"
+    ``reference_sampler``  the sampler of references, which must find all light of the scenes
+    ``timing_spp``, ``timing_repeats``  samples per pixel and number of the renders that measure the cost of a sample
+    ``images``    the images to keep: of the "first" seed, of "all", or "none"
     ``elpips``    files of E-LPIPS: backbone and weights
     ``references``  references from elsewhere, NAME = "FILE" or NAME = ["FILE", "FILE"] for two halves
-    ``groups``    groups of scenes, NAME = ["SCENE", ...]: each gets rows of means in the tables
-    ``against``   rivals at equal whole time, NAME = ["COLUMN", ...]: the columns are settings of one rival, and at each
-              time the best of them counts
-    ``variants``  methods with options of their own, by name
+    ``groups``    groups of scenes, NAME = ["SCENE", ...]: tables have rows with the means of each group
+    ``against``   rivals at equal whole time, NAME = ["COLUMN", ...]: the columns are settings of one rival, of which
+              the best counts at each time
+    ``variants``  methods with other options, by name
     """
 
     title: str = "Evaluation"
@@ -96,7 +96,7 @@ class Config:
     groups: dict[str, Any] = field(default_factory=dict)
     against: dict[str, Any] = field(default_factory=dict)
     variants: dict[str, dict[str, Any]] = field(default_factory=dict)
-    # The options in tables [samplers.NAME]. Files have no entry of this name.
+    # The tables [samplers.NAME]. Files have no entry of this name.
     sampler_options: dict[str, dict[str, Any]] = field(default_factory=dict, metadata={"internal": True})
 
     def __post_init__(self) -> None:
@@ -149,7 +149,7 @@ class Config:
             raise NgptError(f"evaluation: two columns would be called '{repeated}'; rename the variant")
 
     def places(self) -> list[tuple[int, int, list[Column]]]:
-        """Tuples (samples per pixel by ``clock``, seed, columns measured there), in the order of the tables."""
+        """Tuples (samples per pixel by ``clock``, seed, columns that are measured), in the order of the tables."""
         settings = {column for listed in self.against.values() for column in listed} if self.rival_spp else set()
         pairs = [(column, self.rival_spp if column.name in settings else self.spp) for column in self.columns()]
         return [
@@ -163,10 +163,7 @@ class Config:
         return [column for name in self.methods for column in self._columns(name)]
 
     def _columns(self, name: str) -> list[Column]:
-        """The columns of a method or variant: one for its own sampler if it names one.
-
-        Otherwise one for each sampler that is listed for its kind of stack.
-        """
+        """The columns of a method or variant: one if it names a sampler, otherwise one for each listed sampler."""
         table = dict(self.variants.get(name, {}))
         method, kind, sampler = table.pop("method", name), table.pop("stack", ""), table.pop("sampler", "")
         layers = (*METHODS[method].needs, *METHODS[method].uses) if method in METHODS else ()
@@ -178,8 +175,8 @@ class Config:
     def render(self, kind: str, sampler: str) -> Render:
         """The stacks of this ``kind`` by the sampler that the configuration calls ``sampler``.
 
-        Only the default sampler of plain images can leave features out: with another one, kind "path" becomes
-        "features". Raises NgptError for options that the sampler does not take.
+        Only the default sampler of images can leave features out. With another sampler, the kind "path" becomes
+        "features". Raises NgptError for options that the sampler does not have.
         """
         name, given = self.sampler(sampler)
         return Render("features" if kind == "path" and name != KINDS["path"] else kind, name, given)
@@ -187,9 +184,9 @@ class Config:
     def sampler(self, name: str) -> tuple[str, str]:
         """The renderer's name of the sampler that the configuration calls ``name``, and its options, as text.
 
-        The text has only options that differ from their defaults. Subpixels count as one, whose default is 1, and not
-        "auto" as in `ngpt render`: so a configuration keeps its meaning, and stored tables stay what they were. Raises
-        NgptError for options that it does not take.
+        The text has only the options that differ from their defaults. The default of ``subpixels`` is 1, and not "auto"
+        as in `ngpt render`, so that configurations and stored tables keep their meaning. Raises NgptError for options
+        that the sampler does not have.
         """
         table = dict(self.sampler_options.get(name, {}))
         if not table:
@@ -201,9 +198,9 @@ class Config:
             raise NgptError(f"evaluation: samplers.{name}: {error}") from None
 
     def scene_files(self) -> dict[str, str]:
-        """Name -> built-in scene, scene file or folder of stacks, with patterns resolved.
+        """Name -> built-in scene, scene file or folder of stacks, after resolving patterns.
 
-        Raises NgptError if there are no scenes, if a pattern matches none, or if two have the same name.
+        Raises NgptError if there are no scenes, if a pattern matches no file, or if two scenes have the same name.
         """
         if not self.scenes:
             raise NgptError("evaluation: no scenes: name built-in ones, scene files, patterns or folders with --scenes")
@@ -229,20 +226,17 @@ def file_part(column: str) -> str:
 
 
 def scene_name(scene: str) -> str:
-    """The name of a scene in tables.
-
-    For a scene file, this is the name of its folder and the part of the file's name after "scene".
-    """
+    """The name of a scene in tables. For a file, it is the folder's name, and the part of the file's after "scene"."""
     path = Path(scene)
     return f"{path.parent.name}{path.stem.removeprefix('scene')}" if path.suffix == ".xml" else path.name
 
 
 def read_config(path: str | Path) -> Config:
-    """Reads a TOML file; raises NgptError for entries that do not exist or have the wrong type.
+    """Reads a TOML file. Raises NgptError for unknown entries, and for values of a wrong type.
 
-    ``base`` names another file, relative to the folder of this one: entries that this file lacks are taken from there.
-    ``samplers`` may be tables of options. Then the samplers with gradients are compared, except for those that a
-    variant names. ``rivals``, ``clock`` and others may name samplers without gradients.
+    The entry ``base`` names another file, relative to the folder of this one, from which missing entries are taken. If
+    ``samplers`` are tables of options, those with gradients are compared, except for samplers that a variant names.
+    ``rivals``, ``clock`` and other entries may name the samplers without gradients.
     """
     values = _with_base(Path(path))
     if isinstance(tables := values.get("samplers"), dict):
@@ -255,7 +249,7 @@ def read_config(path: str | Path) -> Config:
 
 
 def _with_base(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """The entries of a file and of its base; ``above`` are the files that are built on this one."""
+    """The entries of a file and of its base. ``above`` are the files that have this file as their base."""
     values = read_toml(path)
     base = values.pop("base", None)
     if base is None:

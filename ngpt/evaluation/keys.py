@@ -1,6 +1,6 @@
-"""What the cache of an evaluation is keyed by: code, scenes and versions, so that no table mixes two of them.
+"""Hashes of code and scenes, for the keys of the cache of an evaluation, so that no table mixes two versions.
 
-The code that renders is known to the renderer (``ngpt.renderer``).
+The code that renders is hashed by the renderer (``ngpt.renderer``).
 """
 
 import hashlib
@@ -12,13 +12,13 @@ from typing import Any
 
 from ngpt.system.source import code_text, source_hash
 
-# Packages of the library that affect no image and no number.
+# Packages of the library that affect neither images nor numbers.
 _PRESENTATION = ("cli", "evaluation", "export", "report", "system")
 
 
 @lru_cache(maxsize=1)
 def library_hash() -> str:
-    """A hash of the library's source and weights: a cell of other code is another cell."""
+    """A hash of the source and the weights of the library."""
     folder = Path(__file__).parents[1]
     digest = hashlib.sha256(source_hash(folder, _PRESENTATION).encode())
     for path in sorted((folder / "weights").iterdir()):
@@ -27,7 +27,7 @@ def library_hash() -> str:
 
 
 def code_of(function: Any) -> str:
-    """SHA-256 of the package that a function is from; "" for our own package, whose hash is ``library_hash``."""
+    """The SHA-256 of the package of a function; "" for our own package, whose hash is ``library_hash``."""
     root = getattr(function, "func", function).__module__.partition(".")[0]
     file = getattr(sys.modules.get(root), "__file__", None)
     if root == "ngpt" or not file:

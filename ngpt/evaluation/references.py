@@ -1,6 +1,6 @@
 """The reference of a scene: two independent halves, or one image from elsewhere.
 
-Two halves take the reference's noise off every squared metric (``ngpt.measure.metrics``); one image cannot.
+With two halves, squared metrics do not include the noise of the reference (``ngpt.measure.metrics``).
 """
 
 import os
@@ -19,14 +19,17 @@ from ngpt.measure.metrics import EPSILON, exposure_mismatch
 from ngpt.repair import variance_of_primal
 from ngpt.stack import GradientStack
 
-# What the names of two halves end with, before ".exr".
+# The ends of the names of two halves, before ".exr".
 HALVES = ("-a", "-b")
-# A reconstruction moves the brightness by less; noise of few samples, and fireflies, may reach it.
+# The largest difference in exposure between a reference and a render. Reconstructions differ less from a reference, but
+# renders of few samples, and fireflies, may differ more.
 MOST_STOPS = 1.0
 
 
 @dataclass(frozen=True)
 class Reference:
+    """A reference, with the files that it was read from."""
+
     stacks: tuple[GradientStack, ...]
     files: tuple[str, ...]
 
@@ -37,23 +40,23 @@ class Reference:
 
     @cached_property
     def mean(self) -> np.ndarray:
-        """The best image there is, (H, W, 3): r, or m = (a + b) / 2."""
+        """The reference as one image, (H, W, 3): r, or m = (a + b) / 2."""
         return middle(self.images)
 
     @property
     def key(self) -> list:
-        """What a cached cell depends on."""
+        """The key of the reference in the cache of cells."""
         status = [os.stat(file) for file in self.files]
         return [[Path(f).name, s.st_size, s.st_mtime_ns] for f, s in zip(self.files, status, strict=True)]
 
     def total(self, attribute: str) -> float | None:
-        """The sum of a number in the files' headers, such as the samples; None where it is not in all."""
+        """The sum of a number in the headers of the files, such as the samples; None if a file lacks it."""
         values = [stack.number(attribute) for stack in self.stacks]
         return None if None in values else sum(value for value in values if value is not None)
 
     @property
     def noise(self) -> float | None:
-        """The relMSE that the mean image has by its own noise; None where the files hold no variances."""
+        """The relMSE of the mean image by its own noise; None if the files hold no variances."""
         if not all("primal_var" in stack for stack in self.stacks):
             return None
         if len(self.stacks) == 1:
@@ -63,12 +66,12 @@ class Reference:
 
     @property
     def doubt(self) -> float | None:
-        """The relMSE below which the order of methods means little; None if the files hold no variances.
+        """The relMSE below which the order of methods is not reliable; None if the files hold no variances.
 
-        With one image, it is three times the image's noise, which is part of every error. With two halves, it is three
-        standard errors of the mean of (a - t)(b - t) / (m² + 1e-3), with t the truth: in each pixel the product has
-        expectation 0, and its variance is the product of the variances of a and b. Channels count as one, as if they
-        had the same noise.
+        With one image, it is three times the noise of the image, which is part of every error. With two halves, it is
+        three standard errors of the mean of (a - t)(b - t) / (m² + 1e-3), with t the truth: in each pixel the product
+        has the expectation 0, and its variance is the product of the variances of a and b. The noise of the channels is
+        taken to be the same.
         """
         noise = self.noise
         if noise is None or len(self.stacks) == 1:
@@ -93,12 +96,15 @@ class Reference:
 
 
 def reference_noise(reference: GradientStack) -> float:
-    """What one reference's own noise adds to every relMSE: the mean of its variance / (r² + epsilon)."""
+    """The part of every relMSE that is due to the reference's noise: the mean of its variance / (r² + epsilon)."""
     return float(np.mean(variance_of_primal(reference) / (reference["primal"] ** 2 + EPSILON)))
 
 
 def read_reference(files: Sequence[str | Path]) -> Reference:
-    """Raises NgptError for files that cannot be read, and for halves that differ in size or are the same render."""
+    """The reference in one file or two.
+
+    Raises NgptError for files that cannot be read, and for halves that differ in size or are the same render.
+    """
     stacks = tuple(read(file) for file in files)
     names = tuple(map(str, files))
     if len(stacks) == 2:

@@ -1,4 +1,4 @@
-"""The input of a method: a kind of stack, by a sampler."""
+"""Kinds of stacks, by samplers: the inputs of methods."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,9 +12,9 @@ KINDS = {"gradients": "auto", "features": "primal", "path": "primal"}
 
 @dataclass(frozen=True)
 class Render:
-    """A kind of stack by a sampler, with options of it that are not its defaults: "radius=1, photons=2, subpixels=2".
+    """A kind of stack by a sampler. ``given`` has its options that are not defaults: "radius=1, subpixels=2".
 
-    ``name`` is what files, costs and results call it.
+    ``name`` is its name in files, costs and results.
     """
 
     kind: str
@@ -27,7 +27,7 @@ class Render:
 
     @property
     def by(self) -> str:
-        """Sampler and options where they are not the usual ones of the kind, else ""."""
+        """Sampler and options; "" if they are the usual ones of the kind."""
         usual = self.sampler == KINDS[self.kind] and not self.given
         return "" if usual else " ".join([self.sampler, *filter(None, self.given.split(", "))])
 
@@ -38,5 +38,5 @@ class Render:
         return {"sampler": self.sampler} | given | ({"with_features": False} if self.kind == "path" else {})
 
 
-# Every scene is measured with these, so that tables show the cost of gradients.
+# The usual renders. They are measured in every scene, so that tables can show the cost of gradients.
 DEFAULTS = tuple(Render(kind, sampler) for kind, sampler in KINDS.items())

@@ -1,4 +1,4 @@
-"""The files of results besides the pictures: results.json and results.csv, both made from the cells."""
+"""Writes results.json and results.csv from the cells of an evaluation."""
 
 from pathlib import Path
 from typing import Any
@@ -17,16 +17,16 @@ def write_results(results: dict[str, Any], out: Path) -> None:
 
 
 def shared_scenes(results: dict[str, Any]) -> list[str]:
-    """The scenes that have results; means are over these."""
+    """The scenes that have results, over which means are taken."""
     return [name for name, entry in results["scenes"].items() if not entry.get("absent")]
 
 
 def summarised(results: dict[str, Any]) -> list[dict[str, Any]]:
-    """A row for each scene, spp and method: median and quartiles over seeds; then geometric means over scenes.
+    """A row for each scene, spp and method: median and quartiles over seeds; then means over scenes, with scene None.
 
-    ``error`` is the primary metric's median. Means, with scene None, are of methods that are there on all scenes; a
-    metric that is not an error (PSNR, SSIM) has its arithmetic mean. An error below 0 has no geometric mean: the halves
-    of the reference cannot distinguish it from 0. ``pareto`` says that no cell of the scene is both faster and better.
+    ``error`` is the median of the primary metric. Only methods that have all scenes have means. They are geometric, but
+    arithmetic for metrics that are no errors (PSNR, SSIM). An error below 0 has no geometric mean; the halves of the
+    reference cannot distinguish it from 0. ``pareto`` says that no other row of the scene is faster and better.
     """
     rows: list[dict[str, Any]] = []
     groups: dict[tuple, list[dict[str, Any]]] = {}
@@ -66,7 +66,7 @@ def summarised(results: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _is_timed(row: dict[str, Any]) -> bool:
-    """Whether the row has a time and an error that logarithmic axes can show."""
+    """Whether the row has a time and an error above 0."""
     return (row["error"] or 0) > 0 and bool(row["seconds"]["total"])
 
 

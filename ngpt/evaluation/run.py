@@ -1,4 +1,4 @@
-"""The evaluation itself: scenes x samples x methods x seeds, cell by cell, and the folder of results."""
+"""Runs an evaluation, cell by cell (scenes x samples x methods x seeds), and writes the folder of results."""
 
 import gc
 import os
@@ -30,12 +30,11 @@ from ngpt.system.machine import metadata
 def evaluate(
     config: Config, out: Path, console: Console, command: str, renderer: Renderer, cache: Path | None = None
 ) -> dict[str, Any]:
-    """Fills the folder ``out`` and returns what its results.json holds; ``renderer`` renders stacks that do not exist
-    yet.
+    """Fills the folder ``out``, and returns the contents of its results.json. ``renderer`` renders missing stacks.
 
-    Cells in the cache, ``out``/cache by default, are not computed again: an interrupted run continues when it is
-    started again. If a scene or a method lacks something, its row says so. Raises NgptError, before anything is
-    rendered, for scenes, references and samplers of all scenes that do not exist.
+    Cells in the cache (by default ``out``/cache) are not computed again, so an interrupted run can be continued. Rows
+    of scenes and methods that lack something say so. Raises NgptError for scenes, references and samplers that do not
+    exist, before anything is rendered.
     """
     scenes = config.scene_files()
     check_named(config, scenes, renderer)
@@ -96,16 +95,16 @@ def evaluate(
                     for spp, seed, here in config.places()
                     for column in here
                 ]
-            # After each scene, so that a long run can be looked at.
+            # After each scene, so that the results of a long run can be looked at.
             write_results(results, out)
-            # Kernels hold code for the objects of all scenes in the process, those that are left over too.
+            # Kernels contain code for the objects of all scenes in memory, so finished scenes are removed.
             gc.collect()
         progress(total, total)
     return results
 
 
 def check_named(config: Config, scenes: dict[str, str], renderer: Renderer) -> None:
-    """Raises NgptError unless all ``scenes`` exist, their references, and the samplers that every scene needs."""
+    """Raises NgptError unless all ``scenes``, their references, and the samplers for every scene exist."""
     for name, source in scenes.items():
         if not os.path.exists(source):
             renderer.scene_code(source)
@@ -114,7 +113,7 @@ def check_named(config: Config, scenes: dict[str, str], renderer: Renderer) -> N
             if not os.path.isfile(file):
                 raise NgptError(f"{file}: no such file; evaluation: references.{name} names it")
     if all(os.path.isdir(source) for source in scenes.values()):
-        return  # What rendered their stacks may have any name.
+        return  # The samplers of finished stacks may have any name.
     for entry in ("clock", "reference_sampler"):
         sampler, _ = config.sampler(getattr(config, entry))
         if sampler != KINDS["gradients"]:
@@ -133,7 +132,7 @@ def _scene(
     out: Path,
     advance: Callable[[int], None],
 ) -> None:
-    """Adds a scene and its cells to ``results``. Raises NgptError for errors that concern all cells."""
+    """Adds a scene and its cells to ``results``. Raises NgptError for errors that affect all cells."""
     config, name = stacks.config, stacks.name
     reference = stacks.reference()
     costs = stacks.costs(column.render for column in columns if not lacks[column.name])
@@ -142,7 +141,7 @@ def _scene(
     pilot = _pilot([render for n, render in renders.items() if not lacks[n]])
     first = stacks.stack(pilot, stacks.samples(pilot, config.spp[0], costs), 0)
     if stacks.given or name in config.references:
-        # Not for our own stacks, where fireflies of few samples could pass for another exposure.
+        # Not for our own stacks, where fireflies of few samples could look like another exposure.
         reference.check(first)
     entry: dict[str, Any] = {"file": stacks.source, "size": [first.width, first.height], "cost": costs}
     entry["exposure"] = auto_exposure(reference.mean)
@@ -178,7 +177,7 @@ def _scene(
                     "absent": None,
                 }
             )
-    # All at once: a scene that fails half-way is absent as a whole.
+    # All at once, so that a scene that fails half-way is absent as a whole.
     results["scenes"][name] = entry
     results["cells"] += cells
 
@@ -186,32 +185,34 @@ def _scene(
 def _held(
     held: dict[str, GradientStack], stacks: SceneStacks, render: Render, samples: int, seed: int
 ) -> GradientStack:
-    """The stack of a render, which all columns share that take it."""
+    """The stack of a render, which is loaded once for all columns."""
     if render.name not in held:
         held[render.name] = stacks.stack(render, samples, seed)
     return held[render.name]
 
 
 def _seconds(render: float | None, reconstruct: dict[str, float], clock: str) -> dict[str, float | None]:
-    """The seconds of a cell by the ``clock``: to render (with features, film and recording), to reconstruct, and in
-    total; and the wall seconds to reconstruct. Kernels are compiled and weights are read before."""
+    """The seconds of a cell: to render, to reconstruct and in total by the ``clock``; and wall seconds to reconstruct.
+
+    Renders include features, film and recording, but not the compilation of kernels.
+    """
     total = None if render is None else render + reconstruct[clock]
     seconds = {"render": render, "reconstruct": reconstruct[clock], "total": total}
     return seconds | {"reconstruct wall": reconstruct["wall"]}
 
 
 def _pilot(renders: list[Render]) -> Render:
-    """The gradient stacks that a scene is described by: the usual ones, unless all columns have others."""
+    """The render that size and exposure of a scene are taken from: the usual one, unless all columns have others."""
     gradients = [render for render in renders if render.kind == USUAL.kind]
     return gradients[0] if gradients and USUAL not in gradients else USUAL
 
 
 def _reference_entry(reference: Reference, scorer: Scorer, name: str, out: Path) -> dict[str, Any]:
-    """What results.json says of a reference; writes its pictures."""
+    """The entry of a reference in results.json; also writes its images."""
     images = {"reference.exr": reference.mean}
     if len(reference.images) > 1:
         images |= {f"reference{half}.exr": image for half, image in zip(HALVES, reference.images, strict=True)}
-    # Relative, so that the folder can be moved.
+    # Relative paths, so that the folder can be moved.
     paths = [f"images/{name}/{file}" for file in images]
     if kept := wanted(scorer.config.images, 0):
         (out / paths[0]).parent.mkdir(parents=True, exist_ok=True)
@@ -230,12 +231,12 @@ def _reference_entry(reference: Reference, scorer: Scorer, name: str, out: Path)
 
 
 def wanted(images: str, seed: int) -> bool:
-    """Whether the configuration's entry ``images`` has pictures of a seed kept."""
+    """Whether images of a seed are kept, by the entry ``images`` of the configuration."""
     return images == "all" or (images == "first" and seed == 0)
 
 
 def picture_path(scene: str, spp: int, method: str, seed: int) -> str:
-    """A cell's picture, relative to the folder of results; ``method`` is the name of its column."""
+    """The path of a cell's image, relative to the folder of results. ``method`` is the name of the column."""
     return f"images/{scene}/{spp}-{file_part(method)}{f'-seed{seed}' if seed else ''}.exr"
 
 

@@ -29,7 +29,7 @@ from ngpt.system.machine import version
 from ngpt.system.writing import write_json
 from ngpt.version import __version__
 
-# The seed of the first half; far from the seeds 0, 1 ... of the stacks that are judged.
+# The seed of the first half of a reference, far from the seeds 0, 1 ... of stacks.
 REFERENCE_SEED = 1 << 20
 
 USUAL = DEFAULTS[0]
@@ -37,9 +37,9 @@ Costs = dict[str, dict[str, Any]]
 
 
 class SceneStacks:
-    """The stacks, reference and costs that one scene's cells are made from.
+    """The stacks, the reference and the costs of a scene.
 
-    ``lacks``  why a render's columns are absent on this scene, by the render's name; filled by ``costs``
+    ``lacks``  name of a render -> why its columns are absent on this scene; known after ``costs``
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class SceneStacks:
             self._parts = [scene, list(config.size), __version__, version("mitsuba")]
 
     def key(self, sampler: str) -> str:
-        """What pictures by a sampler depend on."""
+        """A hash of all that images by a sampler depend on."""
         if sampler not in self._keys:
             parts = json.dumps([*self._parts, self.renderer.code(sampler)])
             self._keys[sampler] = hashlib.sha256(parts.encode()).hexdigest()
@@ -78,9 +78,10 @@ class SceneStacks:
         return self.cache / f"{self.name}-{self.key(sampler)[:12]}"
 
     def reference(self) -> Reference:
-        """The reference that the configuration names, or the folder holds; else two halves, of half the budget each.
+        """The reference in the configuration, or in the folder; otherwise two halves, each rendered with half the
+        budget.
 
-        Raises NgptError where there is none.
+        Raises NgptError if a folder has none.
         """
         config = self.config
         if self.name in config.references:
@@ -103,11 +104,11 @@ class SceneStacks:
         return read_reference(paths)
 
     def costs(self, renders: Iterable[Render] = ()) -> Costs:
-        """Seconds per sample of the whole image for the usual renders, the clock and ``renders``, by name.
+        """Name -> seconds per sample of the whole image, for the usual renders, the clock and ``renders``.
 
-        ``median`` and quartiles ``low`` and ``high`` of alternating renders, kernels compiled, and the ``sampler`` that
-        rendered. Costs that are not in the cache are measured in turn with the clock, and scaled to the clock's cached
-        time. Empty for a folder of stacks that were rendered elsewhere.
+        There are ``median`` and quartiles ``low`` and ``high`` over renders in turn, with compiled kernels, and the
+        ``sampler`` that rendered. Costs that are not in the cache are measured in turn with the clock, and scaled to
+        the cached cost of the clock. Empty for a user's folder of stacks.
         """
         if self.given:
             return {}
@@ -141,7 +142,7 @@ class SceneStacks:
         return self.folder(render.sampler) / name
 
     def _costs_in(self, render: Render) -> Costs:
-        """What was measured with the code of the render's sampler."""
+        """The cached costs, which were measured with the present code of the render's sampler."""
         path = self._cost_file(render)
         return json.loads(path.read_text()) if path.exists() else {}
 
@@ -151,18 +152,18 @@ class SceneStacks:
         return self.resolve(self.config.render(USUAL.kind, self.config.clock))
 
     def resolve(self, render: Render) -> Render:
-        """``render``, or the usual one where "auto" stands for its sampler on this scene; after ``costs``."""
+        """``render``, or the usual one if "auto" chooses this sampler on this scene; known after ``costs``."""
         return USUAL if render == Render(USUAL.kind, self._auto) else render
 
     def samples(self, render: Render, spp: int, costs: Costs) -> int:
-        """How many samples the time of ``spp`` of the clock's buys; two at least, or two batches, for a variance."""
+        """The samples that take the time of ``spp`` samples of the clock; at least two (or two batches)."""
         if render == self.clock or not costs:
             return spp
         least = 2 * max(1, self.renderer.batch(costs[render.name]["sampler"]))
         return max(least, round(spp * costs[self.clock.name]["median"] / costs[render.name]["median"]))
 
     def stack(self, render: Render, spp: int, seed: int) -> GradientStack:
-        """A stack with its time in the attribute ``ngpt:seconds``, without the compilation of kernels."""
+        """A stack. Its attribute ``ngpt:seconds`` is the time of the render, without compilation of kernels."""
         path = self._path(render, spp, seed)
         if not path.exists():
             if self.given:
@@ -171,11 +172,11 @@ class SceneStacks:
             stack, seconds = self.renderer.timed(self.load(), render.options, spp, seed, self.config.time)
             stack.attributes["ngpt:seconds"] = seconds
             _keep(path, stack)
-        # In a file without gradients, the reader takes this name for direct light, not for emission seen directly.
+        # Without gradients, the reader would take the layer "direct" for direct light, not for visible emission.
         return read(path, {"direct": "direct"} if render.kind == "features" and not self.given else None)
 
     def stack_key(self, render: Render, spp: int, seed: int) -> list:
-        """What the stack depends on, without rendering it."""
+        """The key of a stack in the cache of cells, which does not need its render."""
         if not self.given:
             return [self.key(render.sampler), render.name, spp, seed]
         path = self._path(render, spp, seed)
@@ -190,13 +191,13 @@ class SceneStacks:
         return self.folder(render.sampler) / f"{render.name.replace(' ', '-')}-{spp}-{seed}.exr"
 
     def _warm_up(self, render: Render) -> GradientStack:
-        """Compiles the kernels, and returns the stack of one sample."""
+        """Compiles the kernels, and returns a stack of one sample."""
         if render.name not in self._warm:
             self._warm[render.name] = self.renderer.warm_up(self.load(), render.options)
         return self._warm[render.name]
 
     def _can(self, render: Render) -> bool:
-        """Whether the sampler can render this scene, and renders that kind of stack; if not, ``lacks`` says why."""
+        """Whether the sampler can render this scene as this kind of stack. If not, ``lacks`` gets the reason."""
         try:
             stack = self._warm_up(render)
         except NgptError as error:
@@ -210,7 +211,7 @@ class SceneStacks:
 
 
 def _keep(path: Path, stack: GradientStack) -> None:
-    """Puts a stack into the cache, if no other process was faster."""
+    """Puts a stack into the cache, unless another process was faster."""
     path.parent.mkdir(parents=True, exist_ok=True)
     save(path, lambda path, overwrite: write(path, stack, overwrite=overwrite), alike=True)
 

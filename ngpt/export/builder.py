@@ -1,13 +1,13 @@
-"""ONNX graphs as Python expressions: a call of an operator, or +, -, *, / between values, adds a node.
+"""Builds ONNX graphs from Python expressions: each call of an operator, and each +, -, * and / of values, adds a node.
 
     graph = Graph("double")
     x = graph.input("x", ("n", 3))
     graph.output("y", op.Max(x, 0.0) * 2.0, ("n", 3))
     model = graph.model({"method": "double"})
 
-``op.NAME`` is ONNX's operator of that name, with its inputs in order and its attributes by name. Among the inputs,
-Python floats become constants of float32, ints and lists of ints become constants of int64, and arrays become constants
-of their own type.
+``op.NAME`` is ONNX's operator of that name, with its inputs in order and its attributes by name. Inputs that are floats
+become constants of float32, ints and lists of ints become constants of int64, and arrays become constants of their own
+type.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +33,7 @@ Shape = Sequence[int | str]
 class Value:
     """A tensor in a graph: an input, or the result of a node."""
 
-    # Makes NumPy arrays use our operators.
+    # Makes NumPy arrays leave operators to this class.
     __array_ufunc__ = None
 
     def __init__(self, graph: "Graph", name: str):
@@ -59,7 +59,7 @@ class Value:
 
 
 class Operators:
-    """The operators of ONNX by name; ``outputs`` of a call, 1 by default, says how many values it returns."""
+    """The operators of ONNX by name. ``outputs`` is the number of values that a call returns, by default 1."""
 
     def __getattr__(self, kind: str) -> Callable[..., Any]:
         if not kind[:1].isupper():
@@ -83,12 +83,12 @@ class Graph:
         self._outputs: list[onnx.ValueInfoProto] = []
         self._initializers: dict[str, onnx.TensorProto] = {}
         self._constants: dict[tuple, Value] = {}
-        # The nodes of the graph, then those of each nested body that is being made.
+        # The nodes of the graph, and of each nested body that is being made.
         self._bodies: list[list[onnx.NodeProto]] = [[]]
         self._names = 0
 
     def input(self, name: str, shape: Shape, default: np.ndarray | None = None) -> Value:
-        """A float32 input. Whoever runs the model may omit an input with a ``default``."""
+        """A float32 input. An input with a ``default`` may be left out when the model is run."""
         self._inputs.append(helper.make_tensor_value_info(name, FLOAT, shape))
         if default is not None:
             self._initializers[name] = numpy_helper.from_array(default.astype(np.float32), name)
@@ -100,17 +100,17 @@ class Graph:
         self._outputs.append(helper.make_tensor_value_info(name, FLOAT, shape))
 
     def node(self, kind: str, inputs: Sequence[Any], outputs: int, attributes: Mapping[str, Any]) -> Any:
-        """The value, or tuple of values, that a new node makes of ``inputs``; None leaves an optional one out."""
+        """The value, or tuple of values, that a new node makes of ``inputs``; None leaves an optional input out."""
         names = ["" if value is None else self._value(value).name for value in inputs]
         results = tuple(self._new(kind) for _ in range(outputs))
-        # Nodes need names: an optimizer of ONNX Runtime 1.21 reuses the names for nodes that it makes, and refuses
+        # Nodes need names, because an optimizer of ONNX Runtime 1.21 derives names of new nodes from them, and refuses
         # duplicates.
         outputs_of = [result.name for result in results]
         self._bodies[-1].append(helper.make_node(kind, names, outputs_of, f"node of {outputs_of[0]}", **attributes))
         return results[0] if outputs == 1 else results
 
     def include(self, model: onnx.ModelProto, prefix: str, value: Value) -> Value:
-        """The only output of a model whose only input is ``value``; ``prefix`` keeps its names apart."""
+        """Adds a model with one input, which gets ``value``, and returns its output. ``prefix`` precedes its names."""
         versions = {imported.domain: imported.version for imported in model.opset_import}
         assert versions == {"": OPSET} and not model.functions, f"of other operators: {versions}"
         graph = onnx.compose.add_prefix(model, prefix).graph
@@ -121,9 +121,9 @@ class Graph:
         return Value(self, graph.output[0].name)
 
     def body(self, make: Callable[..., Sequence[Value]], inputs: Mapping[str, tuple], shapes: Sequence[tuple]) -> Any:
-        """A graph inside the graph, which may read all that was made before it.
+        """A graph inside the graph, which may read all values that were made before.
 
-        ``make`` is called with its inputs and returns its outputs; both are described by (type, shape).
+        ``make`` is called with its inputs, and returns its outputs. ``inputs`` and ``shapes`` have their (type, shape).
         """
         given = [self._new(name) for name in inputs]
         self._bodies.append([])
@@ -138,10 +138,7 @@ class Graph:
         )
 
     def model(self, metadata: Mapping[str, str]) -> onnx.ModelProto:
-        """The checked model, with its producer, and ``metadata`` under names ``ngpt.*``.
-
-        It has no nodes and constants that no output depends on.
-        """
+        """The checked model, with ``metadata`` under names ``ngpt.*``, without unused nodes and constants."""
         (nodes,) = self._bodies
         graph = helper.make_graph(nodes, self.name, self._inputs, self._outputs)
         read = _drop_unused(graph)
@@ -158,7 +155,7 @@ class Graph:
         return Value(self, f"{kind}_{self._names}")
 
     def _value(self, value: Any) -> Value:
-        """The value itself, or a constant; equal constants are stored once."""
+        """The value itself, or the constant of a number or array. Equal constants are stored once."""
         if isinstance(value, Value):
             return value
         array = np.asarray(value, np.float32 if isinstance(value, float) else None)
@@ -182,8 +179,9 @@ def choose(condition: Value, then: Callable[[], Value], otherwise: Callable[[], 
 
 
 def repeat(most: int, step: Callable[[Value, Value], tuple[Value, Value | bool]], state: Value, shape: Shape) -> Value:
-    """The float32 ``state`` after at most this number of steps. ``step`` takes the number of the step, from 0, and the
-    state. It returns the next state, and whether to go on.
+    """The float32 ``state`` after at most this number of steps.
+
+    ``step`` takes the number of the step, from 0, and the state; it returns the next state, and whether to go on.
     """
     graph = state.graph
 

@@ -1,6 +1,6 @@
-"""One of our networks as ONNX: it reads the raw buffers of a renderer and returns the image.
+"""Exports networks as ONNX files that read the raw buffers of a renderer and return the image.
 
-CONTRACT.md is for those who run it.
+export/CONTRACT.md specifies the files.
 """
 
 import json
@@ -27,27 +27,27 @@ from ngpt.version import __version__
 
 
 def network_model(weights: str | Path, name: str, precision: str = "float32") -> onnx.ModelProto:
-    """The graph of the weights in that file; ``name`` is its name in the metadata.
+    """The graph of the weights in a file; ``name`` is its name in the metadata.
 
-    ``precision`` is the precision of all convolutions but the last; everything else is always float32. float16 is for
-    GPUs: ONNX Runtime's CPU provider computes it in float32, with conversions, which hides overflows and takes longer.
+    ``precision`` is the precision of all convolutions except for the last; everything else is always float32. float16
+    is for GPUs: on CPUs, ONNX Runtime computes in float32, with conversions, which hides overflows and takes longer.
 
     Raises NgptError for weights that cannot be read, and for networks whose base has no graph.
     """
     model, header = _load(weights)
-    tell = metadata(model, name, precision) | {"training": json.dumps(header.get("training", {}))}
-    return reconstruction(model.config, model.alignment, network_body(model, precision)).model(tell)
+    facts = metadata(model, name, precision) | {"training": json.dumps(header.get("training", {}))}
+    return reconstruction(model.config, model.alignment, network_body(model, precision)).model(facts)
 
 
 def statistics_model(weights: str | Path, name: str) -> onnx.ModelProto:
-    """The graph that computes the statistics that tiles of an image share, for the model of these weights."""
+    """The graph that computes the statistics for the tiles of an image, for the model of these weights."""
     model, _ = _load(weights)
-    tell = {"version": __version__, "method": name, "statistics": ", ".join(STATISTICS)}
-    return statistics(model.config).model(tell)
+    facts = {"version": __version__, "method": name, "statistics": ", ".join(STATISTICS)}
+    return statistics(model.config).model(facts)
 
 
 def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
-    """Facts that a host may need, by key; CONTRACT.md explains them."""
+    """Facts that a host may need, by the keys in export/CONTRACT.md."""
     seen, light = reach(model), REACH if "caustic_var" in layers(model.config) else 0
 
     def overlap(*pixels: int) -> str:
@@ -73,18 +73,17 @@ def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
 
 
 def _base_reach(model: Reconstructor) -> int:
-    """How far the control variates and the smoothing of their weights see, in pixels, rounded up to the alignment."""
+    """How far, in pixels, the base and the smoothing of its weights read, rounded up to the alignment."""
     return -(-(len(schedule()) + 2) // model.alignment) * model.alignment if model.config.base else 0
 
 
 def bytes_per_pixel(model: Reconstructor) -> int:
-    """The most memory in bytes that a run takes for each pixel, besides the image's layers; measured in
-    tests/network/test_run_onnx.py.
+    """An upper bound of the bytes that a run needs for each pixel, in addition to the image's layers.
 
-    The last convolution reads the longest list of tensors. They are in memory as the list, as one tensor, and about
-    once more. The channels are in memory six times, from raw layers to one tensor. The head holds the prediction in
-    three forms. The arena of ONNX Runtime allocates more than that, most where sizes are halved and doubled without
-    weights. ngpt-combine took 0.6 of its bound at 1280x720.
+    tests/network/test_run_onnx.py measures it. The last convolution reads the longest list of tensors. They are in
+    memory as the list, as one tensor, and about once more. The channels are in memory six times, from raw layers to one
+    tensor. The head holds the prediction in three forms. The arena of ONNX Runtime allocates more than that, most of
+    all if sizes are halved and doubled without weights. ngpt-combine took 0.6 of its bound at 1280x720.
     """
     listed = next(model.network.head.parameters()).shape[1]
     body = 3 * listed + 6 * features.channels(model.config.inputs)
@@ -109,7 +108,7 @@ def _load(weights: str | Path) -> tuple[Reconstructor, dict]:
 
 
 class _Half(torch.nn.Module):
-    """The network in float16; its head, which predicts logarithms, stays in float32."""
+    """The network in float16, with its last convolution, which predicts logarithms, in float32."""
 
     def __init__(self, network: torch.nn.Module):
         super().__init__()
@@ -121,7 +120,7 @@ class _Half(torch.nn.Module):
 
 
 def network_body(model: Reconstructor, precision: str = "float32") -> onnx.ModelProto:
-    """The network itself, from ``channels`` to ``prediction``, (N, C, H, W) of any aligned size."""
+    """The graph of only the network, from ``channels`` to ``prediction``, (N, C, H, W) of any aligned size."""
     inputs = features.channels(model.config.inputs)
     return convolutions(model.network, inputs, model.alignment, "channels", "prediction", precision)
 
@@ -129,20 +128,18 @@ def network_body(model: Reconstructor, precision: str = "float32") -> onnx.Model
 def convolutions(
     network: torch.nn.Module, inputs: int, alignment: int, given: str, made: str, precision: str = "float32"
 ) -> onnx.ModelProto:
-    """A network of ``ngpt.network.unet`` with this number of input channels; ``given`` and ``made`` name input and
-    output.
-    """
+    """The graph of a network of ``ngpt.network.unet``, with the input ``given`` and the output ``made``."""
     for module in network.modules():
         if isinstance(module, Convolution):
-            # Normalised here once, rather than in each run of the graph.
+            # Normalised once, and not in each run of the graph.
             weight = module.weight().detach()
             if precision == "float16" and module is not network.head.convolution:  # type: ignore[union-attr]
                 weight = weight.half()
             module.weight = partial(_same, weight)  # type: ignore[method-assign]
-    # Sizes other than 0 and 1, which the exporter takes for constants.
+    # No size is 0 or 1, which the exporter would take for constants.
     example = torch.zeros(2, inputs, 5 * alignment, 7 * alignment)
     tiles, rows, columns = (torch.export.Dim(name, min=2, max=1 << 16) for name in ("tiles", "r", "c"))
-    # The exporter would report that torchvision, which is not needed, is not installed.
+    # Otherwise the exporter would report that torchvision is not installed, which it does not need.
     logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -1,8 +1,8 @@
 """The least-squares screened Poisson reconstruction (``ngpt.classical.poisson.l2``) as one ONNX graph.
 
-The cosine transforms are matrix products with matrices made inside the graph from the size of its input, so one file
-serves every size. That costs O(H W (H + W)) instead of the O(H W log(H W)) of a fast transform. Matrix products run
-near the peak speed of a machine: up to 1920x1080 both are equally fast on two CPU cores (docs/lab/log).
+The cosine transforms are matrix products. The graph makes the matrices from the size of its input, so one file serves
+every size. They cost O(H W (H + W)) in place of the O(H W log(H W)) of a fast transform. But matrix products run near
+the peak speed of a machine: up to 1920x1080 both take the same time on two CPU cores (docs/lab/log).
 """
 
 import math
@@ -20,9 +20,9 @@ _IMAGE = (1, 3, "height", "width")
 def l2_model(alpha: float = DEFAULT_ALPHA) -> onnx.ModelProto:
     """The graph for one ``alpha`` > 0.
 
-    Inputs ``primal``, ``dx``, ``dy``: (1, 3, height, width) float32, scene-linear RGB, rows from the top, as the layers
-    of a gradient stack, ``primal`` without direct emission. Output ``image``: the same shape and units. All values must
-    be finite. Metadata: ``ngpt.version``, ``ngpt.method``, ``ngpt.alpha``, ``ngpt.gradient``.
+    The inputs ``primal``, ``dx`` and ``dy`` are layers of a gradient stack without direct emission: (1, 3, height,
+    width) float32, scene-linear RGB, rows from the top, with finite values. The output ``image`` has the same shape and
+    units. Metadata: ``ngpt.version``, ``ngpt.method``, ``ngpt.alpha``, ``ngpt.gradient``.
     """
     if not 0 < alpha < float("inf"):
         raise WrongUse(f"alpha {alpha}: must be a positive number; the default is {DEFAULT_ALPHA}")
@@ -40,7 +40,7 @@ def _correction(primal: Value, dx: Value, dy: Value, alpha: float) -> Value:
     coefficients = op.MatMul(op.MatMul(basis_y, right_hand_side), op.Transpose(basis_x, perm=[1, 0]))
     eigenvalues = op.Unsqueeze(eigenvalues_y, [1]) + op.Unsqueeze(eigenvalues_x, [0])
     solution = coefficients / (eigenvalues + alpha**2)
-    # The mean of a divergence is 0; its rounding error would be divided by only alpha squared.
+    # The mean of a divergence is 0. Its rounding error would be divided by alpha squared, which may be small.
     solution = op.Where(op.LessOrEqual(eigenvalues, 0.0), 0.0, solution)
     return op.MatMul(op.MatMul(op.Transpose(basis_y, perm=[1, 0]), solution), basis_x)
 
@@ -57,10 +57,10 @@ def _basis(size: Value) -> tuple[Value, Value]:
     count = op.Squeeze(size)
     k, n = op.Cast(op.Range(0, count, 1), to=FLOAT), op.Cast(count, to=FLOAT)
     frequency, place = op.Unsqueeze(k, [1]), op.Unsqueeze(k + 0.5, [0])
-    # Products of integers and halves are exact; reduced by whole turns before the division, large images keep digits.
+    # Products of integers and halves are exact. Whole turns are removed before the division, which would round.
     turn = n * 2.0
     angle = op.Mod(frequency * place, turn, fmod=1) / n * math.pi
     norm = op.Sqrt(op.Where(op.LessOrEqual(frequency, 0.0), 1.0, 2.0) / n)
-    # 2 - 2 cos(pi k / n) as 4 sin²(pi k / 2n), which does not cancel for small k.
+    # 2 - 2 cos(pi k / n) = 4 sin²(pi k / 2n), which has no cancellation for small k.
     sine = op.Sin(k / turn * math.pi)
     return norm * op.Cos(angle), sine * sine * 4.0

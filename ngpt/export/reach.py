@@ -1,9 +1,9 @@
-"""How far around a pixel a network has to see: the overlap of its tiles.
+"""Measures the overlap that the tiles of a network need.
 
-``Reconstructor.radius`` is how far it can see. For networks with kernels or sweeps at several resolutions, that can be
-twice the distance that makes any difference: light from the far end passes through every convolution, every coarse
-pixel and every sweep, each time with a small weight. Tiles that overlap by the whole radius take four times the memory.
-So the distance that matters is measured, on noise stronger than in images.
+``Reconstructor.radius`` is the distance from which a pixel can influence another. For networks with kernels or sweeps
+at several resolutions, it can be twice the distance that makes any difference: the farthest light passes through every
+convolution, every coarse pixel and every sweep, each time with a small weight. Tiles that overlap by the whole radius
+need four times the memory. So the distance that matters is measured, with noise that is stronger than in images.
 """
 
 import numpy as np
@@ -13,19 +13,20 @@ from torch import Tensor
 from ngpt.network import features, padding
 from ngpt.network.model import Reconstructor
 
-# Pixels farther away change an image by less than this share of its value, a tenth of the tolerance for tiles.
+# Pixels outside of the overlap change an image by less than this share of its value, a tenth of the tolerance for
+# tiles.
 TOLERANCE = 1e-6
-# The number of examples, and the side of the square in the middle of each that is compared.
+# The number of examples, and the side of the square in the middle of an example that is compared.
 EXAMPLES, MIDDLE = 3, 64
-# Pixels added to the distance that the examples need, because images differ; and the distance up to which it is not
-# measured.
+# Pixels that are added to the distance that the examples need, because images differ; and the radius up to which
+# nothing is measured.
 BESIDE, NEAR = 24, 48
 
 
 def reach(model: Reconstructor) -> int:
-    """The overlap in multiples of the alignment, in pixels: ``radius`` rounded up, or less if more makes no difference.
+    """The overlap in pixels, a multiple of the alignment: ``radius`` rounded up, or less if that is enough.
 
-    The result is the least distance that keeps every pixel of all examples within ``TOLERANCE``, plus ``BESIDE``.
+    It is enough if every pixel of all examples is within ``TOLERANCE``. ``BESIDE`` is added to the least such distance.
     """
     step = model.alignment
     whole = -(-model.radius // step)
@@ -37,7 +38,7 @@ def reach(model: Reconstructor) -> int:
 
 @torch.inference_mode()
 def _least(model: Reconstructor, whole: int, seed: int) -> int:
-    """The overlap that one example needs, as a number of alignments."""
+    """The overlap that one example needs, in units of the alignment."""
     step = model.alignment
     middle = -(-MIDDLE // step) * step
     scaled, _ = features.normalised(_example(model, middle + 2 * whole * step, seed))
@@ -63,7 +64,7 @@ def _least(model: Reconstructor, whole: int, seed: int) -> int:
 
 
 def _example(model: Reconstructor, side: int, seed: int) -> dict[str, Tensor]:
-    """Layers (1, C, side, side): rectangles of all brightnesses under noise, 1 % of it a hundred times stronger."""
+    """Layers (1, C, side, side): rectangles of all brightnesses with noise, which is a hundred times stronger in 1 %."""
     rng = np.random.default_rng(seed)
     image = np.ones((3, side, side))
     for _ in range(side):

@@ -1,4 +1,4 @@
-"""The network that blends frames as ONNX: ``inputs`` as in ``ngpt.sequence.network``, (1, C, H, W) of aligned sizes."""
+"""Exports the network that blends frames (``ngpt.sequence.network``) as ONNX, for (1, C, H, W) of aligned sizes."""
 
 import json
 from pathlib import Path
@@ -12,12 +12,12 @@ from ngpt.version import __version__
 
 
 def temporal_model(weights: str | Path) -> onnx.ModelProto:
-    """The graph for the weights of such a network; raises NgptError for other weights."""
+    """The graph for weights of such a network. Raises NgptError for other weights."""
     model, header = load(weights)
     proto = convolutions(model, len(INPUTS), model.alignment, "inputs", "corrections")
     proto.producer_name, proto.producer_version = "ngpt", __version__
     overlap = -(-model.radius // model.alignment) * model.alignment
-    told = {
+    metadata = {
         "version": __version__,
         "method": "temporal",
         "temporal inputs": ", ".join(INPUTS),
@@ -25,6 +25,6 @@ def temporal_model(weights: str | Path) -> onnx.ModelProto:
         "overlap": str(overlap),
         "training": json.dumps(header.get("training", {})),
     }
-    onnx.helper.set_model_props(proto, {f"ngpt.{key}": value for key, value in told.items()})
+    onnx.helper.set_model_props(proto, {f"ngpt.{key}": value for key, value in metadata.items()})
     onnx.checker.check_model(proto, full_check=True)
     return proto

@@ -1,4 +1,4 @@
-"""A small stack and a model's result for it, as files that any language can read, for authors of hosts."""
+"""Writes a small stack and a model's result for it to files that any language can read, to test hosts."""
 
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ def write_vector(model: onnx.ModelProto, folder: Path, overwrite: bool = False) 
 
 
 def quiet() -> Any:
-    """Options that keep the runtime from warning that inputs have defaults."""
+    """Options without warnings that inputs have defaults."""
     options = runtime().SessionOptions()
     options.log_severity_level = 3
     return options
@@ -31,8 +31,9 @@ def quiet() -> Any:
 def example_layers() -> dict[str, np.ndarray]:
     """Layers (1, C, height, width) of a noisy picture, the same on every machine.
 
-    A bright disk on a gradient, a lamp, its image in a mirror, and rare bright light that gradients do not contain;
-    with non-finite values in every kind of layer, in single pixels and in a hole of 7x7 pixels, and variances of -1.
+    The picture has a bright disk on a gradient, a lamp, its image in a mirror, and rare bright light that gradients
+    exclude. Every kind of layer has non-finite values in single pixels, the primal also in a hole of 7x7 pixels, and
+    some variances are -1.
     """
     width, height = SIZE
     rng = np.random.default_rng(7)
@@ -64,12 +65,12 @@ def example_layers() -> dict[str, np.ndarray]:
 
 
 def _light(layers: dict[str, np.ndarray], lamp: tuple, mirror: tuple) -> None:
-    """A lamp, and a mirror that shows it: in a mirror, features describe the reflected object."""
+    """Adds a lamp, and a mirror that shows it. In a mirror, features are those of the reflected object."""
     direct = layers["direct"] = np.zeros_like(layers["primal"])
     direct[lamp] = np.reshape([60.0, 50.0, 35.0], (3, 1, 1))
     direct[mirror][:, 1:4, 2:8] = 0.9 * direct[lamp]
     layers["primal"] += direct
-    # In a pixel at the border of a lamp, only some samples hit the lamp: its variance is larger.
+    # At the border of a lamp, only some samples of a pixel hit it, so its variance is larger.
     layers["primal_var"] += (0.3 * direct) ** 2
     layers["albedo"][mirror], layers["depth"][mirror] = 0.7, 6.0
     layers["normal"][mirror] = np.reshape([0.0, -1.0, 0.0], (3, 1, 1))

@@ -1,4 +1,4 @@
-"""Weights in 16 bits: the repository's files, with their training curve, and the files that OIDN reads."""
+"""Writes weights in 16 bits: files for the repository, with the curve of the training, and files for OIDN."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ POINTS = 100
 
 
 def write_halves(files: Sequence[str | Path], path: str | Path, overwrite: bool = False) -> None:
-    """Writes weights, or the mean of several, to ``path`` in 16 bits; see ``mean``.
+    """Writes weights, or the ``mean`` of several files, to ``path`` in 16 bits.
 
     Raises NgptError for files that hold no weights, and for numbers that 16 bits cannot hold.
     """
@@ -37,10 +37,9 @@ def write_halves(files: Sequence[str | Path], path: str | Path, overwrite: bool 
 def mean(files: Sequence[str | Path]) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The mean of the weights in several files, and a header; a file that is named twice counts twice.
 
-    The mean of a network before and after tuning forgets less than the tuned network does [Wortsman et al. 2022,
-    "Robust fine-tuning of zero-shot models"]. The header is the first file's, with the training of each file. Raises
-    NgptError if a file does not hold weights of a network for single images, or holds another network than the first
-    file.
+    The mean of a network before and after tuning forgets less than the tuned network [Wortsman et al. 2022, "Robust
+    fine-tuning of zero-shot models"]. The header is that of the first file, with the records of all trainings. Raises
+    NgptError if a file holds no network for single images, or another network than the first file.
     """
     models, headers = zip(*map(load_weights, files), strict=True)
     for file, model in zip(files, models, strict=True):
@@ -57,7 +56,7 @@ def mean(files: Sequence[str | Path]) -> tuple[dict[str, Tensor], dict[str, Any]
 
 
 def curve(entries: list[dict[str, float]], last: int) -> dict[str, list[Any]]:
-    """Losses until step ``last``, each the mean over the steps since the previous entry."""
+    """At most ``POINTS`` losses until step ``last``, each the mean over the steps since the previous one."""
     logged = [(entry["step"], entry["loss"]) for entry in entries if "loss" in entry and entry["step"] <= last]
     parts = [part for part in np.array_split(np.array(logged).reshape(-1, 2), POINTS) if len(part)]
     return {
@@ -67,9 +66,9 @@ def curve(entries: list[dict[str, float]], last: int) -> dict[str, list[Any]]:
 
 
 def oidn_weights(weights: str | Path) -> bytes:
-    """The .tza file of weights that `ngpt train` wrote.
+    """The contents of a .tza file with the weights of a file of `ngpt train`.
 
-    Raises NgptError for networks of a shape other than OIDN's, and for numbers beyond 16-bit floats.
+    Raises NgptError for networks that do not have OIDN's shape, and for numbers that 16 bits cannot hold.
     """
     model, _ = load_weights(weights)
     if model.config.network != "oidn":

@@ -7,12 +7,13 @@ import numpy as np
 
 
 def summary(values: list[float]) -> dict[str, float]:
+    """The median, and the quartiles "low" and "high"."""
     low, median, high = statistics.quantiles(values, n=4, method="inclusive") if len(values) > 1 else values * 3
     return {"median": median, "low": low, "high": high}
 
 
 def median(values: Iterable[float | None]) -> float | None:
-    """The median of the known values; None if there are none."""
+    """The median of the values that are not None; None without any."""
     known = [value for value in values if value is not None]
     return float(np.median(known)) if known else None
 

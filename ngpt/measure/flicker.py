@@ -1,4 +1,4 @@
-"""Flicker: how much the error of a shot changes from frame to frame."""
+"""Flicker: the change of a shot's error from frame to frame."""
 
 from collections.abc import Sequence
 
@@ -14,10 +14,10 @@ def flicker_maps(
 ) -> list[np.ndarray]:
     """Maps (H, W, 3) of (d - d_r)² / (m + 1e-3), one for each frame but the first. Unknown values are NaN.
 
-    d = x_t(p) - x_{t-1}(p + motion) is the change of the images x along the motion, d_r the same change of the
-    references r, m the mean of r² in both frames. ``motions`` (H, W, 2) has one entry for each frame; the first entry
-    is not used. None and NaN mean unknown motion. Changes that the reference shows too, such as a moving shadow or a
-    reflection, are not flicker. Raises NgptError for lists of different lengths, or fewer than two frames.
+    d = x_t(p) - x_{t-1}(p + motion) is the change of the images x along the motion, d_r is the same change of the
+    references r, and m is the mean of r² in both frames. ``motions`` has an entry (H, W, 2) for each frame; the first
+    one is not used. None and NaN mean unknown motion. Changes that the reference has, too, are not flicker, such as a
+    moving shadow or a reflection. Raises NgptError for lists of different lengths, or of fewer than two frames.
     """
     if not len(images) == len(references) == len(motions) or len(images) < 2:
         raise NgptError(
@@ -51,7 +51,7 @@ def _changes(
             maps.append(np.full(value.shape, np.nan))
             continue
         before, found = warped(last, motion)
-        # The mean of both frames: a pixel that goes from a lamp to the dark should not count like thousands of others.
+        # The mean of both frames, because a pixel that changes from a lamp to the dark should not dominate all others.
         level = (square + warped(square_before, motion)[0]) / 2
         relative = np.square(value - before) / (level + EPSILON)
         maps.append(np.where(found[..., None], relative, np.nan))
@@ -63,7 +63,7 @@ def flicker(
 ) -> float:
     """The mean of ``flicker_maps`` over frames and known pixels, without the worst 0.1 % of each frame.
 
-    It is 0 for a shot whose error moves with the surfaces, and twice the mean relMSE if the errors of successive frames
+    It is 0 if the error of a shot moves with the surfaces, and twice the mean relMSE if the errors of successive frames
     are independent. NaN if no pixel is known.
     """
     values = []

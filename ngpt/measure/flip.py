@@ -13,8 +13,8 @@ from ngpt.system.forks import in_children
 def flip(image: np.ndarray, reference: np.ndarray) -> tuple[float, np.ndarray]:
     """Mean HDR-FLIP in [0, 1] and its map (H, W) [Andersson et al. 2021, "Visualizing errors in rendered HDR images"].
 
-    In each pixel it is the largest LDR-FLIP over several exposures, at 67 pixels per degree. ``flip_exposures`` derives
-    the exposures from the reference, so all images of a scene are judged at the same ones.
+    In each pixel it is the largest LDR-FLIP over several exposures, at 67 pixels per degree. The exposures depend only
+    on the reference (``flip_exposures``), so they are the same for all images of a scene.
     """
     check_size(image, reference)
     import flip_evaluator
@@ -30,8 +30,8 @@ def flip(image: np.ndarray, reference: np.ndarray) -> tuple[float, np.ndarray]:
 def flip_exposures(reference: np.ndarray) -> tuple[float, float, int]:
     """(first, last, number) of HDR-FLIP's exposures in stops, which depend only on the reference.
 
-    They range over the exposures at which the brightest and the median luminance reach 0.85 under the ACES curve, one
-    for each stop [section 4.3].
+    At the first exposure the ACES curve maps the brightest luminance to 0.85, and at the last one the median luminance;
+    there is one exposure for each stop [section 4.3].
     """
     luminance = np.maximum(reference, 0).astype(np.float64) @ np.array([0.2126, 0.7152, 0.0722])
     lit = luminance[luminance > 0]
@@ -47,7 +47,7 @@ def flip_exposures(reference: np.ndarray) -> tuple[float, float, int]:
 
 
 def _one_thread() -> None:
-    """Sets the package's own OpenMP to one thread: a forked child would wait forever for its parent's threads."""
+    """Sets the package's OpenMP to one thread: a forked child would wait forever for the threads of its parent."""
     import flip_evaluator
 
     for library in Path(f"{Path(flip_evaluator.__file__).parent}.libs").glob("libgomp*"):

@@ -1,14 +1,14 @@
-"""Error of an image against a reference, and the registry of all metrics.
+"""Errors of an image relative to a reference, and the registry of all metrics.
 
 x is the image, scene-linear (H, W, 3). The reference is one image r, or two independent halves a and b: renders of the
-same scene with seeds of their own. Means run over pixels and channels. Pixels that are not finite in any of the images
-are left out and counted, since one of them would hide all others.
+same scene with different seeds. Means are over pixels and channels. Pixels that are not finite in one of the images are
+left out and counted, because otherwise one of them would make the whole mean NaN.
 
-A reference has noise. With one image r = t + n, t the truth, the mean of (x - r)² is the mean of (x - t)² plus the mean
-of n². With two halves the square becomes the product (x - a)(x - b). The noises of a and b are independent with mean
-zero, so the expectation of the product is (x - t)², whatever the noise. The product in a pixel, and even a mean, may be
-negative if the image is nearer to the truth than the reference can resolve. Denominators use the mean m = (a + b) / 2,
-whose noise is not corrected for: a relative variance v of m adds about 6 v² to relMSE, and 4 v times a relative bias of
+A reference has noise. With one image r = t + n, where t is the truth, the mean of (x - r)² is the mean of (x - t)² plus
+the mean of n². With two halves, the square becomes the product (x - a)(x - b). The noise of a and b is independent and
+has mean zero, so the expectation of the product is (x - t)², whatever the noise. The product in a pixel, and even a
+mean, may be negative if the image is closer to the truth than the reference. Denominators use the mean m = (a + b) / 2.
+Its noise is not corrected for: a relative variance v of m adds about 6 v² to relMSE, and 4 v times a relative bias of
 the image.
 """
 
@@ -24,7 +24,7 @@ from ngpt.measure import flip, perceptual
 from ngpt.measure.images import check_size, middle, reinhard
 from ngpt.system.parts import Registry
 
-# Published relMSE values differ in this constant; ours is used in gradient-domain VCM and photon mapping.
+# Publications use different constants for relMSE; this one is from gradient-domain VCM and photon mapping.
 EPSILON = 1e-3
 
 
@@ -44,17 +44,16 @@ def relmse(image: np.ndarray, *halves: np.ndarray) -> float:
 
 
 def relmse_trimmed(image: np.ndarray, *halves: np.ndarray, share: float = 0.001) -> float:
-    """relMSE without the worst 0.1 % of the pixels (by channel mean), which fireflies would otherwise decide.
+    """relMSE without the worst 0.1 % of the pixels, by the mean over channels, so that fireflies do not dominate.
 
-    With two halves the worst have the largest (x - m)² / (m² + 1e-3), whatever the sign of their product.
+    With two halves, the worst pixels have the largest (x - m)² / (m² + 1e-3).
     """
     errors, sizes = (relative_squared_error(image, *r) for r in (halves, (middle(halves),)))
     return trimmed_mean(errors, sizes, share)
 
 
 def trimmed_mean(values: np.ndarray, sizes: np.ndarray, share: float) -> float:
-    """The mean of ``values`` (H, W, 3) without the ``share`` of pixels that have the largest channel mean of
-    ``sizes``."""
+    """The mean of ``values`` (H, W, 3), without the ``share`` of pixels with the largest ``sizes`` (H, W, 3)."""
     order = np.argsort(sizes.mean(axis=-1), axis=None)
     return float(values.mean(axis=-1).ravel()[order[: order.size - int(share * order.size)]].mean())
 
@@ -77,8 +76,8 @@ def mse(image: np.ndarray, *halves: np.ndarray) -> float:
 def psnr_reinhard(image: np.ndarray, *halves: np.ndarray) -> float:
     """Peak signal-to-noise ratio in dB: -10 log10 of the MSE of x' = x / (1 + x); infinite if the MSE is not positive.
 
-    Noise shifts the mean of a tone-mapped half in proportion to its variance and to the curve's second derivative. Two
-    halves do not remove this small bias.
+    Noise changes the mean of a tone-mapped half, in proportion to its variance and to the second derivative of the
+    curve. Two halves do not remove this small bias.
     """
     error = mse(reinhard(image), *map(reinhard, halves))
     return float("inf") if error <= 0 else float(-10 * np.log10(error))
@@ -103,9 +102,9 @@ class Metric:
     ``better``    "lower" or "higher"
     ``function``  (x, r, **options) -> float; a ``squared`` metric also takes (x, a, b)
     ``squared``   the metric is a mean of squares (x - r)², so that two halves remove the noise of the reference
-    ``whole``     the metric reads neighbourhoods: it gets whole images, in which 0 replaces values that are not finite;
+    ``whole``     the metric reads neighbourhoods: it gets whole images, with 0 in place of values that are not finite;
                   other metrics get only the finite pixels
-    ``missing``   (**options) -> why it cannot be computed here, "" if it can; None: it needs only NumPy
+    ``missing``   (**options) -> why it cannot be computed here, "" if it can; None if it needs only NumPy
     """
 
     formula: str
@@ -148,7 +147,7 @@ _OURS = {
         missing=perceptual.elpips_lack,
     ),
 }
-# Other packages register theirs by entry points.
+# Other packages register metrics by entry points.
 METRICS = Registry("ngpt.metrics", "metric", Metric, _OURS)
 
 
@@ -165,7 +164,7 @@ def scores(
     finite = _finite(image, *halves)
     if not finite.any():
         raise NgptError(f"none of {finite.size} pixels is finite in {'both' if len(halves) == 1 else 'all'} images")
-    # Double precision holds squares of 1e12, and means of millions of pixels are accurate enough.
+    # In double precision, squares of 1e12 are finite, and means of millions of pixels are accurate.
     x, *parts = (i[finite][None].astype(np.float64) for i in (image, *halves))
     values = {}
     for name in names:
@@ -197,8 +196,8 @@ def _finite(*images: np.ndarray) -> np.ndarray:
 def exposure_mismatch(image: np.ndarray, reference: np.ndarray) -> float:
     """How many stops the image is brighter than its reference: log2 of the ratio of their mean radiance.
 
-    Values of each image are clamped to its 99.9 % quantile. Reconstruction changes the ratio by a fraction of a stop; a
-    larger value means that the reference has another exposure, camera or scene. 0 if either image is black.
+    Values are clamped to the 99.9 % quantile of their image. A reconstruction changes the ratio by a fraction of a
+    stop. A larger value means that the reference has another exposure, camera or scene. 0 if an image is black.
     """
     sums = []
     for values in (image[np.isfinite(image)], reference[np.isfinite(reference)]):

@@ -1,4 +1,4 @@
-"""Perceptual metrics. Each needs an optional package or weights; ``lack`` and ``elpips_lack`` say which.
+"""Perceptual metrics, which need optional packages or weights (``lack``, ``elpips_lack``).
 
 x is the image and r the reference, scene-linear (H, W, 3), finite; values below 0 count as 0.
 """
@@ -14,12 +14,12 @@ from ngpt.measure.images import check_size, reinhard
 from ngpt.system.forks import in_children
 from ngpt.system.install import install_command
 
-# The number of random transforms of E-LPIPS; the standard error of the mean is then a few per cent.
+# The number of random transforms of E-LPIPS, with which the standard error of the mean is a few per cent.
 _DRAWS = 16
 
 
 def lack(name: str, module: str, package: str, extra: str = "peers") -> str:
-    """Why metric ``name``, which imports ``module`` of ``package``, cannot be computed here; "" if it can."""
+    """Why the metric ``name``, which needs ``module`` of ``package``, cannot be computed here; "" if it can."""
     return "" if find_spec(module) else f"{name} needs {package}: {install_command(extra)}"
 
 

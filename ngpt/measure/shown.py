@@ -1,4 +1,4 @@
-"""The metrics that a page shows beside its pictures, and maps of SSIM and FLIP."""
+"""The metrics that a page shows with its pictures, and maps of SSIM and FLIP."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ _WITH_MAP = {"SSIM": perceptual.ssim, "FLIP": flip}
 def available(height: int, width: int) -> tuple[list[str], dict[str, str]]:
     """(available, unavailable) metrics for images of this size, from SHOWN and from other packages.
 
-    ``unavailable`` maps each name to one line that says why.
+    The second is a dict from names to reasons, in one line each.
     """
     names = (*SHOWN, *METRICS.load())
     lacks = {name: missing() for name in names if (missing := METRICS[name].missing)}
@@ -25,7 +25,7 @@ def available(height: int, width: int) -> tuple[list[str], dict[str, str]]:
 def judge(names: list[str], image: np.ndarray, reference: np.ndarray) -> tuple[dict[str, float], dict[str, np.ndarray]]:
     """Metrics of (H, W, 3) images by name, and maps (H, W) of FLIP and SSIM: 0 where equal, 1 where most different.
 
-    Pixels that are not finite and errors are handled as in :func:`ngpt.measure.metrics.scores`.
+    Pixels that are not finite are treated as in ``ngpt.measure.metrics.scores``, which also raises the same errors.
     """
     values = scores([name for name in names if name not in _WITH_MAP], image, reference)
     maps = {}

@@ -11,7 +11,7 @@ from ngpt.network import features, padding
 from ngpt.network.config import ModelConfig
 from ngpt.network.transfer import signed_exp, signed_log
 
-# For ``quiet``: the side, in pixels, of the window over which variances are averaged (variances of single pixels are too
+# For ``quiet``: the side, in pixels, of the window over which variances are averaged (those of single pixels are too
 # noisy); a number that is added to radiance before noise is divided by it; a large number with a finite square.
 WINDOW, DARK, HUGE = 15, 0.01, 1e15
 

@@ -1,4 +1,4 @@
-"""How much history counts: the rules whose equations are in ``ngpt.sequence.history``."""
+"""The weight of history by the rules whose equations are in ``ngpt.sequence.history``."""
 
 from dataclasses import dataclass
 
@@ -8,26 +8,26 @@ from ngpt.system.late import ndimage
 
 # The standard deviation, in pixels, of the Gaussian window of the evidence.
 WINDOW = 4.0
-# The standard deviation of b around the b of the variances without any evidence.
+# The standard deviation of b around the b of the variances, without any evidence.
 DOUBT = 0.12
-# ALBEDO, NORMAL and DEPTH are differences of features, beyond the allowed ones, at which history counts
-# exp(-1) = 0.37. MIXED scales the allowed difference: if two surfaces share a pixel in parts u and 1 - u, its features
-# have a standard deviation of sqrt(u (1 - u) / spp) times the difference of both surfaces.
-MIXED = 1.0
-# A pixel's history counts less if its change is more than this many times the change around it.
-UNUSUAL = 15.0
+# Differences of features beyond the allowed difference, at which history has exp(-1) = 0.37 of its weight.
 ALBEDO, NORMAL, DEPTH = 0.1, 0.2, 0.03
+# The scale of the allowed difference. If two surfaces share a pixel in parts u and 1 - u, its features have a standard
+# deviation of sqrt(u (1 - u) / spp) times the difference of both surfaces.
+MIXED = 1.0
+# History has less weight in a pixel whose change is more than this number of times the change around it.
+UNUSUAL = 15.0
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """The evidence about a frame's history, and the result of the rules; arrays (H, W), the first two (H, W, 3).
+    """The evidence about the history of a frame, and the result of the rules. Symbols are as in ``history``.
 
-    ``noise``   the variance of the primal around each pixel, positive
-    ``rest``    primal - x, clamped to 4 standard deviations of that noise
-    ``best``    b*, the b of least squared error by this frame's primal; 0 where h is x
-    ``weight``  the weight of b* in its mean with the b of the variances, 0 to 1
-    ``share``   the resulting b, from 0 to the b of the variances
+    ``noise``   (H, W, 3), the variance of the primal around each pixel, positive
+    ``rest``    (H, W, 3), primal - x, clamped to 4 standard deviations of that noise
+    ``best``    (H, W), b*; 0 where h = x
+    ``weight``  (H, W), the weight of b* in its mean with the b of the variances, 0 to 1
+    ``share``   (H, W), the resulting b, from 0 to the b of the variances
     """
 
     noise: np.ndarray
@@ -38,7 +38,7 @@ class Evidence:
 
 
 def agreement(now: dict[str, np.ndarray], then: dict[str, np.ndarray], found: np.ndarray) -> np.ndarray:
-    """How well the features ``then`` agree with the features of each pixel now, (H, W) from 0 to 1."""
+    """How well the features ``then`` agree with the features ``now``, (H, W) from 0 to 1."""
     strange = np.zeros(found.shape)
     for name, scale in (("albedo", ALBEDO), ("normal", NORMAL), ("depth", DEPTH)):
         if name not in then:
@@ -46,7 +46,7 @@ def agreement(now: dict[str, np.ndarray], then: dict[str, np.ndarray], found: np
         here, there = now[name], then[name]
         if name == "depth":
             here, there = (np.log(np.maximum(layer, 1e-6)) for layer in (here, there))
-            # A camera that comes nearer changes all depths by similar factors; the median removes them.
+            # If the camera comes nearer, all depths change by similar factors, which the median removes.
             there = there + (np.median((here - there)[found]) if found.any() else 0)
         low, high = ndimage.minimum_filter(here, (3, 3, 1)), ndimage.maximum_filter(here, (3, 3, 1))
         allowed = MIXED * np.sqrt((here - low) * (high - here))
@@ -58,10 +58,11 @@ def agreement(now: dict[str, np.ndarray], then: dict[str, np.ndarray], found: np
 def weighed(
     x: np.ndarray, h: np.ndarray, p: np.ndarray, variance: np.ndarray | None, trust: np.ndarray, first: np.ndarray
 ) -> Evidence:
-    """The evidence of this frame's primal p on x and h (H, W, 3); ``trust`` (H, W) is the agreement of features.
+    """The evidence for x, h and this frame's primal p, (H, W, 3) each.
 
-    ``variance`` (H, W, 3) is the variance of p: NaN where it is unknown, None if it is unknown everywhere. ``first``
-    (H, W) is the b of the variances.
+    ``variance``  (H, W, 3), the variance of p: NaN where it is unknown, None if it is unknown everywhere
+    ``trust``     (H, W), the ``agreement`` of features
+    ``first``     (H, W), the b of the variances
     """
     rest, change = p - x, h - x
     if variance is None:
@@ -85,9 +86,9 @@ def weighed(
 
 
 def _usual(change: np.ndarray, trust: np.ndarray) -> np.ndarray:
-    """1 where the change of a pixel is usual for its surroundings, less where it is much larger, as at edges.
+    """1 where the change of a pixel is usual for its surroundings; less where it is much larger, as at edges.
 
-    The change of the surroundings is a geometric mean, which single pixels hardly influence.
+    The change of the surroundings is a geometric mean, on which single pixels have little influence.
     """
     tiny = 1e-6 * change.mean() + 1e-30
     around = _mean(trust * np.log(change + tiny)) / np.maximum(_mean(trust), 1e-6)
@@ -95,7 +96,7 @@ def _usual(change: np.ndarray, trust: np.ndarray) -> np.ndarray:
 
 
 def _noise(variance: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """The variance of the primal around each pixel, (H, W, 3), positive; where unknown, from squares of ``rest``."""
+    """The variance of the primal around each pixel, (H, W, 3), positive; estimated from ``rest`` where unknown."""
     known = np.isfinite(variance)
     filled = np.where(known, variance, np.square(rest))
     smooth = ndimage.gaussian_filter(filled.astype(np.float64), (2, 2, 0), mode="nearest")
@@ -105,8 +106,9 @@ def _noise(variance: np.ndarray, rest: np.ndarray) -> np.ndarray:
 def _kept(rest: np.ndarray, noise: np.ndarray, trust: np.ndarray) -> float:
     """d: the share of its own noise that a method leaves in a pixel, from 0 (smooth) to 1 (the noisy image itself).
 
-    For a projection, E (p - x)² = σ² (1 - d), and more where x is biased, so this estimate is a lower bound. It is the
-    median over pixels where history counts: elsewhere, as on newly visible surfaces, a method may leave other noise.
+    For a projection, E (p - x)² = σ² (1 - d). It is more if x is biased, so this estimate of d is a lower bound. It is
+    the median over pixels where history has weight: elsewhere, as on newly visible surfaces, a method may leave another
+    share.
     """
     ratio = _mean((np.square(rest) / noise).mean(axis=-1))
     trusted = ratio[trust > 0.5]

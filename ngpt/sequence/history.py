@@ -4,8 +4,8 @@
 
 The weight b of history depends on
 
-    features      no history where albedo, normal and depth of the last frame differ from this pixel's: a newly visible
-                  surface takes nothing from the surface that hid it
+    features      where albedo, normal and depth of the last frame differ from those of this pixel, history has no
+                  weight. So a newly visible surface gets nothing from the surface that hid it
     variances     with r the variance of h over the variance of x: b = 1 / (1 + r), and y has the relative variance
                   (1 - b)² + b² r. So the first n frames of a shot at rest are averaged, up to ``LONGEST`` of them, and
                   fewer of a fast shot
@@ -13,16 +13,15 @@ The weight b of history depends on
 
                       b* = [Σ w (h - x)(p - x) + k] / Σ w (h - x)²,    k = d Σ w σ²
 
-                  is the b of least squared error of y against the truth, where d is the share of a pixel's noise that
+                  is the b with the least squared error of y against the truth. d is the share of a pixel's noise that
                   the method leaves in it. Errors that h and x share, mainly blur, cancel. b* has a variance of its own.
-                  The b of the variances and b* are averaged with their inverse variances as weights. Where lighting or
-                  reflections change, b* falls; it reaches 0 for fast changes
-
-    change        less history where h - x is much larger than around the pixel, as at edges
+                  The b of the variances and b* are averaged, with their inverse variances as weights. Where lighting or
+                  reflections change, b* falls; for fast changes it is 0
+    change        history has less weight where h - x is much larger than around the pixel, as at edges
 
 b* is the minimum of Stein's unbiased risk over the line from x to h [Rousselle et al. 2013, "Robust denoising using
-feature and color information"]. These are the rules (``ngpt.sequence.evidence``). A network, which sees more than they
-do, corrects b (``ngpt.sequence.network``). Where direct emission is known, only the other light is blended.
+feature and color information"]. These are the rules (``ngpt.sequence.evidence``). A network, which reads more data,
+corrects their b (``ngpt.sequence.network``). Where direct emission is known, only the other light is blended.
 """
 
 from dataclasses import dataclass, replace
@@ -39,20 +38,20 @@ from ngpt.sequence.warp import warped
 from ngpt.stack import GradientStack
 from ngpt.windows import Place
 
-# The most frames that history may count for: slow changes, which the evidence does not see, lag by at most this number.
+# The largest number of frames that history may count for. Slow changes, which the evidence does not detect, lag by at
+# most this number of frames.
 LONGEST = 16
-# Motion in image widths per frame at which history counts for half as many frames: surfaces look different from another
-# viewpoint.
+# The motion, in image widths per frame, at which history counts for half as many frames, because surfaces look
+# different from another viewpoint.
 FAST = 0.005
-# A mean weight of history below this counts as none, since it would be shown as 0 %.
+# A mean weight of history below this counts as 0, because it would be shown as 0 %.
 NOTHING = 0.005
 NO_MOTION = "no layer 'motion'"
 
 
 @dataclass(frozen=True)
 class _History:
-    """The data that a frame passes on to the next: the result without direct emission, the direct emission, the
-    relative variance, the features, its place, and the frame's number."""
+    """The data that a frame passes on to the next: its result without direct emission, and the variance of that."""
 
     light: np.ndarray
     direct: np.ndarray
@@ -65,8 +64,8 @@ class _History:
 class Temporal:
     """Blends the frames of a shot, in their order, one after the other.
 
-    ``corrections``  corrections of the rules by a network (``ngpt.sequence.network``): by default the one that comes
-                     with ngpt, if ONNX Runtime is installed; None for only the rules
+    ``corrections``  the network that corrects the rules (``ngpt.sequence.network``). The default is the network that
+                     comes with ngpt, if ONNX Runtime is installed; None: the rules without a network
     """
 
     def __init__(self, corrections: Corrections | Literal["shipped"] | None = "shipped") -> None:
@@ -74,7 +73,7 @@ class Temporal:
         self._history: _History | None = None
         self.blend: Blend | None = None  # the inputs of the last frame's blend; None for a restart
         self.weight = np.zeros((1, 1), np.float32)  # b of the last frame, (H, W)
-        self.reason = ""  # why history did not count in the last frame; "" if it did
+        self.reason = ""  # why history had no weight in the last frame; "" if it had
 
     @property
     def share(self) -> float:
@@ -82,13 +81,14 @@ class Temporal:
         return float(self.weight.mean())
 
     def next(self, stack: GradientStack, image: np.ndarray, previous: np.ndarray | None = None) -> np.ndarray:
-        """The next frame's result, (H, W, 3) float32: ``image``, its result by any method, blended with history.
+        """The blended result of the next frame, (H, W, 3) float32. ``image`` is its result by any method.
 
-        It is ``image`` itself for a first frame, and after a cut. There is a cut if the stack has no layer ``motion``,
-        is a picture of another size, or names another frame before it (``ngpt:previousFrame``). Frames may be parts
-        of a picture that move and change their size: history is looked up at their place in it. ``previous`` (H, W, 3)
-        is the last frame's result, if it is another one than this method returned. It may also be given for a first
-        frame; the features of the frame before are then unknown.
+        For a first frame and after a cut, it is ``image`` itself. There is a cut if the stack has no layer ``motion``,
+        is a picture of another size, or names another frame before it (``ngpt:previousFrame``). Frames may be parts of
+        a picture that move and change their size: history is looked up at their place in the picture.
+
+        ``previous`` (H, W, 3) takes the place of the last result that this method has returned. It may be given for a
+        first frame, too; then the features of the frame before are unknown.
         """
         power = magnitude(stack)
         data = repair(scaled(stack, power), gradients=False)
@@ -132,29 +132,29 @@ class Temporal:
             relative = (np.square(1 - b) + np.square(b) * spread).astype(np.float32)
             self.weight = b
             self.reason = _doubt(b, found, trust)
-            # Features have noise as well. They are blended with the same weights, so they still match the light.
+            # Features have noise, too. They are blended with the same weights, so that they still match the light.
             features = features | {name: features[name] + b[..., None] * (then[name] - features[name]) for name in then}
-        # Stored in the units of the stack, since the next stack may have another magnitude.
+        # Stored in the units of the stack, because the next stack may have another magnitude.
         light, direct = enlarged(now, power), enlarged(data.direct, power)
         self._history = _History(light, direct, relative, features, stack.place, frame)
-        # History keeps light outside of the coverage: pixels that are empty by chance may have light in the next frame.
+        # History keeps light of pixels that are empty: by chance, they may have light in the next frame.
         return kept_within(enlarged((now + data.direct).astype(np.float32), power), stack)
 
     def assume(self, variance: float) -> None:
-        """Sets the variance of the last result relative to one frame's: that of a mean of 1 / ``variance`` frames."""
+        """Sets the variance of the last result, relative to the variance of one frame."""
         if self._history is not None:
             self._history = replace(self._history, variance=np.full_like(self._history.variance, variance))
 
 
 def _shift(stack: GradientStack, before: _History) -> tuple[int, int] | None:
-    """The position of the stack's first pixel in the last frame; None unless that is the one its motion leads to."""
+    """The position of the stack's first pixel in the last frame; None at a cut."""
     previous = stack.number("ngpt:previousFrame")
     follows = previous is None or before.frame is None or previous == before.frame
     return stack.place.shift_in(before.place) if follows and "motion" in stack else None
 
 
 def _cut(stack: GradientStack, before: _History) -> str:
-    """Why the last frame is not the one that the stack's motion leads to."""
+    """Why there is a cut between the last frame and the stack."""
     if "motion" not in stack:
         return NO_MOTION
     previous = stack.number("ngpt:previousFrame")
@@ -164,9 +164,9 @@ def _cut(stack: GradientStack, before: _History) -> str:
 
 
 def _doubt(weight: np.ndarray, found: np.ndarray, trust: np.ndarray) -> str:
-    """Why history does not count, if the mean of ``weight`` is about 0; else "".
+    """Why history has no weight, if the mean of ``weight`` is about 0; else "".
 
-    ``found``  where motion leads into the last frame; ``trust``  how well features agree
+    ``found`` says where motion leads into the last frame, and ``trust`` how well the features agree.
     """
     if weight.mean() >= NOTHING:
         return ""

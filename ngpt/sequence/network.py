@@ -1,13 +1,13 @@
-"""A network that weights history at each scale of the difference between history and this frame's result.
+"""A network that weights history separately at each scale of the difference between history and this frame's result.
 
     y = x + t Σ_s b_s D_s,        b_s = min(MOST sigmoid(logit(b / t MOST) + C tanh(c_s / C)), f)
 
-D_s are the bands of h - x, fine to coarse, which add up to h - x. b and t are share and trust of the rules, f is the b
-of the variances (``ngpt.sequence.evidence``), and c_s is the output of the network for ``Blend.inputs``. If c_s = 0, y
-is the result of the rules. The network corrects the rules by at most C: so clear evidence, as after a change of all
-light, still decides. Changes of light have coarse scales, and moving reflections fine ones; noise that is left in x has
-both. Whatever the network says, y is between x and h at each scale, and a surface that comes into sight
-takes nothing from what hid it. The network was trained on frames of moving shots, with histories that it made itself
+D_s are the bands of h - x, fine to coarse, whose sum is h - x. b and t are share and trust of the rules, f is the b of
+the variances (``ngpt.sequence.evidence``), and c_s is the output of the network for ``Blend.inputs``. If c_s = 0, y is
+the result of the rules. The network corrects the rules by at most C, so clear evidence still decides, as after a change
+of all light. Changes of light have coarse scales, moving reflections have fine ones, and noise that is left in x has
+both. Whatever the network predicts, y is between x and h at each scale, and a newly visible surface gets nothing from
+the surface that hid it. The network was trained on frames of moving shots, with histories that it made itself
 (``ngpt.training.temporal``).
 """
 
@@ -34,8 +34,8 @@ Corrections = Callable[[np.ndarray], np.ndarray]
 # Standard deviations, in pixels, of the windows that separate the bands.
 SCALES = (1.5, 5.0)
 BANDS = len(SCALES) + 1
-# The largest weight of history; and the least distance of the rules' share of it from 0 and 1, which keeps its logit
-# finite.
+# The largest weight of history; and the least distance of the rules' weight, divided by it, from 0 and 1, so that its
+# logit is finite.
 MOST, LEAST = 0.97, 0.003
 # C: the largest correction by the network, in the logarithm of odds.
 LARGEST = 1.5
@@ -45,15 +45,19 @@ INPUTS = (
     *("share", "first", "trust", "best", "weight", "speed", "albedo", "facing"),
 )
 WEIGHTS = FOLDER / "temporal.onnx"
-# Pixels of a strip of the image that the network processes at a time; each takes about 1 KB.
+# The number of pixels of a strip that the network processes at a time; each needs about 1 KB.
 STRIP = 1 << 20
 
 
 @dataclass(frozen=True)
 class Blend:
-    """One frame and its history: x ``now``, h ``history`` and the noisy ``primal`` (H, W, 3); the rules' evidence,
-    agreement of features ``trust`` and b of the variances ``first`` (H, W); ``speed`` (H, W) in image widths per frame;
-    and features."""
+    """A frame and its history.
+
+    ``now``, ``history``, ``primal``  x, h and the noisy primal, (H, W, 3)
+    ``evidence``, ``trust``, ``first``  the evidence of the rules, the agreement of features, and the b of the variances
+    ``speed``     (H, W), the motion in image widths per frame
+    ``features``  the features of the frame, by name
+    """
 
     now: np.ndarray
     history: np.ndarray
@@ -66,7 +70,7 @@ class Blend:
 
     @cached_property
     def bands(self) -> np.ndarray:
-        """D_s, (BANDS, H, W, 3), finest first. Coarse bands average only trusted pixels."""
+        """D_s, (BANDS, H, W, 3), finest first. Coarse bands are averages of trusted pixels only."""
         lows = [self.history - self.now]
         trusted = self.trust[..., None] * lows[0]
         for scale in SCALES:
@@ -83,7 +87,7 @@ class Blend:
         return np.log(share / (1 - share)).astype(np.float32)
 
     def by(self, corrections: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """y (H, W, 3) and b (H, W) for corrections (H, W, BANDS); b is the mean over bands, weighted by energy."""
+        """y (H, W, 3) and b (H, W) for corrections (H, W, BANDS); b is the mean of b_s, weighted by energy."""
         with np.errstate(over="ignore"):
             shares = MOST / (1 + np.exp(-(self.prior[..., None] + LARGEST * np.tanh(corrections / LARGEST))))
         shares = (self.trust[..., None] * np.minimum(shares, self.first[..., None])).astype(np.float32)
@@ -125,9 +129,9 @@ class Blend:
 
 
 class Network:
-    """The network of a file (``ngpt.export.temporal``), as ``Corrections``.
+    """The network in a file of ``ngpt.export.temporal``, as ``Corrections``.
 
-    Raises NgptError for a file that is no such network, or a network with other inputs.
+    Raises NgptError for other files, and for networks with other inputs.
     """
 
     def __init__(self, path: str | Path):

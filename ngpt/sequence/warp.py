@@ -6,12 +6,16 @@ import numpy as np
 def warped(
     image: np.ndarray, motion: np.ndarray, sharp: bool = False, shift: tuple[int, int] = (0, 0)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """``image`` (h, w, C) of one frame at x + motion for the pixels x of another, and where that is inside the image.
+    """The ``image`` of one frame, looked up at x + motion for each pixel x of another frame.
 
-    ``motion`` (H, W, 2) is in pixels to the right and down; where it is not finite, nothing is found. ``shift`` is the
-    position (x, y) of the other frame's first pixel in the image. Between pixels the value is interpolated bilinearly,
-    or, with ``sharp``, by a Catmull-Rom spline clamped to the range of the four nearest pixels: bilinear interpolation
-    loses detail each time. Returns (H, W, C) of the image's type, 0 where nothing is found, and (H, W) booleans.
+    ``image``   (h, w, C)
+    ``motion``  (H, W, 2), in pixels to the right and down; where it is not finite, nothing is found
+    ``sharp``   whether values between pixels are interpolated by a Catmull-Rom spline, clamped to the range of the four
+                nearest pixels. Otherwise interpolation is bilinear, which loses detail each time
+    ``shift``   the position (x, y) of the other frame's first pixel in the image
+
+    Returns the values (H, W, C), of the image's type, and (H, W) booleans: whether x + motion is inside the image.
+    Where it is not, the value is 0.
     """
     (x, y), (height, width) = _aims(motion, shift), image.shape[:2]
     with np.errstate(invalid="ignore"):
@@ -39,10 +43,10 @@ def warped(
 def bilinear_taps(
     motion: np.ndarray, size: tuple[int, int], shift: tuple[int, int] = (0, 0)
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The taps of a bilinear lookup at x + motion in an image of ``size`` (h, w); ``shift`` is as in ``warped``.
+    """The taps of a bilinear lookup at x + motion in an image of ``size`` (h, w); ``shift`` is as for ``warped``.
 
-    Returns the indices of four pixels, in row-major order, (4, N) with N = H * W; their weights (4, N); and booleans
-    (H, W): where the lookup is between pixel centres of the image.
+    Returns the indices of four pixels in row-major order, (4, N) with N = H * W; their weights (4, N); and booleans
+    (H, W): whether x + motion lies between pixel centres of the image.
     """
     (x, y), (height, width) = _aims(motion, shift), size
     with np.errstate(invalid="ignore"):

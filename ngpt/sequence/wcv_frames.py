@@ -1,15 +1,15 @@
 """Control variates over frames: ``wcv`` with a third difference, in time along motion.
 
-In a window of frames, each pixel becomes the weighted mean of estimates from its neighbours [``controlvariates``,
-survey eq. 14 and 20 - 22]. The neighbours are pixels of its own image, its position in the frame before, and the pixels
-of the frame after that lead to it:
+In a window of frames, each pixel becomes the weighted mean of estimates by its neighbours [``controlvariates``, survey
+eq. 14 and 20 - 22]. These are pixels of its own image, its position in the frame before, and those pixels of the frame
+after whose motion leads to it:
 
-    W I_{t-1}(p) + dt(p)  estimates  I_t(p), with W the image before at p + motion
+    W I_{t-1}(p) + dt(p)  estimates  I_t(p), with W the lookup of the image before at p + motion
 
-W is bilinear (B) on the unknown image, and a Catmull-Rom spline (S) on a first guess G of it, which is computed once:
-W I = B I + (S - B) G. The difference of both on G shows how wrong W may be: ``INTERPOLATION`` ((S - B) G)², the largest
-of 3x3 pixels, is added to the variance of dt. So other frames count little at edges that move by parts of a pixel. A
-newly visible surface needs no test: dt holds the difference to the surface that hid it.
+W is bilinear (B) for the unknown image, and a Catmull-Rom spline (S) for a first guess G of it, which is computed once:
+W I = B I + (S - B) G. The difference (S - B) G shows the possible error of W: ``INTERPOLATION`` times the largest of
+its squares in 3x3 pixels is added to the variance of dt. So other frames have little weight at edges that move by parts
+of a pixel. A newly visible surface needs no test, because dt holds the difference to the surface that hid it.
 
 As in ``controlvariates``, weights are relative: a = f var I / (f var I + var dt), with f the factor by which n
 iterations have lowered the variance of a pixel, and smoothed variances (``ngpt.classical.variances``).
@@ -28,18 +28,18 @@ from ngpt.classical.variances import SHARED, relative, smoothed
 from ngpt.sequence.warp import bilinear_taps, warped
 from ngpt.system.late import ndimage, sparse
 
-# The factor on the squared difference of two interpolations that is added to the variance of dt. Among 3, 10 and 30 it
-# has the least error on slow shots of the built-in scenes `diffuse` and `glossy`.
+# The factor on the squared difference of two interpolations, which is added to the variance of dt. Of 3, 10 and 30,
+# this factor has the least error in slow shots of the built-in scenes `diffuse` and `glossy`.
 INTERPOLATION = 10
-# A factor on the variance of dt. The variance comes from few pairs, which often miss rare light, mainly gloss and
-# caustics. Among 1, 4 and 16 it has the least error over slow and fast shots of those scenes and `coffee`, at 2 pairs a
+# A factor on the variance of dt, which is measured by few pairs and often misses rare light, mainly gloss and caustics.
+# Of 1, 4 and 16, this factor has the least error over slow and fast shots of those scenes and `coffee`, at 2 pairs per
 # pixel.
 DOUBT = 4
 
 
 @dataclass(frozen=True)
 class Link:
-    """The relation of a frame to the one before: ``motion`` (H, W, 2), ``dt``, ``dt_var`` (H, W, 3); NaN: not known.
+    """The relation of a frame to the frame before: ``motion`` (H, W, 2), ``dt`` and ``dt_var`` (H, W, 3); NaN: unknown.
 
     ``shift`` is the position (x, y) of this frame's first pixel in the frame before.
     """
@@ -54,13 +54,13 @@ class Link:
 class Frame:
     """One frame of a window, arrays (H, W, 3), all finite except the variances.
 
-    ``image``      the light whose differences dx and dy are
+    ``image``      the light that dx and dy describe
     ``apart``      light that dx and dy exclude and dt includes; it is added to the image
     ``dx, dy``     the gradients
-    ``variances``  of image, dx and dy; NaN where not known
-    ``trusted``    where dx and dy are trusted, (H, W) booleans; None if everywhere
+    ``variances``  the variances of image, dx and dy; NaN where unknown
+    ``trusted``    (H, W) booleans for dx and dy: where they can be trusted; None: everywhere
     ``guess``      image + apart, reconstructed by any method
-    ``link``       the relation to the frame before in the window; None if there is none
+    ``link``       the relation to the frame before in the window; None without such a frame
     """
 
     image: np.ndarray
@@ -86,7 +86,7 @@ def wcv_frames(frames: Sequence[Frame], sweeps: int | None = None) -> list[np.nd
         None if i == 0 or (link := frame.link) is None else _Step(link, frame.guess, frames[i - 1].guess, level, dtype)
         for i, frame in enumerate(frames)
     ]
-    # The difference, according to dt, between the corrections of both frames.
+    # By dt, the corrections of a frame and the frame before should have this difference.
     rest = [
         None if step is None else step.offset - total[i] + step.before(total[i - 1]) for i, step in enumerate(steps)
     ]
@@ -109,7 +109,10 @@ def _wide(images: Sequence[np.ndarray]) -> bool:
 
 
 class _Still:
-    """A frame by itself: ``primal`` is its relative variance (H, W, 1), x and y are the variances of differences."""
+    """A frame without its neighbours.
+
+    ``primal``  (H, W, 1), the relative variances of its pixels; ``x``, ``y`` are those of its differences
+    """
 
     def __init__(self, frame: Frame, dtype: type):
         p, x, y = frame.variances
@@ -131,8 +134,7 @@ class _Still:
             self.y[~self.trusted[1][:-1]] = np.inf
 
     def swept(self, u: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
-        """The weighted sum of changes to u from its neighbours in the image, and the sum of weights, in which u itself
-        has the weight 1."""
+        """The weighted sum of changes to u by neighbours in the image; and the sum of weights, with 1 for u itself."""
         own = factor * self.primal
         change, weight = np.zeros_like(u), np.ones_like(own)
         for here, there, r, v in (
@@ -165,7 +167,7 @@ class _Step:
         self.offset: np.ndarray = np.where(known[..., None], link.dt + apart, 0).astype(dtype)
         self.variance: np.ndarray = variance[..., None].astype(dtype)
         self.known = known[..., None]
-        # B as a matrix. Its transpose gives each pixel the mean of the estimates by all pixels that look it up,
+        # B as a matrix. By its transpose, each pixel gets the mean of the estimates by all pixels that look it up,
         # weighted by their inverse variances.
         rows = np.broadcast_to(np.arange(known.size), places.shape)
         taps = (weights * known.ravel()).astype(dtype)
@@ -179,7 +181,7 @@ class _Step:
         self.variance_before = (seen / self.total).reshape(height, width, 1)
 
     def before(self, image: np.ndarray) -> np.ndarray:
-        """B of an image of the frame before; 0 where it is not known."""
+        """B of an image of the frame before; 0 where unknown."""
         return (self.look @ image.reshape(-1, 3)).reshape(self.shape)
 
     def add(
@@ -192,8 +194,8 @@ class _Step:
     ) -> None:
         """Adds the estimates of both frames for each other to the changes and weights of both.
 
-        ``e`` is the excess of this frame over its estimate from the frame before; ``own`` and ``own_before`` are the
-        variances of both.
+        ``e`` is the difference between this frame and its estimate from the frame before. ``own`` and ``own_before``
+        are the variances of both frames.
         """
         e = np.where(self.known, e, 0)
         a = own / (own + self.variance)

@@ -1,4 +1,4 @@
-"""Reconstruction of a shot from gradients in space and in time: ``wcv`` over windows of frames.
+"""Reconstructs a shot from gradients in space and in time: ``wcv`` over windows of frames.
 
 Frames that have ``motion``, ``dt`` and ``dt_var`` are linked to the frame before. A window holds ``LENGTH`` linked
 frames; the next window begins ``HOP`` frames later. A frame's result is the mean over its windows, weighted by the
@@ -31,7 +31,8 @@ LINK = ("motion", "dt", "dt_var")
 def reconstruct_shot(
     stacks: Iterable[GradientStack | None], wanted: Callable[[int], bool] = lambda i: True
 ) -> Iterator[tuple[int, GradientStack, Result]]:
-    """(number, stack, result by ``wcv`` over time) of each of ``stacks`` that is ``wanted``, in their order.
+    """Yields (number, stack, result by ``wcv`` over time) for each of the ``stacks`` that is ``wanted``, in their
+    order.
 
     There is a cut before a stack that lacks a layer of ``LINK``, has another size, or whose ``ngpt:previousFrame`` is
     not the stack before; and where a stack is None. At most ``LENGTH`` stacks are in memory. Raises NgptError for
@@ -58,7 +59,7 @@ def _shift(stack: GradientStack, before: GradientStack) -> tuple[int, int] | Non
 
 
 class _Member:
-    """A frame of a run, and the weighted sum of its results so far, in units of 2^power."""
+    """A frame of a run, with the weighted sum of its results so far, in units of 2^power."""
 
     def __init__(self, number: int, stack: GradientStack, shift: tuple[int, int]):
         self.number, self.stack, self.shift, self.power = number, stack, shift, 0
@@ -88,7 +89,7 @@ class _Member:
 
 
 class _Run:
-    """A run of linked frames."""
+    """A series of linked frames, between two cuts."""
 
     def __init__(self, wanted: Callable[[int], bool]):
         self.wanted = wanted

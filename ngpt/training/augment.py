@@ -1,7 +1,7 @@
-"""Augmentation of training examples, as in NGPT: each transform keeps gradients consistent with the image.
+"""Random changes to training examples, as in NGPT: each of them keeps gradients consistent with the image.
 
-An example is a dict of layers (C, H, W), radiance over exposure, among them "target". The transforms take and return
-such dicts. [Kettunen et al. 2019, section 5.2 and their code]
+An example is a dict of layers (C, H, W), among them "target", with radiance divided by the exposure. Transforms take
+and return such dicts. [Kettunen et al. 2019, section 5.2 and their code]
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from ngpt.stack import GradientStack
 
 Layers = dict[str, Tensor]
 
-# Layers with three colours that scale with the light; and those that change with any permutation of colours.
+# The layers that are proportional to the light; and the layers whose three channels are colours.
 _LIGHT = RADIANCE | {"target"}
 _COLOR = _LIGHT | {"albedo"}
 _VARIANCES = ("primal_var", "dx_var", "dy_var", "caustic_var")
@@ -25,15 +25,14 @@ _VARIANCES = ("primal_var", "dx_var", "dy_var", "caustic_var")
 
 @dataclass(frozen=True)
 class Augmentation:
-    """The random changes to each example when it is read.
+    """The random changes to each example.
 
     ``geometry``    flips and transposition, each with probability 1/2
     ``colors``      permutation of RGB, and a factor for each channel: 0..3, of mean 1, uniform on the simplex
     ``brightness``  standard deviation, in the logarithm, of a log-normal factor of mean 1 on radiance
     ``depth``       range of the factor of depth, uniform
-    ``quieter``     range of a factor, log-uniform, one for each crop: adds the crop's best input with its noise
-                    multiplied by the factor (``quieter``). So networks learn to use more samples than training sets
-                    have. [] for none
+    ``quieter``     range of a factor, log-uniform, one for each crop: adds an input with the noise of the crop's best
+                    input times this factor. So networks learn to use more samples than training sets have. [] for none
     """
 
     geometry: bool = True
@@ -68,11 +67,10 @@ class Augmentation:
 def quieter(
     stack: GradientStack, reference: np.ndarray, direct: np.ndarray, caustic: np.ndarray, factor: float
 ) -> GradientStack:
-    """The stack with its noise multiplied by ``factor``, as if it had 1 / factor² times the samples: a weighted mean
-    with the reference.
+    """The stack with its noise multiplied by ``factor``, as if it had 1 / factor² times the samples.
 
-    ``reference`` (H, W, 3) includes directly visible emission and the light of the layer ``caustic``; ``direct`` and
-    ``caustic`` hold these two parts separately. Features stay as they are.
+    It is a weighted mean of the stack and the ``reference`` (H, W, 3). This includes directly visible emission and the
+    light of the layer ``caustic``; ``direct`` and ``caustic`` hold these two parts separately. Features do not change.
     """
     light = reference - direct - caustic
     truth = {
@@ -110,9 +108,9 @@ def _flip(layers: Mapping[str, Tensor], axis: int, difference: str, normal: int)
 
 
 def transpose(layers: Mapping[str, Tensor]) -> Layers:
-    """Mirrored at the diagonal: rows become columns, dx becomes dy; x and y of camera space change places.
+    """Mirrored at the diagonal: rows become columns, and dx becomes dy.
 
-    Image y points down and camera y up: the mirror takes (x, y) to (-y, -x).
+    Image y points down and camera y up, so normals (x, y) become (-y, -x).
     """
     result = {name: layer.transpose(-1, -2) for name, layer in layers.items()}
     for a, b in (("dx", "dy"), ("dx_se", "dy_se")):
@@ -125,7 +123,7 @@ def transpose(layers: Mapping[str, Tensor]) -> Layers:
 
 
 def color(layers: Mapping[str, Tensor], order: np.ndarray, factors: np.ndarray) -> Layers:
-    """The layers with permuted channels, each multiplied by its factor; albedo may exceed 1 after it."""
+    """The layers with permuted colours, each multiplied by its factor. Albedo may then exceed 1."""
     index, factor = torch.as_tensor(order), torch.as_tensor(factors, dtype=torch.float32).reshape(3, 1, 1)
     return {name: layer[index] * factor if name in _COLOR else layer for name, layer in layers.items()}
 

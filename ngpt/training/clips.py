@@ -1,4 +1,4 @@
-"""Shots for training, and the examples that they give the network that blends frames (``ngpt.sequence.network``).
+"""Makes training examples from shots, for the network that blends frames (``ngpt.sequence.network``).
 
 The loss is in ``ngpt.training.temporal``.
 """
@@ -24,7 +24,7 @@ from ngpt.system.files import make_folder
 from ngpt.system.writing import write_bytes
 from ngpt.training.dataset import Dataset
 
-# Squared relative errors saturate at this value, so that single pixels do not dominate the training.
+# Squared relative errors are limited to this value, so that single pixels do not dominate the training.
 OUTLIER = 1.0
 # Errors are divided by a pixel's squared reference plus this share of the mean of squares.
 DARK = 0.02
@@ -32,9 +32,10 @@ DARK = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """A shot with one of its inputs, reconstructed by one method: stacks, results and references (H, W, 3) of frames.
+    """A shot with one of its inputs, reconstructed by one method: for each frame a stack, a result and a reference.
 
-    References exclude direct emission. So do ``halves``, which are pairs of references from half of the samples each.
+    Images are (H, W, 3). References exclude direct emission. So do ``halves``: for each frame two references, each from
+    half of the samples.
     """
 
     paired: ClassVar[bool] = False
@@ -47,9 +48,9 @@ class Clip:
 
 
 def clips(folders: Sequence[str | Path], methods: Sequence[str], kept: Path) -> Iterator[Clip]:
-    """All shots of training sets, with each input, by each method; results are cached in the folder ``kept``.
+    """A clip for each shot of the training sets, each of its inputs, and each method.
 
-    Raises NgptError if a folder is no training set, or has no shots.
+    Results are cached in the folder ``kept``. Raises NgptError if a folder is no training set, or has no shots.
     """
     for folder in folders:
         data = Dataset(folder)
@@ -59,7 +60,7 @@ def clips(folders: Sequence[str | Path], methods: Sequence[str], kept: Path) -> 
         for shot in shots:
             crops = [data[i] for i in shot]
             light = [crop.reference - crop.reference_direct for crop in crops]
-            # Without halves, the reference takes the place of both; its noise then counts as an error.
+            # Without halves, the reference takes the place of both, and its noise counts as an error.
             halves = [
                 tuple(half + crop.reference_caustic for half in crop.reference_halves) or (whole, whole)
                 for crop, whole in zip(crops, light, strict=True)
@@ -83,8 +84,7 @@ def _results(stacks: Sequence[GradientStack], method: str, folder: Path) -> np.n
 
 
 def errors(clip: Clip, images: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Mean error and flicker of images with direct emission, relative to the reference; without the reference's
-    noise."""
+    """(error, flicker): means relative to the reference, without its noise. ``images`` include direct emission."""
     found, changes = [], []
     last = None
     for stack, image, pair, reference in zip(clip.stacks, images, clip.halves, clip.references, strict=True):
@@ -112,9 +112,9 @@ def weight_of(reference: np.ndarray) -> np.ndarray:
 
 
 def play(clip: Clip, corrections: Corrections, long: float = 1.0) -> Iterator[dict[str, np.ndarray]]:
-    """The training examples of a clip, frame by frame: arrays (C, H, W).
+    """Yields the training examples of a clip, one for each frame with a history: arrays (C, H, W) by name.
 
-    The error of the first result is multiplied by ``long``, as if it had a history of 1 / long² frames.
+    The error of the first result is multiplied by ``long``, as if 1 / long² frames had been blended before.
     """
     temporal = Temporal(corrections)
     last = None
@@ -149,7 +149,7 @@ def play(clip: Clip, corrections: Corrections, long: float = 1.0) -> Iterator[di
 
 
 def relit(clip: Clip, rng: np.random.Generator) -> Clip:
-    """The clip with changing light, everywhere or around a random place; at one frame, or evenly over all frames."""
+    """The clip with a change of light: in the whole image or around a random place, suddenly or evenly over time."""
     y, x = np.mgrid[: clip.references[0].shape[0], : clip.references[0].shape[1]] / len(clip.references[0])
     place, width = rng.random(2), rng.choice([0.2, 0.5, 1e3])
     field = np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / (2 * width**2))[..., None]
@@ -168,11 +168,11 @@ def relit(clip: Clip, rng: np.random.Generator) -> Clip:
 
 
 def robust(squares):  # type: ignore[no-untyped-def]
-    """Squares (arrays or tensors) limited to ``OUTLIER``; small ones stay nearly as they are."""
+    """Squares (arrays or tensors), smoothly limited to ``OUTLIER``; small ones hardly change."""
     return squares / (1 + squares / OUTLIER)
 
 
 def blended(clip: Clip, corrections: Corrections | None) -> list[np.ndarray]:
-    """The blended frames of a clip, with corrections by a network, or by the rules without a network (None)."""
+    """The blended frames of a clip, with the corrections of a network, or without a network (None)."""
     temporal = Temporal(corrections)
     return [temporal.next(*pair) for pair in zip(clip.stacks, clip.results, strict=True)]

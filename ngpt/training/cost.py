@@ -1,4 +1,4 @@
-"""The cost of a network, before it is trained."""
+"""Computes the cost of a network before it is trained."""
 
 from typing import Any
 
@@ -15,26 +15,26 @@ from ngpt.training.settings import Settings
 
 
 def network_of(settings: Settings) -> tuple[nn.Module, int]:
-    """The network that a run trains, and the channels that it reads."""
+    """The network that a run trains, and the number of channels that it reads."""
     if settings.model is None:
         return temporal.network(), len(INPUTS)
     return Reconstructor(settings.model).network, features.channels(settings.model.inputs)
 
 
 def per_pixel(model: Any, channels: int) -> tuple[float, float]:
-    """(multiplications, numbers in inputs and outputs of convolutions) per pixel of the padded image."""
+    """(multiplications, numbers in the inputs and outputs of convolutions) for each pixel of the padded image."""
     size, macs, numbers = 8 * model.alignment, 0, 0
 
     def count(module: Any, args: tuple, output: torch.Tensor) -> None:
         nonlocal macs, numbers
         module = getattr(module, "convolution", module)
         weight = module.v if isinstance(module, Convolution) else module.weight
-        # Each output pixel sees one tap of a transposed 2x2 kernel with stride 2, and all taps of any other kernel.
+        # Each output pixel reads one tap of a transposed 2x2 kernel with stride 2, and all taps of other kernels.
         taps = weight.shape[0] if getattr(module, "kind", "") == "unpool" else weight[0].numel()
         macs += taps * output.numel()
         numbers += args[0].numel() + output.numel()
 
-    # LastConvolution runs the weights of its convolution itself, so its inner module is not counted.
+    # LastConvolution may not call its inner module, so only LastConvolution itself is counted.
     last = {m.convolution for m in model.modules() if isinstance(m, LastConvolution)}
     kinds = (Convolution, LastConvolution, torch.nn.Conv2d)
     hooks = [m.register_forward_hook(count) for m in model.modules() if isinstance(m, kinds) and m not in last]
@@ -47,14 +47,14 @@ def per_pixel(model: Any, channels: int) -> tuple[float, float]:
 
 
 def cost(settings: Settings) -> str:
-    """A few lines on parameters, multiplications and memory; nothing is trained."""
+    """Lines of text about parameters, multiplications and memory of a run."""
     (model, channels), run = network_of(settings), settings.run
     macs, numbers = per_pixel(model, channels)
     pixels = run.batch * (settings.data.crop + 2 * padding.MARGIN) ** 2
-    # Backward costs twice as much as forward.
+    # The backward pass costs twice as much as the forward pass.
     step = 3 * macs * pixels
     activations = numbers * pixels * (2 if in_bfloat16(default_device().type, run.precision) else 4)
-    # Weights, gradients, two moments, and the average.
+    # Weights, gradients, two moments of Adam, and the average of the weights.
     states = parameters(model) * 4 * (5 if settings.optimizer.ema else 4)
     lines = {
         "parameters": f"{parameters(model):,}",

@@ -14,9 +14,9 @@ from ngpt.stack import GradientStack
 
 
 class Crop(Protocol):
-    """One view with a reference and several inputs, from ``ngpt.training.dataset`` or ``stack_folder``.
+    """A view with several inputs and a reference, from ``ngpt.training.dataset`` or ``stack_folder``.
 
-    A crop without a reference is ``paired``: its two stacks are the targets of each other.
+    A ``paired`` crop has no reference; each of its two inputs is the target of the other.
     """
 
     scene: str
@@ -40,7 +40,7 @@ class Crop(Protocol):
 
 
 class Mixture(Sequence[Any]):
-    """Several sequences of crops as one. They may grow while they are read, as streams do."""
+    """Several sequences of crops as one sequence. They may grow while they are read, as streams do."""
 
     def __init__(self, *parts: Any):
         self.parts = parts
@@ -57,14 +57,14 @@ class Mixture(Sequence[Any]):
 
 
 def read(path: str) -> GradientStack:
-    """The stack in a file. OpenEXR is imported only here, since training sets do not need it."""
+    """The stack in a file. The reader of OpenEXR is imported only here, because training sets do not need it."""
     from ngpt.io import exr
 
     return exr.read(path)
 
 
 class StackCrop:
-    """The stacks of one folder and the reference they share."""
+    """The stacks in a folder, and their common reference. Raises NgptError if their windows differ."""
 
     reference_halves = ()
     paired = False
@@ -86,7 +86,7 @@ class StackCrop:
 
     def stack(self, k: int) -> GradientStack:
         stack = read(str(self._stacks[k]))
-        # Shards leave it out too: no network reads it, and augmentation would have to transform it.
+        # No network reads this layer, so augmentation does not transform it. Shards leave it out, too.
         stack.layers.pop("shared", None)
         return stack
 
@@ -96,7 +96,7 @@ class StackCrop:
 
     @property
     def reference_direct(self) -> np.ndarray:
-        # References by the path tracer lack this layer; directly visible emission has hardly any noise in any stack.
+        # References by a path tracer lack this layer. Directly visible emission has little noise in any stack.
         most = self._stacks[int(np.argmax(self.spp))]
         for path in (self._reference, most):
             stack = read(str(path))
@@ -106,9 +106,9 @@ class StackCrop:
 
     @property
     def reference_caustic(self) -> np.ndarray:
-        """The layer ``caustic`` of the reference, or else the mean of all stacks, denoised; zeros if they have none.
+        """The layer ``caustic`` of the reference; without it, the denoised mean over all stacks; or else zeros.
 
-        Raises NgptError if only some of the stacks have it.
+        Raises NgptError if only some of the stacks have this layer.
         """
         reference = read(str(self._reference))
         if all(self._caustic) and "caustic" in reference:
@@ -132,9 +132,9 @@ class StackCrop:
 
 
 def stack_folder(folder: Path) -> list[StackCrop]:
-    """The views in a folder; each view is a folder with ``reference.exr`` and any number of gradient stacks.
+    """The views in a folder. Each is a folder with ``reference.exr`` and any number of stacks.
 
-    Raises NgptError if a view has stacks without a reference, if sizes differ, or if there is no view.
+    Raises NgptError for stacks without a reference, for different sizes, and if there is no view.
     """
     crops = []
     views = [path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]

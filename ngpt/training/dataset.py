@@ -1,9 +1,9 @@
-"""Training sets: a folder of shards with a manifest, read crop by crop.
+"""Reads training sets: folders of shards with a manifest.
 
     data = Dataset("DIR")
     crop = data[0]
     crop.stack(0), crop.reference        # a GradientStack, (H, W, 3)
-    for shot in data.shots:              # sets of shots: the crops of each, frame by frame
+    for shot in data.shots:              # in sets of shots: the crops of a shot, frame by frame
         frames = [data[i] for i in shot]
 
 ``python -m data_gen`` makes them, ``ngpt info DIR`` verifies them, and ``ngpt.training.shards`` describes the files.
@@ -35,7 +35,7 @@ _MANIFEST: Shape = {"config": dict, "planned": int, "shards": [_ENTRY]}
 
 @dataclass(frozen=True)
 class Crop:
-    """One crop; cheap: pixels are read when they are first used.
+    """A crop. Its pixels are read only when they are used.
 
     ``spp`` holds the samples per pixel of its inputs. ``frame`` is its number in a shot, from 0; None for a single
     image.
@@ -53,15 +53,15 @@ class Crop:
 
     @property
     def paired(self) -> bool:
-        """Whether it has no reference, but two independent inputs with equal numbers of samples as targets of each
-        other."""
+        """Whether it has no reference, but two independent inputs with equal samples, each the other's target."""
         return shards.REFERENCES[0] not in self.shard.names
 
     def stack(self, k: int) -> GradientStack:
-        """Input ``k`` with all layers of its rendered stack; gradients only if its sampler has them. Values are finite.
+        """Input ``k`` with all layers of its rendered stack, with finite values.
 
-        If the set has subpixels, so has the stack, and its pixels are their means, to the bit. Frames of shots also
-        have the layer ``motion``. It is NaN where it is unknown: everywhere in the first frame.
+        It has gradients if its sampler makes them. If the set has subpixels, so has the stack, and its pixels are their
+        means, to the bit. Frames of shots have the layer ``motion``, which is NaN where it is unknown, and everywhere
+        in a first frame.
         """
         if not 0 <= k < self.inputs:
             raise NgptError(f"{self.shard.path}: there is no input {k}; the crop has inputs 0 .. {self.inputs - 1}")
@@ -83,7 +83,7 @@ class Crop:
         return GradientStack(layers, attributes, path=f"{self.shard.path}, crop {self.index}, input {k}", fine=fine)
 
     def _pixels(self, k: int) -> dict[str, np.ndarray]:
-        """The layers of input ``k`` as tensors of pixels have them, with standard errors."""
+        """The layers of input ``k`` by the tensors of pixels, with standard errors in place of variances."""
         names = [name for name in self.shard.names if name in shards.OF_INPUTS]
         layers = {name: self.shard.input(name, self.index, k) for name in names}
         layers["primal"] = layers.pop("indirect") + layers["direct"] + layers.get("caustic", 0)
@@ -94,17 +94,17 @@ class Crop:
         return {n: self.shard.input(tensor, self.index, k) for n, tensor in names.items() if tensor in self.shard.names}
 
     def strays(self, k: int) -> bool:
-        """Whether input ``k`` has subpixels whose means differ from its pixels by more than the rounding of tensors."""
+        """Whether the means of the subpixels of input ``k`` differ from its pixels by more than rounding."""
         pixels, fine = self._pixels(k), self._subpixels(k)
         for name, layer in fine.items():
-            there = means(layer, subpixels(fine, pixels[name].shape[1])).astype(np.float64)
-            if np.abs(there - pixels[name]).sum() > 2 * shards.MAX_LOSS * np.abs(there).sum():
+            mean = means(layer, subpixels(fine, pixels[name].shape[1])).astype(np.float64)
+            if np.abs(mean - pixels[name]).sum() > 2 * shards.MAX_LOSS * np.abs(mean).sum():
                 return True
         return False
 
     @property
     def reference(self) -> np.ndarray:
-        """(H, W, 3) float32, the converged image with directly visible emission; raises NgptError for a pair."""
+        """(H, W, 3) float32: the converged image with directly visible emission. Raises NgptError for a pair."""
         if self.paired:
             raise NgptError(
                 f"{self.shard.path}: crop {self.index} is a pair: it has no reference, its inputs are halves"
@@ -113,22 +113,21 @@ class Crop:
 
     @property
     def reference_direct(self) -> np.ndarray:
-        """(H, W, 3) float32, only the directly visible emission."""
+        """(H, W, 3) float32: the directly visible emission in the reference."""
         return self.shard.crop("reference_direct", self.index)
 
     @property
     def reference_caustic(self) -> np.ndarray:
-        """(H, W, 3) float32, the part of the reference that the inputs' layer ``caustic`` estimates; zeros without
-        such a layer."""
+        """(H, W, 3) float32: the light in the reference that the layer ``caustic`` of inputs estimates, or zeros."""
         if shards.REFERENCE_CAUSTIC in self.shard.names:
             return self.shard.crop(shards.REFERENCE_CAUSTIC, self.index)
         return np.zeros_like(self.reference_direct)
 
     @property
     def reference_halves(self) -> tuple[np.ndarray, ...]:
-        """Two independent images (H, W, 3) without direct emission and ``reference_caustic``; () if there are none.
+        """Two independent images (H, W, 3), each from half of the reference's samples; () if there are none.
 
-        Each has half of the reference's samples. Their noise is independent, so it cancels in products of errors.
+        They exclude direct emission and ``reference_caustic``. Their noise cancels in products of errors.
         """
         if shards.REFERENCE_HALVES not in self.shard.names:
             return ()
@@ -138,8 +137,8 @@ class Crop:
 class Dataset:
     """The crops of a training set, in the order of its manifest.
 
-    Reads only the manifest; a shard is checked when one of its crops is first read, again in each process that receives
-    an instance. Raises NgptError for shards that are missing, differ from the manifest, or hold other tensors.
+    Only the manifest is read at once. A shard is checked when one of its crops is first read, in each process anew.
+    Raises NgptError for shards that are missing, differ from the manifest, or hold other tensors.
     """
 
     def __init__(self, folder: str | Path):
@@ -152,7 +151,7 @@ class Dataset:
 
     @property
     def scenes(self) -> tuple[str, ...]:
-        """Names of the scenes that have crops, each once."""
+        """The names of the scenes that have crops."""
         return tuple(dict.fromkeys(entry["scene"] for entry, _ in self._places))
 
     @property
@@ -188,7 +187,7 @@ class Dataset:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of the training set in ``folder``; raises NgptError if there is none of this version."""
+    """The manifest of the training set in ``folder``. Raises NgptError if it is missing or invalid."""
     path = folder / MANIFEST
     if not path.is_file():
         raise NgptError(f"{folder}: no training set there ({MANIFEST} is missing); make one by `ngpt dataset`")
@@ -215,7 +214,7 @@ def checksum(path: Path) -> str:
 
 
 def problems(folder: Path) -> list[str]:
-    """All faults of a training set, one line each: files, checksums, shapes, counts, numbers."""
+    """A line for each fault of a training set: files, checksums, shapes, counts and values."""
     found = []
     manifest = read_manifest(folder)
     for entry in manifest["shards"]:
@@ -228,8 +227,8 @@ def problems(folder: Path) -> list[str]:
             bad = int(np.sum(~np.isfinite(shard.tensor(name))))
             if bad:
                 found.append(f"{shard.path}: tensor '{name}' has {bad} values that are not finite")
-        for i, told in enumerate(entry["crops"]):
-            read = Crop(shard, i, entry["scene"], tuple(told["spp"]))
+        for i, crop_entry in enumerate(entry["crops"]):
+            read = Crop(shard, i, entry["scene"], tuple(crop_entry["spp"]))
             for k in filter(read.strays, range(read.inputs)):
                 found.append(f"{shard.path}: the subpixels of crop {i}, input {k} are of another image; make it again")
         if entry["crops"] and shards.REFERENCES[0] not in shard.names:
@@ -243,14 +242,14 @@ def problems(folder: Path) -> list[str]:
 
 
 def _checked(path: Path, entry: dict[str, Any]) -> Shard:
-    """The shard of a manifest's entry. Raises NgptError if its checksum differs, or a tensor is missing or wrong."""
+    """The shard of an entry of the manifest. Raises NgptError if its checksum or one of its tensors is wrong."""
     # Not Path.is_file, which raises for names that are too long.
     if not os.path.isfile(path):
         raise NgptError(f"{path}: is missing; remove it from the manifest by running `ngpt dataset` again")
     if (digest := checksum(path)) != entry["sha256"]:
-        told = entry["sha256"][:12]
+        known = entry["sha256"][:12]
         raise NgptError(
-            f"{path}: its sha256 is {digest[:12]}..., the manifest says {told}...; copy it again or remove it"
+            f"{path}: its sha256 is {digest[:12]}..., the manifest says {known}...; copy it again or remove it"
         )
     shard, crops = Shard(path), entry["crops"]
     if not crops:
@@ -286,7 +285,7 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
 
 
 def summary(folder: Path) -> dict[str, Any]:
-    """The facts of a training set for ``ngpt info``; ``problems`` is empty if there are none."""
+    """The facts of a training set for ``ngpt info``; ``problems`` are the faults."""
     data = Dataset(folder)
     entries = data.manifest["shards"]
     crops = [crop for entry in entries for crop in entry["crops"]]

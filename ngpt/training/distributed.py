@@ -1,4 +1,4 @@
-"""One process or several: what training needs to know about ``torchrun``."""
+"""Training in one process, or in several processes that ``torchrun`` has started."""
 
 import os
 
@@ -10,10 +10,11 @@ from ngpt.network.device import default_device
 
 
 class Processes:
-    """The processes of a run: a single one unless ``torchrun`` started it.
+    """The processes of a run: only this one, unless ``torchrun`` has started several.
 
-    ``rank``, ``count``  the number of this process, from 0, and the number of all
-    ``device``           the GPU of this process, or the CPU
+    ``rank``    the number of this process, from 0
+    ``count``   the number of processes
+    ``device``  the GPU of this process, or the CPU
     """
 
     def __init__(self) -> None:
@@ -30,7 +31,7 @@ class Processes:
         if self.count == 1:
             return
         gradients = [p.grad for p in module.parameters() if p.grad is not None]
-        # One message of a few megabytes costs less than a hundred small ones.
+        # One message of a few megabytes takes less time than a hundred small ones.
         flat = torch.cat([g.flatten() for g in gradients])
         dist.all_reduce(flat)
         flat /= self.count
@@ -38,7 +39,7 @@ class Processes:
             gradient.copy_(part.view_as(gradient))
 
     def any(self, flag: bool) -> bool:
-        """Whether ``flag`` is set in any process, so that all of them stop at the same step."""
+        """Whether ``flag`` is true in any process. So all processes stop at the same step."""
         if self.count == 1:
             return flag
         value = torch.tensor(float(flag), device=self.device)

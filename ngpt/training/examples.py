@@ -19,23 +19,23 @@ from ngpt.stack import GradientStack
 from ngpt.training.augment import Augmentation, Layers, quieter
 from ngpt.training.crops import Crop
 
-# The prefix of the names of layers from the other half of a pair.
+# The names of layers from the other half of a pair begin with this.
 OTHER = "other/"
-# Padding varies by up to this around ``padding.MARGIN``, so that networks do not learn where borders are.
+# Padding varies around ``padding.MARGIN`` by up to this number of pixels, so that networks do not learn its width.
 JITTER = 7
 
 
 class Examples(TorchDataset):
-    """Endless training examples. Each is a function of its index and the seed, in any process and order.
+    """Endless training examples. An example depends only on its index and the seed, not on process and order.
 
-    Example ``i`` is a random crop with one of its inputs (or one by ``Augmentation.quieter``), normalised,
-    augmented and padded: a dict of layers (C, size + 16, size + 16) and the "target" (3, size - 14, size - 14). The
-    target covers the middle, which no jitter of the padding reaches [NGPT's code]. Crops larger than ``size`` are cut
-    at random. Prepared layers are cached in memory, up to ``cache`` bytes.
+    An example is a random crop with one of its inputs (or the one of ``Augmentation.quieter``), normalised, augmented
+    and padded: a dict of layers (C, size + 16, size + 16) and the "target" (3, size - 14, size - 14). The target covers
+    the middle, which the varying padding never reaches [NGPT's code]. Crops larger than ``size`` are cut at random.
+    Prepared layers are cached in memory, up to ``cache`` bytes.
 
-    The input from a pair is one half. Its target is the other half (``ngpt.training.halves``), in layers whose names
-    begin with "other/". If there are both pairs and crops with references, the share ``pairs`` of the examples are
-    pairs.
+    If the crop is a pair, the input is one half, and the target is the other half (``ngpt.training.halves``), in layers
+    whose names begin with "other/". If there are both pairs and crops with references, ``pairs`` is the share of the
+    pairs among the examples.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Examples(TorchDataset):
         return {name: layer.contiguous() for name, layer in (padding.pad(layers, pads) | inside).items()}
 
     def _drawn(self, rng: np.random.Generator) -> tuple[int, Crop]:
-        """A random crop with its index, uniform over all crops of a kind, whatever the number of their inputs."""
+        """A random crop with its index. All crops of a kind are equally likely, whatever the number of their inputs."""
         paired = None if self.pairs is None else bool(rng.random() < self.pairs)
         while True:
             which = int(rng.integers(len(self.crops)))
@@ -84,7 +84,7 @@ class Examples(TorchDataset):
                 return which, crop
 
     def _layers(self, which: int, crop: Crop, k: int) -> tuple[Layers, Layers]:
-        """Input ``k`` of a crop, and its target: the layer "target", or layers of the other half."""
+        """The layers of input ``k`` of a crop, and of its target: "target", or those of the other half."""
         if (crop, k) in self._cache:
             self._cache.move_to_end((crop, k))
             return self._cache[crop, k]
@@ -99,12 +99,12 @@ class Examples(TorchDataset):
         self._cache[crop, k] = layers, judge
         self._free -= _bytes(layers, judge)
         while self._free < 0:
-            # Drop the least recently used entry; in a stream, its crop may be gone.
+            # Drops the least recently used entry. In a stream, its crop may no longer exist.
             self._free += _bytes(*self._cache.popitem(last=False)[1])
         return layers, judge
 
     def _quieter(self, which: int, crop: Crop) -> GradientStack:
-        """The input of the crop with the most samples, as if it had many more."""
+        """The input of the crop with the most samples, as if it had more (``augment.quieter``)."""
         low, high = np.log(self.augmentation.quieter)
         factor = float(np.exp(np.random.default_rng((self.seed, which)).uniform(low, high)))
         best = crop.stack(int(np.argmax(crop.spp)))
@@ -123,20 +123,22 @@ class Examples(TorchDataset):
 
 
 def collated(examples: Sequence[Layers]) -> Layers:
-    """A batch of stacked layers. Examples with a "target" come first, so that targets are in the order of inputs."""
+    """A batch of examples. Those with a "target" come first, so that inputs and targets have the same order."""
     ordered = sorted(examples, key=lambda example: "target" not in example)
     names = dict.fromkeys(name for example in ordered for name in example)
     return {name: torch.stack([example[name] for example in ordered if name in example]) for name in names}
 
 
 def other_half(ours: Repaired, other: GradientStack, whole: bool) -> dict[str, np.ndarray]:
-    """The target of a half (``ngpt.training.halves``): arrays (H, W, C) of ``other``, and standard errors of ``ours``.
+    """The target for one half of a pair (``ngpt.training.halves``): arrays (H, W, C).
 
-    ``ours``   the half, repaired for a method that reads gradients
-    ``whole``  whether the light of the layer ``caustic`` is included. Gradients exclude it, so its pixel differences,
-               which have more noise, are added to them
+    They are layers of the half ``other``, and standard errors of the half ``ours``, which is the input.
 
-    Raises NgptError if both halves are the same, or one lacks gradients or their variances.
+    ``ours``   is repaired for a method that reads gradients
+    ``whole``  whether the target includes the light of the layer ``caustic``. Gradients exclude this light, so its
+               pixel differences, which have more noise, are added to them
+
+    Raises NgptError if both halves are the same, or if one lacks gradients or their variances.
     """
     theirs = repair(other)
     if ours.variances is None or theirs.dx is None:
@@ -156,7 +158,7 @@ def other_half(ours: Repaired, other: GradientStack, whole: bool) -> dict[str, n
         after = [np.concatenate([np.delete(variance, 0, axis), np.take(variance, [-1], axis)], axis) for axis in (1, 0)]
         variances = [variances[0] + variance, *(v + variance + a for v, a in zip(variances[1:], after, strict=True))]
     layers |= dict(zip(("primal_se", "dx_se", "dy_se"), (np.sqrt(v) for v in variances), strict=True))
-    # In pixels that show lamps, the variance of the other light is unknown.
+    # In pixels that show lamps, the variance of all other light is unknown.
     counts = known[0] & ~theirs.direct.any(axis=-1)
     return layers | {"counts": counts[..., None].astype(np.float32)}
 
@@ -170,26 +172,26 @@ def _tensors(arrays: dict[str, np.ndarray]) -> Layers:
 
 
 def judges_of(crop: Crop, config: ModelConfig) -> tuple[np.ndarray, ...]:
-    """The images (H, W, 3) that a network's errors are measured against: two independent halves, or one target.
+    """The images (H, W, 3) for measuring the errors of a network: two independent halves of a reference, or one target.
 
-    The noise of two halves cancels in the product of both errors, see ``ngpt.measure.metrics``.
+    The noise of two halves cancels in the product of both errors (``ngpt.measure.metrics``).
     """
     halves = crop.reference_halves
     if not halves:
         return (target_of(crop, config),)
-    # Halves have no caustic layer of their own; networks without gradients use the one of all samples.
+    # Halves have no ``caustic`` of their own. Networks without gradients use that of the whole reference.
     beside = np.zeros_like(halves[0]) if config.reads_gradients else crop.reference_caustic
     return tuple(half + beside for half in halves)
 
 
 def target_of(crop: Crop, config: ModelConfig) -> np.ndarray:
-    """The target (H, W, 3) of a network of that configuration for a crop's stacks."""
+    """The target (H, W, 3) of a crop, for a network of that configuration."""
     target = crop.reference - crop.reference_direct
     return target - crop.reference_caustic if config.reads_gradients else target
 
 
 def _scaled(layers: Layers, judge: Layers) -> tuple[Layers, Layers]:
-    """``layers`` and ``judge``, divided by the exposure of ``layers``."""
+    """Both, with light divided by the exposure of ``layers``."""
     scaled, exposure = features.normalised({name: layer[None] for name, layer in layers.items()})
     light = features.RADIANCE | {"target"}
     return {name: layer[0] for name, layer in scaled.items()}, {

@@ -1,22 +1,23 @@
-"""The loss of pairs: a network's result from one half of the samples, judged by the other half, with no reference.
+"""The loss of pairs: compares a network's result from one half of the samples with the other half, without a reference.
 
-A and B are independent renders of one view, f the network. f(A) is compared with the image of B at three scales, and
-its differences with the gradients of B:
+A and B are independent renders of the same view, and f is the network. f(A) is compared with the image of B at three
+scales, and its differences with the gradients of B:
 
     L = sum over s = 0, 1, 2 of   mean rho( D_s(f(A) - y)² / D_s(m² + ε + v) )
       + sum over dx, dy of        mean rho( (Δ f(A) - g)² / (0.01 (m² + ε) + v_g) )
 
-    y, g     the image of B, without emission seen directly, and its dx, dy
-    D_s      mean over 2^s x 2^s pixels
-    m        mean over 3x3 pixels of f(A), a constant for the derivative
-    v, v_g   variances of the image and of dx, dy, taken from A, see ``spread``
+    y, g     the image of B, without directly visible emission, and its dx, dy
+    D_s      the mean over 2^s x 2^s pixels
+    m        the mean over 3x3 pixels of f(A), a constant for the derivative
+    v, v_g   the variances of the image and of dx, dy of A (``spread``)
     rho      Huber's function of the squared error: the square up to ``KNEE``², linear in the error beyond it
 
-The noise of B is independent of A and has mean 0: it adds a constant to the expected square, so the minimum is at the
-truth [Lehtinen et al. 2018, "Noise2Noise"]. Gradients have 5 to 24 times less noise than the image, so their term shows
-errors that the noise of the image hides [compare Guo et al. 2019, "GradNet", where input and target are one render].
+The noise of B is independent of A and has mean 0. So it adds a constant to the expected square, and the minimum is at
+the truth [Lehtinen et al. 2018, "Noise2Noise"]. Gradients have 5 to 24 times less noise than the image, so their term
+shows errors that are hidden in the noise of the image [compare Guo et al. 2019, "GradNet", where input and target are
+the same render].
 
-Weights are computed only from A. Weights from B would be small where B is bright by chance, and results would be too
+Divisors are computed only from A. Divisors from B would be large where B is bright by chance, and results would be too
 dark.
 """
 
@@ -25,26 +26,26 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 SCALES, KNEE = 3, 3.0
-# ε, for radiance over the exposure, where 4 is typical. It equals relMSE's ε for a typical radiance of 1/4.
+# ε. Radiance is divided by the exposure, so it is typically 4. For a typical radiance of 1/4, this is the ε of relMSE.
 DARK = 0.25
-# Added to the variance of gradients, as a share of the squared light; the 0.01 of the formula.
+# The 0.01 of the formula: a share of the squared light, which is added to the variance of gradients.
 RELATIVE = 0.01
-# A variance is at least AROUND times the typical one in its window: few samples estimate their own variance badly.
+# A variance is at least AROUND times the typical one in its window, because estimates from few samples are noisy.
 AROUND, WINDOW = 3.0, 5
 
 
 def halves(prediction: Tensor, other: dict[str, Tensor]) -> Tensor:
-    """L of f(A) (N, 3, H, W), radiance over the exposure of A. ``other`` is the target in the same units:
+    """L of f(A), (N, 3, H, W) divided by the exposure of A. ``other`` is the target in the same units:
 
     ``primal``, ``dx``, ``dy``           (N, 3, H, W) of B
     ``primal_se``, ``dx_se``, ``dy_se``  (N, 3, H, W) standard errors from A
-    ``counts``                           (N, 1, H, W) 1, or 0 for pixels that do not count, such as visible lamps
+    ``counts``                           (N, 1, H, W) weights: 1, or 0 for pixels that are left out, such as lamps
     """
     return judged(prediction, avg_pool2d(prediction.detach(), 3, 1, 1, count_include_pad=False), other)
 
 
 def judged(prediction: Tensor, smooth: Tensor, other: dict[str, Tensor]) -> Tensor:
-    """L with ``smooth`` for m."""
+    """L, with ``smooth`` as m."""
     light, counts, total = smooth.square() + DARK, other["counts"], prediction.new_zeros(())
     images = counts * (prediction - other["primal"]), light + spread(other["primal_se"]), counts
     for scale in range(SCALES):
@@ -62,16 +63,16 @@ def judged(prediction: Tensor, smooth: Tensor, other: dict[str, Tensor]) -> Tens
 
 
 def spread(errors: Tensor) -> Tensor:
-    """Variances from standard errors (N, 3, H, W), at least three times the typical variance of the 5x5 pixels around.
+    """Variances from standard errors (N, 3, H, W): at least three times the typical variance of 5x5 pixels.
 
-    The typical variance is the mean of fourth roots, to the power of 4: single large ones hardly count.
+    The typical variance is the fourth power of the mean of fourth roots, which single large variances hardly change.
     """
     around = avg_pool2d(errors.sqrt(), WINDOW, 1, WINDOW // 2, count_include_pad=False)
     return torch.maximum(errors.square(), AROUND * around.pow(4))
 
 
 def _mean(squares: Tensor, share: Tensor) -> Tensor:
-    """The mean of rho over pixels and channels; ``share`` (N, 1, H, W) holds the weights of pixels."""
+    """The mean of rho(squares) over pixels and channels, with the weights ``share`` (N, 1, H, W) of pixels."""
     straight = 2 * KNEE * squares.clamp(min=KNEE**2).sqrt() - KNEE**2
     rho = torch.where(squares < KNEE**2, squares, straight)
     return (share * rho).sum() / (squares.shape[1] * share.sum()).clamp(min=1)

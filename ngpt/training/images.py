@@ -1,4 +1,4 @@
-"""The task of the trainer that teaches networks to reconstruct images (``ngpt.network``), on single crops."""
+"""The task that trains networks which reconstruct images (``ngpt.network``), on single crops."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -22,16 +22,16 @@ from ngpt.training.validation import validate, views
 
 Loss = Callable[..., tuple[Tensor, dict[str, Tensor]]]
 
-# Logarithms are clamped to this before exp; it is 4.9e8 times the typical radiance, far above any useful target.
+# The largest logarithm that is passed to exp. Its radiance, 4.9e8, is far above useful targets.
 LIMIT = 20.0
 
 
 class Images(Task):
-    """Learns from ``crops`` and is validated on ``held_out``.
+    """Trains on ``crops``, and validates on ``held_out``.
 
-    ``loss`` takes scene-linear prediction and target (N, 3, H, W) and a generator of the step's random numbers. If a
-    batch has pairs, it also takes the layers of their other halves; the target then covers only the other examples, and
-    is None if there are none. If crops are rendered during training, as in a stream, runs cannot be repeated exactly.
+    ``loss`` takes scene-linear prediction and target (N, 3, H, W), and a generator of the step's random numbers. If a
+    batch has pairs, it also takes the layers of their other halves; then the target covers only the other examples, and
+    is None without any. If crops are rendered during training, as in a stream, runs cannot be repeated exactly.
     """
 
     def __init__(self, settings: Settings, crops: Sequence[Any], held_out: Sequence[Any], loss: Loss):
@@ -72,7 +72,7 @@ class Images(Task):
                 pin_memory=processes.device.type == "cuda",
             )
         except NgptError as error:
-            # The text of a worker's error begins with the worker's traceback.
+            # The message of an error in a worker begins with the traceback of the worker.
             raise NgptError(str(error).rpartition("NgptError: ")[2]) from None
 
     def loss(

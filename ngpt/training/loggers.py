@@ -1,43 +1,27 @@
-"""Loggers for the numbers of a run, in addition to ``log.jsonl``; and a meter of its speed and memory.
-
-A logger has ``log(step, values)``. TensorBoard is used if it is installed.
-"""
+"""Writes the numbers of a run to TensorBoard, in addition to ``log.jsonl``; and measures its speed and memory."""
 
 import sys
 import time
-from contextlib import suppress
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import torch
 
 
-class Logger(Protocol):
-    def log(self, step: int, values: dict[str, float]) -> None: ...
+def tensorboard(out: Path, step: int) -> Any:
+    """The writer of the folder ``tensorboard`` in ``out``; earlier entries from ``step`` on are dropped.
 
-
-class TensorBoard:
-    """Writes to the folder ``tensorboard`` of the run. Earlier entries for ``step`` and later are dropped."""
-
-    def __init__(self, out: Path, step: int):
+    None if TensorBoard is not installed.
+    """
+    try:
         from torch.utils.tensorboard import SummaryWriter
-
-        self._writer = SummaryWriter(str(out / "tensorboard"), purge_step=step)
-
-    def log(self, step: int, values: dict[str, float]) -> None:
-        for name, value in values.items():
-            self._writer.add_scalar(name, value, step)
-
-
-def loggers(out: Path, step: int) -> list[Logger]:
-    """The loggers of a run in the folder ``out`` that begins with ``step``."""
-    with suppress(ImportError):  # not installed
-        return [TensorBoard(out, step)]
-    return []
+    except ImportError:
+        return None
+    return SummaryWriter(str(out / "tensorboard"), purge_step=step)
 
 
 class Meter:
-    """Steps per second since the last reading, and the largest memory so far in MiB: the GPU's if there is one."""
+    """Measures steps per second since the last reading, and the largest memory so far in MiB, of the GPU if used."""
 
     def __init__(self, step: int, device: torch.device):
         self._step, self._time, self._device = step, time.monotonic(), device
@@ -50,10 +34,11 @@ class Meter:
 
 
 def _memory(device: torch.device) -> int:
+    """The largest memory so far in bytes; 0 on Windows, which does not tell it."""
     if device.type == "cuda":
         return int(torch.cuda.max_memory_allocated(device))
     try:
         import resource
-    except ImportError:  # Windows
+    except ImportError:
         return 0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

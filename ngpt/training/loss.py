@@ -1,4 +1,4 @@
-"""The loss of training: a perceptual distance over random transforms, plus pixelwise terms.
+"""The loss of training: a perceptual distance, averaged over random transforms, and pixelwise terms.
 
 Other packages add terms by entry points of the group "ngpt.losses", see docs/train/add-a-loss.md.
 """
@@ -19,7 +19,7 @@ from ngpt.system.records import from_table
 from ngpt.training import pixelwise
 from ngpt.training.halves import halves
 
-# A term: prediction and target, scene-linear (N, 3, H, W) float32 over the exposure -> a scalar, the mean over all.
+# A term: (prediction, target), scene-linear (N, 3, H, W) float32 divided by the exposure, -> their mean, a scalar.
 Term = Callable[[Tensor, Tensor], Tensor]
 _OURS: dict[str, Term] = {
     "l1": pixelwise.l1,
@@ -39,9 +39,9 @@ class LossSettings:
     ``evaluations``  draws of the random transforms that are averaged in each step
     ``scales``       largest downscaling among the transforms; NGPT trains with 2
     ``l1``, ``gradient``, ``relative``, ``huber``, ``pyramid``
-                     weights of the pixelwise parts; NGPT has 0.01, 0.01, 0, 0, 0
-    ``halves``       weight of the loss of pairs, ``ngpt.training.halves``; 0.25 has about the effect of the weights in
-                     combine.toml
+                     weights of the pixelwise terms; NGPT has 0.01, 0.01, 0, 0, 0
+    ``halves``       weight of the loss of pairs (``ngpt.training.halves``); 0.25 has about the effect of the other
+                     weights in combine.toml
     ``backbone``, ``weights``  files of E-LPIPS (docs/train/losses.md); "" looks for the backbone in PyTorch's cache
     """
 
@@ -58,25 +58,24 @@ class LossSettings:
     weights: str = ""
 
 
-# Weights of terms from other packages also go into [loss], by the terms' names.
+# The table [loss] also has weights for terms of other packages, by the names of the terms.
 _TAKEN = (*perceptual.KINDS, *(field.name for field in fields(LossSettings)))
 TERMS: Registry[Term] = Registry("ngpt.losses", "loss", Callable, _OURS, _TAKEN)
 
 
 class Loss:
-    """The loss of prediction and target, scene-linear (N, 3, H, W) float32, with a generator on their device.
+    """A function of prediction and target, scene-linear (N, 3, H, W) float32, and a generator on their device.
 
-    ``other``  the layers of other halves for the last predictions, which have no target; see ``ngpt.training.halves``
-
-    Returns the weighted sum, a mean over the predictions, and its parts, by name, before weighting.
+    It returns the loss, which is a mean over the predictions, and its parts, by name, before weighting. ``other`` holds
+    the layers of other halves for the last predictions, which have no target (``ngpt.training.halves``).
     """
 
     def __init__(self, settings: LossSettings, others: dict[str, float] | None = None):
-        """``others``: weights of other packages' terms, by name."""
+        """``others`` holds weights for terms of other packages, by name."""
         self.settings = settings
         weights = {name: getattr(settings, name) for name in _OURS} | (others or {})
         if settings.kind in TERMS:
-            # Without a perceptual part its weight would only scale the learning rate.
+            # Without a perceptual part, another weight would only scale the learning rate.
             weights[settings.kind] = 1.0
         self._terms = [(name, weight, TERMS[name]) for name, weight in weights.items() if weight]
         self._distance: PerceptualDistance | None = None

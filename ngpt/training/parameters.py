@@ -1,6 +1,6 @@
-"""The tables of docs/train/training.md: ``python -m ngpt.training.parameters`` prints them.
+"""Makes the tables of docs/train/training.md: ``python -m ngpt.training.parameters`` prints them.
 
-The meaning of a parameter is in the docstring of its dataclass, as ``name``  meaning. The purpose of a configuration is
+The meaning of a parameter is in the docstring of its dataclass, after its ``name``. The purpose of a configuration is
 the first sentence of its file.
 """
 
@@ -42,19 +42,19 @@ def parameter_tables() -> str:
         for names, meaning in entries(kind):
             keys = ", ".join(f"`{table}.{name}`" if table else f"`{name}`" for name in names)
             defaults = ", ".join(_default(known[name]) for name in names)
-            told = meaning.replace("``", "`").replace("|", "\\|")
-            lines.append(f"| {keys} | {described(hints[names[0]])} | {defaults} | {told} |")
+            text = meaning.replace("``", "`").replace("|", "\\|")
+            lines.append(f"| {keys} | {described(hints[names[0]])} | {defaults} | {text} |")
     return "\n".join(lines)
 
 
 def tables_of(text: str) -> dict[str, type | None]:
-    """The tables that a configuration may have; None for tables of the other kind of network."""
+    """The tables that a configuration may have; None for those that it may not have, with its kind of network."""
     other = ("temporal",) if "model" in tomllib.loads(text) else ("model", "loss", "augmentation")
     return TABLES | dict.fromkeys(other)
 
 
 def training_template(text: str) -> str:
-    """``ngpt.system.templates.template`` of a configuration, with the weights of other packages' terms."""
+    """``ngpt.system.templates.template`` of a configuration, with weights for terms of other packages."""
     others = {
         name: f"weight of another package's term: {cleandoc(TERMS[name].__doc__ or name)}" for name in TERMS.load()
     }
@@ -66,7 +66,7 @@ def _default(field: Field) -> str:
 
 
 def configuration_table() -> str:
-    """A table in Markdown of the configurations that come with ngpt: their purposes and the cost of their networks."""
+    """A table in Markdown of the configurations that come with ngpt, with their purposes and costs."""
     lines = ["| configuration | what | parameters | thousand multiplications per pixel |", "|---|---|--:|--:|"]
     return "\n".join(lines + [configuration_row(name) for name in configs.names(configs.TRAINING)])
 

@@ -17,10 +17,7 @@ def l1(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def gradient_l1(prediction: Tensor, target: Tensor) -> Tensor:
-    """Mean |R(Δp) - R(Δt)| of the differences along x, plus that along y; an axis of one pixel adds 0.
-
-    Differences are only between pixels of the image.
-    """
+    """Mean |R(Δp) - R(Δt)| of the differences along x, plus the same along y; an axis of one pixel adds 0."""
     total = prediction.new_zeros(())
     for axis in (-1, -2):
         if prediction.shape[axis] > 1:
@@ -34,11 +31,11 @@ def relative(prediction: Tensor, target: Tensor, epsilon: float = 1e-2) -> Tenso
 
 
 def huber(prediction: Tensor, target: Tensor, epsilon: float = 1e-2, knee: float = 0.5) -> Tensor:
-    """Mean of Huber's function of e = (p - t) / √(p² + ε): e² / 2 up to the knee, straight beyond it.
+    """Mean of Huber's function of e = (p - t) / √(p² + ε): e² / 2 up to the knee, and linear beyond it.
 
-    In its gradient √(p² + ε) counts as a constant. Where the noise of the target is below the knee, the minimum is at
-    the expectation of the target, so noise of mean 0 does no harm [Lehtinen et al. 2018, "Noise2Noise", section 3.3].
-    Fireflies of the target count only by their number; a plain squared error would chase them.
+    For the gradient, √(p² + ε) is a constant. If the noise of the target is below the knee, the minimum is at the
+    expectation of the target, so noise of mean 0 does no harm [Lehtinen et al. 2018, "Noise2Noise", section 3.3].
+    Fireflies in the target count only by their number; with a squared error, they would dominate.
     """
     error = ((prediction - target) / (prediction.detach().square() + epsilon).sqrt()).abs()
     return torch.where(error < knee, error.square() / 2, knee * (error - knee / 2)).mean()
@@ -47,10 +44,10 @@ def huber(prediction: Tensor, target: Tensor, epsilon: float = 1e-2, knee: float
 def pyramid(prediction: Tensor, target: Tensor) -> Tensor:
     """Mean |p - t| of display-encoded images at 4 resolutions and 3 exposures, in [0, 1].
 
-    How visible an error is depends on its width: eyes average out fine noise, above all noise of colours, but not an
-    offset of a whole patch [Andersson et al. 2020, "FLIP", section 4.1, here with box filters]. The SSIM in the
-    structural distance does not see such offsets, because it subtracts the means of patches. Each resolution has half
-    the pixels of the last, rounded up.
+    The visibility of an error depends on its width: eyes average fine noise, above all noise of colours, but not an
+    offset of a whole patch [Andersson et al. 2020, "FLIP", section 4.1, here with box filters]. The structural distance
+    does not detect such offsets, because SSIM subtracts the means of patches. Each resolution is half as fine as the
+    last, rounded up.
     """
     total = prediction.new_zeros(())
     for exposure in _EXPOSURES:

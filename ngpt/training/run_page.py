@@ -1,7 +1,7 @@
-"""The page of a training run, updated during training, and the page that compares several. Needs no PyTorch.
+"""Makes the page of a training run, and the page that compares several runs, without PyTorch.
 
-It reads ``log.jsonl`` in the folder of a run, and ``settings.json``, ``run.json`` and the last ``validation-STEP`` if
-they exist: a page can be made of any run, at any time.
+A page is made from ``log.jsonl`` in the folder of a run, and from ``settings.json``, ``run.json`` and the last
+``validation-STEP`` if they exist. So it can be made of any run at any time.
 """
 
 import base64
@@ -41,7 +41,7 @@ STYLE = """
 
 @dataclass(frozen=True)
 class Run:
-    """The contents of a run's folder: ``entries`` of its log, ``settings`` and ``record`` ({} where there are none)."""
+    """The contents of a run's folder: the ``entries`` of its log, and ``settings`` and ``record``, {} if missing."""
 
     folder: Path
     name: str
@@ -60,25 +60,25 @@ class Run:
 
     @property
     def scores(self) -> list[dict[str, float]]:
-        """The entries of validations."""
+        """The entries with the results of validations."""
         return [entry for entry in self.entries if "relMSE" in entry]
 
     @property
     def best(self) -> dict[str, float]:
-        """The entry of the validation with the least error, {} before the first."""
+        """The entry of the validation with the least error; {} before the first validation."""
         return min(self.scores, key=lambda entry: entry["relMSE"], default={})
 
     def line(self, name: str) -> list[tuple[float, float]]:
-        """The curve of the number ``name`` over the steps."""
+        """The points (step, value) of the number ``name``."""
         return [(entry["step"], entry[name]) for entry in self.entries if name in entry]
 
     def last(self, name: str) -> float:
-        """The newest number of that name; NaN if there is none."""
+        """The last value of the number ``name``; NaN if there is none."""
         return next((entry[name] for entry in reversed(self.entries) if name in entry), math.nan)
 
 
 def read_run(folder: str | Path, name: str = "") -> Run:
-    """The run in a folder. Raises NgptError if it has no log, and for files that cannot be read."""
+    """The run in a folder. Raises NgptError if it has no log, or if a file cannot be read."""
     folder = Path(folder)
     if not (folder / LOG).is_file():
         raise NgptError(f"{folder}: holds no {LOG}; name the folder that `ngpt train --out` wrote")
@@ -98,17 +98,22 @@ def write_run(folder: str | Path) -> None:
 
 
 def page(runs: list[Run], command: str = "") -> str:
-    """One run, or a comparison of several, as HTML."""
+    """The page of one run, or the comparison of several, as HTML."""
     alone = runs[0] if len(runs) == 1 else None
     going = alone is not None and alone.done < alone.steps
     parts = ["<h3>Runs</h3>", plain_table(_overview(runs))]
     parts += [f'<p class="hint">{markup(_state(alone))}</p>' if alone else ""]
     parts += [_pictures(run) for run in runs]
     parts += ["<h3>Curves</h3>", plots_html(_plots(runs))]
-    parts += [_settings("Settings that differ", _differing(runs))] if len(runs) > 1 else []
+    if not alone:
+        values = [flat(run.settings) for run in runs]
+        differing = _side_by_side("setting", runs, values, difference(*values))
+        parts.append(_settings("Settings that differ", differing))
     for run in runs:
         parts.append(_settings(f"{run.name}: what differs from {run.record.get('base', '?')}", _own(run)))
-    parts.append(_settings("System", _system(runs)))
+    facts = [flat(run.record.get("system", {})) for run in runs]
+    names = list(dict.fromkeys(name for fact in facts for name in fact))
+    parts.append(_settings("System", _side_by_side("system", runs, facts, names)))
     if alone:
         rows = [["setting", "value"], *([key, _text(value)] for key, value in flat(alone.settings).items())]
         parts.append(f"<details><summary>All settings</summary>{_settings('', rows)}</details>")
@@ -145,7 +150,7 @@ def _state(run: Run) -> str:
 
 
 def _plots(runs: list[Run]) -> dict[str, str]:
-    """Curves over the steps: for one run, curves of all its numbers; for several runs, one line for each run."""
+    """Curves over the steps. For several runs, each plot has a line for each run."""
     plots: dict[str, str] = {}
     if len(runs) == 1:
         for title, name in (("relMSE of the views held out", "relMSE"), ("flicker of the shots held out", "flicker")):
@@ -180,23 +185,23 @@ def _time(seconds: float) -> str:
 
 
 def _drawn(run: Run) -> tuple[Path, dict[str, Any]] | None:
-    """The picture of the last validation that has captions, and the captions; None if there is none."""
+    """The picture of the last validation with captions, and the captions; None without any."""
     for path in sorted(run.folder.glob("validation-*.json"), reverse=True):
-        told = read_json(path)
-        if path.with_suffix(".png").is_file() and isinstance(told, dict) and told.get("views"):
-            return path.with_suffix(".png"), told
+        captions = read_json(path)
+        if path.with_suffix(".png").is_file() and isinstance(captions, dict) and captions.get("views"):
+            return path.with_suffix(".png"), captions
     return None
 
 
 def _pictures(run: Run) -> str:
-    """The validation views: a strip of three pictures for each, with scene, samples and errors."""
+    """The views of the last validation: for each, a strip of three pictures, its scene, samples and errors."""
     found = _drawn(run)
     if found is None:
         return ""
-    path, told = found
+    path, captions = found
     heads = '<div class="heads">' + "".join(f"<span>{name}</span>" for name in COLUMNS) + "</div>"
     strips = []
-    for row, view in enumerate(told["views"]):
+    for row, view in enumerate(captions["views"]):
         text = f"{markup(str(view['scene']))}, {view['spp']} spp"
         given, made = (_number(view.get(name, math.nan)) for name in ("relMSE primal", "relMSE"))
         errors = f"relMSE {given} &rarr; {made}"
@@ -210,25 +215,25 @@ def _pictures(run: Run) -> str:
 
 
 def _key(run: Run) -> str:
-    """The name of a run's pictures in the style sheet."""
+    """The class of a run's pictures in the style sheet."""
     return "of-" + run.folder.absolute().as_posix().encode().hex()[-48:]
 
 
 def _style(runs: list[Run]) -> str:
-    """Style rules that hold each picture once, as a background; a strip shows one row of it."""
+    """The style sheet. It holds each picture once, as a background, of which each strip shows one row."""
     rules = [STYLE]
     for run in runs:
         if (found := _drawn(run)) is not None:
-            path, told = found
+            path, captions = found
             data = base64.b64encode(path.read_bytes()).decode()
-            width, height = told["size"]
-            # At most two screen pixels for each pixel.
+            width, height = captions["size"]
+            # A pixel is at most two pixels of the screen wide.
             rules.append(f".{_key(run)}-box {{ max-width: {6 * width}px; }}")
             rules.append(
                 f".{_key(run)} {{ background-image: url(data:image/png;base64,{data}); "
                 f"aspect-ratio: {3 * width} / {height}; }}"
             )
-            count = len(told["views"])
+            count = len(captions["views"])
             rules += [
                 f".{_key(run)}.row{i} {{ background-position-y: {round(100 * i / max(count - 1, 1), 4)}%; }}"
                 for i in range(count)
@@ -237,31 +242,20 @@ def _style(runs: list[Run]) -> str:
 
 
 def _settings(title: str, rows: list[list[str]]) -> str:
-    """A table under its title; "" if it has no row except its header."""
+    """A table with its title; "" if it has only a header."""
     head = f"<h3>{markup(title)}</h3>" if title else ""
     return f'{head}<div class="settings">{plain_table(rows)}</div>' if len(rows) > 1 else ""
 
 
 def _own(run: Run) -> list[list[str]]:
-    """The settings of a run that differ from the configuration that it began with."""
+    """The settings of a run that differ from its configuration."""
     changed = run.record.get("changed", {})
     rows = [[name, *map(_text, values)] for name, values in changed.items()]
     return [["setting", str(run.record.get("base", "?")), "this run"], *rows]
 
 
-def _differing(runs: list[Run]) -> list[list[str]]:
-    """The settings that differ between runs."""
-    values = [flat(run.settings) for run in runs]
-    return _side_by_side("setting", runs, values, difference(*values))
-
-
-def _system(runs: list[Run]) -> list[list[str]]:
-    facts = [flat(run.record.get("system", {})) for run in runs]
-    return _side_by_side("system", runs, facts, list(dict.fromkeys(name for fact in facts for name in fact)))
-
-
 def _side_by_side(title: str, runs: list[Run], values: list[dict[str, Any]], names: list[str]) -> list[list[str]]:
-    """A column for each run, a row for each name."""
+    """A table with a column for each run and a row for each of ``names``."""
     head = [title, *(run.name for run in runs)]
     return [head, *([name, *(_text(value.get(name)) for value in values)] for name in names)]
 

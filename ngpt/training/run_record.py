@@ -1,4 +1,4 @@
-"""``run.json``: the settings of a run that differ from its configuration, and the machine that it runs on."""
+"""Writes ``run.json``: the settings of a run that differ from its configuration, and the machine that it runs on."""
 
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,9 @@ from ngpt.training.settings_text import difference, flat
 
 
 def write_record(out: Path, settings: Settings, config: Path, model: nn.Module, device: torch.device) -> None:
-    """Writes the record into the folder ``out``; it names folders without their paths.
+    """Writes the record into the folder ``out``, with the names of folders but not their paths.
 
-    The record's "base" is the configuration ``config``, or the nearest one of ngpt if ``config`` is a user's own file.
+    Its entry "base" is the configuration ``config``, or the nearest one of ngpt if ``config`` is a user's own file.
     """
     base, changed = nearest(settings, config)
     system: dict[str, Any] = metadata("torch", "numpy", "safetensors")
@@ -32,7 +32,7 @@ def write_record(out: Path, settings: Settings, config: Path, model: nn.Module, 
 
 
 def nearest(settings: Settings, config: Path) -> tuple[str, dict[str, list]]:
-    """The nearest configuration of ngpt, and the settings that differ: name -> [value there, value here]."""
+    """The nearest configuration of ngpt, and the settings that differ: name -> [its value, value of the run]."""
     shipped = config.parent == configs.FOLDER
     names = [config.stem] if shipped else configs.names(configs.TRAINING)
     here = flat(published(settings))

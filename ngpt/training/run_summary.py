@@ -1,4 +1,4 @@
-"""The summary of a training run's folder for ``ngpt info``, without PyTorch, also during the run."""
+"""Summarises the folder of a training run for ``ngpt info``, without PyTorch, also during the run."""
 
 import json
 import struct
@@ -13,9 +13,9 @@ from ngpt.system.records import check, parse_json, read_json
 
 CHECKPOINT, SETTINGS, WEIGHTS = "checkpoint.safetensors", "settings.json", "weights.safetensors"
 PAGE = "run.html"
-# The number of log entries that the loss is averaged over, since the loss of one batch is noisy.
+# The loss is averaged over this number of log entries, because the loss of one batch is noisy.
 _RECENT = 10
-# The largest header in bytes, far more than names and shapes of tensors take.
+# The largest header in bytes, far more than the names and shapes of tensors need.
 _MAX_HEADER = 2**26
 
 
@@ -24,9 +24,9 @@ def is_run(folder: Path) -> bool:
 
 
 def summary(folder: Path) -> dict[str, Any]:
-    """Steps, time, losses and validation scores of a run: a table for people and for JSON.
+    """Steps, time, losses and validation scores of a run, as a table for people and for JSON.
 
-    Raises NgptError for a checkpoint, settings or a log that cannot be read.
+    Raises NgptError if checkpoint, settings or log cannot be read.
     """
     entries = entries_of(folder / LOG) if (folder / LOG).is_file() else []
     report: dict[str, Any] = {"training run": str(folder)}
@@ -58,7 +58,7 @@ def summary(folder: Path) -> dict[str, Any]:
 
 
 def _header(path: Path) -> dict[str, Any]:
-    """The record in a checkpoint, without its tensors: a safetensors file begins with the length of its JSON header."""
+    """The record in the header of a checkpoint. A safetensors file begins with the length of its JSON header."""
     try:
         with regular_file(path) as file:
             (length,) = struct.unpack("<Q", file.read(8))

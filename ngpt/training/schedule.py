@@ -1,4 +1,4 @@
-"""Learning rates as functions of the step, and the average of the weights."""
+"""The learning rate as a function of the step, and the average of the weights."""
 
 import math
 
@@ -9,7 +9,7 @@ from ngpt.training.settings import OptimizerSettings
 
 
 def learning_rate(settings: OptimizerSettings, step: int, steps: int) -> float:
-    """The learning rate of step 0 .. steps - 1.
+    """The learning rate of a ``step`` from 0 to ``steps`` - 1, by ``settings.schedule``:
 
     paper    grows exponentially from 1e-4 of the rate to the full rate at ``warmup``, is constant until ``flat``, then
              halves every ``half_life`` steps [Kettunen et al. 2019, section 5.3, and their code]
@@ -27,14 +27,13 @@ def learning_rate(settings: OptimizerSettings, step: int, steps: int) -> float:
 
 
 def warmup_of(settings: OptimizerSettings, steps: int) -> int:
-    """The steps of the warm-up: ``warmup``, or a tenth of the run if the run would end within ``warmup``."""
+    """The steps of the warm-up: ``warmup``, or a tenth of the run if the run is not longer than ``warmup``."""
     return settings.warmup if settings.warmup < steps else steps // 10
 
 
 @torch.no_grad()
 def update_average(average: nn.Module, model: nn.Module, decay: float, step: int) -> None:
-    """average <- d average + (1 - d) model, where d grows to ``decay``, so that the first weights soon stop
-    counting."""
+    """average <- d average + (1 - d) model. d grows to ``decay``, so that the first weights soon lose influence."""
     decay = min(decay, (1 + step) / (10 + step))
     for mean, value in zip(average.parameters(), model.parameters(), strict=True):
         mean.lerp_(value, 1 - decay)

@@ -1,4 +1,4 @@
-"""The settings of a training run, as TOML files hold them: ``configs/*.toml``."""
+"""The settings of a training run, which TOML files hold: ``configs/*.toml``."""
 
 import dataclasses
 import tomllib
@@ -17,7 +17,7 @@ from ngpt.training.settings_text import difference, flat
 
 @dataclass(frozen=True)
 class DataSettings:
-    """The source of examples.
+    """The sources of training examples.
 
     ``folders``     data sets (``python -m data_gen``) or folders of stacks with references; all are mixed
     ``validation``  prefixes of the names of scenes that are kept out of training
@@ -25,8 +25,8 @@ class DataSettings:
                     none out
     ``crop``        side of an example in pixels
     ``pairs``       share of examples that are pairs without a reference, if there are also crops with references
-    ``kept``        folder for references of sets that are rendered during training: references are rendered once, and
-                    used again with new noise in the inputs. "" always renders new ones
+    ``kept``        folder for the references of sets that are rendered during training: references are rendered once,
+                    and used again with new noise in the inputs. "" always renders new ones
     ``workers``     processes that prepare examples, at most one for each processor; 0 prepares them between steps
     ``cache``       MiB of memory for prepared examples, in each of these processes
     """
@@ -70,8 +70,8 @@ class RunSettings:
     """Length, precision and intervals of a run.
 
     ``steps``, ``batch``  length of the run, and examples per step over all processes
-    ``precision``  precision of the network's body: "float32" or "bfloat16". CPUs without instructions for bfloat16,
-                   which would take several times as long, compute in float32
+    ``precision``  precision of the network's body: "float32" or "bfloat16". CPUs without instructions for bfloat16
+                   compute in float32, because emulation takes several times as long
     ``seed``       seed of all random numbers: weights, order, augmentation, transforms of the loss
     ``minutes``    wall-clock budget of one call; 0 means no limit. A run that reaches it can be resumed
     ``log``, ``save``, ``validate``  steps between two log entries, checkpoints or validations
@@ -91,10 +91,10 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class TemporalSettings:
-    """The network that blends frames (``ngpt.training.temporal``), instead of a network that makes images.
+    """Settings for the network that blends frames (``ngpt.training.temporal``) in place of one that makes images.
 
     ``methods``  the methods whose results it learns to blend
-    ``round``    steps of a round; at its beginning the current network makes new histories of shots
+    ``round``    steps of a round. At its beginning, the current network makes new histories of shots
     ``clips``    number of clips in a round, drawn at random; a clip is a shot by one method
     """
 
@@ -105,7 +105,7 @@ class TemporalSettings:
 
 @dataclass(frozen=True)
 class Settings:
-    """All settings of a run. ``ngpt.training.loss.make_loss`` reads ``loss``. Either ``model`` or ``temporal`` is set.
+    """All settings of a run. Either ``model`` or ``temporal`` is set. ``ngpt.training.loss.make_loss`` reads ``loss``.
 
     ``initial``  weights to start from, with the same [model]: a file, or the name of a network that comes with ngpt; ""
                  starts from random weights
@@ -137,20 +137,20 @@ def read_settings(path: str | Path, changes: list[str] = ()) -> Settings:  # typ
 
 
 def from_dict(values: dict[str, Any], path: str) -> Settings:
-    """Settings of nested dicts; ``path`` is for messages."""
+    """Settings from nested dicts; ``path`` is for messages. Raises NgptError as ``read_settings``."""
     settings = from_table(Settings, values, path)
     _check(settings, path)
     return settings
 
 
 def changed(before: Settings, now: Settings) -> list[str]:
-    """The settings that differ, each as "table.key: before -> now"."""
+    """The settings that have changed, each as "table.key: before -> now"."""
     one, other = flat(before.to_dict()), flat(now.to_dict())
     return [f"{name}: {one.get(name)} -> {other.get(name)}" for name in difference(one, other)]
 
 
 def published(settings: Settings) -> dict[str, Any]:
-    """The settings for published files: folders and files without their paths."""
+    """The settings for published files, with the names of folders and files but not their paths."""
     values = settings.to_dict()
     values["data"]["folders"] = [Path(folder).name for folder in settings.data.folders]
     values["initial"] = Path(settings.initial).name

@@ -1,4 +1,4 @@
-"""Settings as flat dictionaries, and their differences. Needs no PyTorch."""
+"""Settings as flat dictionaries, and their differences, without PyTorch."""
 
 from typing import Any
 
@@ -12,6 +12,6 @@ def flat(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def difference(*several: dict[str, Any]) -> list[str]:
-    """The names of flat settings that differ between any of the dictionaries."""
+    """The names of the settings that differ between any of several flat dictionaries."""
     names = dict.fromkeys(name for values in several for name in values)
     return [name for name in names if any(v.get(name) != several[0].get(name) for v in several)]

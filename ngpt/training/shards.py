@@ -1,33 +1,34 @@
-"""Shards of a training set: one safetensors file for a few crops of one scene, written completely or not at all.
+"""Shards of a training set: safetensors files with a few crops of one scene, written completely or not at all.
 
-Tensors, N crops of K inputs each, (N, K, H, W, C) unless said otherwise, scene-linear:
+A shard has N crops with K inputs each. Tensors are scene-linear, and (N, K, H, W, C) unless another shape is given:
 
-    indirect, direct            primal - direct - caustic, and direct: separate, since half floats would lose the light
-                                that a lamp outshines
+    indirect, direct            primal - direct - caustic, and direct. They are separate, because in a sum of half
+                                floats weak light beside a lamp would be lost
     albedo, normal, depth
-    primal_se                   standard errors: variances of small numbers would underflow in half floats
+    primal_se                   standard errors, because variances of small numbers would underflow in half floats
     dx, dy, dx_se, dy_se        all or none: inputs of a sampler without gradients have none
-    caustic, caustic_se         all three or none: light that dx and dy exclude
+    caustic, caustic_se         light that dx and dy exclude; all three or none
     reference_caustic           (N, H, W, 3)
     reference_indirect, reference_direct    (N, H, W, 3)
     reference_halves            (N, 2, H, W, 3), optional: reference_indirect by each half of its samples
     samples                     optional: the number of samples of each pixel, if it varies within inputs
     diffuse, diffuse_se, specular, specular_se    all or none: parts of indirect, where the sampler splits it
-    fine_primal, fine_albedo, fine_normal    (N, K, k H, k W, 3), all or none: k x k subpixels of each pixel; all light
-    feature_noise               (N, K), where there are these: the variance ``ngpt:featureNoise``, -1 if not known
-    motion                      (N, H, W, 2), optional: the layer of that name, floats, ``FAR`` where it is not known
+    fine_primal, fine_albedo, fine_normal    (N, K, k H, k W, 3), all or none: k x k subpixels of each pixel, with all
+                                light
+    feature_noise               (N, K), only with subpixels: the variance ``ngpt:featureNoise``, -1 if unknown
+    motion                      (N, H, W, 2), optional: the layer of that name, floats, ``FAR`` where it is unknown
     spp                         (N, K) samples per pixel, int32
 
 The layer ``shared`` of inputs is left out, because no network reads it.
 
 Pairs have K = 2 independent inputs, and no references.
 
-Shots are crops too, one for each frame, in their order; the records of crops number the frames.
+The frames of a shot are crops in their order; the records of these crops have the numbers of the frames.
 
-A tensor is stored in half floats if that changes at most the share ``MAX_LOSS`` of every crop, in floats otherwise.
-Pixels are the means of their subpixels, so where there are some, all light but ``indirect`` is stored in floats: what
-is left of a pixel beside ``direct`` would be lost otherwise, where a lamp outshines it.
-The header's metadata holds the record of the shard as JSON under "ngpt".
+A tensor is stored in half floats if this changes at most the share ``MAX_LOSS`` of every crop, otherwise in floats.
+With subpixels, ``fine_primal``, ``direct`` and ``caustic`` are always stored in floats. Pixels are the means of their
+subpixels, so otherwise weak light beside a lamp would be lost in their difference to ``direct``. The record of the
+shard is in the metadata of the header, as JSON under "ngpt".
 """
 
 import json
@@ -49,7 +50,7 @@ from ngpt.system.install import install_command
 from ngpt.system.records import check, parse_json
 from ngpt.system.writing import write_bytes
 
-# Tensors of the inputs and their channels.
+# The tensors of inputs, with their numbers of channels.
 GRADIENTS = {"dx": 3, "dy": 3, "dx_se": 3, "dy_se": 3}
 INPUTS = {"indirect": 3, "direct": 3, "albedo": 3, "normal": 3, "depth": 1, "primal_se": 3}
 CAUSTIC = {"caustic": 3, "caustic_se": 3}
@@ -63,10 +64,10 @@ REFERENCE_CAUSTIC = "reference_caustic"
 REFERENCE_HALVES = "reference_halves"
 MOTION = "motion"
 
-# The motion, in pixels, that stands for unknown motion; it leads out of any image.
+# The value, in pixels, that stands for unknown motion. It leads out of any image.
 FAR = 1e6
 
-# Types of numbers in safetensors
+# Name of a type in safetensors -> type of NumPy.
 _TYPES = {"F16": np.float16, "F32": np.float32, "F64": np.float64, "U8": np.uint8, "I32": np.int32, "I64": np.int64}
 
 # Share of the sum of absolute values that conversion to half floats may change; plain rounding changes about 1.8e-4.
@@ -75,13 +76,15 @@ MAX_LOSS = 1e-3
 
 @dataclass(frozen=True)
 class CropData:
-    """One crop as it was rendered: K finite stacks, and the converged image; None for a pair, which has no reference.
+    """A rendered crop.
 
-    ``reference`` is the whole converged image, ``reference_direct`` the emission seen directly in it, and
-    ``reference_caustic`` the light that the layer ``caustic`` of the stacks estimates; None if they have no such layer.
-    ``halves`` are two independent images, each from half of the reference's samples, without ``reference_caustic``; ()
-    if the reference was not made of halves. ``motion`` (H, W, 2) is the motion in a frame of a shot, NaN where it is
-    not known; None for single images.
+    ``stacks``             K inputs with finite values, with ``spp`` samples per pixel
+    ``reference``          the converged image (H, W, 3); None for a pair
+    ``reference_direct``   the directly visible emission in it; None for a pair
+    ``reference_caustic``  the light in it that the layer ``caustic`` of inputs estimates; None without such a layer
+    ``halves``             two independent images, each from half of the reference's samples, without
+                           ``reference_caustic``; () if the reference is not made of halves
+    ``motion``             (H, W, 2), the motion of a frame of a shot, NaN where it is unknown; None for single images
     """
 
     stacks: Sequence[GradientStack]
@@ -116,8 +119,8 @@ def tensor_names(
     """The names of the tensors of a shard.
 
     ``gradients``, ``caustic``  whether its inputs have these layers
-    ``further``                 names of its optional tensors
-    ``pairs``                   whether it holds pairs, which have no references
+    ``further``                 the names of its optional tensors
+    ``pairs``                   whether its crops are pairs, which have no references
     """
     references = () if pairs else (*((REFERENCE_CAUSTIC,) if caustic else ()), *REFERENCES)
     return (*INPUTS, *(GRADIENTS if gradients else ()), *(CAUSTIC if caustic else ()), *further, *references, "spp")
@@ -140,7 +143,7 @@ def _input_tensors(stack: GradientStack) -> dict[str, np.ndarray]:
 
 
 def smallest_float(tensor: np.ndarray) -> np.ndarray:
-    """``tensor`` (N, ...) in half floats where that is safe for each of its N entries, else in floats."""
+    """``tensor`` (N, ...) in half floats if that is accurate enough for each of its N entries, else in floats."""
     if tensor.dtype.kind != "f":
         return tensor
     with np.errstate(over="ignore"):
@@ -152,12 +155,12 @@ def smallest_float(tensor: np.ndarray) -> np.ndarray:
 
 
 def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]) -> None:
-    """Writes a shard and the record of its rendering. It may hold no crop, if all have failed.
+    """Writes a shard with the record of its rendering. It has no crops if all of them have failed.
 
-    An existing shard is kept: another worker has made it. It differs from this one only in the times of its record, and
-    its checksum may be in the manifest already.
+    An existing file is kept: another worker has made it, and its checksum may already be in the manifest. It differs
+    only in the times of its record.
 
-    Raises NgptError for a tensor with numbers that are not finite, and if the file cannot be written.
+    Raises NgptError for values that are not finite, and if the file cannot be written.
     """
     from safetensors.numpy import save
 
@@ -169,18 +172,18 @@ def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]
     for name, tensor in tensors.items():
         if not np.isfinite(tensor).all():
             raise NgptError(f"{path}: tensor '{name}' has {np.sum(~np.isfinite(tensor))} values that are not finite")
-    # safetensors writes the bytes in the order of memory, so arrays must be contiguous in C order.
+    # safetensors writes bytes in the order of memory, so arrays must be contiguous in C order.
     tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
     data = save(tensors, {"ngpt": json.dumps(record)})
     files.save(path, lambda path, overwrite: write_bytes(path, data, overwrite), alike=True)
 
 
 class Shard:
-    """A shard for reading parts of its tensors.
+    """Reads parts of the tensors in a shard.
 
-    The file is not mapped into memory: truncating a mapped file would kill the process without a message.
+    The file is not mapped into memory, because if a mapped file is truncated, the process dies without a message.
 
-    ``keep_open``  whether the file is opened only once, so that it may be removed while it is read
+    ``keep_open``  whether the file stays open, so that it can be read after it has been removed
     """
 
     def __init__(self, path: Path, keep_open: bool = False):
@@ -192,7 +195,7 @@ class Shard:
         if not path.is_file():
             raise NgptError(f"{path}: no such shard; make it again: ngpt dataset")
         try:
-            # safetensors checks the header; tensors are read without it.
+            # safetensors checks the header. Tensors are read by this class.
             with safe_open(path, framework="np") as checked:
                 metadata = checked.metadata() or {}
                 self.names = tuple(checked.keys())
@@ -229,7 +232,7 @@ class Shard:
         return _single(self._part(name, crop, k))
 
     def _part(self, name: str, *index: int) -> np.ndarray:
-        """The part of a tensor at these first indices. Raises NgptError if the file no longer holds it."""
+        """The part of a tensor at these first indices. Raises NgptError if the file is now too short."""
         shape = self.shape(name)
         array = np.empty(shape[len(index) :], _TYPES[self.type(name)])
         place = int(np.ravel_multi_index(index, shape[: len(index)])) if index else 0

@@ -1,4 +1,4 @@
-"""Splits crops into training and validation, by whole scenes."""
+"""Splits crops into crops for training and crops for validation, by whole scenes."""
 
 import hashlib
 from collections.abc import Sequence
@@ -6,28 +6,27 @@ from typing import Any, NamedTuple
 
 from ngpt.errors import NgptError
 
-# The most names in a message, before "..."
+# A message lists at most this number of names.
 _LISTED = 8
 
 
 class Split(NamedTuple):
-    """``training`` and ``held_out`` crops, and one line that says which were set aside ("" if there are no crops)."""
+    """Crops for ``training``, crops ``held_out`` for validation, and a line of text about the split."""
 
     training: list[Any]
     held_out: list[Any]
-    told: str
+    line: str
 
 
 def split(crops: Sequence[Any], validation: tuple[str, ...] = (), share: float = 0.0) -> Split:
-    """Sets whole scenes aside for validation: those whose names begin with one of ``validation``.
+    """Sets the scenes aside for validation whose names begin with one of ``validation``.
 
-    If ``validation`` is empty, a ``share`` of the scenes is set aside, at least one. A hash of the names chooses them,
-    so that the same set is always split the same way. With a single scene, a share of the crops is set aside; a single
-    crop goes to training.
+    If ``validation`` is empty, a ``share`` of the scenes is set aside, at least one. They are chosen by hashes of their
+    names, so that the same set is always split in the same way. With a single scene, a share of its crops is set aside;
+    a single crop goes to training.
 
-    Pairs of scenes that are set aside are in neither part, because they have no reference.
-
-    Raises NgptError for a name that no scene begins with, since the validation would lack that scene.
+    Pairs of scenes that are set aside are in neither part, because they have no reference. Raises NgptError for a name
+    in ``validation`` that no scene begins with.
     """
     scenes = sorted({crop.scene for crop in crops})
     if not scenes:
@@ -49,27 +48,25 @@ def split(crops: Sequence[Any], validation: tuple[str, ...] = (), share: float =
     apart = {scene for scene in scenes if scene.startswith(validation)} if validation else _chosen(known, share)
     training = [crop for crop in crops if crop.scene not in apart]
     held_out = [crop for crop in measurable if crop.scene in apart]
-    told = (
+    line = (
         f"validation: {len(apart)} of {len(scenes)} scenes set aside, {len(held_out)} crops: {_listed(sorted(apart))}"
     )
-    return Split(training, held_out, told)
+    return Split(training, held_out, line)
 
 
 def _of_one_scene(crops: list[Any], measurable: list[Any], share: float) -> Split:
-    """Splits the crops of a single scene. The validation crops resemble the others, so their errors are lower than on
-    another scene."""
+    """Splits the crops of a single scene. Errors on its validation crops are lower than on another scene."""
     scene, number = measurable[0].scene, len(measurable)
     count = min(_count(number, share), number - 1)
     if not count:
         return Split(crops, [], f"validation: nothing is set aside, since only one crop has a reference ('{scene}')")
     held_out = [measurable[i * number // count] for i in range(count)]
-    told = f"validation: {count} of {number} crops set aside, of '{scene}' as are the others: there is no second scene"
-    return Split([crop for crop in crops if crop not in held_out], held_out, told)
+    line = f"validation: {count} of {number} crops set aside, of '{scene}' as are the others: there is no second scene"
+    return Split([crop for crop in crops if crop not in held_out], held_out, line)
 
 
 def _chosen(scenes: list[str], share: float) -> set[str]:
-    """A share of the scenes, in the order of hashes. They stay chosen when a set grows, unless a new scene precedes
-    them."""
+    """A share of the scenes, in the order of hashes, so that most of them stay chosen when a set grows."""
     ordered = sorted(scenes, key=lambda name: hashlib.sha256(name.encode()).hexdigest())
     return set(ordered[: min(_count(len(scenes), share), len(scenes) - 1)])
 

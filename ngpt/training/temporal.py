@@ -1,17 +1,18 @@
 """The task that trains the network that blends frames (``ngpt.sequence.network``), on shots.
 
-The network makes the history of a frame itself: at the beginning of each round the current network blends the shots,
-and it learns from the resulting histories until the next round [Ross et al. 2011, "A reduction of imitation learning
-and structured prediction to no-regret online learning"]. The results to blend come from several methods, so it learns
-to work with any method. The loss of a frame is
+The network makes the histories of frames itself. At the beginning of each round, the current network blends the shots;
+it learns from the resulting histories until the next round [Ross et al. 2011, "A reduction of imitation learning and
+structured prediction to no-regret online learning"]. The results to blend come from several methods, so that the
+network works with any method. The loss of a frame is
 
     E |y - r|² / E_x + FLICKER E |(y - r) - W (y' - r')|² / F_x
 
-where x is the frame before blending, y the blended frame and r the reference. W looks up values along motion, and a
+where x is the frame before blending, y the blended frame and r the reference. W looks up values along the motion, and a
 prime marks the previous frame. E is a mean of errors relative to r. E_x and F_x are the same errors of x, so all shots
-count alike. A further term is the square of the difference between the mean brightness of y and of x, over a batch:
-otherwise the easiest way to remove specks would be to lose their light. The effect of y on later frames is left out:
-among filters that know their own variance, the one with the least error now is also the best for later.
+have equal weight. A further term is the squared difference between the mean brightness of y and of x, over a batch:
+without it, the easiest way to remove specks would be to remove their light. The effect of y on later frames is
+neglected: among filters that know their own variance, the one with the least error now is also the best for later
+frames.
 """
 
 import copy
@@ -38,17 +39,17 @@ from ngpt.training.validation import Pictures, spread
 FLICKER = 1.0
 ENERGY = 300.0
 LEAST = 3e-4
-# Lengths of simulated histories before the first frame of a shot, since shots for training are short.
+# Numbers of frames of simulated histories before the first frame of a shot, because shots for training are short.
 LENGTHS = (1, 1, 4, 12)
-# The share of clips whose light is made to change, more often and more than in the shots themselves.
+# The share of clips to which a change of light is added, because light changes little in the shots.
 RELIT = 0.4
 
 
 class Blending(Task):
-    """Learns to blend the frames of ``clips``, and is measured by ``held_out``.
+    """Trains on the frames of ``clips``, and validates on ``held_out``.
 
-    Everything random is a function of the seed and the number of the round or step. A batch depends, in addition, on
-    the weights that its round was played with. These are the ``state`` of the task.
+    All random numbers depend only on the seed and the number of the round or step. A batch also depends on the weights
+    that made the histories of its round. They are the ``state`` of the task.
     """
 
     def __init__(self, settings: Settings, clips: Sequence[Clip], held_out: Sequence[Clip]):
@@ -67,7 +68,7 @@ class Blending(Task):
         self.settings, self.clips, self.table = settings, clips, settings.temporal
         self.held_out = spread(held_out, settings.run.views)
         self._player: dict[str, Tensor] = {}
-        # Scores of ``held_out`` frame by frame and by the rules, which never change: (2, clips, 2).
+        # Scores of ``held_out`` without blending and by the rules without a network, which never change: (2, clips, 2).
         self._fixed: np.ndarray | None = None
 
     def network(self) -> nn.Module:
@@ -92,7 +93,7 @@ class Blending(Task):
                 frames = self._played(model, number)
             rng = np.random.default_rng((self.settings.run.seed, 1, step))
             picked = rng.integers(len(frames), size=self.settings.run.batch)[mine]
-            # The arrays no longer contain motion, so they may be rotated as they are.
+            # The arrays contain no motion vectors, so they may be mirrored as they are.
             turns = rng.integers(2, size=(self.settings.run.batch, 3)).astype(bool)[mine]
             chosen = [(frames[i], turn) for i, turn in zip(picked, turns, strict=True)]
             batch = {name: [turned(frame[name], *turn) for frame, turn in chosen] for name in frames[0]}
@@ -100,7 +101,7 @@ class Blending(Task):
             step += 1
 
     def _played(self, model: nn.Module, number: int) -> list[dict[str, np.ndarray]]:
-        """The frames of a round, with histories by the network at the beginning of the round."""
+        """The frames of a round, with histories made by the network at its beginning."""
         rng = np.random.default_rng((self.settings.run.seed, 0, number))
         player = copy.deepcopy(model)
         player.load_state_dict(self._player)
@@ -124,7 +125,7 @@ class Blending(Task):
     def validate(self, model: nn.Module, picture: Path) -> dict[str, float]:
         """Errors and flicker relative to the reference, without its noise: geometric means over the clips.
 
-        "primal" means results frame by frame, "base" the blend by the rules without a network.
+        "primal" stands for results without blending, "base" for the blend by the rules without a network.
         """
         if not self.held_out:
             return {}
@@ -143,7 +144,7 @@ class Blending(Task):
                 pictures.add(images, clip.scene, int(last.number("ngpt:spp") or 0), *relative)
         pictures.write(picture)
         every = np.stack([found, *self._fixed])
-        # The estimate of a very small error may be below 0, because the noise of the reference is subtracted.
+        # Estimates of very small errors may be below 0, because the noise of the reference is subtracted.
         good = (np.isfinite(every) & (every > 0)).all(axis=(0, 2))
         if not good.any():
             return {}
@@ -163,7 +164,7 @@ class Blending(Task):
 
 
 def loss(corrections: Tensor, batch: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-    """The loss of frames (N, C, H, W) from ``play``, and its parts; 1 + FLICKER without any improvement."""
+    """The loss of frames (N, C, H, W) from ``play``, and its parts. Without any improvement it is 1 + FLICKER."""
     shares = MOST * torch.sigmoid(batch["prior"] + LARGEST * torch.tanh(corrections / LARGEST))
     shares = batch["trust"] * torch.minimum(shares, batch["first"])
     bands = batch["bands"].unflatten(1, (BANDS, 3))
@@ -172,16 +173,16 @@ def loss(corrections: Tensor, batch: Mapping[str, Tensor]) -> tuple[Tensor, dict
     errors = robust(error.square() * batch["weight"]).mean((1, 2, 3))
     changes = (batch["seen"] * robust((error - batch["before"]).square() * batch["weight"])).mean((1, 2, 3))
     of_x, of_changes = batch["errors"].flatten(), batch["changes"].flatten()
-    # Specks do not count where light really changes, or where there is hardly any.
+    # Clamped, so that neither real changes of light nor dark frames dominate.
     darker = (taken.mean((1, 2, 3)) / (batch["level"].flatten() + 1e-20)).clamp(-0.05, 0.05).mean()
-    # There is nothing to learn from frames with hardly any noise.
+    # LEAST keeps frames without noise, from which nothing can be learnt, from dominating.
     parts = {"error": (errors / (of_x + LEAST)).mean(), "flicker": (changes / (of_changes + LEAST)).mean()}
     parts["light"] = darker.square()
     return parts["error"] + FLICKER * parts["flicker"] + ENERGY * parts["light"], parts
 
 
 def as_corrections(model: Any) -> Corrections:
-    """A network in PyTorch as the corrections of ``ngpt.sequence.history.Temporal``."""
+    """A network in PyTorch as ``Corrections`` for ``ngpt.sequence.history.Temporal``."""
 
     @torch.inference_mode()
     def corrections(inputs: np.ndarray) -> np.ndarray:
@@ -195,6 +196,7 @@ def as_corrections(model: Any) -> Corrections:
 
 
 def turned(layer: np.ndarray, across: bool, down: bool, transposed: bool) -> np.ndarray:
+    """A layer (C, H, W), mirrored left to right, top to bottom and at the diagonal, as asked."""
     layer = layer[:, ::-1] if down else layer
     layer = layer[..., ::-1] if across else layer
     return np.ascontiguousarray(layer.transpose(0, 2, 1) if transposed else layer)

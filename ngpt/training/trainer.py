@@ -1,8 +1,8 @@
-"""The training loop: it can be stopped at any moment and resumed bit for bit.
+"""The training loop, which can be stopped at any moment and resumed bit for bit.
 
-A step depends only on the settings, the seed, its number, and the state in the checkpoint (weights, their average,
-Adam's moments, the state of the task). So a run that was killed and resumed ends with the same weights as an
-uninterrupted one, on the same device with the same number of threads and processes.
+A step depends only on the settings, the seed, its number, and the state in the checkpoint: weights, their average,
+Adam's moments, and the state of the task. So a run that was killed and resumed ends with the same weights as an
+uninterrupted run, on the same device with the same number of threads and processes.
 """
 
 import copy
@@ -30,7 +30,7 @@ from ngpt.system.console import print_line
 from ngpt.system.records import check
 from ngpt.system.writing import write_text
 from ngpt.training.distributed import Processes
-from ngpt.training.loggers import Logger, Meter, loggers
+from ngpt.training.loggers import Meter, tensorboard
 from ngpt.training.run_page import write_run
 from ngpt.training.run_summary import CHECKPOINT, WEIGHTS
 from ngpt.training.schedule import learning_rate, update_average, warmup_of
@@ -40,15 +40,15 @@ from ngpt.version import __version__
 
 
 def show(text: str) -> None:
-    """Prints a line without buffering, so that a growing log can be followed."""
+    """Prints a line at once, so that a log can be followed."""
     print_line(text, sys.stdout)
 
 
 class Trainer:
     """One run in the folder ``out``, new or continued.
 
-    ``task`` defines what it trains. Files in ``out``: ``checkpoint.safetensors``, ``weights.safetensors`` (for
-    inference), ``best.safetensors`` (the weights with the least validation error), ``log.jsonl``, ``run.html``,
+    ``task`` has the network, examples and loss. Files in ``out``: ``checkpoint.safetensors``, ``weights.safetensors``
+    (for inference), ``best.safetensors`` (the weights with the least validation error), ``log.jsonl``, ``run.html``,
     ``tensorboard/``, ``validation-STEP.png``.
     """
 
@@ -82,8 +82,8 @@ class Trainer:
         self._stop = False
         # The least validation error so far.
         self.best = math.inf
-        self._loggers: list[Logger] = []
-        # The number of the signal that ended it, if one did.
+        self._tensorboard: Any = None
+        # The number of the signal that has stopped the run, if any.
         self.signal: int | None = None
 
     @property
@@ -91,8 +91,10 @@ class Trainer:
         return self.out / CHECKPOINT
 
     def resume(self) -> None:
-        """Continues from the checkpoint in ``out``, and says which settings have changed since; raises NgptError if it
-        belongs to another model."""
+        """Continues from the checkpoint in ``out``, and says which settings have changed.
+
+        Raises NgptError if the checkpoint is of another model.
+        """
         tensors, header = safetensors.read_tensors(self.checkpoint)
         if header.get("kind") != "checkpoint":
             raise NgptError(f"{self.checkpoint}: holds {header.get('kind')}, not a checkpoint")
@@ -121,21 +123,21 @@ class Trainer:
             self.task.restore(parts["task"], str(self.checkpoint))
         for change in changed(before, self.settings):
             self.say(f"changed since the checkpoint: {change}")
-        # Entries after the checkpoint will be logged again.
+        # Entries after the checkpoint are dropped, because they will be logged again.
         log = _keep_lines(self.out / LOG, self.step)
         self.best = min((entry["relMSE"] for entry in log if "relMSE" in entry), default=math.inf)
 
     def run(self, progress: Callable[[int, int], None] = lambda done, total: None) -> bool:
-        """Trains until the last step, the wall-clock budget or a signal; True if the last step was reached.
+        """Trains until the last step, the end of the time budget, or a signal; True if the last step was reached.
 
-        ``progress`` is called with (steps done, all steps), before the first step of this run and after each. Raises
-        NgptError when the loss or its gradient is no longer finite, and saves the batch.
+        ``progress`` is called with (steps done, all steps) before the first step and after each. If the loss or its
+        gradient is not finite, the batch is saved and NgptError is raised.
         """
         run, start, before = self.settings.run, time.monotonic(), self.seconds
         batches = self.task.batches(self.model, self.step, self.processes)
         meter = Meter(self.step, self.device)
         if self.processes.rank == 0:
-            self._loggers = loggers(self.out, self.step + 1)
+            self._tensorboard = tensorboard(self.out, self.step + 1)
         previous = {s: signal.signal(s, self._interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
         progress(self.step, run.steps)
         try:
@@ -163,7 +165,7 @@ class Trainer:
 
     @contextmanager
     def _saved(self) -> Iterator[None]:
-        """Saves a checkpoint if the block fails, as on a full disk, so that no steps are lost."""
+        """Saves a checkpoint if the block fails (as on a full disk), so that no steps are lost."""
         try:
             yield
         except (NgptError, OSError):
@@ -171,9 +173,9 @@ class Trainer:
             raise
 
     def save(self) -> None:
-        """Writes checkpoint and weights. If this is interrupted, the previous files stay complete.
+        """Writes checkpoint and weights. If this is interrupted, the previous files remain complete.
 
-        A checkpoint that cannot be written to its place is written elsewhere, and NgptError says where.
+        If the checkpoint cannot be written to its place, it is written elsewhere, and NgptError says where.
         """
         if self.processes.rank:
             return
@@ -206,7 +208,7 @@ class Trainer:
         self.task.save(self.out / name, self.average, provenance)
 
     def validate(self) -> None:
-        """Logs the validation scores of the averaged weights, draws some results, and keeps the best weights."""
+        """Logs validation scores of the averaged weights, writes a picture, and keeps the best weights."""
         if self.processes.rank == 0:
             scores = self.task.validate(self.average, self.out / f"validation-{self.step:07d}.png")
             if scores:
@@ -265,8 +267,9 @@ class Trainer:
                 f"{path}: cannot be written: {error.strerror}; the same command continues from here"
             ) from error
         self.say("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items()))
-        for logger in self._loggers:
-            logger.log(self.step, {name: value for name, value in values.items() if name != "step"})
+        for name, value in values.items() if self._tensorboard else ():
+            if name != "step":
+                self._tensorboard.add_scalar(name, value, self.step)
 
 
 def _seed(seed: int, step: int) -> int:
@@ -274,7 +277,7 @@ def _seed(seed: int, step: int) -> int:
 
 
 def _keep_lines(path: Path, step: int) -> list[dict[str, float]]:
-    """Drops entries of a log after ``step``, and an incomplete last line; returns the other entries."""
+    """Removes the entries after ``step``, and an incomplete last line, from a log; returns the other entries."""
     if not path.is_file():
         return []
     entries = []

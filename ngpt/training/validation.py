@@ -1,4 +1,4 @@
-"""Validation of a network on views that it is not trained on, in numbers and pictures."""
+"""Validates a network on views that it is not trained on, in numbers and pictures."""
 
 import math
 from collections.abc import Sequence
@@ -21,41 +21,43 @@ from ngpt.repair import repair
 from ngpt.system.writing import write_bytes, write_json
 from ngpt.training.examples import judges_of
 
-# Rows of the picture of a validation.
+# The number of rows of the picture of a validation.
 _PICTURES = 6
 
 
 class Pictures:
-    """Rows of input, result and reference of some of ``count`` results, in one picture."""
+    """One picture with rows of input, result and reference, for some of ``count`` results.
+
+    ``shown`` holds the indices of the results that should be added.
+    """
 
     def __init__(self, count: int):
         self.shown = {int(i * count / _PICTURES) for i in range(_PICTURES)} if count else set()
         self._rows: list[np.ndarray] = []
-        self._told: list[dict[str, Any]] = []
+        self._captions: list[dict[str, Any]] = []
 
     def add(self, images: Sequence[np.ndarray], scene: str, spp: int, primal: float, network: float) -> None:
-        """Adds a row of input, result and reference (H, W, 3); ``primal`` and ``network`` are errors of the first
-        two."""
+        """Adds a row of input, result and reference (H, W, 3), with the errors ``primal`` and ``network``."""
         stops = auto_exposure(images[-1])
         self._rows.append(np.hstack([to_srgb8(image, stops) for image in images]))
         errors = {"relMSE primal": float(primal), "relMSE": float(network)}
         finite = {name: error for name, error in errors.items() if math.isfinite(error)}
-        self._told.append({"scene": scene, "spp": spp, **finite})
+        self._captions.append({"scene": scene, "spp": spp, **finite})
 
     def write(self, picture: str | Path) -> None:
         """Writes a PNG, and a JSON file with the size of one picture and each row's scene, samples and errors."""
         if not self._rows:
             return
-        # Folders of stacks may hold views of different sizes; those that differ from the first are left out.
+        # In folders of stacks, views may have different sizes. Rows that differ from the first one are left out.
         fit = [i for i, row in enumerate(self._rows) if row.shape == self._rows[0].shape]
         rows = [self._rows[i] for i in fit]
         write_bytes(picture, encode_png(np.ascontiguousarray(np.vstack(rows))))
         size = [rows[0].shape[1] // 3, rows[0].shape[0]]
-        write_json(Path(picture).with_suffix(".json"), {"size": size, "views": [self._told[i] for i in fit]})
+        write_json(Path(picture).with_suffix(".json"), {"size": size, "views": [self._captions[i] for i in fit]})
 
 
 def views(crops: Sequence[Any], count: int) -> list[tuple[Any, int]]:
-    """At most ``count`` of all pairs (crop, input), evenly spread."""
+    """At most ``count`` pairs of a crop and the number of an input, evenly spread over all."""
     return spread([(crop, k) for crop in crops for k in range(crop.inputs)], count)
 
 
@@ -72,9 +74,9 @@ def validate(
 ) -> dict[str, float]:
     """Geometric means, over views (crop, input), of the trimmed relMSE without direct emission.
 
-    Two halves of a reference remove the reference's noise. "relMSE" is the error of the result, "relMSE primal" of the
-    input, and "relMSE base" of the base (NaN if there is none). With ``picture``, some views are drawn into that file
-    (``Pictures``).
+    With two halves of a reference, errors do not include its noise. "relMSE" is the error of the result, "relMSE
+    primal" of the input, and "relMSE base" of the base (NaN without one). If ``picture`` is given, a picture of some
+    views is written to that file (``Pictures``).
     """
     model.eval()
     device = next(model.parameters()).device

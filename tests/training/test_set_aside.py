@@ -45,9 +45,9 @@ def test_a_share_of_the_scenes_is_set_aside_whole(scenes, share):
 
 def test_nothing_is_set_aside_where_nothing_can_measure_or_nobody_asks():
     given = crops("a", "b", paired=True)
-    assert split(given, (), 0.1)[:2] == (given, []) and "pairs have no reference" in split(given, (), 0.1).told
+    assert split(given, (), 0.1)[:2] == (given, []) and "pairs have no reference" in split(given, (), 0.1).line
     measured = crops("a", "b")
-    assert split(measured, (), 0.0)[:2] == (measured, []) and "validation_share = 0" in split(measured).told
+    assert split(measured, (), 0.0)[:2] == (measured, []) and "validation_share = 0" in split(measured).line
     # All crops are rendered while the network trains.
     assert split([], ("scene1",), 0.1) == ([], [], "")
 

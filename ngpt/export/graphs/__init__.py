@@ -1,3 +1,1 @@
-"""The parts of an ONNX file around the network. Each module repeats the library's module of the same name as a
-graph.
-"""
+"""The parts of an ONNX file around the network. Each module repeats a module of the same name as a graph."""

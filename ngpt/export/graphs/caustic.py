@@ -1,6 +1,6 @@
-"""After ``ngpt.denoisers.caustic`` and ``diffusion``: denoises the light that is not in gradients.
+"""``ngpt.denoisers.caustic`` and ``diffusion`` as a graph: denoises the light that gradients exclude.
 
-Each pixel exchanges light with its four neighbours in one half plane, at one distance after the other. Each exchange is
+At one distance after the other, each pixel exchanges light with its four neighbours in one half plane. Each exchange is
 added to one pixel and subtracted from the other, so no light is lost. Surfaces beyond the border are so far away that
 no light is exchanged with them.
 """
@@ -31,7 +31,7 @@ def _spread(layers: Mapping[str, Value], depth: Value, scale: Value) -> Value:
     light, variance = layers["caustic"] / scale, layers["caustic_var"] / scale / scale
     own = light * light
     known = op.And(finite(variance), op.GreaterOrEqual(variance, 0.0))
-    # Where the variance is not known, the estimate counts as pure noise.
+    # Where the variance is unknown, all light counts as noise.
     noise = op.ReduceMean(op.Where(known, op.Min(variance, LOUDEST), own), [1], keepdims=1)
     floor = op.ReduceMean(own, keepdims=0) * 1e-12 + 1e-37
     surfaces = _surfaces(layers, depth)
@@ -74,7 +74,7 @@ def _moved(padded: Value, start: Value, size: Value) -> Value:
 
 
 def _surfaces(layers: Mapping[str, Value], depth: Value) -> Value:
-    """Those of albedo, normals and the logarithm of the depth that the model reads; without any, a uniform layer."""
+    """Albedo, normals and the logarithm of the depth, as far as the model reads them; a constant without any."""
     planes = [layers[name] for name in ("albedo", "normal") if name in layers]
     if "depth" in layers:
         planes.append(op.Log(op.Max(layers["depth"], depth * FARTHEST + 1e-37)))

@@ -1,4 +1,4 @@
-"""After ``ngpt.classical.controlvariates``: wcv, with its four neighbours as channels: right, below, left, above."""
+"""``ngpt.classical.controlvariates`` as a graph: wcv. The channels are the neighbours right, below, left and above."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def wcv(
 
     ``trusted``   (N, 1, H, W) for dx and dy, true where they can be trusted
     ``variance``  of primal, dx and dy, as the renderer writes them
-    ``mean``      a scalar: the mean variance of the whole image, by which variances are divided
+    ``mean``      a scalar, the mean variance of the whole image, by which variances are divided
     """
     smooth, inside = variances.smoothed(primal, *variance)
     noisy = op.Greater(mean, 0.0)

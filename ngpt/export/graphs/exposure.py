@@ -1,4 +1,4 @@
-"""After ``ngpt.network.exposure``: the numbers that belong to a whole image, which all of its tiles share."""
+"""``ngpt.network.exposure`` as a graph: the statistics of an image that all of its tiles share."""
 
 from collections.abc import Mapping
 
@@ -11,9 +11,9 @@ STATISTICS = ("exposure", "largest depth", "least radiance", "largest radiance",
 
 
 def statistics(clean: Mapping[str, Value], variance_layers: tuple[Value, ...] | None) -> Value:
-    """(5): the values that ``STATISTICS`` lists, for finite layers; 0 for absent ones.
+    """The (5) values of ``STATISTICS``, for finite layers; 0 for values without their layers.
 
-    ``variance_layers`` are the variances of primal, dx and dy; only networks whose base is made in the graph have them.
+    ``variance_layers`` are the variances of primal, dx and dy; None for networks whose graph makes no base.
     """
     primal = clean["primal"]
     absent = op.ReduceMin(primal, keepdims=0) * 0.0
@@ -26,7 +26,7 @@ def statistics(clean: Mapping[str, Value], variance_layers: tuple[Value, ...] | 
 
 
 def exposure(primal: Value) -> Value:
-    """The typical radiance over ``KEY``, a scalar; 1 for black images, see ``ngpt.network.features.exposure``."""
+    """The typical radiance divided by ``KEY``, a scalar; 1 for black images (``ngpt.network.features.exposure``)."""
     brightness = op.ReduceMean(op.Max(primal, 0.0), [1], keepdims=1)
     # Blocks at the border hold fewer pixels, so sums are divided by their number.
     here = brightness * 0.0 + 1.0

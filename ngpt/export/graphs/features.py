@@ -1,4 +1,4 @@
-"""After ``ngpt.network.features``: from layers to the channels a network reads."""
+"""``ngpt.network.features`` as a graph: from layers to the channels that a network reads."""
 
 from collections.abc import Mapping
 
@@ -9,10 +9,10 @@ from ngpt.network.features import ENLARGED, GLOSS, IMAGES, LEAST_DEPTH, NOISE_EN
 
 
 def normalised(finite: Mapping[str, Value], names: tuple[str, ...], exposure: Value, depth: Value) -> dict[str, Value]:
-    """The layers among ``names`` that are inputs of the graph, or square roots of inputs; the base is not an input.
+    """The normalised layers of ``names``, as far as they are inputs of the graph or roots of inputs.
 
-    Radiance is divided by the exposure, depth by the image's largest depth. ``finite`` are the inputs, all finite
-    except for variances.
+    Radiance is divided by the exposure, and depth by the largest depth of the image. ``finite`` are the inputs, which
+    are finite except for variances.
     """
     scaled = {}
     for name in names:
@@ -28,7 +28,7 @@ def normalised(finite: Mapping[str, Value], names: tuple[str, ...], exposure: Va
 
 
 def completed(scaled: Mapping[str, Value], inputs: tuple[str, ...]) -> dict[str, Value]:
-    """The layers before any padding, and the ``inputs`` that are computed from them."""
+    """The layers, with the ``inputs`` that are computed from them; before any padding."""
     return dict(scaled) | {name: _computed(name, scaled, compared(inputs)) for name in inputs if name in SOURCES}
 
 
@@ -50,7 +50,7 @@ def reflectance(albedo: Value) -> Value:
 
 
 def encoded(name: str, layer: Value) -> Value:
-    """The channels of one input, from its normalised and completed layer."""
+    """The channels of an input, from its normalised and completed layer."""
     if name in IMAGES:
         return log_for_networks(op.Max(layer, 0.0))
     if name in ("dx", "dy"):

@@ -1,12 +1,11 @@
-"""After ``ngpt.network.model`` (and ``heads``): the whole graph from a renderer's buffers to the image.
+"""``ngpt.network.model`` as a graph: the whole graph from a renderer's buffers to the image.
 
     buffers -> repaired -> statistics -> normalised -> base -> completed -> encoded -> padded -> [network]
             -> cropped -> head -> (goes over to the base) -> bounds -> exponential -> exposure -> emission -> caustic
             -> image
 
-All of it is float32, whatever the precision of the network. Input and output include the emission that the camera sees
-directly. They also include the light that gradients do not contain. It is denoised by another denoiser, or else by a
-diffusion.
+All of it is float32, whatever the precision of the network. Inputs and output include directly visible emission, and
+the light that gradients exclude. The latter is denoised by another denoiser, or else by a diffusion.
 """
 
 import numpy as np
@@ -24,14 +23,14 @@ from ngpt.network.inputs import DENOISED, LAYERS
 from ngpt.network.model import DARK, HUGE, WINDOW
 
 _VARIANCES = ("primal_var", "dx_var", "dy_var")
-# Light that gradients do not contain, and its variance.
+# Light that gradients exclude, and its variance.
 _APART = ("caustic", "caustic_var")
-# Another denoiser's image of that light, which is also part of that denoiser's image of the primal.
+# Another denoiser's image of this light, which is also a part of its image of the primal.
 _FOUND = "denoised_caustic"
 
 
 class _OperatorsOfHeads(Operators):
-    """Adds the transfer between images and their logarithms. The inverse of a logarithm made here adds no nodes."""
+    """Operators with ``signed_log`` and ``signed_exp``. The inverse of a logarithm that was made here adds no nodes."""
 
     def __init__(self) -> None:
         self._images: dict[str, Value] = {}
@@ -83,7 +82,7 @@ def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto
 
     mirror = Mirror(raw["primal"], alignment)
     completed = features.completed(scaled, config.inputs)
-    # Signs survive the logarithm, so padding may come after it.
+    # The logarithm keeps signs, so padding may come after it.
     padded = [mirror.pad(features.encoded(name, completed[name]), name) for name in config.inputs]
     prediction = graph.include(network, "network/", op.Concat(*padded, axis=1))
 
@@ -108,7 +107,7 @@ def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto
 
 
 def statistics(config: ModelConfig) -> Graph:
-    """The graph that computes the statistics that tiles of an image share, and the input of another denoiser."""
+    """The graph that computes the statistics for the tiles of an image, and the inputs of another denoiser."""
     graph = Graph("statistics_of")
     used = {"primal", "direct", "caustic", "depth", *(("dx", "dy", *_VARIANCES) if config.base else ())}
     denoised = [name for name in DENOISED if name in config.layers]
@@ -136,7 +135,7 @@ def _buffers(graph: Graph, names: tuple[str, ...]) -> dict[str, Value]:
 
 
 def _repaired(raw: dict[str, Value], config: ModelConfig) -> Repaired:
-    """The layers as the network sees them: without emission seen directly."""
+    """The repaired layers, without directly visible emission."""
     data = repaired(raw, config.reads_gradients)
     for name in DENOISED:
         if name in data.layers:

@@ -1,4 +1,4 @@
-"""After ``ngpt.network.padding``: borders reflected, with the right signs for gradients."""
+"""``ngpt.network.padding`` as a graph: reflected borders, with the right signs for gradients."""
 
 from dataclasses import dataclass
 
@@ -8,13 +8,13 @@ from ngpt.network.padding import MARGIN
 
 @dataclass
 class Side:
-    """One padded axis of an image: for each place, the pixel that is copied to it, and its difference to the next.
+    """An axis of a padded image: for each position, its pixel, and its difference to the next position.
 
     ``axis``     the axis in (N, C, H, W)
-    ``size``     pixels along the axis, a scalar
-    ``here``     which pixel lies at each place
-    ``nearest``  which difference stands between this place and the next
-    ``step``     with which sign: 1, -1, or 0 where the image is one pixel wide
+    ``size``     the number of pixels along the axis, a scalar
+    ``here``     the index of the pixel that is copied to each position
+    ``nearest``  the index of the difference between each position and the next
+    ``step``     the sign of this difference: 1, -1, or 0 where the image is one pixel wide
     """
 
     axis: int
@@ -24,13 +24,13 @@ class Side:
     step: Value
 
     def borders(self, values: Value, more: int) -> tuple[Value, Value]:
-        """The entries of ``values`` before the image, and the entries after all of the image but ``more`` pixels."""
+        """The entries of ``values`` before the image; and those after it, and for its last ``more`` pixels."""
         last = op.Reshape(self.size + (MARGIN - more), [1])
         return op.Slice(values, [0], [MARGIN], [0]), op.Slice(values, last, [END], [0])
 
 
 class Mirror:
-    """The padding of images as large as ``image``, to multiples of ``alignment``."""
+    """Pads images of the size of ``image`` to multiples of ``alignment``."""
 
     def __init__(self, image: Value, alignment: int):
         self.rows, self.columns = (
@@ -38,7 +38,7 @@ class Mirror:
         )
 
     def pad(self, layer: Value, name: str = "") -> Value:
-        """A layer with its borders; its name says whether it holds differences, and whether these have a sign."""
+        """A padded layer. Its name determines whether it holds differences, and whether these have a sign."""
         signed = not name.endswith(("_se", "_noise"))
         for side, along in ((self.rows, "dy"), (self.columns, "dx")):
             layer = _differences(layer, side, signed) if name.startswith(along) else _pixels(layer, side)
@@ -56,15 +56,13 @@ class Mirror:
 
 
 def _pixels(layer: Value, side: Side) -> Value:
-    """The layer with its borders along one side. The pixels between them are copied as a block: gathering them takes
-    longer.
-    """
+    """The layer, padded along one axis. Its own pixels are copied as a block, which is faster than gathering them."""
     before, after = (op.Gather(layer, places, axis=side.axis) for places in side.borders(side.here, 0))
     return op.Concat(before, layer, after, axis=side.axis)
 
 
 def _differences(layer: Value, side: Side, signed: bool) -> Value:
-    """``_pixels`` for differences along that side. The last difference leads out of the image; it is in the border."""
+    """``_pixels`` for differences along that axis. The last one leads out of the image, so the border replaces it."""
     steps = [
         op.Reshape(step if signed else abs(step), [-1, 1] if side.axis == 2 else [-1])
         for step in side.borders(side.step, 1)
@@ -78,7 +76,7 @@ def _differences(layer: Value, side: Side, signed: bool) -> Value:
 
 def _side(axis: int, size: Value, alignment: int) -> Side:
     after = op.Mod(-(size + 2 * MARGIN), alignment) + MARGIN
-    # The index of the pixel at each of the places -MARGIN, ..., size - 1 + after, and one beyond.
+    # The index of the pixel at each of the positions -MARGIN .. size + after.
     period = op.Max((size - 1) * 2, 1)
     wave = op.Mod(op.Range(-MARGIN, size + after + 1, 1), period)
     pixels = op.Where(op.Less(wave, size), wave, period - wave)

@@ -1,4 +1,4 @@
-"""After ``ngpt.repair``: subtracts direct emission, replaces non-finite pixels, and marks untrusted differences."""
+"""``ngpt.repair`` as a graph: subtracts direct emission, replaces non-finite pixels, marks untrusted differences."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ _LEVELS = 5
 class Repaired:
     """The inputs of the rest of a graph; (N, C, H, W).
 
-    ``layers``   all of them by name: without direct emission, finite, 0 where not trusted; variances are NaN where
-                 unknown. "primal" excludes "caustic" if the network reads gradients
-    ``direct``   direct emission, finite, to be added back
-    ``trusted``  of dx and dy, where there are any: (N, 1, H, W), true where they can be trusted
+    ``layers``   all layers by name, without direct emission, finite, 0 where they cannot be trusted. Variances are NaN
+                 where unknown. "primal" excludes "caustic" if the network reads gradients
+    ``direct``   the direct emission, finite, which is added to the result again
+    ``trusted``  for dx and dy, if there are any: (N, 1, H, W), true where they can be trusted
     """
 
     layers: dict[str, Value]
@@ -30,7 +30,7 @@ class Repaired:
 
 
 def finite(x: Value) -> Value:
-    """Where values are finite: x - x is not 0 for other values."""
+    """Where values are finite. For other values, x - x is not 0."""
     return op.Equal(x - x, 0.0)
 
 
@@ -40,9 +40,9 @@ def clean(x: Value) -> Value:
 
 
 def repaired(raw: Mapping[str, Value], gradients: bool) -> Repaired:
-    """The layers that a renderer gives, ``primal`` and ``direct`` among them, as ``ngpt.repair`` leaves them.
+    """The ``raw`` layers of a renderer, with ``primal`` and ``direct``, repaired as by ``ngpt.repair``.
 
-    ``gradients``  whether the network reads gradients: such a network works on light without ``caustic``
+    ``gradients``  whether the network reads gradients. Then it works on light without ``caustic``
     """
     light = raw["primal"] - raw["direct"]
     rest = light - raw["caustic"] if "caustic" in raw else light
@@ -76,7 +76,7 @@ def repaired(raw: Mapping[str, Value], gradients: bool) -> Repaired:
 
 
 def _of_all_light(raw: Mapping[str, Value]) -> Value:
-    """The variance of primal plus ``caustic``, NaN where it is not known."""
+    """The variance of primal plus ``caustic``, NaN where unknown."""
     if "caustic" not in raw:
         return raw["primal_var"]
     variance, further = raw["primal_var"], raw["caustic_var"]
@@ -86,12 +86,12 @@ def _of_all_light(raw: Mapping[str, Value]) -> Value:
 
 
 def _everywhere(flags: Value, axis: int) -> Value:
-    """Where ``flags`` hold all along an axis."""
+    """Where ``flags`` are true all along an axis."""
     return op.Greater(op.ReduceMin(op.Cast(flags, to=FLOAT), [axis], keepdims=1), 0.5)
 
 
 def _filled(light: Value, good: Value) -> Value:
-    """The image with replacements, as in ``ngpt.repair``, for the pixels that are not ``good``."""
+    """The image, with the replacements of ``ngpt.repair`` for pixels that are not ``good``."""
     sums = op.Concat(op.Where(good, light, 0.0), op.Cast(good, to=FLOAT), axis=1)
     near = op.AveragePool(sums, kernel_shape=[3, 3], pads=[1, 1, 1, 1], count_include_pad=1)
     levels = [sums, near]

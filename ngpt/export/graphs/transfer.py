@@ -1,10 +1,10 @@
-"""After ``ngpt.network.transfer``."""
+"""``ngpt.network.transfer`` as a graph."""
 
 from ngpt.export.builder import Value, op
 
 
 def signed_log(x: Value) -> Value:
-    """sgn(x) ln(1 + |x|). As ONNX has no log1p: u = 1 + x, x log(u) / (u - 1), exact to rounding [Kahan]."""
+    """sgn(x) ln(1 + |x|). ONNX has no log1p, so it is x log(u) / (u - 1) with u = 1 + x, exact to rounding [Kahan]."""
     size = abs(x)
     u = size + 1.0
     excess = u - 1.0
@@ -24,7 +24,7 @@ def log_for_networks(x: Value) -> Value:
 
 
 def signed_exp(y: Value) -> Value:
-    """sgn(y) (exp|y| - 1). As ONNX has no expm1: u = exp y, (u - 1) y / log(u) [Kahan]."""
+    """sgn(y) (exp|y| - 1). ONNX has no expm1, so it is (u - 1) y / log(u) with u = exp y [Kahan]."""
     size = abs(y)
     u = op.Exp(size)
     logarithm = op.Log(u)

@@ -1,4 +1,4 @@
-"""After ``ngpt.classical.variances``: variances prepared as weights. Channels: primal, dx, dy."""
+"""``ngpt.classical.variances`` as a graph. The channels are primal, dx and dy."""
 
 from ngpt.classical.leastsquares import CLIP
 from ngpt.classical.variances import FEW, TYPICAL
@@ -7,10 +7,10 @@ from ngpt.export.graphs.repair import finite
 
 
 def smoothed(primal: Value, primal_var: Value, dx_var: Value, dy_var: Value) -> tuple[Value, Value]:
-    """The mean over 3x3 known values, taken twice, and ``inside``.
+    """Variances, averaged twice over 3x3 known values; and ``inside``.
 
-    Where none is known, it is the mean of all values. For differences it is the fourth power of the mean of fourth
-    roots, times ``TYPICAL``; larger values stay as they are.
+    Without known values, the result is the mean of all values. For differences it is the fourth power of the mean of
+    fourth roots, times ``TYPICAL``; larger values do not change.
     """
     there = inside(primal)
     (vp, gp), (vx, gx), (vy, gy) = (_over_colours(layer) for layer in (primal_var, dx_var, dy_var))
@@ -19,47 +19,45 @@ def smoothed(primal: Value, primal_var: Value, dx_var: Value, dy_var: Value) -> 
     sums, counts = (op.ReduceSum(_rows(x), [2], keepdims=1) for x in (values, known))
     typical = sums / op.Max(counts, 1.0)
     averaged = op.Concat(channels(values, 0, 1), op.Sqrt(op.Sqrt(channels(values, 1, 3))), axis=1)
-    # Differences have no last column and no last row: these must not contribute to the second mean.
+    # Differences have no last column or row, which must not contribute to the second mean.
     v, n = (_box(_box(x) * there) for x in (averaged, known))
     mean = v / op.Max(n, FEW)
     roots = channels(mean, 1, 3)
     robust = op.Max(op.Mul(roots * roots, roots * roots) * float(TYPICAL), channels(values, 1, 3))
-    # A count is at least a ninth of a ninth; rounding may leave less.
+    # Without rounding, a count would be at least a ninth of a ninth.
     return op.Where(op.Greater(n, 1e-3), op.Concat(channels(mean, 0, 1), robust, axis=1), typical), there
 
 
 def inside(primal: Value) -> Value:
-    """(N, 3, H, W) of 0 and 1: 1 where there is a pixel, a difference to the right, a difference downwards."""
+    """(N, 3, H, W): 1 where there is a pixel, a difference to the right, and a difference downwards; else 0."""
     there = channels(primal, 0, 1) * 0.0 + 1.0
     right, below = (op.Pad(op.Slice(there, [0], [-1], [axis]), [0, 1], 0.0, [axis]) for axis in (3, 2))
     return op.Concat(there, right, below, axis=1)
 
 
 def robust_mean(values: Value, there: Value) -> Value:
-    """``ngpt.classical.leastsquares.robust_mean`` of the values that are ``there`` (1, and 0 elsewhere), a scalar."""
+    """``ngpt.classical.leastsquares.robust_mean`` of the values where ``there`` is 1 (else 0), a scalar."""
     count, used = op.ReduceSum(_rows(there), keepdims=0), values * there
 
     def clipped(_: Value, last: Value) -> tuple[Value, Value]:
         mean = op.ReduceSum(_rows(op.Min(used, last * float(CLIP))), keepdims=0) / count
         return mean, op.Less(mean, last * 0.5)
 
-    # Instead of infinity, the largest number that stays finite when multiplied by CLIP.
+    # In place of infinity, a number that is still finite when it is multiplied by CLIP.
     return repeat(64, clipped, count * 0.0 + 3e36, ())
 
 
 def _rows(x: Value) -> Value:
-    """Sums of rows, which a sum over an image adds.
+    """Sums of rows, as a first step to the sum of an image.
 
-    The WebAssembly runtime adds one number after another in 32 bits: without row sums it lost 0.2 % of the sum of
-    640x360 numbers, and more in larger images.
+    The runtime in WebAssembly adds one number after another in 32 bits. Without sums of rows, it lost 0.2 % of the sum
+    of 640x360 numbers, and more in larger images.
     """
     return op.ReduceSum(x, [3], keepdims=1)
 
 
 def _over_colours(variance: Value) -> tuple[Value, Value]:
-    """Sums over RGB, and 1 where all three values are known, else 0. Values that are not finite, or negative, are
-    unknown.
-    """
+    """Sums over RGB, and 1 where all three values are known (finite and not negative), else 0."""
     usable = op.And(finite(variance), op.GreaterOrEqual(variance, 0.0))
     good = op.ReduceMin(op.Cast(usable, to=FLOAT), [1], keepdims=1)
     return op.ReduceSum(op.Where(usable, variance, 0.0), [1], keepdims=1) * good, good

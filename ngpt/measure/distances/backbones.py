@@ -1,7 +1,8 @@
-"""The convolutional networks whose features perceptual losses compare, defined here so that torchvision is not needed.
+"""The convolutional networks whose features E-LPIPS compares, defined here so that torchvision is not needed.
 
-Names of parameters are torchvision's, so that its weight files load. Each network returns the features that E-LPIPS
-uses, from fine to coarse: the image itself, and every ReLU's output (for SqueezeNet, of every fire module).
+Parameters have the names of torchvision, so that its files of weights can be loaded. Each network yields the features
+that E-LPIPS uses, from fine to coarse: the image itself, and the output of each ReLU (of each fire module in
+SqueezeNet).
 """
 
 import hashlib
@@ -20,10 +21,10 @@ from ngpt.system.reading import read_bytes
 # The inputs of the pretrained networks: (x - shift) / scale of x in [-1, 1].
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 
-# The largest file in bytes; that of VGG16 has half as many.
+# The largest file in bytes, twice as large as that of VGG16.
 _LARGEST = 2**30
 
-# A function that drops inputs of a convolution, the same for both images of a comparison; the identity if none.
+# A function that drops inputs of a convolution at random, the same for both images of a comparison.
 Dropout = Callable[[Tensor], Tensor]
 
 
@@ -100,7 +101,7 @@ def _standardised(image: Tensor) -> Tensor:
 
 
 def _checked(kind: type[SqueezeNet] | type[Vgg16], file: Path) -> dict[str, Tensor]:
-    """The tensors of torchvision's file. It is read only once, so the loaded bytes are the checked ones."""
+    """The tensors in torchvision's file. It is read only once, so that the checked bytes are the loaded ones."""
     content = read_bytes(file, _LARGEST)
     if hashlib.sha256(content).hexdigest() != kind.SHA256:
         raise NgptError(
@@ -113,9 +114,9 @@ def _checked(kind: type[SqueezeNet] | type[Vgg16], file: Path) -> dict[str, Tens
 def load(kind: type[SqueezeNet] | type[Vgg16], path: str = "") -> nn.Module:
     """A backbone with torchvision's weights, from ``path`` or PyTorch's cache, frozen.
 
-    A .safetensors file may hold any weights. torchvision's own file, a pickle, is read only if its SHA-256 is the known
-    one, and by PyTorch's reader that loads tensors and runs no code. Raises NgptError if the file does not exist, has
-    another checksum, or holds other tensors.
+    A .safetensors file may hold any weights. torchvision's own file is a pickle: it is read only if it has the known
+    SHA-256, and by PyTorch's reader that loads tensors and runs no code. Raises NgptError if the file does not exist,
+    has another checksum, or holds other tensors.
     """
     file = Path(path or Path(torch.hub.get_dir()) / "checkpoints" / kind.FILE)
     if not file.is_file():

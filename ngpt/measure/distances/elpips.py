@@ -3,8 +3,8 @@
     d(a, b) = Σ_l  mean over pixels  Σ_c  w_lc (f_lc(a) / |f_l(a)| - f_lc(b) / |f_l(b)|)²
 
 [Zhang et al. 2018, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", eq. 1; Kettunen et al.
-2019, "E-LPIPS"]. The weights w are fitted to people's judgements. They come from E-LPIPS and must be given, since other
-weights would make another metric.
+2019, "E-LPIPS"]. The weights w are fitted to people's judgements. They are those of E-LPIPS and must be given, because
+other weights would make another metric.
 """
 
 from pathlib import Path
@@ -22,7 +22,7 @@ KEEP = 0.99
 class FeatureDistance(nn.Module):
     """The distance of images (N, 3, H, W) in [0, 1], display-encoded, by a backbone and its fitted weights; float32.
 
-    ``weights``  one vector of non-negative numbers for each feature of the backbone, of its number of channels
+    ``weights``  for each feature of the backbone, a vector of non-negative numbers, one for each channel
     """
 
     def __init__(self, backbone: nn.Module, weights: list[Tensor]):

@@ -12,7 +12,7 @@ from torch.nn.functional import avg_pool2d
 
 SCALES = 8
 OFFSET = 7
-# The least side of an image after downscaling. E-LPIPS has twice as much, but our crops have only 114 pixels.
+# The least side of an image after downscaling. It is 64 in E-LPIPS, but our crops have only 114 pixels.
 SMALLEST = 32
 _PERMUTATIONS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
 
@@ -22,7 +22,8 @@ class Transform:
     """One draw of the ensemble for a batch of N images; apply it to every image of a comparison.
 
     ``scale``, ``phase``  box average over scale x scale pixels, from this row and column on; the same for the batch
-    ``offset``            (N, 2) rows and columns cut from the top and left, 0 .. 7, the rest of 7 from the other side
+    ``offset``            (N, 2) rows and columns, 0 .. 7, that are cut from the top and left; the rest of 7 is cut from
+                          the opposite side
     ``flip``              (N,) 0 none, 1 left to right, 2 top to bottom, 3 both
     ``transpose``         whether rows and columns are exchanged; the same for the batch
     ``order``             (N, 3) permutation of the channels
@@ -38,7 +39,7 @@ class Transform:
     factor: Tensor
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Images (N, 3, H, W) to (N, 3, H', W'), smaller by what offset and scale cut; differentiable."""
+        """Images (N, 3, H, W) to smaller ones (N, 3, H', W'); differentiable."""
         if self.scale > 1:
             images = avg_pool2d(images[..., self.phase[0] :, self.phase[1] :], self.scale)
         height, width = (max(size - OFFSET, 1) for size in images.shape[-2:])
@@ -88,7 +89,7 @@ def draw(
 def _stratified(kinds: int, count: int, generator: torch.Generator) -> Tensor:
     """``count`` numbers of 0 .. kinds - 1 in random order; their frequencies differ by at most one."""
     device = generator.device
-    # A random start, so that with fewer than ``kinds`` images all kinds are equally likely.
+    # The start is random, so that all kinds are equally likely even if there are fewer images than kinds.
     start = torch.randint(kinds, (), generator=generator, device=device)
     kind = torch.randperm(kinds, generator=generator, device=device)[
         (start + torch.arange(count, device=device)) % kinds

@@ -4,12 +4,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-# From Wang et al. 2003, for scales 1 to 5. Scales that are too coarse for the image are left out; the others sum to 1.
+# From Wang et al. 2003, for scales 1 to 5. Without scales that are too coarse for the image, the rest is scaled to sum
+# 1.
 _WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
-# Windows of SSIM: boxes at every third pixel. The random offsets of the ensemble cover the skipped positions.
+# The windows of SSIM are boxes at every third pixel. The random offsets of the ensemble cover the positions between.
 _WINDOW, _STRIDE = 7, 3
 _C1, _C2 = 0.01**2, 0.03**2
-# Keeps the root of a gradient magnitude, and its derivative, finite where an image is flat; 0.17 % of the range [GMSD].
+# Keeps the root of a gradient magnitude and its derivative finite where an image is flat [GMSD, 0.17 % of the range].
 _C3 = 0.0026
 
 
@@ -64,7 +65,7 @@ def gradient_similarity(a: Tensor, b: Tensor) -> Tensor:
     if min(a.shape[-2:]) < 3:
         return torch.ones_like(a)
     ma, mb = (_squared_gradient(image) for image in (a, b))
-    # The product of the magnitudes, by the root of one product rather than the product of two roots.
+    # The product of the magnitudes, as the root of a product, which needs one root less.
     product = torch.sqrt((ma + _C3) * (mb + _C3)) - _C3
     return (2 * product + _C3) / (ma + mb + _C3)
 
