@@ -1,11 +1,14 @@
-"""Stacks, references and costs of one scene: rendered once, then taken from the cache.
+"""Stacks, references and costs of a scene, which are rendered once and then taken from the cache.
 
-The cache has folders for each scene, NAME-HASH, named by what the pictures depend on: the contents of the scene's
-files, the size, Mitsuba's version, and the code that their sampler runs. In them are RENDER-SPP-SEED.exr, where RENDER
-is a kind of stack ("gradients"), followed by the sampler where it is not the usual one and its options where there are
-some ("gradients-gpt-reuse=true"), and SPP the number of samples that were rendered; the two halves of references,
-reference-*-a.exr and -b.exr; and cost-*.json. A folder of stacks of one's own looks the same, without the costs; its
-reference may be one image.
+The cache has folders NAME-HASH for each scene. The hash depends on the contents of the scene's files, the size, the
+version of Mitsuba, and the code of the sampler. A folder holds
+
+    RENDER-SPP-SEED.exr         stacks. RENDER is a kind of stack ("gradients"), with the sampler if it is not the usual
+                                one, and its options ("gradients-gpt-reuse=true"). SPP is the number of samples
+    reference-*-a.exr, -b.exr   the two halves of references
+    cost-*.json                 seconds per sample
+
+A user's folder of stacks has the same form, without costs. Its reference may be one image.
 """
 
 import hashlib

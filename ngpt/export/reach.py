@@ -64,7 +64,7 @@ def _least(model: Reconstructor, whole: int, seed: int) -> int:
 
 
 def _example(model: Reconstructor, side: int, seed: int) -> dict[str, Tensor]:
-    """Layers (1, C, side, side): rectangles of all brightnesses with noise, which is a hundred times stronger in 1 %."""
+    """Layers (1, C, side, side): rectangles of all brightnesses with noise, a hundred times stronger in 1 %."""
     rng = np.random.default_rng(seed)
     image = np.ones((3, side, side))
     for _ in range(side):
