@@ -130,13 +130,6 @@ def test_tables_are_those_of_their_files():
     ] == []
 
 
-def test_each_scene_of_the_gallery_has_a_picture_and_a_heading():
-    from bench.gallery import PAGE, SCENES_SHOWN, name_of
-
-    for what in (r"^## (\S+)$", r"gallery/(\S+)\.webp"):
-        assert re.findall(what, PAGE.read_text(), re.M) == [name_of(row) for row in SCENES_SHOWN]
-
-
 def test_the_readme_is_short_and_its_numbers_are_in_the_results():
     readme, results = ((ROOT / page).read_text() for page in ("README.md", "docs/lab/RESULTS.md"))
     # What is read is counted: no pipes and rules of tables.

@@ -9,7 +9,7 @@ import ngpt
 from ngpt.api import lightgroups
 from ngpt.api.uncertainty import reconstruct_with_error
 from ngpt.errors import NgptError
-from ngpt.magnitude import LIGHT, ORDINARY, VARIANCES, magnitude, scaled
+from ngpt.magnitude import LIGHT, VARIANCES, magnitude
 from ngpt.methods import METHODS, reconstruct
 from ngpt.sequence.history import Temporal
 from ngpt.sequence.wcv_windows import reconstruct_shot
@@ -132,12 +132,6 @@ def test_all_that_is_made_of_images_follows_the_exposure(way):
     for scale in SCALES:
         for image, wanted in zip(WAYS[way](scale), expected, strict=True):
             assert_alike(image, scale, wanted)
-
-
-@pytest.mark.parametrize("power", [-ORDINARY, -1, 0, ORDINARY])
-def test_ordinary_light_stays_as_it_is(power):
-    stack = times(full_layers(9, 12) | {"primal": np.full((9, 12, 3), 1.5, np.float32)}, 2.0**power)
-    assert magnitude(stack) == 0 and scaled(stack, 0) is stack
 
 
 def test_magnitude_is_that_of_most_light():

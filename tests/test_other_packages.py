@@ -1,8 +1,6 @@
 """Methods, samplers, losses and metrics of other packages, by entry points: the pages show these packages."""
 
-import os
 import re
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -119,19 +117,6 @@ def test_the_sampler_of_the_page(renderer, site, command):
     assert code("replay") != before[0] and code("replay-path") != before[1]
 
 
-def test_the_integrator_of_the_page_is_a_plugin_of_every_variant(renderer, site):
-    install_page(site, PAGES["sampler"])
-    code = (
-        "import data_gen, mitsuba as mi\n"
-        "for variant in ('llvm_ad_rgb', 'llvm_ad_spectral', 'llvm_ad_rgb'):\n"
-        "    mi.set_variant(variant)\n"
-        "    assert isinstance(mi.load_dict({'type': 'replay_path'}), mi.Integrator), variant\n"
-    )
-    environment = os.environ | {"PYTHONPATH": f"{site}:{ROOT}"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
 def write_views(folder):
     """A training set of two views in the folder "views"."""
     for i in range(2):
@@ -231,16 +216,3 @@ def test_names_of_ours_are_refused(site, capsys):
     for name in ("wcv", "auto", "relMSE", "gpt", "primal"):
         assert f"'{name}' of the package 'own' is left out: ngpt has a" in told
     assert "Traceback" not in told and len(told.splitlines()) == 5
-
-
-def test_a_method_of_ours_is_found_without_a_look_at_other_packages(site, tmp_path):
-    install_page(site, PAGES["method"])
-    code = (
-        "import sys\nimport ngpt.system.parts\nngpt.system.parts.points = None\nfrom ngpt.cli import main\n"
-        "assert main(['denoise', 'stack.exr', '-m', 'wcv']) == 0\n"
-        "heavy = {'ngpt_median', 'torch', 'mitsuba', 'data_gen'} & set(sys.modules)\n"
-        "assert not heavy, heavy\n"
-    )
-    environment = {"PYTHONPATH": f"{site}:{ROOT}"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr

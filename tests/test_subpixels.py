@@ -13,7 +13,7 @@ from ngpt.errors import NgptError
 from ngpt.io.exr import layers_in, read_image, views_in
 from ngpt.io.openexr import read_exr, write_exr
 from ngpt.merging import merge
-from ngpt.methods import METHODS, reconstruct
+from ngpt.methods import reconstruct
 from ngpt.panorama import MARGIN, continued, wrapping
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
@@ -34,12 +34,6 @@ def fine_stack(rng, height=5, width=7, k=2, seed=1, place=None, **attributes):
 
 def same(one, other):
     return one.keys() == other.keys() and all(np.array_equal(one[name], other[name], equal_nan=True) for name in one)
-
-
-def test_means_undo_spread(rng):
-    layer = rng.random((3, 5, 3)).astype(np.float32)
-    for k in (1, 2, 4):
-        assert np.array_equal(means(spread(layer, k), k), layer)
 
 
 @pytest.mark.parametrize("k", [2, 4])
@@ -64,12 +58,6 @@ def test_other_readers_find_the_pixels_in_the_first_part_and_may_ignore_the_othe
         assert second.name() == "fine" and second.channels["albedo.G"].pixels.dtype == np.float16
         assert second.channels["R"].pixels.shape == (10, 14) and second.header["ngpt:subpixels"] == 2
     assert layers_in(tmp_path / "a.exr") == {*stack.names} and len(views_in(tmp_path / "a.exr")) == 1
-
-
-def test_a_stack_without_them_is_the_file_it_was(rng, tmp_path):
-    plain = replace(fine_stack(rng), fine={})
-    with OpenEXR.File(str(ngpt.write(tmp_path / "a.exr", plain)), separate_channels=True) as file:
-        assert len(file.parts) == 1 and not file.parts[0].name() and "ngpt:subpixels" not in file.parts[0].header
 
 
 def test_parts_of_a_picture_keep_their_place(rng, tmp_path):
@@ -191,18 +179,6 @@ def edge(rng, k=2, noise=0.3):
 
 
 @needs_oidn
-def test_oidn_takes_means_of_what_it_makes_of_subpixels(rng):
-    stack = edge(rng)
-    large = GradientStack(stack.fine)
-    for how in ("noisy", "clean", "prefiltered", "none"):
-        expected = means(reconstruct(large, "oidn", auxiliary=how).image, 2)
-        assert np.allclose(reconstruct(stack, "oidn", auxiliary=how).image, expected, atol=1e-6)
-    # Without subpixels, features are prefiltered.
-    plain = replace(stack, fine={})
-    assert np.array_equal(reconstruct(plain, "oidn").image, reconstruct(plain, "oidn", auxiliary="prefiltered").image)
-
-
-@needs_oidn
 @pytest.mark.parametrize("k", [2, 3, 4])
 def test_oidn_takes_the_mean_of_pixels_and_subpixels_of_each_size(rng, k):
     stack = edge(rng, k)
@@ -238,26 +214,6 @@ def test_exposure_of_subpixels(rng, power):
     scaled = GradientStack(layers, stack.attributes, fine=stack.fine | {"primal": scale * stack.fine["primal"]})
     image, other = reconstruct(stack, "oidn").image, reconstruct(scaled, "oidn").image
     assert np.allclose(other / scale, image, rtol=0.01, atol=1e-3)
-
-
-@needs_oidn
-def test_a_checkerboard_finer_than_pixels_is_its_mean(rng):
-    fine = np.indices((64, 64)).sum(axis=0)[..., None] % 2 * np.ones(3, np.float32)
-    stack = GradientStack({"primal": means(fine.astype(np.float32), 2)}, fine={"primal": fine.astype(np.float32)})
-    assert np.allclose(stack["primal"], 0.5)
-    # OIDN takes it for noise, and then makes it darker.
-    image = reconstruct(stack, "oidn").image
-    assert np.ptp(image) < 0.15 and 0.4 < image.mean() < 0.51
-
-
-def test_subpixels_that_are_not_finite_have_the_repaired_value_of_their_pixel(rng):
-    stack = fine_stack(rng)
-    fine = {name: layer.copy() for name, layer in stack.fine.items()}
-    fine["primal"][4:6, 6:8], fine["normal"][0, 0] = np.nan, np.inf
-    broken = replace(stack.replace(primal=means(fine["primal"], 2)), fine=fine)
-    data = repair(broken)
-    assert data.pixels == 1 and all(np.isfinite(layer).all() for layer in data.fine.values())
-    assert np.array_equal(data.fine["primal"][4:6, 6:8], spread(data.image[2:3, 3:4], 2))
 
 
 @needs_oidn
@@ -297,15 +253,12 @@ def test_standard_errors_are_of_the_image_by_subpixels(rng):
 
 
 @needs_oidn
-@pytest.mark.parametrize("method", ["ngpt-primal"])
-def test_networks_read_oidns_image_of_subpixels(rng, method):
-    if METHODS[method].missing():
-        pytest.skip(METHODS[method].missing())
+def test_networks_read_oidns_image_of_subpixels(rng):
     stack = edge(rng)
-    stack = replace(
-        stack.replace(depth=np.ones((48, 64, 1)), primal_var=0.01 * stack["primal"] ** 2 + 1e-6), fine=stack.fine
-    )
-    assert not np.array_equal(reconstruct(stack, method).image, reconstruct(replace(stack, fine={}), method).image)
+    more = {"depth": np.ones((48, 64, 1)), "primal_var": 0.01 * stack["primal"] ** 2 + 1e-6}
+    stack = replace(stack.replace(**more), fine=stack.fine)
+    by_subpixels, by_pixels = (reconstruct(one, "ngpt-primal").image for one in (stack, replace(stack, fine={})))
+    assert not np.array_equal(by_subpixels, by_pixels)
 
 
 def test_the_rule_goes_by_paths_per_pixel():

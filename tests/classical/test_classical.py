@@ -7,7 +7,7 @@ import pytest
 from solvers import METHODS, energy, l1_by_irls, noisy_stack, solve_sparse
 
 from ngpt.classical.controlvariates import cv, wcv
-from ngpt.classical.leastsquares import Equations, solve_weighted
+from ngpt.classical.leastsquares import Equations
 from ngpt.classical.poisson import l1, l2, least_norms
 from ngpt.classical.variances import auto_alpha, smooth_variances
 from ngpt.classical.weighted import wl2
@@ -64,14 +64,6 @@ def test_wl2_is_the_solution_of_the_weighted_system(monkeypatch):
     expected = solve_sparse(*data, 1.0, weights)
     assert close(wl2(*data, *variances), expected, 1e-6)
     assert close(wl2(*(a.astype(np.float32) for a in (*data, *variances))), expected, 1e-4)
-
-
-def test_the_preconditioner_pays():
-    """Weights over five decades: a fraction of the iterations that scaling by the diagonal alone takes."""
-    _, *data, variances = noisy_stack(96, 96, dtype=np.float64)
-    p, d = smooth_variances(*variances)
-    r, _ = Equations(*data).scaled_residual()
-    assert solve_weighted(r, 1 / p, 1 / d, 1e-4)[1] < 60
 
 
 @pytest.mark.parametrize("weighted", [False, True])

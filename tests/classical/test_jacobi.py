@@ -59,19 +59,6 @@ def test_wcv_is_the_formula(monkeypatch, size, sweeps, dtype):
     assert np.abs(result - expected).max() <= tolerance * np.abs(expected).max()
 
 
-def test_long_steps_do_what_many_iterations_do():
-    """For every eigenvalue of an iteration, by variances of differences from none to far above the primal's."""
-    ratio = np.geomspace(1e-3, 100, 20)[:, None]
-    waves = np.linspace(0, 8, 60)[1:] ** 2 / 8
-    f, expected, found = 1.0, np.ones((20, 59)), np.ones((20, 59))
-    for n in range(50):
-        f /= 1.01 + 4 * 0.5**n
-        expected *= 1 - waves * f / (5 * f + ratio)
-    for factor, step in schedule():
-        found *= 1 - step * waves * factor / (5 * factor + ratio)
-    assert np.abs(found - expected).max() < 0.03
-
-
 def test_no_iteration_of_wcv_enlarges_what_those_before_left():
     """And no error of rounding grows tenfold. Four neighbours make eigenvalues up to 1.6, six (in time) up to 1.71."""
     left = np.array([1 - step * np.linspace(0, 1.75, 400) for _, step in schedule()])

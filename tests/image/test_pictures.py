@@ -47,12 +47,6 @@ def opened(path):
     return pytest.importorskip("PIL.Image").open(path)
 
 
-def light_of(path):
-    """The mean code of each frame."""
-    with opened(path) as film:
-        return [np.asarray(film.convert("RGB")).mean() for i in range(film.n_frames) if not film.seek(i)]
-
-
 def usable(name):
     if name == "aces":
         pytest.importorskip("PyOpenColorIO")
@@ -147,24 +141,6 @@ def test_a_film_of_a_shot(tmp_path, frames, image):
     pictures = tmp_path / "pictures"
     assert main(["picture", str(frames), "-o", str(pictures)]) == 0
     assert sorted(path.name for path in pictures.iterdir()) == ["0000.png", "0001.png", "0002.png"]
-
-
-def test_a_film_in_the_order_of_numbers_without_results_between(tmp_path, frames, image, capfd):
-    pytest.importorskip("PIL")
-    plain, shot, clean = (tmp_path / f"{name}.webp" for name in ("plain", "shot", "clean"))
-    for number in (10, 9):
-        write(frames / f"{number}.exr", image * np.float32(number))
-    assert main(["picture", str(frames), "-o", str(plain)]) == 0
-    for path in sorted(frames.iterdir()):
-        write(path.with_name(f"{path.stem}_denoised.exr"), image * 0)
-    (frames / "._9.exr").write_bytes(b"of macOS")
-    capfd.readouterr()
-    assert main(["picture", str(frames), "-o", str(shot)]) == 0
-    assert "5 results beside their inputs are left out" in capfd.readouterr().err
-    assert shot.read_bytes() == plain.read_bytes()
-    assert main(["picture", f"{frames}/*_denoised.exr", "-o", str(clean)]) == 0
-    light = light_of(shot)
-    assert len(light) == 5 and light == sorted(light) and max(light_of(clean)) == 0
 
 
 @pytest.mark.skipif(not (shutil.which("ffmpeg") or find_spec("imageio_ffmpeg")), reason="needs FFmpeg")

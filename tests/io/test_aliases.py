@@ -196,19 +196,6 @@ def test_a_layer_in_a_file_of_its_own(name, parts, channels):
 
 
 @pytest.mark.parametrize(
-    ("parts", "message"),
-    [
-        ([("", names("uv.UV"))], "a.exr: no layer for 'albedo' with channels R G B; the file holds \"uv\" (U V)"),
-        ([("", names("a.RGB", "b.RGB"))], 'a.exr: layer \'albedo\' could be any of "a", "b"'),
-    ],
-)
-def test_a_file_without_the_layer_it_is_for(parts, message):
-    with pytest.raises(NgptError) as caught:
-        resolve_alone(parts, "albedo", "a.exr")
-    assert message in str(caught.value)
-
-
-@pytest.mark.parametrize(
     ("channels", "expected"),
     [
         (names("RGB", "x.BaseColor.RGB", "shading_normal.XYZ", "CameraDistance.R"),

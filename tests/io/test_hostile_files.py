@@ -119,13 +119,6 @@ def test_what_compresses_best_is_no_bomb(tmp_path, name):
         assert all(same_bits(pixels, black["R"]) for pixels in image.parts[0].channels.values())
 
 
-def test_a_part_that_openexr_reads_otherwise_than_its_header_is_refused(tmp_path, monkeypatch):
-    path = write_raw(tmp_path / "a.exr", (PIXELS,))
-    fewer = OpenEXR.File(str(write_raw(tmp_path / "b.exr", ({"R": PIXELS["R"]},))), separate_channels=True)
-    monkeypatch.setattr(openexr.OpenEXR, "File", lambda *args, **kwargs: fewer)
-    assert "damaged or incomplete" in refused(path)
-
-
 @pytest.mark.parametrize(
     ("name", "make", "expected"),
     [
@@ -155,26 +148,16 @@ def test_names_that_are_not_utf8(tmp_path, command):
     assert "is empty" in command(f"denoise -m primal --force {path}", 1).err
 
 
-@pytest.mark.parametrize("how", ["cut", "longer", "another"])
-def test_a_file_that_changes_while_it_is_read_is_named(tmp_path, monkeypatch, how):
-    path, other = write_raw(tmp_path / "a.exr", (PIXELS,)), write_raw(tmp_path / "b.exr", ({"Z": PIXELS["R"]},))
-    original = OpenEXR.File
+@pytest.mark.parametrize("size", [600, 9999])
+def test_a_file_that_changes_while_it_is_read_is_named(tmp_path, monkeypatch, size):
+    path, original = write_raw(tmp_path / "a.exr", (PIXELS,)), OpenEXR.File
 
     def meanwhile(*args, **kwargs):
-        if how == "cut":
-            os.truncate(path, 600)
-        elif how == "longer":
-            with open(path, "ab") as file:
-                file.write(b"more")
-        else:  # a new file under the old name: the old one is read to its end
-            other.rename(path)
+        os.truncate(path, size)
         return original(*args, **kwargs)
 
     monkeypatch.setattr(openexr.OpenEXR, "File", meanwhile)
-    if how == "another":
-        assert set(read_exr(path).parts[0].channels) == set("RGB")
-    else:
-        assert "changed while it was read; wait until its writer is done" in refused(path)
+    assert "changed while it was read; wait until its writer is done" in refused(path)
 
 
 @pytest.mark.parametrize("compression", ["NO", "DWAA"])

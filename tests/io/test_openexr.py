@@ -151,23 +151,6 @@ def test_of_mipmaps_the_full_size_level_is_kept(tmp_path, rip):
         assert same_bits(channels[name], pixels[..., index])
 
 
-def test_parts_of_every_kind_keep_their_names_and_order(tmp_path):
-    rng = np.random.default_rng(5)
-    tiles = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription(), "lineOrder": OpenEXR.RANDOM_Y}
-    parts = [
-        ({"Z": noise(rng, (40, 33), np.float16)}, {"compression": OpenEXR.PIZ_COMPRESSION}, "b.x y"),
-        ({"id": noise(rng, (40, 33), np.uint32)}, {**tiles, "owner": "me"}, "a"),
-        ({".odd.": noise(rng, (2, 3), np.float32)}, {"displayWindow": window(0, 0, 33, 40)}, "c"),
-    ]  # fmt: skip
-    source = write_raw(tmp_path / "a.exr", *parts)
-    written = read_raw(write_exr(tmp_path / "b.exr", read_exr(source)))
-    for (name, header, channels), (old_name, old_header, old) in zip(written, read_raw(source), strict=True):
-        assert name == old_name and set(channels) == set(old)
-        assert all(same_bits(channels[key], old[key]) for key in old)
-        assert old_header["chunkCount"] == header["chunkCount"]
-        assert header["lineOrder"] == old_header["lineOrder"]
-
-
 @pytest.mark.parametrize(
     ("part", "expected"),
     [
@@ -235,22 +218,6 @@ def test_truncated_files_are_refused_wherever_they_end(tmp_path, capsys):
         assert "\n" not in str(caught.value) and str(caught.value).startswith(f"{path}: ")
         assert "damaged" in str(caught.value)
     assert capsys.readouterr().out == ""
-
-
-def test_threads_of_openexr_end_with_the_call_and_the_caller_s_number_stays(tmp_path):
-    image = ExrImage([ExrPart("", {}, {name: np.ones((40, 30), np.float32) for name in "RGB"})])
-    half, data = tmp_path / "half.exr", write_exr(tmp_path / "a.exr", image).read_bytes()
-    half.write_bytes(data[: len(data) // 2])
-    for count in (0, 1):
-        OpenEXR.set_global_thread_count(count)
-        try:
-            write_exr(tmp_path / "a.exr", image, overwrite=True)
-            read_exr(tmp_path / "a.exr")
-            with pytest.raises(NgptError):
-                read_exr(half)
-            assert OpenEXR.global_thread_count() == count
-        finally:
-            OpenEXR.set_global_thread_count(0)
 
 
 def test_a_stale_chunk_count_is_not_written(tmp_path):

@@ -82,13 +82,6 @@ def test_names_of_spaces_that_are_unknown_are_said(tmp_path, image, caplog):
         assert f"'{name}' is ignored" in caplog.text
 
 
-def test_a_named_space_is_shown_as_its_chromaticities_are(tmp_path, image):
-    there = of(ACES_AP1, image)["primal"]
-    named = GradientStack.from_arrays(primal=there, attributes={"colorInteropID": "lin_ap1_scene"})
-    write(tmp_path / "a.exr", named)
-    np.testing.assert_allclose(read_image(tmp_path / "a.exr"), image, atol=2e-6)
-
-
 @pytest.mark.parametrize("primaries", [ACES_AP0, REC2020])
 def test_a_result_is_in_the_primaries_of_its_file(tmp_path, image, primaries):
     write(tmp_path / "stack.exr", of(primaries, image, albedo=image))

@@ -9,7 +9,6 @@ import pytest
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_image, write
 from ngpt.io.openexr import ExrImage, ExrPart, read_exr, write_exr
-from ngpt.io.reduced import reduced_window
 from ngpt.stack import GradientStack
 from ngpt.subpixels import means
 from ngpt.windows import Window
@@ -61,16 +60,6 @@ def test_colours_alpha_and_unknown_channels_are_means(rng, tmp_path, k, dtype):
     for name in ("A", "mist.V"):
         assert small[name].dtype == dtype
         assert np.allclose(small[name], blocks(channels[name].astype(float), k).mean(axis=-1), atol=tolerance)
-
-
-def test_light_groups_still_add_up(rng, tmp_path):
-    key, fill = (rng.random((4, 6, 3)).astype(np.float32) for _ in range(2))
-    channels = {f"V.Combined.{c}": (key + fill)[..., i] for i, c in enumerate("RGB")}
-    channels |= {f"V.Combined_key.{c}": key[..., i] for i, c in enumerate("RGB")}
-    channels |= {f"V.Combined_fill.{c}": fill[..., i] for i, c in enumerate("RGB")}
-    small = reduced_channels(file_of(tmp_path / "large.exr", channels))
-    for c in "RGB":
-        assert np.allclose(small[f"V.Combined_key.{c}"] + small[f"V.Combined_fill.{c}"], small[c], atol=1e-6)
 
 
 def test_depth_is_the_nearest_and_positions_are_there(rng, tmp_path):
@@ -169,19 +158,6 @@ def test_a_cryptomatte_of_half_floats_is_refused(rng, tmp_path):
 
 
 # ------------------------- windows and refusals -------------------------
-
-
-@pytest.mark.parametrize(
-    ("window", "small"),
-    [
-        (Window(0, 0, 8, 6), Window(0, 0, 4, 3)),
-        (Window(0, 0, 7, 5), Window(0, 0, 3, 2)),
-        (Window(3, -3, 8, 6), Window(2, -1, 3, 2)),
-        (Window(-4, 1, 5, 3), Window(-2, 1, 2, 1)),
-    ],
-)
-def test_windows_keep_what_is_whole(window, small):
-    assert reduced_window(window, 2) == small
 
 
 def test_pixels_of_windows_stay_where_they_were(rng, tmp_path, command):

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from ngpt.classical.controlvariates import schedule, wcv
+from ngpt.classical.controlvariates import wcv
 from ngpt.classical.gradients import forward_differences
-from ngpt.classical.variances import FLOOR, SHARED
-from ngpt.sequence import wcv_frames as module
 from ngpt.sequence.warp import bilinear_taps, warped
 from ngpt.sequence.wcv_frames import Frame, Link, wcv_frames
 
@@ -64,54 +62,6 @@ def test_frames_share_what_they_know(rng, motion, share):
 
     alone, together = error(results(False), truth), error(results(True), truth)
     assert together < share * alone
-
-
-def test_it_is_the_iteration_of_its_equation_pixel_by_pixel(rng, monkeypatch):
-    """Against sums over the neighbours of each pixel, one after the other, for whole motion."""
-    monkeypatch.setattr(module, "INTERPOLATION", 0)
-    height, width = SIZE[:2]
-    shift = (1, -2)
-    motion = np.broadcast_to(np.float64(shift), (height, width, 2))
-    images = [rng.random(SIZE), rng.random(SIZE)]
-    frames = [frame(image, 0.2, rng, spread=0.02) for image in images]
-    frames[1] = frame(images[1], 0.2, rng, link(images[1], images[0], motion, 0.01, 0.1, rng), spread=0.02)
-    found = wcv_frames(frames, sweeps=8)
-
-    flat = [0.2**2 * 3, 0.02 * 3, module.DOUBT * max(0.03, 3 * 0.03)]
-    sums = {"p": flat[0], "d": max(flat[1], 3 * flat[1])}
-    counts = [height * width, height * (width - 1), (height - 1) * width]
-    level = (counts[0] * sums["p"] + (counts[1] + counts[2]) * sums["d"]) / sum(counts)
-    p, d, t = (v / level + FLOOR for v in (sums["p"], sums["d"], flat[2]))
-    d *= SHARED
-    u = [np.array(f.image) for f in frames]
-    for factor, length in schedule()[:8]:
-        own, new = factor * p, [np.array(v) for v in u]
-        for k in (0, 1):
-            for y in range(height):
-                for x in range(width):
-                    change, weight = np.zeros(3), 1.0
-                    for oy, ox, layer, ly, lx in (
-                        (0, 1, "dx", 0, 0),
-                        (0, -1, "dx", 0, -1),
-                        (1, 0, "dy", 0, 0),
-                        (-1, 0, "dy", -1, 0),
-                    ):
-                        if 0 <= y + oy < height and 0 <= x + ox < width:
-                            difference = getattr(frames[k], layer)[y + ly, x + lx]
-                            sign = 1 if oy + ox > 0 else -1
-                            a = own / (own + d)
-                            change += a * (u[k][y + oy, x + ox] - sign * difference - u[k][y, x])
-                            weight += a
-                    qy, qx = (y + shift[1], x + shift[0]) if k else (y - shift[1], x - shift[0])
-                    if 0 <= qy < height and 0 <= qx < width:
-                        dt = frames[1].link.dt[(y, x) if k else (qy, qx)]
-                        a = own / (own + t)
-                        change += a * (u[1 - k][qy, qx] + (dt if k else -dt) - u[k][y, x])
-                        weight += a
-                    new[k][y, x] = u[k][y, x] + length * change / weight
-        u = new
-    for result, expected in zip(found, u, strict=True):
-        assert np.allclose(result, expected, atol=2e-5)
 
 
 def test_noisy_differences_in_time_count_little(rng):

@@ -8,9 +8,8 @@ import sys
 import pytest
 
 import ngpt
-from ngpt.cli.info import show
 from ngpt.system import console
-from ngpt.system.console import Console, logged
+from ngpt.system.console import Console
 
 
 class Terminal(io.StringIO):
@@ -46,30 +45,8 @@ def test_it_fits_and_says_how_far_it_is_and_how_long_it_takes(shown, columns, ra
     assert ("…" in last) == ("render scenes" not in last)
 
 
-def test_info_breaks_lines_between_words_on_a_terminal_alone(monkeypatch):
-    told = {"layers": {"primal": {"channels": "R G B", "part": 0, "type": "float32"}}, "missing": ["dx", "dy_var"] * 9}
-    screens = Terminal(), io.StringIO()
-    for screen in screens:
-        monkeypatch.setattr(sys, "stdout", screen)
-        monkeypatch.setenv("COLUMNS", "40")
-        show(told, as_json=False)
-    narrow, plain = (screen.getvalue().splitlines() for screen in screens)
-    assert max(map(len, narrow)) <= 40 and max(map(len, plain)) > 100
-    assert " ".join(narrow).split() == " ".join(plain).split()
-
-
 def test_a_program_hears_it_only_if_it_asks(noisy_stack, caplog):
     with caplog.at_level(logging.INFO, logger="ngpt"):
         ngpt.denoise(noisy_stack[0], "l1")
     assert "method l1" in caplog.text
     assert isinstance(logging.getLogger("ngpt").handlers[0], logging.NullHandler)
-
-
-def test_log_lines_go_where_standard_error_leads_then(monkeypatch):
-    first, second = io.StringIO(), io.StringIO()
-    monkeypatch.setattr(sys, "stderr", first)
-    with logged(True):
-        monkeypatch.setattr(sys, "stderr", second)
-        logging.getLogger("ngpt.test").info("heard")
-    logging.getLogger("ngpt.test").info("unheard")
-    assert first.getvalue() == "" and "ngpt.test: heard" in second.getvalue() and "unheard" not in second.getvalue()

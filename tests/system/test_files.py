@@ -1,6 +1,5 @@
 """Files appear complete or not at all, and nothing is overwritten by accident."""
 
-import json
 import os
 import subprocess
 import sys
@@ -9,7 +8,6 @@ import pytest
 
 from ngpt.errors import NgptError
 from ngpt.system.files import atomic_output, exclusive, save
-from ngpt.system.writing import write_json, write_text
 
 
 def hours_of_work(path, overwrite=False):
@@ -62,22 +60,6 @@ def test_a_file_that_another_writer_finished_meanwhile_is_kept(tmp_path):
         temporary.write_text("mine")
         path.write_text("theirs")
     assert path.read_text() == "theirs" and os.listdir(tmp_path) == ["a.txt"]
-
-
-def test_what_cannot_be_written_as_json_leaves_what_is_there(tmp_path):
-    path = tmp_path / "a.json"
-    write_json(path, {"x²": 1})
-    with pytest.raises(ValueError, match="JSON"):
-        write_json(path, {"x": float("nan")})
-    write_text(tmp_path / "a.md", "σ²\n")
-    assert json.loads(path.read_text()) == {"x²": 1} and (tmp_path / "a.md").read_text(encoding="utf-8") == "σ²\n"
-    assert sorted(os.listdir(tmp_path)) == ["a.json", "a.md"]
-
-
-@pytest.mark.parametrize("name", ["missing/a.txt", "."])
-def test_places_that_cannot_be_written(tmp_path, name):
-    with pytest.raises(NgptError, match=r"does not exist|is a directory"):
-        hours_of_work(tmp_path / name)
 
 
 def test_a_folder_belongs_to_one_writer_at_a_time(tmp_path):

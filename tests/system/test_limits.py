@@ -9,7 +9,7 @@ MACHINE = 8 * 2**30
 
 @pytest.fixture
 def container(tmp_path, monkeypatch):
-    """Makes a container on a machine of 12 processors and 8 GiB: its groups, and what their files say."""
+    """The limits in a container, by its groups and their files, on a machine of 12 processors and 8 GiB."""
     monkeypatch.setattr(limits, "_GROUPS", tmp_path / "cgroup")
     monkeypatch.setattr(limits, "_OWN_GROUPS", tmp_path / "own")
     monkeypatch.setattr(limits, "_visible", lambda: 12)
@@ -17,41 +17,35 @@ def container(tmp_path, monkeypatch):
     monkeypatch.setattr(limits, "address_space", lambda: None)
     monkeypatch.setattr(limits, "_most", None)
 
-    def make(own, **files):
+    def make(own, files):
         limits._quota.cache_clear()
         (tmp_path / "own").write_text(own)
         for name, text in files.items():
-            file = tmp_path / "cgroup" / name.replace("__", "/").replace("_max", ".max")
+            file = tmp_path / "cgroup" / name
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_text(text)
+        return limits.processors(), limits.memory()
 
     yield make
     limits._quota.cache_clear()
 
 
-def test_without_groups_the_machine_counts(container):
-    assert (limits.processors(), limits.memory(), limits.limited()) == (12, MACHINE, False)
-    container("0::/\n", cpu_max="max 100000\n", memory_max="max\n")
-    assert (limits.processors(), limits.memory(), limits.limited()) == (12, MACHINE, False)
+VERSION_1 = "5:cpu,cpuacct:/docker/1f\n3:memory:/docker/1f\n1:name=systemd:/\n"  # the paths are those of the host
+QUOTA, PERIOD, MEMORY = "cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us", "memory/memory.limit_in_bytes"
 
 
-@pytest.mark.parametrize(("quota", "expected"), [("400000 100000", 4), ("150000 100000", 2), ("10000 100000", 1)])
-def test_groups_of_version_2(container, quota, expected):
-    container("0::/a/b\n", a__cpu_max=quota, a__b__cpu_max="max 100000", a__memory_max=str(2**31), memory_max="max")
-    assert (limits.processors(), limits.memory(), limits.limited()) == (expected, 2**31, True)
-
-
-def test_groups_of_version_1_whose_path_is_the_hosts(container, tmp_path):
-    container("5:cpu,cpuacct:/docker/1f\n3:memory:/docker/1f\n1:name=systemd:/\n")
-    for name, text in {
-        "cpu/cpu.cfs_quota_us": "250000",
-        "cpu/cpu.cfs_period_us": "100000",
-        "memory/memory.limit_in_bytes": str(2**30),
-    }.items():
-        (tmp_path / "cgroup" / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / "cgroup" / name).write_text(text)
-    assert (limits.processors(), limits.memory()) == (3, 2**30)
-    (tmp_path / "cgroup/cpu/cpu.cfs_quota_us").write_text("-1")
-    (tmp_path / "cgroup/memory/memory.limit_in_bytes").write_text(str(2**63 - 4096))
-    limits._quota.cache_clear()
-    assert (limits.processors(), limits.memory()) == (12, MACHINE)
+@pytest.mark.parametrize(
+    ("own", "files", "processors", "memory"),
+    [
+        ("", {}, 12, MACHINE),
+        ("0::/\n", {"cpu.max": "max 100000\n", "memory.max": "max\n"}, 12, MACHINE),
+        ("0::/a/b\n", {"a/cpu.max": "400000 100000", "a/b/cpu.max": "max 100000", "a/memory.max": "99"}, 4, 99),
+        ("0::/a/b\n", {"a/cpu.max": "150000 100000", "a/memory.max": "99", "memory.max": "max"}, 2, 99),
+        ("0::/a\n", {"a/cpu.max": "10000 100000"}, 1, MACHINE),
+        (VERSION_1, {QUOTA: "250000", PERIOD: "100000", MEMORY: "99"}, 3, 99),
+        (VERSION_1, {QUOTA: "-1", PERIOD: "100000", MEMORY: str(2**63 - 4096)}, 12, MACHINE),
+    ],
+)
+def test_limits_are_those_of_the_groups(container, own, files, processors, memory):
+    assert container(own, files) == (processors, memory)
+    assert limits.limited() == (processors < 12)

@@ -115,13 +115,3 @@ def test_an_early_end_finishes_what_is_being_written_and_starts_nothing(end):
             next(results)
     assert begun == written == [0, 1][: len(written)] and written
     assert threading.active_count() == before
-
-
-def test_no_room_for_threads(monkeypatch):
-    def start(self):
-        raise RuntimeError("can't start new thread")
-
-    monkeypatch.setattr(threading.Thread, "start", start)
-    assert list(overlapped([1], same, same, same)) == [1]
-    with pytest.raises(MemoryError, match="can't start new thread"):
-        list(overlapped([1, 2], same, same, same))
