@@ -104,9 +104,6 @@ class Session:
     def mouse(self, kind, x, y):
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
 
-    def hover(self, x, y):
-        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
-
     def drag(self, start, end):
         for kind, place in (("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)):
             self.mouse(kind, *place)

@@ -151,7 +151,7 @@ def refused():
     found["a hole"] = hole, r"no stack has all pixels of 7x4 at \(5, 5\): tile0.exr 5x9 at \(0, 0\), tile1"
     found["a whole"] = (
         [tile, two],
-        r"2.exr is 4x5 but tile0.exr is 4x5 at \(0, 0\) of 12x9; merge seeds or tiles of one",
+        r"2.exr is 4x5 but tile0.exr is 4x5 at \(0, 0\) of 12x9; merge seeds or tiles",
     )
     return found
 

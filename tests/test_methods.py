@@ -9,7 +9,6 @@ from full_stack import full_stack
 import ngpt
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS, choose, reconstruct
-from ngpt.repair import repair
 from ngpt.stack import GradientStack
 
 FEATURES = ("albedo", "normal", "depth")
@@ -68,13 +67,6 @@ def test_nonfinite_pixels_are_repaired_and_counted(noisy_stack, method, bad):
     # Around the lone pixel 2 + 2 differences, around the hole 3 * 5 + 4 * 4, and the two by themselves.
     assert result.untrusted == 4 + 15 + 16 + 2
     assert np.abs(result.image - clean).max() < 0.6
-
-
-def test_repair_uses_neighbours():
-    primal = np.ones((5, 5, 3))
-    primal[1:4, 1:4] = 7.0
-    primal[2, 2] = np.nan
-    assert np.allclose(repair(GradientStack.from_arrays(primal=primal)).image[2, 2], 7.0)
 
 
 def test_an_image_that_a_method_spoils_is_refused(noisy_stack):

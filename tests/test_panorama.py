@@ -70,11 +70,6 @@ def test_counts_are_of_the_image_alone(panorama):
     assert (found.repaired, found.untrusted) == (expected.repaired, expected.untrusted) == (1, 4)
 
 
-def test_narrow_images_wrap_several_times(panorama):
-    narrow = {name: layer[:, :5] for name, layer in panorama.items()}
-    assert reconstruct(GradientStack(narrow, LATLONG), "l1").image.shape == (48, 5, 3)
-
-
 def test_from_python_and_from_the_command_line(panorama, tmp_path, command, monkeypatch):
     monkeypatch.chdir(tmp_path)
     image = panorama["primal"]

@@ -12,7 +12,7 @@ from ngpt.api.uncertainty import noisier
 from ngpt.io.aliases import OWN
 from ngpt.io.resolution import resolve
 from ngpt.merging import merge
-from ngpt.shared import box_means, noise_of_light, shared_variance
+from ngpt.shared import noise_of_light, shared_variance
 from ngpt.stack import GradientStack
 
 OWN_VARIANCE, SHARED_VARIANCE = 0.09, 0.04  # of one sample per pixel
@@ -89,15 +89,6 @@ def test_headers_of_merged_stacks_say_both_sorts_of_tails(rng):
     assert "ngpt:samplerOptions" not in merge([paths, stack_of(rng, 4, 5, shared=False)]).attributes
 
 
-def test_pixels_of_shared_noise_that_are_not_finite_spoil_no_others(rng):
-    layer = rng.standard_normal((9, 12, 3)).astype(np.float32)
-    holed = layer.copy()
-    holed[4, 5], holed[0, 0] = np.nan, np.inf
-    known = shared_variance(holed)
-    assert np.isfinite(known).all() and np.allclose(known[:, 8:], shared_variance(layer)[:, 8:])
-    assert np.allclose(shared_variance(layer)[..., 0], box_means(layer[..., 0].astype(np.float64) ** 2, 5))
-
-
 def test_what_a_blur_leaves_of_shared_noise_is_in_the_error(rng):
     """White noise of the same variance would be lost in it."""
 
@@ -115,14 +106,6 @@ def test_what_a_blur_leaves_of_shared_noise_is_in_the_error(rng):
     assert np.array_equal(noisier(stack)["primal"], noisier(stack)["primal"])
     error = ngpt.reconstruct_with_error(stack, "primal").error
     assert np.mean(error) == pytest.approx(0.9 * np.sqrt(OWN_VARIANCE + SHARED_VARIANCE), rel=0.1)
-
-
-def test_shared_noise_is_not_added_where_the_variance_is_not_known(rng):
-    stack = stack_of(rng, 1, 0)
-    stack["primal_var"][3, 4] = np.nan
-    stack["shared"][5, 6] = np.nan
-    added = noisier(stack)["primal"] - stack["primal"]
-    assert not added[3, 4].any() and np.isfinite(added).all() and added[5, 6].all()
 
 
 def test_noise_of_light(rng):

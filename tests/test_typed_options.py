@@ -30,6 +30,7 @@ TAKEN = [
 ]
 REFUSED = [
     ("depth", 0, "method 'x', option 'depth': '0' is not allowed; it takes a whole number from 1 to 64"),
+    ("depth", 65, "'65' is not allowed"),
     ("depth", "2.5", "'2.5' is not allowed"),
     ("depth", True, "'true' is not allowed"),
     ("radius", math.nan, "'nan' is not allowed; it takes a number of 0 or more"),

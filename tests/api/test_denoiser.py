@@ -1,11 +1,5 @@
 """ngpt.Denoiser, called as Mitsuba's are."""
 
-import ast
-import inspect
-from importlib.util import find_spec
-from pathlib import Path
-from typing import get_overloads
-
 import numpy as np
 import pytest
 from full_stack import full_layers, full_stack
@@ -56,37 +50,6 @@ def test_normals_in_world_space(arrays, size):
     turned = denoiser(**world, to_sensor=matrix[:size, :size])
     assert np.allclose(turned, denoiser(**arrays), rtol=1e-4)
     assert not np.allclose(denoiser(**world), turned, rtol=1e-3)
-
-
-def stub():
-    """The signatures of ``mi.OptixDenoiser`` in the stub file of the installed Mitsuba: name -> its forms."""
-    place = find_spec("mitsuba")
-    if place is None or place.origin is None:
-        pytest.skip("Mitsuba is not installed")
-    tree = ast.parse(Path(place.origin).with_name("__init__.pyi").read_text())
-    (theirs,) = [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == "OptixDenoiser"]
-    found: dict[str, list] = {}
-    for node in (node for node in theirs.body if isinstance(node, ast.FunctionDef)):
-        defaults = [ast.unparse(default).replace("...", "None") for default in node.args.defaults]
-        found.setdefault(node.name, []).append(([argument.arg for argument in node.args.args], defaults))
-    return found
-
-
-def signature(function):
-    parameters = [p for p in inspect.signature(function).parameters.values() if p.kind == p.POSITIONAL_OR_KEYWORD]
-    return [p.name for p in parameters], [repr(p.default) for p in parameters if p.default is not p.empty]
-
-
-def test_the_signatures_are_those_of_mitsuba():
-    """Names, order and defaults; where its stub leaves a default open, an empty tensor, ours is None."""
-    theirs = stub()
-    assert signature(ngpt.Denoiser.__init__) == theirs["__init__"][0]
-    assert [signature(form) for form in get_overloads(ngpt.Denoiser.__call__)] == theirs["__call__"]
-    # What runs is neither of the two: every argument of both must find its place in it, by position and by name.
-    accepted = inspect.signature(ngpt.Denoiser.__call__)
-    for names, _ in theirs["__call__"]:
-        accepted.bind(*names)
-        accepted.bind(None, **dict.fromkeys(names[1:]))
 
 
 def test_code_written_for_mitsuba_runs(renderer, arrays):

@@ -32,16 +32,6 @@ def test_the_error_of_an_image_as_it_is_is_its_noise(stack):
         assert np.mean(result.error[side]) == pytest.approx(np.mean(expected[side]), rel=0.05)
 
 
-@pytest.mark.parametrize("method", ["wcv", "l1"])
-def test_it_scales_with_the_image_and_is_the_same_again(stack, method):
-    error = ngpt.reconstruct_with_error(stack, method).error
-    assert np.array_equal(error, ngpt.reconstruct_with_error(stack, method).error)
-    for k in (2.0**-10, 2.0**10):
-        layers = {name: stack[name] * (k * k if name.endswith("_var") else k) for name in stack.names}
-        scaled = ngpt.reconstruct_with_error(GradientStack(layers), method).error
-        assert np.abs(scaled / k - error).max() < 0.01 * error.max()
-
-
 def test_halves_show_a_blotch_that_variances_do_not(stack, rng):
     """A bright spot over several pixels in one half only, whose variance nobody has seen."""
     spot = np.zeros_like(stack["primal"])

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from ngpt.classical.bases import BASES, CLASSICAL
-from ngpt.classical.energy import MOST, keep_energy
 from ngpt.classical.gradients import forward_differences
 from ngpt.classical.variances import SHARED, TYPICAL, smooth_variances
 from ngpt.measure.metrics import relmse
@@ -67,20 +66,6 @@ def test_energy_is_kept_where_few_samples_carry_the_light(name):
     assert CLASSICAL[name](data).mean() == pytest.approx(primal.mean(), rel=0.01)
     if name == "wcv":
         assert BASES[name](data).mean() < 0.99 * primal.mean(), "the test has nothing to give back"
-
-
-def test_what_keeps_the_energy_is_smooth_bounded_and_nothing_where_images_agree():
-    random = np.random.default_rng(0)
-    image = random.gamma(2, 1, (40, 50, 3)).astype(np.float32)
-    assert np.array_equal(keep_energy(image, image), image)
-    assert np.allclose(keep_energy(0.5 * image, image), image, rtol=1e-5)
-    assert not keep_energy(0 * image, image).any()
-    spike = image.copy()
-    spike[3, 3] = 1e12
-    kept = keep_energy(image, spike)
-    assert np.isfinite(kept).all() and kept.max() <= MOST * image.max() * 1.001
-    factor = (keep_energy(image, image * (1 + np.arange(50) / 50)[None, :, None]) / image)[..., 0]
-    assert np.abs(np.diff(factor, axis=1)).max() < 0.05
 
 
 def test_no_difference_is_believed_for_its_luck():

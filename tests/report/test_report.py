@@ -342,7 +342,7 @@ CONTRAST = """(() => {
 })()"""
 
 
-def test_all_text_can_be_read_and_so_can_buttons_under_the_mouse(browser, tmp_path):
+def test_all_text_can_be_read(browser, tmp_path):
     session = browser(address(written(tmp_path, plain_scene(maps=("FLIP",)), plain_scene()), map="FLIP"))
     session.ask(CONTRAST)
     texts = (
@@ -352,13 +352,6 @@ def test_all_text_can_be_read_and_so_can_buttons_under_the_mouse(browser, tmp_pa
     found = session.ask(f"{texts}.map(n => [contrast(n), n.outerHTML.slice(0, 80)])")
     assert len(found) > 40
     assert [text for text in found if text[0] < 4.5] == []
-    for group in ("tabs", "exposures", "zooms", "layouts", "maps"):
-        buttons = f"[...document.querySelectorAll('#{group} button:enabled:not([hidden])')]"
-        for index in range(session.ask(f"{buttons}.length")):
-            middle = "(b => [b.x + b.width / 2, b.y + b.height / 2])"
-            session.hover(*session.ask(f"{middle}({buttons}[{index}].getBoundingClientRect())"))
-            assert session.ask(f"{buttons}[{index}].matches(':hover')") is True
-            assert session.ask(f"contrast({buttons}[{index}])") >= 4.5, (group, index)
 
 
 @pytest.mark.parametrize(("shape", "windows"), [((720, 1280), [(1366, 640), (1920, 1080)]), ((90, 60), [(1366, 640)])])

@@ -60,13 +60,6 @@ def test_a_cut_parts_a_shot_in_two(stacks, cut):
     assert (4 in found) == (cut != "file") and {5, 6} <= found.keys()
 
 
-def test_frames_do_not_depend_on_those_that_are_not_wanted(stacks):
-    whole = results(stacks)
-    for only in (0, HOP, COUNT - 1):
-        found = results(stacks, wanted=lambda number, only=only: number == only)
-        assert list(found) == [only] and np.array_equal(found[only], whole[only])
-
-
 def test_windows_of_pixels_that_move_meet_where_they_lie(rng):
     """Frames at rest; each file holds a part that moves and changes its size."""
     steep = np.linspace(1, 5, SIZE[1])[:, None] + np.zeros(SIZE)
