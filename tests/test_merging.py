@@ -169,14 +169,6 @@ def test_results_are_not_merged(rng, tmp_path):
         merge([ngpt.read(path) for path in paths])
 
 
-def test_files_of_samplers_without_gradients(rng, tmp_path):
-    """Their emission seen directly is that of the contract too: a sampler of ours is named in the file."""
-    bare = [stack_with(rng, seed, gradients=False) for seed in range(2)]
-    direct = [stack.replace(direct=0.5 * stack["primal"]) for stack in bare]
-    merged = merge([ngpt.read(ngpt.write(tmp_path / f"{i}.exr", stack)) for i, stack in enumerate(direct)])
-    assert np.allclose(merged["direct"], 0.5 * merged["primal"], atol=1e-6)
-
-
 def test_command(rng, tmp_path, command):
     stacks = [stack_with(rng, seed) for seed in range(3)]
     for i, stack in enumerate(stacks):

@@ -116,8 +116,7 @@ def test_bitmaps(renderer, layers, features, dtype, channels):
         ngpt.denoise(shown)
 
 
-def test_bitmaps_of_many_channels_are_read_as_files_are(renderer, layers, features, tmp_path):
-    """By names that Mitsuba's film writes, and those of other renderers."""
+def test_bitmaps_of_many_channels_are_read_by_their_names(renderer, layers, features):
     mi = renderer
     pixels = np.concatenate([with_alpha(layers["primal"]), layers["albedo"], layers["normal"]], axis=-1)
     names = [*"RGBA", *(f"albedo.{c}" for c in "RGB"), *(f"sh_normal.{c}" for c in "XYZ")]
@@ -125,9 +124,6 @@ def test_bitmaps_of_many_channels_are_read_as_files_are(renderer, layers, featur
     result = ngpt.denoise(bitmap)
     assert result.pixel_format() == mi.Bitmap.PixelFormat.RGBA
     assert np.array_equal(np.array(result), ngpt.denoise(with_alpha(layers["primal"]), **features))
-    bitmap.write(str(tmp_path / "mitsuba.exr"))
-    from_file = ngpt.denoise(ngpt.read(tmp_path / "mitsuba.exr"))
-    assert np.allclose(np.array(result)[..., :3], from_file, rtol=1e-3)
     # What is passed beside it counts.
     other = ngpt.denoise(bitmap, albedo=np.ones_like(layers["albedo"]))
     assert not np.array_equal(np.array(other), np.array(result))

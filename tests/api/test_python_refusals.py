@@ -9,9 +9,7 @@ from ngpt.errors import NgptError
 
 LAYERS = full_layers(18, 26)
 IMAGE = LAYERS["primal"]
-RGBA = np.concatenate([IMAGE, IMAGE[..., :1]], axis=-1)
 INTEGERS = "is of type {}; pass scene-linear floats"
-PAST = ("previous_denoised", "temporal")
 UNANNOUNCED = "{} is given, but was not announced: Denoiser(size, {}=True)"
 
 
@@ -23,19 +21,13 @@ def torch(make):
 IMAGES = {
     "channels first": (IMAGE.transpose(2, 0, 1), "; channels come first there: pass image.transpose(1, 2, 0)"),
     "several images": (IMAGE[None], "one by one: image[0]"),
-    "flat": (IMAGE[..., 0], "an image of one channel is image[..., None].repeat(3, axis=-1)"),
     "one channel": (IMAGE[..., :1], "an image of one channel is image.repeat(3, axis=-1)"),
     "two channels": (IMAGE[..., :2], "(18, 26, 2); it must be (height, width, 3) or (height, width, 4)"),
-    "five channels": (IMAGE[..., [0, 1, 2, 0, 1]], "pass image[..., :4]"),
     "many channels": (np.tile(IMAGE, 9), "pass ngpt.GradientStack.from_aovs(image, scene.integrator().aov_names())"),
     "no pixels": (IMAGE[:0], "image is 26x0; it has no pixels"),
-    "nothing": (None, "image has shape ()"),
     "uint8": ((IMAGE * 50).astype("uint8"), INTEGERS.format("uint8")),
-    "int32": ((IMAGE * 50).astype("int32"), INTEGERS.format("int32")),
-    "complex": (IMAGE.astype("complex64"), "of type complex64"),
     "a name": ("stack.exr", "image is the name of a file; pass ngpt.read('stack.exr')"),
     "torch, channels first": (torch(lambda t: t.zeros(3, 18, 26)), "pass image.permute(1, 2, 0)"),
-    "torch, integers": (torch(lambda t: t.zeros(18, 26, 3, dtype=t.uint8)), INTEGERS.format("uint8")),
     "torch, meta": (torch(lambda t: t.zeros(18, 26, 3, device="meta")), "image is a Tensor that NumPy cannot read: "),
     "too large": (torch(lambda t: t.full((18, 26, 3), 1e39, dtype=t.float64)), "values that float32 cannot hold"),
 }
@@ -60,25 +52,16 @@ def denoiser(call=(), size=(26, 18), **options):
 
 CALLS = {
     "smaller albedo": (lambda: denoise(albedo=IMAGE[1:]), "albedo has shape (17, 26, 3); it must be (18, 26, 3)"),
-    "albedo with alpha": (lambda: denoise(albedo=RGBA), "pass albedo[..., :3]"),
     "normals": (lambda: denoise(normals=IMAGE), "has no option 'normals'; did you mean 'normal'"),
     "a misspelt option": (lambda: denoise(wieghts=""), "has no option 'wieghts'; did you mean 'weights'"),
     "another's option": (lambda: denoise("l2", weights=""), "'l2' has no option 'weights'; options: alpha; layers: "),
-    "of shots": (lambda: denoise(dt=IMAGE), "no option 'dt'; options: "),
     "no method": (lambda: denoise("l3"), "unknown method 'l3'; choose one of: auto, primal"),
     "no gradients": (lambda: denoise("l2"), "denoise: method 'l2' needs dx, dy: pass dx=..., dy="),
     "unannounced": (lambda: denoiser({"albedo": IMAGE}), UNANNOUNCED.format("albedo", "albedo")),
     "unannounced flow": (lambda: denoiser({"flow": IMAGE}), UNANNOUNCED.format("flow", "temporal")),
-    "unannounced past": (lambda: denoiser({"previous_denoised": IMAGE}), UNANNOUNCED.format(*PAST)),
     "no normals": (lambda: denoiser(normals=True), "normals=True announced normals, which is not given"),
-    "no flow": (lambda: denoiser(temporal=True), "temporal=True announced flow, which is not given"),
     "flow of three": (lambda: denoiser({"flow": IMAGE}, temporal=True), "(18, 26, 3); it must be (18, 26, 2)"),
     "rows first": (lambda: denoiser(size=(18, 26)), "(18, 26, 3); it must be (26, 18, 3) or (26, 18, 4)"),
-    "no size": (lambda: denoiser(size="wide"), "input_size is 'wide'; it must be (width, height)"),
-    "smaller dx": (lambda: denoiser({"dx": IMAGE[1:], "dy": IMAGE}), "dx has shape (17, 26, 3)"),
-    "no layer": (lambda: denoiser({"dt": IMAGE}), "no layer is called 'dt'; there are: depth, dx"),
-    "no option": (lambda: denoiser(method="l2", alhpa=0.1), "method 'l2' has no option 'alhpa'; did you mean 'alpha'"),
-    "no such method": (lambda: denoiser(method="l3"), "unknown method 'l3'"),
     "without its layers": (lambda: denoiser(method="l2"), "Denoiser: method 'l2' needs dx, dy: pass dx=..., dy="),
 }
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
 
@@ -175,15 +174,3 @@ def test_demo(renderer, tmp_path, command):
     rows = {words[1]: float(words[2]) for words in map(str.split, output.splitlines()[1:])}
     assert rows["l1"] < rows["primal"] / 3
     command(line, 1)  # the report is there already
-
-
-def test_ctrl_c_is_ignored_where_whoever_started_it_said_so():
-    from data_gen.session import stop_on_ctrl_c
-
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with stop_on_ctrl_c() as stop:
-            os.kill(os.getpid(), signal.SIGINT)
-            assert not stop()
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -8,9 +8,10 @@ from exr_files import write_raw
 from shots import wall, without
 
 import ngpt
-from ngpt.io.exr import read_image
+from ngpt.io.exr import read_image, with_channels
 from ngpt.io.openexr import read_exr
 from ngpt.sequence.wcv_windows import LENGTH, reconstruct_shot
+from ngpt.stack import GradientStack
 
 
 @pytest.fixture
@@ -112,31 +113,20 @@ def layers_named(stack, names):
     return {f"{other}{c}": stack[k][..., i] for k, other in names.items() for i, c in enumerate("RGB")}
 
 
-@pytest.mark.parametrize(
-    ("name", "suffixes", "more", "reason"),
-    [
-        ("Vector", "XYZW", "", ""),
-        ("motionvector", "RGB", "", "no layer 'motion'"),
-        ("motionvector", "RGB", "--layer motion=-ViewLayer.motionvector.R,ViewLayer.motionvector.G", ""),
-        ("nothing", "", "", "no layer 'motion'"),
-    ],
-)
-def test_why_history_is_nothing_is_said(frames, denoised, name, suffixes, more, reason):
-    """By Cycles' names of motion, by others that have to be chosen, and without any."""
-    (frames / name).mkdir()
+def test_why_history_is_nothing_is_said_and_a_layer_of_motion_is_proposed(frames, denoised):
+    (frames / "odd").mkdir()
     for path in (frames / "rest").iterdir():
-        stack = ngpt.read(path)
-        channels = layers_named(stack, {"primal": "ViewLayer.Combined.", "primal_var": "primal_var."})
-        channels |= {f"ViewLayer.{name}.{c}": np.zeros(stack["primal"].shape[:2], np.float32) for c in suffixes}
-        write_raw(frames / name / path.name, (channels,))
-    output, errors = denoised(name, "clean", f"--json {more}")
-    files = json.loads(output)["files"]
-    assert [f.get("why no history", "") for f in files] == ["the first frame", *[reason] * 4]
-    assert files[0]["history"] == 0 and (files[4]["history"] > 0.5) == (not reason)
-    alone = "without the layer 'motion' each frame is denoised by itself"
-    assert (alone in errors) == bool(reason) == ("0% history (no layer 'motion')" in errors)
-    proposed = "y up: --layer motion=-ViewLayer.motionvector.R,ViewLayer.motionvector.G"
-    assert (proposed in errors) == (name == "motionvector" and not more)
+        stack, nought = ngpt.read(path), np.zeros((16, 20), np.float32)
+        stack = GradientStack({name: stack[name] for name in ("primal", "primal_var")})
+        ngpt.write(frames / "odd" / path.name, with_channels(stack, {f"motionvector.{c}": nought for c in "RGB"}))
+    option = "--layer motion=-motionvector.R,motionvector.G"
+    for more, reason in (("", "no layer 'motion'"), (f"{option} --force", "")):
+        output, errors = denoised("odd", "clean", f"--json {more}")
+        files = json.loads(output)["files"]
+        assert [f.get("why no history", "") for f in files] == ["the first frame", *[reason] * 4]
+        assert files[0]["history"] == 0 and (files[4]["history"] > 0.5) == (not reason)
+        for said in ("without the layer 'motion' each frame is", "0% history (no layer 'motion')", f"y up: {option}"):
+            assert (said in errors) == bool(reason), said
 
 
 def test_each_view_has_a_history_of_its_own(frames, denoised):

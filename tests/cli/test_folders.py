@@ -3,12 +3,11 @@
 import json
 import os
 import re
-import subprocess
 
 import numpy as np
 import pytest
 from full_stack import full_stack
-from processes import ENVIRONMENT, NGPT, ROOT, complete
+from processes import NGPT, complete
 
 import ngpt
 
@@ -64,30 +63,6 @@ def test_a_folder_goes_on_past_existing_results(frames, tmp_path, command):
         after = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
         assert after.keys() == before.keys() and {n for n in after if after[n] != before[n]} == {"2.exr"}
         assert np.array_equal(ngpt.read_image(out / "2.exr"), expected)
-
-
-def on_terminal(*words):
-    """What a command writes to a terminal that is its standard error, and its status."""
-    ours, its = os.openpty()
-    environment = ENVIRONMENT | {"TERM": "xterm", "COLUMNS": "200", "NO_COLOR": "1"}
-    process = subprocess.Popen([*NGPT, *words], stderr=its, stdout=subprocess.DEVNULL, env=environment, cwd=ROOT)
-    os.close(its)
-    seen = b""
-    try:
-        while piece := os.read(ours, 1 << 16):
-            seen += piece
-    except OSError:  # the end, where a terminal is concerned
-        pass
-    os.close(ours)
-    return seen.decode(), process.wait(60)
-
-
-def test_on_a_terminal_there_is_a_bar_and_above_it_a_line_for_each_frame(frames, tmp_path):
-    pytest.importorskip("rich")
-    seen, status = on_terminal("denoise", frames, "-o", tmp_path / "out", "-m", "l2")
-    assert status == 0 and "6/6" in seen and "frames" in seen and "0:00:0" in seen
-    assert all(f"[{i}/6] " in seen for i in range(1, 7)) and "denoise: " not in seen
-    assert on_terminal("denoise", frames / "0.exr", "-o", tmp_path / "quiet", "-m", "l2", "-q") == ("", 0)
 
 
 @pytest.mark.parametrize(

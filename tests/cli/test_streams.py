@@ -29,13 +29,6 @@ def test_an_image_goes_through(data, tmp_path, noisy_stack):
     assert done.stderr.count(b"\n") == 1 and b"l1" in done.stderr
 
 
-def test_one_end_may_be_a_file(data, tmp_path, monkeypatch, command):
-    put_in(monkeypatch, data)
-    command("denoise - -o from/here/ -m l1")
-    command("denoise noisy.exr -o new/folder -m l1")
-    assert (tmp_path / "from/here/standard-input.exr").is_file() and (tmp_path / "new/folder/noisy.exr").is_file()
-
-
 @pytest.mark.parametrize(
     ("line", "said"),
     [

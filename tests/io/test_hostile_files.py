@@ -11,7 +11,6 @@ import pytest
 from exr_files import comparable, same_bits, window, write_raw
 from exr_structure import Attribute, parse
 
-import ngpt
 from ngpt.errors import NgptError
 from ngpt.io import header, isolated, openexr
 from ngpt.io.isolated import read_exr_isolated
@@ -70,20 +69,16 @@ def box(*numbers):
     ("change", "expected"),
     [
         (setting(b"dataWindow", box(0, 0, 65534, 65534)), "is 65535x65535 pixels, and 256 million are read at most"),
-        (setting(b"dataWindow", box(-(2**31), 0, 2**31 - 1, 0)), "is 4294967296x1 pixels"),
         (setting(b"dataWindow", box(0, 0, 2**27 - 1, 0)), "bytes cannot hold 3 channels of 134217728x1 pixels"),
         (setting(b"dataWindow", box(5, 5, 4, 9)), "part 0 is 0x5 pixels"),
         (setting(b"channels", chlist(*(b"c%05d" % i for i in range(100_000)))), "part 0 has more than 4096 channels"),
         (setting(b"channels", chlist(b"B", b"G", b"R", b"R")), "part 0 has two channels b'R'"),
-        (setting(b"channels", chlist(b"B", kind=7)), "channel b'B' of part 0 is of type 7"),
         (setting(b"channels", b"\0"), "part 0 has no channels"),
         (setting(b"channels", b"B" * 300), "its header ends early"),
         (setting(b"channels", chlist(b"B", b"G", b"R"), b"list"), "part 0 has no 'channels' of type chlist"),
         (setting(b"compression", b"\x63"), "part 0 has compression 99"),
         (lambda exr: setattr(exr, "flags", 3), "is of OpenEXR version 3"),
-        (lambda exr: setattr(exr, "flags", 2 | 0x800), "part 0 is a deep image"),
         (lambda exr: exr.parts[0].append(exr.parts[0][0]), "attribute b'channels' comes twice"),
-        (lambda exr: exr.parts[0].append(Attribute(b"x", b"string", bytes(2**24))), "its header is longer than 16 MiB"),
         (lambda exr: exr.parts[0].append(Attribute(b"x", b"int", b"", 2**31 - 1)), "its header is longer than 16 MiB"),
         (lambda exr: exr.parts[0].append(Attribute(b"x", b"int", b"", -5)), "attribute b'x' has -5 bytes"),
         (
@@ -91,7 +86,6 @@ def box(*numbers):
             "its header has more than 10000 attributes",
         ),
         (in_tiles(8, 4194312), "pixels in tiles of 8x4194312"),
-        (lambda exr: exr.parts[0].clear(), "damaged or incomplete"),
     ],
 )  # fmt: skip
 def test_headers_that_ask_for_too_much_or_contradict_themselves(tmp_path, monkeypatch, change, expected):
@@ -210,15 +204,6 @@ def test_the_command_line_isolates_on_request(tmp_path, decoder, command):
     decoder("import os, signal; os.kill(os.getpid(), signal.SIGBUS)")
     assert "killed by SIGBUS" in command("denoise -m primal --untrusted a.exr", 1).err
     command("denoise -m primal a.exr")
-
-
-def test_names_that_collide_with_layers_keep_their_channels(tmp_path):
-    """OpenEXR's own grouping of channels has had memory errors on these."""
-    names = ("R", "G", "B", "left", "left.R", "left.G", "left.B", "left.R.R", "A.B", "A")
-    channels = {name: np.full((4, 5), i, np.float32) for i, name in enumerate(names)}
-    stack = ngpt.read(write_raw(tmp_path / "a.exr", (channels,)))
-    assert np.array_equal(stack["primal"][0, 0], [0, 1, 2])
-    assert ngpt.read(ngpt.write(tmp_path / "b.exr", stack)).source.image.parts[0].channels.keys() == channels.keys()
 
 
 def test_programs_beside_the_file_are_not_run(tmp_path, monkeypatch):

@@ -136,16 +136,6 @@ def test_a_browser_says_when_the_render_was_killed(page, browser):
     session.complaints.clear()  # of addresses that do not answer
 
 
-def test_what_is_shown_of_a_stack_follows_its_layers():
-    bare = GradientStack.from_arrays(primal=np.full((16, 20, 3), 0.5))
-    shown = preview(bare)
-    assert next(iter(shown.images)) == "noisy" and all(not maps for maps in shown.maps.values())
-    full = preview(stack(1.0))
-    assert full.most == 16 and all(set(maps) == {"std. error", "samples"} for maps in full.maps.values())
-    # A standard error of 22 % is two thirds of the way from 1 % to 100 %.
-    assert np.median(full.maps["noisy"]["std. error"]) == pytest.approx(np.log10(22.4) / 2, abs=0.1)
-
-
 def test_names_turn_no_text_around_and_hide_nothing(page):
     evil = "gnp.\u202egpj\u2066 \u200f\u061c\u3164"
     image = np.ones((8, 8, 3), np.float32)
