@@ -160,18 +160,10 @@ def test_who_takes_it_out(method, monkeypatch):
 
 def test_by_oidn_the_light_stays():
     pytest.importorskip("mitsuba_oidn")
-    images = []
-    for scale in (1, 2.0**-10, 2.0**10):
-        stack = with_caustic(full_stack(64, 80))
-        light = {name: stack[name] * scale for name in ("primal", "caustic", "dx", "dy")}
-        data = repair(stack.replace(**light))
-        images.append(Oidn(data).of_caustic / scale)
-    assert images[0].min() >= 0
-    light = data.caustic.sum(dtype=np.float64) / scale
-    assert images[0].sum(dtype=np.float64) == pytest.approx(light, rel=1e-3)
-    assert images[0].std() < 0.5 * data.caustic.std() / scale
-    for image in images[1:]:
-        assert np.allclose(image, images[0], rtol=0.01, atol=0.01 * images[0].max())
+    data = repair(with_caustic(full_stack(64, 80)))
+    image = Oidn(data).of_caustic
+    assert image.min() >= 0 and image.std() < 0.5 * data.caustic.std()
+    assert image.sum(dtype=np.float64) == pytest.approx(data.caustic.sum(dtype=np.float64), rel=1e-3)
 
 
 def test_light_that_is_no_noise_stays_where_it_is():

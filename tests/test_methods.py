@@ -1,37 +1,13 @@
 """The registry, and what happens to pixels that are not finite."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from full_stack import full_stack
 
 import ngpt
 from ngpt.errors import NgptError
-from ngpt.methods import METHODS, choose, reconstruct
+from ngpt.methods import choose, reconstruct
 from ngpt.stack import GradientStack
-
-FEATURES = ("albedo", "normal", "depth")
-NEED_OIDN = ("ngpt-combine", "ngpt-primal", "oidn")
-
-
-@pytest.mark.parametrize(
-    ("layers", "with_oidn", "without"),
-    [
-        ((), "oidn", "nfor"),
-        ((*FEATURES, "primal_var"), "oidn", "nfor"),
-        (("dx", "dy"), "oidn", "l1"),
-        (("dx", "dy", "primal_var", "dx_var", "dy_var"), "oidn", "wcv"),
-        ((*FEATURES, "dx", "dy"), "ngpt-combine", "ngpt-fast"),
-        ((*FEATURES, "dx", "dy", "primal_var", "dx_var", "dy_var"), "ngpt-combine", "ngpt-fast"),
-    ],
-)
-def test_auto_takes_the_best_that_layers_and_machine_allow(monkeypatch, layers, with_oidn, without):
-    """The input comes back only where it is asked for."""
-    for answer, expected in (("", with_oidn), ("OIDN is not installed", without)):
-        entries = {name: replace(METHODS[name], missing=lambda answer=answer: answer) for name in NEED_OIDN}
-        monkeypatch.setattr("ngpt.methods.METHODS", METHODS | entries)
-        assert choose(("primal", *layers)) == expected
 
 
 @pytest.mark.parametrize(

@@ -76,19 +76,6 @@ def test_tiles_keep_what_their_pixels_share(rng):
     assert np.allclose(np.delete(own, np.s_[14:18], 1), OWN_VARIANCE / 4, rtol=1e-4)
 
 
-def test_headers_of_merged_stacks_say_both_sorts_of_tails(rng):
-    shared = [stack_of(rng, 4, i, options={"ngpt:tails": "on", "ngpt:tailsCut": 0.02}) for i in range(2)]
-    paths = stack_of(rng, 12, 2, shared=False, options={"ngpt:tails": "off: paths rarely come by a place to end"})
-    alike, mixed = merge(shared), merge([paths, shared[0]])
-    assert alike.attributes["ngpt:samplerOptions"] == "tails=shared" and alike.attributes["ngpt:tails"] == "on"
-    assert alike.attributes["ngpt:tailsCut"] == pytest.approx(0.02)
-    for found in (mixed, merge([mixed, shared[1]])):
-        assert set(found.attributes["ngpt:samplerOptions"].split(", ")) == {"tails=shared", "tails=paths"}
-        assert found.attributes["ngpt:tails"] == "off: paths rarely come by a place to end; on"
-    assert mixed.attributes["ngpt:tailsCut"] == pytest.approx(0.005)
-    assert "ngpt:samplerOptions" not in merge([paths, stack_of(rng, 4, 5, shared=False)]).attributes
-
-
 def test_what_a_blur_leaves_of_shared_noise_is_in_the_error(rng):
     """White noise of the same variance would be lost in it."""
 

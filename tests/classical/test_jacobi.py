@@ -57,10 +57,3 @@ def test_wcv_is_the_formula(monkeypatch, size, sweeps, dtype):
     tolerance = 1e-5 if dtype is np.float32 else 1e-12
     assert result.dtype == dtype
     assert np.abs(result - expected).max() <= tolerance * np.abs(expected).max()
-
-
-def test_no_iteration_of_wcv_enlarges_what_those_before_left():
-    """And no error of rounding grows tenfold. Four neighbours make eigenvalues up to 1.6, six (in time) up to 1.71."""
-    left = np.array([1 - step * np.linspace(0, 1.75, 400) for _, step in schedule()])
-    assert np.abs(np.cumprod(left, axis=0)).max() <= 1
-    assert np.abs(np.cumprod(left[::-1], axis=0)).max() < 10

@@ -1,6 +1,5 @@
 """The wheel: what it holds and brings. `scripts/wheel.py` installs it with every extra and tries them."""
 
-import os
 import re
 import subprocess
 import sys
@@ -63,23 +62,3 @@ def test_it_is_light_without_extras_and_whole_with_train(metadata):
 
     assert brought("train") == {"mitsuba", "onnx", "onnxscript", "safetensors", "tensorboard", "torch"}
     assert metadata["Description-Content-Type"] == "text/markdown" and "# ngpt" in metadata.get_payload()
-
-
-def test_what_it_brings_is_found(wheel, tmp_path):
-    """The wheel's own verbs that render, configurations and weights are found by name, not the checkout's."""
-    site = tmp_path / "site"
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(site)
-    code = (
-        "from importlib.metadata import distributions; from ngpt.cli import all_verbs\n"
-        "from ngpt.network import safetensors as w; from ngpt.system.configs import DATASET, find_config\n"
-        f"(own,) = [d for d in distributions(path=[{str(site)!r}])]\n"
-        "print(sorted((e.group, e.value) for e in own.entry_points), 'render' in all_verbs())\n"
-        "w.load_weights('ngpt-fast'); print(w.shipped()['ngpt-fast'], find_config('data-tiny', DATASET), sep='\\n')\n"
-    )
-    environment = os.environ | {"PYTHONPATH": str(site)}
-    told = subprocess.check_output([sys.executable, "-c", code], cwd=tmp_path, env=environment, text=True)
-    points, *paths = told.splitlines()
-    assert "('ngpt.verbs', 'data_gen.cli:VERBS')" in points and "('ngpt.renderers', 'data_gen.service')" in points
-    assert points.endswith("True")
-    assert paths == [f"{site}/ngpt/weights/ngpt-fast.safetensors", f"{site}/ngpt/configs/data-tiny.toml"]

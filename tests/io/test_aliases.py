@@ -235,8 +235,6 @@ def test_layers_that_nobody_else_writes_tell_what_those_beside_them_mean():
 
 def test_the_alias_table_is_complete_and_printed_in_full():
     assert {alias.layer for alias in ALIASES} == set(LAYERS)
-    lines = format_aliases().splitlines()
-    assert len(lines) == len(ALIASES) + 1
-    assert any("Denoising Albedo" in line and "Cycles" in line and line.startswith("albedo") for line in lines)
+    assert len(format_aliases().splitlines()) == len(ALIASES) + 1
     for name in LAYERS:
         assert next(alias.name for alias in ALIASES if alias.layer == name) == name, "canonical names come first"

@@ -172,12 +172,6 @@ def test_pixels_of_windows_stay_where_they_were(rng, tmp_path, command):
     assert read_exr(path).parts[0].header["dataWindow"][0].tolist() == [3, -2]
 
 
-def test_what_is_smaller_than_a_block_is_refused(rng, tmp_path, command):
-    file_of(tmp_path / "large.exr", picture(rng, 1, 9))
-    told = command("denoise large.exr -o small.exr -m primal --reduce 2", 1)
-    assert "large.exr: 9x1 at (0, 0) has no whole block of 2x2 pixels" in told.err
-
-
 def test_gradients_and_motion_of_unknown_unit_are_refused(rng, tmp_path):
     zeros = np.zeros((4, 4, 3), np.float32)
     with pytest.raises(NgptError, match=r"has dx, dy, differences between its pixels.*--subpixels"):
@@ -187,15 +181,6 @@ def test_gradients_and_motion_of_unknown_unit_are_refused(rng, tmp_path):
         reduced_channels(path)
     with pytest.raises(WrongUse, match="by 2 or more, not by 0"):
         write(tmp_path / "a.exr", zeros, like=GradientStack({"primal": zeros}), reduce=0)
-
-
-def test_a_file_of_colour_alone_and_tiles(rng, tmp_path):
-    tiles = OpenEXR.TileDescription()
-    tiles.xSize = tiles.ySize = 4
-    path = file_of(tmp_path / "large.exr", picture(rng, 12, 8), tiles=tiles, type=OpenEXR.tiledimage)
-    small = reduced_channels(path)
-    assert small["R"].shape == (6, 4)
-    assert read_exr(tmp_path / "small.exr").parts[0].header["tiles"].xSize == 4
 
 
 def test_pixels_that_are_not_finite_do_not_count(rng, tmp_path):

@@ -74,16 +74,6 @@ def expected(view):
     return pixels | {"motion": (x, -y)}
 
 
-def test_one_view_of_several_is_told(source, caplog):
-    for reads in (read, read_image):
-        caplog.clear()
-        reads(source)
-        assert "has the views left, right; left is read" in caplog.text
-        caplog.clear()
-        reads(source, view="right")
-        assert not caplog.text
-
-
 def test_every_view_is_read(source):
     stacks = read_views(source)
     assert [held(stack) for stack in stacks] == [expected("left"), expected("right")]

@@ -354,7 +354,7 @@ def test_all_text_can_be_read(browser, tmp_path):
     assert [text for text in found if text[0] < 4.5] == []
 
 
-@pytest.mark.parametrize(("shape", "windows"), [((720, 1280), [(1366, 640), (1920, 1080)]), ((90, 60), [(1366, 640)])])
+@pytest.mark.parametrize(("shape", "windows"), [((700, 300), [(1366, 640), (1920, 1080)]), ((90, 60), [(1366, 640)])])
 def test_the_picture_and_its_controls_fit_into_the_window(browser, tmp_path, shape, windows):
     session = browser(address(written(tmp_path, plain_scene(*shape)), map="error"))
     for layout, picture in (("wipe", "#canvas-a"), ("two", "#panes canvas"), ("all", "#panes canvas")):
