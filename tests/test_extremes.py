@@ -8,7 +8,7 @@ from shots import frame_of, view, wall
 from ngpt.api import lightgroups
 from ngpt.api.uncertainty import reconstruct_with_error
 from ngpt.errors import NgptError
-from ngpt.magnitude import LIGHT, VARIANCES, magnitude
+from ngpt.magnitude import LIGHT, VARIANCES
 from ngpt.methods import METHODS, reconstruct
 from ngpt.sequence.history import Temporal
 from ngpt.sequence.wcv_windows import reconstruct_shot
@@ -131,15 +131,6 @@ def test_all_that_is_made_of_images_follows_the_exposure(way):
     for scale in SCALES:
         for image, wanted in zip(WAYS[way](scale), expected, strict=True):
             assert_alike(image, scale, wanted)
-
-
-def test_magnitude_is_that_of_most_light():
-    layers = full_layers(9, 12) | {"primal": np.full((9, 12, 3), 1.5, np.float32)}
-    layers["primal"][0, 0], layers["primal"][1, 1], layers["primal"][2, 2] = np.nan, np.inf, 0
-    assert magnitude(times(layers, 2.0**50)) == 50 and magnitude(times(layers, 2.0**-50)) == -50
-    layers["primal"][3, 3] = 2.0**70
-    # Squares of the brightest pixel stay finite.
-    assert magnitude(times(layers, 2.0**-60)) == -51 and magnitude(times(layers, 2.0**-25)) == 0
 
 
 def test_variances_that_float32_lost_are_not_known():

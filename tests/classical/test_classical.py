@@ -114,7 +114,7 @@ def test_auto_alpha_is_the_ratio_of_the_noise_within_bounds(noise, norm, expecte
 # Memory and refusals
 
 
-# Bytes per pixel, the height of the image and a call. Fewer iterations than usual: the first ones have all their memory.
+# Bytes per pixel, the height of the image and a call. The first iterations have all the memory.
 SHORT = {
     "l2": (35, 1000, l2),
     "l1": (175, 600, lambda *data: l1(*data, max_iterations=26)),

@@ -1,6 +1,5 @@
 """Pictures and films that people look at: what is in the files, and what view transforms make of light."""
 
-import json
 import shutil
 import subprocess
 from importlib.util import find_spec
@@ -105,17 +104,6 @@ def test_a_picture_is_of_rec709_whatever_the_file(tmp_path, image):
         assert main([*words, str(tmp_path / "a.exr"), "-o", str(target), "--exposure", "auto"]) == 0
         expected = shown(image, "standard", display.auto_exposure(image)).astype(int)
         assert np.abs(np.asarray(opened(target)).astype(int) - expected).max() <= 1
-
-
-def test_denoise_writes_a_picture_and_says_what_it_cannot_hold(tmp_path, image, capfd):
-    write(tmp_path / "a.exr", image)
-    words = ["denoise", str(tmp_path / "a.exr"), "-m", "primal", "-o", str(tmp_path / "a.png")]
-    for more in (["--error"], ["--groups"], ["--skip-existing"]):
-        assert main([*words, *more]) == 2
-    capfd.readouterr()
-    assert main([*words, "--json"]) == 0
-    assert json.loads(capfd.readouterr().out)["files"][0]["output"].endswith("a.png")
-    assert np.array_equal(np.asarray(opened(tmp_path / "a.png")), shown(image))
 
 
 @pytest.fixture

@@ -55,26 +55,6 @@ def test_each_producer_is_understood(producer):
         assert set(where.channels) <= set(parts[where.part][1]), name
 
 
-EYE = [*"RGBAZ", *names("albedo.RGB")]
-
-
-@pytest.mark.parametrize(
-    ("parts", "layer", "part", "channels"),
-    [
-        (PRODUCERS["Arnold, multi-part"][0], "albedo", 3, "RGB"),
-        ([("", names("RGB", "normal.RGB"))], "normal", 0, names("normal.RGB")),
-        ([("", names("RGB", "dx.RGB", "shadow.dx.RGB"))], "dx", 0, names("dx.RGB")),
-        ([("", names("C.rgba", "albedo.RGB"))], "alpha", 0, ["C.a"]),
-        ([("left", EYE), ("right", EYE)], "albedo", 0, names("albedo.RGB")),
-        ([("albedo", "RGB"), ("Combined", "RGB")], "primal", 1, "RGB"),
-    ],
-)
-def test_which_channels_a_layer_is_found_in(parts, layer, part, channels):
-    """One name for two layers, parts, other letters, any order, whole names before tails, and the first of two eyes."""
-    found = resolve([(name, list(listed)) for name, listed in parts])[layer]
-    assert (found.part, list(found.channels)) == (part, list(channels))
-
-
 TWO_VIEWS = [("", names("Near.Combined.RGBA", "Far.Combined.RGBA", "Near.Denoising Albedo.RGB", "Far.Depth.Z"))]
 
 

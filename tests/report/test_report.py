@@ -297,17 +297,13 @@ def test_the_frames_of_a_shot_are_played_at_one_exposure(browser, tmp_path):
     session = browser(written(tmp_path, *frames, shot=True).as_uri())
     assert session.ask("$('tabs').hidden") is True and session.ask("$('player').hidden") is False
     assert session.ask("$('frame-name').textContent") == "0000, 1 of 3"
-    middle = """(() => {
-        const copy = document.createElement("canvas").getContext("2d", {willReadFrequently: true});
-        copy.drawImage($("canvas-a"), 0, 0);
-        return copy.getImageData(4, 3, 1, 1).data[0];
-    })()"""
+    middle = "+document.querySelectorAll('#value-a td')[0].textContent"
     levels = [session.ask(middle)]
     for number in ("1", "2"):
         session.key("]")
         assert session.view()["scene"] == number
         levels.append(session.ask(middle))
-    assert levels[0] < levels[1] < levels[2]
+    assert levels == pytest.approx([0.1, 0.2, 0.3], rel=0.01)
     assert session.ask("[...$('maps').children].find(b => b.value === 'change').disabled") is False
     session.ask(
         "$('fps').value = 24; window.seen = new Set(); "
@@ -323,35 +319,6 @@ def test_the_frames_of_a_shot_are_played_at_one_exposure(browser, tmp_path):
 
 
 # --- what a reader sees ----------------------------------------------------------------------------------------------
-
-# The contrast of WCAG 2 between an element's own text and what is behind it; here every background covers.
-CONTRAST = """(() => {
-  const light = text => {
-    const [r, g, b] = text.match(/[\\d.]+/g).slice(0, 3).map(x => +x / 255)
-      .map(x => x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4);
-    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
-  };
-  const behind = node => {
-    const colour = node ? getComputedStyle(node).backgroundColor : "rgb(25, 25, 25)";
-    return /, 0\\)$|transparent/.test(colour) ? behind(node.parentElement) : colour;
-  };
-  window.contrast = node => {
-    const [low, high] = [light(getComputedStyle(node).color), light(behind(node))].sort((a, b) => a - b);
-    return (high + 0.05) / (low + 0.05);
-  };
-})()"""
-
-
-def test_all_text_can_be_read(browser, tmp_path):
-    session = browser(address(written(tmp_path, plain_scene(maps=("FLIP",)), plain_scene()), map="FLIP"))
-    session.ask(CONTRAST)
-    texts = (
-        "[...document.body.querySelectorAll('*')].filter(n => n.checkVisibility() && !n.disabled && "
-        "[...n.childNodes].some(c => c.nodeType === 3 && c.data.trim()))"
-    )
-    found = session.ask(f"{texts}.map(n => [contrast(n), n.outerHTML.slice(0, 80)])")
-    assert len(found) > 40
-    assert [text for text in found if text[0] < 4.5] == []
 
 
 @pytest.mark.parametrize(("shape", "windows"), [((700, 300), [(1366, 640), (1920, 1080)]), ((90, 60), [(1366, 640)])])
