@@ -81,10 +81,10 @@ def test_light_at_alpha_zero_stays_with_the_darkness_among_it():
 @pytest.mark.parametrize("alpha", [0.0, np.nan, -0.5])
 def test_an_alpha_that_covers_nothing_says_nothing(alpha):
     """As of files that hold zeros for want of any: dark pixels are noise there."""
-    primal = full_stack(SIZE, SIZE)["primal"].copy()
+    primal = full_stack(12, 14)["primal"].copy()
     primal[::2, ::2] = 0
     bare = GradientStack.from_arrays(primal=primal)
-    stack = bare.replace(alpha=np.full((SIZE, SIZE), alpha))
+    stack = bare.replace(alpha=np.full((12, 14), alpha))
     assert not empty_pixels(stack).any()
     assert np.array_equal(ngpt.denoise(stack, "nfor"), ngpt.denoise(bare, "nfor"))
 

@@ -165,6 +165,7 @@ def test_the_examples_of_python_run(blocks_of):
     assert made["stack"]["primal"].shape == made["noisy"].shape
 
 
+@pytest.mark.slow
 def test_the_example_of_rendering_runs(renderer, blocks_of, tmp_path):
     blocks, made = blocks_of("python.md"), {}
     exec(blocks[4], made)

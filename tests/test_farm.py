@@ -93,6 +93,7 @@ def check_still(farm, calls, spp):
     assert denoise.verb == "denoise" and [merge.output] == denoise.stacks
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(OPENJD is None, reason="needs openjd-cli")
 def test_open_job_description(farm):
     def run(name, step, *parameters):

@@ -22,7 +22,7 @@ def test_what_a_check_finds_is_judged(monkeypatch, found, status):
     assert gpu.check("arrays", gpu.SMALL)["status"] == status
 
 
-@pytest.mark.parametrize("name", ["arrays", "networks", "training float32"])
+@pytest.mark.parametrize("name", ["arrays", "networks", pytest.param("training float32", marks=pytest.mark.slow)])
 def test_checks_pass_where_there_is_nothing_to_find(name, one_thread):
     record = gpu.check(name, gpu.SMALL)
     assert record["status"] == "passed", record

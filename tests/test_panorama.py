@@ -21,15 +21,15 @@ LATLONG = {"envmap": OpenEXR.ENVMAP_LATLONG}
 
 @pytest.fixture(scope="module")
 def panorama():
-    """The layers of one, 48x160, that is brightest at its borders."""
+    """The layers of one, 24x160, that is brightest at its borders."""
     rng = np.random.default_rng(1)
-    clean = np.zeros((48, 160, 3)) + (1 + 0.8 * np.cos(2 * np.pi * (np.arange(160) + 0.5) / 160))[None, :, None]
-    layers = full_layers(48, 160)
+    clean = np.zeros((24, 160, 3)) + (1 + 0.8 * np.cos(2 * np.pi * (np.arange(160) + 0.5) / 160))[None, :, None]
+    layers = full_layers(24, 160)
     dx, dy = forward_differences(clean)
     noise = {name: 0.05 * rng.normal(size=clean.shape) for name in ("dx", "dy")}
-    layers |= {"primal": clean * rng.gamma(1, 1, (48, 160, 1)), "primal_var": clean**2, "dx": dx + noise["dx"]}
+    layers |= {"primal": clean * rng.gamma(1, 1, (24, 160, 1)), "primal_var": clean**2, "dx": dx + noise["dx"]}
     layers |= {"dy": dy + noise["dy"], "dx_var": 0.0025 + 0 * clean, "dy_var": 0.0025 + 0 * clean}
-    layers |= {"albedo": 0.5 + 0 * clean, "normal": np.zeros_like(clean), "depth": np.ones((48, 160, 1))}
+    layers |= {"albedo": 0.5 + 0 * clean, "normal": np.zeros_like(clean), "depth": np.ones((24, 160, 1))}
     return {name: layer.astype(np.float32) for name, layer in layers.items()}
 
 
@@ -58,7 +58,7 @@ def test_what_wraps(panorama):
     assert not wraps(stack) and not wraps(replace(stack, attributes={"envmap": OpenEXR.ENVMAP_CUBE}))
     assert wraps(replace(stack, attributes=LATLONG)) and wraps(replace(stack, attributes={WRAP: 1}))
     assert not wraps(replace(stack, attributes={"envmap": "of something"}))
-    part = Place(Window(0, 0, 160, 48), Window(0, 0, 320, 48))
+    part = Place(Window(0, 0, 160, 24), Window(0, 0, 320, 24))
     assert not wraps(replace(stack, attributes=LATLONG, place=part))
 
 

@@ -1,6 +1,7 @@
 """``ngpt denoise --temporal``: frames of a shot, in order, by history or by windows."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -14,15 +15,21 @@ from ngpt.sequence.wcv_windows import LENGTH, reconstruct_shot
 from ngpt.stack import GradientStack
 
 
-@pytest.fixture
-def frames(tmp_path, rng):
-    """Five frames at rest without differences in time, ``rest``, and a shot of more than one window, ``shot``."""
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    rng, folder = np.random.default_rng(20261121), tmp_path_factory.mktemp("frames")
     rest = [without(stack, "dt", "dt_var") for stack in wall(rng, 5, growth=0)]
-    for folder, stacks in (("rest", rest), ("shot", wall(rng, LENGTH + 4))):
-        (tmp_path / folder).mkdir()
+    for name, stacks in (("rest", rest), ("shot", wall(rng, LENGTH + 4))):
+        (folder / name).mkdir()
         for i, stack in enumerate(stacks):
-            ngpt.write(tmp_path / folder / f"w.{i:04d}.exr", stack)
-    return tmp_path
+            ngpt.write(folder / name / f"w.{i:04d}.exr", stack)
+    return folder
+
+
+@pytest.fixture
+def frames(written, tmp_path):
+    """Five frames at rest without differences in time, ``rest``, and a shot of more than one window, ``shot``."""
+    return shutil.copytree(written, tmp_path, dirs_exist_ok=True)
 
 
 @pytest.fixture
