@@ -49,7 +49,7 @@ def test_other_methods_see_all_light_and_all_its_variance():
     assert np.array_equal(ngpt.denoise(LIT, "primal"), LIT["primal"])
 
 
-@pytest.mark.parametrize("auxiliary", ["none", "prefiltered"])
+@pytest.mark.parametrize("auxiliary", ["prefiltered", pytest.param("none", marks=pytest.mark.slow)])
 def test_oidn_leaves_the_light_of_photons_to_the_diffusion(auxiliary):
     """Other methods see all light, and so does OIDN where no photons brought it."""
     pytest.importorskip("mitsuba_oidn")

@@ -33,7 +33,7 @@ def test_no_method_puts_light_where_nothing_is(name):
     assert not image[EMPTY].any() and image[~EMPTY].any()
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", ["disc", "fence", pytest.param("wires", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", [name for name in ("oidn", "nfor") if name in USABLE])
 def test_what_is_there_gets_no_worse(rng, name, shape):
     """Nor does light come from nowhere."""

@@ -71,7 +71,7 @@ EXACT |= {str(value): np.full((11, 14, 3), value, np.float32) for value in (0.0,
 
 
 @every_method
-@pytest.mark.parametrize("variance", [(0.1, 0.01, 0.01), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)])
+@pytest.mark.parametrize("variance", [(0.1, 0.01, 0.01), (0.0, 0.0, 0.0)])
 @pytest.mark.parametrize("image", EXACT.values(), ids=EXACT)
 def test_exact_gradients_return_the_image(name, image, variance):
     variances = [np.full_like(image, v) for v in variance]

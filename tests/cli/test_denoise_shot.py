@@ -83,7 +83,7 @@ def test_going_on_gives_the_same_bits(shot, frames, denoised):
     assert "--temporal" not in denoised(shot, "parts", "--skip-existing").err
 
 
-@pytest.mark.parametrize("damaged", [0, 3, LENGTH + 3])
+@pytest.mark.parametrize("damaged", [0, LENGTH + 3, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_file_that_cannot_be_read_is_a_cut_and_changes_no_other_frame(frames, damaged, denoised):
     """Above all not their method: it is chosen by all files that can be read."""
     (frames / f"shot/w.{damaged:04d}.exr").write_bytes(b"nothing")

@@ -13,7 +13,12 @@ NAMES = ("spp", "seconds", "seed", "sampler", "frame", "previousFrame", "discard
 VALUES = {"text": "many", "huge": 1e30, "nan": np.nan, "negative": -4, "vector": np.ones(2, np.float32), "empty": ""}
 
 
-@pytest.mark.parametrize("kind", VALUES)
+QUICK = ("text", "nan", "vector")
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[] if kind in QUICK else pytest.mark.slow) for kind in VALUES]
+)
 def test_verbs_take_them_calmly(kind, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for i in range(2):

@@ -29,7 +29,9 @@ def test_noise_falls_and_texture_stays(room, name):
     keeps_texture(name, *room)
 
 
-@pytest.mark.parametrize("variance", [None, np.inf, 1e38])
+@pytest.mark.parametrize(
+    "variance", [1e38, pytest.param(None, marks=pytest.mark.slow), pytest.param(np.inf, marks=pytest.mark.slow)]
+)
 def test_one_pixel_of_1e30_leaves_nfor_the_others(room, variance):
     stack, clean = room
     usual = reconstruct(stack, "nfor").image
@@ -97,7 +99,7 @@ def test_an_absent_peer_says_what_to_install(room, monkeypatch):
 
 @pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())
 @pytest.mark.parametrize("noise", [None, 0.0, 0.99, 1.01, float("nan")])
-@pytest.mark.parametrize("scale", [1, 1000])
+@pytest.mark.parametrize("scale", [1000, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_combiner_is_given_oidns_images_by_clean_features(noise, scale):
     """Features are prefiltered unless their noise is known to be little beside the image's, whatever the exposure."""
     image = np.full((40, 50, 3), scale, np.float32)

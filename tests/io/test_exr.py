@@ -14,7 +14,7 @@ from ngpt.layers import LAYERS
 from ngpt.stack import GradientStack
 
 LOSSLESS = ("NO", "RLE", "ZIPS", "ZIP", "PIZ")
-quick = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+quick = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @st.composite

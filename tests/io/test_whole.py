@@ -41,7 +41,7 @@ def test_a_file_is_finished_and_no_beginning_of_it_is(tmp_path, make):
     data = path.read_bytes()
     # The smaller levels, which nobody reads, may be cut.
     least = 0.8 if make == "levels" else 1.0
-    for size in [0, 3, 8, *np.linspace(9, least * len(data) - 1, 60).astype(int)]:
+    for size in [0, 3, 8, *np.linspace(9, least * len(data) - 1, 30).astype(int)]:
         path.write_bytes(data[:size])
         assert not finished(path), f"{size} of {len(data)} bytes"
     path.unlink()

@@ -44,7 +44,17 @@ def test_direct_light_and_caustics_are_added_back(stacks):
         assert np.allclose(image, results(stacks[:3])[i] + light, atol=1e-3)
 
 
-@pytest.mark.parametrize("cut", ["dt", "dt_var", "motion", "previous", "size", "file"])
+@pytest.mark.parametrize(
+    "cut",
+    [
+        "dt",
+        "previous",
+        "size",
+        "file",
+        pytest.param("dt_var", marks=pytest.mark.slow),
+        pytest.param("motion", marks=pytest.mark.slow),
+    ],
+)
 def test_a_cut_parts_a_shot_in_two(stacks, cut):
     second = stacks[4]
     changed = {

@@ -30,6 +30,7 @@ def said(code, *arguments):
     return [int(word) for word in done.stdout.split()]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system lets no process choose its cores")
 def test_there_are_two_threads_on_one_core(renderer):
     assert said(ALONE)[0] >= 2
