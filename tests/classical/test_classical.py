@@ -120,7 +120,7 @@ SHORT = {
     "l1": (175, 600, lambda *data: l1(*data, max_iterations=26)),
     "cv": (100, 1000, lambda *data: cv(*data, sweeps=6)),
     "wcv": (100, 1000, lambda *data: wcv(*data, *data, sweeps=6)),
-    "wl2": (180, 600, lambda *data: wl2(*data, *data)),
+    "wl2": (180, 1000, lambda *data: wl2(*data, *data)),
 }
 
 
