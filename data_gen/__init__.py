@@ -1,7 +1,7 @@
 """data_gen: renders gradient stacks with Mitsuba 3. The only package of ngpt that imports mitsuba and drjit.
 
 stack, plan = data_gen.render_scene("scene.xml", spp=64)                       # what `ngpt render` does
-for frame, stack in data_gen.render_frames("shot.xml", range(120), spp=16):    # what it does with --frames
+for frame, stack in data_gen.render_frames("shot.xml", range(120), spp=16):    # what `ngpt render --frames` does
     ...
 scene = mi.load_dict({..., "integrator": {"type": "gpt"}})                     # our integrators are Mitsuba's plugins
 """

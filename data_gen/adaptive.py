@@ -36,7 +36,7 @@ from ngpt.system.late import ndimage
 BLOCK = PACKET
 # Least mean number of samples per pixel: the first step everywhere, and as many again to distribute
 LEAST = 2 * BLOCK
-# The least and the most that a pixel gets, relative to an even share
+# The fewest and the most samples that a pixel gets, relative to an even share
 _FLOOR, _CAP = 0.25, 16.0
 # If an error is given, a step aims at _MARGIN times the samples that seem to be needed, and adds at least this share of
 # the samples so far.
@@ -62,7 +62,7 @@ class Adaptive:
     pixels, for the result x of the ``method`` and the converged image r, as far as standard errors foretell it.
     """
 
-    error: float | None = None  # at which the render ends; None: samples or time end it
+    error: float | None = None  # the render ends at this error; None: samples or time end it
     method: str = "auto"
 
     def chosen_by(self, stack: GradientStack) -> str:
@@ -89,11 +89,11 @@ def check_adaptive(adaptive: Adaptive, sampler: Sampler, options: dict, spp: int
 def render_adaptive(
     sample: SamplePass, sensor: mi.Sensor, seed: int, adaptive: Adaptive, budget: Budget, watch: Watch, **how: Any
 ) -> tuple[GradientFilm, dict]:
-    """Renders adaptive samples. Returns the film, and the attributes that say what its samples were chosen for.
+    """Renders adaptive samples. Returns the film, and the attributes with the method and the error.
 
-    For the parameters see ``data_gen.passes.render_passes()``; samples of the ``budget``, and what is reported of them,
-    are means over pixels. The first 16 samples of each pixel are always rendered. The seed, the size, the method and
-    the number of all samples decide the bits, whatever ended the render. Raises NgptError as the method does.
+    For the parameters see ``data_gen.passes.render_passes()``. The samples of the ``budget`` and of the progress are
+    means over pixels. The first 16 samples of each pixel are always rendered. The seed, the size, the method and the
+    number of all samples decide the bits, whatever ended the render. Raises NgptError as the method does.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     pixels = width * height
@@ -151,7 +151,7 @@ def render_adaptive(
 @dataclass(frozen=True)
 class Assessment:
     relative: np.ndarray  # the standard error of each pixel relative to its light, (pixels)
-    error: float  # in all
+    error: float  # of the whole image, see ``Adaptive``
     method: str
 
 
@@ -203,8 +203,8 @@ def share_out(need: np.ndarray, n: np.ndarray, samples: float) -> np.ndarray:
 
 
 def gain(need: np.ndarray) -> float:
-    """The squared error relative to the same number of even samples, if ``need`` (of each pixel) is right and counts
-    follow it exactly."""
+    """The expected squared error relative to as many even samples, if ``need`` (pixels) is right and the numbers of
+    samples follow it exactly."""
     shares = np.clip(need / max(need.mean(), 1e-300), _FLOOR, _CAP)
     squares = np.square(need)
     return float((squares / (shares / shares.mean())).mean() / max(squares.mean(), 1e-300))
@@ -275,12 +275,12 @@ class UnevenRender:
             self.report()
 
     def _of_round(self) -> int:
-        """Blocks up to the end of the round, which is counted in samples of all pixels."""
+        """The blocks up to the end of the current round. Rounds are counted in samples of all pixels."""
         end = self.rounds.end_of_round(self.done // self.film.pixels)
         return 1 << 62 if end is None else max(1, -(-(end * self.film.pixels - self.done) // BLOCK))
 
     def _at_once(self, whole: bool) -> int:
-        """Blocks of the next pass; 0 where there is no time for one."""
+        """The blocks of the next pass; 0 if there is no time for a pass."""
         if not self.passes:
             return max(1, min(self.at_once, passes.FIRST_LANES // BLOCK))
         begin, each = foretold(self.passes)

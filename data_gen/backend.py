@@ -1,4 +1,4 @@
-"""The Mitsuba variant: which one is used, and what has to be in place before it starts."""
+"""Chooses the Mitsuba variant, and checks that it can start."""
 
 import logging
 
@@ -24,7 +24,7 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
     except ModuleNotFoundError as error:
         raise NgptError(f"rendering needs Mitsuba 3, which is not installed; `{install_command('render')}`") from error
     except (ImportError, NameError) as error:
-        # Dr.Jit fails with a NameError of its own when a system library is missing; the cause is one below it.
+        # If a system library is missing, Dr.Jit raises a NameError, whose context is the cause.
         cause = error.__context__ or error
         raise NgptError(
             f"Mitsuba is installed but cannot be loaded: {cause}; if a library is missing, install it, "
@@ -43,10 +43,10 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
         make_classes()
     except (ImportError, RuntimeError) as error:
         stop_if_interrupted(error)
-        told = " ".join(str(error).split())
-        if name.startswith("cuda") and "hasn't been initialized" in told:
-            told = f"no NVIDIA driver was found; use {DEFAULT_VARIANT}, which runs on the CPU"
-        raise NgptError(f"variant '{name}' cannot start: {told}") from error
+        message = " ".join(str(error).split())
+        if name.startswith("cuda") and "hasn't been initialized" in message:
+            message = f"no NVIDIA driver was found; use {DEFAULT_VARIANT}, which runs on the CPU"
+        raise NgptError(f"variant '{name}' cannot start: {message}") from error
     _LOG.info("Mitsuba %s, variant %s", mi.__version__, name)
     # Without this, every scene loaded prints its timings.
     mi.set_log_level(mi.LogLevel.Error)
@@ -54,5 +54,5 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
 
     if limited():
         dr.set_thread_count(processors())
-    elif dr.thread_count() < 2:  # which scenes need to be loaded, see data_gen.scenes.load
+    elif dr.thread_count() < 2:  # see data_gen.scenes.load: scenes need two threads to load
         dr.set_thread_count(2)

@@ -1,4 +1,4 @@
-"""Renders that were begun: whether a file has all that was requested, and what is left to render.
+"""Unfinished renders: whether a file has all that was requested, and what is left to render.
 
 The rest gets its own seed, made from the requested seed and the number of existing parts. So its samples are
 independent of those in the file, and parts are merged exactly as stacks with different seeds are (``ngpt.merging``).
@@ -28,24 +28,24 @@ from ngpt.system.files import save
 
 # A rest below this fraction of the requested time is not worth rendering
 _NOTHING = 0.02
-# Samples per pixel that are too few to be shared out: what is left is rendered evenly then.
+# If fewer samples per pixel than this are left, they are too few to be adaptive and are rendered evenly.
 SHARED = 32
 
 
 def frame_seed(seed: int, frame: int, use: int = 0) -> int:
-    """The seed of a frame: one of its own, whatever other frames are rendered; and of each use of it."""
+    """The seed of a frame, which depends on no other frame. Each ``use`` of the frame has another seed."""
     # Entropy must not be negative, frames may be.
     entropy = [seed, frame % 2**64]
     return int(np.random.SeedSequence([*entropy, use] if use else entropy).generate_state(1, np.uint64)[0])
 
 
 def part_seed(seed: int, part: int) -> int:
-    """The seed of a part of a render; part 0 has the one that was asked for."""
+    """The seed of a part of a render; part 0 has the requested ``seed``."""
     return int(np.random.SeedSequence([seed, part, 0, 1]).generate_state(1, np.uint64)[0]) if part else seed
 
 
 class Unfinished(NgptError):
-    """A failure amid a render, with the ``stack`` of the samples that were done by then."""
+    """A failure during a render, with the ``stack`` of the samples that were done before."""
 
     def __init__(self, message: str, stack: GradientStack):
         super().__init__(message)
@@ -58,7 +58,7 @@ def rest_of(
     """The part of a request that its file still lacks, for an image or for a ``frame``; None if it lacks nothing.
 
     ``attributes`` are from the header of the file at ``path``. The sampler of the rest is the file's, and its seed is
-    the one for the next part. Raises NgptError if the file is of another request.
+    the one for the next part. Raises NgptError if the file belongs to another request.
     """
     said = _same(request, path, attributes, frame)
     seeds, sampler = str(attributes.get("ngpt:seed", "")).split(), str(attributes.get("ngpt:sampler", ""))
@@ -79,7 +79,7 @@ def rest_of(
     spp = None if request.spp is None else request.spp - int(done)
     even = spp is not None and spp < SHARED
     shares = not even and (request.shares or "ngpt:adaptive" in attributes)
-    # The method that samples were shared out for, or else the one that the render is for
+    # The method whose error the adaptive samples have followed so far, or else the one that will denoise the stack
     methods = (attributes.get("ngpt:adaptive"), request.method, attributes.get("ngpt:for"))
     bare = "features=false" in str(attributes.get(OPTIONS, "")).split(", ")
     return replace(
@@ -122,7 +122,7 @@ def _same(request: RenderRequest, path: Path, attributes: Mapping[str, Any], fra
 
 
 def begun_stack(path: Path) -> GradientStack:
-    """What was rendered of the stack in a file: without the image that a method made of it, if any."""
+    """The stack in a file, without the image that a method may have made of it."""
     found = read(path)
     layers = {name: found[name] for name in found.names if name != "error"}
     attributes = {name: value for name, value in found.attributes.items() if name not in MADE_BY}
@@ -134,7 +134,7 @@ def begun_stack(path: Path) -> GradientStack:
 def joined_or_kept(path: Path, rest: GradientStack, begun: GradientStack) -> GradientStack:
     """Both parts merged; the attributes that say how the render ended come from ``rest``.
 
-    Where that fails, the rest is written beside ``path``, and NgptError says so.
+    If they cannot be merged, the rest is written to another file beside ``path``, and NgptError names that file.
     """
     try:
         whole = merge([begun, rest])
@@ -150,7 +150,7 @@ def joined_or_kept(path: Path, rest: GradientStack, begun: GradientStack) -> Gra
 
 
 def kept_apart(why: str, stack: GradientStack, path: Path, what: str = "was rendered") -> NgptError:
-    """Writes a stack to ``path``, or elsewhere, after a failure; returns the error that says why, and where it is."""
+    """Writes a stack to ``path``, or elsewhere, after a failure. Returns an error that says ``why``, with the file."""
     try:
         save(path, lambda path, overwrite: write(path, stack, overwrite=overwrite))
     except NgptError as other:

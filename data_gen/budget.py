@@ -10,12 +10,12 @@ from typing import Any
 from ngpt.errors import WrongUse
 from ngpt.stack import GradientStack
 
-# What a render may use, in MiB, beside the scene itself
+# The default memory limit of a render in MiB, without the scene itself
 DEFAULT_MEMORY = 6144
-# Bytes that a lane takes in a pass: the most that any path tracer was seen to take, 200, and some more
+# Bytes that a lane takes in a pass. Path tracers were measured to take at most 200; the rest is a margin.
 LANE_BYTES = 256
 
-# Called with (samples per pixel so far, spp), or, where there are seconds, with whole (seconds gone, seconds)
+# Called with (samples per pixel so far, spp), or in renders with a time limit with (elapsed seconds, limit), both whole
 Progress = Callable[[int, int], None]
 
 
@@ -28,10 +28,10 @@ def wall() -> float:
 class Budget:
     """What a render may spend. A render ends when it reaches ``spp`` or ``seconds``, whichever comes first."""
 
-    spp: int | None = None  # base paths per pixel; None: as many as time allows
-    seconds: float | None = None  # of the clock, compilation of kernels included; None: no limit
+    spp: int | None = None  # base paths per pixel; None: as many as the time allows
+    seconds: float | None = None  # on the ``clock``, compilation of kernels included; None: no limit
     memory: int = DEFAULT_MEMORY  # MiB for paths and film
-    clock: Callable[[], float] = wall  # or time.process_time, which other work on the machine hardly moves
+    clock: Callable[[], float] = wall  # or time.process_time, which other work on the machine hardly affects
 
     def check(self) -> None:
         """Raises WrongUse for budgets with which no scene could be rendered."""
@@ -45,10 +45,10 @@ class Budget:
 
 @dataclass(frozen=True)
 class Watch:
-    """Functions that are called while a render goes on."""
+    """Functions that are called during a render."""
 
     progress: Progress = lambda done, total: None  # called before the first pass and after each
-    stop: Callable[[], bool] = lambda: False  # asked after each pass whether to end there
+    stop: Callable[[], bool] = lambda: False  # called after each pass; True ends the render
     # Called after each pass with a function that makes the stack of the samples done by then
     newest: Callable[[Callable[[], GradientStack]], None] = lambda stack: None
     chosen: Callable[[Any], None] = lambda plan: None  # called before the render with the plan of "auto"

@@ -1,9 +1,10 @@
-"""A look at a scene: how much of its light paths from the camera hardly find, since a mirror or glass makes it of lamps
-without size, or tiny ones.
+"""Measures how much of a scene's light paths from the camera hardly find: caustics of lamps that are tiny or have no
+size.
 
-Light paths are joined to the camera at each of their vertices. What counts has come from such a lamp, and met a mirror
-or clear glass first: no connection to the lamp finds it, and hardly a path meets the lamp. Light that is seen only in
-mirrors or through glass is in neither sum.
+Light paths are connected to the camera at each of their vertices. A path counts as a caustic if it starts at such a
+lamp and meets a mirror or clear glass before any other surface. From behind that mirror or glass, no connection leads
+to the lamp, and few paths hit the lamp by chance. Light that the camera sees only in mirrors or through glass is not
+measured.
 """
 
 from __future__ import annotations
@@ -33,9 +34,10 @@ _PIXELS, _SPP, _LONGEST = 1 << 14, 4, 8
 
 
 def share_of_caustics(scene: mi.Scene) -> float | None:
-    """The share of light on what the camera sees that paths from it hardly find; None where light paths do not work.
+    """The share of caustics in the light on the surfaces that the camera sees, 0 to 1; None if ``bdpt`` cannot render
+    the scene.
 
-    0 in scenes without such lamps, or without mirrors and clear glass. The random numbers are always the same.
+    It is 0 in scenes without tiny lamps, and without mirrors and clear glass. The random numbers are always the same.
     """
     if not behind_sharp(scene):
         return 0.0
@@ -55,12 +57,15 @@ def share_of_caustics(scene: mi.Scene) -> float | None:
 
 @dr.syntax
 def _light(plan: Plan, sight: Sight, table: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """The light that each path brings to the camera from lamps in the ``table`` by a mirror or glass; and all of it."""
+    """The caustic light that each light path brings to the camera, and all light that it brings.
+
+    ``table`` says for each emitter of the scene whether it is tiny or has no size.
+    """
     eye, random = sight.eye, sight.random.clone()
     start, end, active = begin(plan, random, sight.ray)
     hard = dr.gather(mi.Bool, table, start.index)
     found, whole = mi.Float(0), mi.Float(0)
-    first, caustic = mi.Bool(True), mi.Bool(False)  # it has met nothing but holes; it has met a mirror or glass first
+    first, caustic = mi.Bool(True), mi.Bool(False)  # the path has met only holes so far; it is a caustic
     while dr.hint(active, label="light to the camera"):
         y, bsdf = end.y, end.y.si.bsdf()
         C, _, _ = to_camera(

@@ -1,8 +1,7 @@
-"""Which code a render runs. Its hash is part of the key of cached stacks, so a change of code makes new ones.
+"""The code that a render runs. Its hash is part of the key of cached stacks, so a change of the code makes new stacks.
 
 The files are found by following imports, anywhere in a file, from the sampler's own module and from
-``data_gen.render``, which all samplers share. Nothing is listed by hand. Nothing is imported either: Mitsuba need not
-be there.
+``data_gen.render``, which all samplers share. No module is imported for this, so Mitsuba need not be installed.
 """
 
 from __future__ import annotations
@@ -17,27 +16,30 @@ from data_gen.samplers import SAMPLERS
 from ngpt.system.source import code_text, imports
 
 ROOT = Path(__file__).parent
-# The registry knows all samplers. A render needs only its own family's entries of what the registry imports.
+# The registry imports the entries of all samplers, but a render runs only the entry of its sampler's own family.
 _REGISTRY, _MACHINERY = "data_gen.samplers", "data_gen.samplers.registry"
 # The package's ``__init__`` only re-exports names of other modules.
 _FACE = "data_gen"
-# Modules of the built-in scenes: a scene has a key of its own.
+# Modules of the built-in scenes. They are left out, because a scene has its own key.
 _BUILT_IN = ("data_gen.scenes.builtin", "data_gen.scenes.grids")
 
 
 def code(sampler: str) -> str:
-    """SHA-256 of the files that a render by the sampler runs, without comments and docstrings; of "auto", by any of the
-    samplers that a scene's description may stand for. For an unknown name, of the code that all samplers share."""
+    """SHA-256 of the files that a render by the sampler runs, without comments and docstrings.
+
+    For "auto" these are the files of all samplers that it may choose. For an unknown name they are the files that all
+    samplers share.
+    """
     return _hash(reached(sampler))
 
 
 def scene_code(name: str) -> str:
-    """SHA-256 of a built-in scene: its name, and the files that all of them are made in."""
+    """SHA-256 of a built-in scene: of its name and of the files that define the built-in scenes."""
     return _hash(_BUILT_IN, name)
 
 
 def reached(sampler: str) -> list[str]:
-    """The modules of data_gen, and of the sampler's own package, that a render by the sampler runs, sorted."""
+    """The sorted names of the modules that a render by the sampler runs, in data_gen and in the sampler's package."""
     entries = [SAMPLERS[sampler]] if sampler in SAMPLERS else [s for s in SAMPLERS.values() if s.rank]
     modules = [entry.module for entry in entries if sampler in (entry.name, "auto") and isinstance(entry.module, str)]
     queue, found = ["data_gen.render", _MACHINERY, *modules, *filter(None, map(_entries_of, modules))], set()
@@ -46,7 +48,8 @@ def reached(sampler: str) -> list[str]:
         module = queue.pop()
         if module not in found and module not in (_REGISTRY, _FACE, *_BUILT_IN):
             found.add(module)
-            queue += _imports(_file(module), homes)
+            file = _file(module)
+            queue += (name for name in _named(file, file.stat().st_mtime_ns, homes) if _file(name).is_file())
     return sorted(found)
 
 
@@ -58,15 +61,10 @@ def _entries_of(module: str) -> str | None:
     return None
 
 
-def _imports(file: Path, homes: frozenset[str]) -> set[str]:
-    """The modules of the packages ``homes`` that a file imports, and the packages they are in."""
-    return {name for name in _named(file, file.stat().st_mtime_ns, homes) if _file(name).is_file()}
-
-
 # Cached by the time of the last change of the file
 @lru_cache(maxsize=1024)
 def _named(file: Path, changed: int, homes: frozenset[str]) -> frozenset[str]:
-    """Names in the packages ``homes`` that a file imports, and what they are in."""
+    """All names of modules in the packages ``homes`` that a file may import, and of the packages that contain them."""
     parts = [name.split(".") for name in imports(file) if name.partition(".")[0] in homes]
     return frozenset(".".join(words[: i + 1]) for words in parts for i in range(len(words)))
 

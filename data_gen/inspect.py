@@ -1,4 +1,4 @@
-"""What a scene is made of, and what that means for rendering it, without loading meshes or textures."""
+"""Describes a scene and how it would be rendered, without loading its meshes and textures."""
 
 from __future__ import annotations
 
@@ -24,12 +24,10 @@ _LOG = logging.getLogger(f"ngpt.{__name__}")
 _KINDS = ("Integrator", "Sensor", "Film", "Shape", "BSDF", "Emitter", "Medium", "Texture")
 _MIRRORS = ("conductor", "dielectric", "thindielectric")
 _POINTS = ("point", "spot", "directional", "projector")
-# What light goes through and is focussed by, so that no connection finds it behind
+# Materials that refract and focus light, so that no connection finds the light behind them
 _LENSES = ("dielectric", "roughdielectric")
 _SHARP = ("conductor", "dielectric")
-
-
-# What depth of field means for samplers with gradients and without
+# Notes on depth of field, for samplers with gradients (True) and without
 _LENS_NOTES = {
     True: "base and offset paths share their lens samples",
     False: "images are made without albedo and normal where the lens blurs them",
@@ -106,7 +104,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
 
 @dataclass(frozen=True)
 class _Camera:
-    """A sensor of a scene file: its id, its plugin, and (width, height) where the file says them."""
+    """A sensor of a scene file: its id, its plugin, and (width, height) if the file gives them."""
 
     id: str = ""
     plugin: str = "perspective"
@@ -129,7 +127,8 @@ def _children(nodes: Sequence, node, kind: mi.ObjectType) -> list:
 
 
 def _transport(nodes: Sequence) -> tuple[str, str, str, bool]:
-    """A scene's integrator, the one whose image is rendered, why there is none, or "", and whether lamps are hidden."""
+    """The plugin of a scene's integrator, the plugin whose image is rendered instead, why that is impossible or "", and
+    whether lamps are hidden from the camera."""
     found = _children(nodes, nodes[0], mi.ObjectType.Integrator)
     if not found:
         return "path", "path", "", False
@@ -144,7 +143,7 @@ def _transport(nodes: Sequence) -> tuple[str, str, str, bool]:
 
 
 def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
-    """What camera, materials, lights and media mean for a stack, whoever renders it, a line for each that matters."""
+    """Notes on camera, materials, lights and media that hold for all samplers, one line each."""
     refusals: dict[str, list[str]] = {}
     for name, sampler in by_standing("use").items():
         if reason := sampler.refuses(facts):
@@ -163,7 +162,7 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
         if able := _finding(facts, "caustics"):
             how = "by photons alone for lights without size" if points else "best by photons"
             lines.append(
-                f"glass: the light behind it, where that is seen in mirrors or through glass, is found {how}: {able}"
+                f"glass: the light behind it, if it is seen in mirrors or through glass, is found {how}: {able}"
             )
         if able := _finding(facts, "caustics", and_hidden_lamps=True):
             lines.append(
@@ -190,21 +189,24 @@ def _of_tiny_lamps(plugins: dict[str, Counter], facts: Facts) -> list[str]:
     if not (tiny and any(name in plugins["BSDF"] for name in _SHARP)):
         return []
     able = _finding(facts, "caustics", and_hidden_lamps=True)
-    what = "lamps without size, or a sun, meet smooth glass or mirrors: what these make of it"
+    what = "caustics of lamps without size, or of a sun, at smooth glass or mirrors"
     if not able:
-        return [f"{what} is found by no sampler that renders this scene"]
-    return [f"{what} needs {able}; `ngpt render` says how much that is"]
+        return [f"{what} are found by no sampler that renders this scene"]
+    return [f"{what} need {able}; `ngpt render` says how much light they are"]
 
 
 def _finding(facts: Facts, light: str, and_hidden_lamps: bool = False) -> str:
-    """The arguments that name samplers, studies left out, which can render the scene and find such light."""
+    """The arguments ``--sampler NAME`` of all samplers that can render the scene and find this kind of ``light``.
+
+    Studies are left out. ``and_hidden_lamps`` says whether the samplers must also find hidden lamps, or must not.
+    """
     able = {name: s for name, s in SAMPLERS.items() if s.standing != "study" and not s.refuses(facts)}
     found = [n for n, s in able.items() if light in s.finds and ("hidden lamps" in s.finds) == and_hidden_lamps]
     return ", ".join(f"`--sampler {name}`" for name in found)
 
 
 def _how_much(scene: mi.Scene) -> str:
-    """What share of the light ``behind_sharp()`` is about, by a look with light paths; "" where these do not work."""
+    """The share of caustics of the lamps in ``behind_sharp()``, as part of a message; "" if it cannot be measured."""
     from data_gen.caustics import share_of_caustics  # .1 s to import, and few scenes need it
 
     share = share_of_caustics(scene)
@@ -215,7 +217,7 @@ def _how_much(scene: mi.Scene) -> str:
 
 
 def warn_of_lost_light(scene: mi.Scene, sampler: str) -> None:
-    """Says before a render which light of the scene the sampler does not find, and which one does."""
+    """Warns before a render if the sampler misses some light of the scene, and names a sampler that finds it."""
     facts = scene_facts(scene)
     if facts.integrator not in ("path", "volpath", "volpathmis"):
         return
@@ -223,12 +225,12 @@ def warn_of_lost_light(scene: mi.Scene, sampler: str) -> None:
     entry = FRAME_SAMPLERS.get(sampler) or SAMPLERS[sampler]
     if not getattr(entry, "finds", ()) and (lamps := behind_sharp(scene)):
         able = _finding(facts, "caustics", and_hidden_lamps=True).replace("`", "").split(", ")[0]
-        remedy = f"{able} finds it" if able else "no sampler that renders this scene finds it"
-        what = f"smooth glass or mirrors: what these make of their light{_how_much(scene)}"
-        _LOG.warning("%s meet %s, '%s' hardly finds; %s", lamps, what, sampler, remedy)
+        remedy = f"{able} finds them" if able else "no sampler that renders this scene finds them"
+        what = f"{lamps} at smooth glass or mirrors{_how_much(scene)}"
+        _LOG.warning("'%s' hardly finds the caustics of %s; %s", sampler, what, remedy)
     if facts.integrator == "path" and entry.loses and without_size(scene) and has_holes(scene):
         remedy = "--sampler gpt, or primal, finds it"
-        _LOG.warning("of lamps without size, '%s' loses light %s; %s", sampler, entry.loses, remedy)
+        _LOG.warning("'%s' loses light of lamps without size %s; %s", sampler, entry.loses, remedy)
     if entry.leaves_lamps and (lamp := bent_lamp(scene)):
         _LOG.warning(
             "'%s' leaves lamp%s, which has few faces and smooth normals, to Mitsuba %s, which weighs it by the wrong "

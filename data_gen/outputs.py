@@ -1,7 +1,7 @@
-"""Where a render goes: its stack into a file, or at once the image that a method makes of it.
+"""Writes the result of a render: the stack, or the image that a method makes of the stack.
 
-Such an image is what `ngpt denoise` makes of the stack, to the bit. In OpenEXR the whole stack is beside it, so that a
-render that was begun goes on from a result as from a stack.
+The image has the same bits as the image that `ngpt denoise` makes of the stack. An OpenEXR file with the image also
+holds the whole stack, so an unfinished render can be continued from it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ngpt.system.text import by_names
 
 @dataclass(frozen=True)
 class Denoising:
-    """``method`` is a name, or "auto": see ``ngpt.methods.choose``."""
+    """How a stack is denoised. ``method`` is a name, or "auto": see ``ngpt.methods.choose``."""
 
     method: str = "auto"
     look: Look = field(default_factory=Look)  # of a picture
@@ -37,8 +37,9 @@ class Denoising:
         return self.method != "auto" and "dx" in runnable(self.method).needs
 
     def check(self, sampler: str, spp: int | None, begun: str = "") -> None:
-        """Raises an error for a method that does not run here, or that needs something such a render lacks. ``begun``
-        is the file of a render that is continued with its sampler.
+        """Raises an error for a method that does not run here, or that needs layers which the render does not have.
+
+        ``begun`` is the file of a render that is continued with its sampler.
         """
         if self.method == "auto":
             return
@@ -56,9 +57,11 @@ class Denoising:
 
 @dataclass(frozen=True)
 class Output:
-    """The ``file`` for the stack of a request or, with ``denoising``, for its image; ``kept``: one for the stack then.
+    """The files of a request.
 
-    ``frame``: of a shot
+    ``file``   holds the stack or, with ``denoising``, the image
+    ``kept``   also holds the stack, if ``file`` holds an image; None: there is no such file
+    ``frame``  the number of the frame of a shot; None for a single image
     """
 
     request: RenderRequest
@@ -66,10 +69,10 @@ class Output:
     denoising: Denoising | None = None
     kept: Path | None = None
     frame: int | None = None
-    header: dict[str, str] = field(init=False)  # what the stack's header says of the request
+    header: dict[str, str] = field(init=False)  # the attribute of the stack's header with the request
 
     def __post_init__(self) -> None:
-        # The checksum of the scene's file before the render
+        # Made before the render, since it contains a checksum of the scene's file
         object.__setattr__(self, "header", self.request.header(self.frame))
 
     @property
@@ -77,7 +80,7 @@ class Output:
         return self.kept or self.file
 
     def check(self, skip_existing: bool) -> None:
-        """Raises WrongUse for files that cannot be written, or that cannot say how far a render is."""
+        """Raises WrongUse for files that cannot be written, and with ``skip_existing`` for files without progress."""
         if self.denoising is not None:
             check_image(self.file, self.denoising.look.transform)
         for path in (self.kept, None if self.denoising else self.file):
@@ -95,9 +98,9 @@ class Output:
             )
 
     def left(self) -> RenderRequest | None:
-        """What is left to render: all, if no whole file is there, or the rest; None: nothing.
+        """The request for what is left: all of it if there is no complete file, the rest of it, or None for nothing.
 
-        Raises NgptError if the file's stack is of another request, or of no use for the image.
+        Raises NgptError if the stack in the file belongs to another request, or cannot be denoised as requested.
         """
         if not finished(self.stack):
             return self.request
@@ -110,7 +113,7 @@ class Output:
     def done(self) -> bool:
         """Whether all that was requested exists.
 
-        Raises NgptError where a stack is there in place of its image, or the image of another method.
+        Raises NgptError if the file holds a stack without an image, or an image by another method.
         """
         try:
             if self.left() is not None:
@@ -125,7 +128,7 @@ class Output:
             )
         if self.kept is not None:
             there = self.file.exists() and (self.file.suffix.lower() != ".exr" or _readable(self.file))
-            # A stack that has grown since then has another image.
+            # If the stack has more samples than when the image was made, the image is out of date.
             return there and self.file.stat().st_mtime_ns >= self.kept.stat().st_mtime_ns
         if self.denoising is not None and not by:
             raise NgptError(
@@ -137,10 +140,10 @@ class Output:
     def write(
         self, stack: GradientStack, overwrite: bool, begun: GradientStack | None = None
     ) -> tuple[GradientStack, dict[str, Any]]:
-        """Writes a stack, in place of the one that was ``begun`` and together with it, or the image of both. The header
-        says what was asked for.
+        """Writes a stack, or its image, or both. The header contains the request.
 
-        Returns the whole stack, and the attributes that say what made the image. Nothing that was rendered is lost.
+        A stack that was ``begun`` is merged with it first, and the file with that stack is replaced. Returns the whole
+        stack, and the attributes that describe the image. If writing fails, the samples are kept in another file.
         """
         stack.attributes |= self.header
         if begun is not None:
@@ -150,9 +153,9 @@ class Output:
         return stack, self.image(stack, overwrite) if self.denoising else {}
 
     def image(self, stack: GradientStack, overwrite: bool) -> dict[str, Any]:
-        """Makes and writes the image, and returns the attributes that say what made it.
+        """Makes and writes the image, and returns the attributes that describe it.
 
-        What was rendered is not lost where that fails: unless the stack is kept, it is written beside the image.
+        If the method fails and the stack is not kept anyway, the stack is written beside the image.
         """
         assert self.denoising is not None
         # Dr.Jit keeps the memory of a render for the next one: at 1920x1080 more than a method takes.
@@ -170,7 +173,7 @@ class Output:
             why = str(error)
             if not isinstance(error, NgptError):
                 why = f"method '{method}' failed: {type(error).__name__}: {error}".rstrip(": ")
-            # What stands for standard output goes when the command ends.
+            # The temporary file that stands for standard output is deleted when the command ends.
             lasting = file if by_names(str(file)) == str(file) else Path(file.name)
             raise kept_apart(why, stack, lasting.with_name(f"{file.stem}.stack.exr")) from error
         views, made = [(result.image, stack)], result.attributes
@@ -179,5 +182,5 @@ class Output:
 
 
 def _readable(file: Path) -> bool:
-    """Whether a file is there that has a header, and is whole."""
+    """Whether this is a complete OpenEXR file."""
     return file.suffix.lower() == ".exr" and file.is_file() and finished(file)

@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -43,18 +43,24 @@ FIRST_LANES = 1 << 20
 PASS_SECONDS = 2.0
 
 
-@runtime_checkable
-class Rounds(Protocol):
-    """A ``SamplePass`` that renders in rounds: its samples depend on what earlier rounds have found.
+class Rounds:
+    """A render in rounds, in which samples depend on what earlier rounds have found.
 
-    ``shares``  whether they depend on it in the current render
-    ``said``    header attributes that say so
-    ``seed``    the seed of what rounds find; None: the seed of the render
+    A ``SamplePass`` that renders in rounds derives from this class. The class itself stands for independent samples,
+    which need no rounds. ``seed`` is the seed of what rounds find; None stands for the seed of the render.
     """
 
-    shares: bool
-    said: dict[str, Any]
-    seed: int | None
+    seed: int | None = None
+
+    @property
+    def shares(self) -> bool:
+        """Whether samples depend on earlier rounds in the current render."""
+        return False
+
+    @property
+    def said(self) -> dict[str, Any]:
+        """Header attributes that say so."""
+        return {}
 
     def begin(self, sensor: mi.Sensor, seed: int, sample: int, film: GradientFilm) -> None:
         """Called before each pass. The ``film`` holds all earlier passes. ``sample`` is the number of the first sample
@@ -62,28 +68,18 @@ class Rounds(Protocol):
 
     def end_of_round(self, sample: int) -> int | None:
         """The sample before which a pass must end if it begins with this ``sample``; None: there is no limit."""
-
-
-class _OneRound:
-    """Independent samples, which need no rounds."""
-
-    shares = False
-    said: dict[str, Any] = {}  # noqa: RUF012 - it stays empty
-    seed: int | None = None
-
-    def begin(self, sensor: mi.Sensor, seed: int, sample: int, film: GradientFilm) -> None:
-        pass
-
-    def end_of_round(self, sample: int) -> int | None:
         return None
 
 
 def rounds_of(sample: SamplePass) -> Rounds:
-    return sample if isinstance(sample, Rounds) else _OneRound()
+    return sample if isinstance(sample, Rounds) else Rounds()
 
 
-def _nothing(left: int) -> str:
-    """Suggests nothing that would fit into this number of bytes per lane."""
+# Called with the bytes that are left for a lane when memory is short. Returns advice for the message, or "".
+Advice = Callable[[int], str]
+
+
+def _no_advice(left: int) -> str:
     return ""
 
 
@@ -99,7 +95,7 @@ def render_passes(
     points: str = "sobol",
     **kind: Any,
 ) -> GradientFilm:
-    """Calls ``sample`` with the camera samples of one pass after the other, and returns the film that it has filled.
+    """Calls ``sample`` with the camera samples of each pass, and returns the film that it has filled.
 
     The first pass is always rendered. A further pass is rendered only if it is expected to fit into the rest of the
     ``budget``'s time. The last block may be a partial one. Passes are short at first if ``points`` are "rounds", which
@@ -121,7 +117,7 @@ def render_passes(
     total = spp if spp is not None else 1 << 31
     rounds = rounds_of(sample)
     lane_bytes = getattr(sample, "lane_bytes", lane_bytes)
-    instead = getattr(sample, "instead", _nothing)
+    instead = getattr(sample, "instead", _no_advice)
     net = first_round(points, spp)
     film, block, most = film_within(budget.memory, sensor, total, lane_bytes, batch, instead, net=net, **kind)
     grows = points == "rounds" and not batch
@@ -138,7 +134,7 @@ def render_passes(
     def next_pass(size: int) -> int:
         """Samples of the next pass, with blocks of ``size`` samples; 0 for none."""
         left, time_left = total - film.samples, math.inf if seconds is None else seconds - (now - start)
-        # What is left over at the end is a block of its own.
+        # The samples that are left over at the end form a block.
         if left < size and seconds is None:
             return left
         blocks = min(most, max(min(left, until) // size, 1)) if size == block else 1
@@ -148,13 +144,13 @@ def render_passes(
         # If passes take long to begin, they are made longer.
         wanted = min(time_left - begin, max(PASS_SECONDS - begin, 3 * begin)) / each
         if seconds is not None:
-            # What short passes took says little of one that is a hundred times as long.
+            # The duration of short passes says little about a pass that is a hundred times as long.
             wanted = min(wanted, _GROWTH * max(n for n, _ in done))
         n = min(left, size * max(1, min(blocks, int(wanted / size))))
         if begin + each * n <= time_left:
             return n
-        # A part of a block: no other pass can follow it. A share of the time is left, since it may take longer than
-        # others.
+        # Only a part of a block fits, and no other pass can follow it. Some time is kept in reserve, since the pass may
+        # take longer than the others.
         return 0 if batch else max(0, min(n, int((_CAUTION * time_left - begin) / each)))
 
     report()
@@ -171,14 +167,14 @@ def render_passes(
             camera = CameraSamples(sensor, seed, n, film.samples, min(n, size), net=net)
             film.begin_pass(camera)
             sample(camera, film)
-            # Frees its memory before the film takes the pass.
+            # Frees the memory of the camera samples before the film processes the pass.
             del camera
             film.end_pass(min(n, size))
             dr.sync_thread()
         now, wall = budget.clock(), time.perf_counter() - wall
         first = ", kernels compiled or loaded" if not done else ""
         _LOG.debug("pass of %d samples per pixel, %.3g s%s", n, now - begin, first)
-        # Kernels report wall seconds of compilation, and the budget's clock may be another one: so their share counts.
+        # Kernels report wall seconds, and the budget may use another clock. So the share of compilation is subtracted.
         done.append((n, max((now - begin) * (1 - sum(compiled) / max(wall, 1e-9)), 1e-6)))
         watch.look(film)
         now = budget.clock()
@@ -190,13 +186,13 @@ def render_passes(
 
 
 def progress_of_time(gone: float, seconds: float) -> tuple[int, int]:
-    """What is reported of a render with a time limit: whole seconds gone, and in all."""
+    """The progress to report in a render with a time limit: (elapsed seconds, limit), both whole numbers."""
     limit = math.ceil(seconds)
     return min(limit - 1, int(gone)), limit
 
 
 def end_of_time(gone: float, seconds: float, early: bool) -> tuple[int, int]:
-    """What is reported when such a render ends: all of its seconds, or only those gone if it ended ``early``."""
+    """The progress to report when such a render ends: all of its time or, if it ended ``early``, the elapsed time."""
     limit = math.ceil(seconds)
     if early:
         limit = max(1, min(limit, math.ceil(gone)))
@@ -204,8 +200,10 @@ def end_of_time(gone: float, seconds: float, early: bool) -> tuple[int, int]:
 
 
 def growing_block(pixels: int, done: int, block: int) -> int:
-    """The number of samples of a pixel in the next block of a render that time may end, after ``done`` samples. It is
-    small at first, and then as large as ``block`` allows."""
+    """The samples per pixel in the next block, after ``done`` samples, of a render that a time limit may end.
+
+    The number is small at first and grows up to ``block``.
+    """
     first = 1
     while first < block and pixels * first < _FEWEST_LANES:
         first *= 2
@@ -228,8 +226,7 @@ def foretold(done: list[tuple[int, float]]) -> tuple[float, float]:
 
 @contextmanager
 def compilation() -> Iterator[list[float]]:
-    """Yields a list. When the ``with`` block ends, it gets the seconds that each kernel of the block took to
-    compile."""
+    """Yields a list that receives the seconds in which each kernel was compiled, when the ``with`` block ends."""
     compiled: list[float] = []
     if dr.flag(dr.JitFlag.KernelHistory):  # The caller reads it, which empties it.
         yield compiled
@@ -246,23 +243,25 @@ def film_within(
     spp: int,
     lane_bytes: int = LANE_BYTES,
     batch: int = 0,
-    instead: Callable[[int], str] = _nothing,
+    instead: Advice = _no_advice,
     *,
     net: int = ROUND,
     **kind: Any,
 ) -> tuple[GradientFilm, int, int]:
     """An empty film for ``spp`` samples per pixel, the samples of a pixel in a block, and the most blocks of a pass.
 
-    ``memory`` is in MiB. ``instead`` is as in ``blocks_within``, ``net`` as in ``CameraSamples``. ``kind`` holds
-    further parameters of the film. If memory is short, the film has fewer ``subpixels``, and a warning says so. Raises
-    NgptError if one block of samples does not fit into ``memory``.
+    ``memory`` is in MiB. ``net`` is as in ``CameraSamples``. ``kind`` holds further parameters of the film. If memory
+    is short, the film has fewer ``subpixels``, and a warning says so. Raises NgptError if one block of samples does not
+    fit into ``memory``.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     block = batch or block_of_samples(width * height)
     lane_bytes += bytes_of_rays(sensor)
     film = film_of(width, height, memory, lane_bytes * min(block, spp), batches=bool(batch), net=net, **kind)
-    most = blocks_within(memory, film, min(block, spp), lane_bytes, instead)
-    return film, block, 1 if batch else most
+    lanes = film.pixels * min(block, spp)
+    most = lanes_within(memory, film, lanes, lane_bytes, instead) // lanes
+    # A block that ends within a packet would shift the next block within its packet.
+    return film, block, most if lanes % PACKET == 0 and not batch else 1
 
 
 def film_of(width: int, height: int, memory: int, pixel_bytes: int, *, subpixels: int = 1, **how: Any) -> GradientFilm:
@@ -285,7 +284,7 @@ def film_of(width: int, height: int, memory: int, pixel_bytes: int, *, subpixels
 
 @contextmanager
 def recording() -> Iterator[None]:
-    """In this context kernels can be recorded: Python does not free scenes of earlier renders.
+    """A context in which kernels can be recorded, because Python does not free scenes of earlier renders in it.
 
     A call of Dr.Jit holds one function for each object (material, lamp ...) that lives at that moment. If a second
     scene were freed while a kernel is recorded, a lamp could be one of two in one call and the only one in the next.
@@ -313,32 +312,13 @@ def block_of_samples(pixels: int) -> int:
     return block
 
 
-def blocks_within(
-    memory: int,
-    film: GradientFilm,
-    block: int,
-    lane_bytes: int = LANE_BYTES,
-    instead: Callable[[int], str] = _nothing,
-) -> int:
-    """How many blocks of ``block`` samples per pixel a pass may have, so that it and the film fit into ``memory`` MiB.
-
-    Raises NgptError if not even one block fits. ``instead`` is called with the bytes that are left for a lane, and
-    returns a text for the message that says what else would fit.
-    """
-    lanes = film.pixels * block
-    blocks = lanes_within(memory, film, lanes, lane_bytes, instead) // lanes
-    # A block that ends within a packet would shift the next block within its packet.
-    return blocks if lanes % PACKET == 0 else 1
-
-
 def lanes_within(
-    memory: int,
-    film: GradientFilm,
-    lanes: int,
-    lane_bytes: int = LANE_BYTES,
-    instead: Callable[[int], str] = _nothing,
+    memory: int, film: GradientFilm, lanes: int, lane_bytes: int = LANE_BYTES, instead: Advice = _no_advice
 ) -> int:
-    """The most lanes of a pass. Raises NgptError if they are fewer than ``lanes``, see ``blocks_within``."""
+    """The most lanes of a pass with which it and the film fit into ``memory`` MiB.
+
+    Raises NgptError if they are fewer than ``lanes``. Its message contains the advice of ``instead``.
+    """
     available = min((memory * 2**20 - film.bytes) // lane_bytes, _MOST_LANES)
     most = 1 << (available.bit_length() - 1) if available > 0 else 0
     if most < lanes:
@@ -360,5 +340,5 @@ def least_memory(film: GradientFilm, lanes: int, lane_bytes: int = LANE_BYTES) -
 
 
 def _allocated(lanes: int) -> int:
-    """Dr.Jit gives each array the next power of two of bytes."""
+    """The lanes for which Dr.Jit allocates memory: each array gets the next power of two of bytes."""
     return 1 << (lanes - 1).bit_length()

@@ -1,4 +1,4 @@
-"""Text that changes from frame to frame, see ``filled``."""
+"""Texts with fields that depend on the number of a frame, see ``filled``."""
 
 import ast
 import math
@@ -10,7 +10,7 @@ from ngpt.errors import WrongUse
 
 # {frame}, {frame:04d}, {10 + frame * 3:.2f}
 _FIELD = re.compile(r"\{([^{}:]+)(?::([^{}]*))?\}")
-# How to write a number, as Python has it, within bounds: a width of a thousand million fills the memory.
+# Python's format of a number. Its width is limited, since a width of a billion would fill the memory.
 _FORM = re.compile(r"(.?[<>=^])?[-+ ]?#?\d{0,2}[,_]?(\.\d{1,2})?[a-zA-Z%]?")
 _OPERATORS: dict[type, Callable] = {
     ast.Add: operator.add,
@@ -26,15 +26,15 @@ _FUNCTIONS: dict[str, Callable] = {"sin": math.sin, "cos": math.cos, "min": min,
 
 
 def varies(text: str) -> bool:
-    """Whether a text is another one in another frame."""
+    """Whether a text depends on the frame."""
     return any("frame" in field for field, _ in _FIELD.findall(text))
 
 
 def filled(text: str, frame: int) -> str:
     """The text with its fields replaced: ``{frame}``, ``{frame:04d}``, ``{10 + frame * 3:.2f}``.
 
-    A field is a number, ``frame``, ``pi``, + - * / // %, brackets, sin, cos, min, max, and how to write it, as in
-    Python, in at most 99 letters and with at most 99 places. Raises WrongUse for anything else.
+    A field is an expression of numbers, ``frame``, ``pi``, + - * / // %, brackets, sin, cos, min and max. Python's
+    format of the result may follow, with a width and a precision of at most 99. Raises WrongUse for anything else.
     """
 
     def value(match: re.Match) -> str:

@@ -2,8 +2,8 @@
 
 Samplers of other packages are registered too, by their entry points.
 
-Mitsuba knows plugins by variant, and only once one is set. So each time a variant is set, constructors are registered
-that need only a name. A class is made when it is first used: all of them take half a second.
+Plugins belong to a variant of Mitsuba and can be registered only after it is set. So each time a variant is set,
+constructors are registered that need only a name. The classes are made on first use, since this takes half a second.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def register_when_ready() -> None:
 
 
 class _UntilMitsubaComes(MetaPathFinder):
-    """Finds no module itself. It notices the first import of Mitsuba, and then has its variants followed."""
+    """Finds no module itself. It notices the first import of Mitsuba, and calls ``_follow_variants`` after it."""
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:
         if name != "mitsuba":
@@ -56,7 +56,7 @@ def _follow_variants() -> None:
 
 
 def _register() -> None:
-    """Has the current variant know the names of our integrators."""
+    """Registers the names of our integrators with the current variant."""
     import mitsuba as mi
 
     from data_gen.samplers.registry import SAMPLERS, plugin_of
@@ -66,7 +66,7 @@ def _register() -> None:
 
 
 def _construct(name: str, props: Any) -> Any:
-    """The integrator of a sampler, of the current variant. Raises NgptError where the sampler is none of Mitsuba's."""
+    """Makes the integrator of a sampler. Raises NgptError if the sampler is not an integrator of Mitsuba."""
     from data_gen.samplers.registry import SAMPLERS, integrator_of
     from ngpt.errors import NgptError
 
@@ -81,9 +81,9 @@ def _construct(name: str, props: Any) -> Any:
 
 
 def make_classes() -> None:
-    """Has samplers derive from the classes of the current variant: Mitsuba has classes of their own for each.
+    """Makes samplers derive from the classes of the current variant, since each variant of Mitsuba has its own classes.
 
-    Modules that were imported for another variant are reloaded. Raises NgptError for one that cannot vectorise.
+    Modules that were imported for another variant are reloaded. Raises NgptError for a variant that is not vectorised.
     """
     global _made_for
     import mitsuba as mi

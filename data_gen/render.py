@@ -36,7 +36,7 @@ from ngpt.version import __version__
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
-# The share of light cut from the cache from which on a message reports it
+# A message reports the light that was cut from the cache if its share exceeds this.
 _MUCH_CUT = 0.01
 
 
@@ -55,15 +55,15 @@ def render_stack(
 ) -> GradientStack:
     """Renders a stack from the first sensor of a loaded scene.
 
-    ``given`` is as for ``data_gen.render_scene``; a request may be given in place of the scene. Here "auto" is the
-    sampler that the scene's description stands for, without a pilot, and "auto" subpixels must be asked for.
+    ``given`` is as for ``data_gen.render_scene``; a request may be given in place of the scene. Here sampler "auto" is
+    chosen by the scene's description, without a pilot, and the default of ``subpixels`` is 1.
 
     ``with_features``  False is the option ``features=False`` of sampler "primal": the stack holds only the primal
-    ``adaptive``       may say error and method at once; ``ngpt:spp`` is the mean over pixels then, and the layer
-                       ``samples`` says how many each has
-    ``made``           renders of one scene that are given the same object share their samplers, where possible
-    ``tails_seed``     of the noise of the cache of tails, by default ``seed``: it stands still in frames that have the
-                       same
+    ``adaptive``       may contain error and method; ``ngpt:spp`` is then the mean over pixels, and the layer
+                       ``samples`` holds the number of samples of each pixel
+    ``made``           renders of one scene with the same object share their samplers, where possible
+    ``tails_seed``     the seed of the cache of tails, by default ``seed``; frames with the same ``tails_seed`` have
+                       the same noise of the cache
     """
     if isinstance(adaptive, Adaptive):
         given |= {"error": adaptive.error, "method": adaptive.method}
@@ -125,7 +125,7 @@ def render(
     sensor = scene.sensors()[0]
     chosen: dict[str, Any] = {}
     known = {GATHERED: 1} if entry.gathers else {}
-    whole: list[GradientFilm] = []  # the film after the last pass, if there was one
+    whole: list[GradientFilm] = []  # the film after the last pass, if a pass is complete
 
     def look(film: GradientFilm) -> None:
         whole[:] = [film]
@@ -142,7 +142,7 @@ def render(
         made = made or Made()
         sample = made.sampler(entry, scene, how_made)
         rounds_of(sample).seed = tails_seed
-        # However long it took to weigh the lamps, the render is begun.
+        # The render begins even if weighing the lamps took all the time.
         if seconds is not None:
             budget = replace(budget, seconds=max(seconds - (clock() - begun), 1e-3))
         failed = None
@@ -170,7 +170,7 @@ def render(
     if failed or (watch.stop() and (spp is None or done < spp)):
         chosen[UNFINISHED] = "failed" if failed else "interrupted"
     stack = stack_of(film, sensor, seed, sampler, start, chosen, diagnostics=request.diagnostics)
-    if request.subpixels == "auto" and best(done) == 1 and stack.fine:  # it was ended early
+    if request.subpixels == "auto" and best(done) == 1 and stack.fine:  # the render ended early
         stack = replace(stack, fine={})
         del stack.attributes[SUBPIXELS]
     if failed:

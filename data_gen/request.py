@@ -31,14 +31,14 @@ _MACHINES = {"scalar", "llvm", "cuda", "metal", "ad", "double"}
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """What to render, how, until when, and what for.
+    """Everything that is requested of a render.
 
     ``scene``      a scene file, a built-in scene by name, or a Mitsuba scene; of frames also a ``frames.shot.Shot``
     ``spp``        base paths per pixel (32 if nothing else ends the render); with ``adaptive`` their mean
     ``sampler``    "auto", one of ``data_gen.samplers.SAMPLERS``, or for frames one of ``FRAME_SAMPLERS``; ``options``
                    are its options, which may be texts
 
-    Film and sight, of files and built-in scenes:
+    Film and camera, for scene files and built-in scenes:
 
     ``size``       (width, height) in pixels; None: the scene's own
     ``sensor``     number or id of the sensor to render; None: the first
@@ -48,28 +48,28 @@ class RenderRequest:
                    known to help (docs/use/subpixels.md)
     ``diagnostics`` adds rates of failed shifts and discarded values as channels
 
-    Budget; what is reached first ends the render:
+    Budget; the limit that is reached first ends the render:
 
-    ``seconds``    wall-clock time, compilation included, of each frame; with ``method`` of pilot, render and method
+    ``seconds``    wall-clock time of each frame, compilation included; with ``method``, also pilot and method
     ``cpu_seconds`` as ``seconds``, but processor time of this process, on all cores: other work hardly changes it
     ``error``      adaptive samples until the result is expected to have this relative error (0.05: 5 %)
     ``memory``     MiB for paths and film, beside the scene (6144)
 
-    How samples are used, and what for:
+    How samples are distributed, and what the stack is for:
 
     ``adaptive``   more samples where the error of the result is large
-    ``method``     the method that will denoise the stack: samples go by its error. With only ``seconds``, a pilot
-                   chooses the sampler for it; "auto": the method too
+    ``method``     the method that will denoise the stack. Adaptive samples follow its error. With only ``seconds``, a
+                   pilot chooses the sampler for it, and for "auto" the method too
     ``unbiased``   turns off the cache of tails that paths share (docs/samplers/tails.md), which lowers the noise of
                    most renders and adds a small bias
-    ``gradients``  whether the stack must have dx and dy, also where a sampler without them leaves less error ("auto")
-    ``needs_features`` False: albedo, normal and depth may be missing where a lens blurs them, so they do not pay
+    ``gradients``  whether sampler "auto" must render dx and dy, even if a sampler without them leaves less error
+    ``needs_features`` False: albedo, normal and depth may be left out if a lens blurs them too much to be useful
 
-    Of a shot; its scene and parameters may hold {frame}, {frame:04d}, {frame * 3}:
+    Shots, whose scene and parameters may contain {frame}, {frame:04d} or {frame * 3}:
 
     ``frames``     their numbers; () for a single image
     ``camera``     its path: key frames (.json), or a file with an animated camera (.glb, .gltf) at so many ``fps``
-    ``dt``         pairs of paths a pixel, 2 or more, for differences to the frame before; 0: none
+    ``dt``         pairs of paths per pixel, 2 or more, for differences to the previous frame; 0: none
 
     Raises NgptError for values that make no sense for any scene.
     """
@@ -209,13 +209,13 @@ def said_by(attributes: Mapping[str, Any]) -> dict[str, Any] | None:
     """The canonical request in the header of a file, with its budget; None if it has none."""
     try:
         said = json.loads(str(attributes.get(REQUEST, "")))
-    except (ValueError, RecursionError):  # whoever wrote the file
+    except (ValueError, RecursionError):  # the file may come from another program
         return None
     return said if isinstance(said, dict) else None
 
 
 def _plain(value: Any) -> Any:
-    """A value of NumPy as one of Python, and its sequences as tuples: only those can be compared and put in headers."""
+    """NumPy values as Python values, and sequences as tuples: these can be compared and written to headers."""
     value = value.tolist() if hasattr(value, "tolist") else value
     return tuple(map(_plain, value)) if isinstance(value, list | tuple | range) else value
 

@@ -17,7 +17,7 @@ from ngpt.subpixels import choice
 if TYPE_CHECKING:
     import mitsuba as mi
 
-# Seconds of the wall clock, or of this process on all processors, which other work on the machine does not change
+# Wall-clock time, or processor time of this process on all processors, which other work hardly changes; in seconds
 CLOCKS: dict[str, Callable[[], float]] = {"wall": time.perf_counter, "processor": time.process_time}
 
 
@@ -56,7 +56,7 @@ def measure(
     for options in renders.values():
         warm_up(scene, options)
     stacks = {}
-    # In turn, so that a busy moment hits all alike
+    # The renders take turns, so that a busy moment of the machine affects all of them alike.
     for seed in range(repeats):
         for name, options in renders.items():
             stacks[name], duration = timed(scene, options, spp, seed, clock)
@@ -75,7 +75,7 @@ def gradients(sampler: str) -> bool:
 def unusual(sampler: str, options: Options) -> str:
     entry, own = find(sampler), dict(options)
     kept = choice(own.pop("subpixels", 1))
-    entry.subpixels(kept, None)  # raises WrongUse where it cannot keep them
+    entry.subpixels(kept, None)  # raises WrongUse if the sampler cannot keep them
     given = entry.unusual(entry.settings(own))
     return ", ".join(filter(None, (given, "" if kept == 1 else f"subpixels={kept}")))
 

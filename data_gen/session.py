@@ -1,4 +1,4 @@
-"""What ``ngpt render`` does, for programs: a scene's stack, and the stacks of a shot's frames.
+"""The functions of Python that do what ``ngpt render`` does: a scene's stack, and the stacks of a shot's frames.
 
 stack, plan = data_gen.render_scene("scene.xml", spp=64)
 stack, plan = data_gen.render_scene(scene, seconds=60, method="auto")  # the method to denoise with: plan.method
@@ -47,8 +47,8 @@ def render_scene(
     """Renders the stack of a scene: a Mitsuba scene, a scene file, or a built-in scene by name.
 
     ``given`` are fields of ``data_gen.request.RenderRequest``, which says what they mean, functions of
-    ``data_gen.budget.Watch``, which follow the render (``progress``, ``stop``, ...), and options of the sampler. A
-    request may be given in place of the scene, and then only functions with it.
+    ``data_gen.budget.Watch``, which follow the render (``progress``, ``stop``, ...), and options of the sampler. If a
+    request is given in place of the scene, ``given`` may contain only functions.
 
     The same seed and number of samples give the same bits. Raises NgptError for options that do not exist or make no
     sense, and for scenes that cannot be loaded or that the sampler cannot render.
@@ -88,15 +88,15 @@ def render_frames(
     progress: Callable[[int], Callable[[int, int], None]] = lambda frame: lambda done, total: None,
     **given: Any,
 ) -> Iterator[tuple[int, GradientStack]]:
-    """(frame, its stack with motion vectors) of each of the ``frames`` of a shot, one after the other.
+    """Yields (frame, stack with motion vectors) for each of the ``frames`` of a shot, one after the other.
 
     ``skip``     called when a frame's turn has come; returns whether to leave the frame out
     ``progress`` frame -> a function that is called as the ``progress`` of ``render_scene``
 
     All else is as in ``render_scene``; ``data_gen.frames.shot`` describes seeds and motion. A frame that ``stop`` ended
     early is the last one, with ``ngpt:unfinished``; with ``dt`` it is not yielded. A shot that changes by other means
-    than a file's parameters is a ``data_gen.frames.shot.Shot``. Raises NgptError as
-    ``render_scene``, and for cameras without a projection.
+    than a file's parameters is a ``data_gen.frames.shot.Shot``. Raises NgptError as ``render_scene`` does, and for
+    cameras without a projection.
     """
     request, watch = asked(scene, {"spp": spp, "seed": seed, "sampler": sampler, **given}, frames)
     if not request.frames:
@@ -116,7 +116,7 @@ def render_frames(
     return whole()
 
 
-# Yields a function that says whether Ctrl-C was pressed, or SIGTERM has come, for ``stop``; the next one interrupts.
+# A context that yields a function for ``stop``. It returns True after Ctrl-C or SIGTERM; a second signal interrupts.
 stop_on_ctrl_c = noted
 
 

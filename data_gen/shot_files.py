@@ -25,8 +25,12 @@ FRAMES_OF_A_PART = 8
 
 @dataclass
 class Written:
-    """``frames``: of each that was written its ``output``, size and attributes; how many were ``skipped`` since their
-    files are there; and the first that has not all its samples since it was ``interrupted``, if any."""
+    """The frames of a shot that are done.
+
+    ``frames``       a report for each frame that was written, see ``report_of``
+    ``skipped``      the number of frames whose files already existed
+    ``interrupted``  the first frame that lacks samples because the render was interrupted, if there is one
+    """
 
     frames: list[dict[str, Any]] = field(default_factory=list)
     skipped: int = 0
@@ -67,7 +71,7 @@ def write_frames(
         output.check(skip_existing)
         _check(files[frame], overwrite or skip_existing)
     written = Written()
-    # Begun frames come first, grouped by what is left of them: the scene stays in memory.
+    # Unfinished frames come first, grouped by the request that finishes them, so that the scene stays in memory.
     begun = _begun(outputs) if skip_existing else []
     gone_on = {frame for _, frames in begun for frame in frames}
 
@@ -78,7 +82,7 @@ def write_frames(
         made(written, len(ours))
 
     def skip(frame: int) -> bool:
-        # Only when its turn has come, for several machines may be at work on one shot.
+        # Not checked before the frame's turn, since several machines may work on one shot.
         if part_of[frame] != number or frame in gone_on:
             return True
         there = skip_existing and outputs[frame].left() is None and outputs[frame].done()
@@ -87,7 +91,7 @@ def write_frames(
 
     def add(frame: int, stack: GradientStack) -> None:
         cut = skip_existing and files[frame].exists() and not finished(files[frame])
-        # Another machine may have been faster.
+        # Another machine may have finished the frame in the meantime.
         by: dict[str, Any] = {}
         if not (skip_existing and outputs[frame].done()):
             before = begun_stack(files[frame]) if frame in gone_on else None
@@ -122,9 +126,9 @@ def write_frames(
 
 
 def report_of(stack: GradientStack, file: Path, made: Mapping[str, Any]) -> dict[str, Any]:
-    """What ``ngpt render --json`` says of a stack: its file, its size, and the attributes of ours, by short names.
+    """The report of ``ngpt render --json`` on a stack: its file, its size, and its attributes "ngpt:NAME" as NAME.
 
-    ``made`` are the attributes of its image, if any.
+    ``made`` are the attributes of its image, if there is one.
     """
     attributes = {**stack.attributes, **made}
     ours = {name.removeprefix("ngpt:"): value for name, value in attributes.items() if "ngpt:" in name}
@@ -147,7 +151,7 @@ def write_frames_on_cluster(
     for file in files.values():
         _check(file, overwrite or skip_existing)
     parts = -(-len(files) // FRAMES_OF_A_PART)
-    # A part that is tried again, since its worker died, goes on.
+    # A part whose worker died is tried again, and continues from the files that exist.
     how: Any = {"overwrite": overwrite, "skip_existing": skip_existing or not overwrite, "denoising": denoising}
     order = list(files)
     whole = Written()
@@ -164,7 +168,7 @@ def write_frames_on_cluster(
 
 
 def _begun(outputs: Mapping[int, Output]) -> list[tuple[RenderRequest, list[int]]]:
-    """The requests that finish the frames which were begun, each with the numbers of its frames."""
+    """The requests that finish the unfinished frames, each with the numbers of its frames."""
     begun: list[tuple[RenderRequest, list[int]]] = []
     for frame, output in outputs.items():
         if (rest := output.left()) is not None and rest is not output.request:
@@ -176,6 +180,6 @@ def _begun(outputs: Mapping[int, Output]) -> list[tuple[RenderRequest, list[int]
 
 
 def _check(file: Path, overwrite: bool) -> None:
-    """``check_output``, for a file whose folder need not be there."""
+    """Calls ``check_output`` if the folder of the file exists."""
     if file.parent.exists():
         check_output(file, overwrite, may_skip=True)

@@ -1,1 +1,1 @@
-"""Which sampler, how many samples, which method: trials of a scene, and plans made of them."""
+"""The choice of sampler, method and number of samples: trials of a scene, and plans made from them."""

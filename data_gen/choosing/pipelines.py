@@ -33,8 +33,8 @@ BY_GRADIENTS, BY_DENOISERS = -0.95, -0.55
 SEEN, STEEPEST, FLATTEST = 0.3, -1.2, -0.2
 # The exponent for images by photons, from theory, and the number of standard errors that are added to their error
 _BY_PHOTONS, _DOUBT = -2 / 3, 2.0
-# The power of the pilot's gain that adaptive samples with gradients achieve: the need that a pilot sees is smoother
-# than the true one. And the number of samples from which on adaptive samples are considered
+# Adaptive samples with gradients gain this power of what the pilot foretells, since the need that a pilot measures is
+# smoother than the true one. Below FROM samples per pixel, adaptive samples are not considered.
 REALISED, FROM = 2.0, 2 * LEAST
 
 
@@ -70,11 +70,11 @@ class Pipeline:
 
     @property
     def gain(self) -> float:
-        """The error relative to the error of as many even samples."""
+        """The error of adaptive samples relative to the error of as many even samples."""
         return self.adaptive ** (REALISED if SAMPLERS[self.sampler].gradients else 1)
 
     def samples(self, seconds: float) -> float:
-        """How many samples per pixel fit into the time; less than 1 where none do."""
+        """How many samples per pixel fit into the time; less than 1 if not even one fits."""
         spp = (seconds - self.after) / self.seconds
         return spp - self._choices(spp) / self.seconds
 
@@ -95,18 +95,18 @@ class Pipeline:
         return max(1, 2 * batch if self.method == "wcv" else batch)
 
     def expected(self, spp: float) -> float:
-        """The error after so many samples; infinite where there are too few."""
+        """The error after this number of samples per pixel; infinite if they are fewer than ``least``."""
         if spp < self.least:
             return math.inf
         return self._begins * (spp / self.spp) ** self.fall
 
     def needed(self, error: float) -> float:
-        """The samples that are expected to leave the error, or the least there are."""
+        """The samples per pixel that are expected to leave the ``error``, at least ``least``."""
         return max(self.least, self.spp * (error / self._begins) ** (1 / self.fall))
 
     @property
     def _begins(self) -> float:
-        """The error assumed at ``spp``."""
+        """The expected error after ``spp`` samples per pixel."""
         return (self.error + _DOUBT * self.doubt) * self.gain
 
 

@@ -31,8 +31,8 @@ from ngpt.system.console import brief
 
 # The share of the time that a pilot may take, and the part of it for trials of samplers where it tries methods too
 SHARE, _TRIALS = 0.1, 2 / 3
-# Below this number of seconds, or of paths where a number of samples is given, a pilot costs more than it could gain: a
-# tenth of them is enough to compile the kernels of other samplers and to try them. One or two cores trace a million
+# There is no pilot in renders of fewer seconds than this, or of fewer paths if the number of samples is given. A tenth
+# of the render must suffice to compile the kernels of other samplers and to try them. One or two cores trace a million
 # paths per second. Two trials on the smallest images take 3.0 to 13.5 processor seconds, with their methods about 4
 # more.
 LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
@@ -49,8 +49,8 @@ LONG, LEAST_PIXELS = 400.0, 1 / 16
 # Another sampler is chosen only if its error is smaller by this factor, since smaller differences could be chance.
 # Errors of networks and denoisers are foretold less well: in one choice they were wrong by a factor of 1.6.
 _MARGIN, _MARGIN_OF_IMAGES = 1.1, 1.6
-# Photons are taken if only they find at least this share of the light, and if this number of samples per pixel fits
-# into the time. Then their seconds on two cores: for a million samples, and until the first one is done
+# Photons are taken if at least this share of the light is found only by them, and if this number of samples per pixel
+# fits into the time. On two cores a million samples take _CAUSTIC_SECONDS, and the first sample _CAUSTIC_BEGINS.
 _CAUSTIC_SHARE, _CAUSTIC_SPP = 0.02, 16
 _CAUSTIC_SECONDS, _CAUSTIC_BEGINS = 10.0, 8.0
 
@@ -58,7 +58,7 @@ _CAUSTIC_SECONDS, _CAUSTIC_BEGINS = 10.0, 8.0
 @dataclass(frozen=True)
 class Plan:
     sampler: str
-    method: str  # whose result it was chosen for; "" if the method is not known
+    method: str  # the method for which the sampler was chosen; "" if the method is not known
     shared: bool  # whether samples are adaptive
     render: float | None  # seconds for the render, without pilot and method; None: as long as it takes
     reason: str  # a line for the user
@@ -108,8 +108,8 @@ def _beside(scene: mi.Scene) -> float:
 
 
 def _able(scene: mi.Scene, method: str, gradients_too: bool = False) -> list[str]:
-    """The samplers to try: those whose stacks the method can use. The one that the scene's description stands for comes
-    first. ``gradients_too`` adds the one that it stands for if gradients are asked for.
+    """The samplers to try: those whose stacks the method can use. The first is the one that the scene's description
+    suggests. ``gradients_too`` adds the one that it suggests if gradients are requested.
     """
     needs_gradients = method != "auto" and "dx" in runnable(method).needs
     names = candidates(scene, gradients=needs_gradients)
@@ -156,7 +156,7 @@ def plan(
     if method == "auto":
         method = its_method or "auto"
     after = _beside(scene) + _METHOD_SECONDS.get(method, _OTHERS) * _pixels(scene) / 1e6
-    # However slow the method may be here, half of the time is rendered.
+    # Even if the method is slow, half of the time is left for the render.
     return Plan(sampler, method, False, max(left - after, left / 2, 1e-3), f"{why}; there is no time for a pilot")
 
 
@@ -177,8 +177,8 @@ def _for_caustics(scene: mi.Scene, seconds: float, method: str, start: float, pi
     share = share_of_caustics(scene)
     if share is None or share < _CAUSTIC_SHARE:
         return None
-    why = f"about {share:.0%} of the light is what smooth glass or mirrors make of lamps without size, or tiny ones"
-    # However long the look took, the render is begun.
+    why = f"about {share:.0%} of the light is caustics of lamps that are tiny or have no size"
+    # Even if the measurement took all the time, the render begins.
     return Plan(able[0], methods[0], False, max(left - (pilot.clock() - start), 1e-3), why)
 
 
@@ -220,7 +220,7 @@ def plan_sampler(
     found = (sampler, reason)
     if sampler in trials and not pilot.stop():
         found = best_of(measure(trials, methods=lambda name: [simple(name)], shared=False), whole(trials) / scale)
-    # However long the pilot took, the render is begun.
+    # Even if the pilot took all the time, the render begins.
     left = None if seconds is None else max(seconds - (pilot.clock() - start), 1e-3)
     method = method if found[0] == sampler else ""
     return replace(described, sampler=found[0], method=method, reason=found[1], render=left)
@@ -263,7 +263,7 @@ def simple(sampler: str) -> str:
 
 
 def best_image(ranked: Sequence[Pipeline], default: str, seconds: float, margin: float = _MARGIN_OF_IMAGES) -> Pipeline:
-    """The best of ``ranked`` pipelines, the best first, or the best of sampler ``default`` unless its error is at least
+    """The first of the ``ranked`` pipelines, or the best one of sampler ``default`` if its error is less than
     ``margin`` times as large."""
     own = next((p for p in ranked if p.sampler == default), ranked[0])
     errors = [p.expected(p.samples(seconds)) for p in (ranked[0], own)]

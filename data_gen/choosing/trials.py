@@ -6,9 +6,9 @@ made of primals of the sampler's other stacks and of all other unbiased samplers
 reconstructions would not show the error: light that a sampler finds in one pixel of a thousand is an outlier, which a
 method removes from both.
 
-What a sample takes is measured in processor seconds, which other work on the machine hardly changes, so a busy moment
-favours no sampler. Users give wall seconds. One factor for all trials converts processor seconds to these: the wall
-seconds of all trials divided by their processor seconds, both for further samples.
+The time of a sample is measured in processor seconds, which other work on the machine hardly changes, so a busy moment
+favours no sampler. Users give wall seconds. One factor for all trials converts processor seconds to wall seconds: the
+sum of the wall seconds of one sample of each trial, divided by the sum of their processor seconds.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SPP = 8
 PIXELS, _LEAST_PIXELS = 1 << 16, 1 << 10
 # The worst pixels are left out, as ngpt.measure.metrics.relmse_trimmed does.
 _TRIM = 0.001
-# Seeds far from the ones that users take
+# Seeds that users are unlikely to take
 SEED = 0x9E3779B9
 
 
@@ -60,10 +60,10 @@ class Pilot:
 
 
 def candidates(scene: mi.Scene, biased: bool = False, gradients: bool = False) -> list[str]:
-    """Samplers that could render the scene: the one that its description stands for, then the ones to compare it with.
+    """Samplers that could render the scene: the one that its description suggests, then the ones to compare it with.
 
-    If the first is the default (``SIMPLE``), the others are those that find light which it hardly finds. ``biased``
-    adds biased samplers at the end. ``gradients`` asks for the one that the description stands for, which has no rival.
+    If the first is the default (``SIMPLE``), the others are samplers that find light which it hardly finds. ``biased``
+    adds biased samplers at the end. With ``gradients`` the only candidate is the sampler that renders gradients.
     """
     facts = scene_facts(scene)
     first, method, _ = described(facts, gradients)
@@ -96,11 +96,11 @@ def try_all(
             continue
         pilot.said(f"pilot: trying '{name}'; to compile its kernels may take {slow * compiles:.0f} s")
         begins = clock()
-        trial, compiled = try_out(scene, name, clock, rest, stop, unbiased=pilot.unbiased)
+        trial, compiled = try_out(scene, name, rest, pilot)
         if stop():
             break
-        # A scene of many materials, or a busy machine, slows down the next one as well. Where kernels are cached from
-        # another render, nothing is learnt.
+        # A scene of many materials, or a busy machine, also slows down the next trial. If the kernels were cached by
+        # another render, the time shows nothing.
         slow = max(slow, (compiled - begins) / compiles)
         if trial is not None:
             trials[name] = trial
@@ -121,19 +121,14 @@ def by_processor(trials: dict[str, Trial]) -> dict[str, Trial]:
 
 
 def try_out(
-    scene: mi.Scene,
-    sampler: str,
-    clock: Callable[[], float] = time.perf_counter,
-    limit: float = math.inf,
-    stop: Callable[[], bool] = lambda: False,
-    unbiased: bool = False,
+    scene: mi.Scene, sampler: str, limit: float = math.inf, pilot: Pilot = Pilot()
 ) -> tuple[Trial | None, float]:
-    """Four small stacks by a sampler, and when its kernels were compiled.
+    """The trial of a sampler, and the time at which its kernels were compiled.
 
-    Returns None for the stacks if the sampler cannot render the scene, if they would take longer than ``limit``, or if
-    ``stop`` returns true.
+    The trial is None if the sampler cannot render the scene, if the stacks would take longer than ``limit`` seconds, or
+    if the pilot was stopped.
     """
-    begins = clock()
+    clock, unbiased, begins = pilot.clock, pilot.unbiased, pilot.clock()
     batch = SAMPLERS[sampler].batch
     spp, seed = max(SPP, 2 * batch), seed_of(sampler)
     # The time that a render takes to begin is not part of the time of a sample. A render of another length separates
@@ -145,7 +140,7 @@ def try_out(
         return None, clock()
     compiled = clock()
     if compiled - begins > limit / 2:
-        # Each of the stacks takes a good part of that again.
+        # Each of the stacks would take a good part of that time again.
         return None, compiled
 
     def timed(n: int, seed: int) -> tuple[GradientStack, tuple[float, float]]:
@@ -157,7 +152,7 @@ def try_out(
     made: list[tuple[GradientStack, tuple[float, float]]] = []
     others: list[tuple[float, float]] = []
     for i in range(4):
-        if stop():
+        if pilot.stop():
             return None, compiled
         made.append(timed(spp, seed + i))
         if i == 0 and (4 + 2 * other / spp) * made[0][1][0] > limit - (compiled - begins):
@@ -178,7 +173,7 @@ class Witnesses:
 
     primals: dict[str, list[np.ndarray]]  # four of each sampler, by name
     noise: dict[str, float]  # of a single primal, by name of sampler
-    scale: np.ndarray  # what errors are relative to: an image from all samplers, those with little noise count most
+    scale: np.ndarray  # errors are relative to it: the mean of the primals of all samplers, weighted by 1 / noise
 
     @classmethod
     def of(cls, trials: dict[str, Trial]) -> Witnesses:

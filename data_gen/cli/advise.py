@@ -1,4 +1,4 @@
-"""``ngpt advise``: which sampler and method, and how many samples, for the time there is or the error to reach."""
+"""``ngpt advise``: finds the sampler, the method and the number of samples for a given time or error."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from data_gen.choosing.pipelines import Pipeline
 
 
-# More are not advised.
+# The advice is always below this number of samples per pixel.
 LARGEST_SPP = 1 << 20
 # Seconds that the trials may take
 _LONGEST = 60.0
@@ -46,12 +46,12 @@ class Row:
     method: str
     adaptive: bool
     spp: int
-    seconds: float  # of sampler and method
+    seconds: float  # of sampler and method together
     error: float
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    """What each sampler and method is expected to do, by small renders of this scene."""
+    """Prints what each sampler and method is expected to achieve, judged by small renders of the scene."""
     # Only the verbs that render import the renderer.
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
@@ -62,8 +62,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     start = time.perf_counter()
     scene = load_scene(args.scene, args.size, dict(args.define), sensor=args.sensor)
-    # The advice takes at most as long as the render that it is about, in addition to it. On a machine that is too busy
-    # for it the first sampler is tried all the same, on a small image, and no other.
+    # The trials take at most as long as the render for which advice is given. If the machine is too busy for them, only
+    # the first sampler is tried, on a small image.
     longest = _LONGEST / SHARE
     whole = longest if args.seconds is None else min(max(args.seconds / SHARE, LEAST_SECONDS), longest)
     seen = explore(scene, whole, pilot=Pilot(said=console.say), patient=True)
@@ -109,7 +109,7 @@ def rows_of(pipelines: list[Pipeline], seconds: float | None, error: float | Non
 
 
 def commands_of(row: Row, args: argparse.Namespace) -> list[str]:
-    """The commands for that row: a line that renders the stack, and one that denoises it."""
+    """The commands for a row: one renders the stack, and one denoises it."""
     stem = f"{Path(args.scene).stem}-{row.spp}spp"
     adaptive = ["--adaptive"] if row.adaptive else []
     render = ["ngpt", "render", args.scene, "-o", f"{stem}.exr", "--spp", str(row.spp), "--sampler", row.sampler]
@@ -118,7 +118,7 @@ def commands_of(row: Row, args: argparse.Namespace) -> list[str]:
 
 
 def of_the_scene(args: argparse.Namespace) -> list[str]:
-    """The options of this call that a render has too."""
+    """The options of this command that ``ngpt render`` also has."""
     words = ["--size", "{}x{}".format(*args.size)] if args.size else []
     words += ["--sensor", args.sensor] if args.sensor is not None else []
     words += ["--variant", args.variant] if args.variant else []

@@ -48,7 +48,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     config = read_config(path)
     if not args.cluster:
-        use_variant(args.variant)  # whether it can be used, before anything is made
+        use_variant(args.variant)  # fails here if the variant cannot be used, before any file is made
     executor = cluster(args.cluster) if args.cluster else processes(args.workers)
     with executor as workers, console.progress(str(args.out), "crops", begins=KERNELS) as progress:
         generate(config, args.out, workers, shard=args.shard, variant=args.variant, progress=progress)

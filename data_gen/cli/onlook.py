@@ -1,4 +1,4 @@
-"""``ngpt render --live``: who looks on while a render goes on, and how little that may cost."""
+"""``ngpt render --live``: shows the image on a page during the render, within a small share of its time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from ngpt.report.preview import preview
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 
-# The share of the render's time that making and sending images may take; the first image may take half of all this.
+# The share of the render's time that making and sending images may take. The first image may use up half of it for the
+# whole render.
 SHARE, _AHEAD = 0.02, 0.5
 _CAUTION = 1.5
 # Seconds that the first image is expected to take: to load the method, and for a pixel.
@@ -20,7 +21,7 @@ _LOAD, _PIXEL = 0.1, 3e-6
 
 
 class Onlookers:
-    """The page of a render, if there is one; without it, looking on costs nothing.
+    """The page of a render, if there is one. Without a page these functions cost nothing.
 
     ``data_gen.render_scene`` calls ``newest`` after each pass, and ``progress`` with the progress.
     """
@@ -46,7 +47,7 @@ class Onlookers:
             self.page.tell(far + left)
 
     def newest(self, stack: Callable[[], GradientStack]) -> None:
-        """Shows the samples done by now, if somebody looks on and that costs little enough."""
+        """Shows the samples done so far, if somebody has opened the page and time allows."""
         if not self._watched():
             return
         begin = time.perf_counter()
@@ -57,14 +58,14 @@ class Onlookers:
                 self.expected = _LOAD + _PIXEL * made.width * made.height
             gone = begin - self.start
             if not self.shown:
-                # Relative to the whole render, but cautiously: how long it takes is not known well yet.
+                # The expected time of the whole render counts, but only a part of it, since it is not known well yet.
                 gone = max(gone, _AHEAD * (gone + self.left))
             if self.spent + self.expected <= SHARE * gone:
                 self.shown = True
                 try:
                     self._show(made or stack())
                 finally:
-                    # On a busy machine the next may well take longer.
+                    # On a busy machine the next image may take longer.
                     self.expected = _CAUTION * (time.perf_counter() - begin)
         self.spent += time.perf_counter() - begin
 
@@ -82,13 +83,13 @@ class Onlookers:
 
     @contextmanager
     def _harmless(self) -> Iterator[None]:
-        """A failure in it, of a method or for lack of memory, is reported in one line, once. The render goes on."""
+        """A context in which no failure, of a method or for lack of memory, ends the render. The first is reported."""
         try:
             yield
         except Exception as error:
             stop_if_interrupted(error)
             if not self.failed:
-                self.say(f"no image for who looks on: {error or type(error).__name__}; the render goes on")
+                self.say(f"no live image: {error or type(error).__name__}; the render goes on")
             self.failed = True
 
     def _watched(self) -> bool:
@@ -102,7 +103,7 @@ class Onlookers:
 
 
 def onlookers(live: bool, scene: str, command: str, console: Console, unit: str) -> Onlookers:
-    """The page, if it was asked for; a line says why there is none, and the render goes on."""
+    """Makes the page if it is requested. If that fails, a line says why, and the render goes on without a page."""
     page = None
     try:
         page = LivePage(f"{scene}, live", command) if live else None

@@ -1,4 +1,4 @@
-"""``ngpt render``: from a scene to a gradient stack, or at once to the image of a method."""
+"""``ngpt render``: renders a scene to a gradient stack, or directly to a denoised image."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def denoising_of(args: argparse.Namespace) -> Denoising | None:
-    """How the stack is to be denoised; None: it is written as it is. Raises an error for requests that would fail after
-    the render.
+    """How the stack is to be denoised; None if the stack itself is written. Raises an error for requests that would
+    fail after the render.
     """
     of_its_kind = Path(args.output or "").suffix.lower() in IMAGES[1:]
     if args.denoise is None and not of_its_kind:
@@ -67,7 +67,7 @@ def denoising_of(args: argparse.Namespace) -> Denoising | None:
 
 
 def request_of(args: argparse.Namespace, denoising: Denoising | None) -> RenderRequest:
-    """What the command line asks for."""
+    """The request of the command line."""
     given = {name: value for name, value in vars(args).items() if name in FIELDS}
     given |= {"options": dict(args.option), "parameters": dict(args.define), "frames": tuple(args.frames or ())}
     return RenderRequest(
@@ -104,7 +104,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
     if begun is not None:
         console.say(f"{output.stack}: has {begun.attributes['ngpt:spp']} samples per pixel; going on with it")
     with rendering(args, left, denoising, console) as (stack, failed, stop, looking):
-        # Within it: the samples of an hour are not lost to a signal that comes while they are written.
+        # Inside this context a signal that arrives while the samples are written does not lose them.
         if args.skip_existing and not there and output.done():
             console.say(f"{target}: skipped: it is there by now, of another process")
             return 0
@@ -118,7 +118,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
         tell, why = (console.error, "interrupted") if stop() else (console.say, "enough")
         tell(f"{why}: {target} holds the {done} samples per pixel done by then")
     if denoising is None and by_names(str(target)) == str(target):
-        # It differs from the requested one where that needs variances, which one sample per pixel does not have.
+        # The method may differ from the requested one, which may need variances that one sample per pixel lacks.
         then = f"then: ngpt denoise {shlex.quote(str(target))}, which takes method '{choose(stack)}'"
         console.say(f"{target} is a stack, with its noise; {then}")
     if args.json:
@@ -131,8 +131,9 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
 def rendering(
     args: argparse.Namespace, request: RenderRequest, denoising: Denoising | None, console: Console
 ) -> Iterator[tuple[GradientStack, NgptError | None, Interrupt, Onlookers]]:
-    """Renders and shows progress. Yields the stack, the failure that ended it, the interrupts, and the onlookers."""
-    from data_gen.cli.onlook import onlookers  # takes as long as all else that help needs
+    """Renders and shows progress. Yields the stack, the failure that ended the render or None, the interrupts, and the
+    onlookers."""
+    from data_gen.cli.onlook import onlookers  # its import takes as long as all others that --help needs
 
     def chosen(plan: Plan) -> None:
         if denoising is not None:
@@ -147,7 +148,7 @@ def rendering(
         stop_on_ctrl_c(ending) as stop,
     ):
 
-        def told(done: int, total: int) -> None:
+        def both(done: int, total: int) -> None:
             progress(done, total)
             looking.progress(done, total)
 
@@ -156,7 +157,7 @@ def rendering(
 
         try:
             stack, _ = render_scene(
-                request, progress=told, stop=ended, newest=looking.newest, chosen=chosen, said=console.say
+                request, progress=both, stop=ended, newest=looking.newest, chosen=chosen, said=console.say
             )
             failed = None
         except Unfinished as error:
@@ -165,7 +166,7 @@ def rendering(
 
 
 def say(stack: GradientStack, made: dict[str, Any], args: argparse.Namespace, target: Path, console: Console) -> None:
-    """What a user should know about the samples, and how long they took."""
+    """Prints how long the render took, and warnings about its samples."""
     attributes = stack.attributes
     done, took = attributes["ngpt:spp"], attributes["ngpt:seconds"]
     if attributes["ngpt:discarded"]:
@@ -205,7 +206,7 @@ def shot(args: argparse.Namespace, denoising: Denoising | None, console: Console
         def begin() -> Callable[[int, int], None]:
             return shown.enter_context(console.progress(f"render {args.scene}", "frames", begins=KERNELS))
 
-        # Before the cluster has answered nobody works, so there is no bar yet.
+        # On a cluster the progress bar appears only when the cluster has answered.
         if not args.cluster:
             progress = begin()
 

@@ -28,7 +28,7 @@ from ngpt.subpixels import choice
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.usage = f"{parser.prog} SCENE [options]"  # with all of them it is a fifth of the help
+    parser.usage = f"{parser.prog} SCENE [options]"  # a list of all options would fill a fifth of the help
     parser.add_argument("scene", metavar="SCENE", help="a scene file of Mitsuba 3, or a built-in scene")
     parser.add_argument(
         "-o",
@@ -181,9 +181,9 @@ _MOST = 1_000_000
 
 
 def frames(text: str) -> list[int]:
-    """``0:120`` (120 is not in it), ``0:120:2``, ``7``, or several of them with commas between; in order.
+    """Frames such as ``0:120`` (without 120), ``0:120:2``, ``7``, or several of them separated by commas, in order.
 
-    And as farms write them, with the last one in it: ``1-10``, ``1-9x2``, ``1-9:2``.
+    In the notation of render farms the last frame is included: ``1-10``, ``1-9x2``, ``1-9:2``.
     """
     numbers: dict[int, None] = {}
     for some in text.split(","):
@@ -203,7 +203,7 @@ def frames(text: str) -> list[int]:
 
 
 def _of_a_farm(some: str) -> list[int]:
-    """First, end and step of ``1-10``, whose end is in it; [] for anything else."""
+    """First, end and step of a text such as ``1-10``, which includes 10; [] for other texts."""
     if not (match := re.fullmatch(r"(-?\d+)-(-?\d+)(?:[x:](-?\d+))?", some)):
         return []
     step = int(match[3] or 1)
@@ -211,9 +211,9 @@ def _of_a_farm(some: str) -> list[int]:
 
 
 def targets(output: str | None, scene: str, numbers: list[int]) -> dict[int, Path]:
-    """Frame -> file. ``output`` is a pattern (``shot.{frame:04d}.exr``), or a folder, which need not be there.
+    """Frame -> file. ``output`` is a pattern (``shot.{frame:04d}.exr``), or a folder, which need not exist.
 
-    Raises WrongUse for a name that is one file for several frames.
+    Raises WrongUse if several frames would have the same file.
     """
     stem = re.sub(r"[._-]*\{[^{}]*\}", "", Path(scene).stem) or "frame"
     pattern = output if output is not None else f"{stem}.{{frame:04d}}.exr"

@@ -34,7 +34,7 @@ class Config:
     ``seed``       of scenes, cameras and samples
     ``size``       pixels of a crop's side
     ``inputs``     stacks of each crop; their sample counts are log-uniform and stratified within ``spp``
-    ``frames``     of a shot: 1 makes single crops; with more, each crop is a shot, and its frames are crops of the set
+    ``frames``     frames of a shot: 1 makes single crops; with more, each crop is a shot, whose frames are crops too
     ``spp``        least and greatest samples per pixel of the inputs
     ``sampler``    of the inputs and references: a name of `ngpt info`, or "auto", chosen for each scene
     ``samplers``   options of that sampler, a table [samplers.NAME]
@@ -45,9 +45,9 @@ class Config:
     ``reference_spp``  samples per pixel of references, in two halves; 0 makes pairs, without references
     ``reference_method``  method that reconstructs the references
     ``scenes``     number of procedural scenes
-    ``varied``     whether some of them have sights
-    ``sights``     share of the varied scenes that have each sight: names of data_gen.scenes.procedural.variety.SHARES
-    ``adaptive``   share of the inputs from 32 samples on whose samples are uneven, docs/use/adaptive.md
+    ``varied``     whether procedural scenes may have sights, which are rare features
+    ``sights``     share of the varied scenes with each sight (data_gen.scenes.procedural.variety.SHARES has the names)
+    ``adaptive``   share of adaptive ones among inputs with at least 32 samples, see docs/use/adaptive.md
     ``crops``      number of crops of each procedural scene
     ``files``      scene files, a table [[files]] each: pattern and crops, optionally parameters and boxes
     """
@@ -133,7 +133,7 @@ class Config:
         return self.reference_spp == 0
 
     def _check_adaptive(self) -> None:
-        from data_gen.adaptive import LEAST  # It needs the renderer.
+        from data_gen.adaptive import LEAST  # this import needs the renderer
 
         name, of = self.sampler, f"adaptive = {self.adaptive:g}:"
         even = name != "auto" and find(name).even

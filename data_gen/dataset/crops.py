@@ -37,7 +37,7 @@ def make_shard(config: Config, job: Job, folder: str, variant: str, again: Again
     It can run in any process. The same config and job give the same bits. A crop that fails is recorded and left out.
     With ``again`` the references exist already, and only inputs are rendered, with new noise.
     """
-    if (Path(folder) / job.file).exists():  # made by a worker that died before it reported this
+    if (Path(folder) / job.file).exists():  # a worker made it and died before it reported it
         return job.file
     use_variant(variant)
     import mitsuba as mi
@@ -76,7 +76,7 @@ def make_shard(config: Config, job: Job, folder: str, variant: str, again: Again
                 crops += [data for data, _ in made]
                 record["crops"] += [told for _, told in made]
     write_shard(Path(folder) / job.file, crops, record)
-    # Kernels belong to a scene, and a process that makes thousands of scenes would keep them all.
+    # Each scene has its own kernels, and a process that makes thousands of scenes would keep them all.
     import drjit as dr
 
     dr.flush_kernel_cache()
@@ -117,7 +117,7 @@ def uneven_inputs(config: Config, name: str, crop: int, counts: list[int]) -> li
 
 
 def render_input(config: Config, scene, spp: int, seed: int, uneven: bool, made: Any = None) -> GradientStack:
-    """One input. If the set has uneven inputs, all its inputs have the layer ``samples``."""
+    """Renders one input. If the set has ``adaptive`` inputs, all its inputs have the layer ``samples``."""
     from data_gen.render import render_stack
 
     options = {"made": made, "unbiased": True, "gradients": True, "subpixels": config.subpixels, **config.options}

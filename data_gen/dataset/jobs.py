@@ -46,9 +46,9 @@ class Pool(ProcessPoolExecutor):
     def __init__(self, count: int, interruptible: bool = True):
         # Spawned, since LLVM does not survive a fork.
         super().__init__(count, mp_context=get_context("spawn"), initializer=end_with_parent, initargs=(interruptible,))
-        # An exception out of a signal handler may leave a lock of the executor held, on which its own thread then waits
-        # for ever. So the handler only ends the workers; the executor notices, and the signal has its effect at the end
-        # of the block.
+        # If a signal handler raised an exception, it could leave a lock of the executor held, and the executor's thread
+        # would wait for it for ever. So the handler only ends the workers. The signal is raised again at the end of the
+        # block.
         self._signals, self._interrupt = ExitStack(), Interrupt()
         self._interruptible = interruptible
 
@@ -60,7 +60,7 @@ class Pool(ProcessPoolExecutor):
     def submit(self, fn, /, *args, **kwargs) -> Future:
         future = super().submit(fn, *args, **kwargs)
         if self._interrupt():
-            self.end()  # the signal may have come before the workers were there
+            self.end()  # the signal may have come before the workers were started
         return future
 
     def end(self) -> None:

@@ -15,8 +15,8 @@ from data_gen.dataset.cameras import Surroundings, View, floats
 from data_gen.frames.motion import seen
 from data_gen.scenes.geometry import VERTICES, put_vertices, vertices
 
-# Shares of the shots in which the camera moves, a thing moves, and the light changes. LAMP is the share of the last in
-# which a lamp moves, if there is one, instead of changing its radiance.
+# Shares of the shots in which the camera moves, a thing moves, and the light changes. If the light changes and there is
+# a lamp, the lamp moves with probability LAMP. Otherwise a radiance changes.
 CAMERA, THING, LIGHT, LAMP = 0.8, 0.35, 0.35, 0.5
 # Movement per frame at the median distance, as a share of the image's width: 0.1 to 9.6 of 96 pixels.
 SPEEDS = 0.001, 0.1
@@ -36,10 +36,10 @@ class Movement:
     view: View
     way: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the camera, in world units per frame
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of its target, in addition to ``way``
-    shape: str = ""  # the parameter that places a shape,
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # and its movement per frame
-    light: str = ""  # the parameter of a light,
-    gain: float = 1.0  # and its factor per frame
+    shape: str = ""  # the parameter that places the moving shape
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # the movement of that shape per frame
+    light: str = ""  # the parameter with the radiance of the changing light
+    gain: float = 1.0  # the factor of that radiance per frame
     _start: dict = field(default_factory=dict, repr=False)
 
     def view_at(self, frame: int) -> View:
@@ -123,7 +123,7 @@ def random_movement(around: Surroundings, view: View, rng: np.random.Generator, 
 
 
 def _movable(scene: mi.Scene) -> dict[int, str]:
-    """Number of a shape that can be moved -> the parameter that places it."""
+    """The parameter that places a shape, by the number of the shape, for all shapes that can be moved."""
     places: dict[int, str] = {}
     numbers = {shape: number for number, shape in enumerate(scene.shapes())}
     # By nodes and not by names, since shapes may have no name

@@ -20,7 +20,7 @@ from ngpt.errors import NgptError
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
 from ngpt.training.dataset import Crop, Dataset
 
-# One of this number of scenes is for validation, and at least one if there are two scenes.
+# One in VALIDATION scenes is for validation, and at least one scene if there are two.
 VALIDATION = 10
 
 
@@ -28,7 +28,6 @@ def write_layout(data: Dataset, folder: Path, progress: Callable[[int, int], Non
     """Writes the crops of ``data`` into ``folder``, except existing files, and returns how many inputs were left out.
 
     An input is left out if another input of its crop has as many samples, since both would have the same name.
-
     Raises NgptError for sets of shots or without references, and if a file cannot be written.
     """
     if data.shots:

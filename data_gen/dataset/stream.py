@@ -116,7 +116,7 @@ class Stream:
             while not self._stop.is_set():
                 while len(running) < ahead:
                     job, again = next(jobs)
-                    # Two jobs of the same name would write the same file.
+                    # A running job of the same name would write the same file.
                     if job.file not in running.values():
                         given = (self.config, job, self._temporary.name, self.variant, again)
                         running[self.executor.submit(make_shard, *given)] = job.file
@@ -141,7 +141,7 @@ class Stream:
         with self._changed:
             self._crops.extend(Crop(shard, i, told["scene"], tuple(c["spp"]), c.get("frame")) for i, c in crops)
             self._changed.notify_all()
-        # The shard is open, so its data stay until its last crop is gone.
+        # The shard stays open, so its data can be read until its last crop is gone.
         path.unlink()
 
 

@@ -12,7 +12,7 @@ little light is found by chance, and not at all where all of it is found by chan
 which the noise may fall, and ``data_gen.film.nets.law`` gives the expected square and the variance of the mean for each
 law. One square says little about a pixel, but pixels of about the same noise together show which law holds. They show
 less if most of the noise is in few pixels. So the factor is a mean over all laws, weighted by their probabilities. It
-is a geometric mean, since factors are wrong by ratios. All laws expect the same contrast of two samples; there, only
+is a geometric mean, since errors of factors are ratios. All laws expect the same contrast of two samples; there, only
 the prior of each law counts.
 """
 

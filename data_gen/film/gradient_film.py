@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -13,12 +13,15 @@ from data_gen.film import claims
 from data_gen.film.moments import Moments, Strands, accumulate, no_moments, one_more, put_back, taken
 from data_gen.film.splats import SPLAT_BYTES, Splats
 from data_gen.film.statistics import contrast, statistics
-from data_gen.film.subpixels import Celled, Subpixels, bytes_of_subpixels
+from data_gen.film.subpixels import Subpixels, bytes_of_subpixels
 from ngpt.layers import DIFFERENCES, FEATURE_NOISE
 from ngpt.shared import shared_variance
 from ngpt.stack import GradientStack
 from ngpt.subpixels import SUBPIXELS, means
 from ngpt.windows import Place
+
+if TYPE_CHECKING:
+    from data_gen.paths.camera import CameraSamples
 
 # The shifts of samplers, (x, y) in pixels, y down: forward ("+") and backward ("-") for each difference of the
 # contract. The film keeps the differences "neighbour - base" at the base pixel and combines both directions when it
@@ -29,7 +32,7 @@ SHIFTS = {
     for sign, factor in (("+", 1), ("-", -1))
 }
 
-# Values put under these names become diagnostic images, not layers of the stack: name -> name of the image.
+# Values under these names become diagnostic images and not layers of the stack: name -> name of the image
 DIAGNOSTICS = {"shift_failures": "diagnostics.shiftFailures"}
 DISCARDED = "diagnostics.discarded"
 
@@ -110,7 +113,7 @@ class GradientFilm:
         self._pass: dict[str, tuple] = {}
         self._splats: dict[str, Splats] = {}
 
-    def begin_pass(self, camera: Celled) -> None:
+    def begin_pass(self, camera: CameraSamples) -> None:
         """Records the subpixel of each sample of the next pass, if the film has subpixels."""
         if self._fine:
             self._cell = camera.cells(self.subpixels)
@@ -188,7 +191,7 @@ class GradientFilm:
             strands = Strands(first, opaque(lanes), opaque(block), stride, number, further)
             for name, (components, active) in values.items():
                 new = accumulate(self._moments(name, len(components)), components, active, strands)
-                # One by one: the old moments and the new ones are in memory together.
+                # Evaluated one by one, since the old and the new moments of a name are in memory together.
                 dr.eval(new)
                 self.moments[name] = new
             if self._fine:
@@ -248,8 +251,8 @@ class GradientFilm:
             if name in splats:
                 sums, lost_splats = splats[name].totals(), splats[name].lost
                 share = dr.opaque(dr.float64_array_t(mi.Float), 1 / spp)
-                # Where nothing was put, the value is the splats. Where all values that were put are lost, the pixel is
-                # unknown.
+                # If nothing was put, the value is the sum of the splats. If all values that were put are lost, the
+                # pixel is unknown.
                 mean = [(m if mean else 0) + s * share for m, s in zip(mean or sums, sums, strict=True)]
                 lost = lost + lost_splats
             number = opaque(self.blocks) + dr.zeros(mi.UInt32, self.pixels)
@@ -295,7 +298,7 @@ class GradientFilm:
         if "shared" in layers:
             if layers["shared"].any():
                 variances["primal_var"] = variances["primal_var"] + shared_variance(layers["shared"])
-            else:  # paths could share their tails, and did not
+            else:  # paths were allowed to share their tails, but no path did
                 del layers["shared"]
         for layer in _SPLIT:
             if layer in layers:
@@ -368,9 +371,6 @@ class GradientFilm:
     def _statistics(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         return statistics(self.moments[name], self.strands, self.batch)
 
-    def _contrast(self, name: str) -> np.ndarray:
-        return contrast(self.moments[name], self.strands, self._numbers)
-
     def _gradient(self, layer: str) -> tuple[np.ndarray, np.ndarray]:
         """Both directions of one difference, each with weight 1/2 (survey, Algorithm 1), and its variance.
 
@@ -401,7 +401,8 @@ class GradientFilm:
         variance of a sum of ``terms``: (name, which pixels, factor)."""
         if not self.net:
             return variance
-        seen = sum(factor * self._image(self._contrast(name))[pixels] for name, pixels, factor in terms)
+        contrasts = {name: contrast(self.moments[name], self.strands, self._numbers) for name, _, _ in terms}
+        seen = sum(factor * self._image(contrasts[name])[pixels] for name, pixels, factor in terms)
         where = terms[0][1]
         claimed = variance.copy()
         samples = self._image(self._numbers)[where][..., 0]

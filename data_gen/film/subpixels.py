@@ -7,7 +7,6 @@ subpixel gets the same number of samples if the number of samples per pixel is a
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -19,15 +18,8 @@ from ngpt.subpixels import FINE, stored
 # Per strand and subpixel: a count and double sums of 3 channels, for each of ``FINE``, and for ``caustic``
 BYTES = 3 * (4 + 3 * 8)
 BYTES_OF_CAUSTIC = 4 + 3 * 8
-# Values put under these names are summed. The light put as ``caustic`` is not in the values put as ``primal``.
+# The values under these names are summed. Values of ``primal`` do not include the light of ``caustic``.
 SUMMED = (*FINE, "caustic")
-
-
-class Celled(Protocol):
-    """Samples that know where they are, such as ``data_gen.paths.camera.CameraSamples``."""
-
-    def cells(self, k: int) -> mi.UInt32:
-        """Which of the K x K subpixels of its pixel each sample is in, counted row by row."""
 
 
 @dataclass

@@ -1,1 +1,1 @@
-"""Shots: scenes over time, cameras along paths, and where what is seen was one frame before."""
+"""Shots: scenes over time, cameras along paths, and motion vectors to the previous frame."""

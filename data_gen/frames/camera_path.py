@@ -1,4 +1,4 @@
-"""Camera paths: key frames in a JSON file, and the view between them. Pure NumPy."""
+"""Camera paths: key frames in a JSON file, and the interpolation between them. Pure NumPy."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _KNOWN = {"frame", "to_world", *_LOOK, "fov", "fov_axis"}
 @dataclass(frozen=True)
 class Key:
     frame: float
-    to_world: np.ndarray  # (4, 4), Mitsuba's: columns left, up, forward, position; in a path without scale
-    look: np.ndarray | None = None  # (3, 3), rows origin, target and up, where the key was given by them
+    to_world: np.ndarray  # (4, 4), as in Mitsuba: columns left, up, forward, position; a ``CameraPath`` has no scale
+    look: np.ndarray | None = None  # (3, 3), rows origin, target and up; None if the key has only a matrix
     fov: float | None = None  # degrees; None: the scene's own
     fov_axis: str = "x"  # the axis of ``fov``: "x" (width) or "y" (height)
 
 
 class CameraPath:
-    """Key frames in rising order; before the first and after the last the camera rests.
+    """Key frames in rising order. Before the first and after the last one the camera rests.
 
     A camera's scale, which exporters write and Mitsuba refuses, is taken out of its matrix. Raises NgptError for a
     matrix that flattens space or is not finite, and for cameras that are mirrored in some keys and not in others.
@@ -47,8 +47,8 @@ class CameraPath:
     def at(self, frame: float) -> Key:
         """The camera at a frame.
 
-        Between two keys that both look at a point, origin, target, up and fov change evenly. Else the position does,
-        and the orientation turns evenly about one axis.
+        Between two keys with a target, origin, target, up and fov are interpolated linearly. Otherwise the position is
+        interpolated linearly, and the orientation turns evenly about one axis.
         """
         after = bisect_right([key.frame for key in self.keys], frame)
         if after == 0 or after == len(self.keys):
@@ -80,7 +80,7 @@ def look_at(origin, target, up) -> np.ndarray:
 
 
 def _rigid(key: Key) -> np.ndarray:
-    """The matrix of a key without scale: it looks the same way, with the same side up, mirrored if it was."""
+    """The matrix of a key without its scale. Direction of view, side that is up, and reflection stay the same."""
     matrix = np.asarray(key.to_world, np.float64)
     # Numbers of the renderer are single precision.
     with np.errstate(over="ignore"):

@@ -21,7 +21,7 @@ from ngpt.system.records import check
 # A glTF camera looks along its -z with +x to the right, one of Mitsuba's along +z with +x to the left.
 _TURN = np.diag([-1.0, 1.0, -1.0, 1.0])
 _DEFAULTS = {"translation": [0.0, 0, 0], "rotation": [0.0, 0, 0, 1], "scale": [1.0, 1, 1]}
-# More than anyone animates; times of a broken file must not fill the memory.
+# The most frames: more than anyone animates, so that the times in a broken file do not fill the memory
 _MOST = 1_000_000
 _MOST_BYTES = 2**30  # of a file or a buffer beside it
 
@@ -96,7 +96,10 @@ def _path(path: Path, content: dict[str, Any], binary: bytes, fps: float) -> Cam
 
 
 def _channels(path: Path, content: dict[str, Any], binary: bytes, chain: list[int]) -> dict[tuple[int, str], Channel]:
-    """What moves the nodes of ``chain``: (node, property) -> channel; of several animations the first counts."""
+    """The channels of all animated properties of the nodes in ``chain``: (node, property) -> channel.
+
+    If several animations change a property, the first one counts.
+    """
     channels: dict[tuple[int, str], Channel] = {}
     for animation in content.get("animations", []):
         for channel in animation["channels"]:

@@ -1,10 +1,10 @@
-"""Motion vectors: from each pixel to the place on the film, one frame before, of the point that it shows.
+"""Motion vectors. They lead from each pixel to where the point that it shows was on the film one frame before.
 
 A pixel shows the first smoothly scattering point on the ray through its centre. The hit is looked up in the scene of
-the frame before by shape, primitive and barycentric coordinates, which holds for any deformation of a mesh; shapes that
-are no meshes, and instances, move by their ``to_world``. A ``Snapshot`` keeps the geometry of the scene before.
+the frame before by shape, primitive and barycentric coordinates, which works for any deformation of a mesh. Instances,
+and shapes that are no meshes, move by their ``to_world``. A ``Snapshot`` keeps the geometry of the scene before.
 
-A thing seen in a mirror or through glass counts where it seems to be: at the end of a straight ray as long as the path.
+For a thing seen in a mirror or through glass its apparent place counts: the end of a straight ray as long as the path.
 This is exact for plane mirrors in a scene at rest. It ignores the motion of things seen in curved mirrors. Rays that
 escape show points at infinity. Surfaces count, media do not.
 """
@@ -74,15 +74,15 @@ class _Middle:
 class Seen:
     """The hits of the rays through the centres of all N pixels, row by row."""
 
-    points: np.ndarray  # (N, 4) homogeneous, in the world: where it seems to be; directions where rays escape
-    straight: np.ndarray  # whether it is there: no mirror and no lens on the way
-    shape: np.ndarray  # its number in ``scene.shapes()``, -1 where rays escape
-    primitive: np.ndarray  # the triangle
-    barycentric: np.ndarray  # (N, 2) the weights of its second and third vertex
+    points: np.ndarray  # (N, 4) homogeneous, in the world: apparent places, or directions where rays escape
+    straight: np.ndarray  # (N,) whether the hit is at its apparent place, with no mirror or lens on the way
+    shape: np.ndarray  # (N,) number of the shape in ``scene.shapes()``, -1 where rays escape
+    primitive: np.ndarray  # (N,) number of the triangle
+    barycentric: np.ndarray  # (N, 2) weights of its second and third vertex
 
 
 def seen(scene: mi.Scene) -> Seen:
-    """What the pixels of the first sensor show, in the middle of its exposure."""
+    """The points that the pixels of the first sensor show in the middle of its exposure."""
     sensor = scene.sensors()[0]
     width, height = (int(n) for n in sensor.film().crop_size())
     with recording():
@@ -113,17 +113,17 @@ def seen(scene: mi.Scene) -> Seen:
 
 
 def depth(scene: mi.Scene, now: Snapshot, what: Seen) -> np.ndarray:
-    """(H, W): how far along the camera's axis things seem to be, in units of its own; infinite where rays escape."""
+    """(H, W): apparent distance along the camera's axis, in units of its own space; infinite where rays escape."""
     width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
     return np.where(what.shape >= 0, what.points @ now.film[3], np.inf).reshape(height, width)
 
 
 def motion_vectors(scene: mi.Scene, now: Snapshot, before: Snapshot, what: Seen | None = None) -> np.ndarray:
-    """(H, W, 2) float32: pixels from each pixel to where what it shows was in the frame ``before``; x right, y down.
+    """(H, W, 2) float32: motion in pixels from each pixel to its point in the frame ``before``; x right, y down.
 
-    It leads from pixel to pixel of the two arrays; the motion in the whole picture is the sum of it and
-    ``window_moved``. ``now`` is the snapshot of ``scene``, ``what`` its ``seen(scene)`` if that is known. NaN where
-    motion is not known: behind the camera of before, or on a shape that was not there.
+    Both places are counted in pixels of the crop windows. Add ``window_moved`` for the motion in the whole picture.
+    ``now`` is the snapshot of ``scene``, and ``what`` is ``seen(scene)`` if that is known. The motion is NaN where it
+    is not known: for points behind the previous camera, or on a shape that did not exist.
     """
     what = seen(scene) if what is None else what
     moved = what.points.copy()
@@ -146,7 +146,7 @@ def motion_vectors(scene: mi.Scene, now: Snapshot, before: Snapshot, what: Seen 
 
 
 def window_moved(now: Snapshot, before: Snapshot) -> tuple[int, int]:
-    """Pixels (x, y) by which the crop window of ``before`` lies further to the right and down than the one now."""
+    """Pixels (x, y) by which the crop window of ``before`` is further right and down than the one of ``now``."""
     (x, y), (x_before, y_before) = now.place.data.corner, before.place.data.corner
     return x_before - x, y_before - y
 

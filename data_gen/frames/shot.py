@@ -41,7 +41,7 @@ class Remembering:
         self._making = 0.0  # seconds that belong to the first frame
 
     def begin(self, scene: mi.Scene) -> None:
-        """Makes the sampler, if there is none yet. Raises NgptError where it cannot render the scene in its memory."""
+        """Makes the sampler if there is none yet. Raises NgptError if it refuses the scene or lacks memory."""
         if self._sampler is None:
             if reason := self.entry.refuses(scene_facts(scene)):
                 raise NgptError(f"sampler '{self.entry.name}' cannot render this scene: {reason}; use --sampler gpt")
@@ -59,9 +59,10 @@ class Remembering:
         depth: np.ndarray | None,
         progress: Callable[[int, int], None],
     ) -> GradientStack:
-        """The stack of frame number ``index`` of the shot, after ``begin``; the ``scene`` has its ``shapes`` there.
+        """The stack of frame number ``index`` of the shot, after ``begin``. ``shapes`` are those of the ``scene``.
 
-        Where the shot ``changes``, it is not the scene of the frame before, which must be as it was then.
+        If the shot ``changes``, it must not be the same object as the scene of the frame before, which must stay as it
+        was in that frame.
         """
         start, self._making = time.perf_counter() - self._making, 0.0
         spp = int(self.request.spp or 0)
@@ -76,8 +77,8 @@ class Remembering:
 class Shot:
     """A scene over time: ``at(frame)`` is the scene in the state of that frame.
 
-    ``describe``  frame -> the scene's file or name, and its ``<default>`` values. The scene is loaded again only where
-                  they change; kernels are compiled once, as long as frames consist of the same kinds of things.
+    ``describe``  frame -> the scene's file or name, and its ``<default>`` values. The scene is loaded again only if
+                  they change. Kernels are compiled once if all frames consist of the same kinds of things.
     ``camera``    moves the first sensor
     ``sensor``    number or id of the sensor to render; None: the first
     ``update``    changes ``mi.traverse(scene)`` for a frame; it must set the same parameters in every frame
@@ -97,7 +98,7 @@ class Shot:
         self._shapes: tuple[Geometry, ...] | None = None
 
     def at(self, frame: int) -> mi.Scene:
-        """The scene in the state of a frame. A scene returned earlier changes with it or is out of use."""
+        """The scene in the state of a frame. A scene that was returned earlier must not be used any more."""
         name, parameters = self.describe(frame)
         wanted = (name, dict(parameters))
         if self._scene is None or wanted != self._loaded:
@@ -149,20 +150,20 @@ def render_shot(
     skip: Callable[[int], bool] = lambda frame: False,
     progress: Callable[[int], Callable[[int, int], None]] = lambda frame: lambda done, total: None,
 ) -> Iterator[tuple[int, GradientStack]]:
-    """Yields (frame, stack) for each frame of a request, but where ``skip`` returns true when the frame's turn comes.
+    """Yields (frame, stack) for each frame of a request. A frame is left out if ``skip`` returns True at its turn.
 
     Stacks have the layer ``motion`` to the previous frame of the request. For the first frame, it is the motion to the
     frame that a shot of the same step would have before it, or all NaN if there is none. Motion refers to the whole
     picture; crop windows may show another part of it in each frame. Each frame has its own seed, so its bits do not
-    depend on which other frames are rendered. Only the cache of tails is filled by ``seed`` in all frames: its noise is
-    smooth, and would flicker. Errors are as in ``render_stack``; cameras without a projection raise NgptError.
+    depend on which other frames are rendered. Only the cache of tails has the same ``seed`` in all frames, because its
+    smooth noise would flicker. Errors are as in ``render_stack``; cameras without a projection raise NgptError.
 
     A ``sampler`` of ``data_gen.samplers.FRAME_SAMPLERS`` reuses the previous frames, up to ``warm_up`` of them where
     frames are skipped, and uses ``seed`` for all frames. If more than the camera changes, it needs the scene of the
-    previous frame: two scenes are in memory, in turn.
+    previous frame, so two scenes are in memory and take turns.
 
     With ``dt`` pairs of samples per pixel, 2 or more, stacks have ``dt`` and ``dt_var``, of separate samples
-    (``data_gen.frames.time_differences``) by Mitsuba's integrator. Where parameters change, scenes are loaded twice per
+    (``data_gen.frames.time_differences``) by Mitsuba's integrator. If parameters change, scenes are loaded twice per
     frame then. The time for this is included in ``ngpt:seconds``.
     """
     before: Snapshot | None = None
@@ -179,7 +180,7 @@ def render_shot(
     for i, wanted in enumerate(frames):
         if skip(wanted):
             continue
-        # Previous frames, only for their history
+        # Previous frames that were skipped are rendered again for the sampler's history.
         for j in range(max(done, i - remembers.warm_up if remembers else i), i + 1):
             frame, previous = frames[j], frames[j - 1] if j else frames[0] - step
             shot, other = turns[j % len(turns)], turns[(j - 1) % len(turns)]
@@ -193,7 +194,7 @@ def render_shot(
                     f"frame {frame} is {now.place.data} and frame {previous} {before.place.data}: --dt and "
                     "samplers that reuse frames need crop windows of one size; only move them"
                 )
-            # A frame that cannot be rendered, for lack of memory for example, is refused before motion is computed.
+            # A frame that cannot be rendered, for example for lack of memory, fails before its motion is computed.
             failed: Exception | None = None
             if remembering is not None:
                 remembering.begin(scene)
@@ -214,8 +215,9 @@ def render_shot(
                     stack.attributes[UNFINISHED] = "failed"
             before, last = now, frame
         done = i + 1
-        stack = _placed(stack, frame, previous, motion + np.asarray(shift, np.float32))
-        stack.attributes |= request.header(frame)
+        stack.attributes |= {"ngpt:frame": frame, "ngpt:previousFrame": previous} | request.header(frame)
+        # In the file, motion is measured in the whole picture.
+        stack = stack.replace(motion=motion + np.asarray(shift, np.float32))
         if failed is not None:
             raise Unfinished(f"frame {frame}: {failed}", stack) from failed
         del scene  # two scenes in memory would make kernels larger
@@ -229,7 +231,7 @@ def render_shot(
 def _motion(scene: mi.Scene, now: Snapshot, before: Snapshot | None) -> tuple[np.ndarray, Any, Any]:
     """Motion vectors from array to array, how far the crop window has moved, and what ``seen`` returns.
 
-    Without a frame ``before``, motion is NaN and nothing was looked at.
+    Without a frame ``before``, motion is NaN, and the last value is None.
     """
     if before is None:
         width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
@@ -238,17 +240,11 @@ def _motion(scene: mi.Scene, now: Snapshot, before: Snapshot | None) -> tuple[np
     return motion_vectors(scene, now, before, what), window_moved(now, before), what
 
 
-def _placed(stack: GradientStack, frame: int, previous: int, motion: np.ndarray) -> GradientStack:
-    """A stack as one of the shot's frames; ``motion`` is measured in the whole picture."""
-    stack.attributes.update({"ngpt:frame": frame, "ngpt:previousFrame": previous})
-    return stack.replace(motion=motion)
-
-
 def _with_dt(
     stack: GradientStack, motion: np.ndarray, here: tuple[Shot, int], before: tuple[Shot, int], pairs: int, seed: int
 ) -> GradientStack:
-    """The stack with ``dt`` and ``dt_var``, by the ``motion`` from array to array; ``here`` and ``before`` are what has
-    the scene, and the frame's number."""
+    """The stack with ``dt`` and ``dt_var``. ``motion`` is measured between pixels of the two arrays. ``here`` and
+    ``before`` are the two frames: the shot that has the scene, and the frame's number."""
     mean = variance = np.full((*motion.shape[:2], 3), np.nan, np.float32)
     if np.isfinite(motion).any():
         scene, begun = here[0].at(here[1]), time.perf_counter()

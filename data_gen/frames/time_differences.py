@@ -3,7 +3,7 @@
 A camera sample at x in this frame has a partner at x + m in the previous frame, with the pixel's motion m. From there
 on, both paths use the same random numbers: where nothing but the motion has changed, both find the same light. The mean
 of the difference over a pixel p is I_t(p) - I_{t-1}(p + m), where p + m is a pixel between the pixels of the film,
-box-filtered like them: nothing is interpolated.
+box-filtered like them; no values are interpolated.
 
 [Random sequence replay between frames: Manzi et al. 2016, "Temporal gradient-domain path tracing", section 4]
 """
@@ -21,15 +21,15 @@ from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import radiance
 from data_gen.scenes.load import reference_integrator
 
-# For each batch, means over its samples are kept for all pixels: enough batches to estimate the variance.
+# The number of batches is large enough to estimate the variance. Each batch keeps a mean for every pixel.
 BATCHES = 16
 
 
 def light(scene: mi.Scene, seed: int, spp: int, motion: np.ndarray | None = None) -> list[tuple[int, np.ndarray]]:
-    """All light but what the camera sees directly, in batches: how many samples a pixel, and their mean (H, W, 3).
+    """All light except directly seen emission, in batches: (samples per pixel, their mean (H, W, 3)).
 
     With the ``motion`` (H, W, 2) of a later frame, samples are partners of the samples with the same ``seed`` there.
-    NaN where a partner is not on the film, where the motion is not known, and where a sample is not finite.
+    A mean is NaN where a partner is not on the film, the motion is not known, or a sample is not finite.
     """
     integrator, sensor = reference_integrator(scene), scene.sensors()[0]
     estimate, medium = radiance(scene, integrator), sensor.get_medium()
@@ -51,7 +51,7 @@ def light(scene: mi.Scene, seed: int, spp: int, motion: np.ndarray | None = None
 
 
 def _partners(camera: CameraSamples, motion: np.ndarray) -> mi.Vector2f:
-    """The motion of each sample's pixel; off the film where it is not known."""
+    """The motion of each sample's pixel. Where it is not known, it leads off the film."""
     pixels = np.where(np.isfinite(motion).all(axis=-1, keepdims=True), motion, -1e6).reshape(-1, 2)
     return mi.Vector2f(*(dr.gather(mi.Float, mi.Float(pixels[:, axis]), camera.pixel) for axis in (0, 1)))
 

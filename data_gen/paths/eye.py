@@ -15,7 +15,7 @@ from data_gen.scenes.cameras import camera_name
 
 @dataclass
 class ThinLens:
-    """Computes what Mitsuba's camera ``thinlens`` does. Dr.Jit 1.5 does not find the arrays of that camera, and cannot
+    """A copy of Mitsuba's camera ``thinlens``. Dr.Jit 1.5 does not find the arrays of the camera itself, and cannot
     freeze a function that calls it."""
 
     radius: mi.Float

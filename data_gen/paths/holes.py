@@ -18,7 +18,7 @@ from data_gen.paths.vertex import NULL, SMOOTH, ByMaterial, dr_number
 from data_gen.scenes.facts import shapes_of
 from data_gen.scenes.integrators import objects_in
 
-# Materials that give the share of light that goes straight through, if the materials within them do
+# Materials for which the share of light that goes straight through is known, if it is known for all materials inside
 _KNOWN = ("MaskBSDF", "Null", "ThinDielectric", "BlendBSDF")
 
 
@@ -69,7 +69,7 @@ class Edge(_Straight):
 
 
 class Holes:
-    """Materials that light goes straight through, with a known share."""
+    """Materials that let a known share of the light go straight through."""
 
     def __init__(self, bsdfs: list[mi.BSDF]):
         numbers = {dr_number(mi.BSDFPtr(bsdf)) for bsdf in bsdfs}

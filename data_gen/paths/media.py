@@ -83,7 +83,7 @@ def vertex(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, place: Place | None
 
 
 def in_medium(x: mi.SurfaceInteraction3f, place: Place) -> mi.MediumInteraction3f:
-    """Vertex ``x`` as Mitsuba's media and phase functions know it."""
+    """Vertex ``x`` as an interaction for Mitsuba's media and phase functions."""
     found = dr.zeros(mi.MediumInteraction3f, dr.width(x.t))
     found.t, found.p, found.time, found.wavelengths = x.t, x.p, x.time, x.wavelengths
     found.wi, found.medium = x.wi, place.medium

@@ -102,7 +102,7 @@ def fly_on(passes, trace, ray, medium, channel, u, *, active):
 
 @dr.syntax
 def cross(passes, trace, ray, medium, reach, *, active, target):
-    """Straight along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary.
+    """Follows ``ray`` for the distance ``reach``, or up to the first surface that is no boundary.
 
     Each piece aims at the ``target`` again, if there is one and it is finite: see ``media.onward()``. Returns τ, the
     hit, the last piece of the ray, and the medium there.

@@ -1,4 +1,4 @@
-"""Path vertices: whether a shifted path may connect to one, and what kind of event scatters light there."""
+"""Path vertices: whether a shifted path may connect to them, and what kind of event scatters light there."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def loses_light(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> bool:
 
 
 def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[..., mi.Spectrum]:
-    """(sampler, ray, medium, active) -> radiance, by the integrator, or by ``prb`` if that ``loses_light``."""
+    """A function (sampler, ray, medium, active) -> radiance of the integrator, or of ``prb`` if it ``loses_light``."""
     if loses_light(scene, integrator):
         integrator = mi.load_dict({"type": "prb", **path_depths(integrator)})
     return own_estimate(scene, integrator)
@@ -83,7 +83,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
         self.options = self.entry.settings({name: props[name] for name in self.entry.options if name in props})
         # Whether the user has set this option. If not, ``share_tails`` sets it for each render
         self.given_tails = "tails" in self.entry.options and "tails" in props
-        # Whether the film counts failed shifts, where the sampler ``diagnoses`` them
+        # Whether the film counts failed shifts, if the sampler ``diagnoses`` them
         self.diagnostics = props.get("diagnostics", False)
         if not self.nested:
             self.limits = Limits.read(props)

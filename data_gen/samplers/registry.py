@@ -118,12 +118,12 @@ class Sampler(Entry):
     _: KW_ONLY
     gradients: bool = True  # whether it renders dx and dy
     rank: int = 0  # "auto" takes the sampler of least rank that can render the scene; 0: never
-    # Whether the pilot of "auto" compares it with others in scenes that it can render. True for samplers of which
-    # measurements have shown that the pilot chooses them where they are best (``data_gen.choosing.plans``)
+    # Whether the pilot of "auto" compares it with others in scenes that it can render. This is set if measurements have
+    # shown that the pilot chooses the sampler in the scenes where it is best (``data_gen.choosing.plans``)
     tried: bool = False
     compiles: float = 2.0  # seconds that a core takes to compile its kernels; used if ``tried``
-    # Light that it finds and paths from the camera hardly find: "caustics" (that are seen in mirrors or through glass),
-    # "hidden lamps" (that the surfaces they light do not see), "grids" (light in media of varying density, by photons)
+    # Kinds of light that it finds, and that paths from the camera hardly find: "caustics" (seen in mirrors or through
+    # glass), "hidden lamps" (whose light comes indirectly), "grids" (light in media of varying density, by photons)
     finds: tuple[str, ...] = ()
     diagnoses: bool = False  # whether it counts failed shifts (--diagnostics): ``make`` takes ``diagnostics=True``
     # 0 if all samples are independent. Otherwise samples of a pass depend on each other or splat: this is the number of
@@ -134,7 +134,7 @@ class Sampler(Entry):
     by_place: bool = False  # whether it can choose lamps by place: ``make`` takes ``places``
     gathers: bool = False  # whether its layer ``caustic`` is light of photons (``ngpt.layers.GATHERED``)
     biased: bool = False  # whether its expected image approaches Mitsuba's only as the number of samples grows
-    counts: bool = False  # whether it replays numbers one by one, which must be independent: it has no ``points``
+    counts: bool = False  # whether it needs independent random numbers, one by one: then it has no option ``points``
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -197,7 +197,7 @@ class FrameSampler(Entry):
     _: KW_ONLY
     spp: int  # samples per pixel of a frame, where the user gives none
     warm_up: int  # earlier frames to render again, as its history, when a shot is continued
-    alone: str  # the reason, in a message, why it renders no single images
+    alone: str  # the reason why it renders no single images, as part of a message
 
 
 # Other packages add samplers by entry points. ngpt has no sampler of shots itself.
@@ -239,8 +239,8 @@ def find(name: str, facts: Facts | None = None) -> Sampler:
     return sampler
 
 
-# The default: samples without gradients, and OIDN. A way that takes longer to compile, to render or to explain replaces
-# it only where measurements show that it is better.
+# The default sampler, without gradients, and the default method. Others that take longer to compile, to render or to
+# explain replace them only where measurements show that they are better.
 SIMPLE = ("primal", "oidn")
 
 
@@ -250,7 +250,7 @@ def tried(facts: Facts) -> list[Sampler]:
 
 
 def described(facts: Facts, gradients: bool = False) -> tuple[str, str, str]:
-    """What "auto" stands for in `ngpt render`, judged by the scene's description only: sampler, method, and why.
+    """The sampler and the method for "auto" in `ngpt render`, judged by the scene's description only, and the reason.
 
     Returns ``SIMPLE``, except in two cases: gradients were asked for, or OIDN is missing, without which gradients give
     better images. Then the method is "": the layers decide.
@@ -262,7 +262,7 @@ def described(facts: Facts, gradients: bool = False) -> tuple[str, str, str]:
 
 
 def choose(facts: Facts) -> tuple[str, str]:
-    """The sampler with gradients for "auto", judged by the scene's description only, and why."""
+    """The sampler with gradients for "auto", judged by the scene's description only, and the reason."""
     reasons: list[str] = []
     for sampler in sorted(SAMPLERS.values(), key=lambda sampler: sampler.rank):
         if not sampler.rank:
@@ -276,7 +276,7 @@ def choose(facts: Facts) -> tuple[str, str]:
 
 
 def check_options(name: str, given: Mapping[str, Any]) -> None:
-    """Raises WrongUse for options that the sampler does not have. "auto" has those that all its samplers share."""
+    """Raises WrongUse for options that the sampler lacks. "auto" has the options that all its samplers share."""
     if name != "auto":
         (FRAME_SAMPLERS[name] if name in FRAME_SAMPLERS else find(name)).settings(given)
         return

@@ -17,7 +17,7 @@ from ngpt.errors import stop_if_interrupted
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
-# Numbers of a film that are in arrays of the camera, not in kernels
+# Parameters of a film whose values are in arrays of the camera and not in kernels
 _IN_ARRAYS = ("film.size", "film.crop_offset")
 
 
@@ -51,7 +51,7 @@ class Made:
 
 
 def _key(scene: mi.Scene, options: dict[str, Any]) -> tuple:
-    """What a recorded kernel depends on, except arrays of the camera: numbers by value, arrays by identity."""
+    """Values on which a recorded kernel depends, except arrays of the camera: numbers by value, arrays by identity."""
     camera = scene.sensors()[0]
     of_scene, of_camera = map(_values, (scene, camera))
     numbers = {key: value for key, value in of_camera.items() if not leaves(value) and key not in _IN_ARRAYS}

@@ -22,7 +22,9 @@ from data_gen.tails.schedule import enough
 
 
 class Sharing(NamedTuple):
-    """``never``  why no paths with these options can share their tails in this scene, "" if they can
+    """Whether paths can share their tails, and whether they should.
+
+    ``never``    why paths with these options cannot share their tails in this scene, "" if they can
     ``not_now``  why the paths of this render should not or cannot share them, "" if they should
     ``rest``     the budget without the memory of the cache
     """

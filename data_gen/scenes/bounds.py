@@ -1,4 +1,4 @@
-"""Corrects the bounding boxes of meshes that Mitsuba has merged, which leave out rectangles.
+"""Corrects the bounding boxes of meshes that Mitsuba has merged.
 
 ``mi.load_file`` and ``mi.load_dict`` merge meshes of one material (``optimize=True``), and so does ``load_scene``. In
 Mitsuba 3.9 the box of a merged mesh leaves out all rectangles in it, and so does the box of the scene. Light from far

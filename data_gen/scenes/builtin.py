@@ -1,4 +1,4 @@
-"""The scenes that come with ngpt: small, made in code, one for each kind of transport that the demo shows.
+"""The built-in scenes: small, made in code, one for each kind of light transport that the demo shows.
 
 Each function returns a Mitsuba scene dictionary. Units are metres, and +y is up.
 """
@@ -158,7 +158,7 @@ def lens() -> dict:
 
 
 def _volume(box: tuple, medium: dict) -> dict:
-    """A box from the corner ``box[0]`` to ``box[1]``. Only the medium in it is visible."""
+    """A box from the corner ``box[0]`` to the corner ``box[1]``. Only the medium in it is visible."""
     low, high = np.array(box, float)
     to_world = _transform().translate(list((low + high) / 2)).scale(list((high - low) / 2))
     return {"type": "cube", "to_world": to_world, "bsdf": {"type": "null"}, "interior": medium}

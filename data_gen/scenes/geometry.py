@@ -21,7 +21,7 @@ class Mesh:
 # Names of the parameter with a mesh's vertices: rows of three numbers since Mitsuba 3.10, a flat array before
 VERTICES = ("positions", "vertex_positions")
 
-# A matrix (4, 4) to world space, or a mesh; None for shapes that expose neither.
+# A matrix (4, 4) to world space, or a mesh, or None for shapes that expose neither of them
 Geometry = np.ndarray | Mesh | None
 
 

@@ -1,4 +1,4 @@
-"""Mitsuba's integrators: their names, and which one our samplers follow instead of another with the same image."""
+"""Mitsuba's integrators: their names, and the integrators that our samplers follow instead of others."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _PLUGINS = {
     "BasicVolumetricPrimitiveRadianceFieldIntegrator": "volprim_rf_basic",
 }
 # Plugin -> the integrator with the same image, and the one with the same image if emitters are hidden from the camera.
-# "" if there is none: Mitsuba's projective integrators treat hidden emitters differently.
+# The second is "" for Mitsuba's projective integrators, which treat hidden emitters differently.
 _SAME = {
     "prb": ("path", "path"),
     "prb_basic": ("path", "path"),

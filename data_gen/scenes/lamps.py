@@ -19,12 +19,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# Camera paths of the pilot, and vertices of each path at which lamps are sampled
+# The number of camera paths of the pilot, and of vertices of each path at which lamps are sampled
 _PATHS, _VERTICES = 1 << 14, 3
-# Paths of a pilot that weights lamps by place, and the least number of lamps for such a pilot
+# The number of paths of a pilot that weights lamps by place, and the least number of lamps for such a pilot
 _PATHS_BY_PLACE, MANY = 1 << 17, 8
-# Lamps are chosen by place if this is expected to lower the variance of direct light to less than this share. The
-# expectation holds in matt scenes. With glossy materials, which the pilot ignores, it was wrong by a factor of two.
+# Lamps are chosen by place if the variance of direct light is expected to fall below this share. In matt scenes the
+# expectation is right. With glossy materials, which the pilot ignores, it was wrong by a factor of two.
 PROMISE = 0.45
 # The share of the choice that is uniform over lamps. In a cell this share follows the weights of the whole scene. Lamps
 # that the pilot did not see may light other places and start light paths.

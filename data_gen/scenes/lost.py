@@ -1,4 +1,4 @@
-"""Lamps whose light is hard to find, or wrong in Mitsuba, and properties of a scene that cause it."""
+"""Finds lamps whose light is hard to find or wrong in Mitsuba, and the surfaces that cause it."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from data_gen.scenes.nodes import MESHES, added, is_part, parts_of
 
 # The least number of lamps of one material that are merged
 MANY = 256
-# The number of times the lamps are split into halves, which gives 64 meshes
+# How often the lamps are split into halves: this gives 64 meshes
 _HALVINGS = 6
 # The corners of Mitsuba's rectangle, and its faces
 _RECTANGLE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)

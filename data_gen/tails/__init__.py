@@ -1,1 +1,1 @@
-"""Light that other paths have found: a cache of radiance in the world, and which vertices may end a path in it."""
+"""A cache of the light that other paths have found, and the rules for paths that end in it."""

@@ -1,4 +1,4 @@
-"""Which materials and media let a path end in the cache, and the share of arriving light that they scatter evenly.
+"""The materials and media at which a path may end in the cache, and the share of light that they scatter evenly.
 
 The cache knows the light that *arrives* at a surface, weighted by the cosine: its irradiance over π. Every material
 with a diffuse part scatters some of that light as a matt surface of reflectance ρ would,
@@ -71,7 +71,7 @@ class Matt:
         return active & (matt if place is None else matt | (self._even(place, active) > 0))
 
     def lambertian(self, x: mi.SurfaceInteraction3f, place: Place | None, active: mi.Bool) -> mi.Bool:
-        """Whether a vertex scatters in no other way: a path that ends there need not go on for a rest."""
+        """Whether a vertex scatters in no other way. Then a path that ends there has no rest to follow."""
         listed, lambertian = self.nothing_else.of(x.bsdf(), active)
         all_matt = listed & lambertian
         return all_matt if place is None else all_matt | (self._even(place, active) == 1)

@@ -6,6 +6,8 @@ same, whether a number of samples or a time ends the render.
 
 from __future__ import annotations
 
+import math
+
 # The cache begins when the image has this number of paths, or at once if the image has this number of pixels. Small
 # images of few samples have no cache: its kernels would take longer to compile than these images take to render.
 BEGIN = 1 << 14
@@ -38,7 +40,4 @@ def fineness(paths: int) -> float:
 
 
 def _power_of_two(least: float) -> int:
-    n = 1
-    while n < least:
-        n *= 2
-    return n
+    return 1 << (math.ceil(least) - 1).bit_length()

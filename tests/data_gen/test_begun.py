@@ -397,7 +397,7 @@ def test_light_that_overflows_ends_no_render_that_somebody_looks_at(renderer, co
 
     monkeypatch.setattr(onlook, "onlookers", looking)
     told = [line for line in command(f"{words} --live").splitlines() if "the render goes on" in line]
-    assert len(told) == 1 and told[0].startswith("no image for who looks on: ")
+    assert len(told) == 1 and told[0].startswith("no live image: ")
     Path("it.exr").unlink()
     assert "; it.exr has the 16 samples per pixel done before" in command(f"{words} --adaptive", 1)
     assert ngpt.read("it.exr").attributes["ngpt:spp"] == 16

@@ -69,7 +69,7 @@ def test_a_plan_takes_photons_where_there_is_time(renderer):
     scene = burning_glass(renderer)
     plan = planned(scene, 60.0, pilot=Pilot(lambda: 0.0))
     assert (plan.sampler, plan.method) == ("vcm", "oidn") and 20 < plan.render < 60
-    assert "of the light is what smooth glass or mirrors make" in plan.reason
+    assert "of the light is caustics of lamps" in plan.reason
     # Too short, too large, a method that cannot use them, and nothing to find
     assert planned(scene, 5.0).sampler == "primal"
     assert planned(burning_glass(renderer, film=(1920, 1080)), 60.0).sampler == "primal"
@@ -92,4 +92,5 @@ def test_how_much_is_said(renderer, caplog):
     with caplog.at_level(logging.WARNING):
         warn_of_lost_light(scene, "primal")
     percent = f"{share_of_caustics(scene):.0%}"
-    assert f"about {percent} of the light on what the camera sees directly, 'primal' hardly finds" in caplog.text
+    assert "'primal' hardly finds the caustics of " in caplog.text
+    assert f", about {percent} of the light on what the camera sees directly; " in caplog.text

@@ -16,8 +16,7 @@ from data_gen import passes
 from data_gen import render as rendering
 from data_gen.adaptive import Adaptive
 from data_gen.budget import Budget, Watch
-from data_gen.film import GradientFilm
-from data_gen.passes import blocks_within, film_within, foretold, render_passes
+from data_gen.passes import film_within, foretold, render_passes
 from data_gen.paths.streams import first_round
 from data_gen.render import render_stack
 from data_gen.scenes.load import set_film_size
@@ -33,9 +32,10 @@ def test_large_images_with_small_blocks(renderer, monkeypatch):
 
 
 def test_passes_do_not_move_blocks_within_packets(renderer):
-    assert blocks_within(1000, GradientFilm(32, 21), 4) > 1
-    # 33 * 21 * 4 lanes are no whole number of packets of 16: a second block would start amid one.
-    assert blocks_within(1000, GradientFilm(33, 21), 4) == 1
+    # 33 * 21 * 4 lanes are no whole number of packets of 16: a second block would start in the middle of a packet.
+    for width, many in ((32, True), (33, False)):
+        _, _, blocks = film_within(1000, load(renderer, "diffuse", (width, 21)).sensors()[0], 4)
+        assert (blocks > 1) == many
 
 
 def test_time_is_kept_and_its_samples_are_those_of_spp(renderer):

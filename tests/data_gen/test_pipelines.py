@@ -152,10 +152,10 @@ def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
     monkeypatch.setattr(plans, "candidates", lambda scene, **_: ["gpt", "primal", "bdpt", "ppm"])
     tried, sizes = [], []
 
-    def try_out(scene, name, clock, limit, stop, unbiased):
+    def try_out(scene, name, limit, pilot):
         tried.append((name, limit))
         for _ in range(8):
-            compiled = clock()
+            compiled = pilot.clock()
         sizes.append(tuple(int(n) for n in scene.sensors()[0].film().size()))
         return None, compiled
 
@@ -208,9 +208,9 @@ def test_slow_compilation_keeps_other_samplers_out(renderer, monkeypatch):
     for took, names in ((30.0, ["gpt"]), (20.0, ["gpt", "ppm"])):
         tried.clear()
 
-        def try_out(scene, name, clock, limit, stop, unbiased, took=took):
+        def try_out(scene, name, limit, pilot, took=took):
             tried.append(name)
-            return None, clock() + took
+            return None, pilot.clock() + took
 
         monkeypatch.setattr(trials, "try_out", try_out)
         trials.try_all(scene, ["gpt", "ppm"], lambda _: 40.0, pilot=Pilot(ticking(0.1)))
@@ -220,12 +220,12 @@ def test_slow_compilation_keeps_other_samplers_out(renderer, monkeypatch):
 def test_a_sampler_that_takes_too_long_is_not_tried(renderer):
     scene = load(renderer, "diffuse", (16, 12))
     # A second to compile; a render of 8 samples takes another, and there are four of these and two of 16.
-    assert try_out(scene, "primal", ticking(1.0), 8.5)[0] is None
-    assert len(try_out(scene, "primal", ticking(1.0), 9.5)[0].stacks) == 4
-    assert try_out(scene, "primal", stop=lambda: True)[0] is None
+    assert try_out(scene, "primal", 8.5, Pilot(ticking(1.0)))[0] is None
+    assert len(try_out(scene, "primal", 9.5, Pilot(ticking(1.0)))[0].stacks) == 4
+    assert try_out(scene, "primal", pilot=Pilot(stop=lambda: True))[0] is None
     # Where compilation takes more than half of the time, no stack is begun.
     clock = ticking(1.0)
-    assert try_out(scene, "primal", clock, 1.9) == (None, 1.0) and clock() == 2.0
+    assert try_out(scene, "primal", 1.9, Pilot(clock)) == (None, 1.0) and clock() == 2.0
 
 
 def test_a_method_is_tried_where_it_can_run(renderer):

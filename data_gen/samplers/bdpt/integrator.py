@@ -43,6 +43,8 @@ from data_gen.samplers.common import GradientIntegrator
 
 @dataclass
 class Splatter:
+    """The ``Visitor`` of light paths that splats their connections to the camera."""
+
     splats: Splats
     ray: mi.Ray3f
     importance: mi.Spectrum

@@ -38,7 +38,7 @@ class Seen:
 
 
 class Visitor(Protocol):
-    """Is called at each vertex of a light path. Its state is part of the loop's state."""
+    """Functions that are called at each vertex of a light path. Their state is part of the state of the loop."""
 
     def start(self) -> Any:
         """The state before the first vertex."""
@@ -49,6 +49,8 @@ class Visitor(Protocol):
 
 @dataclass
 class End:
+    """The last edge of a light path, and the vertex ``y`` at its end."""
+
     ray: mi.Ray3f
     hit: mi.PreliminaryIntersection3f
     y: Vertex
@@ -81,7 +83,7 @@ def lit(plan: Plan, start: LightRay, si: mi.SurfaceInteraction3f) -> mis.Partial
 
 
 def go_on(plan: Plan, random, start: LightRay, y: Vertex, bsdf, active) -> tuple:
-    """The next vertex after ``y``, whether it exists, the event that leads there, and 1 / survival probability."""
+    """The next vertex after ``y``, whether it exists, the event that leads there, and 1 / the survival probability."""
     u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
     sample, f_p = bsdf.sample(context(IMPORTANCE), y.si, u_lobe, u_direction, active)
     known = replace(y, end=plan.known(y.end, bsdf))

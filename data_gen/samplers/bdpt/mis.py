@@ -60,13 +60,13 @@ def begin_light(e: mi.Float, p: mi.Float, delta: mi.Bool, cos: mi.Float) -> Part
 
 
 def leave(end: Partial, cos: mi.Float, p: mi.Float, q: mi.Float, delta: mi.Bool, η: mi.Float | float = 0.0) -> Partial:
-    """Behind an event that was sampled with density ``p``. ``η`` is that of the vertex, for camera paths."""
+    """Behind an event that was sampled with density ``p``. For camera paths, ``η`` is the η of the vertex."""
     vc = dr.select(delta, (end.vc + end.waiting) * cos, cos / p * (end.vcm + end.vc * q))
     return Partial(dr.select(delta, 0, dr.rcp(p)), vc, dr.select(delta, 0, mi.Float(η) * (cos / p)))
 
 
 def arrive(end: Partial, cos: mi.Float, distance2: mi.Float) -> Partial:
-    """At the next vertex."""
+    """At the next vertex, at the end of an edge of squared length ``distance2``."""
     return Partial(end.vcm * distance2 / cos, end.vc / cos, end.waiting * dr.rcp(cos))
 
 

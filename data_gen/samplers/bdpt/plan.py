@@ -20,6 +20,8 @@ from data_gen.samplers.bdpt.vertex import Vertex, cosine
 
 @dataclass(kw_only=True)
 class Plan(World):
+    """The scene and the rules for its paths."""
+
     limits: Limits
     longest: int  # the number of edges up to which paths are found from both ends
     first_hit: Callable  # (scene, ray, active): where a ray from the camera leads

@@ -80,6 +80,7 @@ def record(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, vertex: Vertex, smo
 
 
 def recall(kept, time: mi.Float, wavelengths: mi.Wavelength) -> Vertex:
+    """The vertex of a record."""
     hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(kept.t))
     hit.t, hit.prim_uv, hit.prim_index = kept.t, kept.prim_uv, kept.prim_index
     hit.shape, hit.instance = kept.shape, kept.instance

@@ -1,4 +1,4 @@
-"""The base path of ``gpt``, vertex by vertex: Mitsuba's ``path``, and what offset paths need from it."""
+"""The base path of ``gpt``, vertex by vertex: the path of Mitsuba's ``path``, and the values that offset paths need."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ class Path:
 
 @dataclass
 class Recording:
-    """What a path records for the cache."""
+    """The records of a path that feeds the cache."""
 
-    any: mi.Bool  # it has a record: light that it finds before is of no use
-    here: mi.Bool  # its newest record is at the current vertex
+    any: mi.Bool  # the path has a record; light that it found earlier is not used
+    here: mi.Bool  # the newest record is at the current vertex
 
 
 @dataclass
 class Step:
-    """What the base path does at its vertex x; x1 is the next one."""
+    """A step of the base path from its vertex x to the next vertex x1."""
 
     x: mi.SurfaceInteraction3f
     x_connectable: mi.Bool

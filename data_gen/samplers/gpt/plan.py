@@ -1,4 +1,4 @@
-"""What the kernel of ``gpt`` contains for a scene: code that its transport cannot reach is not compiled."""
+"""The plan of ``gpt`` for a scene: it decides which code the kernel contains. Code that no path reaches is left out."""
 
 from __future__ import annotations
 

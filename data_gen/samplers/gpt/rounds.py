@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.film import GradientFilm
-from data_gen.passes import SamplePass, recording
+from data_gen.passes import Rounds, SamplePass, recording
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.frozen import Frozen
 from data_gen.samplers.gpt.plan import Plan
@@ -45,7 +45,7 @@ def sharing(view, plan: Plan, frozen: Frozen, take: Take) -> SamplePass:
     return SharedTails(view, plan, frozen, take) if plan.matt else partial(take, None)
 
 
-class SharedTails:
+class SharedTails(Rounds):
     """A ``data_gen.passes.SamplePass`` whose paths may end in a cache. The cache changes only between rounds.
 
     ``take`` puts samples into a film. It is given what is known, or None if paths do not end in a cache. ``view`` is
@@ -56,7 +56,6 @@ class SharedTails:
         self.frozen, self.take = frozen, take
         # Not a method of this object: ``frozen`` keeps it, and a reference back to this object would form a cycle.
         self.plan, self.paths = plan, partial(paths, view, plan)
-        self.seed: int | None = None
         self.cache: Cache | None = None
         self.off, self.fed, self.pixels, self.until, self.share = "", 0, 1, 0, feeding.BEGIN
 

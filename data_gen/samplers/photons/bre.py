@@ -195,7 +195,7 @@ def by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, em
         if dr.hint(at_surface is not None, mode="scalar"):
             L += β * at_surface(si, bsdf, depth, receives)
 
-        # ---------------- Where the path goes on ------------------
+        # -------------------- The next piece ----------------------
         u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
         sample, f_p = bsdf.sample(context(RADIANCE), si, u_lobe, u_direction, active)
         kind = event_kind(sample.sampled_type)

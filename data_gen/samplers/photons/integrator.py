@@ -33,10 +33,12 @@ GRID_BYTES = VERTICES_PER_PATH * 3 * 4
 
 @dataclass
 class Traced:
-    photons: Any  # the record
-    paths: int  # light paths of the pass
-    number: int  # of the pass
-    seed: int  # of the render
+    """The photon map of a pass."""
+
+    photons: Any  # the vertices of light paths, see ``map.vertices``
+    paths: int  # number of light paths of the pass
+    number: int  # number of the pass
+    seed: int  # seed of the render
     first_radius: float  # the gathering radius in pass 0
 
     def radius(self, dimension: int = 2) -> float:
@@ -45,7 +47,7 @@ class Traced:
 
 
 class PhotonIntegrator(GradientIntegrator):
-    """Derived classes define ``sample_pass(passes, camera, film)`` and these attributes:
+    """An integrator with photon maps. Derived classes define ``sample_pass(passes, camera, film)``, and the attributes
 
     ``follows``       "volpath" if they render media, or "path" for surfaces only
     ``camera_bytes``  memory of a camera sample

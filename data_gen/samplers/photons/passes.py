@@ -25,7 +25,7 @@ class Passes:
 
     integrator: Any
     world: World
-    width: float  # of a pixel
+    width: float  # of a pixel, in world units, see ``map.radius.pixel_width``
     frozen: Frozen = field(init=False)
 
     def __post_init__(self) -> None:
@@ -44,9 +44,11 @@ class Passes:
 
 @dataclass
 class Start:
+    """The start of camera paths."""
+
     ray: mi.RayDifferential3f
     importance: mi.Spectrum
-    random: Any  # the stream of their random numbers
+    random: Any  # the stream of random numbers of the paths
 
 
 def begun(passes: Passes, camera: CameraSamples) -> tuple[Start, dict]:

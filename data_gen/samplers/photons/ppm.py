@@ -133,13 +133,13 @@ def by_vertices(integrator: PhotonIntegrator, world: World, start: Start, near, 
     L = dr.zeros(mi.Spectrum, dr.width(ray))
     active = si.is_valid() & (depth < limits.max_depth)
     while dr.hint(active, label="camera path"):
-        # ------------------ What is gathered at a vertex ------------------
+        # --------------------- Gather at the vertex -----------------------
         bsdf = si.bsdf()
         receives = active & connectable(bsdf)
         if dr.hint(gathered is not None, mode="scalar"):
             L += β * gathered(si, bsdf, depth, receives)
 
-        # ------- The next direction: what scatters widely is gathered ------
+        # ------- The next direction; a path ends where it is gathered ------
         u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
         sample, f_p = bsdf.sample(context(RADIANCE), si, u_lobe, u_direction, active)
         kind = event_kind(sample.sampled_type)

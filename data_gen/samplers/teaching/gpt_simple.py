@@ -222,7 +222,7 @@ def step_joined(step: Step, path: Offset) -> tuple[mi.Spectrum, mi.Spectrum]:
 
 
 def refuse(scene) -> None:
-    """Raises NgptError for materials at which paths cannot be reconnected, also for polish, which rules cannot see."""
+    """Raises NgptError for materials at which paths cannot be reconnected, including polish, which no rule detects."""
     if materials := Materials(scene, CONNECTABLE.default).unconnectable:
         more = f" and {len(materials) - 3} more" if len(materials) > 3 else ""
         reason = f"paths cannot be reconnected at {', '.join(materials[:3])}{more}"

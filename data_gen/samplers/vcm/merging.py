@@ -7,8 +7,8 @@ camera path and its light path. So ``mis`` can weight it against all connections
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any, get_type_hints
+from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -21,7 +21,8 @@ from data_gen.samplers.bdpt.plan import Plan
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, evaluate, record_class
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.radius import spread
-from data_gen.samplers.photons.map.vertices import Photon, faces
+from data_gen.samplers.photons.map.trace import empty_map
+from data_gen.samplers.photons.map.vertices import Photon, at, faces, put
 
 # Bytes of a vertex: 23 words of a record, one for whether it is a photon, and 12 words while the grid is made.
 VERTEX_BYTES = (23 + 1 + 12) * 4
@@ -39,12 +40,8 @@ class Map:
     @classmethod
     def empty(cls, paths: int, size: int) -> Map:
         """An empty map for this number of light paths of at most ``size`` vertices."""
-        n, kind = paths * size, record_class(mi.variant())
-        vertices = kind(*(dr.empty(t, n) for t in get_type_hints(kind, {"mi": mi}).values()))
-        # 0 says that nothing is kept there
-        vertices.depth = dr.zeros(mi.UInt32, n)
-        first = dr.arange(mi.UInt32, paths) * dr.opaque(mi.UInt32, size)
-        found = cls(vertices, dr.zeros(mi.UInt32, n), first, dr.zeros(mi.UInt32, paths))
+        vertices, first, _ = empty_map(record_class(mi.variant()), paths, size)
+        found = cls(vertices, dr.zeros(mi.UInt32, paths * size), first, dr.zeros(mi.UInt32, paths))
         dr.make_opaque(found)
         return found
 
@@ -53,14 +50,13 @@ class Map:
 
 
 class Reader:
-    """Reads the vertices of each lane's own light path, as ``bdpt`` does. It is no part of a loop's state."""
+    """Reads the vertices of each lane's own light path, as ``bdpt`` does. It is not part of the state of a loop."""
 
     def __init__(self, kept: Map):
         self.kept = kept
 
     def read(self, i: mi.UInt32):
-        vertices, place = self.kept.vertices, self.kept.first + i
-        return type(vertices)(*(dr.gather(type(v), v, place) for v in _values(vertices)))
+        return at(self.kept.vertices, self.kept.first + i)
 
 
 class Keeper:
@@ -74,8 +70,7 @@ class Keeper:
 
     def sees(self, state: Any, seen: Seen) -> Any:
         place, here = self.kept.first + seen.y.depth - 1, seen.kept.depth > 0
-        for target, value in zip(_values(self.kept.vertices), _values(seen.kept), strict=True):
-            dr.scatter(target, value, place, here)
+        put(self.kept.vertices, seen.kept, place, here)
         # ``Plan.known`` has set vcm to η there.
         photon = dr.select(seen.y.end.vcm == self.η, mi.UInt32(1), 0)
         dr.scatter(self.kept.photon, photon, place, here)
@@ -154,7 +149,3 @@ def brought(photon: Photon, si, bsdf: mi.BSDFPtr, active) -> tuple[mi.Spectrum, 
 def eta(radius: float, paths: int) -> float:
     """η of ``mis``."""
     return float(np.pi * radius**2 * paths)
-
-
-def _values(record) -> list:
-    return [getattr(record, f.name) for f in fields(record)]

@@ -7,8 +7,6 @@ mirrors     a large mirror on a wall, and up to two more, or panes that stand in
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from data_gen.scenes.procedural import things
@@ -71,26 +69,17 @@ def partition(stage: Stage) -> None:
         stage.add(things.placed(parts, [place, 0, 0]))
 
 
-def _bare(rng: np.random.Generator, radius: float) -> list[things.Part]:
-    return []
-
-
-def _shaded(rng: np.random.Generator, radius: float) -> list[things.Part]:
-    """A lampshade, open below, or above and below."""
-    top, tall = rng.choice([0.001, rng.uniform(1.2, 2.0)]) * radius, rng.uniform(3, 6) * radius
-    profile = [(rng.uniform(2.0, 4.0) * radius, -tall / 2), (top, tall / 2)]
-    return [(str(rng.choice(["fabric", "metal"])), lathe(profile))]
-
-
-def _in_glass(rng: np.random.Generator, radius: float) -> list[things.Part]:
-    return [("glass", sphere(rng.uniform(1.5, 3.0) * radius, 32))]
-
-
-def _behind_a_ledge(rng: np.random.Generator, radius: float) -> list[things.Part]:
-    return [("wall", box([8 * radius, 0.02, 8 * radius], [0, -1.5 * radius, 0]))]
-
-
-FIXTURES: list[Callable[[np.random.Generator, float], list[things.Part]]] = [_bare, _shaded, _in_glass, _behind_a_ledge]
+def fixture(rng: np.random.Generator, radius: float) -> list[things.Part]:
+    """The parts around a lamp of this ``radius``: none, a shade, a glass ball, or a ledge below it."""
+    kind = rng.integers(4)
+    if kind == 1:
+        # A shade that is open below, or above and below
+        top, tall = rng.choice([0.001, rng.uniform(1.2, 2.0)]) * radius, rng.uniform(3, 6) * radius
+        profile = [(rng.uniform(2.0, 4.0) * radius, -tall / 2), (top, tall / 2)]
+        return [(str(rng.choice(["fabric", "metal"])), lathe(profile))]
+    if kind == 2:
+        return [("glass", sphere(rng.uniform(1.5, 3.0) * radius, 32))]
+    return [("wall", box([8 * radius, 0.02, 8 * radius], [0, -1.5 * radius, 0]))] if kind == 3 else []
 
 
 def lamps(stage: Stage, count: int) -> list[tuple[Mesh, np.ndarray]]:
@@ -101,7 +90,7 @@ def lamps(stage: Stage, count: int) -> list[tuple[Mesh, np.ndarray]]:
     for _ in range(count):
         radius = np.exp(rng.uniform(np.log(0.015), np.log(0.12)))
         place = rng.uniform(-0.45, 0.45, 3) * [width, 0, depth] + [0, rng.uniform(0.3, 0.92) * height, 0]
-        stage.add(things.placed(FIXTURES[rng.integers(len(FIXTURES))](rng, radius), place))
+        stage.add(things.placed(fixture(rng, radius), place))
         power = brightest * 10 ** rng.uniform(-2, 0)
         made.append(
             (sphere(radius, 16).placed(place), power / np.pi / (4 * np.pi * radius**2) * colour(rng, 0.6, 1, 0.5))

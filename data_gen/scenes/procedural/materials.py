@@ -8,6 +8,7 @@ refractive index of glass is the same in all scenes.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from xml.etree import ElementTree as xml
 
 import numpy as np
@@ -54,6 +55,14 @@ def plugin(tag: str, kind: str, name: str | None = None, **values) -> xml.Elemen
 def inside(element: xml.Element, *children: xml.Element) -> xml.Element:
     element.extend(children)
     return element
+
+
+def add_transform(element: xml.Element, **steps: Mapping[str, Iterable[float]]) -> None:
+    """Adds a ``to_world`` to an element: its ``steps`` by name, such as ``scale``, each with its vectors by name."""
+    transform = xml.SubElement(element, "transform", name="to_world")
+    for step, vectors in steps.items():
+        texts = {name: ", ".join(f"{x:.6g}" for x in vector) for name, vector in vectors.items()}
+        xml.SubElement(transform, step, texts)
 
 
 def two_sided(bsdf: xml.Element) -> xml.Element:

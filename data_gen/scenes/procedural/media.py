@@ -13,7 +13,7 @@ from xml.etree import ElementTree as xml
 import numpy as np
 
 from data_gen.scenes.grids import cloud, plume, write_vol
-from data_gen.scenes.procedural.materials import inside, plugin
+from data_gen.scenes.procedural.materials import add_transform, inside, plugin
 from data_gen.scenes.procedural.meshes import box, cylinder, sphere, write_ply
 from data_gen.scenes.procedural.stage import Stage
 from data_gen.scenes.procedural.textures import colour
@@ -56,9 +56,7 @@ def beams(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
         intensity = light * colour(rng, 0.7, 1, 0.8)
         spot = plugin("emitter", "spot", cutoff_angle=angle, beam_width=0.8 * angle, intensity=intensity)
         points = {"origin": [at[0], stage.height - 0.05, at[1]], "target": [target[0], 0, target[1]]}
-        transform = xml.SubElement(spot, "transform", name="to_world")
-        named = {key: ", ".join(f"{x:.6g}" for x in point) for key, point in points.items()}
-        xml.SubElement(transform, "lookat", named | {"up": "1, 0, 0"})
+        add_transform(spot, lookat={**points, "up": [1, 0, 0]})
         media.elements.append(spot)
     return media
 
@@ -136,9 +134,7 @@ def _homogeneous(rng: np.random.Generator, sigma_t: np.ndarray, albedo: np.ndarr
 def _grid(rng: np.random.Generator, file: str, low: np.ndarray, high: np.ndarray, sigma_t: float) -> xml.Element:
     medium = plugin("medium", "heterogeneous", "interior", scale=sigma_t)
     volume = plugin("volume", "gridvolume", "sigma_t", filename=file, raw=True)
-    transform = xml.SubElement(volume, "transform", name="to_world")
-    xml.SubElement(transform, "scale", value=", ".join(f"{x:.6g}" for x in high - low))
-    xml.SubElement(transform, "translate", value=", ".join(f"{x:.6g}" for x in low))
+    add_transform(volume, scale={"value": high - low}, translate={"value": low})
     value = np.clip(float(rng.choice([0.4, 0.8, 0.95, 0.99])) * _tinted(rng), 0, 0.995)
     albedo = plugin("volume", "constvolume", "albedo", value=value)
     return _boundary(low, high, inside(medium, volume, albedo, _phase(rng)))
@@ -148,7 +144,5 @@ def _boundary(low, high, medium: xml.Element) -> xml.Element:
     """An invisible box with a medium in it."""
     low, high = np.asarray(low), np.asarray(high)
     shape = plugin("shape", "cube")
-    transform = xml.SubElement(shape, "transform", name="to_world")
-    xml.SubElement(transform, "scale", value=", ".join(f"{x:.6g}" for x in (high - low) / 2))
-    xml.SubElement(transform, "translate", value=", ".join(f"{x:.6g}" for x in (high + low) / 2))
+    add_transform(shape, scale={"value": (high - low) / 2}, translate={"value": (high + low) / 2})
     return inside(shape, plugin("bsdf", "null"), medium)

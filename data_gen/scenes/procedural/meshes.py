@@ -1,4 +1,4 @@
-"""Triangle meshes made in code, with normals and texture coordinates in metres, and a PLY writer for them.
+"""Triangle meshes made in code, with texture coordinates in metres, and a PLY writer for them.
 
 Every mesh has normals and texture coordinates, so that all meshes use the same kernel.
 """

@@ -17,7 +17,7 @@ from xml.etree import ElementTree as xml
 import numpy as np
 
 from data_gen.scenes.procedural import things
-from data_gen.scenes.procedural.materials import SLOTS, Palette, inside, plugin
+from data_gen.scenes.procedural.materials import SLOTS, Palette, add_transform, inside, plugin
 from data_gen.scenes.procedural.media import Media, some_media
 from data_gen.scenes.procedural.meshes import (
     Mesh,
@@ -223,9 +223,7 @@ def make_scene(seed: int | tuple[int, ...], folder: Path, shares: Mapping[str, f
 
 def _camera(rng: np.random.Generator, origin, target) -> xml.Element:
     lens = plugin("sensor", "thinlens", fov=rng.uniform(45, 75), aperture_radius=1e-4, focus_distance=2.0)
-    transform = xml.SubElement(lens, "transform", name="to_world")
-    point = ({"origin": origin, "target": target}).items()
-    xml.SubElement(transform, "lookat", {k: ", ".join(f"{x:.6g}" for x in v) for k, v in point} | {"up": "0, 1, 0"})
+    add_transform(lens, lookat={"origin": origin, "target": target, "up": [0, 1, 0]})
     film = plugin("film", "hdrfilm", width=1280, height=720, pixel_format="rgb", component_format="float32")
     return inside(lens, inside(film, plugin("rfilter", "box")))
 

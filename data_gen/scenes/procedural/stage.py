@@ -1,4 +1,4 @@
-"""A scene while it is made: its parts by slot, and the places of things."""
+"""A scene under construction: its parts by slot of material, and the places of things."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Sights, which are rare features of scenes: fine pictures, hair, many small lamps, caustics, media, and the light of
-``data_gen.scenes.procedural.hard_light``.
+"""Sights, which are rare features of scenes: fine pictures, hair, many small lamps, caustics, media, and light that is
+hard to find (``data_gen.scenes.procedural.hard_light``).
 
 They are added to a finished scene and use separate random numbers, so a scene without sights does not depend on this
 file.

@@ -35,7 +35,7 @@ class Fog:
 
     @dr.syntax
     def around(self, scene, p: mi.Point3f) -> mi.MediumPtr:
-        """The medium around points ``p``, since Mitsuba does not know the medium of a lamp that is no boundary itself.
+        """The medium around points ``p``. Mitsuba does not know the medium of a lamp that is not a boundary itself.
 
         The first boundary on the way to the camera gives the medium on its side of ``p``. Without a boundary it is the
         camera's medium. Other surfaces on the way have the same medium on both sides.

@@ -22,7 +22,7 @@ _LEAST_CELLS = 1 << 12
 class Grid:
     """Points ``p[i]`` with numbers ``index[i]``, sorted by cell. Cell c has i from ``start[c]`` to ``start[c + 1]``.
 
-    Of the ``points`` those that ``exist`` are entered. ``radius`` is the largest radius of a search.
+    The grid contains the ``points`` that ``exist``. ``radius`` is the largest radius of a search.
     """
 
     low: mi.Point3f
@@ -46,7 +46,7 @@ class Grid:
         low, high = (np.array([f(axis)[0] for axis in p], np.float64) for f in (dr.min, dr.max))
         most = max(_LEAST_CELLS, _CELLS_PER_PHOTON * dr.width(index))
         edge, cells = self.cells(high - low, 2 * radius, most)
-        # A cell of room on all sides: the cells of a ball around any of the points are in the grid.
+        # There is a spare cell on all sides, so the grid contains all cells of a ball around any of the points.
         self.low = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in low - edge))
         self.edge, self.rate = (dr.opaque(mi.Float, value) for value in (edge, 1 / edge))
         self.n = mi.Vector3u(*(dr.opaque(mi.UInt32, int(n)) for n in cells))

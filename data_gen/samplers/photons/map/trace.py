@@ -109,7 +109,7 @@ def _walk(world: World, paths: Paths, random, depths: tuple, photons, places: tu
     ray, β, brightest = mi.Ray3f(paths.ray), paths.β, paths.brightest
     bounce, alive, channel, medium = mi.UInt32(paths.bounce), mi.Bool(paths.alive), paths.channel, paths.medium
     while dr.hint(alive & (place < end), label="light paths"):
-        # ------------------ The edge: what is at its end ------------------
+        # ------------------ The edge, and the vertex at its end -----------
         if dr.hint(fog is not None, mode="scalar"):
             segment, si = fog.fly(next_surface(scene), ray, medium, channel, random, alive)
             where, β = segment.place, β * segment.weight
@@ -120,7 +120,7 @@ def _walk(world: World, paths: Paths, random, depths: tuple, photons, places: tu
             si = hit.compute_surface_interaction(ray, active=alive)
             where, exists, scatters, around = None, alive & si.is_valid(), mi.Bool(False), {}
 
-        # ---------------- The vertex, as it is in the map -----------------
+        # ------------------------ Into the map ----------------------------
         depth = dr.select(receives(si.bsdf()) | scatters, bounce, 0)
         put(photons, kind(p=si.p, n=si.n, d=ray.d, β=β, depth=depth, **around), place, exists)
         place += 1
