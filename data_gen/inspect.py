@@ -12,7 +12,7 @@ import mitsuba as mi
 
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, SIMPLE, by_standing, described, tried
 from data_gen.scenes.builtin import SCENES, no_scene
-from data_gen.scenes.facts import Facts, polarised, scene_facts, spectral
+from data_gen.scenes.facts import Facts, colours, scene_facts
 from data_gen.scenes.integrators import AROUND, lack, same_image
 from data_gen.scenes.load import complaint
 from data_gen.scenes.lost import behind_sharp, bent_lamp, has_holes, without_size
@@ -69,13 +69,12 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
     facts = Facts(
         followed,
         tuple(sorted(media)),
-        polarised(),
-        mirrors,
+        mirrors=mirrors,
         grids="heterogeneous" in plugins["Medium"],
         camera=taken.plugin,
         hair="hair" in plugins["BSDF"],
-        spectral=spectral(),
         hides=hides,
+        **colours(),
     )
     sampler, method, reason = described(facts)
     tries = any(each.finds for each in tried(facts))

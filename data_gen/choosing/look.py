@@ -7,9 +7,9 @@ import mitsuba as mi
 import numpy as np
 
 _PIXELS = 1 << 12
-# Features do not pay if their noise exceeds this share of their variance. Outdoors they take between half and all of the
-# time of the rest of a sample. A product shot with .03 had 1.1 times the error with features, after 1.1 times the
-# seconds (docs/start/which-sampler.md).
+# Features do not pay if their noise exceeds this share of their variance. Outdoors they cost half to all of the time of
+# the rest of a sample. A product shot with .03 had 1.1 times the error with features, after 1.1 times the seconds
+# (docs/start/which-sampler.md).
 _NOISE = 0.01
 
 

@@ -32,16 +32,19 @@ class CameraPath:
     """Key frames in rising order. Before the first and after the last one the camera rests.
 
     A camera's scale, which exporters write and Mitsuba refuses, is taken out of its matrix. Raises NgptError for a
-    matrix that flattens space or is not finite, and for cameras that are mirrored in some keys and not in others.
+    matrix that flattens space or is not finite, and for cameras that are mirrored in some keys and not in others. Its
+    message begins with the name of the ``file``, if given.
     """
 
-    def __init__(self, keys: list[Key]):
-        self.keys = [replace(key, to_world=_rigid(key)) for key in keys]
+    def __init__(self, keys: list[Key], file: str | Path = ""):
+        where = f"{file}: " if file else ""
+        self.keys = [replace(key, to_world=_rigid(key, where)) for key in keys]
         for one, other in pairwise(self.keys):
             if _mirrored(one.to_world) != _mirrored(other.to_world):
+                frames = f"frames {one.frame:g} and {other.frame:g}"
                 raise NgptError(
-                    f"the camera is mirrored in one of the frames {one.frame:g} and {other.frame:g} and not in the "
-                    "other, and nothing is between them; give both the same sign of scale"
+                    f"{where}the camera is mirrored in one of the {frames} and not in the other, and nothing is "
+                    "between them; give both the same sign of scale"
                 )
 
     def at(self, frame: float) -> Key:
@@ -79,20 +82,21 @@ def look_at(origin, target, up) -> np.ndarray:
     return matrix
 
 
-def _rigid(key: Key) -> np.ndarray:
+def _rigid(key: Key, where: str) -> np.ndarray:
     """The matrix of a key without its scale. Direction of view, side that is up, and reflection stay the same."""
     matrix = np.asarray(key.to_world, np.float64)
     # Numbers of the renderer are single precision.
     with np.errstate(over="ignore"):
         if not np.isfinite(matrix.astype(np.float32)).all():
-            raise NgptError(f"frame {key.frame:g}: the camera's matrix has numbers that are not finite, or beyond 1e38")
+            what = "the camera's matrix has numbers that are not finite, or beyond 1e38"
+            raise NgptError(f"{where}frame {key.frame:g}: {what}")
     axes = matrix[:3, :3]
     if np.allclose(axes.T @ axes, np.eye(3), atol=1e-6):
         return matrix
     lengths = np.linalg.norm(axes, axis=0)
     volume = np.linalg.det(axes / lengths) if lengths.min() > 0 else 0.0
     if not abs(volume) > 1e-6:
-        raise NgptError(f"frame {key.frame:g}: the camera's matrix flattens space (a scale of 0?)")
+        raise NgptError(f"{where}frame {key.frame:g}: the camera's matrix flattens space (a scale of 0?)")
     forward = axes[:, 2] / lengths[2]
     up = axes[:, 1] / lengths[1]
     up = up - (up @ forward) * forward
@@ -132,10 +136,7 @@ def read_camera_path(path: str | Path) -> CameraPath:
             raise NgptError(f"{path}: frame {other.frame:g} comes after frame {one.frame:g}; sort keys by frame")
         if (one.fov is None) != (other.fov is None) or one.fov_axis != other.fov_axis:
             raise NgptError(f"{path}: frames {one.frame:g} and {other.frame:g} differ in fov_axis, or one has no fov")
-    try:
-        return CameraPath(keys)
-    except NgptError as error:
-        raise NgptError(f"{path}: {error}") from error
+    return CameraPath(keys, path)
 
 
 def _key(entry: Any, number: int, where: str) -> Key:

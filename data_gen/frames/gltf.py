@@ -89,10 +89,7 @@ def _path(path: Path, content: dict[str, Any], binary: bytes, fps: float) -> Cam
         for number in chain:
             matrix = _local(nodes[number], number, channels, frame / fps) @ matrix
         keys.append(Key(frame, matrix @ _TURN, None, fov, "y"))
-    try:
-        return CameraPath(keys)
-    except NgptError as error:
-        raise NgptError(f"{path}: {error}") from error
+    return CameraPath(keys, path)
 
 
 def _channels(path: Path, content: dict[str, Any], binary: bytes, chain: list[int]) -> dict[tuple[int, str], Channel]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import mitsuba as mi
 
@@ -42,12 +43,11 @@ def scene_facts(scene: mi.Scene, sensor: mi.Sensor | None = None, integrator: mi
     return Facts(
         "path" if reference is None else plugin_name(reference),
         tuple(sorted(names)),
-        polarised(),
         grids=grids,
         camera=camera_name(camera),
         hair=hair,
-        spectral=spectral(),
         hides=bool(getattr(reference, "hide_emitters", False)),
+        **colours(),
     )
 
 
@@ -78,11 +78,7 @@ def media_of(scene: mi.Scene) -> list[mi.Medium]:
     return [medium for medium in found if medium is not None]
 
 
-def polarised() -> str:
-    """The current variant's name if it renders polarised light, else ""."""
-    return mi.variant() if mi.is_polarized else ""
-
-
-def spectral() -> str:
-    """The current variant's name if its paths have wavelengths, else ""."""
-    return mi.variant() if mi.is_spectral else ""
+def colours() -> dict[str, Any]:
+    """The facts ``polarised`` and ``spectral`` about the current variant."""
+    name = mi.variant()
+    return {"polarised": name if mi.is_polarized else "", "spectral": name if mi.is_spectral else ""}
