@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -13,15 +13,12 @@ from data_gen.film import claims
 from data_gen.film.moments import Moments, Strands, accumulate, no_moments, one_more, put_back, taken
 from data_gen.film.splats import SPLAT_BYTES, Splats
 from data_gen.film.statistics import contrast, statistics
-from data_gen.film.subpixels import Subpixels, bytes_of_subpixels
+from data_gen.film.subpixels import Celled, Subpixels, bytes_of_subpixels
 from ngpt.layers import DIFFERENCES, FEATURE_NOISE
 from ngpt.shared import shared_variance
 from ngpt.stack import GradientStack
 from ngpt.subpixels import SUBPIXELS, means
 from ngpt.windows import Place
-
-if TYPE_CHECKING:
-    from data_gen.paths.camera import CameraSamples
 
 # The shifts of samplers, (x, y) in pixels, y down: forward ("+") and backward ("-") for each difference of the
 # contract. The film keeps the differences "neighbour - base" at the base pixel and combines both directions when it
@@ -113,7 +110,7 @@ class GradientFilm:
         self._pass: dict[str, tuple] = {}
         self._splats: dict[str, Splats] = {}
 
-    def begin_pass(self, camera: CameraSamples) -> None:
+    def begin_pass(self, camera: Celled) -> None:
         """Records the subpixel of each sample of the next pass, if the film has subpixels."""
         if self._fine:
             self._cell = camera.cells(self.subpixels)

@@ -7,6 +7,7 @@ subpixel gets the same number of samples if the number of samples per pixel is a
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -20,6 +21,13 @@ BYTES = 3 * (4 + 3 * 8)
 BYTES_OF_CAUSTIC = 4 + 3 * 8
 # The values under these names are summed. Values of ``primal`` do not include the light of ``caustic``.
 SUMMED = (*FINE, "caustic")
+
+
+class Celled(Protocol):
+    """Samples whose places in their pixels are known, such as ``data_gen.paths.camera.CameraSamples``."""
+
+    def cells(self, k: int) -> mi.UInt32:
+        """Which of the K x K subpixels of its pixel each sample is in, counted row by row."""
 
 
 @dataclass
