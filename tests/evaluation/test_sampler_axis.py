@@ -94,15 +94,10 @@ subpixels = "auto"
 def test_subpixels_are_part_of_what_a_column_is_given(tmp_path):
     """And of its name, by which stacks, costs and cells are cached. Without them it is the name that it was."""
     text = 'scenes = ["diffuse"]' + SUBPIXELS
-    renders = {column.sampler: column.render for column in read(text, tmp_path).columns()}
-    assert [render.name for render in renders.values()] == [
-        "features",
-        "features primal subpixels=2",
-        "features primal points=independent subpixels=auto",
-    ]
-    assert renders["fine"].options == {"sampler": "primal", "subpixels": "2"}
-    one = read(text.replace("= 2", "= 1"), tmp_path).columns()
-    assert one[1].render == renders["primal"] and "subpixels" not in renders["primal"].options
+    plain, fine, by_default = (column.render for column in read(text, tmp_path).columns())
+    assert (plain.name, fine.name) == ("features", "features primal subpixels=2")
+    assert by_default.name == "features primal points=independent subpixels=auto"
+    assert read(text.replace("= 2", "= 1"), tmp_path).columns()[1].render == plain
     with pytest.raises(NgptError, match=r"samplers\.fine: '3' subpixels cannot be kept; write 1, 2, 4, or auto"):
         read(text.replace("= 2", "= 3"), tmp_path)
     with pytest.raises(NgptError, match=r"samplers\.fine: sampler 'bdpt' puts light on any pixel and has no subpixels"):

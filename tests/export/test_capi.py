@@ -2,12 +2,7 @@
 
 import numpy as np
 import pytest
-from capi import MISSING_LAYER, OK, WEIGHTS, Job, Network, agree, example, in_python, place, result, those
-
-from ngpt.methods import reconstruct
-from ngpt.network.inputs import DENOISED, Oidn, base_image, denoised
-from ngpt.repair import repair
-from ngpt.stack import GradientStack
+from capi import WEIGHTS, Network, agree, example, in_python, result, those
 
 NETWORKS = [path for path in sorted(WEIGHTS.glob("ngpt-*.onnx")) if not path.stem.endswith(".statistics")]
 
@@ -22,41 +17,6 @@ def test_networks_agree_with_python(both, size):
     network, python = both
     layers = those(network, example(*size))
     agree(result(network, layers), python(layers))
-
-
-def stack_of(layers) -> GradientStack:
-    return GradientStack.from_arrays(**{name: layer for name, layer in layers.items() if "denoised" not in name})
-
-
-def test_a_network_that_corrects_another_denoiser(library):
-    pytest.importorskip("mitsuba_oidn")
-    network = Network(library, WEIGHTS / "ngpt-combine.onnx")
-    layers = {name: layer for name, layer in example(60, 150).items() if "denoised" not in name}
-    data = repair(stack_of(layers))
-    made = base_image(data, "wcv")
-    expected = {"oidn_primal": data.image + data.caustic + data.direct, "oidn_base": made + data.direct}
-    expected |= {"oidn_albedo": data.features["albedo"], "oidn_normal": data.features["normal"]}
-    expected["oidn_caustic"] = data.caustic
-    job = Job(network, those(network, layers))
-    images = {name: np.zeros_like(image) for name, image in expected.items()}
-    for name, image in images.items():
-        assert job.set_output(name, *place(image)) == OK, job.message()
-    assert job.run() == MISSING_LAYER and "denoised, denoised_base, denoised_caustic" in job.message()
-    assert job.prepare() == OK, job.message()
-    # Most of it is 0.
-    assert np.allclose(images["oidn_caustic"], expected.pop("oidn_caustic"), rtol=1e-5, atol=1e-6)
-    for name, image in expected.items():
-        agree(images[name], image)
-    by_oidn = Oidn(data)
-    other = {name: image + data.direct for name, image in denoised(by_oidn, made, DENOISED).items()}
-    other |= {"base": images["oidn_base"], "denoised_caustic": by_oidn.of_caustic}
-    other["denoised"] += by_oidn.of_caustic
-    for name, image in other.items():
-        assert job.set_layer(name, *place(image)) == OK, job.message()
-    expected_image = reconstruct(stack_of(layers), "ngpt-combine").image
-    for memory in (0, 60):
-        assert job.run(memory) == OK, job.message()
-        agree(job.image, expected_image)
 
 
 def test_tiles_agree_with_the_whole_and_may_be_written_where_a_layer_is(fast):

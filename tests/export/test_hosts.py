@@ -9,6 +9,7 @@ import hashlib
 import json
 import re
 import shutil
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -61,14 +62,7 @@ def of_python():
 @pytest.fixture(scope="module")
 def host(toolchain, tmp_path_factory):
     """A function: the caller of a host of that kind, which is compiled once."""
-    made: dict = {}
-
-    def of(kind):
-        if kind not in made:
-            made[kind] = caller(kind(tmp_path_factory.mktemp(kind.__name__)))
-        return made[kind]
-
-    return of
+    return cache(lambda kind: caller(kind(tmp_path_factory.mktemp(kind.__name__))))
 
 
 @pytest.fixture(scope="module", params=["wide", *(pytest.param(name, marks=pytest.mark.slow) for name in SCENES)])

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import ngpt
@@ -20,7 +19,7 @@ SHIPPED = [
 
 @pytest.fixture(scope="module")
 def views(renderer):
-    """A stack of 8 samples and a reference of each built-in scene."""
+    """A stack of 8 samples and a reference of two built-in scenes."""
     from data_gen.render import render_stack
     from data_gen.scenes.load import load_scene
 
@@ -49,22 +48,3 @@ def test_it_is_better_than_classical_methods_on_scenes_of_its_own_kind(views, na
         ours, theirs = (relmse_trimmed(ngpt.denoise(stack, method), reference) for method in (name, classical))
         # Which needs no more layers than it.
         assert ours < theirs
-
-
-@pytest.mark.parametrize("name", SHIPPED)
-def test_a_firefly_stays_where_it_is(views, name):
-    view, _ = views["diffuse"]
-    # Wide enough for that.
-    layers = {layer: np.tile(view[layer], (1, 3, 1)) for layer in view.layers}
-    layers["dx"][:, -1] = 0
-    stack = ngpt.GradientStack(layers)
-    primal = stack["primal"].copy()
-    primal[20, 10] += 1e6
-    before, after = ngpt.denoise(stack, name), ngpt.denoise(stack.replace(primal=primal), name)
-    model, _ = load_weights(TWINS / f"{name}.safetensors")
-    # The sweeps of its base reach less far than what the network sees.
-    far = np.s_[:, 10 + model.network.radius + 1 :]
-    assert np.isfinite(after).all() and before[far].size
-    # OIDN sees further than our networks, and its exposure is that of the whole image.
-    bound = 0.1 if name in ("ngpt-combine", "ngpt-primal") else 0.01
-    assert (np.abs(after - before)[far] <= bound * before[far] + 1e-3).mean() > 0.99

@@ -154,9 +154,8 @@ def test_models_are_made_anew_with_scene_files_and_without(model, files, tmp_pat
         if line[0] == "-m":
             made.append(line)
             continue
-        sources = [read_config(each[each.index("--config") + 1]) for each in made]
         if not weights:
-            assert any(source.files for source in sources) == files
+            assert any(read_config(each[each.index("--config") + 1]).files for each in made) == files
         changes = [line[i + 1] for i, word in enumerate(line) if word == "--set"]
         settings = read_settings(line[line.index("--config") + 1], changes)
         assert settings.run.steps == 5
@@ -166,7 +165,5 @@ def test_models_are_made_anew_with_scene_files_and_without(model, files, tmp_pat
         made = []
     assert len(weights) == (2 if model == "primal" else 1) and not made
     # The tuned weights count three times.
-    files = weights[:1] + 3 * weights[1:]
-    at = small.index("--weights") + 1
-    assert small[at : small.index("-o")] == files
+    assert small[small.index("--weights") + 1 : small.index("-o")] == weights[:1] + 3 * weights[1:]
     assert small[-1] in whole and whole[-1].endswith(".onnx")
