@@ -1,4 +1,4 @@
-"""Trains a network: what ``ngpt train`` does. Several GPUs: torchrun --nproc-per-node N train.py ..."""
+"""Trains a network, as ``ngpt train`` does. For several GPUs: torchrun --nproc-per-node N train.py ..."""
 
 import sys
 
