@@ -1,7 +1,7 @@
 """--init of train, dataset and evaluate: a configuration of one's own, with all that could be set."""
 
 import re
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -30,6 +30,10 @@ def test_it_is_the_configuration_and_offers_all_that_could_be_set(verb, name, tm
     read, text = READERS[verb], path.read_text()
     given = read(configs.find_config(name, KINDS[verb]))
     assert read(path) == given
+    offers = {key or table for key, table in re.findall(r"^(?:# )?(\w+) = |^\[+(\w+)", text, re.M)}
+    parts = [value for name, value in vars(given).items() if is_dataclass(value) and name in offers] or [given]
+    keys = {field.name for part in parts for field in fields(part) if getattr(part, field.name) is not None}
+    assert keys - offers <= {"sampler_options"}
     offered.write_text(re.sub(r"^# (\w+ = .*)$", r"\1", text, flags=re.M))
     assert offered.read_text() != text
     everything = read(offered)
