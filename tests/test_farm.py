@@ -31,6 +31,15 @@ for n in $(seq ${array%-*} ${array#*-}); do
 done
 echo 4711
 """
+# Renders until it gets SIGTERM, and the second time to the end.
+STOPPED = """#!/bin/bash
+echo "$@" >> "$FARM_LOG"
+[ -e "$FARM_LOG.stopped" ] && exit 0
+trap 'touch "$FARM_LOG.stopped"; sleep 0.2; exit 143' TERM
+kill -TERM $PPID
+for n in $(seq 100); do sleep 0.1; done
+"""
+SCONTROL = '#!/bin/bash\necho scontrol "$@" >> "$FARM_LOG"\n'
 
 
 def parsed(words):
@@ -112,3 +121,17 @@ def test_slurm(farm):
     calls = farm.run("sbatch", "--array=0-2", FARM / "slurm-shot.sh", farm.scene, farm.out, "0:240")
     assert [call.shard for call in shares(calls)] == [(0, 3), (1, 3), (2, 3)]
     assert all(call.frames == list(range(240)) for call in calls)
+
+
+def test_slurm_has_a_part_that_ran_out_of_time_run_again(farm, monkeypatch):
+    """As Slurm does it: it signals the script, ends with its status, and runs it again once it is queued anew."""
+    farm.tool(ngpt=STOPPED, scontrol=SCONTROL)
+    for name, number in (("SLURM_ARRAY_JOB_ID", "4711"), ("SLURM_ARRAY_TASK_ID", "2")):
+        monkeypatch.setenv(name, number)
+    script = [str(FARM / "slurm-still.sh"), str(farm.scene), str(farm.out), "3", "500"]
+    statuses = [subprocess.run(script, timeout=60, check=False).returncode for _ in range(2)]
+    first, queued, again = farm.log.read_text().splitlines()
+    assert statuses == [143, 0] and queued == "scontrol requeue 4711_2"
+    assert first == again and "--skip-existing" in first
+    # The signal goes to the script, which Slurm does not do by itself.
+    assert "--signal=B:TERM@" in (FARM / "slurm-still.sh").read_text()

@@ -11,6 +11,7 @@ import pytest
 from exr_files import comparable, same_bits, window, write_raw
 from exr_structure import Attribute, parse
 
+import ngpt
 from ngpt.errors import NgptError
 from ngpt.io import header, isolated, openexr
 from ngpt.io.isolated import read_exr_isolated
@@ -211,3 +212,12 @@ def test_programs_beside_the_file_are_not_run(tmp_path, monkeypatch):
     (tmp_path / "numpy.py").write_text("raise SystemExit('run')")
     monkeypatch.chdir(tmp_path)
     assert read_exr_isolated(path).parts[0].channels.keys() == set("RGB")
+
+
+def test_names_that_collide_with_layers_keep_their_channels(tmp_path):
+    """OpenEXR's own grouping of channels has had memory errors on these."""
+    names = ("R", "G", "B", "left", "left.R", "left.G", "left.B", "left.R.R", "A.B", "A")
+    channels = {name: np.full((4, 5), i, np.float32) for i, name in enumerate(names)}
+    stack = ngpt.read(write_raw(tmp_path / "a.exr", (channels,)))
+    assert np.array_equal(stack["primal"][0, 0], [0, 1, 2])
+    assert ngpt.read(ngpt.write(tmp_path / "b.exr", stack)).source.image.parts[0].channels.keys() == channels.keys()
