@@ -38,17 +38,17 @@ BLOCK = PACKET
 LEAST = 2 * BLOCK
 # The fewest and the most samples that a pixel gets, relative to an even share
 _FLOOR, _CAP = 0.25, 16.0
-# If an error is given, a step aims at _MARGIN times the samples that seem to be needed, and adds at least this share of
-# the samples so far.
+# If an error is given, a step aims at _MARGIN times the samples that seem to be needed, and adds at least the share
+# _SMALLEST of the samples so far.
 _MARGIN, _SMALLEST = 1.05, 0.125
 # The worst pixels are left out, as ngpt.measure.metrics.relmse_trimmed does.
 _TRIM = 0.001
 # This share of the changes, the largest ones, is cut to the next smaller change. Otherwise all pixels around a firefly
 # would get more samples.
 _CUT = 0.03
-# The mean square error over the mean of squared standard errors. A standard error is right for two values in three, and
-# a few values far off raise the mean square. Standard errors of l1 count the light that it leaves out, so its factor is
-# below 1. By bench/adaptive.py of commit e61ee6f3, six scenes.
+# The error of an image relative to the root mean square of its standard errors. It is above 1, since a few errors are
+# much larger than their standard errors. For l1 it is below 1, since its standard errors include light that it leaves
+# out. Measured by bench/adaptive.py of commit e61ee6f3 in six scenes.
 _TAILS, _TAIL = {"l1": 0.75}, 1.25
 # Side, in pixels, of the part of an image that the method is timed on
 _PART = 96

@@ -31,15 +31,15 @@ PACKET = 16
 _BLOCK_LANES = 1 << 21
 # Lanes are numbered with 32 bits.
 _MOST_LANES = 1 << 30
-# The least lanes of the first pass of a render that time may end: fewer would leave cores idle.
+# The fewest lanes of the first pass of a render with a time limit, since fewer lanes would leave cores idle
 _FEWEST_LANES = 1 << 13
-# For renders with a time limit: the share of the remaining time that the last pass is planned to take, and how many
-# times as many samples as the largest pass before it a pass may have
+# In renders with a time limit, the last pass is planned to take the share _CAUTION of the remaining time. A pass has at
+# most _GROWTH times as many samples as the largest pass before it.
 _CAUTION, _GROWTH = 0.9, 8
 # Lanes of the first pass of other renders: enough to render small images in one pass, and to foretell how long the next
 # pass takes
 FIRST_LANES = 1 << 20
-# Seconds that a pass should take: much more than to start it, and so few that the render reacts soon
+# The seconds that a pass should take: much longer than its start, but short enough for the render to react quickly
 PASS_SECONDS = 2.0
 
 

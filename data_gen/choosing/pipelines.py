@@ -46,9 +46,9 @@ class Pipeline:
     error: float  # trimmed relMSE
     step: float  # the exponent of the error as a power of the samples, as the pilot measured it
     seconds: float  # for one sample per pixel of the whole image
-    after: float  # seconds of the method
+    after: float  # seconds that the method takes
     adaptive: float = 1.0  # expected error of adaptive samples relative to even ones; 1: samples are even
-    choosing: float = 0.0  # seconds of the method each time that samples are distributed
+    choosing: float = 0.0  # seconds that the method takes each time that samples are distributed
     doubt: float = 0.0  # standard error of a biased sampler's error, by which the error is raised; otherwise 0
 
     @property
@@ -82,7 +82,7 @@ class Pipeline:
         return spp * self.seconds + self._choices(spp) + self.after
 
     def _choices(self, spp: float) -> float:
-        """Seconds spent on distributing samples: each time, their number doubles."""
+        """Seconds for distributing ``spp`` samples. Their number doubles each time that samples are distributed."""
         return self.choosing * math.ceil(math.log2(spp / LEAST) + 1) if self.shared and spp > LEAST else 0.0
 
     @property

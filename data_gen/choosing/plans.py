@@ -29,22 +29,24 @@ from ngpt.errors import NgptError
 from ngpt.methods import METHODS, runnable
 from ngpt.system.console import brief
 
-# The share of the time that a pilot may take, and the part of it for trials of samplers where it tries methods too
+# The share of the time that a pilot may take, and the part of its time for trials of samplers if it also tries methods
 SHARE, _TRIALS = 0.1, 2 / 3
 # There is no pilot in renders of fewer seconds than this, or of fewer paths if the number of samples is given. A tenth
 # of the render must suffice to compile the kernels of other samplers and to try them. One or two cores trace a million
 # paths per second. Two trials on the smallest images take 3.0 to 13.5 processor seconds, with their methods about 4
 # more.
 LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
-# Seconds of `ngpt denoise` besides the method, and of `ngpt render` to write the stack: to start a process; and for a
-# million pixels, to write the stack, read it and write the image
+# Seconds that `ngpt render` and `ngpt denoise` take besides render and method: to start a process, and for each million
+# pixels to write the stack, to read it and to write the image
 _BEGINS, _FILES = 0.8, 3.7
-# The power of the pixels by which the seconds of methods grow: from 4,080 to 230,400 pixels 0.84 (ngpt-combine), 0.86
-# (oidn, ngpt-primal) to 0.96 (ngpt-fast), from 57,600 on 0.89 to 1.1. A call takes some time whatever the size.
+# The time of methods grows by this power of the number of pixels. From 4,080 to 230,400 pixels it was 0.84
+# (ngpt-combine), 0.86 (oidn, ngpt-primal) and 0.96 (ngpt-fast), and from 57,600 pixels on 0.89 to 1.1. On small images
+# each call also takes some time that does not depend on the size.
 _GROWS = 0.9
 # Seconds for a million pixels, on two cores, of methods that no pilot has measured, and of methods that are not listed
 _METHOD_SECONDS, _OTHERS = {"auto": 18.0, "ngpt-combine": 18.0, "ngpt-primal": 14.0, "oidn": 13.0}, 3.0
-# The seconds from which on the images of a pilot have all of PIXELS, and the least share of PIXELS
+# In renders of at least LONG seconds the images of a pilot have PIXELS pixels. In shorter renders they have fewer, but
+# at least the share LEAST_PIXELS of that number.
 LONG, LEAST_PIXELS = 400.0, 1 / 16
 # Another sampler is chosen only if its error is smaller by this factor, since smaller differences could be chance.
 # Errors of networks and denoisers are foretold less well: in one choice they were wrong by a factor of 1.6.

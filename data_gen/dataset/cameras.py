@@ -1,7 +1,7 @@
 """Cameras in the free space of any scene, found by casting rays.
 
-The scene's own camera stands in free space. From there a walk goes along random rays, each time a part of the way to
-the hit. So it never enters an object and stays in reachable space. Views that see nothing are rejected. If hardly any
+The scene's own camera stands in free space. From there a walk follows random rays, each for a part of the way to its
+hit. So it never enters an object and stays in reachable space. Views that see nothing are rejected. If hardly any
 view sees something, as around an object in empty space, a camera stands between the scene's own camera and a point that
 this camera sees, and looks at another such point.
 """

@@ -31,7 +31,7 @@ _OF_INPUTS = ("inputs", "spp", "adaptive", "subpixels")
 
 @dataclass(frozen=True)
 class Again:
-    """The file of kept references, and the seed of the noise of their new inputs."""
+    """A file of kept references, and the seed for the noise of their new inputs."""
 
     path: str
     seed: int

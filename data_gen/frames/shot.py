@@ -29,16 +29,16 @@ from ngpt.stack import GradientStack
 
 
 class Remembering:
-    """The frames of one shot, by a sampler that remembers previous frames.
+    """Renders the frames of one shot by a sampler that remembers previous frames.
 
-    ``changes``: whether more than the camera may change from frame to frame.
+    ``changes`` says whether more than the camera may change from frame to frame.
     """
 
     def __init__(self, entry: FrameSampler, changes: bool, request: RenderRequest):
         self.entry, self.changes, self.request = entry, changes, request
         self.options = entry.settings(request.options)
         self._sampler: Any = None
-        self._making = 0.0  # seconds that belong to the first frame
+        self._making = 0.0  # seconds to make the sampler, counted for the first frame
 
     def begin(self, scene: mi.Scene) -> None:
         """Makes the sampler if there is none yet. Raises NgptError if it refuses the scene or lacks memory."""

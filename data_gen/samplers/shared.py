@@ -106,7 +106,7 @@ def first_radius(default: float) -> Option:
     return Option(default, meaning, range=(1e-6, 1e6))
 
 
-# Which light of lamps without size a sampler loses
+# The light of lamps without size that a sampler loses, as part of a message
 THROUGH_HOLES = "that comes through masks and thin panes"
 
 IN_MIRRORS = "followed from the camera and from the lights; caustics that are seen in them are found, too"

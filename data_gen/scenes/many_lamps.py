@@ -1,4 +1,4 @@
-"""Merges lamps: hundreds of small meshes that shine become 64 meshes, each with one emitter for all of its lamps.
+"""Merges lamps: hundreds of small shining meshes become 64 meshes, each with one emitter for all of its lamps.
 
 Before the first sample, Dr.Jit records every virtual call of a kernel for each shape and each emitter of a scene. With
 2,000 lamps this takes seconds. Lamps that are close together share a mesh, so samplers can still choose lamps by place.

@@ -1,6 +1,6 @@
 """The entries of the samplers that use only photons: ``ppm`` on surfaces, and ``bre`` in media.
 
-Each pass has its own photon map. Maps blur the light, less from pass to pass.
+Each pass has its own photon map. A map blurs the light, and the blur becomes smaller from pass to pass.
 """
 
 from typing import Any

@@ -1,4 +1,4 @@
-"""Adds light that is hard to find: openings between two rooms, lamps of very different power, mirrors, panes.
+"""Adds things that make light hard to find: openings between rooms, lamps of very different power, mirrors, panes.
 
 partition   a wall across a room, with a doorway, a door left ajar, a crack, slats, or a pane of glass in it
 lamps       four lamps whose power differs by up to 100 : 1: bare, in shades, in glass, or behind a ledge

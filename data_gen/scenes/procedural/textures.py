@@ -1,4 +1,4 @@
-"""Pictures made in code, for walls, floors and things, and skies.
+"""Pictures made in code for walls, floors and things; and skies.
 
 A pattern is a (H, W) array in [0, 1] that tiles; ``coloured`` lays two or three colours over it.
 """

@@ -1,1 +1,1 @@
-"""The photon map: its light paths, its radius, and the search for photons."""
+"""The photon map: its light paths, the radius of gathering, and the search for photons."""
