@@ -3,7 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-from ngpt.measure.averages import geometric_mean, mean, median, summary
+import numpy as np
+
+from ngpt.measure.averages import geometric_mean, median, summary
 from ngpt.system.writing import csv_text, write_json, write_text
 
 _SECONDS = ("render", "reconstruct", "total", "reconstruct wall")
@@ -51,10 +53,9 @@ def summarised(results: dict[str, Any]) -> list[dict[str, Any]]:
                     found = [row["metrics"][name] for row in parts if name in row["metrics"]]
                     lower = results["metrics"][name]["better"] == "lower"
                     if len(found) == len(parts) and not (lower and min(value["median"] for value in found) < 0):
-                        scores[name] = {
-                            key: mean([value[key] for value in found], geometric=lower)
-                            for key in ("median", "low", "high")
-                        }
+                        average = geometric_mean if lower else np.mean
+                        ends = ("median", "low", "high")
+                        scores[name] = {key: float(average([value[key] for value in found])) for key in ends}
                 times: dict[str, float | None] = {}
                 for key in _SECONDS:
                     known = [row["seconds"][key] for row in parts if row["seconds"][key] is not None]

@@ -1,7 +1,7 @@
 """Averages of repeated measurements."""
 
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -21,8 +21,3 @@ def median(values: Iterable[float | None]) -> float | None:
 def geometric_mean(values: Iterable[float]) -> float:
     """The geometric mean. Values of 0 or less count as 1e-30."""
     return float(np.exp(np.mean(np.log(np.maximum(list(values), 1e-30)))))
-
-
-def mean(values: Sequence[float], geometric: bool) -> float:
-    """The arithmetic or the geometric mean."""
-    return geometric_mean(values) if geometric else float(np.mean(values))
