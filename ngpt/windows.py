@@ -166,7 +166,7 @@ def put(image: np.ndarray, window: Window, canvas: Window, outside: float = 0.0)
         return image
     if canvas.width * canvas.height > MOST:
         size = f"{canvas.width}x{canvas.height}"
-        raise NgptError(f"the display window is {size}; at most {MOST >> 20} million pixels are shown: make it smaller")
+        raise NgptError(f"the display window is {size} pixels; at most {MOST >> 20} million are shown: make it smaller")
     filled = np.full((canvas.height, canvas.width, *image.shape[2:]), outside, image.dtype)
     if common := window.common(canvas):
         filled[common.within(canvas)] = image[common.within(window)]
