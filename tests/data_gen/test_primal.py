@@ -7,7 +7,6 @@ from references import references
 from unbiased import load, render_ours, right_integrator
 
 from data_gen.scenes.load import reference_integrator
-from ngpt.errors import NgptError
 from ngpt.testing import z_test
 
 
@@ -22,39 +21,20 @@ def test_light_on_what_has_holes_is_not_lost(renderer):
 
 @pytest.mark.parametrize("more", [{"sky": {"type": "constant", "radiance": 0.1}}, {"leaf": {"type": "sphere"}}])
 def test_elsewhere_it_is_the_integrator_itself(renderer, more):
-    """With an environment, and without holes: the very same numbers as ``path`` gives."""
-    from data_gen.samplers.common import radiance
+    """With an environment, and without holes."""
+    from data_gen.samplers.common import loses_light
 
     scene = load(renderer, lambda: leaf() | more, (16, 16))
-    integrator = reference_integrator(scene)
     assert right_integrator(renderer, scene).class_name() == "PathIntegrator"
-
-    class Called(Exception):
-        pass
-
-    class Own:
-        hide_emitters = False
-
-        def __str__(self):
-            return str(integrator)
-
-        def class_name(self):
-            return "PathIntegrator"
-
-        def sample(self, *_):
-            raise Called
-
-    with pytest.raises(NgptError, match="Called"):
-        radiance(scene, Own())(None, None, None, True)
+    assert not loses_light(scene, reference_integrator(scene))
 
 
-@pytest.mark.parametrize(
-    "sampler", ["primal", "gpt", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bdpt", "gbdpt"))]
-)
+@pytest.mark.parametrize("sampler", ["primal", "gpt", pytest.param("bdpt", marks=pytest.mark.slow)])
 def test_lamps_seen_directly_are_seen_by_four_rays_a_sample(renderer, sampler):
     """A lamp of radiance 2 over parts of pixels: one ray a sample would have variance m (2 - m) / spp."""
     spp = 16
-    stacks = render_ours(load(renderer, lamp_alone, (16, 16)), sampler, batches=24, spp=spp)
+    # Points of nets would take noise away whatever the number of rays.
+    stacks = render_ours(load(renderer, lamp_alone, (16, 16)), sampler, batches=24, spp=spp, points="independent")
     direct = np.stack([stack["direct"][..., 0] for stack in stacks]).astype(np.float64)
     np.testing.assert_allclose([stack["primal"] for stack in stacks], [stack["direct"] for stack in stacks], atol=1e-6)
     m = direct.mean(axis=0)
