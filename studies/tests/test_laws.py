@@ -74,12 +74,12 @@ def test_where_there_are_no_media_points_on_surfaces_do():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["vpm", "gvpm", "beams"])
 def test_photons_in_grids_give_the_same_bits_whatever_the_passes(renderer, monkeypatch, name):
-    have_the_same_bits(renderer, monkeypatch, name, media_scenes.wisps, 3, {})
+    have_the_same_bits(renderer, monkeypatch, name, media_scenes.wisps, 3)
 
 
 @pytest.mark.slow
 def test_paths_from_both_ends_give_the_same_bits_whatever_the_passes(renderer, monkeypatch):
-    have_the_same_bits(renderer, monkeypatch, "gbdpt", caustics, 32, {})
+    have_the_same_bits(renderer, monkeypatch, "gbdpt", caustics, 32)
 
 
 CLAIMS = [

@@ -8,7 +8,6 @@ import pytest
 from camera_cases import camera
 from photon_copies import assert_no_bias, gain
 from photon_images import cases, named
-from photon_laws import passes
 from unbiased import load, render_ours
 
 from data_gen.paths.camera import CameraSamples
@@ -55,7 +54,8 @@ ON_SURFACES = [("areas", 4), ("areas", 1), ("glass", 1), ("points", 1), ("points
 def test_differences_are_those_of_the_image(renderer, sampler, name, pixels, options):
     """In one pass after another: with the same photons, so that the noise of both falls out in part."""
     scene = load(renderer, without_glass if name == "sky" else named(name), (12, 12))
-    stacks = passes(scene, 32, pixels, sampler, **GRADIENTS[sampler] | options)
+    options = GRADIENTS[sampler] | options | {"points": "independent"}
+    stacks = render_ours(scene, sampler, 32, 1, pixels, **options)
     assert np.mean([stack["primal"].mean() for stack in stacks]) > 0.01
     assert_no_bias(stacks, pixels)
 
@@ -106,7 +106,7 @@ def test_there_are_copies_and_differences_have_little_noise(
     if fails:
         stack = render_stack(scene, 2, 0, sampler, diagnostics=True, unbiased=True, **options)
         assert pass_through(stack)["diagnostics.shiftFailures"].mean() < fails
-    gained = gain(passes(scene, 8, 1, sampler, **options))
+    gained = gain(render_ours(scene, sampler, 8, 1, points="independent", **options))
     assert gained[0] > mean and gained[1] > median, gained
 
 

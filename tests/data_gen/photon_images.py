@@ -7,7 +7,7 @@ import data_gen_scenes
 import media_scenes
 import numpy as np
 import pytest
-from photon_laws import assert_alike, passes
+from photon_laws import assert_alike
 from references import REFERENCES, references
 from unbiased import light_of_gradients, load, render_ours
 
@@ -57,8 +57,8 @@ class Image:
         scene, options = load(renderer, description, self.size), {"radius": self.radius, **self.options}
         if self.photons:
             options["photons"] = self.photons
-        # As renders draw them: few images of independent photons have tails that their variance does not know.
-        ours = passes(scene, self.batches, 1, sampler, net=1, **options)
+        # Points are not independent: few images of independent photons have tails that their variance does not know.
+        ours = render_ours(scene, sampler, self.batches, 1, **options)
         if name in STORED and not integrator:
             theirs = references(renderer, getattr(media_scenes, name, data_gen_scenes.fog), self.size)
         else:

@@ -1,11 +1,11 @@
-"""What tests of photons share: passes, maps, and images beside each other."""
+"""What tests of photons share: maps, and images beside each other."""
 
 import media_scenes
 import numpy as np
 from bdpt_scenes import SCENES
 from references import references
 from renders import dr, mi
-from unbiased import assert_unbiased, far_shifts, load, render_ours
+from unbiased import assert_unbiased, load, render_ours
 
 from data_gen.film import GradientFilm
 from data_gen.passes import recording
@@ -16,19 +16,6 @@ from data_gen.paths.streams import sample_streams
 from data_gen.paths.vertex import Materials
 from data_gen.samplers import find
 from data_gen.samplers.photons.map.trace import trace
-
-
-def passes(scene, n, pixels=1, sampler="ppm", net=0, **options):
-    """The layers of ``n`` first passes, each with its own seed, prepared once; a ``net`` of 1 is what renders have."""
-    sample, sensor = find(sampler).made(scene, **options), scene.sensors()[0]
-    stacks = []
-    with far_shifts(pixels), recording():
-        for seed in range(n):
-            film = GradientFilm(*(int(n) for n in sensor.film().crop_size()), batches=True)
-            sample(CameraSamples(sensor, seed, 1, net=net), film)
-            film.end_pass(1)
-            stacks.append(film.develop())
-    return stacks
 
 
 def assert_alike(images, references, block, share=0.03):

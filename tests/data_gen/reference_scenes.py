@@ -17,21 +17,6 @@ LARGE, SMALL = (32, 32), (16, 16)
 BUILTIN = ["diffuse", "glossy", "environment", "lens"]
 PATHS = [*BUILTIN, "glass", "hidden_lamp", "plenty", "leaf", "fog", "within_fog", "caustics", "under_the_sky"]
 PATHS += ["courtyard"]
-QUICK = {*BUILTIN, "glass", "hidden_lamp", "plenty", "leaf", "within_fog", "caustics", "courtyard", "sky", "areas"}
-QUICK |= {
-    "curtains",
-    "few_edges",
-    "panels",
-    "everything",
-    "gallery: flat",
-    "haze",
-    "colours",
-    "colours by mis",
-    "before_the_sky",
-    "lamp_alone",
-}
-QUICK |= {"coloured_smoke", "far plane, media True", "lit by all, fog False", "courtyard to 2", "courtyard to 3"}
-QUICK |= {f"{view}, media False" for view in ("principal point", "near plane", "principal point, crop")}
 # Of these ``path`` finds hardly any light, or none: references are by ``bdpt``.
 BENT = ["by_a_point", "by_the_sun", "by_a_wall", "under_a_sky", "lacquered", "caustics", "glass", "glossy"]
 MEDIA = ["haze", "forward", "colours", "dense", "milk", "nested", "smoke", "coloured_smoke", "before_the_sky"]
@@ -79,9 +64,4 @@ def listed():
     yield from ((variant, "lens", "lens", (24, 24), None) for variant in (SPECTRAL, MONO))
 
 
-def quick_first(row):
-    """Rows of `make test` come first, so that a run that is broken off has them."""
-    return row[1] not in QUICK
-
-
-ALL = sorted(listed(), key=quick_first)
+ALL = [*listed()]

@@ -9,12 +9,11 @@ from data_gen_scenes import _scale
 from photon_laws import (
     assert_lamps_behind_grids_are_seen,
     assert_recorded_once,
-    passes,
     traced,
     world_of,
 )
 from renders import dr, mi
-from unbiased import load
+from unbiased import load, render_ours
 
 from data_gen.paths.light_ends import LightEnds
 from data_gen.samplers import find
@@ -163,7 +162,7 @@ def test_boundaries_within_one_medium_change_nothing(renderer):
         return media_scenes.haze() | {"cube": cube}
 
     whole, cut = (
-        passes(load(renderer, scene, (16, 16)), 3, 1, "bre", radius=1.0, photons=8)
+        render_ours(load(renderer, scene, (16, 16)), "bre", 3, 1, radius=1.0, photons=8)
         for scene in (media_scenes.haze, crossed)
     )
     whole, cut = (np.mean([stack["primal"] for stack in stacks], axis=0) for stacks in (whole, cut))

@@ -54,12 +54,23 @@ def render_ours(scene, sampler, batches=16, spp=64, pixels=1, seed=0, **options)
         return [stack.layers for stack in stacks_of(scene, sampler, batches, spp, seed, **options)]
 
 
+class Once:
+    """Makes the sampler of a scene once. ``data_gen.samplers.reused.Made`` does not keep samplers that have batches."""
+
+    def sampler(self, entry, scene, options):
+        if not hasattr(self, "made"):
+            self.made = entry.make(scene, **options)
+        return self.made
+
+    def keep(self, *_):
+        pass
+
+
 def stacks_of(scene, sampler, batches, spp, seed=0, **options):
     """Independent unbiased stacks, of seeds from ``seed`` on. Their kernels are recorded once."""
     from data_gen.render import render_stack
-    from data_gen.samplers.reused import Made
 
-    options |= {"unbiased": True, "made": Made()}
+    options |= {"unbiased": True, "made": Once()}
     return [render_stack(scene, spp, seed + i, sampler, **options) for i in range(batches)]
 
 
@@ -92,26 +103,28 @@ def right_integrator(mi, scene):
     return integrator
 
 
-def gradient_tests(stacks, references, level=0.01, pixels=1):
-    """(name, z-test) of the primal and of any gradients, those of the light apart included; each at ``level``."""
-    yield "primal", z_test(np.stack([stack["primal"] for stack in stacks]), references, level=level)
-    if "dx" not in stacks[0]:
-        return
-    slopes = [differences(reference, pixels) for reference in references]
+def slopes(stacks, references, pixels):
+    """(name, ours, theirs) of dx and dy, the differences of the light apart included."""
+    theirs = [differences(reference, pixels) for reference in references]
     for axis, name in enumerate(("dx", "dy")):
         # The contract keeps some light out of dx and dy; its own differences put it back.
         ours = np.stack([stack[name] + differences(light_apart(stack), pixels)[axis] for stack in stacks])
-        yield name, z_test(ours, np.stack([slope[axis] for slope in slopes]), level=level)
+        yield name, ours, np.stack([slope[axis] for slope in theirs])
+
+
+def gradient_tests(stacks, references, level=0.01, pixels=1):
+    """(name, z-test) of the primal and of any gradients, each at ``level``."""
+    yield "primal", z_test(np.stack([stack["primal"] for stack in stacks]), references, level=level)
+    if "dx" in stacks[0]:
+        for name, ours, theirs in slopes(stacks, references, pixels):
+            yield name, z_test(ours, theirs, level=level)
 
 
 def sum_of_squares(stacks, references, pixels, block=4):
     """The probability of so large a sum of z² over blocks of grey pixels of dx and dy: it sees errors everywhere."""
     total, count = 0.0, 0
-    slopes = [differences(reference, pixels) for reference in references]
-    for axis, name in enumerate(("dx", "dy")):
-        ours = np.stack([stack[name] + differences(light_apart(stack), pixels)[axis] for stack in stacks])
-        theirs = np.stack([slope[axis] for slope in slopes])
-        result = z_test(*(images.mean(axis=-1, keepdims=True) for images in (ours, theirs)), block=block)
+    for _, *both in slopes(stacks, references, pixels):
+        result = z_test(*(images.mean(axis=-1, keepdims=True) for images in both), block=block)
         z = norm.isf(result.p / 2)[result.z != 0]
         total, count = total + (z**2).sum(), count + z.size
     return chi2.sf(total, count)
@@ -147,11 +160,8 @@ def failed_shifts(scene, name, spp=16):
 
     if not SAMPLERS[name].diagnoses:
         return 0.0
-    return float(
-        pass_through(render_stack(scene, spp, 0, name, diagnostics=True, unbiased=True))[
-            "diagnostics.shiftFailures"
-        ].mean()
-    )
+    stack = render_stack(scene, spp, 0, name, diagnostics=True, unbiased=True)
+    return float(pass_through(stack)["diagnostics.shiftFailures"].mean())
 
 
 def assert_unbiased(stacks, references, level=0.01, pixels=1, about=""):

@@ -14,7 +14,7 @@ from data_gen.scenes.facts import Facts
 from ngpt.testing import z_test
 
 
-@pytest.mark.parametrize("sampler", ["gpt", slow("gpt-simple"), slow("bdpt"), slow("gbdpt")])
+@pytest.mark.parametrize("sampler", ["gpt", slow("gpt-simple"), slow("bdpt")])
 def test_furnace(renderer, sampler):
     """Up to forty vertices in a closed ball, where roulette ends most paths."""
     stacks = render_ours(load(renderer, furnace, (16, 16)), sampler, batches=12, spp=32)
@@ -70,9 +70,8 @@ def shortened(scene, depth):
     return scene | {"integrator": scene["integrator"] | {"max_depth": depth}}
 
 
-@pytest.mark.parametrize("depth", [2, -1])
-def test_light_of_longer_paths_is_that_of_mitsuba(renderer, depth):
-    scene = load(renderer, shortened(polished(0.3), depth), (12, 12))
+def test_light_of_paths_of_two_edges_is_that_of_mitsuba(renderer):
+    scene = load(renderer, shortened(polished(0.3), 2), (12, 12))
     stacks = render_ours(scene, "gpt", 1, 64)
     assert stacks[0]["dx"].any()
     assert stacks[0]["primal"].mean() == pytest.approx(np.array(renderer.render(scene, spp=256)).mean(), rel=0.05)

@@ -69,9 +69,9 @@ def test_where_there_are_no_media_points_on_surfaces_do():
         find("bre", Facts("volpath", ()))
 
 
-@pytest.mark.parametrize(("sampler", "option", "memory"), [("ppm", "photons", 400), ("vcm", "joined_depth", 50)])
+@pytest.mark.parametrize(("sampler", "option", "memory"), [("ppm", "photons", 100), ("vcm", "joined_depth", 13)])
 def test_maps_larger_than_memory_are_refused_with_what_fits(renderer, sampler, option, memory):
-    scene = load(renderer, "diffuse", (128, 128))
+    scene = load(renderer, "diffuse", (64, 64))
     with pytest.raises(NgptError, match=rf"pass --memory \d+, or .* or no more than -O {option}=\d+") as caught:
         render_stack(scene, 1, 0, sampler, memory=memory, unbiased=True, **{option: 64})
     words = str(caught.value)
@@ -79,4 +79,4 @@ def test_maps_larger_than_memory_are_refused_with_what_fits(renderer, sampler, o
     assert 1 < fits < 64 and needed > memory
     render_stack(scene, 1, 0, sampler, memory=memory, unbiased=True, **{option: fits})
     with pytest.raises(NgptError, match=r"render a smaller image$"):
-        render_stack(scene, 1, 0, sampler, memory=20, unbiased=True)
+        render_stack(scene, 1, 0, sampler, memory=5, unbiased=True)
