@@ -2,25 +2,13 @@
 
 import numpy as np
 import pytest
+from ply_files import square
+from unbiased import stacks_of
 
 from data_gen.scenes.load import load_scene
 from ngpt.testing import z_test
 
 SIZE, COUNT = (48, 32), 300
-QUAD = """ply
-format ascii 1.0
-element vertex 4
-property float x
-property float y
-property float z
-{names}element face 2
-property list uchar int vertex_indices
-end_header
-{corners}
-3 0 1 2
-3 0 2 3
-"""
-NORMALS = "property float nx\nproperty float ny\nproperty float nz\n"
 CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 RGB = '<emitter type="area"><rgb name="radiance" value="{}"/></emitter>'
 # What may stand where a lamp's shape begins: 300 lamps of these kinds in turn face down, or to all sides (cubes)
@@ -35,12 +23,12 @@ KINDS = [
 ]
 
 
-def write_quads(folder):
-    """A square, and one whose vertex normals are against the order of its corners."""
-    for name, names, more in (("plain", "", ""), ("against", NORMALS, " 0 0 -1"), ("bent", NORMALS, None)):
-        tips = [f" {0.8 * x} {0.8 * y} 1" if more is None else more for x, y in CORNERS]
-        corners = "\n".join(f"{x} {y} 0{tip}" for (x, y), tip in zip(CORNERS, tips, strict=True))
-        (folder / f"{name}.ply").write_text(QUAD.format(names=names, corners=corners))
+def write_squares(folder):
+    """A square, and two with vertex normals: against the order of the corners, and bent."""
+    corners = [(x, y, 0) for x, y in CORNERS]
+    bent = [(0.8 * x, 0.8 * y, 1) for x, y in CORNERS]
+    for name, normals in (("plain", ()), ("against", 4 * [(0, 0, -1)]), ("bent", bent)):
+        (folder / f"{name}.ply").write_text(square(corners, normals))
 
 
 def lamp(i, rng, kind=None, material="", emitter=None):
@@ -53,7 +41,7 @@ def lamp(i, rng, kind=None, material="", emitter=None):
 
 
 def written(folder, lamps, more="", depth=3):
-    write_quads(folder)
+    write_squares(folder)
     path = folder / "scene.xml"
     path.write_text(
         f'<scene version="3.0.0"><integrator type="path"><integer name="max_depth" value="{depth}"/></integrator>'
@@ -93,21 +81,22 @@ def test_each_shines_to_its_own_side_with_its_own_light(renderer, many):
 
 @pytest.fixture(scope="module")
 def expected(renderer, many):
-    scene = load_scene(many, SIZE, merged=False)
-    return np.stack([np.array(renderer.render(scene, spp=32, seed=100 + i)) for i in range(12)])
+    return by_path(renderer, load_scene(many, SIZE, merged=False), 48, 100)
+
+
+def by_path(mi, scene, spp, seed):
+    return np.stack([np.array(mi.render(scene, spp=spp, seed=seed + i)) for i in range(8)])
 
 
 @pytest.mark.parametrize(
     "sampler", ["path", "bdpt", *(pytest.param(s, marks=pytest.mark.slow) for s in ("primal", "gpt"))]
 )
 def test_their_light_is_that_of_the_file(renderer, many, expected, sampler):
-    from data_gen.render import render_stack
-
     scene = load_scene(many, SIZE)
     if sampler == "path":
-        images = np.stack([np.array(renderer.render(scene, spp=32, seed=i)) for i in range(8)])
+        images = by_path(renderer, scene, 32, 0)
     else:
-        images = np.stack([render_stack(scene, 16, i, sampler, unbiased=True).layers["primal"] for i in range(8)])
+        images = np.stack([stack["primal"] for stack in stacks_of(scene, sampler, 8, 16)])
     result = z_test(images, expected, block=8)
     assert result.passed, result
     assert images.mean() == pytest.approx(expected.mean(), rel=0.02)

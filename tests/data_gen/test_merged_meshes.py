@@ -5,31 +5,21 @@ import sys
 
 import numpy as np
 import pytest
+from ply_files import square
 
 from data_gen.scenes.load import load_scene
 from ngpt.errors import NgptError
 
-QUAD = """ply
-format ascii 1.0
-element vertex 4
-property float x
-property float y
-property float z
-{normals}element face 2
-property list uchar int vertex_indices
-end_header
-{vertices}
-3 0 1 2
-3 0 2 3
-"""
+SCENE = """<scene version="3.0.0"><integrator type="volpath"/><emitter type="constant"/>
+<sensor type="perspective"><float name="fov" value="60"/><transform name="to_world">
+<lookat origin="2,1,9" target="0,0,0" up="0,1,0"/></transform>
+<film type="hdrfilm"><integer name="width" value="48"/><integer name="height" value="12"/></film></sensor>{}</scene>"""
 
 
-def quad(x: float, smooth: bool = False) -> str:
-    """A wall of a side of 1 at ``x``, whose corners have normals of their own or none."""
-    corners = [(x, -0.5), (x + 1, -0.5), (x + 1, 0.5), (x, 0.5)]
-    more = " 0.1 0 0.995" if smooth else ""
-    names = "property float nx\nproperty float ny\nproperty float nz\n" if smooth else ""
-    return QUAD.format(normals=names, vertices="\n".join(f"{a} {b} 0{more}" for a, b in corners))
+def wall(x: float, smooth: bool = False) -> str:
+    """A square of a side of 1 at ``x``, whose corners have normals of their own or none."""
+    corners = [(x, -0.5, 0), (x + 1, -0.5, 0), (x + 1, 0.5, 0), (x, 0.5, 0)]
+    return square(corners, 4 * [(0.1, 0, 0.995)] if smooth else ())
 
 
 def shape(name: str, inside: str) -> str:
@@ -48,19 +38,17 @@ def scene_file(tmp_path):
     fog = green + '<medium type="homogeneous" name="interior"/>'
     inside = {"a": red, "b": green, "c": red, "lamp": lamp, "smooth": red, "d": green, "fog": fog}
     for i, name in enumerate(inside):
-        (tmp_path / f"{name}.ply").write_text(quad(1.2 * i - 4.2, name == "smooth"))
+        (tmp_path / f"{name}.ply").write_text(wall(1.2 * i - 4.2, name == "smooth"))
     shapes = "".join(shape(name, text) for name, text in inside.items())
-    camera = (
-        '<sensor type="perspective"><float name="fov" value="60"/><transform name="to_world">'
-        '<lookat origin="0,0,8" target="0,0,0" up="0,1,0"/></transform>'
-        '<film type="hdrfilm"><integer name="width" value="48"/><integer name="height" value="12"/></film></sensor>'
-    )
     path = tmp_path / "scene.xml"
-    path.write_text(
-        '<scene version="3.0.0"><integrator type="volpath"/><emitter type="constant"/>'
-        f"{camera}{bsdf('red', '.7,.2,.2')}{bsdf('green', '.2,.7,.2')}{shapes}</scene>"
-    )
+    path.write_text(SCENE.format(f"{bsdf('red', '.7,.2,.2')}{bsdf('green', '.2,.7,.2')}{shapes}"))
     return path
+
+
+def views(mi, scene):
+    """What the camera sees: normals, texture coordinates, depths and colours; the first channel is the normal's x."""
+    integrator = mi.load_dict({"type": "aov", "aovs": "n:sh_normal,g:geo_normal,u:uv,d:depth,a:albedo"})
+    return np.array(mi.render(scene, integrator=integrator, spp=4, seed=1))
 
 
 def test_meshes_of_one_material_are_one(renderer, scene_file):
@@ -72,12 +60,10 @@ def test_meshes_of_one_material_are_one(renderer, scene_file):
     assert len(merged.shapes()) in (4, 5)
     kept = [s for s in merged.shapes() if s.id() in ("lamp", "fog")]
     assert kept[0].is_emitter() and kept[1].is_medium_transition() and len(merged.emitters()) == 2
-
-
-INLINE = """<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/>
-<sensor type="perspective"><float name="fov" value="60"/><transform name="to_world">
-<lookat origin="2,1,9" target="0,0,0" up="0,1,0"/></transform>
-<film type="hdrfilm"><integer name="width" value="48"/><integer name="height" value="12"/></film></sensor>{}</scene>"""
+    before, after = views(renderer, plain), views(renderer, merged)
+    # The smooth one turns its normal, the flat ones do not.
+    assert 0.01 < (np.abs(before[..., 0]) > 0.05).mean() < 0.3
+    assert np.allclose(before, after, atol=1e-5)
 
 
 def inline(x, kind="cube", color=".7,.2,.2", more=""):
@@ -87,19 +73,16 @@ def inline(x, kind="cube", color=".7,.2,.2", more=""):
 
 
 def test_equal_materials_are_one_and_shapes_keep_the_order_of_the_file(renderer, tmp_path):
-    import mitsuba as mi
-
     path, green = tmp_path / "scene.xml", ".2,.7,.2"
     lamp = '<emitter type="area"><rgb name="radiance" value="2"/></emitter>'
     shapes = [inline(-4), inline(-3, color=green), inline(-2, "rectangle"), inline(-1, "sphere"), inline(0)]
     shapes += [inline(1, "rectangle", green), inline(2, more=lamp), inline(3, "rectangle"), inline(4, color="0,0,.1")]
-    path.write_text(INLINE.format("".join(shapes)))
-    views = mi.load_dict({"type": "aov", "aovs": "n:sh_normal,g:geo_normal,u:uv,d:depth,a:albedo"})
+    path.write_text(SCENE.format("".join(shapes)))
     images = []
     for merged in (True, False):
         scene = load_scene(str(path), merged=merged)
         assert np.allclose(scene.bbox().min, (-4.546, -0.4, -0.546), atol=1e-3)
-        images.append(np.array(mi.render(scene, integrator=views, spp=4, seed=1)))
+        images.append(views(renderer, scene))
         if merged:
             # Red: two cubes and two rectangles. Green: a cube and a rectangle. The sphere, the lamp, the last cube
             assert [shape.primitive_count() for shape in scene.shapes()] == [28, 14, 1, 12, 12]
@@ -110,11 +93,9 @@ def test_many_meshes_are_merged_in_pairs(renderer, tmp_path, monkeypatch):
     """Each is copied as often as they can be halved. One after the other, the time grows with the square."""
     from data_gen.scenes import merge
 
-    (tmp_path / "it.ply").write_text(quad(0))
+    (tmp_path / "it.ply").write_text(wall(0))
     path = tmp_path / "scene.xml"
-    path.write_text(
-        INLINE.format(bsdf("red", ".7,.2,.2") + 33 * shape("it", '<ref id="red"/>').replace(' id="it"', ""))
-    )
+    path.write_text(SCENE.format(bsdf("red", ".7,.2,.2") + 33 * shape("it", '<ref id="red"/>').replace(' id="it"', "")))
     halves, known = [], merge._in_pairs
 
     def spied(state, meshes):
@@ -135,50 +116,30 @@ GROUP = """<shape type="shapegroup" id="group">{}</shape>
 
 def test_instances_of_small_groups_are_meshes(renderer, tmp_path, monkeypatch):
     """And so they share the shape of their material, which is recorded once, not once for each."""
-    import mitsuba as mi
-
     path = tmp_path / "scene.xml"
-    (tmp_path / "it.ply").write_text(quad(0.5, smooth=True))
+    (tmp_path / "it.ply").write_text(wall(0.5, smooth=True))
     smooth = shape("it", bsdf("green", ".2,.7,.2"))
-    path.write_text(INLINE.format(GROUP.format(inline(0) + smooth) + inline(3)))
-    views = mi.load_dict({"type": "aov", "aovs": "n:sh_normal,g:geo_normal,u:uv,d:depth,a:albedo"})
+    path.write_text(SCENE.format(GROUP.format(inline(0) + smooth) + inline(3)))
     images = []
     for merged, kinds in ((True, ["Mesh", "Mesh"]), (False, ["Instance", "Instance", "Cube"])):
         scene = load_scene(str(path), merged=merged)
         assert [shape.class_name() for shape in scene.shapes()] == kinds
-        images.append(np.array(mi.render(scene, integrator=views, spp=4, seed=1)))
+        images.append(views(renderer, scene))
     assert images[0][..., 0].max() > 0 and np.allclose(*images, atol=1e-4)
     ball = inline(1, "sphere")
     for inside, most in ((inline(0), 1000), (inline(0) + ball, 1 << 24)):
         monkeypatch.setattr("data_gen.scenes.merge._MOST_BYTES", most)
-        path.write_text(INLINE.format(GROUP.format(inside)))
+        path.write_text(SCENE.format(GROUP.format(inside)))
         assert [shape.class_name() for shape in load_scene(str(path)).shapes()] == ["Instance"] * 2
-
-
-def test_it_is_the_same_scene(renderer, scene_file):
-    import mitsuba as mi
-
-    views = mi.load_dict({"type": "aov", "aovs": "n:sh_normal,g:geo_normal,u:uv,d:depth,a:albedo"})
-    images = [
-        np.array(mi.render(load_scene(str(scene_file), merged=merged), integrator=views, spp=4, seed=1))
-        for merged in (True, False)
-    ]
-    assert images[0][..., 0].max() > 0
-    # The smooth one turns its normal, the flat ones do not.
-    assert 0.01 < (np.abs(images[0][..., 0]) > 0.05).mean() < 0.3
-    assert np.allclose(*images, atol=1e-5)
 
 
 def test_a_scene_of_nothing_else_has_its_bounds(renderer, tmp_path):
     """Mitsuba loses the bounds of rectangles that it merges by itself, and with them the sky's sphere."""
     for i, name in enumerate("abc"):
-        (tmp_path / f"{name}.ply").write_text(quad(1.2 * i))
+        (tmp_path / f"{name}.ply").write_text(wall(1.2 * i))
     shapes = "".join(shape(name, '<ref id="red"/>') for name in "abc")
     path = tmp_path / "scene.xml"
-    path.write_text(
-        '<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/><sensor type="perspective"/>'
-        f"{bsdf('red', '.7,.2,.2')}{shapes}</scene>"
-    )
+    path.write_text(SCENE.format(bsdf("red", ".7,.2,.2") + shapes))
     scene = load_scene(str(path))
     assert len(scene.shapes()) == 1
     assert np.allclose(scene.bbox().min, (0, -0.5, 0)) and np.allclose(scene.bbox().max, (3.4, 0.5, 0))

@@ -24,25 +24,33 @@ THEIRS = re.compile(r".+_([0-9]+(spp)?|ref|reference|gt|target)\.(hdr|ldr|sh1[xy
 SAMPLES = [2, 16, 16, 300]
 
 
+def crop(number):
+    """A crop with a stack of each of ``SAMPLES``, whose reference is ``number`` + 1."""
+    stacks = [full_stack(12, 10, seed=10 * number + k) for k in range(len(SAMPLES))]
+    reference = np.full((12, 10, 3), 1 + number, np.float32)
+    return CropData([stack.replace(direct=0 * stack["primal"]) for stack in stacks], SAMPLES, reference, 0 * reference)
+
+
 def stand_in(config, job, folder, variant):
-    made = []
-    for number in job.crops:
-        stacks = [full_stack(12, 10, seed=10 * number + k) for k in range(len(SAMPLES))]
-        stacks = [stack.replace(direct=0 * stack["primal"]) for stack in stacks]
-        reference = np.full((12, 10, 3), 1 + number, np.float32)
-        made.append(CropData(stacks, SAMPLES, reference, 0 * reference))
-    told = [{"crop": crop, "spp": SAMPLES, "seconds": {}} for crop in job.crops]
-    write_shard(Path(folder) / job.file, made, {"scene": job.scene, "crops": told, "failures": []})
+    """As ``jobs.make_shard``: a shard of crops, or of frames where the configuration asks for them."""
+    frames = [{"frame": frame} for frame in range(config.frames)] if config.frames > 1 else [{}]
+    told = [{"crop": n, "spp": SAMPLES, "seconds": {}} | frame for n in job.crops for frame in frames]
+    record = {"scene": job.scene, "crops": told, "failures": []}
+    write_shard(Path(folder) / job.file, [crop(each["crop"]) for each in told], record)
     return job.file
 
 
 @pytest.fixture
 def dataset(tmp_path, monkeypatch):
-    """Runs ``ngpt dataset --layout oidn`` for three scenes with two crops each."""
+    """Runs ``ngpt dataset --layout oidn`` for three scenes with two crops each; returns its status."""
     monkeypatch.setattr(jobs, "make_shard", stand_in)
-    (tmp_path / "set.toml").write_text("scenes = 3\ncrops = 2\ncrops_per_shard = 2\ninputs = 4\nspp = [2, 300]\n")
-    command = ["dataset", "--config", str(tmp_path / "set.toml"), "--out", str(tmp_path / "set"), "--layout", "oidn"]
-    return lambda *more: main([*command, *more])
+
+    def run(*more, settings="scenes = 3\ncrops = 2\ncrops_per_shard = 2\ninputs = 4\nspp = [2, 300]\n"):
+        (tmp_path / "set.toml").write_text(settings)
+        files = ["--config", str(tmp_path / "set.toml"), "--out", str(tmp_path / "set")]
+        return main(["dataset", *files, "--layout", "oidn", *more])
+
+    return run
 
 
 def test_names_and_pixels(dataset, tmp_path, capsys):
@@ -92,18 +100,6 @@ def test_parts_write_it_when_all_is_made_and_files_stay(dataset, tmp_path, capsy
     assert {path for path in files if files[path] != again[path]} == {lost}
 
 
-def test_shots_are_refused(tmp_path, monkeypatch, capsys):
-    def shots(config, job, folder, variant):
-        stack = full_stack(12, 10)
-        stack = stack.replace(direct=0 * stack["primal"])
-        light = np.ones((12, 10, 3), np.float32)
-        frames = [CropData([stack], [2], light, 0 * light) for _ in range(2)]
-        told = [{"crop": 0, "spp": [2], "seconds": {}, "frame": frame} for frame in range(2)]
-        write_shard(Path(folder) / job.file, frames, {"scene": job.scene, "crops": told, "failures": []})
-        return job.file
-
-    monkeypatch.setattr(jobs, "make_shard", shots)
-    (tmp_path / "set.toml").write_text("scenes = 1\ncrops = 1\nframes = 2\ninputs = 1\n")
-    command = ["dataset", "--config", str(tmp_path / "set.toml"), "--out", str(tmp_path / "set"), "--layout", "oidn"]
-    assert main(command) == 1
+def test_shots_are_refused(dataset, capsys):
+    assert dataset(settings="scenes = 1\ncrops = 1\nframes = 2\ninputs = 4\n") == 1
     assert "is a set of shots, and Open Image Denoise trains on single images" in capsys.readouterr().err

@@ -13,8 +13,8 @@ from ngpt.system.install import install_command
 pytest.importorskip("mitsuba")
 
 from data_gen.render import render_stack
-from data_gen.samplers import SAMPLERS, find
-from data_gen.scenes.facts import scene_facts
+from data_gen.samplers import SAMPLERS
+from data_gen.scenes.facts import Facts
 from data_gen.scenes.load import load_scene
 
 LOADED = (
@@ -45,55 +45,56 @@ ORDERS = {
     "import mitsuba as mi; assert mi.variant() is None; mi.set_variant('llvm_ad_rgb')\n" + LOADED,
     "Mitsuba first": "import mitsuba as mi; import data_gen; mi.set_variant('llvm_ad_rgb')\n" + LOADED,
     "variant first": "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import data_gen\n" + LOADED,
-    "variants there and back": f"NAMES = 'gpt', 'gpt-basic', 'ppm', 'bre', 'vcm'\n{THERE_AND_BACK}" + RENDERED,
-    "by our own way": "import data_gen; data_gen.use_variant()\nimport mitsuba as mi\n" + LOADED,
 }
 
 
-def run(code):
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+def assert_runs(code):
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert told.returncode == 0, told.stderr[-3000:]
+    return told.stdout
 
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_they_are_there_whatever_comes_first(renderer, order):
-    told = run(ORDERS[order])
-    assert told.returncode == 0, told.stderr[-3000:]
+    assert_runs(ORDERS[order])
+
+
+def test_they_are_there_whatever_the_variants(renderer):
+    assert_there_whatever_the_variants("gpt", "gpt-basic", "ppm", "bre", "vcm")
 
 
 def assert_there_whatever_the_variants(*names):
-    told = run(f"NAMES = {names}\n{THERE_AND_BACK}" + RENDERED)
-    assert told.returncode == 0, told.stderr[-3000:]
+    assert_runs(f"NAMES = {names}\n{THERE_AND_BACK}{RENDERED}")
 
 
 def test_without_mitsuba_the_package_is_imported():
-    told = run(
+    told = assert_runs(
         "import sys; sys.modules['mitsuba'] = None\nimport data_gen\n"
         "try: data_gen.render_scene('diffuse')\nexcept data_gen.session.NgptError as error: print(error)\n"
     )
-    assert install_command("render") in told.stdout, told.stderr
+    assert install_command("render") in told
 
 
-def test_each_renders_what_its_sampler_does(renderer):
-    scene = load_scene("diffuse", (8, 8))
-    none = []
-    for name, entry in SAMPLERS.items():
-        if not entry.module:
-            continue
-        own = {"integrator": scene.integrator()} if name == "gpt-basic" else {"max_depth": 8}
-        try:
-            integrator = renderer.load_dict({"type": entry.plugin, **own})
-        except RuntimeError as error:
-            assert "is no integrator of Mitsuba; use data_gen.render_scene" in str(error)
-            none.append(name)
-            continue
-        assert str(integrator).startswith(f"{type(integrator).__name__}[")
-        if find(name).refuses(scene_facts(scene)):
-            continue
-        spp = max(2, 2 * entry.batch)
-        stack = ngpt.GradientStack.from_aovs(integrator.render(scene, spp=spp), integrator.aov_names())
-        expected = render_stack(scene, spp, 0, name, unbiased=True)
-        assert all(np.array_equal(stack[layer], expected[layer], equal_nan=True) for layer in stack.names), name
-    assert {name for name in none if SAMPLERS[name].standing != "study"} == {"primal"}
+# Those of studies are covered by the tests of studies.
+ON_SURFACES = [n for n, e in SAMPLERS.items() if e.standing != "study" and not e.refuses(Facts("path", ()))]
+PLUGINS = sorted({*ON_SURFACES} - {"primal"})
+
+
+@pytest.mark.parametrize("name", PLUGINS)
+def test_each_renders_what_its_sampler_does(renderer, name):
+    scene, entry = load_scene("diffuse", (8, 8)), SAMPLERS[name]
+    own = {"integrator": scene.integrator()} if name == "gpt-basic" else {"max_depth": 8}
+    integrator = renderer.load_dict({"type": entry.plugin, **own})
+    assert str(integrator).startswith(f"{type(integrator).__name__}[")
+    spp = max(2, 2 * entry.batch)
+    stack = ngpt.GradientStack.from_aovs(integrator.render(scene, spp=spp), integrator.aov_names())
+    expected = render_stack(scene, spp, 0, name, unbiased=True)
+    assert all(np.array_equal(stack[layer], expected[layer], equal_nan=True) for layer in stack.names)
+
+
+def test_one_that_is_no_integrator_says_so(renderer):
+    with pytest.raises(RuntimeError, match=r"is no integrator of Mitsuba; use data_gen.render_scene"):
+        renderer.load_dict({"type": "primal"})
 
 
 def test_a_tensor_that_is_no_stack_is_told_why():

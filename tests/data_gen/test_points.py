@@ -6,7 +6,7 @@ from data_gen_scenes import fog
 from renders import dr, mi
 from scipy.ndimage import uniform_filter
 from scipy.stats import kstest
-from unbiased import load
+from unbiased import load, same, stacks_of
 
 from data_gen.film import GradientFilm
 from data_gen.film.claims import box_means, factors
@@ -112,7 +112,7 @@ def test_points_take_noise_away(renderer):
     """Of pixels, and more of blocks; that they take no light, see ``laws``."""
     scene, found = load(renderer, "diffuse", (24, 16)), []
     for points in ("sobol", "independent"):
-        stacks = [render_stack(scene, 16, seed, "gpt", points=points, unbiased=True) for seed in range(16)]
+        stacks = stacks_of(scene, "gpt", 16, 16, points=points)
         found.append({name: np.array([stack[name] for stack in stacks], np.float64) for name in ("primal", "dx")})
     for layer, most, of_blocks in (("primal", 0.9, 0.75), ("dx", 0.98, np.inf)):
         images = [layers[layer] for layers in found]
@@ -133,7 +133,7 @@ def test_a_render_by_time_can_be_had_again_by_its_number_of_samples(renderer):
     timed = render_stack(scene, None, 2, "gpt", seconds=60, stop=stop, unbiased=True)
     assert timed.attributes["ngpt:samplerOptions"] == "points=rounds"
     again = render_stack(scene, timed.attributes["ngpt:spp"], 2, "gpt", points="rounds", unbiased=True)
-    assert all(np.array_equal(timed[layer], again[layer], equal_nan=True) for layer in again.names)
+    same(timed, again)
 
 
 # ------------------------- What variances claim -------------------------
@@ -150,7 +150,7 @@ def test_images_of_one_row_or_column_have_no_differences_in_them(renderer, rng):
         assert np.isfinite(layers["dx_var"]).all() and layers["dx"].shape == (height, width, 3)
 
 
-@pytest.mark.parametrize("shape", [(36, 64), (5, 4), (1, 7), (0, 7)])
+@pytest.mark.parametrize("shape", [(36, 64), (1, 7), (0, 7)])
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 def test_box_means_are_those_of_scipy_to_the_bit(renderer, rng, shape, kind):
     image = rng.gamma(0.2, size=shape).astype(kind)
@@ -158,24 +158,14 @@ def test_box_means_are_those_of_scipy_to_the_bit(renderer, rng, shape, kind):
         assert np.array_equal(box_means(image, size), uniform_filter(image, size))
 
 
+CLAIMS = [("primal", "glossy", (48, 32), 17), ("gpt", "glossy", (48, 32), 17)]
+# Over passes of one sample: just after half of a net, where the claim was 0.7 of the noise
+CLAIMS += [("ppm", "diffuse", (48, 32), 17)]
+SLOW = [("bdpt", "diffuse", (64, 40), 12), ("vcm", "diffuse", (64, 40), 17), ("bre", fog, (32, 24), 17)]
+
+
 @pytest.mark.parametrize(
-    ("sampler", "scene", "size", "spp"),
-    [
-        ("primal", "glossy", (48, 32), 17),
-        ("gpt", "glossy", (48, 32), 17),
-        # Over passes of one sample: just after half of a net, where the claim was 0.7 of the noise
-        ("ppm", "diffuse", (64, 40), 17),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in (
-                ("ppm", "diffuse", (64, 40), 9),
-                ("bdpt", "diffuse", (64, 40), 12),
-                ("vcm", "diffuse", (64, 40), 9),
-                ("vcm", "diffuse", (64, 40), 17),
-                ("bre", fog, (32, 24), 17),
-            )
-        ),
-    ],
+    ("sampler", "scene", "size", "spp"), [*CLAIMS, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)]
 )
 def test_claims_are_those_over_seeds(renderer, sampler, scene, size, spp):
     assert_claims_are_those_over_seeds(renderer, sampler, scene, size, spp)
@@ -183,7 +173,7 @@ def test_claims_are_those_over_seeds(renderer, sampler, scene, size, spp):
 
 def assert_claims_are_those_over_seeds(renderer, sampler, scene, size, spp):
     scene, options = load(renderer, scene, size), {"features": False} if sampler == "primal" else {}
-    stacks = [render_stack(scene, spp, seed, sampler, unbiased=True, **options) for seed in range(16)]
+    stacks = stacks_of(scene, sampler, 10, spp, **options)
     for layer in ("primal", "dx", "dy", "caustic"):
         if layer in stacks[0].names:
             part = "caustic" if layer == "primal" and "caustic" in stacks[0].names else None
@@ -199,7 +189,7 @@ def assert_claims_are_those_over_seeds(renderer, sampler, scene, size, spp):
 
 def test_noise_of_features_is_that_over_seeds(renderer):
     scene = load(renderer, "lens", (64, 40))
-    stacks = [render_stack(scene, 16, seed, "primal", unbiased=True) for seed in range(8)]
+    stacks = stacks_of(scene, "primal", 8, 16)
     seen = max(np.var([s[name] for s in stacks], axis=0, ddof=1).mean() for name in ("albedo", "normal"))
     told = np.mean([stack.attributes["ngpt:featureNoise"] for stack in stacks])
     assert 0.5 < seen / told < 2
@@ -257,9 +247,10 @@ def check_claims(stacks):
 
 
 @pytest.mark.parametrize("n", [7, 16, 17, 31, 65, 129])
-@pytest.mark.parametrize("kind", ["sobol", "rounds", "cut"])
-def test_claims_hold_at_any_number_of_samples(renderer, kind, n):
-    net = 4096 if kind == "cut" else streams.first_round(kind, n)
+@pytest.mark.parametrize("net", [16, 4096, None])
+def test_claims_hold_at_any_number_of_samples(renderer, net, n):
+    """In rounds, in a part of a net, and in the net that is made for this number."""
+    net = net or streams.first_round("sobol", n)
     check_claims([evenly(seed, n, net) for seed in range(8)])
 
 
@@ -389,14 +380,10 @@ def test_weights_that_a_scene_gives_are_honoured(renderer):
         assert sorted(float(scene.pdf_emitter(i)[0]) for i in range(3)) == [0, 0.25, 0.75]
 
 
-@pytest.mark.parametrize("sampler", ["gpt", pytest.param("gbdpt", marks=pytest.mark.slow)])
-def test_lamps_take_noise_away_and_no_light(renderer, sampler):
+def test_lamps_take_noise_away_and_no_light(renderer):
     scene, found = load(renderer, room()), []
     for lamps in ("power", "uniform"):
-        stacks = [
-            render_stack(scene, 16, seed, sampler, points="independent", lamps=lamps, unbiased=True)
-            for seed in range(16)
-        ]
+        stacks = stacks_of(scene, "gpt", 16, 16, points="independent", lamps=lamps)
         found.append(np.array([stack["primal"] for stack in stacks], np.float64).mean(axis=-1))
     better, before = (np.median(images.var(axis=0, ddof=1)) for images in found)
     assert better < 0.6 * before
@@ -442,7 +429,7 @@ def test_light_of_a_lamp_that_is_chosen_never_is_found_or_refused(renderer, ligh
             render_stack(scene, 1, 0, sampler, unbiased=True)
         return
     spp = 3 if SAMPLERS[sampler].batch == 1 else 16
-    means = np.array([render_stack(scene, spp, seed, sampler, unbiased=True)["primal"].mean() for seed in range(8)])
+    means = np.array([stack["primal"].mean() for stack in stacks_of(scene, sampler, 8, spp)])
     z = (means.mean() - light_of_box.mean()) / np.sqrt((means.var(ddof=1) + light_of_box.var(ddof=1)) / 8)
     # About p = 0.001 of so few images
     assert abs(z) < 5 and abs(means.mean() / light_of_box.mean() - 1) < 0.1
