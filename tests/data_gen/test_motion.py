@@ -2,15 +2,13 @@
 
 import numpy as np
 import pytest
+from renders import mi
 from unbiased import load
-
-from ngpt.errors import NgptError
-
-pytest.importorskip("mitsuba")
 
 from data_gen.frames.motion import motion_vectors, seen, snapshot
 from data_gen.scenes.geometry import Mesh, geometry, geometry_of, put_vertices, vertices, vertices_name
 from data_gen.scenes.load import set_film_size
+from ngpt.errors import NgptError
 
 SIZE = (32, 24)
 
@@ -19,7 +17,7 @@ def floats(*values):
     return [float(value) for value in values]
 
 
-def scene_of(mi, origin=(0, 0, 5), target=(0, 0, 0), **objects):
+def scene_of(origin=(0, 0, 5), target=(0, 0, 0), **objects):
     to_world = mi.ScalarTransform4f().look_at(origin=list(origin), target=list(target), up=[0, 1, 0])
     camera = {"type": "perspective", "fov": 30, "to_world": to_world}
     scene = load(mi, {"type": "scene", "sensor": camera, "light": {"type": "constant"}, **objects})
@@ -27,13 +25,13 @@ def scene_of(mi, origin=(0, 0, 5), target=(0, 0, 0), **objects):
     return scene
 
 
-def move_camera(mi, scene, origin, target):
+def move_camera(scene, origin, target):
     params = mi.traverse(scene.sensors()[0])
     params["to_world"] = mi.Transform4f().look_at(floats(*origin), floats(*target), floats(0, 1, 0))
     params.update()
 
 
-def wall(mi, z=0.0):
+def wall(z=0.0):
     return {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, z]).scale(20)}
 
 
@@ -42,7 +40,7 @@ def pixel_width(distance, fov=30):
     return 2 * distance * np.tan(np.radians(fov) / 2) / SIZE[0]
 
 
-def moved(mi, scene, change):
+def moved(scene, change):
     """Motion from the state of a scene to that after ``change``, which is thus the current one."""
     before = snapshot(scene)
     change()
@@ -51,26 +49,25 @@ def moved(mi, scene, change):
 
 @pytest.mark.parametrize("across, up", [(1, 0), (-2, 0.5)])
 def test_a_camera_that_moves_by_pixels_sees_a_wall_move_by_pixels(renderer, across, up):
-    scene = scene_of(renderer, wall=wall(renderer))
+    scene = scene_of(wall=wall())
     step = pixel_width(5)
     origin = (across * step, up * step, 5)
-    motion = moved(renderer, scene, lambda: move_camera(renderer, scene, origin, (*origin[:2], 0)))
+    motion = moved(scene, lambda: move_camera(scene, origin, (*origin[:2], 0)))
     # What the camera sees now it saw to the right of here before it moved to the right; y points down.
     assert np.allclose(motion, [across, -up], atol=1e-3)
 
 
 def test_a_sky_turns_with_the_camera_and_stays_when_that_moves(renderer):
-    scene = scene_of(renderer)
-    assert np.allclose(moved(renderer, scene, lambda: move_camera(renderer, scene, (3, 1, 5), (3, 1, 0))), 0, atol=1e-3)
+    scene = scene_of()
+    assert np.allclose(moved(scene, lambda: move_camera(scene, (3, 1, 5), (3, 1, 0))), 0, atol=1e-3)
     angle = np.arctan(pixel_width(1))
     right = (3 + np.tan(angle), 1, 4)
-    motion = moved(renderer, scene, lambda: move_camera(renderer, scene, (3, 1, 5), right))
+    motion = moved(scene, lambda: move_camera(scene, (3, 1, 5), right))
     assert np.allclose(motion[12, 16], [1, 0], atol=0.02)
 
 
 def test_a_sphere_moves_in_front_of_a_wall_at_rest(renderer):
-    mi = renderer
-    scene = scene_of(mi, wall=wall(mi, -1), ball={"type": "sphere", "radius": 0.5})
+    scene = scene_of(wall=wall(-1), ball={"type": "sphere", "radius": 0.5})
     params = mi.traverse(scene)
     key = next(filter(lambda name: name.endswith("ball.to_world"), params.keys()))
 
@@ -78,14 +75,13 @@ def test_a_sphere_moves_in_front_of_a_wall_at_rest(renderer):
         params[key] = mi.Transform4f().translate(floats(2 * pixel_width(5), 0, 0)).scale(0.5)
         params.update()
 
-    motion = moved(mi, scene, change)
+    motion = moved(scene, change)
     assert np.allclose(motion[1, 1], 0) and np.allclose(motion[12, 18], [-2, 0], atol=0.3)
     assert (np.abs(motion).max(axis=-1) > 0).sum() > 20
 
 
 def test_vertices_have_the_names_of_this_mitsuba_and_of_the_next(renderer):
     """Mitsuba 3.10 has "positions", a tensor (V, 3); what is installed is asked for its own."""
-    mi = renderer
     box = mi.load_dict({"type": "cube"})
     installed, found = mi.traverse(box), geometry(box)
     name = vertices_name(installed)
@@ -101,8 +97,7 @@ def test_vertices_have_the_names_of_this_mitsuba_and_of_the_next(renderer):
 
 
 def test_any_deformation_of_a_mesh_is_followed(renderer):
-    mi = renderer
-    scene = scene_of(mi, box={"type": "cube", "to_world": mi.ScalarTransform4f().scale([1.5, 1.5, 0.1])})
+    scene = scene_of(box={"type": "cube", "to_world": mi.ScalarTransform4f().scale([1.5, 1.5, 0.1])})
     params = mi.traverse(scene)
     key = vertices_name(params, "box")
     points = vertices(params, key)
@@ -112,19 +107,17 @@ def test_any_deformation_of_a_mesh_is_followed(renderer):
         put_vertices(params, key, points + [0.1, 0, 0] * points[:, 1:2])
         params.update()
 
-    motion = moved(mi, scene, change)
+    motion = moved(scene, change)
     y = (11.5 - np.arange(24)) * pixel_width(4.9)
     assert np.allclose(motion[6:18, 16, 0], -0.1 * y[6:18] / pixel_width(4.9), atol=1e-2)
     assert np.allclose(motion[6:18, 16, 1], 0, atol=1e-3)
 
 
 def test_instances_move_by_their_own_matrix(renderer):
-    mi = renderer
-
     def scene(shift):
         instance = {"type": "instance", "to_world": mi.ScalarTransform4f().translate([shift, 0, 0])}
         instance["shapegroup"] = {"type": "ref", "id": "group"}
-        return scene_of(mi, group={"type": "shapegroup", "one": {"type": "cube"}}, wall=wall(mi, -1), thing=instance)
+        return scene_of(group={"type": "shapegroup", "one": {"type": "cube"}}, wall=wall(-1), thing=instance)
 
     step = 2 * pixel_width(4)  # of its front, 4 from the camera
     now = scene(step)
@@ -134,11 +127,10 @@ def test_instances_move_by_their_own_matrix(renderer):
 
 def test_what_is_seen_here_was_seen_there(renderer):
     """Under a turn and a move of camera and box: the hit's place in the scene before is that of the pixel before."""
-    mi = renderer
 
     def scene(angle, origin):
         box = {"type": "cube", "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], angle)}
-        return scene_of(mi, origin, box=box, floor=wall(mi, -3))
+        return scene_of(origin, box=box, floor=wall(-3))
 
     old, new = scene(20, (0, 0.5, 6)), scene(26, (0.2, 0.7, 6))
     before = snapshot(old)
@@ -162,28 +154,25 @@ def test_what_is_seen_here_was_seen_there(renderer):
 
 
 def test_a_plane_mirror_shows_what_stands_behind_it(renderer):
-    mi = renderer
     mirror = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(20), "bsdf": {"type": "conductor"}}
     # The wall is 15 behind the mirror's plane in the mirror: 10 behind the camera, which stands 5 before it.
     back = mi.ScalarTransform4f().translate([0, 0, 15]).rotate([0, 1, 0], 180).scale(60)
-    scene = scene_of(mi, mirror=mirror, back={"type": "rectangle", "to_world": back})
+    scene = scene_of(mirror=mirror, back={"type": "rectangle", "to_world": back})
     step = pixel_width(5 + 15)
-    motion = moved(mi, scene, lambda: move_camera(mi, scene, (step, 0, 5), (step, 0, 0)))
+    motion = moved(scene, lambda: move_camera(scene, (step, 0, 5), (step, 0, 0)))
     assert np.allclose(motion, [1, 0], atol=2e-3)
 
 
 def test_what_was_not_there_or_behind_the_camera_has_no_motion(renderer):
-    mi = renderer
-
-    scene, before = scene_of(mi, wall=wall(mi)), snapshot(scene_of(mi))
+    scene, before = scene_of(wall=wall()), snapshot(scene_of())
     assert np.isnan(motion_vectors(scene, snapshot(scene), before)).all()
-    motion = moved(mi, scene, lambda: None)
-    before = snapshot(scene_of(mi, (0, 0, -5), (0, 0, -9), wall=wall(mi)))
+    motion = moved(scene, lambda: None)
+    before = snapshot(scene_of((0, 0, -5), (0, 0, -9), wall=wall()))
     assert np.isnan(motion_vectors(scene, snapshot(scene), before)).all() and not np.isnan(motion).any()
 
 
 def test_a_camera_without_a_projection_is_refused(renderer):
-    sensor = {"type": "orthographic", "to_world": renderer.ScalarTransform4f().translate([0, 0, 5])}
-    scene = renderer.load_dict({"type": "scene", "sensor": sensor, "light": {"type": "constant"}})
+    sensor = {"type": "orthographic", "to_world": mi.ScalarTransform4f().translate([0, 0, 5])}
+    scene = mi.load_dict({"type": "scene", "sensor": sensor, "light": {"type": "constant"}})
     with pytest.raises(NgptError, match="perspective or thinlens"):
         snapshot(scene)
