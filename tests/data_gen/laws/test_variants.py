@@ -35,7 +35,7 @@ def test_unbiased(renderer, variant, name, sampler, scene, size, pixels):
     variant(name)
     expected = references(renderer, scene, size)
     expected = np.broadcast_to(expected, (*expected.shape[:3], 3))
-    assert_unbiased(render_ours(load(renderer, scene, size), sampler, 8, 72, pixels), expected, pixels=pixels)
+    assert_unbiased(render_ours(load(renderer, scene, size), sampler, 12, 48, pixels), expected, pixels=pixels)
 
 
 def test_photons_follow_no_spectra(renderer, variant):
