@@ -275,7 +275,7 @@ def best_image(ranked: Sequence[Pipeline], default: str, seconds: float, margin:
 def best_of(pipelines: Sequence[Pipeline], seconds: float) -> tuple[str, str]:
     """The sampler for a render of this many ``seconds`` at the pilot's size, and the reason.
 
-    The first of ``pipelines`` has the sampler that the scene's description stands for. It stays unless another is
+    The first of ``pipelines`` has the sampler that the scene's description suggests. It is kept unless another is
     expected to leave clearly less error.
     """
     own = pipelines[0].sampler

@@ -20,13 +20,13 @@ COLUMNS = 4  # each shows its noisiest input and its reference
 def write_card(folder: Path) -> None:
     """Writes README.md and contact.png into the training set at ``folder``."""
     data = Dataset(folder)
-    told = summary(folder)
+    facts = summary(folder)
     if len(data):
         with atomic_output(folder / "contact.png", overwrite=True) as path:
             path.write_bytes(encode_png(contact_sheet(data)))
     with atomic_output(folder / "README.md", overwrite=True) as path:
-        path.write_text(card(data, told))
-    for problem in told["problems"]:
+        path.write_text(card(data, facts))
+    for problem in facts["problems"]:
         Console().say(problem)
 
 
@@ -48,15 +48,15 @@ def shown(crop: Crop) -> tuple[np.ndarray, np.ndarray]:
     return crop.stack(0)["primal"], crop.stack(1)["primal"] if crop.paired else crop.reference
 
 
-def card(data: Dataset, told: dict) -> str:
+def card(data: Dataset, facts: dict) -> str:
     config = data.manifest["config"]
     records = [crop for entry in data.manifest["shards"] for crop in entry["crops"]]
     failures = [(entry["scene"], failure) for entry in data.manifest["shards"] for failure in entry["failures"]]
     counts = np.array([n for crop in records for n in crop["spp"]])
     edges = 2 ** np.arange(int(np.log2(config["spp"][0])), int(np.log2(config["spp"][1])) + 2)
     exposures = np.array([-auto_exposure(shown(crop)[1]) for crop in data])
-    shots = f"{told['shots']} shots of up to {config['frames']} frames: " if "shots" in told else ""
-    k = told.get("subpixels", 1)
+    shots = f"{facts['shots']} shots of up to {config['frames']} frames: " if "shots" in facts else ""
+    k = facts.get("subpixels", 1)
     fine = f", with {k}x{k} subpixels" if k > 1 else ""
     sampler = config.get("sampler", "gpt")
     if config["reference_spp"]:
@@ -70,9 +70,9 @@ def card(data: Dataset, told: dict) -> str:
     lines = [
         "# Training set",
         "",
-        f"{shots}{told['crops']} crops of {config['size']}x{config['size']} pixels from {told['scenes']} scenes "
-        f"({told['planned']} planned, {told['failed']} failed), {config['inputs']} inputs each{fine}; "
-        f"{told['megabytes']} MB in {told['shards']} shards. Verify it by `ngpt info DIR`.",
+        f"{shots}{facts['crops']} crops of {config['size']}x{config['size']} pixels from {facts['scenes']} scenes "
+        f"({facts['planned']} planned, {facts['failed']} failed), {config['inputs']} inputs each{fine}; "
+        f"{facts['megabytes']} MB in {facts['shards']} shards. Verify it by `ngpt info DIR`.",
         "",
         f"{how} Seed {config['seed']}.",
         "",
@@ -87,7 +87,7 @@ def card(data: Dataset, told: dict) -> str:
         if within := int(np.sum((exposures >= low) & (exposures < low + 2))):
             lines.append(f"| {low} to {low + 2} | {within} |")
     lines += ["", "| seconds | all | per crop |", "|---|---|---|"]
-    lines += [f"| {part} | {value:.0f} | {value / max(len(data), 1):.2f} |" for part, value in told["seconds"].items()]
+    lines += [f"| {part} | {value:.0f} | {value / max(len(data), 1):.2f} |" for part, value in facts["seconds"].items()]
     if failures:
         lines += ["", "Failures:", ""] + [f"- {scene}, crop {one['crop']}: {one['error']}" for scene, one in failures]
     return "\n".join(lines) + "\n"

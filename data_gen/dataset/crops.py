@@ -74,7 +74,7 @@ def make_shard(config: Config, job: Job, folder: str, variant: str, again: Again
                 record["failures"].append({"crop": crop, "error": " ".join(str(error).split())})
             else:
                 crops += [data for data, _ in made]
-                record["crops"] += [told for _, told in made]
+                record["crops"] += [facts for _, facts in made]
     write_shard(Path(folder) / job.file, crops, record)
     # Each scene has its own kernels, and a process that makes thousands of scenes would keep them all.
     import drjit as dr
@@ -104,7 +104,7 @@ def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:
 
 
 def uneven_inputs(config: Config, name: str, crop: int, counts: list[int]) -> list[bool]:
-    """Which inputs of a crop get adaptive samples: the share ``config.adaptive`` of those with enough samples.
+    """Which inputs of a crop get adaptive samples: the share ``config.adaptive`` of the inputs with enough samples.
 
     It uses separate random numbers, so that views, seeds and references are the same as with even samples.
     """
@@ -161,16 +161,16 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
                 seeds = _seeds(rng, config)
                 clock = time.perf_counter()
                 first = render_input(config, scene, counts[0], seeds[0], uneven[0], around.made)
-            data, told = _crop(config, scene, first, counts, seeds, uneven, clock=clock, made=around.made)
-            told = {"crop": crop, "view": asdict(movement.view_at(frame))} | told
-            told["seconds"] = {part: round(value, 4) for part, value in (told["seconds"] | {"camera": found}).items()}
+            data, facts = _crop(config, scene, first, counts, seeds, uneven, clock=clock, made=around.made)
+            facts = {"crop": crop, "view": asdict(movement.view_at(frame))} | facts
+            facts["seconds"] = {part: round(value, 4) for part, value in (facts["seconds"] | {"camera": found}).items()}
             if moving:
                 now = snapshot(scene, None if before is None or movement.shape else before.shapes)
                 motion = np.full((config.size, config.size, 2), np.nan, np.float32)
                 data = replace(data, motion=motion if before is None else motion_vectors(scene, now, before))
-                told |= {"frame": frame, "movement": movement.record()}
+                facts |= {"frame": frame, "movement": movement.record()}
                 before = now
-            made.append((data, told))
+            made.append((data, facts))
     finally:
         # Other crops need the scene in its original state.
         movement.apply(scene, 0)
@@ -183,18 +183,18 @@ def make_inputs(config: Config, scene, made: Any, kept: Kept, place: int, seed: 
     """
     from data_gen.dataset.cameras import View
 
-    told = kept.record["crops"][place]
-    rng = np.random.default_rng((*scene_seed(config, kept.record["scene"]), told["crop"], seed))
+    facts = kept.record["crops"][place]
+    rng = np.random.default_rng((*scene_seed(config, kept.record["scene"]), facts["crop"], seed))
     counts = sample_counts(rng, config)
     seeds = [int(seed) for seed in rng.integers(0, 2**32, config.inputs)]
-    uneven = uneven_inputs(config, kept.record["scene"], told["crop"], counts)
+    uneven = uneven_inputs(config, kept.record["scene"], facts["crop"], counts)
     clock = time.perf_counter()
-    View.of(told["view"]).apply(scene)
+    View.of(facts["view"]).apply(scene)
     cleaned = [finite(render_input(config, scene, *each, made)) for each in zip(counts, seeds, uneven, strict=True)]
     new: dict[str, Any] = {"spp": counts, "seeds": seeds, "repaired": [count for _, count in cleaned]}
     new["seconds"] = {"inputs": round(time.perf_counter() - clock, 4)}
     images: Any = kept.images(place)
-    return [(CropData([stack for stack, _ in cleaned], counts, *images), told | new)]
+    return [(CropData([stack for stack, _ in cleaned], counts, *images), facts | new)]
 
 
 def _seeds(rng: np.random.Generator, config: Config) -> list[int]:
@@ -219,10 +219,10 @@ def _crop(
     stacks = [first] + [render_input(config, scene, *each, made) for each in further]
     seconds = {"inputs": time.perf_counter() - clock}
     cleaned = [finite(stack) for stack in stacks]
-    told: dict[str, Any] = {"spp": counts, "seeds": seeds} | ({"adaptive": uneven} if config.adaptive else {})
-    told |= {"repaired": [count for _, count in cleaned], "seconds": seconds}
+    facts: dict[str, Any] = {"spp": counts, "seeds": seeds} | ({"adaptive": uneven} if config.adaptive else {})
+    facts |= {"repaired": [count for _, count in cleaned], "seconds": seconds}
     if config.pairs:
-        return CropData([stack for stack, _ in cleaned], counts), told
+        return CropData([stack for stack, _ in cleaned], counts), facts
     clock = time.perf_counter()
     spp, method = -(-config.reference_spp // HALVES), config.reference_method
     options = {"made": made, "unbiased": True, "gradients": True, **config.unbiased_options}
@@ -235,7 +235,7 @@ def _crop(
     light = np.maximum(reference, direct)
     light = light if caustic is None else light + caustic
     parts = tuple(np.maximum(half, direct) for half in apart)
-    return CropData([stack for stack, _ in cleaned], counts, light, direct, caustic, parts), told
+    return CropData([stack for stack, _ in cleaned], counts, light, direct, caustic, parts), facts
 
 
 def references(converged: GradientStack, method: str) -> tuple[np.ndarray, np.ndarray | None]:

@@ -39,8 +39,8 @@ class Again:
 
 def home(config: Config, folder: Path) -> Path:
     """The subfolder of ``folder`` for references of ``config``. Configurations that differ only in inputs share it."""
-    told = {name: value for name, value in as_json(config).items() if name not in _OF_INPUTS}
-    return folder / f"{zlib.crc32(json.dumps(told, sort_keys=True).encode()):08x}"
+    facts = {name: value for name, value in as_json(config).items() if name not in _OF_INPUTS}
+    return folder / f"{zlib.crc32(json.dumps(facts, sort_keys=True).encode()):08x}"
 
 
 def keep(shard: Shard, path: Path) -> None:
@@ -65,7 +65,7 @@ class Kept:
     @property
     def places(self) -> dict[int, int]:
         """The place of each crop in the file, by the number of the crop in its scene."""
-        return {told["crop"]: place for place, told in enumerate(self.record["crops"])}
+        return {facts["crop"]: place for place, facts in enumerate(self.record["crops"])}
 
     def images(self, place: int) -> tuple[np.ndarray, ...]:
         """The reference (H, W, 3) of all light, emission seen directly, and the layer ``caustic`` if there is one."""

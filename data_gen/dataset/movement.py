@@ -67,8 +67,8 @@ class Movement:
         params.update()
 
     def record(self) -> dict:
-        told = {"way": self.way, "turn": self.turn, "shape": self.shape, "shift": self.shift}
-        return told | {"light": self.light, "gain": self.gain}
+        facts = {"way": self.way, "turn": self.turn, "shape": self.shape, "shift": self.shift}
+        return facts | {"light": self.light, "gain": self.gain}
 
 
 def random_movement(around: Surroundings, view: View, rng: np.random.Generator, frames: int) -> Movement:

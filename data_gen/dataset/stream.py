@@ -137,9 +137,9 @@ class Stream:
         shard = Shard(path, keep_open=True)
         if self.kept and shard.names and not (kept := self.kept / future.result()).exists():
             keep(shard, kept)
-        told, crops = shard.record, enumerate(shard.record["crops"])
+        facts, crops = shard.record, enumerate(shard.record["crops"])
         with self._changed:
-            self._crops.extend(Crop(shard, i, told["scene"], tuple(c["spp"]), c.get("frame")) for i, c in crops)
+            self._crops.extend(Crop(shard, i, facts["scene"], tuple(c["spp"]), c.get("frame")) for i, c in crops)
             self._changed.notify_all()
         # The shard stays open, so its data can be read until its last crop is gone.
         path.unlink()

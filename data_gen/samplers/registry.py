@@ -72,7 +72,7 @@ class Entry:
             raise NgptError(f"sampler '{self.name}': standing '{self.standing}' is none of {', '.join(STANDINGS)}")
 
     def make(self, *args: Any, **options: Any) -> Any:
-        """Returns what the module makes. Raises NgptError for a scene that cannot be rendered."""
+        """Returns the object that the module makes. Raises NgptError for a scene that cannot be rendered."""
         make = self.module if callable(self.module) else import_module(self.module).make
         return make(*args, **options)
 
@@ -252,7 +252,7 @@ def tried(facts: Facts) -> list[Sampler]:
 def described(facts: Facts, gradients: bool = False) -> tuple[str, str, str]:
     """The sampler and the method for "auto" in `ngpt render`, judged by the scene's description only, and the reason.
 
-    Returns ``SIMPLE``, except in two cases: gradients were asked for, or OIDN is missing, without which gradients give
+    Returns ``SIMPLE``, except in two cases: gradients are requested, or OIDN is missing, without which gradients give
     better images. Then the method is "": the layers decide.
     """
     sampler, reason = choose(facts)

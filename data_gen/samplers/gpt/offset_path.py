@@ -137,7 +137,7 @@ def next_steps(scene, plan: Plan, step: Step, offsets: list[Offset], first: bool
 
 
 def settle(step: Step, offsets: list[Offset]) -> None:
-    """Adds to settled paths what the base path finds in this step."""
+    """Adds the light that the base path finds in this step to settled paths."""
     # From here on both paths are the same. All that came before is in a = 2 w (β' - β). So the sample
     # 2 w (C(y) |J| - C(x)) / p(x) of either technique is a times what the base path finds (survey, eq. 4 and 16).
     C = step.L_light + step.f_p * step.L_bsdf

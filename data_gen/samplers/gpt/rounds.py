@@ -48,7 +48,7 @@ def sharing(view, plan: Plan, frozen: Frozen, take: Take) -> SamplePass:
 class SharedTails(Rounds):
     """A ``data_gen.passes.SamplePass`` whose paths may end in a cache. The cache changes only between rounds.
 
-    ``take`` puts samples into a film. It is given what is known, or None if paths do not end in a cache. ``view`` is
+    ``take`` puts samples into a film. Its first argument is what the cache knows, or None without a cache. ``view`` is
     the integrator. ``cache`` is None before the first round, and if the cache is turned off. Then ``off`` says why.
     """
 
