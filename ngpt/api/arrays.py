@@ -76,7 +76,22 @@ def denoise(
 
 @_with_methods  # type: ignore[misc]
 def denoise(
-    image: Image | GradientStack, method: str = "auto", *, wrap: bool = False, **layers_and_options: Any
+    image: Image | GradientStack,
+    method: str = "auto",
+    *,
+    albedo: Image | None = None,
+    normal: Image | None = None,
+    depth: Image | None = None,
+    dx: Image | None = None,
+    dy: Image | None = None,
+    direct: Image | None = None,
+    caustic: Image | None = None,
+    primal_var: Image | None = None,
+    dx_var: Image | None = None,
+    dy_var: Image | None = None,
+    caustic_var: Image | None = None,
+    wrap: bool = False,
+    **options: Value,
 ) -> Any:
     """Reconstructs a scene-linear image or stack.
 
@@ -96,8 +111,8 @@ def denoise(
     do not fit, for unknown names, if a layer that the method needs is missing, and for an image without any finite
     pixel.
     """
-    options = {name: value for name, value in layers_and_options.items() if name not in _BESIDE}
-    given = {name: layers_and_options[name] for name in _BESIDE if layers_and_options.get(name) is not None}
+    keywords = dict(locals())
+    given = {name: value for name, value in keywords.items() if name in _BESIDE and value is not None}
     _check_options("denoise", method, options, _BESIDE)
     if isinstance(image, str | os.PathLike):
         raise NgptError(f"denoise: image is the name of a file; pass ngpt.read({os.fspath(image)!r})")
