@@ -14,6 +14,23 @@ from data_gen.paths.walk import Sky
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.strategies import connection, to_camera
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, Vertex, context, scatters_smoothly
+from data_gen.scenes.builtin import _camera, _diffuse, _light, _sphere, _wall
+
+
+def corner():
+    """All is diffuse or glossy, and one lamp is a rectangle of area 1; some paths begin in a mirror."""
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 8, "rr_depth": 100},
+        "sensor": _camera([0, 0.9, 3.6], [0, 0.6, 0], 45),
+        "floor": _wall([0, 0, 0], [0, 1, 0], (6, 6), _diffuse(0.6, 0.5, 0.4)),
+        "back": _wall([0, 1, -1.2], [0, 0, 1], (6, 3), _diffuse(0.4, 0.6, 0.4)),
+        "wall": _wall([1.2, 1, 0], [-1, 0, 0], (6, 3), _diffuse(0.7, 0.2, 0.2)),
+        "ball": _sphere([0.3, 0.4, 0], 0.4, {"type": "roughconductor", "material": "Cu", "alpha": 0.3}),
+        "mirror": _sphere([-0.6, 0.4, 0.2], 0.4, {"type": "conductor", "material": "Al"}),
+        "lamp": _light([0, 2, 0.3], [0, -1, 0], (1, 1), (3, 4, 5)),
+    }
+
 
 plan_of = partial(bdpt_ends.plan_of, sampler="gbdpt")
 

@@ -4,8 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bdpt_scenes import SCENES, corner
-from path_copies import Copies, check_copies_to_the_camera, check_going_straight_and_back, compare_copies, plan_of
+from bdpt_scenes import SCENES
+from path_copies import (
+    Copies,
+    check_copies_to_the_camera,
+    check_going_straight_and_back,
+    compare_copies,
+    corner,
+    plan_of,
+)
 from renders import dr, mi
 from unbiased import FAR, load, render_ours
 

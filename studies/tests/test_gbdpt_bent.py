@@ -10,7 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from bdpt_ends import Ends
-from bdpt_scenes import ENDS, LIT, by_the_sun
+from bdpt_scenes import by_a_point, by_a_wall, by_the_sun, lacquered, under_a_sky
+from data_gen_scenes import caustics, glass
 from path_copies import check_back, close, fresh, plan_of
 from renders import dr, mi
 from unbiased import load, render_ours
@@ -29,6 +30,10 @@ from data_gen.samplers.bdpt.vertex import (
     scatters_smoothly,
 )
 from ngpt_studies.gbdpt.pairs import difference_of_one
+
+# Light behind mirrors and glass: where light paths end through them, and where camera paths do
+LIT = {"lamp": caustics, "point": by_a_point, "sun": by_the_sun, "wall": by_a_wall}
+ENDS = {"lamp": caustics, "wall": by_a_wall, "sky": under_a_sky, "room": glass, "lacquer": lacquered}
 
 
 def event(si, code, mode, active):

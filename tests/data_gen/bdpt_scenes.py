@@ -127,21 +127,6 @@ def lacquered():
     return scene
 
 
-def corner():
-    """All is diffuse or glossy, and one lamp is a rectangle of area 1; some paths begin in a mirror."""
-    return {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 8, "rr_depth": 100},
-        "sensor": _camera([0, 0.9, 3.6], [0, 0.6, 0], 45),
-        "floor": _wall([0, 0, 0], [0, 1, 0], (6, 6), _diffuse(0.6, 0.5, 0.4)),
-        "back": _wall([0, 1, -1.2], [0, 0, 1], (6, 3), _diffuse(0.4, 0.6, 0.4)),
-        "wall": _wall([1.2, 1, 0], [-1, 0, 0], (6, 3), _diffuse(0.7, 0.2, 0.2)),
-        "ball": _sphere([0.3, 0.4, 0], 0.4, {"type": "roughconductor", "material": "Cu", "alpha": 0.3}),
-        "mirror": _sphere([-0.6, 0.4, 0.2], 0.4, {"type": "conductor", "material": "Al"}),
-        "lamp": _light([0, 2, 0.3], [0, -1, 0], (1, 1), (3, 4, 5)),
-    }
-
-
 def seen_through_glass():
     """A floor under a pane of thick glass, lit through it by a point: no connection finds that light."""
     pane = {"type": "cube", "bsdf": {"type": "dielectric"}}
@@ -167,7 +152,3 @@ SCENES = {
     "environment": "environment",
     "lens": "lens",
 }
-
-# Light behind mirrors and glass: where light paths of ``gbdpt`` end through them, and where camera paths do
-LIT = {"lamp": caustics, "point": by_a_point, "sun": by_the_sun, "wall": by_a_wall}
-ENDS = {"lamp": caustics, "wall": by_a_wall, "sky": under_a_sky, "room": glass, "lacquer": lacquered}

@@ -6,9 +6,8 @@ The scenes have no symmetry. A card stands before some near planes, and somethin
 import numpy as np
 from data_gen_scenes import _scale
 from renders import mi
-from unbiased import differences, light_apart, load
+from unbiased import differences, light_apart, load, render_ours
 
-from data_gen.render import render_stack
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
 from data_gen.scenes.builtin import _diffuse, _light, _sphere, _wall
 from data_gen.scenes.facts import scene_facts
@@ -177,7 +176,7 @@ def stacks_of(scene, sampler, batches, spp):
         options = {"photons": 1 if sampler.endswith(("beams", "planes")) else 8, "radius": 0.6}
     if np.prod(scene.sensors()[0].film().crop_size()) == 1:
         spp *= 8 if getattr(SAMPLERS.get(sampler), "batch", 0) else 128
-    return [render_stack(scene, spp, seed, sampler, unbiased=True, **options).layers for seed in range(batches)]
+    return render_ours(scene, sampler, batches, spp, **options)
 
 
 def last_frame(scene, entry, seed, spp, frames=3):

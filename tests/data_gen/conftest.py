@@ -16,6 +16,16 @@ def command(command):
 
 
 @pytest.fixture(scope="module")
+def first_view():
+    """Crops take the first view that shows anything. By default one of five is chosen, after dozens of attempts."""
+    from data_gen.dataset import cameras
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cameras, "CHOICES", 1)
+        yield
+
+
+@pytest.fixture(scope="module")
 def small_images_share():
     """Small images have a cache from the first sample on. It is small, since to read all its cells takes long."""
     from data_gen.tails import cache, schedule

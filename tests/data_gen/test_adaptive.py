@@ -2,11 +2,11 @@
 
 import json
 import time
-from functools import cache
 from itertools import count
 
 import numpy as np
 import pytest
+from references import references
 from unbiased import load, same
 
 import ngpt
@@ -21,27 +21,36 @@ from data_gen import adaptive, passes
 from data_gen.adaptive import Adaptive, Assessment, assess, share_out
 from data_gen.choosing import plans
 from data_gen.render import render_stack
+from data_gen.samplers.reused import Made
 
-SIZE = (24, 16)
-
-
-def render(mi, spp, seed=0, scene="glossy", sampler="gpt", error=None, method="wcv", **options):
-    scene = load(mi, scene, SIZE) if isinstance(scene, str) else scene
-    return render_stack(scene, spp, seed, sampler, adaptive=Adaptive(error, method), unbiased=True, **options)
+SIZE = (32, 32)
 
 
 @pytest.fixture(scope="module")
-def converged(renderer):
-    """Two independent images of a scene at 48x32."""
+def rendered(renderer):
+    """Renders a built-in scene; the kernels of each scene are recorded once."""
+    scenes, made = {}, {}
 
-    @cache
-    def images(scene):
-        loaded = load(renderer, scene, (48, 32))
-        return [
-            render_stack(loaded, 512, 100 + i, "primal", with_features=False, unbiased=True)["primal"] for i in range(2)
-        ]
+    def render(scene, *arguments, **options):
+        if scene not in scenes:
+            scenes[scene], made[scene] = load(renderer, scene, SIZE), Made()
+        return render_stack(scenes[scene], *arguments, unbiased=True, made=made[scene], **options)
 
-    return images
+    return render
+
+
+@pytest.fixture
+def render(rendered):
+    def render(spp, seed=0, scene="glossy", sampler="gpt", error=None, method="wcv", **options):
+        return rendered(scene, spp, seed, sampler, adaptive=Adaptive(error, method), **options)
+
+    return render
+
+
+def halves(mi, scene):
+    """Two converged images of a built-in scene."""
+    images = references(mi, scene, SIZE)
+    return images[::2].mean(axis=0), images[1::2].mean(axis=0)
 
 
 def test_counts_are_proportional_to_what_is_needed(renderer, rng):
@@ -59,24 +68,24 @@ def test_counts_are_proportional_to_what_is_needed(renderer, rng):
     assert share_out(np.zeros(5000), n, 16).sum() > 0  # a step is never empty
 
 
-def test_the_mean_number_is_kept_and_passes_are_not_seen(renderer, monkeypatch):
-    stack = render(renderer, 40, 3)
+def test_the_mean_number_is_kept_and_passes_are_not_seen(render, monkeypatch):
+    stack = render(40, 3)
     samples = stack["samples"]
     assert samples.mean() == 40 and samples.min() == 16 and samples.max() > 60
     assert stack.attributes["ngpt:spp"] == 40 and stack.attributes["ngpt:adaptive"] == "wcv"
     calls = []
     monkeypatch.setattr(passes, "FIRST_LANES", 16 * 100)
     monkeypatch.setattr(passes, "PASS_SECONDS", 0.3)
-    same(stack, render(renderer, 40, 3, progress=lambda *call: calls.append(call)))
+    same(stack, render(40, 3, progress=lambda *call: calls.append(call)))
     assert calls[0] == (0, 40) and calls[-1] == (40, 40) and len(calls) > 5
-    assert render(renderer, 1 << 20, 3, stop=lambda: True).attributes["ngpt:spp"] == 16
+    assert render(1 << 20, 3, stop=lambda: True).attributes["ngpt:spp"] == 16
 
 
-def test_time_is_kept(renderer, monkeypatch):
-    """On a clock that a look at it takes forward, whatever the machine is at."""
+def test_time_is_kept(render, monkeypatch):
+    """The clock advances with each look at it, however busy the machine is."""
     looks = count()
     monkeypatch.setattr(time, "perf_counter", lambda: 0.05 * next(looks))
-    stack = render(renderer, None, 3, load(renderer, "diffuse", SIZE), seconds=2.0)
+    stack = render(None, 3, "diffuse", seconds=2.0)
     assert 1.0 < 0.05 * next(looks) < 2.5
     assert stack.attributes["ngpt:spp"] >= 16
 
@@ -92,66 +101,55 @@ def test_a_firefly_gets_no_samples_for_all_around_it(renderer, rng):
     assert np.all(wild.relative < 1.5 * calm.relative)
 
 
-def test_what_a_choice_takes_is_known_ahead(renderer, monkeypatch):
-    """A method that takes long for its pixels is not begun where it would end too late."""
-    calls = []
+def test_what_a_choice_takes_is_known_ahead(render, monkeypatch):
+    """A method that takes long for its pixels is not begun where it would end too late. Subpixels count too."""
+    parts = []
 
     def slow(stack, method):
-        calls.append(stack.width * stack.height)
-        return adaptive.Assessment(np.ones(calls[-1]), 1.0, method)
+        parts.append(stack)
+        return Assessment(np.ones(stack.width * stack.height), 1.0, method)
 
     monkeypatch.setattr(adaptive, "assess", slow)
     monkeypatch.setattr(adaptive, "_PART", 40)
-    scene = load(renderer, "diffuse", (100, 80))
     # A clock on which all takes long: nothing is begun when time is over.
     clock = count()
     monkeypatch.setattr(time, "perf_counter", lambda: float(next(clock)))
-    stack = render(renderer, None, 0, scene, "primal", method="primal", seconds=0.1)
-    assert not calls and stack.attributes["ngpt:spp"] == 16
-    stack = GradientStack({"primal": np.ones((80, 100, 3), np.float32)})
-    # And one on which the method takes 20 us a pixel.
-    monkeypatch.setattr(time, "perf_counter", lambda: 2e-5 * sum(calls))
-    assert adaptive.seconds_to_assess(stack, "primal") == pytest.approx(0.16) and calls == [100, 1600]
+    stack = render(None, 0, "diffuse", "primal", method="primal", seconds=0.1)
+    assert not parts and stack.attributes["ngpt:spp"] == 16
+    # And one on which the method takes 20 us a pixel
+    monkeypatch.setattr(time, "perf_counter", lambda: 2e-5 * sum(part.width * part.height for part in parts))
+    y, x = np.mgrid[:160, :200].astype(np.float32)
+    fine = {"primal": np.repeat((1000 * y + x)[..., None], 3, axis=-1)}
+    stack = GradientStack({"primal": means(fine["primal"], 2)}, fine=fine)
+    assert adaptive.seconds_to_assess(stack, "oidn") == pytest.approx(0.16)
+    assert [part.fine["primal"].shape for part in parts] == [(20, 20, 3), (80, 80, 3)]
+    assert all(np.array_equal(means(part.fine["primal"], 2), part["primal"]) for part in parts)
     assert adaptive.seconds_to_assess(GradientStack({"primal": stack["primal"][:79, :80]}), "primal") == 0.0
 
 
-def test_what_a_choice_takes_includes_subpixels(renderer, monkeypatch):
-    parts = []
-    monkeypatch.setattr(adaptive, "assess", lambda stack, method: parts.append(stack))
-    monkeypatch.setattr(adaptive, "_PART", 40)
-    y, x = np.mgrid[:160, :200].astype(np.float32)
-    fine = {"primal": np.repeat((1000 * y + x)[..., None], 3, axis=-1)}
-    adaptive.seconds_to_assess(GradientStack({"primal": means(fine["primal"], 2)}, fine=fine), "oidn")
-    assert [part.fine["primal"].shape for part in parts] == [(20, 20, 3), (80, 80, 3)]
-    assert all(np.array_equal(means(part.fine["primal"], 2), part["primal"]) for part in parts)
-
-
-def test_samples_go_where_the_error_is(renderer, converged):
+def test_samples_go_where_the_error_is(rendered, render, renderer):
     """The same number makes a better image, by the method they were meant for."""
-    scene, halves, errors = load(renderer, "glossy", (48, 32)), converged("glossy"), []
+    expected, errors = halves(renderer, "glossy"), []
     for seed in range(3):
-        stacks = (render_stack(scene, 96, seed, "gpt", unbiased=True), render(renderer, 96, seed, scene))
-        errors.append([relmse_trimmed(reconstruct(stack, "wcv").image, *halves) for stack in stacks])
+        stacks = rendered("glossy", 96, seed, "gpt"), render(96, seed)
+        errors.append([relmse_trimmed(reconstruct(stack, "wcv").image, *expected) for stack in stacks])
     even, adaptive = np.mean(errors, axis=0)
     assert adaptive < 0.95 * even
 
 
 @pytest.mark.slow
-def test_samples_that_choose_hardly_bias_the_mean(renderer, monkeypatch):
+def test_samples_that_choose_hardly_bias_the_mean(rendered, render, monkeypatch):
     """They stay in the means: were each pixel judged by its own noise alone, the image would be too dark."""
 
     def by_pixel(stack, method):
         return adaptive.Assessment(np.sqrt(stack["primal_var"].sum(axis=-1)).ravel(), 1.0, method)
 
-    scene = load(renderer, "glossy", SIZE)
-    light = render_stack(scene, 8192, 99, "primal", with_features=False, unbiased=True)["primal"].mean()
+    light = rendered("glossy", 8192, 99, "primal", with_features=False)["primal"].mean()
 
     def bias():
         """In the mean over renders, and its standard error."""
-        stacks = [
-            render(renderer, 32, seed, scene, "primal", method="primal", with_features=False) for seed in range(10)
-        ]
-        each = np.array([stack["primal"].mean() for stack in stacks]) / light - 1
+        how = {"sampler": "primal", "method": "primal", "with_features": False}
+        each = np.array([render(32, seed, **how)["primal"].mean() for seed in range(10)]) / light - 1
         return each.mean(), each.std(ddof=1) / np.sqrt(len(each))
 
     mean, error = bias()
@@ -162,25 +160,25 @@ def test_samples_that_choose_hardly_bias_the_mean(renderer, monkeypatch):
 
 
 @pytest.mark.slow
-def test_gradients_are_shared_out_by_what_is_quick(renderer):
+def test_gradients_are_shared_out_by_what_is_quick(render):
     """Where no method is named: those of a network would cost more than they gain."""
-    stack = render(renderer, 32, method="auto")
+    stack = render(32, method="auto")
     assert stack.attributes["ngpt:adaptive"] == "wcv"
-    same(stack, render(renderer, 32, method="wcv"))
+    same(stack, render(32, method="wcv"))
 
 
 @pytest.mark.parametrize("sampler", [pytest.param("primal", marks=pytest.mark.slow), "gpt"])
-def test_an_error_is_reached(renderer, converged, sampler):
-    scene, halves = load(renderer, "diffuse", (48, 32)), converged("diffuse")
+def test_an_error_is_reached(render, renderer, sampler):
     method = "primal" if sampler == "primal" else "wcv"
-    stack = render(renderer, None, 1, scene, sampler, 0.1, method)
+    stack = render(None, 1, "diffuse", sampler, 0.1, method)
     assert 0.05 < stack.attributes["ngpt:error"] <= 0.1
-    assert np.sqrt(relmse_trimmed(reconstruct(stack, method).image, *halves)) == pytest.approx(0.09, rel=0.5)
-    ended = render(renderer, 32, 1, scene, sampler, 1e-4, method)
+    error = relmse_trimmed(reconstruct(stack, method).image, *halves(renderer, "diffuse"))
+    assert np.sqrt(error) == pytest.approx(0.09, rel=0.5)
+    ended = render(32, 1, "diffuse", sampler, 1e-4, method)
     assert ended["samples"].mean() == 32 and ended.attributes["ngpt:error"] > 1e-4
 
 
-def test_an_error_is_reached_in_few_steps(renderer, monkeypatch):
+def test_an_error_is_reached_in_few_steps(render, monkeypatch):
     """Errors fall with the root of the samples. 200 are needed here: after 128, the next step goes there, and not far
     beyond."""
     taken = [16.0]
@@ -191,9 +189,10 @@ def test_an_error_is_reached_in_few_steps(renderer, monkeypatch):
         return blocks
 
     monkeypatch.setattr(adaptive, "share_out", shared_out)
-    monkeypatch.setattr(adaptive, "assess", lambda stack, method: Assessment(np.ones(64), taken[-1] ** -0.5, method))
-    scene = load(renderer, "diffuse", (8, 8))
-    render(renderer, None, 1, scene, "primal", 200**-0.5, "primal", with_features=False)
+    monkeypatch.setattr(
+        adaptive, "assess", lambda stack, method: Assessment(np.ones(32 * 32), taken[-1] ** -0.5, method)
+    )
+    render(None, 1, "diffuse", "primal", 200**-0.5, "primal", with_features=False)
     assert taken[:4] == [16, 32, 64, 128] and len(taken) == 5 and 200 <= taken[4] <= 224
 
 

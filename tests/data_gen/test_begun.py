@@ -3,9 +3,11 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from stress_scenes import hair
 from unbiased import load, same
 
 import ngpt
@@ -20,8 +22,12 @@ from data_gen.adaptive import LEAST
 from data_gen.begun import frame_seed, part_seed
 from data_gen.cli import onlook, render
 from data_gen.film import GradientFilm
+from data_gen.frames import shot
 from data_gen.frames.camera_path import CameraPath, Key
+from data_gen.frames.shot import Shot
+from data_gen.render import render_stack
 from data_gen.request import RenderRequest, said_by
+from data_gen.samplers import reused
 from data_gen.session import render_frames, render_scene
 from data_gen.shot_files import write_frames
 
@@ -133,11 +139,9 @@ def test_a_number_beyond_floats_in_a_header_counts_as_none(tmp_path):
 
 def test_a_scene_or_camera_without_a_file_goes_on_with_nothing(tmp_path, renderer):
     """Its header does not say which one it is, and samples of two must not be mixed."""
-    from data_gen.frames.shot import Shot
-
-    path, shot = tmp_path / "a.exr", Shot(lambda frame: ("diffuse", {}))
+    path = tmp_path / "a.exr"
     for what, asked in {
-        "scene": RenderRequest(shot, 9, frames=(7,)),
+        "scene": RenderRequest(Shot(lambda frame: ("diffuse", {})), 9, frames=(7,)),
         "camera": RenderRequest("diffuse", 9, frames=(7,), camera=CameraPath([Key(0, np.eye(4))])),
     }.items():
         there(path, spp=4, request=asked.header(7)["ngpt:request"])
@@ -153,40 +157,34 @@ def test_what_is_counted_is_a_whole_number(given):
 
 def test_a_request_holds_plain_values_of_its_own():
     options = {"reuse": True}
-    request = box(spp=np.int64(9), seed=np.uint64(2**63), size=np.array([16, 12]), error=np.float32(0.5),
-                  seconds=np.float64(2), subpixels=np.int64(2), unbiased=np.bool_(True), options=options,
-                  frames=np.arange(2))  # fmt: skip
-    plain = box(spp=9, seed=2**63, size=(16, 12), error=0.5, seconds=2.0, subpixels=2, unbiased=True, options=options,
-                frames=(0, 1))  # fmt: skip
+    plain = {"spp": 9, "seed": 2**63, "size": (16, 12), "error": 0.5, "seconds": 2.0, "subpixels": 2, "unbiased": True}
+    kinds = (np.int64, np.uint64, np.array, np.float32, np.float64, np.int64, np.bool_)
+    odd = {name: kind(value) for kind, (name, value) in zip(kinds, plain.items(), strict=True)}
+    request, same = box(**odd, options=options, frames=np.arange(2)), box(**plain, options=options, frames=(0, 1))
     options["reuse"] = False
-    assert request == plain and request.options == {"reuse": True}
-    assert request.header(0) == plain.header(0) and said_by(request.header(0))["seed"] == 2**63
+    assert request == same and request.options == {"reuse": True}
+    assert request.header(0) == same.header(0) and said_by(request.header(0))["seed"] == 2**63
     assert box(size=[16, 12]) == box(size=(16, 12))
 
 
 def test_nothing_that_is_asked_for_is_left_out_without_a_word(renderer):
-    from data_gen.render import render_stack
-
     one, shot = RenderRequest("diffuse", 2, size=(16, 12)), RenderRequest("diffuse", 2, size=(16, 12), frames=(0, 1))
-    for what in ({"camera": "path.json"}, {"dt": 2}):
-        with pytest.raises(WrongUse, match="belongs to a shot"):
-            render_scene("diffuse", 2, **what)
-    for image in (lambda: render_scene(shot), lambda: render_scene("diffuse", 2, frames=(0, 1))):
-        with pytest.raises(WrongUse, match="2 frames were asked for, and one image is rendered"):
-            image()
-    for none in (lambda: render_frames(one), lambda: render_frames("diffuse", [])):
-        with pytest.raises(WrongUse, match="there are no frames to render"):
-            none()
     loaded = RenderRequest(load(renderer, "diffuse", (16, 12)), 2, sampler="primal")
-    for other in (
-        lambda: render_frames(one, range(2)),
-        lambda: render_frames(shot, (0, 2)),
-        lambda: write_frames(shot, {2: Path("a.exr")}),
-        lambda: render_stack(loaded, adaptive=True),
-        lambda: render_stack(loaded, with_features=False),
-    ):
-        with pytest.raises(WrongUse, match="a RenderRequest says all"):
-            other()
+    for call, message in [
+        (lambda: render_scene("diffuse", 2, camera="path.json"), "belongs to a shot"),
+        (lambda: render_scene("diffuse", 2, dt=2), "belongs to a shot"),
+        (lambda: render_scene(shot), "2 frames were asked for, and one image is rendered"),
+        (lambda: render_scene("diffuse", 2, frames=(0, 1)), "2 frames were asked for, and one image is rendered"),
+        (lambda: render_frames(one), "there are no frames to render"),
+        (lambda: render_frames("diffuse", []), "there are no frames to render"),
+        (lambda: render_frames(one, range(2)), "a RenderRequest says all"),
+        (lambda: render_frames(shot, (0, 2)), "a RenderRequest says all"),
+        (lambda: write_frames(shot, {2: Path("a.exr")}), "a RenderRequest says all"),
+        (lambda: render_stack(loaded, adaptive=True), "a RenderRequest says all"),
+        (lambda: render_stack(loaded, with_features=False), "a RenderRequest says all"),
+    ]:
+        with pytest.raises(WrongUse, match=message):
+            call()
     assert [frame for frame, _ in render_frames(shot, (0, 1))] == [0, 1]
 
 
@@ -288,9 +286,8 @@ def test_a_frame_that_is_broken_off_is_kept_and_gone_on_with(renderer, tmp_path,
     assert ngpt.read(files[0]).attributes["ngpt:unfinished"] == "interrupted"
     written = write_frames("diffuse", files, **asked)
     assert written.interrupted is None and written.skipped == 0
-    for file in files.values():
-        attributes = ngpt.read(file).attributes
-        assert attributes["ngpt:spp"] == 64 and "ngpt:unfinished" not in attributes
+    found = [ngpt.read(file).attributes for file in files.values()]
+    assert all(attributes["ngpt:spp"] == 64 and "ngpt:unfinished" not in attributes for attributes in found)
 
 
 def failing(monkeypatch, passes_before):
@@ -326,9 +323,6 @@ def test_a_pass_that_fails_takes_none_before_it_along(renderer, command, monkeyp
 
 
 def test_nothing_that_comes_after_the_last_sample_takes_the_image_along(renderer, command, monkeypatch):
-    from data_gen.frames import shot
-    from data_gen.samplers import reused
-
     def gone(*arguments):
         raise RuntimeError("gone")
 
@@ -347,11 +341,6 @@ def test_nothing_that_comes_after_the_last_sample_takes_the_image_along(renderer
 
 def test_hair_with_the_colour_of_melanin_is_rendered(renderer):
     """Of its parameters one is None, which Mitsuba's own list of them cannot give."""
-    from stress_scenes import hair
-
-    from data_gen.render import render_stack
-    from data_gen.samplers import reused
-
     scene, made = load(renderer, hair, (16, 12)), reused.Made()
     first, second = (render_stack(scene, 2, 0, "primal", made=made, unbiased=True) for _ in range(2))
     assert first["primal"].mean() > 0.1 and "primal" in made._kept
@@ -374,28 +363,22 @@ def test_what_was_rendered_is_kept_where_it_cannot_be_written(renderer, command,
 
 def test_light_that_overflows_ends_no_render_that_somebody_looks_at(renderer, command, monkeypatch):
     Path("nan.xml").write_text(
-        '<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"><film type="hdrfilm">'
-        '<integer name="width" value="24"/><integer name="height" value="16"/></film></sensor>'
+        '<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"/>'
         '<emitter type="constant"><rgb name="radiance" value="3e38 3e38 3e38"/></emitter></scene>'
     )
-    words = "render nan.xml --sampler gpt --spp 32 -o it.exr"
+    words = "render nan.xml --size 24x16 --sampler gpt --spp 32 -o it.exr"
 
-    class Page:
-        watched, enough, ended = True, False, False
+    def fail(error):
+        def failing(*_):
+            raise error
 
-        def tell(self, line):
-            pass
+        return failing
 
-        def show(self, preview, caption):
-            raise MemoryError
-
-        def close(self, line):
-            raise OSError("gone")
-
-    def looking(live, scene, command, console, unit):
-        return onlook.Onlookers(Page(), console.say, unit)
-
-    monkeypatch.setattr(onlook, "onlookers", looking)
+    page = SimpleNamespace(watched=True, enough=False, ended=False, tell=lambda line: None)
+    page.show, page.close = fail(MemoryError()), fail(OSError("gone"))
+    monkeypatch.setattr(
+        onlook, "onlookers", lambda live, scene, command, console, unit: onlook.Onlookers(page, console.say, unit)
+    )
     told = [line for line in command(f"{words} --live").splitlines() if "the render goes on" in line]
     assert len(told) == 1 and told[0].startswith("no live image: ")
     Path("it.exr").unlink()

@@ -6,17 +6,16 @@ that is met by chance has no density.
 
 import numpy as np
 import pytest
-from unbiased import load
+from unbiased import differences, light_apart, load, render_ours
 
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
 from ngpt.testing import z_test
 
 SIZE, BLOCK = (48, 32), 4
 # Without those whose radius blurs (vcm gathers little of direct light), and those that leave such lamps to Mitsuba
-RIGHT = [
-    name
-    for name, entry in SAMPLERS.items()
-    if name == "vcm" or not (entry.biased or entry.leaves_lamps or entry.standing == "study")
+RIGHT = [pytest.param("vcm", marks=pytest.mark.slow)]
+RIGHT += [
+    name for name, entry in SAMPLERS.items() if not (entry.biased or entry.leaves_lamps or entry.standing == "study")
 ]
 
 
@@ -36,16 +35,12 @@ def ball(**surface):
     }
 
 
-def by_chance(mi, description, batches=24, spp=512):
-    scene = load(mi, description, SIZE)
-    integrator = mi.load_dict({"type": "direct", "emitter_samples": 0, "bsdf_samples": 1})
-    images = [mi.render(scene, integrator=integrator, spp=spp, seed=1000 + i) for i in range(batches)]
-    return np.stack([np.array(image) for image in images])
-
-
 @pytest.fixture(scope="module")
 def expected(renderer):
-    return by_chance(renderer, ball())
+    scene = load(renderer, ball(), SIZE)
+    integrator = renderer.load_dict({"type": "direct", "emitter_samples": 0, "bsdf_samples": 1})
+    images = [renderer.render(scene, integrator=integrator, spp=512, seed=1000 + i) for i in range(24)]
+    return np.stack([np.array(image) for image in images])
 
 
 def off(images, references):
@@ -54,13 +49,7 @@ def off(images, references):
     return float(np.sqrt((result.z[result.z != 0] ** 2).mean()))
 
 
-def rendered(mi, description, sampler, spp=64, batches=16, **options):
-    from data_gen.render import render_stack
-
-    scene = load(mi, description, SIZE)
-    return [render_stack(scene, spp, i, sampler, unbiased=True, **options).layers for i in range(batches)]
-
-
+@pytest.mark.slow
 def test_mitsuba_is_no_reference(renderer, expected):
     """The day that Mitsuba is right, ``paths/bent.py`` can go."""
     scene = load(renderer, ball(), SIZE)
@@ -71,14 +60,12 @@ def test_mitsuba_is_no_reference(renderer, expected):
 @pytest.mark.parametrize("sampler", RIGHT)
 def test_samplers_have_the_light_of_paths_that_sample_no_lamps(renderer, expected, sampler):
     # Where a sample is a pass, few of them: a pass takes long to start.
-    stacks = rendered(renderer, ball(), sampler, 16 if SAMPLERS[sampler].batch == 1 else 64)
+    spp = 16 if SAMPLERS[sampler].batch == 1 else 64
+    stacks = render_ours(load(renderer, ball(), SIZE), sampler, 16, spp)
     assert off(np.stack([stack["primal"] for stack in stacks]), expected) < 1.3
-    if "dx" in stacks[0]:
-        from unbiased import differences, light_apart
-
-        for axis, name in enumerate(("dx", "dy")):
-            ours = np.stack([stack[name] + differences(light_apart(stack))[axis] for stack in stacks])
-            assert off(ours, np.stack([differences(each)[axis] for each in expected])) < 1.3
+    for axis, name in enumerate(("dx", "dy") if "dx" in stacks[0] else ()):
+        ours = np.stack([stack[name] + differences(light_apart(stack))[axis] for stack in stacks])
+        assert off(ours, np.stack([differences(each)[axis] for each in expected])) < 1.3
 
 
 def test_it_is_said_of_samplers_that_leave_lamps_to_mitsuba(renderer, caplog):

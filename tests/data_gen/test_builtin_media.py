@@ -7,7 +7,6 @@ from unbiased import load
 from data_gen.inspect import inspect_scene
 from data_gen.render import render_stack
 from data_gen.scenes import builtin, grids
-from data_gen.scenes.facts import scene_facts
 
 MEDIA = ("haze", "smoke", "cloud")
 
@@ -16,8 +15,7 @@ MEDIA = ("haze", "smoke", "cloud")
 def test_a_built_in_scene_with_media_renders(renderer, name):
     """By `gpt`, and by volpathmis alike; without the media it is another image."""
     scene = load(renderer, name, (24, 16))
-    facts, stack = scene_facts(scene), render_stack(scene, 16, sampler="gpt", unbiased=True)
-    assert facts.integrator.lower().startswith("vol") and facts.media
+    stack = render_stack(scene, 16, sampler="gpt", unbiased=True)
     assert "dx" in stack and all(np.isfinite(stack[layer]).all() for layer in stack.names)
     assert np.mean(stack["primal"].max(axis=-1) > 0) > 0.9 and stack.attributes["ngpt:discarded"] == 0
     mis = renderer.load_dict({"type": "volpathmis", "max_depth": 12})

@@ -13,30 +13,20 @@ from data_gen.choosing import plans
 from data_gen.choosing.trials import Pilot
 from data_gen.render import render_stack
 from data_gen.request import RenderRequest
+from data_gen.scenes.builtin import _camera, _diffuse, _sphere, _wall
 
 
 def burning_glass(mi, ball="dielectric", lamp=None, film=(48, 36)):
     """A floor, seen from below a ball that a lamp shines through; the ball is out of sight."""
-    matte = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
-    to = mi.ScalarTransform4f()
+    # Of a size that paths meet
+    beside = _sphere([1.5, 1, 1], 0.2, _diffuse(0.5, 0.5, 0.5)) | {"emitter": {"type": "area", "radiance": 2.0}}
     scene = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 8},
-        "sensor": {
-            "type": "perspective",
-            "fov": 45,
-            "to_world": to.look_at(origin=[0, 0.35, 1.2], target=[0, 0, 0], up=[0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": 48, "height": 36, "rfilter": {"type": "box"}},
-        },
-        "floor": {"type": "rectangle", "to_world": to.rotate([1, 0, 0], -90).scale(2), "bsdf": matte},
-        "ball": {"type": "sphere", "center": [0, 1.3, 0], "radius": 0.5, "bsdf": {"type": ball}},
-        # Of a size that paths meet
-        "beside": {
-            "type": "sphere",
-            "center": [1.5, 1, 1],
-            "radius": 0.2,
-            "emitter": {"type": "area", "radiance": 2.0},
-        },
+        "sensor": _camera([0, 0.35, 1.2], [0, 0, 0], 45),
+        "floor": _wall([0, 0, 0], [0, 1, 0], (4, 4), _diffuse(0.5, 0.5, 0.5)),
+        "ball": _sphere([0, 1.3, 0], 0.5, {"type": ball}),
+        "beside": beside,
         "lamp": lamp or {"type": "point", "position": [0, 3, 0], "intensity": 5.0},
     }
     return load(mi, scene, film)

@@ -5,6 +5,7 @@ import json
 import math
 import os
 import struct
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -52,25 +53,24 @@ INFINITE = embedded(np.full(64, np.inf, np.float32).tobytes())
 FALLING = embedded(np.array([1, 0], np.float32).tobytes() + content(None)[1][8:])
 
 
-@pytest.fixture(params=["embedded", "beside", "glb"])
-def file(request, tmp_path):
-    if request.param == "glb":
-        scene, data = content(None)
-        text = json.dumps(scene).encode()
-        text += b" " * (-len(text) % 4)
-        path = tmp_path / "shot.glb"
-        chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(data), 0x4E4942) + data
-        path.write_bytes(b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks)
-        return path
-    path = tmp_path / "shot.gltf"
-    scene, data = content(embedded if request.param == "embedded" else lambda data: "the%20buffer.bin")
-    (tmp_path / "the buffer.bin").write_bytes(data)
-    path.write_text(json.dumps(scene))
-    return path
+def stored(folder, way):
+    """The camera in a file: with its numbers in the text, in a file beside it, or behind it."""
+    if way != "glb":
+        scene, data = content(embedded if way == "embedded" else lambda data: "the%20buffer.bin")
+        (folder / "the buffer.bin").write_bytes(data)
+        (folder / "a.gltf").write_text(json.dumps(scene))
+        return folder / "a.gltf"
+    scene, data = content(None)
+    text = json.dumps(scene).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(data), 0x4E4942) + data
+    (folder / "a.glb").write_bytes(b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks)
+    return folder / "a.glb"
 
 
-def test_a_camera_moves_as_in_the_file(file):
-    path = read_gltf_camera(file, 24)
+@pytest.mark.parametrize("way", ["embedded", "beside", "glb"])
+def test_a_camera_moves_as_in_the_file(tmp_path, way):
+    path = read_gltf_camera(stored(tmp_path, way), 24)
     assert path.keys[0].frame == 0 and path.keys[-1].frame == 24 and len(path.keys) == 25
     # It looks along -z to begin with, one unit above its own place.
     assert np.allclose(path.at(0).to_world, look_at((0, 2, 4), (0, 2, 3), (0, 1, 0)), atol=1e-6)
@@ -104,37 +104,34 @@ def test_a_spline_of_any_length_has_the_speed_that_its_tangents_say(tmp_path):
     assert all(np.isclose(path.at(10 * t).to_world[0, 3], cubic(t), atol=1e-5) for t in (2, 2.5, 3.5, 4.8))
 
 
-@pytest.mark.parametrize(
-    ("change", "complaint"),
-    [
-        (lambda scene: scene["nodes"].pop(), "has no camera"),
-        (lambda scene: scene["cameras"][0].update(type="orthographic"), "must be perspective"),
-        (lambda scene: scene.pop("accessors"), "can be understood"),
-        (lambda scene: scene["accessors"][1].update(count=1000), "can be understood"),
-        (lambda scene: scene["buffers"][0].update(uri="gone.bin"), "gone.bin: not found"),
-        (lambda scene: scene["accessors"][0].update(componentType=5123), "export them as floats"),
-        (lambda scene: scene["buffers"][0].update(uri=5), "can be understood"),
-        (lambda scene: scene["buffers"][0].update(uri="/dev/zero"), "'/dev/zero' is not in its folder or below"),
-        (lambda scene: scene["buffers"][0].update(uri="a/../../b.bin"), "is not in its folder or below"),
-        (lambda scene: scene["buffers"][0].update(uri="%2e%2e/b.bin"), "'../b.bin' is not in its folder"),
-        (lambda scene: scene["buffers"][0].update(uri="http://a.b/c.bin"), "is not in its folder or below"),
-        (lambda scene: scene["buffers"][0].update(uri="c:\\b.bin"), "is not in its folder or below"),
-        (lambda scene: scene["buffers"][0].update(uri="pipe.bin"), "pipe.bin: is a pipe or a device"),
-        (lambda scene: scene["buffers"][0].update(uri=INFINITE), "accessor 0 has numbers that are not"),
-        (lambda scene: scene["buffers"][0].update(uri=FALLING), "do not rise"),
-        (lambda scene: scene["animations"][0]["channels"][0].update(target=[]), "can be understood"),
-        (lambda scene: scene["nodes"][1].update(translation=[0, math.nan, 0]), "frame 0: .* not finite, or beyond"),
-        (lambda scene: scene["nodes"][1].update(translation=[0, 1e200, 0]), "frame 0: .* not finite, or beyond"),
-        (lambda scene: scene["nodes"][1].update(scale=[0, 1, 1]), "frame 0: .* flattens space"),
-        (lambda scene: scene["nodes"][1].update(matrix=[0] * 16), "frame 0: .* flattens space"),
-        (lambda scene: scene["cameras"][0]["perspective"].update(yfov=math.nan), "yfov .* between 0 and 180"),
-        (lambda scene: scene["cameras"][0]["perspective"].update(yfov=0), "yfov"),
-        (lambda scene: scene["cameras"][0]["perspective"].update(yfov=10), "yfov"),
-    ],
-)
-def test_files_that_cannot_be_used_are_refused(tmp_path, change, complaint):
+NOT_BELOW = "is not in its folder or below"
+# The place of a part of the scene, what is there instead, and the complaint
+REFUSED = [
+    (["nodes", 2], {}, "has no camera"),
+    (["cameras", 0, "type"], "orthographic", "must be perspective"),
+    (["accessors"], [], "can be understood"),
+    (["accessors", 1, "count"], 1000, "can be understood"),
+    (["accessors", 0, "componentType"], 5123, "export them as floats"),
+    *((["buffers", 0, "uri"], uri, NOT_BELOW) for uri in ("/dev/zero", "a/../../b.bin", "%2e%2e/b.bin")),
+    *((["buffers", 0, "uri"], uri, NOT_BELOW) for uri in ("http://a.b/c.bin", "c:\\b.bin")),
+    (["buffers", 0, "uri"], "gone.bin", "gone.bin: not found"),
+    (["buffers", 0, "uri"], "pipe.bin", "pipe.bin: is a pipe or a device"),
+    (["buffers", 0, "uri"], 5, "can be understood"),
+    (["buffers", 0, "uri"], INFINITE, "accessor 0 has numbers that are not"),
+    (["buffers", 0, "uri"], FALLING, "do not rise"),
+    (["animations", 0, "channels", 0, "target"], [], "can be understood"),
+    *((["nodes", 1, "translation", 1], far, "frame 0: .* not finite, or beyond") for far in (math.nan, 1e200)),
+    (["nodes", 1, "scale"], [0, 1, 1], "frame 0: .* flattens space"),
+    (["nodes", 1, "matrix"], [0] * 16, "frame 0: .* flattens space"),
+    *((["cameras", 0, "perspective", "yfov"], angle, "yfov .* between 0 and 180") for angle in (math.nan, 0, 10)),
+]
+
+
+@pytest.mark.parametrize(("place", "value", "complaint"), REFUSED)
+def test_files_that_cannot_be_used_are_refused(tmp_path, place, value, complaint):
     scene, _ = content(embedded)
-    change(scene)
+    *path, last = place
+    reduce(lambda part, key: part[key], path, scene)[last] = value
     os.mkfifo(tmp_path / "pipe.bin")
     with pytest.raises(NgptError, match=complaint):
         read(tmp_path, scene)
@@ -169,12 +166,11 @@ def test_scaled_cameras_and_parents_are_cameras_without_scale(tmp_path):
 def test_mitsuba_renders_scaled_and_mirrored_cameras(renderer, tmp_path, scale):
     import data_gen
 
-    images = []
+    images, camera, how = [], {"type": "perspective", "perspective": {"yfov": 0.7}}, {"size": (17, 12)}
     for given in ([1, 1, 1], scale):
         node = {"camera": 0, "translation": [0, 1, 4], "scale": given}
-        camera = {"type": "perspective", "perspective": {"yfov": 0.7}}
         (tmp_path / "a.gltf").write_text(json.dumps({"nodes": [node], "cameras": [camera]}))
-        shot = data_gen.render_frames("diffuse", [0], 4, size=(17, 12), sampler="primal", camera=tmp_path / "a.gltf")
+        shot = data_gen.render_frames("diffuse", [0], 4, sampler="primal", camera=tmp_path / "a.gltf", **how)
         images.append(next(iter(shot))[1]["albedo"])
     assert images[0].std() > 0.01
     mirrored = images[0][:, ::-1] if scale[0] < 0 else images[0]

@@ -163,8 +163,8 @@ def steps(renderer):
     return cache(Steps)
 
 
-PLANS = [("replay", 0.05, True), ("half-vector", 0.05, False), ("replay", 10.0, True), ("half-vector", 10.0, True)]
-MORE_PLANS = [("replay", 0.05, False), ("half-vector", 0.05, True)]
+PLANS = [("replay", 0.05, True), ("half-vector", 0.05, False), ("half-vector", 10.0, True)]
+MORE_PLANS = [("replay", 10.0, True), ("replay", 0.05, False), ("half-vector", 0.05, True)]
 
 
 @pytest.mark.parametrize(

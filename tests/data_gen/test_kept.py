@@ -47,7 +47,7 @@ def test_damage_is_named():
 
 
 @pytest.fixture(scope="module")
-def made(renderer, tmp_path_factory):
+def made(renderer, first_view, tmp_path_factory):
     """Makes the shard of a configuration, and reads its crops."""
 
     def make(config=SMALL, again=None):
@@ -91,7 +91,7 @@ def test_inputs_are_rendered_anew(made, first, tmp_path):
         assert not any(np.array_equal(inputs[i], inputs[i - 1]) for i in range(3))
 
 
-def test_pairs(renderer, tmp_path):
+def test_pairs(renderer, first_view, tmp_path):
     jobs.generate(replace(SMALL, reference_spp=0), tmp_path, jobs.Serial())
     write_card(tmp_path)
     assert problems(tmp_path) == [] and "No references" in (tmp_path / "README.md").read_text()

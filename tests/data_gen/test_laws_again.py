@@ -1,63 +1,73 @@
 """A law runs again where its code has changed, however deep; with the code with which it passed last it is skipped."""
 
 import os
-import re
-import shutil
 import subprocess
 import sys
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+from ngpt.system.source import code_text
 
 ROOT = Path(__file__).parents[2]
-LAWS = Path("tests") / "data_gen" / "laws"
-LAW = """
-import pytest
-@pytest.mark.parametrize("name", ["gpt", "ppm"])
-def test_law(name): {}
-"""
 
 
 @pytest.fixture
-def tree(tmp_path):
-    """A copy of what renders, with a law of two samplers."""
-    for name in ("ngpt", "data_gen"):
-        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("weights"))
-    (tmp_path / LAWS).mkdir(parents=True)
-    for file in ("references.py", "references.npz", "laws/conftest.py"):
-        shutil.copy(ROOT / "tests" / "data_gen" / file, tmp_path / "tests" / "data_gen" / file)
-    (tmp_path / LAWS / "test_law.py").write_text(LAW.format("pass"))
-    return tmp_path
+def laws():
+    spec = spec_from_file_location("laws", ROOT / "tests/data_gen/laws/conftest.py")
+    spec.loader.exec_module(laws := module_from_spec(spec))
+    return laws
 
 
-def ran(tree, strict="0"):
-    """The samplers whose law ran."""
-    places = os.pathsep.join(map(str, (tree, tree / "tests" / "data_gen")))
-    more = {"PYTHONPATH": places, "XDG_CACHE_HOME": str(tree / "cache"), "NGPT_STRICT": strict}
-    more["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
-    words = [sys.executable, "-m", "pytest", "-v", "-p", "no:cacheprovider", LAWS / "test_law.py"]
-    told = subprocess.run(words, cwd=tree, env=os.environ | more, capture_output=True, text=True, timeout=300).stdout
-    found = dict(re.findall(r"test_law\[(\w+)\] (PASSED|FAILED|SKIPPED)", told))
-    assert found.keys() == {"gpt", "ppm"}, told
-    return {name for name, outcome in found.items() if outcome != "SKIPPED"}
+def test_a_law_depends_on_all_code_that_its_sampler_imports(laws, monkeypatch):
+    changed = set()
+    monkeypatch.setattr(laws, "_text", lambda file: file.relative_to(ROOT).as_posix() in changed)
+
+    def codes(*files):
+        changed.update(files)
+        laws.hash_of.cache_clear()
+        law = {"path": ROOT / "tests/data_gen/renders.py"}
+        params = ({"name": name} for name in ("gpt", "ppm"))
+        return [laws.code_of(SimpleNamespace(callspec=SimpleNamespace(params=p), **law)) for p in params]
+
+    before, again = codes(), codes()
+    assert before == again
+    shared = codes("data_gen/paths/walk.py")
+    assert shared[0] != before[0] and shared[1] != before[1]
+    of_photons = codes("data_gen/samplers/photons/map/trace.py")
+    assert of_photons[0] == shared[0] and of_photons[1] != shared[1]
 
 
-def test_a_law_runs_where_its_code_is_not_that_with_which_it_passed(tree):
-    shared, of_photons = tree / "data_gen/paths/walk.py", tree / "data_gen/samplers/photons/map/trace.py"
-    assert ran(tree) == {"gpt", "ppm"}
-    shared.write_text(shared.read_text() + "# A remark is no code.\n")
-    assert ran(tree) == set()
-    assert ran(tree, strict="1") == {"gpt", "ppm"}
-    assert shared.read_text().count("_MOST = 0.95") == 1
-    shared.write_text(shared.read_text().replace("_MOST = 0.95", "_MOST = 0.96"))
-    assert ran(tree) == {"gpt", "ppm"}
-    of_photons.write_text(of_photons.read_text() + "something = 1\n")
-    assert ran(tree) == {"ppm"}
+def test_remarks_are_no_code(tmp_path):
+    file, texts = tmp_path / "a.py", []
+    for text in ("x = 1\n", '"""A docstring."""\nx = 1  # A comment\n', "x = 2\n"):
+        file.write_text(text)
+        texts.append(code_text(file))
+    assert texts[0] == texts[1] != texts[2]
 
 
-def test_a_law_that_failed_runs_again(tree):
-    (tree / LAWS / "test_law.py").write_text(LAW.format("assert name == 'ppm'"))
-    assert ran(tree) == {"gpt", "ppm"} and ran(tree) == {"gpt"}
+def test_a_law_is_skipped_only_where_it_has_passed_with_the_same_code(laws, monkeypatch, tmp_path):
+    law = SimpleNamespace(nodeid="law", fixturenames=())
+    monkeypatch.setattr(laws, "PASSED", tmp_path / "passed")
+
+    def runs(code, passes, strict="0"):
+        monkeypatch.setattr(laws, "code_of", lambda item: code)
+        monkeypatch.setenv("NGPT_STRICT", strict)
+        try:
+            laws.pytest_runtest_setup(law)
+        except pytest.skip.Exception:
+            return False
+        hook = laws.pytest_runtest_makereport(law, SimpleNamespace(when="call"))
+        next(hook)
+        with pytest.raises(StopIteration):
+            hook.send(SimpleNamespace(passed=passes))
+        return True
+
+    assert runs("old", passes=False) and runs("old", passes=True)
+    assert not runs("old", passes=True) and runs("old", passes=True, strict="1")
+    assert runs("new", passes=True) and not runs("new", passes=True)
 
 
 LOADED = """
