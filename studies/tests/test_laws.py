@@ -3,10 +3,12 @@
 import media_scenes
 import pytest
 from bdpt_scenes import SCENES as OF_ALL_LAMPS
+from camera_cases import CAMERAS
 from data_gen_scenes import caustics, fog, hidden_lamp
 from reference_scenes import BENT, SMALL
 from registered import slow
 from test_bits import have_the_same_bits
+from test_cameras import check
 from test_energy import have_no_gradients
 from test_frozen import assert_a_scene_goes_with_its_last_render, assert_paths_are_recorded_once
 from test_plugins import assert_there_whatever_the_variants
@@ -16,7 +18,7 @@ from test_unbiased import LONG, Case, holds
 from unbiased import FAR, load
 
 from data_gen.adaptive import Adaptive
-from data_gen.samplers import find
+from data_gen.samplers import SAMPLERS, find
 from data_gen.scenes.facts import Facts
 from ngpt.errors import NgptError
 
@@ -110,3 +112,10 @@ def test_a_scene_goes_with_its_last_render(renderer, name):
 @pytest.mark.parametrize("name", ["split", "gpt-tiles", "gpm", "gvcm", "gbdpt"])
 def test_paths_of_no_edge_and_of_one_have_no_gradients(renderer, name):
     have_no_gradients(renderer, name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("view", CAMERAS)
+@pytest.mark.parametrize("name", [name for name, entry in SAMPLERS.items() if entry.standing == "study"])
+def test_cameras(renderer, name, view):
+    check(renderer, name, view, batches=10, spp=8 if SAMPLERS[name].batch == 1 else 16)

@@ -8,10 +8,8 @@ from data_gen_scenes import _scale
 from renders import mi
 from unbiased import differences, light_apart, load, render_ours
 
-from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
+from data_gen.samplers import SAMPLERS
 from data_gen.scenes.builtin import _diffuse, _light, _sphere, _wall
-from data_gen.scenes.facts import scene_facts
-from ngpt.errors import NgptError
 from ngpt.testing import z_test
 
 # Pixels, and those of blocks whose means are compared
@@ -165,24 +163,10 @@ def block_means(image, edge):
 
 def stacks_of(scene, sampler, batches, spp):
     """Layers of independent stacks by any sampler; those by photons with a radius that hardly blurs."""
-    if sampler in FRAME_SAMPLERS:
-        if reason := FRAME_SAMPLERS[sampler].refuses(scene_facts(scene)):
-            raise NgptError(reason)
-        return [last_frame(scene, FRAME_SAMPLERS[sampler], seed, spp) for seed in range(batches)]
-
     options = {}
     if "photons" in SAMPLERS[sampler].options:
         # Beams and planes are all tried for each camera ray: fewer do.
         options = {"photons": 1 if sampler.endswith(("beams", "planes")) else 8, "radius": 0.6}
     if np.prod(scene.sensors()[0].film().crop_size()) == 1:
-        spp *= 8 if getattr(SAMPLERS.get(sampler), "batch", 0) else 128
+        spp *= 8 if SAMPLERS[sampler].batch else 128
     return render_ours(scene, sampler, batches, spp, **options)
-
-
-def last_frame(scene, entry, seed, spp, frames=3):
-    """Layers of the last of some frames in which nothing moves."""
-    width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
-    still, depth = np.zeros((height, width, 2), np.float32), np.ones((height, width), np.float32)
-    made = entry.made(scene, seed, spp, 2048)
-    films = [made.film(i, still if i else None, depth if i else None) for i in range(frames)]
-    return films[-1].develop()

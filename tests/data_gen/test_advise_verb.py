@@ -74,10 +74,10 @@ def test_the_pilot_takes_no_longer_than_the_time_it_advises_on(renderer, advice,
 
 def test_on_a_busy_machine_one_sampler_is_tried_and_no_more(renderer, monkeypatch):
     """Every look at the clock is a second late: nothing fits, and the first trial ends all the same."""
-    scene, seconds = load_scene("diffuse", (48, 32)), count()
+    scene, seconds = load_scene("diffuse", (16, 12)), count()
     monkeypatch.setattr(plans, "candidates", lambda scene, **_: ["gpt", "bdpt"])
-    found = plans.explore(scene, 30.0, pilot=Pilot(lambda: float(next(seconds))), patient=True)
-    assert {p.sampler for p in found} == {"gpt"} and len(found) == 1
+    (found,) = plans.explore(scene, 30.0, pilot=Pilot(lambda: float(next(seconds))), patient=True)
+    assert found.sampler == "gpt"
     assert plans.explore(scene, 30.0, pilot=Pilot(lambda: float(next(seconds)))) == []
 
 

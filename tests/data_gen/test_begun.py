@@ -22,16 +22,14 @@ from data_gen.adaptive import LEAST
 from data_gen.begun import frame_seed, part_seed
 from data_gen.cli import onlook, render
 from data_gen.film import GradientFilm
-from data_gen.frames import shot
 from data_gen.frames.camera_path import CameraPath, Key
-from data_gen.frames.shot import Shot
 from data_gen.render import render_stack
 from data_gen.request import RenderRequest, said_by
 from data_gen.samplers import reused
 from data_gen.session import render_frames, render_scene
 from data_gen.shot_files import write_frames
 
-GPT = "render diffuse --size 16x12 --sampler gpt"
+RENDER = "render diffuse --size 16x12 --sampler primal"
 ONE_PASS = 16 * 12 * 16  # lanes
 
 
@@ -139,6 +137,8 @@ def test_a_number_beyond_floats_in_a_header_counts_as_none(tmp_path):
 
 def test_a_scene_or_camera_without_a_file_goes_on_with_nothing(tmp_path, renderer):
     """Its header does not say which one it is, and samples of two must not be mixed."""
+    from data_gen.frames.shot import Shot
+
     path = tmp_path / "a.exr"
     for what, asked in {
         "scene": RenderRequest(Shot(lambda frame: ("diffuse", {})), 9, frames=(7,)),
@@ -234,13 +234,13 @@ def test_parts_and_frames_have_seeds_of_their_own():
 
 def test_the_same_command_goes_on_and_then_is_done(renderer, command):
     assert begun.SHARED == LEAST
-    command(f"{GPT} --seed 3 --spp 16 -o it.exr")
-    first, on = ngpt.read("it.exr"), f"{GPT} --seed 3 --spp 48 --skip-existing -o it.exr"
+    command(f"{RENDER} --seed 3 --spp 16 -o it.exr")
+    first, on = ngpt.read("it.exr"), f"{RENDER} --seed 3 --spp 48 --skip-existing -o it.exr"
     assert "has 16 samples per pixel; going on with it" in command(on)
     whole = ngpt.read("it.exr")
     assert whole.attributes["ngpt:spp"] == 48 and whole.attributes["ngpt:seed"] == f"3 {part_seed(3, 1)}"
     # The samples that were there, and others: to the bit what merging them gives.
-    command(f"{GPT} --seed {part_seed(3, 1)} --spp 32 -o rest.exr")
+    command(f"{RENDER} --seed {part_seed(3, 1)} --spp 32 -o rest.exr")
     merged = ngpt.merge([first, ngpt.read("rest.exr")])
     assert all(np.array_equal(whole[name], merged[name], equal_nan=True) for name in merged.names)
     data = Path("it.exr").read_bytes()
@@ -257,14 +257,14 @@ def test_the_same_command_goes_on_and_then_is_done(renderer, command):
 @pytest.mark.parametrize("more", ["--adaptive", "--error 0.001"])
 def test_samples_that_are_shared_out_go_on_so(renderer, command, more):
     for spp in (32, 80):
-        command(f"{GPT} {more} --skip-existing -o it.exr --spp {spp}")
+        command(f"{RENDER} --sampler gpt {more} --skip-existing -o it.exr --spp {spp}")
     found = ngpt.read("it.exr")
     assert found.attributes["ngpt:spp"] == 80 and len(found.attributes["ngpt:seed"].split()) == 2
     assert found.attributes["ngpt:adaptive"] and "samples" in found
 
 
 def test_frames_go_on_too(renderer, command):
-    words = f"{GPT} --frames 0:3 -o shot"
+    words = f"{RENDER} --frames 0:3 -o shot"
     command(f"{words} --spp 4")
     Path("shot/diffuse.0001.exr").unlink()
     command(f"{words} --spp 12 --skip-existing")
@@ -291,7 +291,7 @@ def test_a_frame_that_is_broken_off_is_kept_and_gone_on_with(renderer, tmp_path,
 
 
 def failing(monkeypatch, passes_before):
-    """Has the sampler `gpt` fail after so many passes."""
+    """Has renders fail after so many passes."""
     monkeypatch.setattr(passes, "FIRST_LANES", ONE_PASS)
     end, ended = GradientFilm.end_pass, []
 
@@ -307,18 +307,18 @@ def failing(monkeypatch, passes_before):
 def test_a_pass_that_fails_takes_none_before_it_along(renderer, command, monkeypatch):
     with monkeypatch.context() as patched:
         failing(patched, 1)
-        said = command(f"{GPT} --spp 64 -o it.exr", 1)
+        said = command(f"{RENDER} --spp 64 -o it.exr", 1)
     assert "the device is gone; it.exr has the 16 samples per pixel done before" in said
     kept = ngpt.read("it.exr")
     assert kept.attributes["ngpt:spp"] == 16 and kept.attributes["ngpt:unfinished"] == "failed"
-    command(f"{GPT} --spp 16 -o same.exr")
+    command(f"{RENDER} --spp 16 -o same.exr")
     assert np.allclose(kept["primal"], ngpt.read("same.exr")["primal"], rtol=0.5, atol=0.1)
-    command(f"{GPT} --spp 64 -o it.exr --skip-existing")
+    command(f"{RENDER} --spp 64 -o it.exr --skip-existing")
     assert ngpt.read("it.exr").attributes["ngpt:spp"] == 64
     # One that fails at first leaves nothing.
     failing(monkeypatch, 0)
     with pytest.raises(RuntimeError):
-        command(f"{GPT} --spp 64 -o none.exr")
+        command(f"{RENDER} --spp 64 -o none.exr")
     assert not Path("none.exr").exists()
 
 
@@ -326,14 +326,16 @@ def test_nothing_that_comes_after_the_last_sample_takes_the_image_along(renderer
     def gone(*arguments):
         raise RuntimeError("gone")
 
+    from data_gen.frames import shot
+
     with monkeypatch.context() as patched:
         patched.setattr(reused, "_key", gone)  # whether the next render may have the sampler
-        command("render diffuse --size 16x12 --spp 4 --sampler primal -o it.exr")
-    command("render diffuse --size 16x12 --spp 4 --sampler primal -o same.exr")
+        command(f"{RENDER} --spp 4 -o it.exr")
+    command(f"{RENDER} --spp 4 -o same.exr")
     same(ngpt.read("it.exr"), ngpt.read("same.exr"))
     with monkeypatch.context() as patched:
         patched.setattr(shot, "motion_vectors", gone)
-        told = command("render diffuse --size 16x12 --spp 4 --sampler primal --frames 0:2 -o f{frame}.exr", 1)
+        told = command(f"{RENDER} --spp 4 --frames 0:2 -o f{{frame}}.exr", 1)
     assert "frame 0: gone; f0.exr has the samples done before" in told
     frame = ngpt.read("f0.exr")
     assert frame.attributes["ngpt:unfinished"] == "failed" and frame["primal"].mean() > 0.1
@@ -356,7 +358,7 @@ def test_what_was_rendered_is_kept_where_it_cannot_be_written(renderer, command,
         return render_scene(*args, **given)
 
     monkeypatch.setattr(render, "render_scene", moved)
-    said = command(f"{GPT} --sampler primal --spp 4 -o {folder.absolute()}/it.exr", 1)
+    said = command(f"{RENDER} --spp 4 -o {folder.absolute()}/it.exr", 1)
     assert f"what was made is kept in {Path('it.kept.exr').absolute()}" in said
     assert ngpt.read("it.kept.exr").attributes["ngpt:spp"] == 4
 

@@ -44,7 +44,7 @@ def test_the_demo_leaves_media_out_by_default():
 
 
 @pytest.mark.parametrize("make", [grids.plume, grids.cloud])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_grids_come_from_their_seed_and_end_before_their_box(make, seed):
     grid = make(np.random.default_rng(seed))
     assert grid.dtype == np.float32 and np.array_equal(grid, make(np.random.default_rng(seed)))

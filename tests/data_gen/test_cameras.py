@@ -20,7 +20,7 @@ from camera_cases import (
 from references import references
 from unbiased import load
 
-from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
+from data_gen.samplers import SAMPLERS
 from ngpt.errors import NgptError
 
 pytest.importorskip("mitsuba")
@@ -32,31 +32,27 @@ from data_gen.paths.light_ends import LightEnds
 from data_gen.render import render_stack
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.radius import pixel_width
+from data_gen.samplers.shared import unreachable_camera
 from data_gen.scenes.facts import Facts
 from data_gen.scenes.lamps import lamp_weights
 
-FROM_BOTH_ENDS = ("bdpt", "gbdpt", "vcm", "gvcm")
 # Where light paths end at the camera, and elsewhere
 QUICK = [("bdpt", "principal point"), ("bdpt", "near plane"), ("gpt", "principal point, crop")]
-SLOW = [(name, view) for view in CAMERAS for name in (*SAMPLERS, *FRAME_SAMPLERS) if (name, view) not in QUICK]
+CORE = [name for name, entry in SAMPLERS.items() if entry.standing != "study"]
+SLOW = [(name, view) for view in CAMERAS for name in CORE if (name, view) not in QUICK]
 # Of a layer: a cell of the matrix fails by chance once in 3000 times.
 LEVEL = 1e-4
 
 
-def in_media(sampler):
-    """Whether it renders scenes with media alone."""
-    return bool({**SAMPLERS, **FRAME_SAMPLERS}[sampler].refuses(Facts("path", ())))
-
-
 def check(mi, sampler, view, batches, spp, media=False):
-    media = media or in_media(sampler)
-    scene = scene_with(mi, view, media)
-    kind = CAMERAS[view]()["sensor"]["type"]
-    kind = view if view == "irradiancemeter" else kind
-    by_photons = sampler in SAMPLERS and "photons" in SAMPLERS[sampler].options
+    """The sampler is right before that camera, or refuses it. Where it renders nothing but media, there are some."""
+    entry = SAMPLERS[sampler]
+    media = media or bool(entry.refuses(Facts("path", ())))
+    scene, by_photons = scene_with(mi, view, media), "photons" in entry.options
+    kind = view if view == "irradiancemeter" else CAMERAS[view]()["sensor"]["type"]
     if (
         view in ("batch", "radiancemeter, scaled")
-        or (sampler in FROM_BOTH_ENDS and kind not in ("perspective", "thinlens"))
+        or (unreachable_camera in entry.refusals and kind not in ("perspective", "thinlens"))
         or (by_photons and kind not in ("perspective", "thinlens", "orthographic"))
     ):
         with pytest.raises(NgptError, match=rf"camera '{kind}'.*; (use --sampler gpt|remove <scale>|take its cameras)"):
@@ -77,7 +73,7 @@ def test_right(renderer, sampler, view):
 @pytest.mark.slow
 @pytest.mark.parametrize(("sampler", "view"), SLOW)
 def test_right_or_refused(renderer, sampler, view):
-    check(renderer, sampler, view, batches=10, spp=8 if getattr(SAMPLERS.get(sampler), "batch", 0) == 1 else 16)
+    check(renderer, sampler, view, batches=10, spp=8 if SAMPLERS[sampler].batch == 1 else 16)
 
 
 @pytest.mark.parametrize("sampler", ["gpt", pytest.param("gpt-basic", marks=pytest.mark.slow)])
@@ -175,16 +171,11 @@ def test_a_mirrored_camera_has_mirrored_features(renderer):
 
 
 def test_photons_are_gathered_in_pixels_wherever_the_near_plane_is(renderer):
-    mi = renderer
-    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(20)}
-
-    def width(sensor):
-        scene = mi.load_dict({"type": "scene", "sensor": sensor, "wall": wall})
-        return pixel_width(scene, scene.sensors()[0])
-
-    expected = 2 * np.tan(np.radians(20)) / 24 * 3.6
+    wall = {"type": "rectangle", "to_world": renderer.ScalarTransform4f().scale(20)}
     for near in (0.01, 2.5):
-        assert width(camera(fov=40, near_clip=near)) == pytest.approx(expected, rel=0.05)
+        scene = renderer.load_dict({"type": "scene", "sensor": camera(fov=40, near_clip=near), "wall": wall})
+        expected = 2 * np.tan(np.radians(20)) / 24 * 3.6
+        assert pixel_width(scene, scene.sensors()[0]) == pytest.approx(expected, rel=0.05)
 
 
 @pytest.mark.parametrize("view", ["perspective", "irradiancemeter"])
@@ -223,7 +214,7 @@ def test_a_still_camera_sees_nothing_move_and_knows_where_its_pixels_look(render
 
 @pytest.mark.parametrize("view", ["batch", "radiancemeter, scaled"])
 def test_cameras_that_no_sampler_renders(renderer, view):
-    for sampler in (*SAMPLERS, *FRAME_SAMPLERS):
+    for sampler in CORE:
         check(renderer, sampler, view, 1, 1)
     integrator = renderer.load_dict({"type": "gpt"})
     with pytest.raises(NgptError, match="camera '"):
@@ -241,6 +232,6 @@ def test_plugins_render_from_any_camera_of_a_scene(renderer, sampler):
     assert [s.class_name() for s in second.sensors()] == ["OrthographicCamera", "PerspectiveCamera"]
     images = [np.array(integrator.render(s, sensor=i, seed=3, spp=4)) for s, i in ((first, 0), (second, 1))]
     assert np.array_equal(*images) and images[0][..., :3].mean() > 0.01
-    if sampler in FROM_BOTH_ENDS:
+    if sampler == "bdpt":
         with pytest.raises(NgptError, match="light paths cannot reach a camera 'orthographic'"):
             integrator.render(second, sensor=0, spp=4)

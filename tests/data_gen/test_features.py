@@ -136,28 +136,19 @@ GLOSSY = {
 }
 
 
-@pytest.fixture(scope="module")
-def strips(renderer):
-    """The albedo of upright strips side by side, one of each glossy material, (33, 33, 3)."""
-    t = renderer.ScalarTransform4f
-    return features_of(
-        renderer,
-        spp=64,
-        **{
-            name: {"type": "rectangle", "to_world": t().translate([0.5 * i - 1, 0, 0]).scale([0.25, 2, 1]), "b": bsdf}
-            for i, (name, (bsdf, _, _)) in enumerate(GLOSSY.items())
-        },
-    )["albedo"]
-
-
-@pytest.mark.parametrize("name", GLOSSY)
-def test_albedo_is_a_reflectance_for_glossy_materials_too(strips, name):
-    _, low, high = GLOSSY[name]
-    # Strips are 6.2 pixels wide; the middle one is in the middle.
-    middle = round(16.5 + 6.16 * (list(GLOSSY).index(name) - 2))
-    albedo = strips[:, middle - 2 : middle + 2]
-    assert albedo.min() >= 0 and albedo.max() <= 1
-    assert (albedo.mean(axis=(0, 1)) >= low).all() and (albedo.mean(axis=(0, 1)) <= high).all()
+def test_albedo_is_a_reflectance_for_glossy_materials_too(renderer):
+    """Upright strips side by side, one of each material and 6.2 pixels wide; the middle one is in the middle."""
+    place = renderer.ScalarTransform4f().translate
+    strips = {
+        name: {"type": "rectangle", "to_world": place([0.5 * i - 1, 0, 0]).scale([0.25, 2, 1]), "b": bsdf}
+        for i, (name, (bsdf, _, _)) in enumerate(GLOSSY.items())
+    }
+    seen = features_of(renderer, spp=64, **strips)["albedo"]
+    for number, (name, (_, low, high)) in enumerate(GLOSSY.items()):
+        middle = round(16.5 + 6.16 * (number - 2))
+        albedo = seen[:, middle - 2 : middle + 2]
+        assert albedo.min() >= 0 and albedo.max() <= 1, name
+        assert (albedo.mean(axis=(0, 1)) >= low).all() and (albedo.mean(axis=(0, 1)) <= high).all(), name
 
 
 def test_a_hall_of_mirrors_ends(renderer):

@@ -19,6 +19,7 @@ def fill(mi, film, samples, **kwargs):
 
 
 def test_mean_and_variance_over_passes_of_different_size(renderer, rng):
+    """In float64: constant samples keep their value and have no variance, however many they are."""
     samples = (1000 + rng.normal(size=(6, 7, 3))).astype(np.float32)  # mean large beside the deviation
     whole = film(3, 2)
     fill(renderer, whole, samples[:, :4])
@@ -28,6 +29,11 @@ def test_mean_and_variance_over_passes_of_different_size(renderer, rng):
     assert np.allclose(layers["primal"].reshape(6, 3), samples.mean(axis=1), rtol=1e-6)
     expected = samples.astype(np.float64).var(axis=1, ddof=1) / 7
     assert np.allclose(layers["primal_var"].reshape(6, 3), expected, rtol=1e-3)
+    constant = film(1, 1)
+    for _ in range(50):
+        fill(renderer, constant, np.full((1, 1000, 3), 0.1))
+    layers = constant.develop()
+    assert (layers["primal"] == np.float32(0.1)).all() and not layers["primal_var"].any()
 
 
 def test_nonfinite_samples_have_no_weight_and_are_counted(renderer, rng):
@@ -96,15 +102,6 @@ def test_diagnostics_are_images_beside_the_layers(renderer, rng):
     assert images["diagnostics.shiftFailures"].tolist() == [[0, 0.25], [0.5, 1]]
     # A share of all values: 2 of 8 colours, and none of 8 rates.
     assert images["diagnostics.discarded"].tolist() == [[0, 0], [0, 0.125]]
-
-
-def test_constant_samples_have_no_variance_and_float64_keeps_long_sums(renderer):
-    mi = renderer
-    target = film(1, 1)
-    for _ in range(50):
-        target.put("primal", mi.Color3f(mi.Float(np.full(1000, 0.1, np.float32))))
-    layers = target.develop()
-    assert (layers["primal"] == np.float32(0.1)).all() and not layers["primal_var"].any()
 
 
 def test_blocks_and_strands_lose_no_sample(renderer, rng, monkeypatch):
@@ -190,13 +187,10 @@ def test_what_is_put_and_what_is_splatted_are_one_value(renderer):
             target.splat("primal", mi.UInt32([pixel]), mi.Color3f(mi.Float([4.0 * scale])))
         target.end_pass(2)
     image = target.develop()["primal"][0, :, 0]
+    with pytest.raises(ValueError, match="make the film with batches"):
+        film(2, 1).splat("primal", mi.UInt32([0]), mi.Color3f(1))
     # (1 + 3) / 2 + (4 + 4) / 2 = 6, and three times that; 8 + 4 / 2 = 10, once.
     assert image.tolist() == [(6 + 18) / 2, 10]
-
-
-def test_films_of_independent_samples_take_no_splats(renderer):
-    with pytest.raises(ValueError, match="make the film with batches"):
-        film(2, 1).splat("primal", renderer.UInt32([0]), renderer.Color3f(1))
 
 
 @pytest.mark.parametrize("strands", [1, 2, 5])

@@ -1,33 +1,14 @@
-"""What ``gpt`` is made of: the rules of its shift, Jacobians, weights of pairs, classes of materials."""
-
-from itertools import product
+"""What ``gpt`` is made of: Jacobians, weights of pairs, classes of materials. Its shifts have a file of their own."""
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 import pytest
 from unbiased import load
 
 from data_gen.paths.mis import gradient_weight, mis_weight
-from data_gen.paths.shift import reconnection_jacobian, reconnects, replay_inverts
+from data_gen.paths.shift import reconnection_jacobian
 from data_gen.paths.vertex import Materials, smallest_roughness
 from data_gen.render import render_stack
-
-
-def test_the_reverse_shift_takes_back_every_kind_of_step(renderer):
-    """A step is taken as the sampler takes it. Its reverse begins with the offset path as the base, whose next vertex
-    is the shared one after a reconnection and its own after a replay."""
-    states = np.array(list(product(range(3), *[(False, True)] * 4, range(3))))
-    kind, offset_kind = mi.UInt32(states[:, 0]), mi.UInt32(states[:, 5])
-    base, base_next, offset, offset_next = (mi.Bool(states[:, i].astype(bool)) for i in range(1, 5))
-    joins = reconnects(kind, base, base_next, offset)
-    replays = ~joins & replay_inverts(offset_kind, offset, offset_next, base)
-    # The reverse of a reconnection reconnects, having been sampled as a smooth event at the offset path's vertex.
-    assert not np.array(joins & ~reconnects(kind, offset, base_next, base)).any()
-    # The reverse of a replay replays, under the same rule.
-    replays_back = ~reconnects(offset_kind, offset, offset_next, base) & replay_inverts(kind, base, base_next, offset)
-    assert not np.array(replays & ~replays_back).any()
-    assert np.array(joins).any() and np.array(replays).any()
 
 
 def test_jacobian_is_that_of_the_shift(renderer):

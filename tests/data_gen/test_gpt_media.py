@@ -68,8 +68,8 @@ class Ways:
 
 
 @pytest.mark.parametrize("scene", [haze, colours, nested, smoke, coloured_smoke])
-def test_a_segment_shifted_to_itself_is_itself(renderer, scene):
-    """Its null collisions too, which are made anew."""
+def test_a_segment_shifted_and_back_is_itself(renderer, scene):
+    """Shifted to its own vertex too, with null collisions that are made anew. There and back, r(T(x)) r(x) = 1."""
     ways = Ways(scene)
     T, T_c, blocked = ways.reconnect(ways.x, ways.around[0], ways.base)
     assert blocked.mean() < 1e-3
@@ -77,6 +77,14 @@ def test_a_segment_shifted_to_itself_is_itself(renderer, scene):
     assert not ways.media.grids or np.array(ways.base.nulls.n).mean() > 0.3
     assert (np.abs(T_c - 1) < 2e-3)[~blocked].mean() > 0.999
     assert (np.abs(T - weight) < 2e-3 * np.abs(weight).max())[~blocked].mean() > 0.999
+    if ways.media.grids:
+        return
+    _, T_c, blocked = ways.reconnect(ways.y, ways.around[1], ways.base)
+    assert np.mean(~blocked) > 0.5 and np.std(np.log(T_c[~blocked])) > 0.02
+    shifted = replace(ways.base, τ_c=ways.base.τ_c - mi.Float(np.log(T_c)))
+    _, back, also_blocked = ways.reconnect(ways.x, ways.around[0], shifted)
+    assert np.mean(also_blocked[~blocked]) < 1e-3
+    assert (np.abs(T_c * back - 1) < 2e-3)[~blocked].mean() > 0.999
 
 
 def test_segments_to_a_surface_behind_a_boundary_are_not_blocked_by_it(renderer):
@@ -86,18 +94,6 @@ def test_segments_to_a_surface_behind_a_boundary_are_not_blocked_by_it(renderer)
     floor = np.array(ways.end.is_valid() & (ways.end.p.y < -0.999))
     assert floor.mean() > 0.1
     assert blocked[floor].mean() < 1e-3
-
-
-@pytest.mark.parametrize("scene", [haze, colours, nested])
-def test_the_shift_of_the_shift_is_the_segment(renderer, scene):
-    """In homogeneous media r(T(x)) r(x) = 1."""
-    ways = Ways(scene)
-    _, T_c, blocked = ways.reconnect(ways.y, ways.around[1], ways.base)
-    assert np.mean(~blocked) > 0.5 and np.std(np.log(T_c[~blocked])) > 0.02
-    shifted = replace(ways.base, τ_c=ways.base.τ_c - mi.Float(np.log(T_c)))
-    _, back, also_blocked = ways.reconnect(ways.x, ways.around[0], shifted)
-    assert np.mean(also_blocked[~blocked]) < 1e-3
-    assert (np.abs(T_c * back - 1) < 2e-3)[~blocked].mean() > 0.999
 
 
 @pytest.mark.parametrize("scene", [nested, smoke, coloured_smoke])

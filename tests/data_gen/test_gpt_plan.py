@@ -25,42 +25,33 @@ def render(scene, spp=16, **options):
     return film.develop() | {k: v for k, v in film.diagnose().items() if k == FAILURES}
 
 
-# Whether shifts replay, and whether emitters answer the same numbers alike everywhere: a point light is neither far
-# away nor a surface.
-PLANS = {
-    "diffuse": (False, True),
-    "glossy": (True, True),
-    "environment": (True, True),
-    "lens": (False, False),
-    plenty: (True, False),
-}
-
-
-@pytest.mark.parametrize("scene", PLANS)
-def test_plans(renderer, scene):
-    plan = make_plan(load(renderer, scene, (4, 4)), Limits())
-    assert (plan.replays, plan.lights.shared) == PLANS[scene]
-    assert not plan.half_vectors and not plan.hides and not plan.space.media
-
-
-def test_plans_by_option_and_roughness(renderer):
+def test_plans(renderer):
+    """Whether shifts replay, and whether emitters answer the same numbers alike everywhere: a point light is neither
+    far away nor a surface."""
+    plans = [
+        ("diffuse", (False, True)),
+        ("glossy", (True, True)),
+        ("environment", (True, True)),
+        ("lens", (False, False)),
+        (plenty, (True, False)),
+        (lambda: polished(0.01), (True, True)),
+        (lambda: polished(0.3), (False, True)),
+    ]
+    for description, expected in plans:
+        plan = make_plan(load(renderer, description, (4, 4)), Limits())
+        assert (plan.replays, plan.lights.shared) == expected, description
+        assert not plan.half_vectors and not plan.hides and not plan.space.media
     hiding, by_half_vectors = Limits(hide_emitters=True), {"shift": "half-vector"}
     scene = load(renderer, "environment", (4, 4))
     assert make_plan(scene, hiding).hides and make_plan(scene, Limits(), **by_half_vectors).half_vectors
     assert not make_plan(load(renderer, "diffuse", (4, 4)), hiding, **by_half_vectors).half_vectors
-    assert [make_plan(load(renderer, polished(α), (4, 4)), Limits()).replays for α in (0.01, 0.3)] == [True, False]
 
 
+AREA = {"emitter": {"type": "area"}}
 LAMPS = {
-    "rectangle": {"type": "rectangle", "emitter": {"type": "area"}},
-    "disk": {"type": "disk", "emitter": {"type": "area"}},
-    "cylinder": {"type": "cylinder", "emitter": {"type": "area"}},
-    "cube": {"type": "cube", "emitter": {"type": "area"}},
-    "constant": {"type": "constant"},
-    "sunsky": {"type": "sunsky"},
-    "directional": {"type": "directional"},
-    "envmap": {"type": "envmap"},
-    "two": {"type": "rectangle", "emitter": {"type": "area"}},
+    **{shape: {"type": shape, **AREA} for shape in ("rectangle", "disk", "cylinder", "cube")},
+    **{sky: {"type": sky} for sky in ("constant", "sunsky", "directional", "envmap")},
+    "two": {"type": "rectangle", **AREA},
 }
 
 

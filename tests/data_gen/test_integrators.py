@@ -72,14 +72,11 @@ def test_a_loaded_scene_and_its_file_are_told_apart_alike(scene_file, case):
     assert (line in told["plan"]) == (followed not in (outer, "path" if outer == "none" else ""))
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        pytest.param(case, marks=() if case in ("prbvolpath", "prb_projective, hiding") else pytest.mark.slow)
-        for case in CASES
-        if case not in ("none", "volprim_rf_basic")
-    ],
-)
+QUICK = ["prbvolpath", "prb_projective, hiding"]
+SLOW = [case for case in CASES if case not in (*QUICK, "none", "volprim_rf_basic")]
+
+
+@pytest.mark.parametrize("case", [*QUICK, *(pytest.param(case, marks=pytest.mark.slow) for case in SLOW)])
 def test_the_image_is_the_one_that_mitsuba_renders(renderer, scene_file, case):
     file = scene_file(integrator(case))
     scene = renderer.load_file(file)

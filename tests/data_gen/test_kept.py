@@ -118,6 +118,12 @@ def test_plans_go_on_for_ever(tmp_path):
 # ------------------------- The replay buffer, fed by a stand-in for rendering -------------------------
 
 
+def until(condition):
+    deadline = time.monotonic() + 20
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.02)
+
+
 def stand_in(config, job, folder, variant, again=None):
     """One grey crop, as bright as its scene's number; its input is 1 brighter where the reference was kept."""
     number = int(job.scene[-5:])
@@ -142,12 +148,6 @@ def test_new_crops_replace_old_ones(monkeypatch):
         assert np.all(first.stack(0)["primal"] == int(first.scene[-5:]))
 
 
-def until(condition):
-    deadline = time.monotonic() + 20
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.02)
-
-
 def test_kept_references_are_met_again_with_new_inputs(monkeypatch, tmp_path):
     monkeypatch.setattr(stream, "make_shard", stand_in)
     config = Config(scenes=3, crops=1, size=8)
@@ -161,16 +161,13 @@ def test_kept_references_are_met_again_with_new_inputs(monkeypatch, tmp_path):
     assert places[0] == places[1] != places[2]
 
 
-@pytest.mark.parametrize(
-    ("config", "why"),
-    [
-        (Config(scenes=1, reference_spp=0, inputs=2), "pairs .* have no references"),
-        (Config(scenes=1, frames=3), "shots"),
-    ],
-)
-def test_what_has_no_references_to_keep_is_refused(config, why, tmp_path):
-    with pytest.raises(NgptError, match=f"{why}.*leave data.kept out"):
-        stream.Stream(config, None, kept=tmp_path)
+def test_what_has_no_references_to_keep_is_refused(tmp_path):
+    for why, changes in {
+        "pairs .* have no references": {"reference_spp": 0, "inputs": 2},
+        "shots": {"frames": 3},
+    }.items():
+        with pytest.raises(NgptError, match=f"{why}.*leave data.kept out"):
+            stream.Stream(Config(scenes=1, **changes), None, kept=tmp_path)
 
 
 def test_an_error_of_a_worker_reaches_the_reader(monkeypatch):
