@@ -136,19 +136,7 @@ def seen_through_glass():
 
 
 SCENES = {
-    "points": points,
-    "areas": areas,
-    "sky": sky,
-    "glass": glass,
-    "hidden_lamp": hidden_lamp,
-    "hidden_sky": hidden_sky,
-    "bumps": bumps,
-    "plenty": without_the_point,
-    "furnace": furnace,
-    "caustics": caustics,
-    "polished": lambda: polished(0.05),
-    "diffuse": "diffuse",
-    "glossy": "glossy",
-    "environment": "environment",
-    "lens": "lens",
+    room.__name__: room for room in (points, areas, sky, glass, hidden_lamp, hidden_sky, bumps, furnace, caustics)
 }
+SCENES |= {"plenty": without_the_point, "polished": lambda: polished(0.05)}
+SCENES |= {name: name for name in ("diffuse", "glossy", "environment", "lens")}

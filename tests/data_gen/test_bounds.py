@@ -8,29 +8,23 @@ from ngpt.errors import NgptError
 
 pytest.importorskip("mitsuba")
 
+from data_gen_scenes import _two
+
 from data_gen.scenes import bounds
+from data_gen.scenes.builtin import _wall
 
 
 def closed_room(mi, **more):
-    """Walls on five sides, the camera in the open one, and a sun behind the wall on the right."""
-    space = mi.ScalarTransform4f
-
-    def wall(at, axis=(1, 0, 0), angle=0):
-        placed = space().translate(list(at)).rotate(list(axis), angle)
-        return {"type": "rectangle", "to_world": placed, "bsdf": {"type": "twosided", "each": {"type": "diffuse"}}}
-
+    """Walls on all sides, the camera between them, and a sun behind the wall on the right."""
+    sides = {"floor": [0, -1, 0], "ceiling": [0, 1, 0], "back": [0, 0, -1], "front": [0, 0, 1]}
+    sides |= {"left": [-1, 0, 0], "right": [1, 0, 0]}
     film = {"type": "hdrfilm", "width": 12, "height": 8, "rfilter": {"type": "box"}}
-    look = space().look_at([0, 0, 0.9], [0, 0, -1], [0, 1, 0])
+    look = mi.ScalarTransform4f().look_at([0, 0, 0.9], [0, 0, -1], [0, 1, 0])
     return {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 3},
         "sensor": {"type": "perspective", "fov": 70, "to_world": look, "film": film},
-        "floor": wall((0, -1, 0), angle=-90),
-        "ceiling": wall((0, 1, 0), angle=90),
-        "back": wall((0, 0, -1)),
-        "front": wall((0, 0, 1)),
-        "left": wall((-1, 0, 0), (0, 1, 0), 90),
-        "right": wall((1, 0, 0), (0, 1, 0), -90),
+        **{name: _wall(at, [-x for x in at], (2, 2), _two(0.5, 0.5, 0.5)) for name, at in sides.items()},
         "sun": {"type": "directional", "direction": [-1, -0.3, -0.1], "irradiance": 3.0},
         **more,
     }

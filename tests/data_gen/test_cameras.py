@@ -37,7 +37,7 @@ from data_gen.scenes.facts import Facts
 from data_gen.scenes.lamps import lamp_weights
 
 # Where light paths end at the camera, and elsewhere
-QUICK = [("bdpt", "principal point"), ("bdpt", "near plane"), ("gpt", "principal point, crop")]
+QUICK = [("bdpt", "principal point"), ("gpt", "principal point, crop")]
 CORE = [name for name, entry in SAMPLERS.items() if entry.standing != "study"]
 SLOW = [(name, view) for view in CAMERAS for name in CORE if (name, view) not in QUICK]
 # Of a layer: a cell of the matrix fails by chance once in 3000 times.

@@ -19,7 +19,6 @@ from data_gen.dataset import crops, jobs, stream
 from data_gen.dataset.card import write_card
 from data_gen.dataset.config import Config, Files
 from data_gen.dataset.kept import Again, Kept, home, keep, packed, unpacked
-from data_gen.tails import schedule
 from ngpt.training.shards import CropData, Shard, write_shard
 
 SMALL = Config(size=16, inputs=2, spp=(2, 4), scenes=1, crops=2, reference_spp=8)
@@ -64,9 +63,8 @@ def first(made):
     return made()
 
 
-def test_references_share_no_tails(made, first, monkeypatch):
-    """Images of inputs that do are the same to the bit. Such small ones of few samples have no cache by themselves."""
-    monkeypatch.setattr(schedule, "BEGIN", 1)
+def test_references_share_no_tails(made, first, small_images_share):
+    """References stay the same to the bit where inputs share tails."""
     for paths, shared in zip(first[1], made(replace(SMALL, samplers={"gpt": {"tails": "shared"}}))[1], strict=True):
         assert np.array_equal(paths.reference, shared.reference)
         assert not np.array_equal(paths.stack(1)["primal"], shared.stack(1)["primal"])
