@@ -194,5 +194,5 @@ def test_the_plugin_takes_it_too(renderer):
 def test_unbiased(renderer, name, by_any_places):
     """Differences of ``gpt``, and the primal by its base paths alone."""
     scene, expected = load(renderer, GALLERIES[name], (32, 32)), references(renderer, GALLERIES[name], (32, 32))
-    assert_unbiased(render_ours(scene, "gpt", 6, 64, FAR), expected, pixels=FAR)
-    assert_unbiased(render_ours(scene, "primal", 6, 64, features=False), expected)
+    assert_unbiased(render_ours(scene, "gpt", 8, 48, FAR), expected, pixels=FAR)
+    assert_unbiased(render_ours(scene, "primal", 8, 48, features=False), expected)
