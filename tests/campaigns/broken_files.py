@@ -137,7 +137,7 @@ def manifest(rng: Random | None, folder: Path) -> None:
 
 
 def shard(rng: Random | None, folder: Path) -> None:
-    """With the checksum of the broken shard in the manifest, so that it is not refused for that alone."""
+    """The manifest has the checksum of the broken shard. Otherwise each would be refused for its checksum."""
     value, data = _dataset()
     data = safetensors_changed(rng, data) if rng else data
     entry = value["shards"][0] | {"sha256": sha256(data).hexdigest(), "bytes": len(data)}

@@ -33,7 +33,7 @@ TRIED: Counter = Counter()
 
 @st.composite
 def stacks(draw):
-    """Layers by name: those of a plausible image, some of them missing, of another type, or with other values."""
+    """Layers of a plausible image, by name. Some are missing, of another type, or have other values."""
     height, width = draw(st.sampled_from(SIZES))
     made = full_layers(max(height, 1), max(width, 1), seed=draw(st.integers(0, 3)))
     made["direct"] = np.zeros_like(made["primal"])

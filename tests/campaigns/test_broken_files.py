@@ -6,6 +6,7 @@ Where a test fails, Hypothesis has looked for a small change that fails: the las
 import resource
 import time
 from collections import Counter
+from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
 
@@ -31,13 +32,15 @@ TEXTS = {
 SECONDS, MEBIBYTES = 5.0, 512
 
 
-@pytest.fixture
+@contextmanager
 def little_memory():
     """No call gets more than 1 GiB of address space beyond what the process has."""
     before = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (int((status("VmSize") + 2 * MEBIBYTES) * 2**20), before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_AS, before)
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 def status(name):
@@ -53,13 +56,12 @@ def status(name):
         *(at_length(target, many) for target, (_, many, _) in TEXTS.items()),
     ],
 )
-def test_broken_files_are_refused_or_handled(target, count, tmp_path, request):
+def test_broken_files_are_refused_or_handled(target, count, tmp_path):
     (text, many, needs), run = TEXTS[target], TARGETS[target]
     for package in needs:
         pytest.importorskip(package)
     # A whole file is accepted. This also imports what is needed, and starts threads.
     run(None, tmp_path)
-    request.getfixturevalue("little_memory")
     outcomes, worst, begun = Counter(), Counter(), time.perf_counter()
 
     @settings(
@@ -82,7 +84,9 @@ def test_broken_files_are_refused_or_handled(target, count, tmp_path, request):
         outcomes[outcome] += 1
         worst.update({what: max(0, value - worst[what]) for what, value in found.items()})
 
-    try_them()
+    with little_memory():
+        try_them()
     tried = outcomes.total()
     assert outcomes["named error"] > tried / 10 and outcomes["accepted"] > tried / 100, "does it work?"
-    record(text, tried, dict(outcomes), worst=dict(worst), seconds=round(time.perf_counter() - begun, 1))
+    worst = {what: round(value, 4) for what, value in worst.items()}
+    record(text, tried, dict(outcomes), worst=worst, seconds=round(time.perf_counter() - begun, 1))

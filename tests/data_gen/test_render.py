@@ -71,11 +71,12 @@ def test_crops_keep_their_place_whatever_renders_them(scene_file, command):
     command("diff part.exr whole.exr --tolerance 0.5")
 
 
-def test_paths_alone_are_those_with_features(scene_file):
+def test_paths_are_the_same_with_and_without_features(scene_file):
     scene = load_scene(scene_file(), (17, 5))
     bare, full = (render_stack(scene, 4, 0, "primal", with_features=flag, unbiased=True) for flag in (False, True))
     assert set(full.names) - set(bare.names) == {"direct", "albedo", "normal", "depth"}
-    # A pixel's four rays a sample meet lamps that its path alone does not, but not where they meet none, or one evenly.
+    # Each sample has four rays for features, and they may meet lamps that its path misses. So only those pixels count
+    # where all rays meet a lamp, or none.
     even = np.isin(full["direct"], (0, 1)).all(axis=-1)
     assert 0.5 < even.mean() < 1
     assert np.allclose(bare["primal"][even], full["primal"][even], rtol=1e-5)

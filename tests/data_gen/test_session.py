@@ -111,7 +111,7 @@ def test_frames_end_where_they_are_stopped(renderer):
         data_gen.render_frames("diffuse", [0], dt=1)
 
 
-def test_a_variant_is_chosen_by_a_render_alone():
+def test_only_a_render_chooses_a_variant():
     code = (
         "import sys, data_gen\n"
         "data_gen.render_scene; data_gen.stop_on_ctrl_c\n"
@@ -144,7 +144,7 @@ def test_a_folder_in_place_of_a_scene_is_said_to_be_one(renderer, tmp_path):
         data_gen.load_scene(str(tmp_path))
 
 
-def test_the_tensor_of_an_integrator_is_told_how_it_becomes_a_stack(renderer):
+def test_an_error_says_how_the_tensor_of_an_integrator_becomes_a_stack(renderer):
     box = renderer.cornell_box() | {"integrator": {"type": "gpt", "max_depth": 3}}
     box["sensor"]["film"] |= {"width": 16, "height": 12}
     scene = load(renderer, box)

@@ -58,7 +58,7 @@ MATERIALS = {
 
 
 @pytest.mark.parametrize("name", MATERIALS)
-def test_paths_end_at_diffuse_parts_alone(renderer, name):
+def test_paths_end_only_at_diffuse_parts(renderer, name):
     description, ends, lambertian = MATERIALS[name]
     material = renderer.load_dict(description)
     assert mi.has_flag(material.flags(), mi.BSDFFlags.DiffuseReflection) == ends
@@ -297,7 +297,7 @@ ROOMS = [*(pytest.param(scene, marks=pytest.mark.slow) for scene in ("diffuse", 
 
 @pytest.mark.parametrize("scene", ROOMS)
 def test_differences_are_those_of_the_image(shared, scene):
-    """In the mean over blocks, within four standard errors and a little for places where but one of two paths ends."""
+    """In means over blocks, within four standard errors. A little more is allowed where only one of two paths ends."""
     stacks = shared(scene)
     assert all(np.isfinite(stack["primal"]).all() for stack in stacks)
     lights = np.array([light_of_gradients(stack) for stack in stacks], np.float64)
@@ -370,7 +370,7 @@ def test_who_shares(renderer, monkeypatch, tmp_path):
     assert ngpt.read(tmp_path / "shared.exr").attributes["ngpt:samplerOptions"] == "tails=shared"
 
 
-def test_the_cache_goes_by_paths_alone(renderer):
+def test_the_cache_depends_only_on_the_number_of_paths(renderer):
     """Whatever ends a render, and whatever its size: rounds double from some ten thousand paths on."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(schedule, "BEGIN", 1 << 14)

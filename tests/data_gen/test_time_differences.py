@@ -107,7 +107,7 @@ def test_slow_changes_have_little_noise(renderer, monkeypatch, scene, camera, mo
     monkeypatch.setattr("data_gen.frames.time_differences.BATCHES", 4)
     found = Estimates(moving(scene, camera, **moved), 12, 8)
     noise, of_light = np.nanvar(found.dt, axis=0), np.nanvar(found.light, axis=0)
-    # Of typical pixels: the mean is that of a few.
+    # Roots count typical pixels: a few pixels have most of the variance.
     ratio = np.nanmean(np.sqrt(noise)) ** 2 / np.nanmean(np.sqrt(of_light)) ** 2
     assert ratio < most
     assert np.nanmean(found.variances) == pytest.approx(np.nanmean(noise), rel=0.5)

@@ -78,7 +78,7 @@ def test_what_ends_it_is_not_seen(renderer, rng, monkeypatch):
     ],
 )
 def test_uneven_counts_are_unbiased(renderer, rng, scene, sampler):
-    """Also where one end of a pair has five times the samples of the other; and variances are those of the means."""
+    """Even where one end of a pair has five times the samples of the other. The layers of variances are right, too."""
     loaded, blocks = load(renderer, scene, SIZE), uneven(rng)
     stacks = [render(renderer, loaded, blocks, seed, sampler) for seed in range(24)]
     assert_unbiased(stacks, references(renderer, scene, SIZE))
@@ -94,7 +94,7 @@ def test_uneven_counts_are_unbiased(renderer, rng, scene, sampler):
 
 
 def test_directions_are_means_over_their_own_ends(renderer, rng):
-    """Against NumPy: the forward part by the counts of this pixel, the backward part by those of the other."""
+    """Against NumPy: the forward part has the counts of this pixel, and the backward part has those of the other."""
     mi, film = renderer, GradientFilm(3, 1)
     values = {name: rng.normal(size=(3, 4, 16)).astype(np.float32) for name in ("primal", "dx+", "dx-")}
     blocks = [1, 4, 2]

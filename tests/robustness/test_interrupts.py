@@ -28,7 +28,7 @@ def test_sigterm_leaves_the_samples_done_so_far(tmp_path):
 
 
 @pytest.mark.parametrize("name", SIGNALS)
-def test_the_status_is_told_wherever_it_comes(name, tmp_path):
+def test_an_interrupt_has_its_status_wherever_it_comes(name, tmp_path):
     """Python 3.11 ends itself by SIGINT after a KeyboardInterrupt in code that was compiled from a text."""
     (tmp_path / "texts.py").write_text(
         "import os, sys\nfrom ngpt.system.console import run_command\n"
@@ -111,7 +111,7 @@ def test_a_reader_that_has_enough(arguments, stack):
 
 
 def test_files_do_not_take_the_place_of_a_closed_stream(tmp_path, stack):
-    """Else what is printed would go into the next file opened."""
+    """Otherwise what is printed would go into the next file that is opened."""
     out = tmp_path / "o.exr"
     run = shell('"$@" >&- 2>&-', *NGPT, "denoise", stack, "-o", out, "-m", "l2", "--json")
     assert run.returncode == 0 and half_written(tmp_path) == []

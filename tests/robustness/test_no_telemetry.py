@@ -82,8 +82,8 @@ def test_denoising_leaves_nothing_in_a_home(tmp_path):
     assert Place(tmp_path).left_in_home(DENOISE) == []
 
 
-def test_the_library_alone_would_leave_something(tmp_path):
-    """Else the test above could not fail."""
+def test_the_library_would_leave_something_without_the_switch(tmp_path):
+    """Otherwise the test above could not fail."""
     load = "import onnxruntime"
     assert Place(tmp_path / "off", **{SWITCH: "1"}).left_in_home(load) == [], "the switch works in this version"
     if not Place(tmp_path / "on").left_in_home(load):
@@ -119,7 +119,7 @@ def test_making_data_training_and_evaluating_write_where_they_should_and_speak_t
 
 @pytest.mark.slow
 def test_a_long_program_asks_for_no_address(tmp_path):
-    """Events are sent after a minute: that is when the library alone asks for the address of its maker."""
+    """Without the switch, the library sends events after a minute, and asks for the address of its maker."""
     assert Place(tmp_path).traced(sys.executable, "-c", f"{DENOISE}\nimport time; time.sleep(80)")[1] == set()
 
 

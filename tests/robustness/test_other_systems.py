@@ -1,6 +1,6 @@
-"""Windows and macOS: nothing that POSIX or Linux alone has is needed to read, write, denoise or keep a folder.
+"""Windows and macOS: to read, write, denoise or lock a folder needs nothing that only POSIX or Linux has.
 
-Not run there: run here, with what they lack taken away (``lesser_system``).
+The tests run here, without what those systems lack (``lesser_system``).
 """
 
 import ast
