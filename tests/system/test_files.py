@@ -115,3 +115,24 @@ def test_what_cannot_be_written_is_kept_elsewhere_and_the_message_says_where(pla
     with pytest.raises(NgptError, match=rf"kept in {working / 'b.kept.txt'}$"):
         save(asked / "b.txt", hours_of_work, alike=True)
     assert sorted(os.listdir(asked)) == ["a.kept-2.txt", "a.kept.txt", "a.txt", "b.txt"]
+
+
+def test_a_working_directory_that_is_full_or_gone_leaves_the_folder_for_temporary_files(places):
+    asked, working, temporary = places
+    free = [temporary]
+
+    def on_full_disks(path, overwrite):
+        with atomic_output(path, overwrite) as unfinished:
+            unfinished.write_text("hours")
+            if path.parent not in free:
+                raise OSError(28, "No space left on device")
+
+    with pytest.raises(NgptError, match=rf"a.txt: .*No space left.*; what was made is kept in {temporary / 'a.kept'}"):
+        save(asked / "a.txt", on_full_disks)
+    assert [os.listdir(folder) for folder in places] == [[], [], ["a.kept.txt"]]
+    free.clear()
+    with pytest.raises(NgptError, match=r"a.txt: .*No space left.*; nor can it be written elsewhere, so it is lost$"):
+        save(asked / "a.txt", on_full_disks)
+    working.rmdir()
+    with pytest.raises(NgptError, match=rf"kept in {temporary / 'b.kept.txt'}$"):
+        save(asked / "gone" / "b.txt", hours_of_work)
