@@ -184,6 +184,7 @@ def test_two_samplers_at_equal_time(renderer, tmp_path, monkeypatch):
     assert next(c["spp used"] for c in slow["cells"] if c["method"] == "wcv") == 16
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())
 def test_a_column_with_subpixels_is_its_method_on_stacks_with_them(renderer, tmp_path, monkeypatch):
     monkeypatch.setattr(service, "timed", by_our_clock)
