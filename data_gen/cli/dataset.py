@@ -33,10 +33,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> int:
     path = config_of(args, configs.DATASET)
     if args.init:
-        from data_gen.dataset.config import Config
+        from data_gen.dataset.config import DatasetConfig
         from ngpt.system.templates import template
 
-        return write_template(args, template(path.read_text(encoding="utf-8"), {"": Config}), "dataset", console)
+        return write_template(args, template(path.read_text(encoding="utf-8"), {"": DatasetConfig}), "dataset", console)
     if not args.out:
         raise WrongUse("--out is missing: the folder of the training set")
     # Only the verbs that render import the renderer.

@@ -15,7 +15,7 @@ from ngpt.io.exr import write
 from ngpt.measure.metrics import METRICS
 from ngpt.measure.shown import available, judge
 from ngpt.methods import METHODS, reconstruct
-from ngpt.report.content import Entry, Scene, median
+from ngpt.report.content import ReportEntry, Scene, median
 from ngpt.report.page import oversize, write_report
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
@@ -109,11 +109,11 @@ def demo_scene(name: str, args: argparse.Namespace, folder: Path, console: Conso
     return Scene(name, caption, reference, entries, layers, rising)
 
 
-def demo_method(method: str, stack: GradientStack, reference: np.ndarray, target: Path, force: bool) -> Entry:
+def demo_method(method: str, stack: GradientStack, reference: np.ndarray, target: Path, force: bool) -> ReportEntry:
     result = reconstruct(stack, method)
     write(target, result.image, like=stack, overwrite=force, attributes=result.attributes)
     metrics, maps = judge(available(stack.height, stack.width)[0], result.image, reference)
-    return Entry(method, result.image, result.seconds, metrics, maps)
+    return ReportEntry(method, result.image, result.seconds, metrics, maps)
 
 
 def print_table(scenes: list[Scene]) -> None:

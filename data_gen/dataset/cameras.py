@@ -29,7 +29,7 @@ MOST_BOUNDARIES = 8  # boundaries of media through which a ray is followed
 
 
 @dataclass(frozen=True)
-class View:
+class CameraView:
     """A camera and the window of its virtual image that is rendered. These numbers reproduce the view."""
 
     origin: tuple[float, float, float]
@@ -59,7 +59,7 @@ class View:
         params.update()
 
     @classmethod
-    def of(cls, record: dict) -> View:
+    def of(cls, record: dict) -> CameraView:
         values: dict[str, Any] = {n: tuple(value) if isinstance(value, list) else value for n, value in record.items()}
         return cls(**values)
 
@@ -147,14 +147,14 @@ def grid_rays(sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
     return np.broadcast_to(np.array(ray.o).T, towards.shape), towards
 
 
-def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float) -> View:
+def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float) -> CameraView:
     """A random view that shows something. Views that show more edges are more likely.
 
     ``size`` is the size of the crop in pixels, ``roll`` the largest angle about the view direction in degrees, and
     ``lens`` the standard deviation of the aperture's radius, relative to the focus distance (0.005 in the paper).
     Raises NgptError if no view is found.
     """
-    views: list[View] = []
+    views: list[CameraView] = []
     details: list[float] = []
     for attempt in range(2 * ATTEMPTS):
         if attempt == ATTEMPTS and views:
@@ -176,7 +176,7 @@ def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: f
 
 def random_view(
     around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float, aimed: bool = False
-) -> View:
+) -> CameraView:
     """Any view, or a view ``aimed`` at points that the scene's own camera sees."""
     if aimed:
         before, target = around.seen[rng.integers(len(around.seen), size=2)]
@@ -198,7 +198,7 @@ def random_view(
     fov = float(np.clip(around.fov * rng.uniform(0.7, 1.2), 15, 100))
     aperture = max(abs(rng.normal(0, lens)), 1e-5) * focus
     target = floats(origin + focus * towards)
-    return View(floats(origin), target, floats(up), fov, float(aperture), float(focus), film, window, size)
+    return CameraView(floats(origin), target, floats(up), fov, float(aperture), float(focus), film, window, size)
 
 
 def floats(vector: np.ndarray) -> tuple[float, float, float]:
@@ -206,7 +206,7 @@ def floats(vector: np.ndarray) -> tuple[float, float, float]:
     return x, y, z
 
 
-def with_one_kernel(around: Surroundings, view: View) -> View:
+def with_one_kernel(around: Surroundings, view: CameraView) -> CameraView:
     """The view, or a nearly equal one, with which all views of a scene share their kernels.
 
     Pixels are square, so two factors of the camera's projection are equal except for rounding. If they are equal to the
@@ -228,7 +228,7 @@ def with_one_kernel(around: Surroundings, view: View) -> View:
     return view
 
 
-def what_shows(around: Surroundings, view: View) -> float:
+def what_shows(around: Surroundings, view: CameraView) -> float:
     """The share of edges in a view, or 0 if it is mostly empty, very close to something, or one flat surface."""
     view.apply(around.scene)
     n = GRID

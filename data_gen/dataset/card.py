@@ -11,7 +11,7 @@ from ngpt.image.display import auto_exposure, to_srgb8
 from ngpt.image.png import encode_png
 from ngpt.system.console import Console
 from ngpt.system.files import atomic_output
-from ngpt.training.dataset import Crop, Dataset, summary
+from ngpt.training.dataset import Dataset, ShardCrop, summary
 
 CELLS = 24  # crops on the contact sheet, evenly spaced in the set
 COLUMNS = 4  # each shows its noisiest input and its reference
@@ -43,7 +43,7 @@ def contact_sheet(data: Dataset) -> np.ndarray:
     return np.vstack([np.hstack(pairs[i : i + COLUMNS]) for i in range(0, len(pairs), COLUMNS)])
 
 
-def shown(crop: Crop) -> tuple[np.ndarray, np.ndarray]:
+def shown(crop: ShardCrop) -> tuple[np.ndarray, np.ndarray]:
     """The noisiest input and the reference, or the two halves of a pair, (H, W, 3) each."""
     return crop.stack(0)["primal"], crop.stack(1)["primal"] if crop.paired else crop.reference
 

@@ -28,7 +28,7 @@ class Files:
 
 
 @dataclass(frozen=True)
-class Config:
+class DatasetConfig:
     """The entries of a training set. ``ngpt dataset --init FILE`` writes them all with their meanings.
 
     ``seed``       of scenes, cameras and samples
@@ -205,10 +205,10 @@ class Job:
         return f"shards/{self.scene}-{self.batch:03d}.safetensors"
 
 
-def read_config(path: str | Path) -> Config:
+def read_config(path: str | Path) -> DatasetConfig:
     """Reads a TOML file; raises NgptError for entries that do not exist or have the wrong type."""
-    return from_table(Config, read_toml(path), str(path))
+    return from_table(DatasetConfig, read_toml(path), str(path))
 
 
-def as_json(config: Config) -> dict:
+def as_json(config: DatasetConfig) -> dict:
     return asdict(config) | {"spp": list(config.spp), "files": [asdict(source) for source in config.files]}

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from data_gen.backend import use_variant
-from data_gen.dataset.config import Config, Job
+from data_gen.dataset.config import DatasetConfig, Job
 from data_gen.dataset.kept import Again, Kept
 from ngpt.errors import NgptError, stop_if_interrupted
 from ngpt.merging import merge
@@ -31,7 +31,7 @@ HALVES = 2
 LIT = 0.1  # the share of pixels of the first input that must have seen any light
 
 
-def make_shard(config: Config, job: Job, folder: str, variant: str, again: Again | None = None) -> str:
+def make_shard(config: DatasetConfig, job: Job, folder: str, variant: str, again: Again | None = None) -> str:
     """Renders the crops of ``job`` and writes its shard into ``folder``; returns its name there.
 
     It can run in any process. The same config and job give the same bits. A crop that fails is recorded and left out.
@@ -83,18 +83,18 @@ def make_shard(config: Config, job: Job, folder: str, variant: str, again: Again
     return job.file
 
 
-def scene_seed(config: Config, name: str) -> tuple[int, int]:
+def scene_seed(config: DatasetConfig, name: str) -> tuple[int, int]:
     return config.seed, zlib.crc32(name.encode())
 
 
-def made_scene(config: Config, name: str, folder: Path) -> Path:
+def made_scene(config: DatasetConfig, name: str, folder: Path) -> Path:
     from data_gen.scenes.procedural.scenes import make_scene
     from data_gen.scenes.procedural.variety import SHARES
 
     return make_scene(scene_seed(config, name), folder, SHARES | config.sights if config.varied else None)
 
 
-def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:
+def sample_counts(rng: np.random.Generator, config: DatasetConfig) -> list[int]:
     """Samples per pixel of the inputs: log-uniform, stratified, smallest first. The two numbers of a pair are equal."""
     low, high = np.log(config.spp[0]), np.log(config.spp[1] + 1)
     if config.pairs:
@@ -103,7 +103,7 @@ def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:
     return [int(n) for n in np.exp(low + u * (high - low))]
 
 
-def uneven_inputs(config: Config, name: str, crop: int, counts: list[int]) -> list[bool]:
+def uneven_inputs(config: DatasetConfig, name: str, crop: int, counts: list[int]) -> list[bool]:
     """Which inputs of a crop get adaptive samples: the share ``config.adaptive`` of the inputs with enough samples.
 
     It uses separate random numbers, so that views, seeds and references are the same as with even samples.
@@ -116,7 +116,7 @@ def uneven_inputs(config: Config, name: str, crop: int, counts: list[int]) -> li
     return [bool(rng.random() < config.adaptive) and n >= LEAST for n in counts]
 
 
-def render_input(config: Config, scene, spp: int, seed: int, uneven: bool, made: Any = None) -> GradientStack:
+def render_input(config: DatasetConfig, scene, spp: int, seed: int, uneven: bool, made: Any = None) -> GradientStack:
     """Renders one input. If the set has ``adaptive`` inputs, all its inputs have the layer ``samples``."""
     from data_gen.render import render_stack
 
@@ -127,7 +127,7 @@ def render_input(config: Config, scene, spp: int, seed: int, uneven: bool, made:
     return stack
 
 
-def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropData, dict]]:
+def make_crop(config: DatasetConfig, around, name: str, crop: int) -> list[tuple[CropData, dict]]:
     """One crop and its record, or one for each frame of a shot. ``around`` is the ``Surroundings`` of its scene."""
     from data_gen.dataset.cameras import find_view
     from data_gen.dataset.movement import Movement, random_movement
@@ -177,11 +177,13 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
     return made
 
 
-def make_inputs(config: Config, scene, made: Any, kept: Kept, place: int, seed: int) -> list[tuple[CropData, dict]]:
+def make_inputs(
+    config: DatasetConfig, scene, made: Any, kept: Kept, place: int, seed: int
+) -> list[tuple[CropData, dict]]:
     """The crop at ``place`` of kept references, and its record: the same view with new inputs, whose noise depends on
     ``seed``.
     """
-    from data_gen.dataset.cameras import View
+    from data_gen.dataset.cameras import CameraView
 
     facts = kept.record["crops"][place]
     rng = np.random.default_rng((*scene_seed(config, kept.record["scene"]), facts["crop"], seed))
@@ -189,7 +191,7 @@ def make_inputs(config: Config, scene, made: Any, kept: Kept, place: int, seed: 
     seeds = [int(seed) for seed in rng.integers(0, 2**32, config.inputs)]
     uneven = uneven_inputs(config, kept.record["scene"], facts["crop"], counts)
     clock = time.perf_counter()
-    View.of(facts["view"]).apply(scene)
+    CameraView.of(facts["view"]).apply(scene)
     cleaned = [finite(render_input(config, scene, *each, made)) for each in zip(counts, seeds, uneven, strict=True)]
     new: dict[str, Any] = {"spp": counts, "seeds": seeds, "repaired": [count for _, count in cleaned]}
     new["seconds"] = {"inputs": round(time.perf_counter() - clock, 4)}
@@ -197,12 +199,12 @@ def make_inputs(config: Config, scene, made: Any, kept: Kept, place: int, seed: 
     return [(CropData([stack for stack, _ in cleaned], counts, *images), facts | new)]
 
 
-def _seeds(rng: np.random.Generator, config: Config) -> list[int]:
+def _seeds(rng: np.random.Generator, config: DatasetConfig) -> list[int]:
     return [int(seed) for seed in rng.integers(0, 2**32, config.inputs + HALVES)]
 
 
 def _crop(
-    config: Config,
+    config: DatasetConfig,
     scene,
     first: GradientStack,
     counts: list[int],

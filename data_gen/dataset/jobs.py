@@ -13,7 +13,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Self
 
-from data_gen.dataset.config import Config, Job, as_json
+from data_gen.dataset.config import DatasetConfig, Job, as_json
 from data_gen.dataset.crops import make_shard
 from ngpt.errors import NgptError
 from ngpt.system.files import exclusive
@@ -79,7 +79,7 @@ def processes(count: int) -> Executor:
 
 
 def generate(
-    config: Config,
+    config: DatasetConfig,
     folder: Path,
     executor: Executor,
     *,
@@ -131,7 +131,7 @@ def finished(executor: Executor, make: Callable[[Job], str], jobs: list[Job], ah
             future.cancel()
 
 
-def start(config: Config, folder: Path, planned: int) -> None:
+def start(config: DatasetConfig, folder: Path, planned: int) -> None:
     """Prepares ``folder`` for the training set of this configuration. Raises NgptError if it belongs to another one."""
     (folder / "shards").mkdir(parents=True, exist_ok=True)
     with exclusive(folder, wait=True):
@@ -139,7 +139,7 @@ def start(config: Config, folder: Path, planned: int) -> None:
             empty = {"format": FORMAT, "version": VERSION, "config": as_json(config), "planned": planned, "shards": []}
             write_json(folder / MANIFEST, empty)
         # An entry that did not exist when the set was begun has its default.
-        theirs = as_json(Config(scenes=1)) | read_manifest(folder)["config"]
+        theirs = as_json(DatasetConfig(scenes=1)) | read_manifest(folder)["config"]
     ours = json.loads(json.dumps(as_json(config)))
     different = [key for key in ours if theirs.get(key) != ours[key]]
     if different:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_gen.dataset.config import Config, as_json
+from data_gen.dataset.config import DatasetConfig, as_json
 from ngpt.errors import NgptError
 from ngpt.system.files import atomic_output
 from ngpt.training.shards import REFERENCE_CAUSTIC, REFERENCES, Shard
@@ -37,7 +37,7 @@ class Again:
     seed: int
 
 
-def home(config: Config, folder: Path) -> Path:
+def home(config: DatasetConfig, folder: Path) -> Path:
     """The subfolder of ``folder`` for references of ``config``. Configurations that differ only in inputs share it."""
     facts = {name: value for name, value in as_json(config).items() if name not in _OF_INPUTS}
     return folder / f"{zlib.crc32(json.dumps(facts, sort_keys=True).encode()):08x}"

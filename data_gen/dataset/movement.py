@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.dataset.cameras import Surroundings, View, floats
+from data_gen.dataset.cameras import CameraView, Surroundings, floats
 from data_gen.frames.motion import seen
 from data_gen.scenes.geometry import VERTICES, put_vertices, vertices
 
@@ -33,7 +33,7 @@ RADIANCE = (".radiance.value", ".intensity.value", ".irradiance.value")
 class Movement:
     """The changes from frame to frame. With only a ``view`` nothing changes."""
 
-    view: View
+    view: CameraView
     way: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the camera, in world units per frame
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of its target, in addition to ``way``
     shape: str = ""  # the parameter that places the moving shape
@@ -42,7 +42,7 @@ class Movement:
     gain: float = 1.0  # the factor of that radiance per frame
     _start: dict = field(default_factory=dict, repr=False)
 
-    def view_at(self, frame: int) -> View:
+    def view_at(self, frame: int) -> CameraView:
         origin = np.add(self.view.origin, frame * np.array(self.way))
         target = np.add(self.view.target, frame * (np.array(self.way) + self.turn))
         return replace(self.view, origin=floats(origin), target=floats(target))
@@ -71,7 +71,7 @@ class Movement:
         return facts | {"light": self.light, "gain": self.gain}
 
 
-def random_movement(around: Surroundings, view: View, rng: np.random.Generator, frames: int) -> Movement:
+def random_movement(around: Surroundings, view: CameraView, rng: np.random.Generator, frames: int) -> Movement:
     """A random movement for a shot of ``frames`` frames that starts at ``view``. It applies the view to the scene."""
     scene = around.scene
     view.apply(scene)

@@ -18,7 +18,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
-from ngpt.training.dataset import Crop, Dataset
+from ngpt.training.dataset import Dataset, ShardCrop
 
 # One in VALIDATION scenes is for validation, and at least one scene if there are two.
 VALIDATION = 10
@@ -49,7 +49,7 @@ def write_layout(data: Dataset, folder: Path, progress: Callable[[int, int], Non
     return left_out
 
 
-def _named(data: Dataset) -> Iterator[tuple[str, Crop]]:
+def _named(data: Dataset) -> Iterator[tuple[str, ShardCrop]]:
     counts: dict[str, int] = {}
     for crop in data:
         number = counts.get(crop.scene, 0)
@@ -57,7 +57,7 @@ def _named(data: Dataset) -> Iterator[tuple[str, Crop]]:
         yield f"crop{number:04d}", crop
 
 
-def _images(crop: Crop, digits: int) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
+def _images(crop: ShardCrop, digits: int) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
     """(end of the name, images) of each input and of the reference. The features of the reference are means over all
     inputs, weighted by their samples."""
     if "reference_indirect" not in crop.shard.names:

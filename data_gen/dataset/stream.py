@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from data_gen.dataset.config import Config, Job, read_config
+from data_gen.dataset.config import DatasetConfig, Job, read_config
 from data_gen.dataset.crops import make_shard
 from data_gen.dataset.jobs import Pool
 from data_gen.dataset.kept import Again, home, keep
 from ngpt.errors import NgptError
-from ngpt.training.dataset import Crop
+from ngpt.training.dataset import ShardCrop
 from ngpt.training.shards import Shard
 
 
@@ -40,7 +40,7 @@ class Stream:
 
     def __init__(
         self,
-        config: Config,
+        config: DatasetConfig,
         executor: Executor,
         capacity: int = 1000,
         ahead: int = 2,
@@ -56,7 +56,7 @@ class Stream:
                 "the training: ngpt dataset"
             )
         self.kept = home(config, Path(kept)) if kept else None
-        self._crops: deque[Crop] = deque(maxlen=capacity)
+        self._crops: deque[ShardCrop] = deque(maxlen=capacity)
         self._error: BaseException | None = None
         self._changed = threading.Condition()
         self._stop = threading.Event()
@@ -81,12 +81,12 @@ class Stream:
     def __len__(self) -> int:
         return len(self._crops)
 
-    def __getitem__(self, index: int) -> Crop:
+    def __getitem__(self, index: int) -> ShardCrop:
         self._check()
         with self._changed:
             return self._crops[index]
 
-    def __iter__(self) -> Iterator[Crop]:
+    def __iter__(self) -> Iterator[ShardCrop]:
         with self._changed:
             return iter(list(self._crops))
 
@@ -139,7 +139,7 @@ class Stream:
             keep(shard, kept)
         facts, crops = shard.record, enumerate(shard.record["crops"])
         with self._changed:
-            self._crops.extend(Crop(shard, i, facts["scene"], tuple(c["spp"]), c.get("frame")) for i, c in crops)
+            self._crops.extend(ShardCrop(shard, i, facts["scene"], tuple(c["spp"]), c.get("frame")) for i, c in crops)
             self._changed.notify_all()
         # The shard stays open, so its data can be read until its last crop is gone.
         path.unlink()

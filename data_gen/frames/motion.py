@@ -20,7 +20,7 @@ import numpy as np
 from data_gen.passes import recording
 from data_gen.paths.features import first_nonspecular_vertex
 from data_gen.scenes.cameras import camera_name, place_of
-from data_gen.scenes.geometry import Geometry, Mesh, geometry, matrix
+from data_gen.scenes.geometry import Geometry, Triangles, geometry, matrix
 from ngpt.errors import NgptError
 from ngpt.windows import Place
 
@@ -71,7 +71,7 @@ class _Middle:
 
 
 @dataclass(frozen=True)
-class Seen:
+class CentreHits:
     """The hits of the rays through the centres of all N pixels, row by row."""
 
     points: np.ndarray  # (N, 4) homogeneous, in the world: apparent places, or directions where rays escape
@@ -81,7 +81,7 @@ class Seen:
     barycentric: np.ndarray  # (N, 2) weights of its second and third vertex
 
 
-def seen(scene: mi.Scene) -> Seen:
+def seen(scene: mi.Scene) -> CentreHits:
     """The points that the pixels of the first sensor show in the middle of its exposure."""
     sensor = scene.sensors()[0]
     width, height = (int(n) for n in sensor.film().crop_size())
@@ -109,16 +109,17 @@ def seen(scene: mi.Scene) -> Seen:
     numbers = np.full(max(int(ids.max(initial=0)), int(np.array(number).max(initial=0))) + 1, -1)
     numbers[ids] = np.arange(len(ids))
     shape = np.where(valid, numbers[np.array(number)], -1)
-    return Seen(points, straight, shape, np.array(hit.prim_index), np.array(hit.prim_uv, np.float64).T.reshape(-1, 2))
+    uv = np.array(hit.prim_uv, np.float64).T.reshape(-1, 2)
+    return CentreHits(points, straight, shape, np.array(hit.prim_index), uv)
 
 
-def depth(scene: mi.Scene, now: Snapshot, what: Seen) -> np.ndarray:
+def depth(scene: mi.Scene, now: Snapshot, what: CentreHits) -> np.ndarray:
     """(H, W): apparent distance along the camera's axis, in units of its own space; infinite where rays escape."""
     width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
     return np.where(what.shape >= 0, what.points @ now.film[3], np.inf).reshape(height, width)
 
 
-def motion_vectors(scene: mi.Scene, now: Snapshot, before: Snapshot, what: Seen | None = None) -> np.ndarray:
+def motion_vectors(scene: mi.Scene, now: Snapshot, before: Snapshot, what: CentreHits | None = None) -> np.ndarray:
     """(H, W, 2) float32: motion in pixels from each pixel to its point in the frame ``before``; x right, y down.
 
     Both places are counted in pixels of the crop windows. Add ``window_moved`` for the motion in the whole picture.
@@ -151,9 +152,9 @@ def window_moved(now: Snapshot, before: Snapshot) -> tuple[int, int]:
     return x_before - x, y_before - y
 
 
-def _displacement(now: Geometry, old: Geometry, what: Seen, here: np.ndarray) -> np.ndarray | None:
+def _displacement(now: Geometry, old: Geometry, what: CentreHits, here: np.ndarray) -> np.ndarray | None:
     """(n, 3) from the points of a shape seen by the pixels ``here`` to their previous places; None if not known."""
-    if isinstance(now, Mesh) and isinstance(old, Mesh) and now.faces.shape == old.faces.shape:
+    if isinstance(now, Triangles) and isinstance(old, Triangles) and now.faces.shape == old.faces.shape:
         b1, b2 = what.barycentric[here].T
         weights = np.stack([1 - b1 - b2, b1, b2], axis=-1)[..., None]
         triangles = what.primitive[here]

@@ -11,7 +11,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Mesh:
+class Triangles:
     """Vertices (V, 3) and triangles (F, 3) of a shape, in the world."""
 
     vertices: np.ndarray
@@ -22,7 +22,7 @@ class Mesh:
 VERTICES = ("positions", "vertex_positions")
 
 # A matrix (4, 4) to world space, or a mesh, or None for shapes that expose neither of them
-Geometry = np.ndarray | Mesh | None
+Geometry = np.ndarray | Triangles | None
 
 
 def geometry(shape: mi.Shape) -> Geometry:
@@ -33,7 +33,7 @@ def geometry_of(params: Mapping[str, Any]) -> Geometry:
     if "to_world" in params:
         return matrix(params["to_world"])
     if (name := vertices_name(params)) and "faces" in params:
-        return Mesh(vertices(params, name), np.array(params["faces"]).reshape(-1, 3))
+        return Triangles(vertices(params, name), np.array(params["faces"]).reshape(-1, 3))
     return None
 
 

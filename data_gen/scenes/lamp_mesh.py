@@ -11,7 +11,7 @@ import numpy as np
 
 
 @dataclass
-class Table:
+class LampFaces:
     """The lamps of one mesh: the ``corners`` (F, 3, 3) of all faces, the number of each face's ``lamp`` (F,), and the
     ``radiance`` (L, 3) of each lamp."""
 
@@ -26,15 +26,15 @@ class Table:
         return min(float(np.linalg.norm(np.ptp(corners, axis=(0, 1)))) for corners in each)
 
 
-def lamps(table: Table) -> mi.Emitter:
+def lamps(table: LampFaces) -> mi.Emitter:
     """The emitter of these lamps, in the current variant of Mitsuba."""
     return _emitter(mi.variant())(table)
 
 
-def table_of(emitter: mi.Emitter) -> Table | None:
+def table_of(emitter: mi.Emitter) -> LampFaces | None:
     """The table of an emitter with many lamps; None for all others."""
     table = getattr(emitter, "table", None)
-    return table if isinstance(table, Table) else None
+    return table if isinstance(table, LampFaces) else None
 
 
 def is_area(emitter: mi.Emitter) -> bool:
@@ -66,7 +66,7 @@ def _emitter(variant: str) -> type:
         A face is sampled in proportion to its area times its mean radiance, and points on it uniformly.
         """
 
-        def __init__(self, table: Table):
+        def __init__(self, table: LampFaces):
             super().__init__(mi.Properties())
             self.table = table
             corners, lamp, radiance = table.corners, table.lamp, table.radiance

@@ -66,7 +66,7 @@ def _set(scene: mi.Scene, weights) -> None:
     scene.parameters_changed()
 
 
-def lamp_weights(scene: mi.Scene, found: Found | None = None) -> np.ndarray:
+def lamp_weights(scene: mi.Scene, found: LampSamples | None = None) -> np.ndarray:
     """The probability of each lamp, in the order of ``scene.emitters()``; they sum to 1.
 
     It depends only on the scene and the camera. ``found`` are the samples of a pilot with at least ``_PATHS`` paths.
@@ -83,13 +83,13 @@ def lamp_weights(scene: mi.Scene, found: Found | None = None) -> np.ndarray:
     return (1 - _FLOOR) * roots / roots.sum() + _FLOOR / n
 
 
-def lamp_places(scene: mi.Scene, weights: np.ndarray, found: Found) -> Places | None:
+def lamp_places(scene: mi.Scene, weights: np.ndarray, found: LampSamples) -> Places | None:
     """The choice of lamps by place, given the ``weights`` of the whole scene; None if it is not worth its cost."""
     share, table = promised(found, weights)
     return Places(scene, table) if table and share < PROMISE else None
 
 
-def promised(found: Found, weights: np.ndarray) -> tuple[float, Table | None]:
+def promised(found: LampSamples, weights: np.ndarray) -> tuple[float, LampTable | None]:
     """The expected share of the variance of direct light that is left with a choice by place, and the table for it.
 
     One half of the pilot's samples gives a table, and the other half measures its gain. If the pilot meets nothing,
@@ -105,7 +105,7 @@ def promised(found: Found, weights: np.ndarray) -> tuple[float, Table | None]:
 
 
 @dataclass
-class Found:
+class LampSamples:
     """Samples of lamps at the first vertices of a pilot's paths, (N) each: the number of the ``lamp``, its light ``L``,
     the vertex ``at`` (N, 3), and the number of the ``path``."""
 
@@ -114,13 +114,13 @@ class Found:
     at: np.ndarray
     path: np.ndarray
 
-    def first(self, paths: int) -> Found:
+    def first(self, paths: int) -> LampSamples:
         """The samples of the first ``paths`` paths only."""
         some = self.path < paths
-        return Found(self.lamp[some], self.L[some], self.at[some], self.path[some])
+        return LampSamples(self.lamp[some], self.L[some], self.at[some], self.path[some])
 
 
-def _pilot(scene: mi.Scene, paths: int) -> Found:
+def _pilot(scene: mi.Scene, paths: int) -> LampSamples:
     """Runs the pilot with ``paths`` paths.
 
     The light of a lamp includes its MIS weight against BSDF sampling, so large or close lamps count for less.
@@ -133,7 +133,7 @@ def _pilot(scene: mi.Scene, paths: int) -> Found:
     dr.eval(ray, random)
     index, L, at, there = _walk(scene, ray, random, dr.opaque(mi.UInt32, len(scene.emitters())), paths)
     met = np.array(there) > 0
-    return Found(
+    return LampSamples(
         np.array(index)[met],
         np.array(L, np.float64)[met],
         np.array(at).reshape(-1, 3)[met],
@@ -216,7 +216,7 @@ class Chosen:
 
 
 @dataclass
-class Table:
+class LampTable:
     """The probability ``p`` of each lamp in each cell, (cells + 1, lamps). Its rows sum to 1.
 
     The last row is for paths that have ended. ``low`` is the first corner of the grid and ``size`` the size of a cell,
@@ -242,7 +242,7 @@ def cell_of(at: np.ndarray, low: np.ndarray, size: np.ndarray, side: int) -> np.
 class Places:
     """A table as Dr.Jit arrays, and the emitters of its scene."""
 
-    def __init__(self, scene: mi.Scene, table: Table):
+    def __init__(self, scene: mi.Scene, table: LampTable):
         self.emitters, self.lamps, self.side = scene.emitters_dr(), table.p.shape[1], table.side
         self.low, self.per_size = mi.Point3f(*table.low.tolist()), mi.Vector3f(*(1 / table.size).tolist())
         self.p = mi.Float(table.p.ravel().astype(np.float32))
@@ -293,7 +293,7 @@ class Places:
         return dr.gather(mi.UInt32, self.indices, dr.reinterpret_array(mi.UInt32, emitter), active)
 
 
-def learn(lamp: np.ndarray, squares: np.ndarray, at: np.ndarray, whole: np.ndarray) -> Table:
+def learn(lamp: np.ndarray, squares: np.ndarray, at: np.ndarray, whole: np.ndarray) -> LampTable:
     """Makes a table from samples of a pilot: the number of the ``lamp``, its squared light, and the vertex, (N, 3).
 
     ``whole`` (lamps,) are the weights of lamps in the whole scene, all above 0.
@@ -322,4 +322,4 @@ def learn(lamp: np.ndarray, squares: np.ndarray, at: np.ndarray, whole: np.ndarr
     roots = np.sqrt(means.reshape(-1, lamps))
     total = roots.sum(axis=1, keepdims=True)
     table = np.where(total > 0, (1 - _FLOOR) * roots / np.maximum(total, 1e-300) + _FLOOR * whole, whole)
-    return Table(np.vstack([table, whole]), low, size, side)
+    return LampTable(np.vstack([table, whole]), low, size, side)

@@ -17,7 +17,7 @@ from functools import cache
 import mitsuba as mi
 import numpy as np
 
-from data_gen.scenes.lamp_mesh import Table, lamps, mesh_of
+from data_gen.scenes.lamp_mesh import LampFaces, lamps, mesh_of
 from data_gen.scenes.lost import is_bent
 from data_gen.scenes.nodes import MESHES, added, is_part, parts_of
 
@@ -142,7 +142,7 @@ def _halved(part: np.ndarray, middles: np.ndarray, times: int) -> Iterator[np.nd
         yield from _halved(half, middles, times - 1)
 
 
-def _table(each: list[Lamp]) -> Table:
+def _table(each: list[Lamp]) -> LampFaces:
     numbers = np.repeat(np.arange(len(each)), [len(lamp.corners) for lamp in each])
     corners = np.concatenate([lamp.corners for lamp in each])
-    return Table(corners, numbers, np.array([lamp.radiance for lamp in each]))
+    return LampFaces(corners, numbers, np.array([lamp.radiance for lamp in each]))

@@ -34,7 +34,7 @@ import mitsuba as mi
 
 from data_gen.paths.streams import mixed
 from data_gen.tails.schedule import FINENESS
-from data_gen.tails.table import INSIDE, Grid, Place, in_table, key, octahedral
+from data_gen.tails.table import INSIDE, CellGrid, CellPlace, in_table, key, octahedral
 
 # MiB that the cache takes, and the least memory limit of a render that has a cache, in MiB
 MIB, LEAST_MIB = 320, 640
@@ -105,9 +105,11 @@ class Known:
     means: list[mi.Float]
     differences: list[mi.Float]
     fineness: mi.Float
-    grid: Grid
+    grid: CellGrid
 
-    def place_of(self, x: mi.SurfaceInteraction3f, inside: mi.Bool, spread: mi.Float, kind: mi.UInt32 | int) -> Place:
+    def place_of(
+        self, x: mi.SurfaceInteraction3f, inside: mi.Bool, spread: mi.Float, kind: mi.UInt32 | int
+    ) -> CellPlace:
         """The place of vertex ``x`` among the cells whose edge is at most ``spread`` / ``fineness``.
 
         Vertices ``inside`` media share no cells with vertices on surfaces. Vertices of different ``kind`` share none
@@ -115,10 +117,10 @@ class Known:
         """
         level = mi.Int32(dr.floor(dr.log2(dr.maximum(spread / self.fineness, 1e-20))))
         normal = dr.select(inside, mi.UInt32(INSIDE), octahedral(mi.Normal3f(dr.mulsign(x.sh_frame.n, x.wi.z))))
-        return Place(self.grid.place_of(x.p, level), normal + (mi.UInt32(kind) << 16), level)
+        return CellPlace(self.grid.place_of(x.p, level), normal + (mi.UInt32(kind) << 16), level)
 
     def look(
-        self, place: Place, least: int, active: mi.Bool, half: mi.UInt32 | None = None
+        self, place: CellPlace, least: int, active: mi.Bool, half: mi.UInt32 | None = None
     ) -> tuple[list[mi.Color3f], list[mi.Color3f], mi.Bool]:
         """The light of each sort at a place, a sample of its error, and whether the light is known.
 
@@ -159,7 +161,7 @@ class Cache:
     have different light, for example because a wall goes through it. Paths do not end in such a cell.
     """
 
-    def __init__(self, fineness: float, sorts: int = 1, grid: Grid | None = None):
+    def __init__(self, fineness: float, sorts: int = 1, grid: CellGrid | None = None):
         self.keys = dr.zeros(mi.UInt32, CELLS)
         # For each half and cell: the sum of the weights of its records, and the weighted sums of their light
         self.weight = dr.zeros(mi.UInt32, HALVES * CELLS)
@@ -172,11 +174,11 @@ class Cache:
         # much of this light was cut
         self.records = self.light = self.cut = 0
         means, differences = ([dr.zeros(mi.Float, 4 * CELLS) for _ in range(sorts)] for _ in range(2))
-        grid = grid or Grid.at()
+        grid = grid or CellGrid.at()
         self.known = Known(self.keys, means, differences, dr.opaque(mi.Float, fineness), grid)
         dr.make_opaque(self.keys, self.weight, self.sums, self.parts, means, differences)
 
-    def add(self, place: Place, half: mi.UInt32, values: list[mi.Float]) -> None:
+    def add(self, place: CellPlace, half: mi.UInt32, values: list[mi.Float]) -> None:
         """Adds records to their cells. ``values`` are R, G, B of each sort of light, which may be below 0. ``half`` is
         0 or 1."""
         largest = reduce(dr.maximum, map(dr.abs, values))

@@ -63,7 +63,7 @@ class Matt:
         # Materials inside shape groups may tilt their normals too.
         self.any_tilted = groups or bool(tilted.any())
         self.tilts = ByMaterial(mi.Bool(tilted))
-        self.plain = Plain(bsdfs)
+        self.plain = MattTable(bsdfs)
 
     def at(self, x: mi.SurfaceInteraction3f, place: Place | None, active: mi.Bool) -> mi.Bool:
         """Whether a path may end here for the diffuse part of the material, or the even part of the phase function."""
@@ -94,7 +94,7 @@ class Matt:
         return ρ if place is None else dr.select(place.scatters, mi.Color3f(self._even(place, active)), ρ)
 
 
-class Plain:
+class MattTable:
     """A table of ρ for the sides of all matt materials without a texture. It is quicker than calls of the materials."""
 
     def __init__(self, bsdfs: dict[int, mi.BSDF]):

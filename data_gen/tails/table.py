@@ -19,7 +19,7 @@ INSIDE = _DIRECTIONS**2
 
 
 @dataclass
-class Place:
+class CellPlace:
     """The place of a vertex in the grid of the cache."""
 
     p: mi.Point3f  # from the origin of the grid of its level
@@ -28,7 +28,7 @@ class Place:
 
 
 @dataclass
-class Grid:
+class CellGrid:
     """Where cells lie: the ``origin``, and the ``shift`` of the grid of each level from there, in edges of its cells.
 
     Floats are finest near the origin. If the camera is there, cells beside it can be small, however large the scene is.
@@ -38,7 +38,7 @@ class Grid:
     shift: mi.Vector3f
 
     @classmethod
-    def at(cls, origin: Sequence[float] = (0.0, 0.0, 0.0), shift: Sequence[float] = (0.0, 0.0, 0.0)) -> Grid:
+    def at(cls, origin: Sequence[float] = (0.0, 0.0, 0.0), shift: Sequence[float] = (0.0, 0.0, 0.0)) -> CellGrid:
         # Opaque: they would be compiled into kernels, new ones for every seed.
         point, vector = ([dr.opaque(mi.Float, float(x)) for x in each] for each in (origin, shift))
         return cls(mi.Point3f(*point), mi.Vector3f(*vector))
@@ -60,7 +60,7 @@ def octahedral(n: mi.Vector3f) -> mi.UInt32:
     return i + _DIRECTIONS * j
 
 
-def key(place: Place) -> tuple[mi.UInt32, mi.UInt32, list[mi.Bool]]:
+def key(place: CellPlace) -> tuple[mi.UInt32, mi.UInt32, list[mi.Bool]]:
     """A hash that says in which slot the search for the cell begins, the cell's check value, and whether the place is
     in the upper half of the cell along each axis. The check value is never 0, which marks free slots."""
     q = place.p * dr.exp2(mi.Float(-place.level))

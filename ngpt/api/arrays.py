@@ -12,7 +12,7 @@ from typing import Any, TypeVar, overload
 
 import numpy as np
 
-from ngpt.api.tensors import Bitmap, Image, Kind, Tensor, Transform, is_bitmap, layer, like, to_numpy
+from ngpt.api.tensors import Bitmap, Image, Kind, Tensor, TransformLike, is_bitmap, layer, like, to_numpy
 from ngpt.errors import NgptError, did_you_mean
 from ngpt.io.resolution import resolve
 from ngpt.methods import METHODS, by_standing, reconstruct, unknown_method
@@ -175,7 +175,7 @@ class Denoiser:
         noisy: Kind,
         albedo: Image | None = None,
         normals: Image | None = None,
-        to_sensor: Tensor | Transform | None = None,
+        to_sensor: Tensor | TransformLike | None = None,
         flow: Image | None = None,
         previous_denoised: Image | None = None,
         **layers: Image,
@@ -187,7 +187,7 @@ class Denoiser:
         noisy: Bitmap,
         albedo_ch: str = "",
         normals_ch: str = "",
-        to_sensor: Tensor | Transform | None = None,
+        to_sensor: Tensor | TransformLike | None = None,
         flow_ch: str = "",
         previous_denoised_ch: str = "",
         noisy_ch: str = "<root>",

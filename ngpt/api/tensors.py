@@ -28,7 +28,7 @@ class Bitmap(Protocol):
     def component_format(self) -> Any: ...
 
 
-class Transform(Protocol):
+class TransformLike(Protocol):
     @property
     def matrix(self) -> Any: ...
 

@@ -30,7 +30,7 @@ from ngpt.network.run_onnx import MEMORY
 from ngpt.options import as_text, settings, unusual
 from ngpt.panorama import wrapping
 from ngpt.sequence.history import Temporal
-from ngpt.sequence.network import Network
+from ngpt.sequence.network import CorrectionNetwork
 from ngpt.system.console import Console
 from ngpt.system.limits import limit_threads
 from ngpt.system.pipeline import overlapped
@@ -243,7 +243,7 @@ def compute_view(view: View, request: DenoiseRequest, history: Temporal | None) 
         result = replace(result, image=image, seconds=result.seconds + time.perf_counter() - begun)
         over_time = {"ngpt:temporal": "history", "ngpt:history": history.share}
         notes = {"why no history": history.reason} if history.reason else {}
-        if isinstance(history.corrections, Network):
+        if isinstance(history.corrections, CorrectionNetwork):
             over_time["ngpt:historyWeights"] = str(identify(history.corrections.path))
     if request.reference is not None:
         notes |= request.reference.errors(result.image, stack, request.reduce)

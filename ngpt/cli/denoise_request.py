@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ngpt.cli import arguments
-from ngpt.cli.reference import Reference
+from ngpt.cli.reference import ReferenceImage
 from ngpt.errors import WrongUse
 from ngpt.io.framenames import named, number_of, varies
 from ngpt.io.frames import RESULT_SUFFIX
@@ -45,7 +45,7 @@ class DenoiseRequest:
     halves: list[str] | None
     groups: list[str] | None
     temporal: bool
-    reference: Reference | None
+    reference: ReferenceImage | None
     into: str | None
     look: Look
     force: bool
@@ -66,7 +66,7 @@ def request_of(args: argparse.Namespace) -> DenoiseRequest:
     options = {name: getattr(args, name) for name in ("alpha", "weights", "device", "memory")}
     options = {name: value for name, value in options.items() if value is not None} | dict(args.option)
     check_request(args.method, options)
-    reference = Reference.read(args.ref, args.untrusted) if args.ref else None
+    reference = ReferenceImage.read(args.ref, args.untrusted) if args.ref else None
     for _, target in pairs:
         if target.suffix.lower() != ".exr":
             check_image(target, args.transform)

@@ -25,13 +25,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> int:
     path = config_of(args, configs.EVALUATION)
     if args.init:
-        from ngpt.evaluation.config import Config
+        from ngpt.evaluation.config import EvaluationConfig
         from ngpt.system.records import read_toml
         from ngpt.system.templates import template
 
         if base := read_toml(path).get("base"):
             raise WrongUse(f"{path.stem} only changes numbers of {base}; give that file to --config")
-        return write_template(args, template(path.read_text(encoding="utf-8"), {"": Config}), "evaluate", console)
+        text = template(path.read_text(encoding="utf-8"), {"": EvaluationConfig})
+        return write_template(args, text, "evaluate", console)
     if not args.out:
         raise WrongUse("--out is missing: the folder of the results")
     # Imported here, so that a mistyped option is reported at once.

@@ -12,7 +12,7 @@ from ngpt.stack import GradientStack
 from ngpt.windows import Place, overlap
 
 
-class Reference(NamedTuple):
+class ReferenceImage(NamedTuple):
     """A reference image, (H, W, 3) in linear Rec. 709, its file, and its place in the picture."""
 
     path: str
@@ -20,7 +20,7 @@ class Reference(NamedTuple):
     place: Place
 
     @classmethod
-    def read(cls, path: str, isolated: bool) -> "Reference":
+    def read(cls, path: str, isolated: bool) -> "ReferenceImage":
         return cls(path, *read_picture(path, isolated))
 
     def errors(self, image: np.ndarray, stack: GradientStack, reduce: int = 1) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from ngpt.io.frames import frame_name, is_shot, natural, remarks, shot_files
 from ngpt.measure.flicker import change_maps, flicker, flicker_maps
 from ngpt.measure.metrics import METRICS, exposure_mismatch
 from ngpt.measure.shown import available, judge
-from ngpt.report.content import REFERENCE, Entry, Overview, Scene
+from ngpt.report.content import REFERENCE, Overview, ReportEntry, Scene
 from ngpt.report.layers import of_stack
 from ngpt.report.page import oversize, write_report
 from ngpt.system.console import Console, tell
@@ -88,7 +88,7 @@ def images_or_shots(args: argparse.Namespace, target: Path, console: Console) ->
     images = all_have.of(whole)
     reference = images.pop() if args.ref else None
     height, width = images[0].shape[:2]
-    entries = [Entry(name, image) for name, image in zip(names, images, strict=True)]
+    entries = [ReportEntry(name, image) for name, image in zip(names, images, strict=True)]
     layers: dict[str, np.ndarray] = {}
     formulas, caption = {}, "no reference: with --ref the page has errors, SSIM, FLIP and their maps"
     if len(images) == 1 and reference is None:
@@ -160,7 +160,7 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
             for values, image, window in zip(known, whole, all_have.windows, strict=True):
                 values.append(put(image, window, display, np.nan))
             reference = images.pop() if args.ref else None
-            entries = [Entry(name, image) for name, image in zip(names, images, strict=True)]
+            entries = [ReportEntry(name, image) for name, image in zip(names, images, strict=True)]
             motions.append(motion_of(paths, places[0]))
             if reference is not None:
                 for entry, path in zip(entries, paths, strict=False):
@@ -255,7 +255,7 @@ def labels(paths: list[str]) -> list[str]:
 
 
 def add_errors(
-    entry: Entry, metrics: list[str], reference: np.ndarray, path: str, other: str, part: Slices = np.s_[:, :]
+    entry: ReportEntry, metrics: list[str], reference: np.ndarray, path: str, other: str, part: Slices = np.s_[:, :]
 ) -> None:
     """Measures ``part`` of the picture of file ``path`` against the reference of file ``other``."""
     try:

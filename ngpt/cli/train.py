@@ -90,7 +90,7 @@ def _task(settings: Any, out: Path, stack: ExitStack, processes: Any, say: Calla
     """The task of the settings with its data; ``stack`` ends the rendering of training sets."""
     from ngpt.system.parts import find_crops
     from ngpt.training.clips import clips
-    from ngpt.training.crops import Mixture, open_crops
+    from ngpt.training.crops import JoinedCrops, open_crops
     from ngpt.training.images import Images
     from ngpt.training.loss import make_loss
     from ngpt.training.split import split
@@ -112,4 +112,4 @@ def _task(settings: Any, out: Path, stack: ExitStack, processes: Any, say: Calla
         return Blending(settings, training, held_out)
     made = [configs.find_config(f, configs.DATASET) for f in settings.data.folders if f.endswith(".toml")]
     streams = [stack.enter_context(find_crops()(config, settings.data.kept)) for config in made]
-    return Images(settings, Mixture(training, *streams), held_out, loss)
+    return Images(settings, JoinedCrops(training, *streams), held_out, loss)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.errors import NgptError
-from ngpt.evaluation.config import Column, Config
+from ngpt.evaluation.config import Column, EvaluationConfig
 from ngpt.evaluation.keys import code_of, file_hash, library_hash
 from ngpt.evaluation.references import Reference
 from ngpt.io.exr import write
@@ -33,7 +33,7 @@ _FORMAT = 2
 class Scorer:
     """Runs methods after a warm-up, and measures their errors and times."""
 
-    def __init__(self, config: Config, cache: Path):
+    def __init__(self, config: EvaluationConfig, cache: Path):
         self.config, self.cache = config, cache
         make_folder(self.cache)
         self._warm: set[tuple] = set()

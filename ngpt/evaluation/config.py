@@ -41,7 +41,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Config:
+class EvaluationConfig:
     """The settings of an evaluation. configs/eval-tiny.toml explains them by example.
 
     ``ngpt evaluate --init FILE`` writes all of them to a file.
@@ -231,7 +231,7 @@ def scene_name(scene: str) -> str:
     return f"{path.parent.name}{path.stem.removeprefix('scene')}" if path.suffix == ".xml" else path.name
 
 
-def read_config(path: str | Path) -> Config:
+def read_config(path: str | Path) -> EvaluationConfig:
     """Reads a TOML file. Raises NgptError for unknown entries, and for values of a wrong type.
 
     The entry ``base`` names another file, relative to the folder of this one, from which missing entries are taken. If
@@ -245,7 +245,7 @@ def read_config(path: str | Path) -> Config:
         own = {table.get("sampler") for table in values.get("variants", {}).values()}
         with_gradients = [n for n, table in tables.items() if n not in own and gradients(table.get("sampler", n))]
         values |= {"samplers": with_gradients or [KINDS["gradients"]], "sampler_options": tables}
-    return from_table(Config, values, str(path))
+    return from_table(EvaluationConfig, values, str(path))
 
 
 def _with_base(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:

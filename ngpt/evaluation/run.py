@@ -10,7 +10,7 @@ from typing import Any
 
 from ngpt.errors import NgptError
 from ngpt.evaluation.cells import PACKAGES, Scorer, absence
-from ngpt.evaluation.config import Column, Config, file_part
+from ngpt.evaluation.config import Column, EvaluationConfig, file_part
 from ngpt.evaluation.references import HALVES, Reference
 from ngpt.evaluation.renders import KINDS, Render
 from ngpt.evaluation.results import write_results
@@ -28,7 +28,7 @@ from ngpt.system.machine import metadata
 
 
 def evaluate(
-    config: Config, out: Path, console: Console, command: str, renderer: Renderer, cache: Path | None = None
+    config: EvaluationConfig, out: Path, console: Console, command: str, renderer: Renderer, cache: Path | None = None
 ) -> dict[str, Any]:
     """Fills the folder ``out``, and returns the contents of its results.json. ``renderer`` renders missing stacks.
 
@@ -103,7 +103,7 @@ def evaluate(
     return results
 
 
-def check_named(config: Config, scenes: dict[str, str], renderer: Renderer) -> None:
+def check_named(config: EvaluationConfig, scenes: dict[str, str], renderer: Renderer) -> None:
     """Raises NgptError unless all ``scenes``, their references, and the samplers for every scene exist."""
     for name, source in scenes.items():
         if not os.path.exists(source):

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from ngpt.errors import NgptError
-from ngpt.evaluation.config import Config
+from ngpt.evaluation.config import EvaluationConfig
 from ngpt.evaluation.keys import scene_hash
 from ngpt.evaluation.references import HALVES, Reference, find_reference, read_reference
 from ngpt.evaluation.renders import DEFAULTS, Render
@@ -49,7 +49,7 @@ class SceneStacks:
         self,
         name: str,
         source: str,
-        config: Config,
+        config: EvaluationConfig,
         cache: Path,
         renderer: Renderer,
         *,

@@ -12,7 +12,7 @@ BASELINE = "primal"  # the picture that tables compare the others to; without it
 
 
 @dataclass
-class Entry:
+class ReportEntry:
     """One picture of a scene: the result of a method, or the contents of a file.
 
     ``name``     'primal', 'l2', ...: unique in its scene
@@ -43,7 +43,7 @@ class Scene:
     name: str
     caption: str
     reference: np.ndarray | None
-    entries: list[Entry]
+    entries: list[ReportEntry]
     layers: dict[str, np.ndarray] = field(default_factory=dict)
     rising: Collection[str] = ()
     meanings: dict[str, tuple[str, list[str]]] = field(default_factory=dict)
@@ -55,7 +55,7 @@ class Scene:
         return pictures if self.reference is None else [*pictures, (REFERENCE, np.asarray(self.reference))]
 
     @property
-    def baseline(self) -> Entry:
+    def baseline(self) -> ReportEntry:
         """The entry that the others are compared to."""
         return next((entry for entry in self.entries if entry.name == BASELINE), self.entries[0])
 

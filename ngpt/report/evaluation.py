@@ -9,7 +9,7 @@ from typing import Any
 
 from ngpt.errors import NgptError
 from ngpt.io.exr import read_image
-from ngpt.report.content import Entry, Overview, Scene
+from ngpt.report.content import Overview, ReportEntry, Scene
 from ngpt.report.page import write_report
 
 FORMAT = 2
@@ -89,7 +89,7 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
             found = [cell["metrics"].get(metric) for cell in mine if not cell["absent"]]
             values = [math.nan if value is None else value for value in found]
             metrics[metric] = values[0] if len(values) == 1 else values
-        entries.append(Entry(method, read_image(folder / pictured["image"]), seconds, metrics))
+        entries.append(ReportEntry(method, read_image(folder / pictured["image"]), seconds, metrics))
     # The first metric is shown below the pictures and decides which method is best.
     for entry in entries:
         entry.metrics = dict(sorted(entry.metrics.items(), key=lambda item: item[0] != results["primary"]))

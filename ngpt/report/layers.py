@@ -4,14 +4,14 @@ import numpy as np
 
 from ngpt.io.exr import channels_alone, layers_of_light
 from ngpt.io.primaries import converted, to_rec709
-from ngpt.report.content import Entry
+from ngpt.report.content import ReportEntry
 from ngpt.stack import GradientStack
 
 # Layers of the contract that hold light
 _LIGHT = ("primal", "direct", "caustic", "diffuse", "specular")
 
 
-def of_stack(stack: GradientStack, shown: np.ndarray, name: str) -> tuple[list[Entry], dict[str, np.ndarray]]:
+def of_stack(stack: GradientStack, shown: np.ndarray, name: str) -> tuple[list[ReportEntry], dict[str, np.ndarray]]:
     """The entries and the layers of a ``Scene`` for one file: (H, W, 3) scene-linear; and (H, W, 1) or (H, W, 3).
 
     ``shown`` (H, W, 3) is the picture that a viewer shows. It is the first entry, called ``name``. In a result, the
@@ -21,11 +21,11 @@ def of_stack(stack: GradientStack, shown: np.ndarray, name: str) -> tuple[list[E
     light |= {layer: image for layer, image in layers_of_light(stack).items() if layer not in light}
     matrix = to_rec709(stack.attributes)
     light = {layer: converted(image, matrix) for layer, image in light.items()}
-    entries = [Entry(name, shown)]
+    entries = [ReportEntry(name, shown)]
     for layer, image in light.items():
         # A file may hold the root a second time, under its renderer's name.
         if not np.array_equal(image, shown, equal_nan=True):
-            entries.append(Entry(layer if layer != name else f"{layer} (layer)", image))
+            entries.append(ReportEntry(layer if layer != name else f"{layer} (layer)", image))
     taken = {entry.name for entry in entries}
     layers = {layer: stack[layer] for layer in stack.names if layer not in light}
     # The page shows one or three channels, so layers of two get a third one of zeros.

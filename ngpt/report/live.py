@@ -110,7 +110,7 @@ class LivePage:
 
 
 def _listening(port: int, page: LivePage) -> ThreadingHTTPServer:
-    handler = type("Handler", (_Handler,), {"page": page})
+    handler = type("Handler", (_PageHandler,), {"page": page})
     try:
         return _Server((ADDRESS, port), handler)
     except OSError:
@@ -169,7 +169,7 @@ def _hang_up(connection: socket.socket) -> None:
         connection.shutdown(socket.SHUT_RDWR)
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _PageHandler(BaseHTTPRequestHandler):
     page: LivePage
     server: _Server
     timeout = 10

@@ -8,7 +8,7 @@ import numpy as np
 
 from ngpt.image import display
 from ngpt.image.png import encode_palette_png, encode_png
-from ngpt.report.content import Entry, Overview, Scene, median
+from ngpt.report.content import Overview, ReportEntry, Scene, median
 from ngpt.system.text import markup
 
 THUMBNAIL_WIDTH = 240
@@ -21,7 +21,7 @@ def section(number: int, scene: Scene, stops: float) -> str:
     entries = {entry.name: entry for entry in scene.entries}
     measured = any(entry.metrics or entry.seconds is not None for entry in scene.entries)
     for name, image in scene.pictures:
-        entry = entries.get(name) or Entry(name, image)  # the reference
+        entry = entries.get(name) or ReportEntry(name, image)  # the reference
         note = (
             f"<small>{markup(first)} {_number(median(entry.metrics[first]))}</small>" if first in entry.metrics else ""
         )

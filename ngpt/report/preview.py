@@ -7,7 +7,7 @@ import numpy as np
 from ngpt.api.uncertainty import reconstruct_with_error
 from ngpt.image.display import ERROR_EPSILON, ERROR_RANGE, auto_exposure
 from ngpt.methods import METHODS, reconstruct
-from ngpt.report.content import Entry, Scene
+from ngpt.report.content import ReportEntry, Scene
 from ngpt.stack import GradientStack
 
 _NOISY = "noisy"
@@ -34,7 +34,7 @@ class Preview:
 
     def scene(self, name: str, caption: str) -> Scene:
         """The preview as a tab of the report."""
-        entries = [Entry(image, pixels, maps=self.maps.get(image, {})) for image, pixels in self.images.items()]
+        entries = [ReportEntry(image, pixels, maps=self.maps.get(image, {})) for image, pixels in self.images.items()]
         share = [f"{self.most * part:.0f}" for part in (0, 0.25, 0.5, 0.75, 1)]
         meanings = {"std. error": (_MEANING, _MARKS), "samples": ("samples of the pixel", share)}
         return Scene(name, caption, None, entries, meanings=meanings)

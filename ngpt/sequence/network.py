@@ -128,7 +128,7 @@ class Blend:
         return np.stack(channels, axis=-1).astype(np.float32)
 
 
-class Network:
+class CorrectionNetwork:
     """The network in a file of ``ngpt.export.temporal``, as ``Corrections``.
 
     Raises NgptError for other files, and for networks with other inputs.
@@ -160,6 +160,6 @@ class Network:
         return result[:height, :width]
 
 
-def shipped() -> Network | None:
+def shipped() -> CorrectionNetwork | None:
     """The network that comes with ngpt; None without ONNX Runtime."""
-    return Network(WEIGHTS) if find_spec("onnxruntime") is not None and WEIGHTS.is_file() else None
+    return CorrectionNetwork(WEIGHTS) if find_spec("onnxruntime") is not None and WEIGHTS.is_file() else None

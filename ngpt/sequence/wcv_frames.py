@@ -51,7 +51,7 @@ class Link:
 
 
 @dataclass(frozen=True)
-class Frame:
+class WindowFrame:
     """One frame of a window, arrays (H, W, 3), all finite except the variances.
 
     ``image``      the light that dx and dy describe
@@ -73,7 +73,7 @@ class Frame:
     link: Link | None
 
 
-def wcv_frames(frames: Sequence[Frame], sweeps: int | None = None) -> list[np.ndarray]:
+def wcv_frames(frames: Sequence[WindowFrame], sweeps: int | None = None) -> list[np.ndarray]:
     """The reconstruction of image + apart of each frame, (H, W, 3) float32; frames without links give ``wcv``."""
     total = [frame.image + frame.apart for frame in frames]
     dtype = np.float64 if _wide(total) else np.float32
@@ -114,7 +114,7 @@ class _Still:
     ``primal``  (H, W, 1), the relative variances of its pixels; ``x``, ``y`` are those of its differences
     """
 
-    def __init__(self, frame: Frame, dtype: type):
+    def __init__(self, frame: WindowFrame, dtype: type):
         p, x, y = frame.variances
         self.primal, self.x, self.y = smoothed(p), smoothed(x[:, :-1], True), smoothed(y[:-1], True)
         self.level, self.dtype = robust_mean(self.primal, self.x, self.y), dtype

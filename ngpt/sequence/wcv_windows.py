@@ -19,7 +19,7 @@ from ngpt.errors import NgptError
 from ngpt.magnitude import enlarged, magnitude, scaled
 from ngpt.methods import METHODS, Result
 from ngpt.repair import Repaired, repair
-from ngpt.sequence.wcv_frames import Frame, Link, wcv_frames
+from ngpt.sequence.wcv_frames import Link, WindowFrame, wcv_frames
 from ngpt.stack import GradientStack
 
 LENGTH = 10
@@ -66,14 +66,14 @@ class _Member:
         self.sum, self.weight, self.seconds = np.zeros(stack["primal"].shape), 0.0, 0.0
 
     @cached_property
-    def frame(self) -> Frame:
+    def frame(self) -> WindowFrame:
         data, stack = self.data, scaled(self.stack, self.power)
         light = CLASSICAL["wcv"](data)
         apart = np.zeros_like(light) if data.caustic is None else caustic.denoised(data)
         link = None
         if all(name in stack for name in LINK):
             link = Link(stack["motion"], stack["dt"], stack["dt_var"], self.shift)
-        return Frame(data.image, apart, data.dx, data.dy, data.variances, data.trusted, light + apart, link)
+        return WindowFrame(data.image, apart, data.dx, data.dy, data.variances, data.trusted, light + apart, link)
 
     @cached_property
     def data(self) -> Repaired:

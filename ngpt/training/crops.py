@@ -39,7 +39,7 @@ class Crop(Protocol):
     def reference_halves(self) -> tuple[np.ndarray, ...]: ...
 
 
-class Mixture(Sequence[Any]):
+class JoinedCrops(Sequence[Any]):
     """Several sequences of crops as one sequence. They may grow while they are read, as streams do."""
 
     def __init__(self, *parts: Any):

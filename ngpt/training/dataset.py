@@ -34,7 +34,7 @@ _MANIFEST: Shape = {"config": dict, "planned": int, "shards": [_ENTRY]}
 
 
 @dataclass(frozen=True)
-class Crop:
+class ShardCrop:
     """A crop. Its pixels are read only when they are used.
 
     ``spp`` holds the samples per pixel of its inputs. ``frame`` is its number in a shot, from 0; None for a single
@@ -170,16 +170,16 @@ class Dataset:
     def __len__(self) -> int:
         return len(self._places)
 
-    def __getitem__(self, index: int) -> Crop:
+    def __getitem__(self, index: int) -> ShardCrop:
         if not -len(self) <= index < len(self):
             raise IndexError(f"{self.folder}: crop {index} of {len(self)}")
         entry, place = self._places[index]
         if entry["file"] not in self._open:
             self._open[entry["file"]] = _checked(self.folder / entry["file"], entry)
         crop = entry["crops"][place]
-        return Crop(self._open[entry["file"]], place, entry["scene"], tuple(crop["spp"]), crop.get("frame"))
+        return ShardCrop(self._open[entry["file"]], place, entry["scene"], tuple(crop["spp"]), crop.get("frame"))
 
-    def __iter__(self) -> Iterator[Crop]:
+    def __iter__(self) -> Iterator[ShardCrop]:
         return (self[i] for i in range(len(self)))
 
     def __getstate__(self) -> dict[str, Any]:
@@ -228,7 +228,7 @@ def problems(folder: Path) -> list[str]:
             if bad:
                 found.append(f"{shard.path}: tensor '{name}' has {bad} values that are not finite")
         for i, crop_entry in enumerate(entry["crops"]):
-            read = Crop(shard, i, entry["scene"], tuple(crop_entry["spp"]))
+            read = ShardCrop(shard, i, entry["scene"], tuple(crop_entry["spp"]))
             for k in filter(read.strays, range(read.inputs)):
                 found.append(f"{shard.path}: the subpixels of crop {i}, input {k} are of another image; make it again")
         if entry["crops"] and shards.REFERENCES[0] not in shard.names:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from restir_shots import SEED, Candidates, Room, close, inverse, lamp, set_vertices, things, worth
 
-from data_gen.scenes.geometry import Mesh
+from data_gen.scenes.geometry import Triangles
 from ngpt_studies.restir.carry import Carry
 from ngpt_studies.restir.record import STUCK
 
@@ -111,7 +111,7 @@ def test_what_was_not_there_is_not_carried(rooms):
     names, shapes = list(numbers), list(target.shapes)[:-1]
     assert names[-1] == "ball"
     tall = shapes[names.index("tall")]
-    shapes[names.index("tall")] = Mesh(tall.vertices, tall.faces[:-1])
+    shapes[names.index("tall")] = Triangles(tall.vertices, tall.faces[:-1])
     there = carried(source, replace(target, shapes=shapes), found)
     joined = found.lit & np.isin(found.kind, (1, 2, 3))
     gone = joined & np.isin(drjit_ids(found.record.shape), [numbers["tall"], numbers["ball"]])

@@ -165,7 +165,7 @@ def weights(rng: Random | None, folder: Path) -> None:
 
 def settings(rng: Random | None, folder: Path) -> None:
     """Configurations of training and of data generation: other values, or other bytes."""
-    from data_gen.dataset.config import Config, read_config
+    from data_gen.dataset.config import DatasetConfig, read_config
     from ngpt.system.records import from_table
     from ngpt.training.settings import from_dict, read_settings
 
@@ -177,7 +177,7 @@ def settings(rng: Random | None, folder: Path) -> None:
             value["files"] = [{"pattern": str(folder / "*.xml"), "crops": 2, "boxes": {"a": [[0, 0, 0], [1, 1, 1]]}}]
         changed = value_changed(rng, value)
         changed = changed if isinstance(changed, dict) else {"x": changed}
-        from_table(Config, changed, str(path)) if name == "data-cpu.toml" else from_dict(changed, str(path))
+        from_table(DatasetConfig, changed, str(path)) if name == "data-cpu.toml" else from_dict(changed, str(path))
         return
     path.write_bytes(bytes_changed(rng, data) if rng else data)
     if name == "data-cpu.toml":

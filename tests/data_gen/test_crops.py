@@ -20,7 +20,7 @@ pytest.importorskip("safetensors")
 
 from data_gen.dataset import cameras, crops, jobs, movement
 from data_gen.dataset.card import write_card
-from data_gen.dataset.config import Config
+from data_gen.dataset.config import DatasetConfig
 from data_gen.render import render_stack
 from data_gen.scenes import load as loading
 from data_gen.scenes.geometry import VERTICES
@@ -58,7 +58,7 @@ def around(renderer, first_view):
 
 def config_of(**changes):
     settings = {"size": 16, "inputs": 1, "spp": (2, 2), "sampler": "primal", "reference_method": "primal"}
-    return Config(**(settings | {"scenes": 1, "reference_spp": 4, "roll": 0.0} | changes))
+    return DatasetConfig(**(settings | {"scenes": 1, "reference_spp": 4, "roll": 0.0} | changes))
 
 
 @pytest.fixture

@@ -23,8 +23,8 @@ pytest.importorskip("mitsuba")
 
 from data_gen.cluster import cluster as dask_cluster
 from data_gen.dataset import jobs
-from data_gen.dataset.cameras import Surroundings, View, find_view, random_view, what_shows, with_one_kernel
-from data_gen.dataset.config import Config, Files, read_config
+from data_gen.dataset.cameras import CameraView, Surroundings, find_view, random_view, what_shows, with_one_kernel
+from data_gen.dataset.config import DatasetConfig, Files, read_config
 from data_gen.scenes.load import load_scene
 from data_gen.scenes.procedural import scenes
 from ngpt.training.shards import write_shard
@@ -91,7 +91,7 @@ def test_bad_configurations(tmp_path, text, message):
 @pytest.mark.parametrize("way", ["one process", "threads", "parts"])
 def test_a_set_is_the_same_however_it_is_made(tmp_path, monkeypatch, way):
     monkeypatch.setattr(jobs, "make_shard", stand_in)
-    config, folder = Config(scenes=5, crops=3, crops_per_shard=2), tmp_path / "again"
+    config, folder = DatasetConfig(scenes=5, crops=3, crops_per_shard=2), tmp_path / "again"
     jobs.generate(config, tmp_path / "whole", jobs.Serial())
     for i in range(3 if way == "parts" else 1):
         with ThreadPoolExecutor(3) if way == "threads" else jobs.Serial() as executor:
@@ -102,7 +102,7 @@ def test_a_set_is_the_same_however_it_is_made(tmp_path, monkeypatch, way):
 
 def test_goes_on_where_it_stopped(tmp_path, monkeypatch):
     monkeypatch.setattr(jobs, "make_shard", stand_in)
-    config = Config(scenes=4, crops=1)
+    config = DatasetConfig(scenes=4, crops=1)
     jobs.generate(config, tmp_path, jobs.Serial())
     before = hashes(tmp_path)
     lost = next((tmp_path / "shards").iterdir())
@@ -124,7 +124,7 @@ def test_disk_full_stops_cleanly(tmp_path, monkeypatch):
 
     monkeypatch.setattr(jobs, "make_shard", full)
     with pytest.raises(NgptError, match="No space left"):
-        jobs.generate(Config(scenes=4, crops=1), tmp_path, jobs.Serial())
+        jobs.generate(DatasetConfig(scenes=4, crops=1), tmp_path, jobs.Serial())
     assert len(hashes(tmp_path)) == 2
 
 
@@ -132,10 +132,10 @@ def test_scene_files_as_sources(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "scene.xml").touch()
     box = [[0, 0, 0], [1, 1, 1]]
-    config = Config(files=(Files(str(tmp_path / "*" / "*.xml"), 3, boxes={"a-scene": box}),))
+    config = DatasetConfig(files=(Files(str(tmp_path / "*" / "*.xml"), 3, boxes={"a-scene": box}),))
     assert [(job.scene, job.crops, job.box) for job in config.plan()] == [("a-scene", (0, 1, 2), box)]
     with pytest.raises(NgptError, match="no scene file matches"):
-        Config(files=(Files(str(tmp_path / "nothing"), 3),)).plan()
+        DatasetConfig(files=(Files(str(tmp_path / "nothing"), 3),)).plan()
 
 
 def test_a_scene_can_be_saved_by_its_seed(tmp_path, monkeypatch, capsys):
@@ -176,7 +176,7 @@ def test_views_of_a_scene_share_their_kernels(renderer):
     around = Surroundings(scene)
     point = dr.opaque(mi.Point2f, 0.3, 64)
 
-    def kernels(views: list[View]) -> int:
+    def kernels(views: list[CameraView]) -> int:
         found = set()
         for view in views:
             view.apply(scene)
@@ -224,7 +224,7 @@ def test_tiny(renderer, tmp_path):
 def test_dask_cluster_with_a_worker_killed(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
     monkeypatch.setattr(jobs, "make_shard", stand_in)
-    config = Config(scenes=60, crops=1)
+    config = DatasetConfig(scenes=60, crops=1)
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         pids = [worker.pid for worker in cluster.workers.values()]
         killed = []
@@ -241,7 +241,7 @@ def test_dask_cluster_with_a_worker_killed(tmp_path, monkeypatch):
 def test_a_dead_worker_is_an_error_that_says_how_to_go_on(tmp_path, monkeypatch):
     monkeypatch.setattr(jobs, "make_shard", die)
     with ProcessPoolExecutor(1) as executor, pytest.raises(NgptError, match="continue"):
-        jobs.generate(Config(scenes=1, crops=1), tmp_path, executor)
+        jobs.generate(DatasetConfig(scenes=1, crops=1), tmp_path, executor)
 
 
 def die(config, job, folder, variant):

@@ -12,7 +12,7 @@ from unbiased import load
 pytest.importorskip("mitsuba")
 
 from data_gen.adaptive import Adaptive
-from data_gen.dataset.cameras import View
+from data_gen.dataset.cameras import CameraView
 from data_gen.film import GradientFilm
 from data_gen.passes import recording
 from data_gen.paths import frozen
@@ -237,7 +237,7 @@ def test_renders_of_one_scene_share_what_is_recorded(renderer, recordings):
 
     def rendered(i, made=None, **options):
         origin, up, window = (0.2 * i, 1.2, 3.5 - 0.3 * i), (0.1 * i, 1, 0), (10 + i, 12)
-        View(origin, (0, 1, 0), up, 50 - 5 * i, 0.02 * (i + 1), 4 - i, (64 + 8 * i, 48), window, 16).apply(scene)
+        CameraView(origin, (0, 1, 0), up, 50 - 5 * i, 0.02 * (i + 1), 4 - i, (64 + 8 * i, 48), window, 16).apply(scene)
         return render_stack(scene, 4, i, "gpt", made=made, unbiased=True, **options)
 
     anew = [rendered(i) for i in range(3)]

@@ -10,18 +10,18 @@ import pytest
 
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
-from ngpt.training.dataset import Crop, Dataset, problems
+from ngpt.training.dataset import Dataset, ShardCrop, problems
 
 pytest.importorskip("safetensors")
 pytest.importorskip("mitsuba")
 
 from data_gen.dataset import crops, jobs, stream
 from data_gen.dataset.card import write_card
-from data_gen.dataset.config import Config, Files
+from data_gen.dataset.config import DatasetConfig, Files
 from data_gen.dataset.kept import Again, Kept, home, keep, packed, unpacked
 from ngpt.training.shards import CropData, Shard, write_shard
 
-SMALL = Config(size=16, inputs=2, spp=(2, 4), scenes=1, crops=2, reference_spp=8)
+SMALL = DatasetConfig(size=16, inputs=2, spp=(2, 4), scenes=1, crops=2, reference_spp=8)
 
 
 def test_numbers_come_back_within_half_a_step(rng):
@@ -53,7 +53,7 @@ def made(renderer, first_view, tmp_path_factory):
         folder = tmp_path_factory.mktemp("set")
         (folder / "shards").mkdir()
         shard = Shard(folder / crops.make_shard(config, config.plan()[0], str(folder), "llvm_ad_rgb", again))
-        return shard, [Crop(shard, i, "made", tuple(told["spp"])) for i, told in enumerate(shard.record["crops"])]
+        return shard, [ShardCrop(shard, i, "made", tuple(told["spp"])) for i, told in enumerate(shard.record["crops"])]
 
     return make
 
@@ -136,7 +136,8 @@ def stand_in(config, job, folder, variant, again=None):
 
 def test_new_crops_replace_old_ones(monkeypatch):
     monkeypatch.setattr(stream, "make_shard", stand_in)
-    with ThreadPoolExecutor(2) as executor, stream.Stream(Config(scenes=1, crops=1), executor, capacity=4) as data:
+    config = DatasetConfig(scenes=1, crops=1)
+    with ThreadPoolExecutor(2) as executor, stream.Stream(config, executor, capacity=4) as data:
         first = data[0]
         until(lambda: max(data.scenes) >= "made-00010")
         assert len(data) == 4 and max(data.scenes) >= "made-00010"
@@ -148,7 +149,7 @@ def test_new_crops_replace_old_ones(monkeypatch):
 
 def test_kept_references_are_met_again_with_new_inputs(monkeypatch, tmp_path):
     monkeypatch.setattr(stream, "make_shard", stand_in)
-    config = Config(scenes=3, crops=1, size=8)
+    config = DatasetConfig(scenes=3, crops=1, size=8)
     with ThreadPoolExecutor(1) as executor, stream.Stream(config, executor, capacity=3, kept=tmp_path) as data:
         until(lambda: all(np.any(crop.stack(0)["primal"] != crop.reference) for crop in data))
         assert {crop.scene for crop in data} <= {"made-00000", "made-00001", "made-00002"}
@@ -165,7 +166,7 @@ def test_what_has_no_references_to_keep_is_refused(tmp_path):
         "shots": {"frames": 3},
     }.items():
         with pytest.raises(NgptError, match=f"{why}.*leave data.kept out"):
-            stream.Stream(Config(scenes=1, **changes), None, kept=tmp_path)
+            stream.Stream(DatasetConfig(scenes=1, **changes), None, kept=tmp_path)
 
 
 def test_an_error_of_a_worker_reaches_the_reader(monkeypatch):
@@ -174,4 +175,4 @@ def test_an_error_of_a_worker_reaches_the_reader(monkeypatch):
 
     monkeypatch.setattr(stream, "make_shard", fail)
     with ThreadPoolExecutor(1) as executor, pytest.raises(NgptError, match="disk full"):
-        stream.Stream(Config(scenes=1, crops=1), executor).__enter__()
+        stream.Stream(DatasetConfig(scenes=1, crops=1), executor).__enter__()

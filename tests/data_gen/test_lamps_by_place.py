@@ -16,7 +16,7 @@ from unbiased import FAR, assert_unbiased, load, render_ours
 from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.paths.lights import Lights, emission, emission_in_pixel, replay_lamp, shared_emission
 from data_gen.paths.vertex import seen_from
-from data_gen.scenes.lamps import Places, Table, weighed
+from data_gen.scenes.lamps import LampTable, Places, weighed
 
 LANES = 1 << 14
 
@@ -26,7 +26,7 @@ def any_places(scene, side=4, seed=1):
     lamps = len(scene.emitters())
     table = np.random.default_rng(seed).dirichlet(np.full(lamps, 0.5), side**3 + 1)
     low, high = np.array([-2.5, -0.1, -2.5]), np.array([2.5, 2.5, 2.5])
-    return Places(scene, Table(0.8 * table + 0.2 / lamps, low, (high - low) / side, side))
+    return Places(scene, LampTable(0.8 * table + 0.2 / lamps, low, (high - low) / side, side))
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from renders import mi
 from unbiased import load
 
 from data_gen.frames.motion import motion_vectors, seen, snapshot
-from data_gen.scenes.geometry import Mesh, geometry, geometry_of, put_vertices, vertices, vertices_name
+from data_gen.scenes.geometry import Triangles, geometry, geometry_of, put_vertices, vertices, vertices_name
 from data_gen.scenes.load import set_film_size
 from ngpt.errors import NgptError
 
@@ -86,7 +86,7 @@ def test_vertices_have_the_names_of_this_mitsuba_and_of_the_next(renderer):
     installed, found = mi.traverse(box), geometry(box)
     name = vertices_name(installed)
     rows = vertices(installed, name)
-    assert isinstance(found, Mesh) and np.array_equal(found.vertices, rows) and rows.shape[1] == 3
+    assert isinstance(found, Triangles) and np.array_equal(found.vertices, rows) and rows.shape[1] == 3
     new = {"positions": mi.TensorXf(rows.astype(np.float32)), "faces": mi.TensorXu(found.faces)}
     for params, mesh in ((installed, ""), (new, ""), ({f"box.{key}": value for key, value in new.items()}, "box")):
         name = vertices_name(params, mesh)

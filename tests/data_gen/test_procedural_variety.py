@@ -15,7 +15,7 @@ pytest.importorskip("mitsuba")
 
 from data_gen.dataset import crops, jobs
 from data_gen.dataset.cameras import Surroundings, find_view
-from data_gen.dataset.config import Config, made_name
+from data_gen.dataset.config import DatasetConfig, made_name
 from data_gen.scenes.builtin import _box, _camera, _diffuse, _sphere, _volume, _wall
 from data_gen.scenes.procedural import hard_light, media, things, variety
 from data_gen.scenes.procedural.materials import ROLES
@@ -225,7 +225,8 @@ def test_cameras_are_found_beside_media_and_see_through_their_boundaries(rendere
 def test_crops_of_scenes_with_media(renderer, tmp_path, monkeypatch, kind):
     """By the sampler that `auto` takes; every layer is finite."""
     only(monkeypatch, "media", kind=kind)
-    config = Config(size=16, inputs=1, spp=(2, 4), sampler="auto", scenes=1, varied=True, crops=1, reference_spp=8)
+    small = {"size": 16, "inputs": 1, "spp": (2, 4), "scenes": 1, "crops": 1, "reference_spp": 8}
+    config = DatasetConfig(sampler="auto", varied=True, **small)
     (tmp_path / "shards").mkdir()
     crops.make_shard(config, config.plan()[0], str(tmp_path), "llvm_ad_rgb")
     shard = Shard(tmp_path / config.plan()[0].file)
@@ -233,7 +234,7 @@ def test_crops_of_scenes_with_media(renderer, tmp_path, monkeypatch, kind):
 
 
 def test_a_set_begun_before_there_was_an_entry_goes_on(tmp_path):
-    config = Config(scenes=2)
+    config = DatasetConfig(scenes=2)
     jobs.start(config, tmp_path, 8)
     manifest = read_manifest(tmp_path)
     del manifest["config"]["varied"]
@@ -244,7 +245,7 @@ def test_a_set_begun_before_there_was_an_entry_goes_on(tmp_path):
 
 
 def test_a_configuration_sets_shares(tmp_path):
-    config = Config(scenes=40, varied=True, sights={"media": 1.0, "hair": 0.0})
+    config = DatasetConfig(scenes=40, varied=True, sights={"media": 1.0, "hair": 0.0})
     for number in range(40):
         seed = crops.scene_seed(config, made_name(number))
         sights = variety.further_sights(seed, variety.SHARES | config.sights)[0]

@@ -27,7 +27,7 @@ from data_gen.tails import cache, schedule
 from data_gen.tails.cache import LEAST
 from data_gen.tails.matt import is_lambertian
 from data_gen.tails.schedule import FINENESS
-from data_gen.tails.table import Place
+from data_gen.tails.table import CellPlace
 from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError, WrongUse
 from ngpt.shared import shared_variance
@@ -71,7 +71,7 @@ N = 20_000
 
 def flat(x, y):
     """Places on a floor."""
-    return Place(mi.Point3f(x, y, 0.02), mi.UInt32(0), mi.Int32(-3))
+    return CellPlace(mi.Point3f(x, y, 0.02), mi.UInt32(0), mi.Int32(-3))
 
 
 def known(place, values, unit=0.0, at=None):
@@ -96,7 +96,7 @@ def test_what_is_known_depends_on_no_order(renderer):
 
     def part(pairs):
         which = np.stack([2 * pairs, 2 * pairs + 1], axis=1).ravel()
-        place = Place(mi.Point3f(p[:, which]), mi.UInt32(code[which]), mi.Int32(level[which]))
+        place = CellPlace(mi.Point3f(p[:, which]), mi.UInt32(code[which]), mi.Int32(level[which]))
         return place, [mi.Float(v[which]) for v in value], 2.0**-26
 
     everywhere = part(np.arange(N // 2))
@@ -253,7 +253,7 @@ def cell_with_a_wall(at, bright, dark, share=1.0, n=4000):
     rng = np.random.default_rng(4)
     x = rng.random(n).astype(np.float32)
     light = np.where(x < at, bright, dark) * (rng.random(n) < share) * rng.uniform(0.5, 1.5, n)
-    place = Place(mi.Point3f(0.25 * x, 0.1, 0.1), mi.UInt32(0), mi.Int32(-2))
+    place = CellPlace(mi.Point3f(0.25 * x, 0.1, 0.1), mi.UInt32(0), mi.Int32(-2))
     filled = cache.Cache(FINENESS)
     filled.add(place, dr.arange(mi.UInt32, n) & 1, [mi.Float(light.astype(np.float32))] * 3)
     filled.settle(FINENESS)

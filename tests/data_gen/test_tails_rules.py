@@ -10,7 +10,7 @@ import pytest
 
 from data_gen.tails import feeding
 from data_gen.tails.cache import NEAR, Trail
-from data_gen.tails.table import Place, in_table, key
+from data_gen.tails.table import CellPlace, in_table, key
 
 
 def test_cells_that_share_a_place_find_others(renderer):
@@ -28,7 +28,7 @@ def test_cells_that_share_a_place_find_others(renderer):
 def test_cells_of_other_sizes_are_other_cells(renderer):
     """Cells of two sizes with the same number along each axis lie in different places of the scene."""
     p, level = np.array([[0.3, 0.6], [0.7, 1.4], [-0.2, -0.4]]), np.array([-3, -2])
-    first, name, _ = key(Place(mi.Point3f(p), mi.UInt32(0), mi.Int32(level)))
+    first, name, _ = key(CellPlace(mi.Point3f(p), mi.UInt32(0), mi.Int32(level)))
     assert first[0] != first[1] and name[0] != name[1]
 
 

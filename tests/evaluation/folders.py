@@ -7,7 +7,7 @@ import numpy as np
 import ngpt
 from data_gen import service
 from ngpt.classical.gradients import forward_differences
-from ngpt.evaluation.config import Config, read_config
+from ngpt.evaluation.config import EvaluationConfig, read_config
 from ngpt.evaluation.run import evaluate
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
@@ -51,11 +51,11 @@ def write_halves(folder: Path, rng: np.random.Generator, deviation: float, name:
         ngpt.write(folder / f"{name}-{half}.exr", stack)
 
 
-def evaluated(config: Config, out: Path, command: str = "") -> dict:
+def evaluated(config: EvaluationConfig, out: Path, command: str = "") -> dict:
     return evaluate(config, out, Console(quiet=True), command, service)
 
 
-def read(text: str, folder: Path) -> Config:
+def read(text: str, folder: Path) -> EvaluationConfig:
     path = folder / "config.toml"
     path.write_text(text)
     return read_config(path)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from data_gen import code, service
-from ngpt.evaluation.config import Config
+from ngpt.evaluation.config import EvaluationConfig
 from ngpt.evaluation.keys import scene_hash
 from ngpt.evaluation.stacks import SceneStacks
 
@@ -23,7 +23,7 @@ def tree(tmp_path, monkeypatch):
 
 
 def key_of(scene: str, folder: Path, sampler: str = "gpt") -> str:
-    return SceneStacks("s", scene, Config(scenes=(scene,)), folder, service).key(sampler)
+    return SceneStacks("s", scene, EvaluationConfig(scenes=(scene,)), folder, service).key(sampler)
 
 
 def test_a_sampler_has_the_key_of_the_code_it_runs(tree, tmp_path):

@@ -9,7 +9,7 @@ from data_gen import service
 from ngpt.denoisers import oidn
 from ngpt.errors import NgptError
 from ngpt.evaluation import cells
-from ngpt.evaluation.config import Config
+from ngpt.evaluation.config import EvaluationConfig
 from ngpt.evaluation.stacks import SceneStacks
 from ngpt.methods import reconstruct
 from ngpt.report.evaluation import write_evaluation_report
@@ -41,7 +41,7 @@ VARIANTS = {
     ],
 )
 def test_methods_appear_once_for_each_sampler_of_their_kind_of_stack(entries, expected):
-    config = Config(**{"scenes": ("diffuse",), "methods": ("primal", "wcv", "oidn")} | entries)
+    config = EvaluationConfig(**{"scenes": ("diffuse",), "methods": ("primal", "wcv", "oidn")} | entries)
     columns = config.columns()
     assert "; ".join(f"{column.name}: {column.render.name}" for column in columns) == expected
     for column in columns:

@@ -14,7 +14,7 @@ import pytest
 from ngpt.errors import NgptError
 from ngpt.image import display
 from ngpt.report import pixelcodec
-from ngpt.report.content import Entry, Scene
+from ngpt.report.content import ReportEntry, Scene
 from ngpt.report.page import write_report
 
 FACTS = {"command": "ngpt demo --spp 16", "footer": {"ngpt": "0.1.0", "device": "CPU"}}
@@ -39,8 +39,8 @@ def shown(name, stops=0.0) -> np.ndarray:
 
 def flat_scene(name="flat") -> Scene:
     entries = [
-        Entry("primal", constant(COLOURS["primal"]), None, {"relMSE": 0.5, "PSNR": 10.0}),
-        Entry("l1", constant(COLOURS["l1"]), 0.25, {"relMSE": 0.05, "PSNR": 14.0}),
+        ReportEntry("primal", constant(COLOURS["primal"]), None, {"relMSE": 0.5, "PSNR": 10.0}),
+        ReportEntry("l1", constant(COLOURS["l1"]), 0.25, {"relMSE": 0.05, "PSNR": 14.0}),
     ]
     return Scene(name, "two colours", constant(COLOURS["reference"]), entries, {"dx": constant(-1.0)}, rising=("PSNR",))
 
@@ -51,13 +51,13 @@ def noise_scene(name="noise") -> Scene:
     image[0, :6] = [[np.nan] * 3, [np.inf] * 3, [-np.inf] * 3, [-2.5] * 3, [1e12] * 3, [1e-30] * 3]
     layers = {"dx": image, "dy": np.zeros_like(image), "albedo": np.clip(image, 0, 1), "normal": image - 1}
     layers |= {"depth": image[:, :, :1], "primal_var": image}
-    return Scene(name, "", None, [Entry("primal", image, 0.0, {"relMSE": np.nan, "FLIP": np.inf})], layers)
+    return Scene(name, "", None, [ReportEntry("primal", image, 0.0, {"relMSE": np.nan, "FLIP": np.inf})], layers)
 
 
 def plain_scene(height=24, width=36, maps=()) -> Scene:
     image = np.random.default_rng(0).gamma(1.0, 1.0, (height, width, 3)).astype(np.float32)
     entries = [
-        Entry(name, image * k, None, {"relMSE": 0.1 * k}, {m: np.full((height, width), 0.5) for m in maps})
+        ReportEntry(name, image * k, None, {"relMSE": 0.1 * k}, {m: np.full((height, width), 0.5) for m in maps})
         for k, name in ((1, "a picture with a rather long name"), (2, "other"))
     ]
     return Scene(f"{width}x{height}", "a caption", image, entries)
@@ -133,7 +133,7 @@ def test_names_are_only_names(tmp_path):
 
 def test_a_page_that_would_be_too_big_stores_its_noise_coarser(tmp_path, monkeypatch):
     noise, smooth = np.random.default_rng(0).gamma(1.0, 1.0, (300, 400, 3)), np.ones((300, 400, 3))
-    scene = Scene("s", "", None, [Entry("primal", noise), Entry("l1", smooth)])
+    scene = Scene("s", "", None, [ReportEntry("primal", noise), ReportEntry("l1", smooth)])
     limit = 600_000  # at full precision the page takes over 800 kB
     monkeypatch.setattr("ngpt.report.page.PAGE_LIMIT", limit)
     text = written(tmp_path, scene).read_text()
@@ -221,7 +221,7 @@ def test_the_script_decodes_what_was_written(browser, both):
 
 def test_hostile_names_and_numbers_do_not_break_the_script(browser, tmp_path):
     noise = noise_scene(HOSTILE)
-    noise.entries.append(Entry(HOSTILE, np.full((20, 30, 3), 1e12)))
+    noise.entries.append(ReportEntry(HOSTILE, np.full((20, 30, 3), 1e12)))
     path = written(tmp_path, flat_scene(), noise)
     session = browser(address(path, scene=1, a=HOSTILE, b="dx", exposure=-4, zoom=4))
     assert "owned" not in session.ask("document.title") and unbroken(session)
@@ -292,7 +292,8 @@ def test_panes_zoom_and_pan_together_and_keys_drive_them(browser, both):
 def test_the_frames_of_a_shot_are_played_at_one_exposure(browser, tmp_path):
     change = {"change": np.zeros((6, 8))}
     frames = [
-        Scene(f"{i:04}", "", None, [Entry("shot", np.full((6, 8, 3), 0.1 * (i + 1)), maps=change)]) for i in range(3)
+        Scene(f"{i:04}", "", None, [ReportEntry("shot", np.full((6, 8, 3), 0.1 * (i + 1)), maps=change)])
+        for i in range(3)
     ]
     session = browser(written(tmp_path, *frames, shot=True).as_uri())
     assert session.ask("$('tabs').hidden") is True and session.ask("$('player').hidden") is False

@@ -7,7 +7,7 @@ from shots import frame_of, view
 from ngpt.errors import NgptError
 from ngpt.sequence import network as module
 from ngpt.sequence.history import Temporal
-from ngpt.sequence.network import BANDS, INPUTS, Network, shipped
+from ngpt.sequence.network import BANDS, INPUTS, CorrectionNetwork, shipped
 
 SIZE = (24, 36)
 
@@ -77,4 +77,4 @@ def test_other_files_are_refused(tmp_path, file):
     onnx.save(torn, tmp_path / "torn.onnx")
     messages = {"ngpt-fast.onnx": "is no network that blends frames", "none.onnx": "no such file"}
     with pytest.raises(NgptError, match=messages.get(file, "torn.onnx: its metadata .* no whole number")):
-        Network((WEIGHTS if file.startswith("ngpt") else tmp_path) / file)
+        CorrectionNetwork((WEIGHTS if file.startswith("ngpt") else tmp_path) / file)

@@ -6,7 +6,7 @@ import pytest
 from ngpt.classical.controlvariates import wcv
 from ngpt.classical.gradients import forward_differences
 from ngpt.sequence.warp import bilinear_taps, warped
-from ngpt.sequence.wcv_frames import Frame, Link, wcv_frames
+from ngpt.sequence.wcv_frames import Link, WindowFrame, wcv_frames
 
 SIZE = (12, 16, 3)
 
@@ -16,7 +16,7 @@ def frame(image, noise, rng, link=None, spread=1.0, trusted=None):
     dx, dy = forward_differences(image)
     variances = np.full(SIZE, noise**2), np.full(SIZE, spread), np.full(SIZE, spread)
     noisy = image + noise * rng.normal(size=SIZE)
-    return Frame(noisy, np.zeros(SIZE), dx, dy, variances, trusted, noisy, link)
+    return WindowFrame(noisy, np.zeros(SIZE), dx, dy, variances, trusted, noisy, link)
 
 
 def link(now, before, motion, variance=1e-6, noise=0.0, rng=None):
@@ -57,7 +57,7 @@ def test_frames_share_what_they_know(rng, motion, share):
             one = frame(image, 0.3, rng, known, spread=100.0)
             noisy = image + noise[t]
             # A first guess without noise has what interpolation does not know.
-            found.append(Frame(noisy, one.apart, one.dx, one.dy, one.variances, None, np.zeros(SIZE), known))
+            found.append(WindowFrame(noisy, one.apart, one.dx, one.dy, one.variances, None, np.zeros(SIZE), known))
         return wcv_frames(found)
 
     alone, together = error(results(False), truth), error(results(True), truth)

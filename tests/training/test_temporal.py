@@ -12,7 +12,7 @@ from shots import frame_of, without
 from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.network import safetensors
-from ngpt.sequence.network import BANDS, INPUTS, Network
+from ngpt.sequence.network import BANDS, INPUTS, CorrectionNetwork
 from ngpt.training import clips as module
 from ngpt.training.clips import Clip, errors
 from ngpt.training.settings import from_dict
@@ -88,7 +88,7 @@ def test_it_learns_and_its_onnx_file_is_the_same(finished, tmp_path):
     for weights, output in ((finished / "weights.safetensors", halves), (halves, graph)):
         assert main(["export", "--weights", str(weights), "-o", str(output)]) == 0
     inputs = np.random.default_rng(0).normal(size=(22, 19, len(INPUTS))).astype(np.float32)
-    made, (model, header) = Network(graph)(inputs), load(halves)
+    made, (model, header) = CorrectionNetwork(graph)(inputs), load(halves)
     assert made.shape == (22, 19, BANDS) and np.allclose(made, as_corrections(model)(inputs), atol=1e-4)
     assert header["training"]["step"] == 50
 

@@ -179,6 +179,6 @@ def worth(z: Vertex, come_from: mi.Float, y) -> mi.Float:
     cos_z, cos_y = cosine(z.si, d), dr.abs(dr.dot(y.n, d))
     side_z = mis.Side(cos_z, cos_z / dr.pi, come_from / dr.pi)
     side_y = mis.Side(cos_y, cos_y / dr.pi, dr.abs(dr.dot(y.n, y.d)) / dr.pi)
-    others = mis.others_connected(z.end, Partial(y.vcm, y.vc), mis.Edge(side_z, side_y, distance2))
+    others = mis.others_connected(z.end, Partial(y.vcm, y.vc), mis.Connection(side_z, side_y, distance2))
     w = dr.max(y.β) * (cos_z + _LEAST_COSINE) * (cos_y + _LEAST_COSINE) / (distance2 * (1 + others))
     return dr.select((y.depth > 0) & dr.isfinite(w), w, 0)

@@ -117,7 +117,7 @@ class Side:
 
 
 @dataclass
-class Edge:
+class Connection:
     """The edge between the last vertices of a camera path and a light path."""
 
     z: Side
@@ -125,7 +125,7 @@ class Edge:
     distance2: mi.Float
 
 
-def others_connected(z: Partial, y: Partial, edge: Edge) -> mi.Float:
+def others_connected(z: Partial, y: Partial, edge: Connection) -> mi.Float:
     """``others`` for a camera path connected to a light path; ``z`` and ``y`` are their last vertices."""
     from_camera = edge.z.p * edge.y.cos / edge.distance2 * (y.vcm + y.vc * edge.y.q)
     from_light = edge.y.p * edge.z.cos / edge.distance2 * (z.vcm + z.vc * edge.z.q)

@@ -19,7 +19,7 @@ import mitsuba as mi
 from data_gen.paths.eye import Eye
 from data_gen.paths.light_ends import LightEnds
 from data_gen.samplers.bdpt import mis
-from data_gen.samplers.bdpt.mis import Edge, Side
+from data_gen.samplers.bdpt.mis import Connection, Side
 from data_gen.samplers.bdpt.plan import Plan
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, Vertex, cosine, evaluate
 
@@ -49,7 +49,7 @@ def connected(plan: Plan, z: Vertex, z_bsdf, y: Vertex, active) -> tuple[mi.Spec
 
 def connection(
     plan: Plan, z: Vertex, z_bsdf, y: Vertex, active, sees: Callable | None = None
-) -> tuple[mi.Spectrum, Edge, tuple[Any, Any]]:
+) -> tuple[mi.Spectrum, Connection, tuple[Any, Any]]:
     """f / p without the camera path's throughput; the edge, for the MIS weight; T of holes and their number.
 
     ``sees(z, y, active)``, if given, replaces ``plan.sees`` to find T and the number of holes.
@@ -64,7 +64,7 @@ def connection(
     lit = active & (dr.max(z.β * C) > 0) & (distance2 > 0)
     T, holes = sees(z, y, lit) if sees else plan.sees(z.si, y.si.p, plan.longest - 1 - z.depth - y.depth, lit)
     C = dr.select(lit, C * T, 0)
-    return C, Edge(Side(cosine(z.si, d), p_z, q_z), Side(cosine(y.si, d), p_y, q_y), distance2), (T, holes)
+    return C, Connection(Side(cosine(z.si, d), p_z, q_z), Side(cosine(y.si, d), p_y, q_y), distance2), (T, holes)
 
 
 def to_camera(eye: Eye, lens: mi.Point2f, y: Vertex, bsdf, active, seen) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:

@@ -20,7 +20,7 @@ from data_gen.tails import cache as tails
 from data_gen.tails import feeding
 from data_gen.tails.cache import Cache, Known, joined
 from data_gen.tails.schedule import end_of_round, fineness, first_sample
-from data_gen.tails.table import Grid, Place
+from data_gen.tails.table import CellGrid, CellPlace
 from ngpt.shared import CUT, TAILS
 
 # The least number of paths that feed the cache before its first round
@@ -122,7 +122,7 @@ class SharedTails(Rounds):
             # to run.
             fields = zip(*([dr.gather(type(v), v, which) for v in record] for which, record in there), strict=True)
             x, y, z, code, level, halves, *values = map(joined, fields)
-            self.cache.add(Place(mi.Point3f(x, y, z), code, level), halves, values)
+            self.cache.add(CellPlace(mi.Point3f(x, y, z), code, level), halves, values)
         return dr.width(lanes[0]) / n
 
 
@@ -139,9 +139,9 @@ def paths(view, plan: Plan, known: Known, camera: CameraSamples, half: mi.UInt32
     ]
 
 
-def grid(sensor: mi.Sensor, seed: int) -> Grid:
+def grid(sensor: mi.Sensor, seed: int) -> CellGrid:
     """Returns the grid of cells around a camera. Each seed shifts it, so that no wall lies on the border of cells for
     all seeds.
     """
     origin = np.array(sensor.world_transform().translation(), np.float64).ravel()
-    return Grid.at(origin, np.random.default_rng([seed, _SEED]).random(3))
+    return CellGrid.at(origin, np.random.default_rng([seed, _SEED]).random(3))

@@ -35,7 +35,7 @@ from data_gen.paths.walk import UNLIMITED
 from data_gen.samplers.gpt.base_path import Path, Recording, base_step, begin
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.tails.cache import LEAST, LEAST_TO_FEED, NEAR, RENEW, Known, Trail
-from data_gen.tails.table import Place
+from data_gen.tails.table import CellPlace
 
 # The most records that a path may have
 RECORDS = 3
@@ -43,7 +43,7 @@ RECORDS = 3
 _ALL = 16
 
 
-def place(plan: Plan, known: Known, path: Path) -> tuple[Place, mi.Bool]:
+def place(plan: Plan, known: Known, path: Path) -> tuple[CellPlace, mi.Bool]:
     """Returns the path's place in the cache, and whether it may end there or open a record."""
     x, trail = path.x, path.trail
     able = path.walks & x.is_valid() & (path.depth < plan.limits.max_depth) & (trail.spread > NEAR * trail.reach)
@@ -89,7 +89,7 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
 class Record:
     """A vertex of a path that feeds the cache, and the light of each sort that the path has found to arrive there."""
 
-    place: Place
+    place: CellPlace
     T: mi.Spectrum  # throughput from there on
     late: mi.Bool  # what follows belongs to the layer ``caustic``
     E: list[mi.Spectrum]
@@ -111,7 +111,7 @@ def feed(view, plan: Plan, known: Known, random, camera_ray: tuple, half: mi.UIn
     x = media.vertex(mi.Ray3f(first.ray), first.hit, first.place)
     path = begin(plan, x, first.place, drawn.channel if drawn else None, importance * first.weight)
     path.trail, path.ρ, lanes = Trail.to(space.length(ray.o, x)), mi.Color3f(0), dr.width(x.t)
-    blank = Place(dr.zeros(mi.Point3f, lanes), mi.UInt32(0), mi.Int32(0))
+    blank = CellPlace(dr.zeros(mi.Point3f, lanes), mi.UInt32(0), mi.Int32(0))
     dark = [dr.zeros(mi.Spectrum, lanes) for _ in known.means]
     none = [Record(blank, mi.Spectrum(0), mi.Bool(False), list(dark)) for _ in range(RECORDS)]
     # Light is late relative to each record here, and not relative to the camera.

@@ -23,14 +23,14 @@ FORWARD = (0.0, 0.3, 0.7)
 
 
 @dataclass
-class Media:
+class MediaElements:
     """``elements`` for the scene itself, and elements for its ``camera``."""
 
     elements: list[xml.Element] = field(default_factory=list)
     camera: list[xml.Element] = field(default_factory=list)
 
 
-def fog(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
+def fog(stage: Stage, rng: np.random.Generator, folder: Path) -> MediaElements:
     """Grey or slightly coloured fog that fills the place. Its transmittance across the place is e^-0.2 to e^-2."""
     size = np.array([stage.area[0], stage.height, stage.area[1]]) if stage.closed else 3 * np.full(3, stage.area[0])
     depth = np.exp(rng.uniform(np.log(0.2), np.log(2)))
@@ -41,10 +41,10 @@ def fog(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
     # Larger than the room, to contain the window frames; in an open set the fog ends far away
     low, high = [-size[0] / 2 - 0.3, -0.3, -size[2] / 2 - 0.3], [size[0] / 2 + 0.3, size[1] + 0.3, size[2] / 2 + 0.3]
     around = _boundary(low, high, xml.Element("ref", name="interior", id="air"))
-    return Media([air, around], [xml.Element("ref", name="medium", id="air")])
+    return MediaElements([air, around], [xml.Element("ref", name="medium", id="air")])
 
 
-def beams(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
+def beams(stage: Stage, rng: np.random.Generator, folder: Path) -> MediaElements:
     """Fog as in ``fog``, with two spotlights whose beams are visible in it."""
     media = fog(stage, rng, folder)
     for _ in range(2):
@@ -61,9 +61,9 @@ def beams(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
     return media
 
 
-def smoke(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
+def smoke(stage: Stage, rng: np.random.Generator, folder: Path) -> MediaElements:
     """Two grids: plumes on the floor, or a cloud that hangs in the air."""
-    media = Media()
+    media = MediaElements()
     for i in range(2):
         width = rng.uniform(0.25, 0.45) * min(*stage.area, 3.5)
         height = min(stage.height - 0.1, width * rng.uniform(1.2, 2.2))
@@ -82,9 +82,9 @@ def smoke(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
     return media
 
 
-def liquid(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
+def liquid(stage: Stage, rng: np.random.Generator, folder: Path) -> MediaElements:
     """Two glass objects whose inside absorbs and scatters, like ink, milk or amber."""
-    media = Media()
+    media = MediaElements()
     for i in range(2):
         size = rng.uniform(0.1, 0.35)
         kind = str(rng.choice(["ball", "block", "can"]))
@@ -108,11 +108,11 @@ def liquid(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
     return media
 
 
-Maker = Callable[[Stage, np.random.Generator, Path], Media]
+Maker = Callable[[Stage, np.random.Generator, Path], MediaElements]
 KINDS: dict[str, Maker] = {made.__name__: made for made in (fog, beams, smoke, liquid)}
 
 
-def some_media(stage: Stage, rng: np.random.Generator, folder: Path) -> Media:
+def some_media(stage: Stage, rng: np.random.Generator, folder: Path) -> MediaElements:
     """Media of a random kind, with their files in ``folder``."""
     return KINDS[str(rng.choice(list(KINDS), p=[0.35, 0.2, 0.3, 0.15]))](stage, rng, folder)
 

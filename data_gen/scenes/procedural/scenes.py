@@ -18,7 +18,7 @@ import numpy as np
 
 from data_gen.scenes.procedural import things
 from data_gen.scenes.procedural.materials import SLOTS, Palette, add_transform, inside, plugin
-from data_gen.scenes.procedural.media import Media, some_media
+from data_gen.scenes.procedural.media import MediaElements, some_media
 from data_gen.scenes.procedural.meshes import (
     Mesh,
     box,
@@ -180,7 +180,7 @@ def make_scene(seed: int | tuple[int, ...], folder: Path, shares: Mapping[str, f
     # No further thing may stand at the camera.
     stage.standing.append((origin[0], origin[2], 0.6))
     bulbs = add_sights(stage, sights, further)
-    media = some_media(stage, further, folder) if "media" in sights else Media()
+    media = some_media(stage, further, folder) if "media" in sights else MediaElements()
 
     def save(image: np.ndarray, raw: bool) -> str:
         image = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=-1)

@@ -30,7 +30,7 @@ DISH = np.array([(0, 0), (1, 0), (1.3, 1), (1.15, 1), (0.85, 0.15), (0, 0.12)])
 
 
 @dataclass(frozen=True)
-class Lamp:
+class MeshLamp:
     """A mesh that emits ``radiance`` (R, G, B)."""
 
     mesh: Mesh
@@ -50,10 +50,10 @@ def further_sights(
     return frozenset(name for name, share in shares.items() if drawn[name] < share), rng
 
 
-def add_sights(stage: Stage, sights: frozenset[str], rng: np.random.Generator) -> list[Lamp]:
+def add_sights(stage: Stage, sights: frozenset[str], rng: np.random.Generator) -> list[MeshLamp]:
     """Puts all ``sights`` except media on the stage. Returns their lamps: ``EMITTERS`` lamps or none."""
     before, stage.rng = stage.rng, rng
-    lamps: list[Lamp] = []
+    lamps: list[MeshLamp] = []
     if "partition" in sights:
         hard_light.partition(stage)
     if "mirrors" in sights:
@@ -62,7 +62,7 @@ def add_sights(stage: Stage, sights: frozenset[str], rng: np.random.Generator) -
         hair(stage)
     # "caustic" and "bulbs" already use all additional lamps that a scene may have.
     if "lamps" in sights and not sights & {"caustic", "bulbs"}:
-        lamps = [Lamp(*lamp) for lamp in hard_light.lamps(stage, EMITTERS)]
+        lamps = [MeshLamp(*lamp) for lamp in hard_light.lamps(stage, EMITTERS)]
     if "caustic" in sights:
         lamps = caustic(stage)
     if "bulbs" in sights:
@@ -95,7 +95,7 @@ def hair(stage: Stage) -> None:
         stage.stand(things.net(rng), stage.area)
 
 
-def bulbs(stage: Stage, others: list[Lamp]) -> list[Lamp]:
+def bulbs(stage: Stage, others: list[MeshLamp]) -> list[MeshLamp]:
     """10 to 50 small lamps: strings of bulbs, a grid under the ceiling, or scattered candles; and the ``others``."""
     rng, (width, depth), height = stage.rng, stage.area, stage.height
     count, radius = int(rng.integers(10, 51)), rng.uniform(0.006, 0.03)
@@ -120,11 +120,11 @@ def bulbs(stage: Stage, others: list[Lamp]) -> list[Lamp]:
     tints = [colour(rng, 0.6, 1, rng.choice([0.3, 1.5])) for _ in meshes]
     light = power / np.pi / (4 * np.pi * radius**2 * count)
     if others:
-        others = [Lamp(merge([lamp.mesh for lamp in others]), others[0].radiance)]
-    return others + [Lamp(mesh, light * tint) for mesh, tint in zip(meshes, tints, strict=True)]
+        others = [MeshLamp(merge([lamp.mesh for lamp in others]), others[0].radiance)]
+    return others + [MeshLamp(mesh, light * tint) for mesh, tint in zip(meshes, tints, strict=True)]
 
 
-def caustic(stage: Stage) -> list[Lamp]:
+def caustic(stage: Stage) -> list[MeshLamp]:
     """A glass object or a polished ring, which focuses the light of a small lamp on the floor or on a slab."""
     rng = stage.rng
     size = rng.uniform(0.08, 0.22)
@@ -149,4 +149,4 @@ def caustic(stage: Stage) -> list[Lamp]:
     lamp = sphere(radius, 24).placed(place + [0, size, 0] + far * toward)
     light = np.exp(rng.uniform(np.log(5), np.log(60))) / np.pi / (4 * np.pi * radius**2)
     radiance = light * colour(rng, 0.8, 1, 0.4)
-    return [Lamp(replace(lamp, faces=faces), radiance) for faces in np.array_split(lamp.faces, EMITTERS)]
+    return [MeshLamp(replace(lamp, faces=faces), radiance) for faces in np.array_split(lamp.faces, EMITTERS)]

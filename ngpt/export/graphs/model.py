@@ -15,7 +15,7 @@ from ngpt.export.builder import Graph, Operators, Value, channels, choose, op
 from ngpt.export.graphs import caustic, controlvariates, exposure, features
 from ngpt.export.graphs.controlvariates import IMAGE
 from ngpt.export.graphs.padding import Mirror
-from ngpt.export.graphs.repair import Repaired, clean, repaired
+from ngpt.export.graphs.repair import RepairedInputs, clean, repaired
 from ngpt.export.graphs.transfer import signed_exp, signed_log
 from ngpt.network.config import ModelConfig
 from ngpt.network.features import CHANNELS
@@ -134,7 +134,7 @@ def _buffers(graph: Graph, names: tuple[str, ...]) -> dict[str, Value]:
     return {name: graph.input(name, ("tiles", CHANNELS.get(name, 3), "height", "width")) for name in names}
 
 
-def _repaired(raw: dict[str, Value], config: ModelConfig) -> Repaired:
+def _repaired(raw: dict[str, Value], config: ModelConfig) -> RepairedInputs:
     """The repaired layers, without directly visible emission."""
     data = repaired(raw, config.reads_gradients)
     for name in DENOISED:
@@ -145,7 +145,7 @@ def _repaired(raw: dict[str, Value], config: ModelConfig) -> Repaired:
     return data
 
 
-def _statistics(config: ModelConfig, data: Repaired) -> Value:
+def _statistics(config: ModelConfig, data: RepairedInputs) -> Value:
     variances = tuple(data.layers[name] for name in _VARIANCES) if config.base else None
     return exposure.statistics(data.layers, variances)
 
@@ -155,7 +155,7 @@ def _numbers(shared: Value) -> tuple[Value, ...]:
     return tuple(op.ReduceMax(op.Slice(shared, [i], [i + 1]), keepdims=0) for i in range(len(exposure.STATISTICS)))
 
 
-def _base(data: Repaired, scale: Value, mean: Value) -> Value:
+def _base(data: RepairedInputs, scale: Value, mean: Value) -> Value:
     """The control variates' image, divided by the exposure, without direct emission."""
     primal, dx, dy = (data.layers[name] / scale for name in ("primal", "dx", "dy"))
     variances = tuple(data.layers[name] for name in _VARIANCES)

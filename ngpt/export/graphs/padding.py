@@ -7,7 +7,7 @@ from ngpt.network.padding import MARGIN
 
 
 @dataclass
-class Side:
+class PaddedAxis:
     """An axis of a padded image: for each position, its pixel, and its difference to the next position.
 
     ``axis``     the axis in (N, C, H, W)
@@ -55,13 +55,13 @@ class Mirror:
         return op.Pad(padded, [radius] * 4, None, [2, 3], mode="edge") if radius else padded
 
 
-def _pixels(layer: Value, side: Side) -> Value:
+def _pixels(layer: Value, side: PaddedAxis) -> Value:
     """The layer, padded along one axis. Its own pixels are copied as a block, which is faster than gathering them."""
     before, after = (op.Gather(layer, places, axis=side.axis) for places in side.borders(side.here, 0))
     return op.Concat(before, layer, after, axis=side.axis)
 
 
-def _differences(layer: Value, side: Side, signed: bool) -> Value:
+def _differences(layer: Value, side: PaddedAxis, signed: bool) -> Value:
     """``_pixels`` for differences along that axis. The last one leads out of the image, so the border replaces it."""
     steps = [
         op.Reshape(step if signed else abs(step), [-1, 1] if side.axis == 2 else [-1])
@@ -74,11 +74,11 @@ def _differences(layer: Value, side: Side, signed: bool) -> Value:
     return op.Concat(before, op.Slice(layer, [0], [-1], [side.axis]), after, axis=side.axis)
 
 
-def _side(axis: int, size: Value, alignment: int) -> Side:
+def _side(axis: int, size: Value, alignment: int) -> PaddedAxis:
     after = op.Mod(-(size + 2 * MARGIN), alignment) + MARGIN
     # The index of the pixel at each of the positions -MARGIN .. size + after.
     period = op.Max((size - 1) * 2, 1)
     wave = op.Mod(op.Range(-MARGIN, size + after + 1, 1), period)
     pixels = op.Where(op.Less(wave, size), wave, period - wave)
     here, there = op.Slice(pixels, [0], [-1], [0]), op.Slice(pixels, [1], [END], [0])
-    return Side(axis, size, here, op.Min(here, there), op.Cast(there - here, to=FLOAT))
+    return PaddedAxis(axis, size, here, op.Min(here, there), op.Cast(there - here, to=FLOAT))

@@ -15,7 +15,7 @@ _LEVELS = 5
 
 
 @dataclass(frozen=True)
-class Repaired:
+class RepairedInputs:
     """The inputs of the rest of a graph; (N, C, H, W).
 
     ``layers``   all layers by name, without direct emission, finite, 0 where they cannot be trusted. Variances are NaN
@@ -39,7 +39,7 @@ def clean(x: Value) -> Value:
     return op.Where(finite(x), x, 0.0)
 
 
-def repaired(raw: Mapping[str, Value], gradients: bool) -> Repaired:
+def repaired(raw: Mapping[str, Value], gradients: bool) -> RepairedInputs:
     """The ``raw`` layers of a renderer, with ``primal`` and ``direct``, repaired as by ``ngpt.repair``.
 
     ``gradients``  whether the network reads gradients. Then it works on light without ``caustic``
@@ -72,7 +72,7 @@ def repaired(raw: Mapping[str, Value], gradients: bool) -> Repaired:
         if name in raw:
             variance = _of_all_light(raw) if name == "primal_var" and not gradients else raw[name]
             layers[name] = op.Where(flags, variance, _UNKNOWN)
-    return Repaired(layers, direct, trusted)
+    return RepairedInputs(layers, direct, trusted)
 
 
 def _of_all_light(raw: Mapping[str, Value]) -> Value:

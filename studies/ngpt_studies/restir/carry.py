@@ -30,7 +30,7 @@ from data_gen.paths.vertex import SMOOTH, evaluate
 from data_gen.paths.walk import roulette
 from data_gen.samplers.gpt.base_path import light_mis
 from data_gen.samplers.gpt.plan import Plan
-from data_gen.scenes.geometry import Mesh
+from data_gen.scenes.geometry import Triangles
 from ngpt_studies.restir.record import LIGHT, RC_LIGHT, REPLAY, STUCK, SUFFIX, Record, word_of
 from ngpt_studies.restir.stage import Stage
 from ngpt_studies.restir.walk import DRAWN, draw, sample_event
@@ -53,7 +53,7 @@ class Carry:
             if isinstance(old, np.ndarray) and isinstance(new, np.ndarray):
                 if not np.array_equal(old, new):
                     moves[i] = (new @ np.linalg.inv(old))[:3]
-            elif isinstance(old, Mesh) and isinstance(new, Mesh) and old.faces.shape == new.faces.shape:
+            elif isinstance(old, Triangles) and isinstance(new, Triangles) and old.faces.shape == new.faces.shape:
                 if not (np.array_equal(old.vertices, new.vertices) and np.array_equal(old.faces, new.faces)):
                     first[i] = last
                     stretches.append(_areas(new) / np.maximum(_areas(old), 1e-37))
@@ -120,7 +120,7 @@ class Carry:
         return found
 
 
-def _areas(mesh: Mesh) -> np.ndarray:
+def _areas(mesh: Triangles) -> np.ndarray:
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     return np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
