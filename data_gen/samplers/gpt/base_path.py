@@ -32,17 +32,19 @@ class Path:
     β: mi.Spectrum  # throughput up to x; 0 for a ghost
     η: mi.Float  # product of the relative indices of refraction up to x
     depth: mi.UInt32  # number of x, from 1 on
-    sky: Sky  # whether an escape sees the environment
-    rough: mi.Bool  # the path has scattered smoothly at a connectable vertex: see data_gen.paths.caustic
-    late: mi.Bool  # and it has later left a vertex by a mirror, glass or sharp gloss
-    walks: mi.Bool  # some path of the five may go on from x
-    aim: Aim | None = None  # of the edge that has led to x; None in scenes without holes
-    # If paths may end in the cache: how far this one has come, and ρ of the part of x that the cache has supplied
+    sky: Sky  # whether the path sees the environment if it escapes
+    # Whether the path has scattered smoothly (not specularly) at a connectable vertex: see data_gen.paths.caustic
+    rough: mi.Bool
+    late: mi.Bool  # whether the path was rough and has later left a vertex by a mirror, glass or sharp gloss
+    walks: mi.Bool  # whether any of the five paths may go on from x
+    aim: Aim | None = None  # the aim of the edge that has led to x; None in scenes without holes
+    # If paths may end in the cache: how far this path has come, and the reflectance ρ of the matt part of x whose light
+    # the cache has supplied (0: no light)
     trail: Trail | None = None
     ρ: mi.Color3f | None = None
 
     def goes_on(self, plan: Plan, offsets: list) -> mi.Bool:
-        """Whether there is another step: while the base path lives, or offset paths are apart from a ghost."""
+        """Whether there is another step: the base path lives, or it is a ghost and offset paths are apart from it."""
         company = dr.any([y.apart for y in offsets])
         return self.walks & (self.x.is_valid() | company) & (self.depth < plan.limits.max_depth)
 
@@ -51,8 +53,8 @@ class Path:
 class Recording:
     """The records of a path that feeds the cache."""
 
-    any: mi.Bool  # the path has a record; light that it found earlier is not used
-    here: mi.Bool  # the newest record is at the current vertex
+    any: mi.Bool  # whether the path has a record; light that it finds before its first record is not used
+    here: mi.Bool  # whether the newest record is at the current vertex
 
 
 @dataclass
@@ -73,8 +75,8 @@ class Step:
     light_weight: mi.Spectrum  # Le / p
     lamp: Chosen | None  # None where lamps are not chosen by place
     T_light: mi.Spectrum | int  # transmittance
-    lit: mi.Bool  # the sample is visible from x, or nothing uses it and it was not tested
-    L_light: mi.Spectrum  # f m Le V / p
+    lit: mi.Bool  # whether the sample is visible from x; says nothing where no path uses the sample
+    L_light: mi.Spectrum  # f m Le V / p, where V is the visibility
     # BSDF sampling
     wo: mi.Vector3f
     η: mi.Float  # relative index of refraction along the sampled direction
@@ -82,8 +84,8 @@ class Step:
     p: mi.Float
     f_p: mi.Spectrum  # f / p, survival included
     survival: mi.Float  # 1 / probability to survive Russian roulette
-    goes_on: mi.Bool  # there is a next vertex, or an escape
-    walks: mi.Bool  # some path of the five may go on
+    goes_on: mi.Bool  # whether the base path goes on: to a next vertex, or out of the scene
+    walks: mi.Bool  # whether any of the five paths may go on
     β1: mi.Spectrum
     segment: Segment  # from x to x1
     x1: mi.SurfaceInteraction3f
@@ -91,15 +93,15 @@ class Step:
     Le: mi.Spectrum  # emitted at x1 toward x
     p_light: mi.Float  # density with which emitter sampling would have found x1
     L_bsdf: mi.Spectrum  # m Le
-    # See data_gen.paths.caustic; L_light and L_bsdf hold nothing of that layer
+    # The layer ``caustic``, see data_gen.paths.caustic; L_light and L_bsdf contain none of its light
     L_caustic: mi.Spectrum  # f m Le / p of both techniques
-    ends_late: mi.Bool  # the path is late after x, or after x1 at the latest
+    ends_late: mi.Bool  # whether the path is late behind x, or will be late behind x1
     more: mi.UInt32 | int  # number of edges that may follow after x1
-    # In scenes with holes: whether the path has passed one at x, and its aim after x
+    # In scenes with holes: whether the path has passed a hole at x, and its aim behind x
     passed: mi.Bool | None = None
     aim: Aim | None = None
-    # For a matt surface of reflectance 1 at x: f m Le V / p, and f / p, survival included. None where no path ends in
-    # the cache
+    # f m Le V / p and f / p (survival included), as they would be if x were a matt surface of reflectance 1. None if no
+    # path may end in the cache
     E_light: mi.Spectrum | None = None
     E_p: mi.Float | None = None
 
@@ -128,9 +130,9 @@ def base_step(
 ) -> tuple[Step, Path]:
     """Samples an emitter and the next vertex from the ``path``'s vertex. Returns that step, and the path after it.
 
-    All random numbers are drawn, also those that are not used: a replay needs the same numbers, whatever its path
-    meets. A path that is ``recording`` leaves the vertex of its newest record as if the surface were also matt and
-    white: see ``data_gen.samplers.gpt.tails``.
+    All random numbers are drawn, even those that the base path does not use: offset paths replay the same numbers, and
+    may need them for what they meet. A path that is ``recording`` leaves the vertex of its newest record as if the
+    surface were also matt and white: see ``data_gen.samplers.gpt.tails``.
     """
     x, place, space = path.x, path.place, plan.space
 
@@ -165,7 +167,8 @@ def base_step(
         f_p, survival_of_rest = rest(f_p, path.ρ * E_p)
         followed = u_survival < survival_of_light
         f = dr.select(followed, f * dr.rcp(dr.maximum(survival_of_light, 1e-20)), 0)
-    # No shadow ray is traced where f is 0, as behind the surface, unless a joined path arrives there from elsewhere.
+    # No shadow ray is traced where f is 0, for example behind the surface. A joined path is an exception: it arrives
+    # from elsewhere, so its f may not be 0.
     asked = dr.max(dr.abs(f)) > 0
     if recording:
         asked |= recording.here & (E_light > 0)
@@ -181,14 +184,15 @@ def base_step(
 
     # ----------------------- BSDF sampling -----------------------
     found = sample.pdf > 0
-    # Where a base path ends, there is nothing to reconnect to. DELTA makes its offset paths replay, beside a ghost.
+    # Where a base path ends, there is nothing to reconnect to. The kind DELTA makes offset paths replay beside the
+    # ghost.
     kind = dr.select(found, event_kind(sample.sampled_type), DELTA)
     sky = path.sky.behind(kind)
     η = dr.select(found, path.η * sample.eta, path.η)
 
     # ---------------------- Russian roulette ---------------------
-    # Roulette uses the brightness that the rest has if it is followed. Otherwise a faint rest would have to survive
-    # twice.
+    # Roulette uses the brightness that the rest has if it is followed. With its own brightness, a faint rest would have
+    # to survive twice.
     whole = f_p * dr.rcp(dr.maximum(survival_of_rest, 1e-20))
     largest = brightest(path.β * whole, whole, offsets)
     if recording:
@@ -208,10 +212,10 @@ def base_step(
     if path.ρ is not None:
         E_p = dr.select(goes_on, E_p * survival, 0)
     if recording:
-        # All later light belongs to the record, however dark the surface is. After a mirror event it belongs only to
-        # earlier records, and E_p is 0.
+        # All later light belongs to the record at x, however dark the surface is. After a mirror event, later light
+        # belongs only to earlier records, and E_p is 0.
         β1 = dr.select(recording.here, dr.maximum(β1, E_p * segment.weight), β1)
-    # After a mirror emitter sampling could not have found x1: p_light = 0, and m = 1.
+    # After a mirror event, emitter sampling could not have found x1. So p_light = 0, and m = 1.
     aim, passed, seen_by, sampled, p_x1 = None, None, x, kind == SMOOTH, sample.pdf
     if path.aim is not None:
         passed = space.holes.passed(bsdf, kind)
@@ -293,8 +297,8 @@ def brightest(β1: mi.Spectrum, f_p: mi.Spectrum, offsets: list) -> mi.Float:
     """
     largest = dr.max(dr.abs(β1))
     for y in offsets:
-        # The most that an offset path can still contribute to Δ / 2. Until it is settled, this is w β', with β' from
-        # before this step, because its f is not known yet. Then it is w |β' - β| = |a| / 2.
+        # The most that an offset path can still contribute to Δ / 2. Until the path is settled, this is w β', with β'
+        # from before this step, because the path's f is not known yet. Once settled, it is w |β' - β| = |a| / 2.
         ahead = dr.select(y.apart | y.joined, dr.max(y.β) / (1 + y.r), 0)
         largest = dr.fmax(largest, dr.fmax(ahead, dr.max(dr.abs(y.a * f_p)) / 2))
     return largest
@@ -304,9 +308,9 @@ def matt_too(plan: Plan, path: Path, recording: Recording | None) -> mi.Bool | N
     """Returns the lanes in which all directions of a matt surface must be sampled, even those that the material does
     not sample. None stands for no lane.
 
-    A record needs them, because it holds the light that arrives at a matt surface. They also count where the cache has
-    supplied the matt part of a vertex, if a bump or normal map tilts the material: in directions into which the
-    material scatters nothing, the rest is negative.
+    A record needs these directions, because it holds the light that arrives at a matt surface. They are also needed
+    where the cache has supplied the matt part of a vertex and a bump or normal map tilts the material. There, in
+    directions into which the material scatters nothing, the rest is negative and not 0.
     """
     x, both = path.x, None
     if path.ρ is not None and plan.matt.any_tilted:
@@ -318,8 +322,8 @@ def matt_too(plan: Plan, path: Path, recording: Recording | None) -> mi.Bool | N
 
 
 def rest(f: mi.Spectrum, ended: mi.Spectrum) -> tuple[mi.Spectrum, mi.Float]:
-    """Returns the rest of ``f`` after the cache has supplied ``ended``, and the probability of following it. The
-    probability is the size of the rest relative to f, so that a path that follows it has the brightness of f."""
+    """Returns the rest of ``f`` after the cache has supplied ``ended``, and the probability of following the rest. This
+    probability is the size of the rest relative to f, so that a path that follows the rest has the brightness of f."""
     left = f - ended
     size = dr.max(dr.abs(left)) / dr.maximum(dr.max(dr.abs(f)), 1e-20)
     return left, dr.select(dr.max(ended) > 0, dr.minimum(size, 1), 1)
@@ -327,5 +331,5 @@ def rest(f: mi.Spectrum, ended: mi.Spectrum) -> tuple[mi.Spectrum, mi.Float]:
 
 def light_mis(delta: mi.Bool, p_light: mi.Float, p: mi.Float) -> mi.Float:
     """MIS weight of a sampled emitter whose direction BSDF sampling finds with density ``p``."""
-    # A sampled direction never meets a point or a single direction.
+    # BSDF sampling never meets a lamp that is a point or has a single direction, so m = 1.
     return dr.select(delta, 1, mis_weight(p_light, p))

@@ -1,7 +1,7 @@
 """The shift "half-vector": an offset path leaves its vertex with the half-vector of its base path's event.
 
-It replaces random sequence replay where the base path goes on by a smooth event. [Kettunen et al. 2015, section 5.2 and
-supplement; Hua et al. 2019, section 3.2]
+It replaces random sequence replay where the base path goes on by a *smooth* event, which means: an event that is not
+specular (no Dirac delta). [Kettunen et al. 2015, section 5.2 and supplement; Hua et al. 2019, section 3.2]
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from data_gen.samplers.gpt.base_path import Step
 
 @dataclass
 class Departure:
-    """How an offset path apart from its base path leaves its vertex."""
+    """How an offset path that is apart from its base path leaves its vertex."""
 
-    found: mi.Bool  # there is a direction
+    found: mi.Bool  # whether there is a direction
     wo: mi.Vector3f
     p: mi.Float  # its density
     kind: mi.UInt32
@@ -42,11 +42,11 @@ def copy_where_smooth(step: Step, y: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, 
         wo=dr.select(copies, wo, replayed.wo),
         p=dr.select(copies, p, replayed.p),
         kind=dr.select(copies, SMOOTH, replayed.kind),
-        # The same half-vector does not mean the same random numbers (survey, eq. 15). So |J| does not cancel in
-        # f |J| / p and in r.
+        # Paths with the same half-vector do not have the same random numbers (survey, eq. 15). So |J| does not cancel
+        # in f |J| / p and in r.
         f_p=dr.select(copies, f * (J / step.p), replayed.f_p),
         r=dr.select(copies, p * J / step.p, replayed.r),
-        # A replayed smooth event is rejected, since the reverse shift would copy its half-vector. Beside a ghost
-        # neither shift has a half-vector to copy.
+        # If the replayed event is smooth, the shift is rejected, since the reverse shift would copy the half-vector of
+        # this event. Beside a ghost the event is allowed: there neither shift has a half-vector to copy.
         allowed=dr.select(copies, found, (replayed.kind != SMOOTH) | ~step.x.is_valid()),
     )

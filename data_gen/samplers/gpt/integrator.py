@@ -1,37 +1,42 @@
 r"""The gradient-domain path tracer: one base path and four offset paths that join it as early as they can.
 
-Each base path is Mitsuba's ``path``: emitter sampling and BSDF sampling combined by the power heuristic, Russian
-roulette by throughput. Its four offset paths go through the neighbours of its pixel with the same sub-pixel, lens, time
-and wavelength samples. An offset path goes straight to the base path's next vertex where materials allow it, and
-replays the base path's random numbers where not (mirrors, glass). Past the vertex they share, both are one path, so
-four offsets cost about as much as the base path and not four times that.
+Each base path is a path of Mitsuba's ``path``: the power heuristic combines emitter sampling and BSDF sampling, and
+Russian roulette depends on the throughput. Its four offset paths go through the neighbours of its pixel with the same
+sub-pixel, lens, time and wavelength samples. Where materials allow it, an offset path goes straight to the base path's
+next vertex. Elsewhere (mirrors, glass) it replays the base path's random numbers. Behind the vertex that they share,
+both paths are the same and are traced only once. So four offset paths cost about as much as the base path, and not four
+times as much.
 
     x, y              base path, offset path y = T(x); x1 is the base path's next vertex
-    L, Le             radiance of the base path without, and of only, the emission that the camera sees directly
-    β, β'             throughput f |J| / p of either path, both divided by the density of the *base* path
+    L, Le             radiance of the base path: Le is emission that the camera sees directly, L is all other light
     J                 |dT/dx|, the Jacobian of the shift
-    p, p'             densities of BSDF sampling, in solid angle
-    r                 p(y) |J| / p(x), the product of the ratios of each step (survey, eq. 17); 1 while replaying
+    p, p'             densities of BSDF sampling for the base path and the offset path, in solid angle
+    β, β'             throughput f / p of the base path, and f |J| / p of the offset path, with the *base* path's p
+    r                 p(y) |J| / p(x), a product with one ratio for each step (survey, eq. 17); 1 while replaying
     w                 1 / (1 + r), or 1 where the shift is rejected: see data_gen.paths.mis.gradient_weight()
-    m                 MIS weight of emitter against BSDF sampling, each path's own
-    Δ                 gradient sample 2 w (C(y) |J| - C(x)) / p(x), the sum over all lengths of paths and over the two
-                      techniques, which are shifted separately: C is the contribution f m of one
-    a                 once a path is settled, all that follows in Δ is a times the radiance that reaches the base path
+    m                 MIS weight of emitter sampling against BSDF sampling; each path has its own
+    C                 the contribution f m of a path that one of these two techniques finds
+    Δ                 gradient sample: the sum of 2 w (C(y) |J| - C(x)) / p(x) over all lengths of paths and over both
+                      techniques, which are shifted separately
+    a                 factor of a settled offset path (see below): radiance R that arrives later adds a R to Δ
     A                 the base path's part of Δ, the sum of 2 w C(x) / p(x)
-    rough, late       whether light belongs to the layer ``caustic``, which is in neither L nor Δ: see
-                      data_gen.paths.caustic
+    rough, late       whether the light of a path belongs to the layer ``caustic``; this light is in neither L nor Δ:
+                      see data_gen.paths.caustic
 
-An offset path is *apart* from its base path, then *joined* to it for one step (it shares the vertex, but arrives there
-from elsewhere), then *settled*: joined for longer, ended, or rejected. A base path that ends while offset paths are
-apart walks on as a ghost. Its offset paths replay random numbers that it does not use. So the light that their pixels
-see counts for this pixel too, with w = 1/2, as in random sequence replay. Rejecting these paths would double their
-variance.
+An offset path is *apart* from its base path at first. Then it is *joined* for one step: both paths share a vertex, but
+arrive there from different directions. After this step it is *settled*: both paths are the same. Offset paths that have
+ended or were rejected are settled, too.
+
+If a base path ends while offset paths are apart, it walks on as a *ghost*, which contributes no light. The offset paths
+replay random numbers that the ghost does not use itself. So the light that they find counts in the differences of this
+pixel, with w = 1/2, as in random sequence replay. Rejecting these offset paths would double their variance.
 
 All paths begin in ``trace``; the rules of shifting are in ``data_gen.paths.shift``; ``plan`` decides which code a scene
 needs in its kernel. ``data_gen.paths.space`` knows whether a vertex is in a medium.
 
-Russian roulette looks at all five paths, so that none is starved. It leaves r as it is: the weights of the two
-directions of a difference sum to one whatever paths survive.
+Russian roulette looks at all five paths, which survive together, so that none of them is starved. Its probabilities are
+left out of r. This is right, because the weights of the two directions of a difference sum to one, whatever paths
+survive.
 
 [Kettunen et al. 2015, "Gradient-Domain Path Tracing"; Hua et al. 2019, "A Survey on Gradient-Domain Rendering",
 sections 3 and 4.1]
@@ -68,11 +73,11 @@ class GPT(GradientIntegrator):
     Plugin ``gpt``, with the parameters of Mitsuba's ``path``, the options of its entry, and
 
     ``volumes``      false: media are not seen, as with ``path``; true: they are, as with ``volpath``
-    ``diagnostics``  false; true adds the layer ``shift_failures``, the share in [0, 1] of a sample's shifts without a
-                     counterpart: rejected, or of zero density, at a step that the base path took
+    ``diagnostics``  false; true adds the layer ``shift_failures``: the share, in [0, 1], of a sample's shifts that
+                     failed. A shift fails if it is rejected, or has density 0, at a step that the base path takes
 
-    The primal of ``reuse`` has 2.6 times less variance, but the noise of neighbouring pixels is then correlated. The
-    shift "half-vector" is rarely better than "replay". For the other options see ``data_gen.paths.caustic`` and
+    With ``reuse`` the primal has 2.6 times less variance, but the noise of neighbouring pixels is correlated. The shift
+    "half-vector" is rarely better than "replay". For the other options see ``data_gen.paths.caustic`` and
     ``data_gen.tails``.
 
     Not handled: polarised variants, for which rendering raises NgptError. In media only the shift "replay" works. The
@@ -90,7 +95,7 @@ class GPT(GradientIntegrator):
     def parameters(cls, scene: mi.Scene) -> dict[str, Any]:
         return super().parameters(scene) | {"volumes": integrator_name(scene) in VOLUMETRIC}
 
-    # Not an attribute, because each render of a plugin decides it anew.
+    # Not an attribute, because each render of a plugin decides anew whether paths share their tails.
     @property
     def shared(self) -> bool:
         return self.options["tails"] == "shared"
@@ -105,7 +110,9 @@ class GPT(GradientIntegrator):
         return sharing(self, plan, frozen, partial(self.sample_pass, frozen, plan))
 
     def plan(self, scene) -> Plan:
-        """What the kernel contains for a scene. Raises NgptError where its paths cannot share their tails."""
+        """Returns the plan: what the kernel for a scene contains. Raises NgptError if paths must share their tails (end
+        in the cache of ``data_gen.tails``), but cannot with these options or in this variant.
+        """
         volumes = self.volumes and bool(media_of(scene))
         if self.shared and (reason := why_not_shared(self.options, mi.variant())):
             raise NgptError(f"gpt: tails=shared is not possible: {reason}; use tails=paths")
@@ -113,15 +120,17 @@ class GPT(GradientIntegrator):
         return make_plan(scene, self.limits, self.roughness_threshold, self.shift, **more)
 
     def sample_pass(self, frozen: Frozen, plan: Plan, known: Known | None, camera: CameraSamples, film: GradientFilm):
-        """Traces one base path and its four offset paths for each camera sample. Paths may end in what is ``known``."""
+        """Traces one base path and its four offset paths for each camera sample. Paths may end where the cache has
+        ``known`` light.
+        """
         values, Δ, inside, A = frozen(self.samples, plan, known, camera.look((0, 0), *SHIFTS.values(), *QUARTERS))
         if self.reuse:
             values["primal"] = reused(camera, A, Δ, inside) + values["direct"]
         film.put_all(values | dict(zip(SHIFTS, zip(Δ, inside, strict=True), strict=True)))
 
     def samples(self, plan: Plan, known: Known | None, camera: CameraSamples) -> tuple[dict, list, list, list | None]:
-        """Returns the layers, Δ in the order of SHIFTS, whether each of its neighbours is on the film, and A for
-        ``reuse``.
+        """Returns the layers, Δ for each neighbour in the order of SHIFTS, whether each neighbour is on the film, and A
+        for each neighbour if ``reuse`` needs it.
         """
         # ------------------------- Paths -----------------------------
         scene, (ray, importance, _) = plan.space.scene, camera.rays()
@@ -148,17 +157,17 @@ class GPT(GradientIntegrator):
 
 
 def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f:
-    """Returns L of each sample as the mean over its four pairs with neighbours, where both paths of a pair estimate
-    this pixel.
+    """Returns L of each sample: the mean of four estimates, one for each neighbour.
 
-    A pair is sampled from here, with the base path's part ``A``, and from the neighbour, with the offset path's part
-    A + Δ of the same sample there. [Kettunen et al. 2015, section 5]
+    Each estimate combines a base path of this pixel with an offset path that leads to this pixel from the neighbour's
+    sample of the same number. ``A`` is the base path's part; the neighbour's A + Δ is the offset path's part.
+    [Kettunen et al. 2015, section 5]
     """
     names, lane = list(SHIFTS), dr.arange(mi.Int32, dr.width(inside[0]))
     L = mi.Color3f(0)
     for a, (x, y), active in zip(A, SHIFTS.values(), inside, strict=True):
         back = names.index(next(name for name, shift in SHIFTS.items() if shift == (-x, -y)))
-        # The same sample of another pixel, in the same block.
+        # The lane of the neighbouring pixel's sample of the same number, which is in the same block
         neighbour = mi.UInt32(lane + dr.opaque(mi.Int32, camera.block * (x + camera.size.x * y)))
         L += (a + dr.gather(mi.Color3f, A[back] + Δ[back], neighbour, active)) / 8
     return L

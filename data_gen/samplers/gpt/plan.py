@@ -24,9 +24,11 @@ class Plan:
     lights: Lights
     space: Space  # what is between its surfaces: nothing, or media
     limits: Limits
-    replays: bool  # offset paths may stay apart for more than a step: there are mirrors, glass, holes or polish
-    half_vectors: bool  # smooth events that cannot be reconnected are shifted by half-vector copy, else by replay
-    caustic: bool  # light that no shift can follow goes into a layer of its own, see ``data_gen.paths.caustic``
+    # Whether offset paths may stay apart for more than a step: at mirrors, glass, holes or polish (very low roughness)
+    replays: bool
+    # Whether smooth (not specular) events that cannot be reconnected are shifted by half-vector copy; else by replay
+    half_vectors: bool
+    caustic: bool  # whether light that no shift can follow has a layer of its own, see ``data_gen.paths.caustic``
     matt: Matt | None = None  # where paths may end in the cache of ``data_gen.tails``; None: nowhere
 
     @property

@@ -1,4 +1,8 @@
-"""Passes whose paths end in a cache, which is fed between rounds of samples."""
+"""Passes of samples whose paths may end in a cache of light (``data_gen.tails``).
+
+Samples are taken in rounds. Between two rounds, other paths feed the cache: they add records of the light that they
+find.
+"""
 
 from __future__ import annotations
 
@@ -28,20 +32,20 @@ FEWEST = 1 << 13
 
 # Gives paths that feed the cache their own random numbers ("TAILS" in ASCII)
 _SEED = 0x5441494C53
-# The most paths that feed the cache before it is checked again whether there is room for new cells
+# The most paths that feed the cache at once. Then the cache checks again whether there is room for new cells.
 _AT_ONCE = 1 << 18
-# The paths that feed the cache before its first round come in two parts. Paths of the second part may end in what the
-# first part has found. This is the share of the first part.
+# The paths that feed the cache before its first round come in two parts. Paths of the second part may end in cells that
+# the first part has filled. This is the share of the first part.
 _FIRST_PART = 1 / 4
 # If fewer than this share of the first paths pass a vertex where paths may end, the cache is turned off, since it would
-# cost more than it gains. Measured: .74 to 1 in rooms, .04 to .39 outdoors and in product shots.
+# cost more than it gains. Measured shares: .74 to 1 in rooms, .04 to .39 outdoors and in product shots.
 _PAYS = 0.5
 
 Take = Callable[[Known | None, CameraSamples, GradientFilm], None]
 
 
 def sharing(view, plan: Plan, frozen: Frozen, take: Take) -> SamplePass:
-    """Returns the pass that ``take`` makes. Its paths share a cache if the ``plan`` says so."""
+    """Returns a pass that calls ``take``. Its paths share a cache if the ``plan`` says so."""
     return SharedTails(view, plan, frozen, take) if plan.matt else partial(take, None)
 
 
@@ -49,12 +53,14 @@ class SharedTails(Rounds):
     """A ``data_gen.passes.SamplePass`` whose paths may end in a cache. The cache changes only between rounds.
 
     ``take`` puts samples into a film. Its first argument is what the cache knows, or None without a cache. ``view`` is
-    the integrator. ``cache`` is None before the first round, and if the cache is turned off. Then ``off`` says why.
+    the integrator. ``cache`` is None before the first round, and if the cache is turned off. ``off`` says why the cache
+    is turned off; "" if it is not.
     """
 
     def __init__(self, view, plan: Plan, frozen: Frozen, take: Take):
         self.frozen, self.take = frozen, take
-        # Not a method of this object: ``frozen`` keeps it, and a reference back to this object would form a cycle.
+        # ``paths`` is not a method of this object, because ``frozen`` keeps the functions that it calls: a method would
+        # refer back to this object, and form a cycle.
         self.plan, self.paths = plan, partial(paths, view, plan)
         self.cache: Cache | None = None
         self.off, self.fed, self.pixels, self.until, self.share = "", 0, 1, 0, feeding.BEGIN
@@ -89,11 +95,11 @@ class SharedTails(Rounds):
             self.next_round(sensor, seed, max(self.fed + more, FEWEST), fineness(self.until * self.pixels))
 
     def next_round(self, sensor: mi.Sensor, seed: int, wanted: int, size: float) -> None:
-        """Feeds the cache until this number of paths have done so. ``size`` is the fineness of its cells."""
+        """Feeds the cache until ``wanted`` paths in all have fed it. ``size`` is the fineness of its cells."""
         parts = [wanted]
         if self.cache is None:
             parts = [round(_FIRST_PART * wanted), wanted]
-            # The light of the layer ``caustic`` is kept apart, where there is such a layer.
+            # If there is a layer ``caustic``, the cache keeps its light apart, as a second sort of light.
             self.cache = Cache(size, 2 if self.plan.caustic else 1, grid(sensor, seed))
         for part in parts:
             self.cache.fade()
@@ -107,7 +113,7 @@ class SharedTails(Rounds):
                 self.cache.settle(size)
 
     def feed(self, sensor: mi.Sensor, seed: int, n: int) -> float:
-        """Lets this number of paths feed the cache. Returns the share that pass a vertex where paths may end."""
+        """Lets ``n`` paths feed the cache. Returns the share of them that pass a vertex where paths may end."""
         # The paths are spread over the image row by row, since neighbouring rays trace faster.
         number = np.arange(n, dtype=np.int64)
         some, first = number * self.pixels // n, self.fed + number % -(-n // self.pixels)
@@ -118,8 +124,8 @@ class SharedTails(Rounds):
         lanes = [dr.compress(count > i) for i in range(len(records))]
         there = [(which, record) for which, record in zip(lanes, records, strict=True) if dr.width(which)]
         if there:
-            # One call for all: separate kernels for first, second and third records would take longer to launch than
-            # to run.
+            # One call adds all records: separate kernels for first, second and third records would take longer to
+            # launch than to run.
             fields = zip(*([dr.gather(type(v), v, which) for v in record] for which, record in there), strict=True)
             x, y, z, code, level, halves, *values = map(joined, fields)
             self.cache.add(CellPlace(mi.Point3f(x, y, z), code, level), halves, values)
@@ -127,8 +133,8 @@ class SharedTails(Rounds):
 
 
 def paths(view, plan: Plan, known: Known, camera: CameraSamples, half: mi.UInt32) -> tuple[mi.UInt32, list[list]]:
-    """Returns the number of records of each path, and the records: place, half of the cache, and RGB of each sort of
-    light.
+    """Returns the number of records of each path, and the records as lists of fields: the place, the half of the cache,
+    and the RGB of each sort of light.
     """
     ray, importance, _ = camera.rays()
     within = plan.space.around(camera.sensor)
@@ -140,8 +146,8 @@ def paths(view, plan: Plan, known: Known, camera: CameraSamples, half: mi.UInt32
 
 
 def grid(sensor: mi.Sensor, seed: int) -> CellGrid:
-    """Returns the grid of cells around a camera. Each seed shifts it, so that no wall lies on the border of cells for
-    all seeds.
+    """Returns the grid of cells around a camera. The grid is shifted differently for each seed, so that no wall lies on
+    the border of cells for all seeds.
     """
     origin = np.array(sensor.world_transform().translation(), np.float64).ravel()
     return CellGrid.at(origin, np.random.default_rng([seed, _SEED]).random(3))

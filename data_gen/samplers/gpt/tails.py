@@ -1,25 +1,26 @@
-"""Paths of ``gpt`` and ``primal`` that end in the cache (``data_gen.tails``), and those that feed it.
+"""Paths of ``gpt`` and ``primal`` that end in the cache of light (``data_gen.tails``), and paths that feed it.
 
-A path may end at its second vertex or a later one. Three conditions must hold: the material has a diffuse part, or the
-vertex is in a medium that scatters evenly enough; the path's spread is large; and the cell is trusted. A path of
-``gpt`` ends only where all offset paths have joined it. The cache then supplies the light that a matt surface, or an
-even phase function, would scatter toward the path (``data_gen.tails.matt``):
+A path may end at its second vertex or a later one, under three conditions:
 
-    ρ C,
+1. The material has a diffuse part, or the vertex is in a medium that scatters evenly enough.
+2. The path's spread is large. The spread is the width of the bundle of similar paths (``data_gen.tails.cache``).
+3. The cell of the cache is trusted: it has enough records.
 
-the vertex's ρ times the mean light of the cell. An offset path adds a ρ C to its difference, with the factor ``a`` that
-it would have had for all that follows (``offset_path.settle``). If the vertex scatters in no other way, the path is
-over. Otherwise it goes on for the rest. The step before has already found the emission at the vertex itself, with its
-usual MIS weight.
+A path of ``gpt`` ends only where all offset paths have joined it. The cache then supplies the light ρ C that a matt
+surface, or an even phase function, would scatter toward the path (``data_gen.tails.matt``). C is the mean light of the
+cell, and ρ is the share of it that the vertex scatters. An offset path adds a ρ C to its difference, where ``a`` is its
+factor for all later light (``offset_path.settle``). If the vertex scatters in no other way, the path is over. Otherwise
+the path goes on, to find the rest of the scattered light. ρ C does not contain the emission of the vertex itself: the
+step before has already found it, with its usual MIS weight.
 
-If there is the layer ``caustic``, the cache stores the light of that layer separately: light that has passed a sharp
-surface behind the vertex (``data_gen.paths.caustic``). It goes into the layer and into no difference.
+If there is a layer ``caustic``, the cache stores the light of this layer separately: light that has passed a sharp
+surface behind the vertex (``data_gen.paths.caustic``). This light goes into the layer, and into no difference.
 
-A path that feeds the cache opens a record at its first vertex that meets the first two conditions, and at later ones,
-at most ``RECORDS``. From the second such vertex on it may end in the cache itself, in its own half of the records. So
-light of many bounces builds up. A record holds the light that arrives. Therefore the path leaves the vertex as if it
-were matt and white, even where the texture is black. [Müller et al. 2021, "Real-time neural radiance caching for path
-tracing", section 4]
+A path that feeds the cache opens a record at its first vertex that meets conditions 1 and 2. It may open more at later
+such vertices, up to ``RECORDS`` in all. From the second such vertex on, the path itself may end in the cache, where it
+reads only its own half of the records. So the cache collects light of many bounces. A record holds the light that
+arrives. Therefore the path leaves the vertex as if it were matt and white, even where the texture is black. [Müller et
+al. 2021, "Real-time neural radiance caching for path tracing", section 4]
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ from data_gen.tails.table import CellPlace
 
 # The most records that a path may have
 RECORDS = 3
-# If the depth of paths is limited, cells are separated by the number of bounces that are left, where it is below this.
+# If the depth of paths is limited, and fewer than this number of bounces are left, each number of bounces that are left
+# has its own cells.
 _ALL = 16
 
 
@@ -49,7 +51,8 @@ def place(plan: Plan, known: Known, path: Path) -> tuple[CellPlace, mi.Bool]:
     able = path.walks & x.is_valid() & (path.depth < plan.limits.max_depth) & (trail.spread > NEAR * trail.reach)
     able = plan.matt.at(x, path.place, able)
     if plan.replays:
-        # At other vertices all light is late, even the light that a diffuse part scatters.
+        # At vertices that are not connectable all light is late (it belongs to the layer ``caustic``), even the light
+        # that a diffuse part scatters.
         able &= plan.materials.connectable(x.bsdf()) | media.scatters(path.place)
     most = plan.limits.max_depth
     late = mi.UInt32(0) if most == UNLIMITED else path.depth - dr.minimum(path.depth, max(most - _ALL, 0))
@@ -59,14 +62,15 @@ def place(plan: Plan, known: Known, path: Path) -> tuple[CellPlace, mi.Bool]:
 def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.Spectrum, mi.Spectrum, mi.Spectrum]:
     """Ends paths where the cache knows the light that follows.
 
-    Returns the paths, that light without the layer ``caustic``, that light of the layer, and a sample of the error of
-    both (``data_gen.tails.cache``). The differences of the ``offsets`` get their part of the light that is not of the
-    layer.
+    Returns four values: the paths, the cache's light outside the layer ``caustic``, the cache's light of this layer,
+    and a sample of the error of both lights (``data_gen.tails.cache``). The light outside the layer is also added to
+    the differences of the ``offsets``.
     """
     where, able = place(plan, known, path)
     lambertian = plan.matt.lambertian(path.x, path.place, able)
     for y in offsets:
-        # A joined path has come from elsewhere, so the material scatters another rest for it than for the base path.
+        # A joined offset path has come from another direction than the base path. So the rest of the scattered light
+        # differs between the two paths, except at Lambertian materials, where the rest is 0.
         able &= ~(y.apart | (y.joined & ~lambertian))
     sorts, errors, ends = known.look(where, LEAST, able)
     ρ = plan.matt.reflectance(path.x, path.place, ends)
@@ -74,13 +78,13 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
     found, caustic_found = caustic.split(path.late, found)
     caustic_found = sum(late, caustic_found)
     for y in offsets:
-        # For a joined path: the factor with which it would settle at this vertex, which scatters evenly
+        # For a joined path, this is the factor a with which it would settle at this vertex, which scatters evenly.
         joined = gradient_weight(y.r, True) * (y.β - path.β)
         y.Δ = y.Δ + dr.select(y.joined, joined, y.a) * found
     path.walks = path.walks & ~(ends & lambertian)
     path.ρ = ρ
-    # A path that could have ended here but goes on has a new spread from here, as after a record of a path that feeds
-    # the cache.
+    # If a path was able to end here, but the cache did not know the light, its spread starts again from 0. A path that
+    # feeds the cache does the same after each record.
     path.trail.spread = dr.select(able & ~ends, 0, path.trail.spread)
     return path, path.β * found, path.β * caustic_found, path.β * ρ * sum(errors)
 
@@ -90,8 +94,8 @@ class Record:
     """A vertex of a path that feeds the cache, and the light of each sort that the path has found to arrive there."""
 
     place: CellPlace
-    T: mi.Spectrum  # throughput from there on
-    late: mi.Bool  # what follows belongs to the layer ``caustic``
+    T: mi.Spectrum  # throughput from the record's vertex on
+    late: mi.Bool  # whether later light belongs to the layer ``caustic``
     E: list[mi.Spectrum]
 
     def find(self, light: mi.Spectrum, late: mi.Bool) -> None:
@@ -114,7 +118,8 @@ def feed(view, plan: Plan, known: Known, random, camera_ray: tuple, half: mi.UIn
     blank = CellPlace(dr.zeros(mi.Point3f, lanes), mi.UInt32(0), mi.Int32(0))
     dark = [dr.zeros(mi.Spectrum, lanes) for _ in known.means]
     none = [Record(blank, mi.Spectrum(0), mi.Bool(False), list(dark)) for _ in range(RECORDS)]
-    # Light is late relative to each record here, and not relative to the camera.
+    # ``base_step`` must not split off the layer ``caustic``, because here each record decides for itself which light is
+    # late: the way from the camera to the record does not count.
     whole = replace(plan, caustic=False)
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
         return walk(whole, known, random, path, none, half)
@@ -128,7 +133,7 @@ def walk(plan: Plan, known: Known, random, path: Path, records: list, half: mi.U
         step, path = base_step(scene, plan, random, path, [], Recording(count > 0, fresh))
         rough = mi.Bool(True)
         for i in range(RECORDS):
-            # A record at the step's vertex is the newest one. There light is scattered as by a matt white surface.
+            # A record at the step's vertex is always the newest one. This vertex scatters as a matt white surface.
             r, here = records[i], fresh & (count == i + 1)
             r.find(
                 dr.select(here, step.E_light, r.T * step.L_light), caustic.lit_late(rough, r.late, step.x_connectable)
@@ -139,7 +144,7 @@ def walk(plan: Plan, known: Known, random, path: Path, records: list, half: mi.U
             r.find(r.T * step.L_bsdf, r.late)
         where, able = place(plan, known, path)
         sorts, _, ends = known.look(where, LEAST_TO_FEED, able, half)
-        # The first vertex where paths may end has a record in any case.
+        # At the first vertex where paths may end, the path always goes on and opens a record.
         ends &= (count > 0) & ((count == RECORDS) | (random.next_1d() >= RENEW))
         ρ = plan.matt.reflectance(path.x, path.place, ends)
         fresh = able & ~ends & (count < RECORDS)

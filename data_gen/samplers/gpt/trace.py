@@ -20,18 +20,18 @@ class Traced:
     """What base paths and their offset paths have found so far."""
 
     L: mi.Spectrum  # radiance of base paths, without the emission that the camera sees directly
-    Le: mi.Spectrum  # that emission
-    L_caustic: mi.Spectrum  # of the layer ``caustic``
-    shared: mi.Spectrum  # a sample of the error of what comes from the cache
+    Le: mi.Spectrum  # the emission that the camera sees directly
+    L_caustic: mi.Spectrum  # the light of the layer ``caustic``
+    shared: mi.Spectrum  # a sample of the error of the light that comes from the cache
     offsets: list[Offset]
 
 
 def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=None, *, known=None) -> Traced:
-    """Traces base paths that begin with ``camera_ray``, a ray and its importance, and their four offset paths.
+    """Traces base paths and their four offset paths. Base paths begin with ``camera_ray``: a ray and its importance.
 
-    Offset paths begin with the ``shifted`` rays, and are in the order of SHIFTS. The camera is in the medium
-    ``within``. ``view`` is the integrator, which knows what is hidden from the camera. Paths may end in what is
-    ``known`` of the cache; None: there is no cache.
+    Offset paths begin with the ``shifted`` rays, in the order of SHIFTS. The camera is in the medium ``within``.
+    ``view`` is the integrator, which knows what is hidden from the camera. Paths may end where the cache has ``known``
+    light; None: there is no cache.
     """
     # --------------------- First vertices ------------------------
     (ray, importance), space, scene = camera_ray, plan.space, plan.space.scene
@@ -41,7 +41,7 @@ def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=Non
     path = begin(plan, x, first.place, drawn.channel if drawn else None, β)
     if known:
         path.trail, path.ρ = Trail.to(space.length(ray.o, x)), mi.Color3f(0)
-    # Kept out of the gradients: it has little noise, but its edges would be the strongest of the image.
+    # Le is kept out of the gradients: it has little noise, but its edges would be the strongest of the image.
     if space.media:
         Le = importance * view.lamps_in_fog(scene, space.media, ray, within, drawn.channel)
     else:
@@ -52,7 +52,7 @@ def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=Non
         there = space.first(view, offset_ray, within, drawn)
         y = start(plan, path, there, offset_importance, inside)
         if space.grids:
-            # Both paths replay the numbers of this segment: r = 1, w = 1/2.
+            # Both paths use the same random numbers in this segment, so r = 1 and w = 1/2.
             y.Δ = y.β * view.behind_grids(scene, space.media, there) - L_first
             y.A = dr.select(inside, 1, 2) * L_first
         offsets.append(y)
@@ -63,15 +63,17 @@ def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=Non
     # Loop optimisation would record each loop twice, and would not make the kernel quicker.
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
         if not plan.replays:
-            # If the first step is outside the loop, the loop needs no code for paths that are apart.
+            # Without replay no offset path is apart after the first step. So if the first step is outside the loop, the
+            # loop needs no code for paths that are apart.
             path, so_far = go_on(scene, plan, random, path, so_far, known=known, first=True)
         return walk(scene, plan, random, path, so_far, known)
 
 
 def go_on(scene, plan: Plan, random, path: Path, so_far: Traced, *, known, first=False) -> tuple[Path, Traced]:
-    # The base path first: an offset path can only join a vertex that is known.
+    # The base path goes first, because an offset path can only join a vertex that is already known.
     step, path = base_step(scene, plan, random, path, so_far.offsets)
-    # Two techniques, two terms: they are weighted by m against each other, and shifted separately.
+    # Emitter sampling and BSDF sampling each give a term. The two terms are weighted against each other by m, and are
+    # shifted separately.
     L, L_caustic = so_far.L + (step.β * step.L_light + step.β1 * step.L_bsdf), so_far.L_caustic
     if plan.caustic:
         L_caustic = L_caustic + step.β * step.L_caustic
